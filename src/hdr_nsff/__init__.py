@@ -1,0 +1,3 @@
+"""HDR-NSFF: alternating-exposure video in, dynamic HDR radiance field out."""
+
+__version__ = "0.1.0"

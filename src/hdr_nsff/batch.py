@@ -1,0 +1,70 @@
+"""A batch of pixels of one frame with everything the objective compares them to, and how pixels are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.camera import Camera
+from hdr_nsff.scene import Frame, Scene
+
+
+@dataclass(frozen=True)
+class PixelBatch:
+    """`N` pixels of one training frame."""
+
+    frame: int  # position of the frame in `scene.train`
+    time: float  # in frames
+    camera: Camera
+    camera_id: int
+    bracket: int
+    neighbours: dict[int, Camera]  # {+-1: camera of the next / previous training frame}; a missing side is absent
+    pixels: Tensor  # (N, 2) xy, centres at +0.5
+    rgb: Tensor  # (N, 3) recorded, in [0, 1]
+    uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
+    moving: Tensor | None = None  # (N,) bool
+    disparity: Tensor | None = None  # (N,) 1 / scene units (or relative)
+    disparity_confidence: Tensor | None = None  # (N,) in [0, 1]
+    flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (N, 2)} pixels
+    flow_valid: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (N,)} bool
+
+
+def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = None) -> PixelBatch:
+    """The batch of integer `pixels` (N, 2; column, row) of training frame `frame`."""
+    f: Frame = scene.train[frame]
+    column, row = pixels[:, 0], pixels[:, 1]
+
+    def at(image: Tensor | None) -> Tensor | None:
+        return None if image is None else image[row, column]
+
+    neighbours = {o: scene.train[j].camera for o, j in f.neighbours.items()}
+    return PixelBatch(
+        frame=frame,
+        time=f.time,
+        camera=f.camera,
+        camera_id=f.camera_id,
+        bracket=f.bracket,
+        neighbours=neighbours,
+        pixels=pixels.to(f.image) + 0.5,
+        rgb=f.image[row, column],
+        uniform=torch.ones(len(pixels), dtype=torch.bool, device=pixels.device) if uniform is None else uniform,
+        moving=at(f.moving),
+        disparity=at(f.disparity),
+        disparity_confidence=at(f.disparity_confidence),
+        flow={o: v[row, column] for o, v in f.flow.items()},
+        flow_valid={o: v[row, column] for o, v in f.flow_valid.items()},
+    )
+
+
+def draw_pixels(scene: Scene, frame: int, num_uniform: int, num_moving: int, generator: torch.Generator) -> PixelBatch:
+    """`num_uniform` random pixels of training frame `frame`, and `num_moving` more from its moving mask (none where nothing moves)."""
+    f = scene.train[frame]
+    h, w = f.image.shape[:2]
+    flat = torch.randint(h * w, (num_uniform,), generator=generator).to(f.image.device)
+    if num_moving and f.moving is not None and len(inside := f.moving.reshape(-1).nonzero()[:, 0]):
+        extra = torch.randint(len(inside), (num_moving,), generator=generator).to(f.image.device)
+        flat = torch.cat([flat, inside[extra]])
+    uniform = torch.arange(len(flat), device=flat.device) < num_uniform
+    return gather(scene, frame, torch.stack([flat % w, flat // w], -1), uniform)

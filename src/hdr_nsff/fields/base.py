@@ -1,0 +1,60 @@
+"""What every radiance field answers: what does this camera see, at this time, at these pixels, in linear HDR radiance.
+
+Fields know nothing of exposure, white balance or response curves: tone mapping happens outside. `S` is the number of
+pixels asked for. Camera, time and pixels are the currency, not rays: an NSFF casts rays through the pixels, a splat
+field rasterises the frame and reads them off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+from torch import Tensor
+
+from hdr_nsff.batch import PixelBatch
+from hdr_nsff.camera import Camera
+
+
+@dataclass(frozen=True)
+class Warp:
+    """The same pixels rendered through the content of a neighbouring frame (eq. 2-3)."""
+
+    offset: int  # which neighbour: -1, +1, and -2, +2 for the two-step chain
+    flow: Tensor  # (S, 2) pixels: where the content goes in the neighbour's camera, minus where it is here
+    confidence: Tensor  # (S,) in [0, 1]: 1 - rendered disocclusion
+    radiance: Tensor | None  # (S, 3) linear HDR, None where the field offers no warped render
+
+
+@dataclass(frozen=True)
+class Render:
+    """What a field saw at S pixels."""
+
+    radiance: Tensor  # (S, 3) linear HDR, >= 0
+    depth: Tensor  # (S,) z-depth, scene units
+    opacity: Tensor  # (S,) in [0, 1]
+    motion: Tensor  # (S,) in [0, 1]: share of dynamic content
+    scene_flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (S, 3)} scene units to the next / previous training time
+    warps: tuple[Warp, ...] = ()  # while training
+    dynamic_radiance: Tensor | None = None  # (S, 3) the dynamic branch alone, while training
+    dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch alone, while training
+
+
+@runtime_checkable
+class RadianceField(Protocol):
+    """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses by type."""
+
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks itself. `time` in frames, may be fractional."""
+        ...
+
+    def __call__(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
+        """A training render with warps, and the field's own per-sample regularisers by their `LossWeights` name."""
+        ...
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Parameter groups with their learning rates, for the optimiser."""
+        ...
+
+    def after_step(self, step: int) -> None:
+        """Housekeeping between optimiser steps (culling grids, schedules)."""
+        ...

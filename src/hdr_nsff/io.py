@@ -1,0 +1,244 @@
+"""Files: PNG and TIFF images, OpenEXR, video, npy, json. Reading checks and says what is wrong in one sentence
+(`InputError`); writing is atomic: a temporary file beside the target, fsync, rename."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import OpenEXR
+
+from hdr_nsff.errors import InputError
+
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # chromaticities of R, G, B and white
+
+
+@contextmanager
+def atomic(path: Path | str) -> Iterator[Path]:
+    """A temporary path beside `path` with the same suffix; renamed onto `path` once the block ends without an error."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(prefix=".partial-", suffix=path.suffix, dir=path.parent)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        temporary.chmod(0o644)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write `text` as UTF-8, atomically."""
+    with atomic(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def write_json(path: Path | str, value: Any) -> None:
+    """Write `value` as readable JSON, atomically."""
+    write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+
+
+def write_npy(path: Path | str, array: np.ndarray) -> None:
+    """Write an array, atomically."""
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.save(file, array, allow_pickle=False)
+        file.flush()
+
+
+def read_npy(path: Path | str) -> np.ndarray:
+    """An array as it was written, memory-mapped, read-only."""
+    try:
+        return np.load(path, mmap_mode="r", allow_pickle=False)
+    except FileNotFoundError as error:
+        raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it") from error
+    except (ValueError, EOFError, OSError) as error:
+        raise InputError(f"{path}: not a readable .npy array ({error}); run `hdr-nsff prepare` with `--redo`") from error
+
+
+def encode(path: Path | str, image: np.ndarray) -> None:
+    """Write 8- or 16-bit (H, W) or (H, W, 3) RGB through OpenCV, atomically."""
+    data = np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image)
+    with atomic(path) as temporary:
+        ok, buffer = cv2.imencode(Path(path).suffix, data)
+        assert ok, f"could not encode {path}"
+        temporary.write_bytes(buffer.tobytes())
+
+
+def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
+    """Write `rgb` (H, W, 3) or (H, W) in [0, 1] (clipped here: a PNG is for looking at or a recorded image), or a bool mask."""
+    if rgb.dtype == bool:
+        encode(path, rgb.astype(np.uint8) * 255)
+        return
+    top = 2**bits - 1
+    encode(path, np.rint(np.clip(rgb, 0, 1) * top).astype(np.uint8 if bits == 8 else np.uint16))
+
+
+def read_image(path: Path | str) -> np.ndarray:
+    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such image")
+    raw = np.frombuffer(path.read_bytes(), np.uint8)
+    if path.suffix.lower() == ".png" and not raw.tobytes().rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+        raise InputError(f"{path}: the PNG is cut short; copy it again")
+    if path.suffix.lower() in {".jpg", ".jpeg"} and b"\xff\xd9" not in raw[-64:].tobytes():
+        raise InputError(f"{path}: the JPEG is cut short; copy it again")
+    try:
+        image = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if len(raw) else None
+    except cv2.error:
+        image = None
+    if image is None:
+        raise InputError(f"{path}: not a readable image (PNG, JPEG or TIFF)")
+    if image.dtype not in (np.uint8, np.uint16):
+        raise InputError(f"{path}: {image.dtype} pixels; convert to 8 or 16 bits, or to EXR for linear data")
+    return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+
+
+def read_mask(path: Path | str) -> np.ndarray:
+    """A mask image as bool (H, W): true above half."""
+    return read_image(path).mean(-1) > 0.5
+
+
+def write_exr(path: Path | str, channels: dict[str, np.ndarray], header: dict[str, Any] | None = None, half: bool = True) -> None:
+    """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped; depth `Z` stays 32-bit. NaN is an error.
+
+    Header defaults: ZIP compression, Rec. 709 chromaticities. Extra keys (str, float) become attributes."""
+    arrays = {}
+    for name, array in channels.items():
+        assert np.isfinite(array).all(), f"{path}: channel {name} holds NaN or Inf"
+        kind = np.float16 if half and name != "Z" else np.float32
+        with np.errstate(over="ignore"):
+            data = np.ascontiguousarray(array, dtype=kind)  # OpenEXR writes wrong pixels for anything not contiguous
+        if kind == np.float16 and np.isinf(data).any():
+            data = np.ascontiguousarray(array, dtype=np.float32)  # beyond 65504: keep the radiance, not the size
+        arrays[name] = data
+    full = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "chromaticities": REC709, **(header or {})}
+    with atomic(path) as temporary, OpenEXR.File(full, arrays) as file:
+        file.write(str(temporary))
+
+
+def read_exr(path: Path | str) -> dict[str, np.ndarray]:
+    """Channels of an EXR as float32: {"RGB": (H, W, 3)} and {name: (H, W)} for the others. InputError for a file cut short, NaN or Inf."""
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    try:
+        with OpenEXR.File(str(path)) as file:
+            if not file.parts:
+                raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")
+            channels = {n: np.array(c.pixels, dtype=np.float32) for n, c in file.channels().items()}
+    except InputError:
+        raise
+    except Exception as error:  # OpenEXR raises several unrelated types
+        raise InputError(
+            f"{path}: not a readable EXR ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
+        ) from error
+    if "RGB" not in channels and "RGBA" in channels:
+        channels["RGB"] = np.ascontiguousarray(channels["RGBA"][..., :3])
+    for name, array in channels.items():
+        if not np.isfinite(array).all():
+            raise InputError(f"{path}: channel {name} holds NaN or Inf; mend it in the program that wrote it")
+    return channels
+
+
+def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float = 24.0, crf: int = 16) -> int:
+    """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4 (8 bits, Rec. 709 tags, fast start), atomically; the number of frames written.
+
+    Odd sizes lose their last row or column (4:2:0 needs even ones)."""
+    import av
+
+    count = 0
+    with atomic(path) as temporary:
+        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
+            stream: Any = None
+            for frame in frames:
+                h, w = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
+                if stream is None:
+                    stream = container.add_stream(
+                        "libx264", rate=Fraction(fps).limit_denominator(1001), options={"crf": str(crf)}
+                    )
+                    stream.width, stream.height, stream.pix_fmt = w, h, "yuv420p"
+                    tag(stream.codec_context)
+                data = np.rint(np.clip(frame[:h, :w], 0, 1) * 255).astype(np.uint8)
+                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(data), format="rgb24").reformat(
+                    format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG"
+                )
+                tag(picture)
+                container.mux(stream.encode(picture))
+                count += 1
+            if stream is None:
+                raise InputError(f"{path}: no frames to write")
+            container.mux(stream.encode())
+    return count
+
+
+def tag(target: Any) -> None:
+    """Rec. 709 colour tags on a codec context or a frame (players guess otherwise)."""
+    target.colorspace, target.color_range, target.color_primaries, target.color_trc = 1, 1, 1, 1
+
+
+def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
+    """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds. InputError where nothing can be decoded."""
+    import av
+
+    path = Path(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: no video stream in this file")
+            for frame in container.decode(video=0):
+                deep = frame.format.components[0].bits > 8
+                array = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+                yield array.astype(np.float32) / np.float32(65535 if deep else 255), float(frame.time or 0.0)
+    except (av.FFmpegError, OSError) as error:
+        raise InputError(
+            f"{path}: not a readable video, or cut short ({str(error).split(':')[0]}); check that it plays, or copy it again"
+        ) from error
+
+
+def contact_sheet(rows: list[list[np.ndarray]], gap: int = 4, background: float = 0.12) -> np.ndarray:
+    """One picture (H, W, 3) of a table of pictures; grey (H, W) ones become rgb, all cells take the size of the largest."""
+    cells = [[c if c.ndim == 3 else np.repeat(c[..., None], 3, -1) for c in row] for row in rows]
+    h = max(c.shape[0] for row in cells for c in row)
+    w = max(c.shape[1] for row in cells for c in row)
+    columns = max(len(row) for row in cells)
+    sheet = np.full((len(cells) * (h + gap) + gap, columns * (w + gap) + gap, 3), background, np.float32)
+    for i, row in enumerate(cells):
+        for j, cell in enumerate(row):
+            y, x = gap + i * (h + gap), gap + j * (w + gap)
+            sheet[y : y + cell.shape[0], x : x + cell.shape[1]] = cell
+    return sheet
+
+
+def colorize(
+    values: np.ndarray, low: float | None = None, high: float | None = None, valid: np.ndarray | None = None
+) -> np.ndarray:
+    """A scalar map (H, W) as rgb (H, W, 3) in [0, 1] through matplotlib's turbo, from percentiles 2 to 98 unless `low`, `high` are given."""
+    import matplotlib
+
+    known = values[valid] if valid is not None and valid.any() else values.reshape(-1)
+    low = float(np.percentile(known, 2)) if low is None else low
+    high = float(np.percentile(known, 98)) if high is None else high
+    rgb = matplotlib.colormaps["turbo"](np.clip((values - low) / max(high - low, 1e-12), 0, 1))[..., :3].astype(np.float32)
+    return rgb if valid is None else rgb * valid[..., None]
+
+
+def colorize_flow(flow: np.ndarray, maximum: float | None = None) -> np.ndarray:
+    """Optical flow (H, W, 2) px as rgb (H, W, 3): hue is direction, saturation is length up to `maximum` (98th percentile)."""
+    length = np.linalg.norm(flow, axis=-1)
+    maximum = maximum or max(float(np.percentile(length, 98)), 1e-6)
+    hue = (np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) % 360).astype(np.float32)
+    hsv = np.stack([hue, np.clip(length / maximum, 0, 1).astype(np.float32), np.ones_like(hue)], -1)
+    return cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)

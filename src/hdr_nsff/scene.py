@@ -1,0 +1,236 @@
+"""The scene folder: what `prepare` writes and everything else reads.
+
+`scene.json` (pydantic, unknown keys are errors) names every file relative to the folder, says where it came from, in
+which units, and holds the hashes of the inputs. Maps are one half-precision `.npy` per array, images and masks are PNG.
+Held-out truth of a synthetic scene lives outside, see `truth.py`; nothing here can read it."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from hdr_nsff.camera import Camera
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_image, read_mask, read_npy, write_json
+
+VERSION = 1
+Parallax = Literal["full", "rotation", "none"]
+Split = Literal["train", "test"]
+
+
+class Strict(BaseModel):
+    """A model that refuses what it does not know."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class FlowFiles(Strict):
+    """Optical flow from one frame to another."""
+
+    flow: str  # .npy (H, W, 2) half, pixels: where a pixel goes in the other frame, minus where it is
+    valid: str  # PNG, 255 where the forward-backward check passed
+
+
+class FrameEntry(Strict):
+    """One recorded frame and the files of its priors."""
+
+    index: int = Field(ge=0)
+    image: str  # PNG, recorded rgb, 8 or 16 bit
+    source: str  # which file (and frame of it) this came from
+    time: float  # in frames of the footage
+    camera_id: int = Field(default=0, ge=0)  # physical camera: owns a response curve and a white balance
+    bracket: int = Field(ge=0)  # which exposure of the cycle
+    ev: float | None = None  # log2 exposure relative to the reference bracket where it is known
+    split: Split = "train"
+    K: list[list[float]] | None = None  # 3x3 pixels
+    c2w: list[list[float]] | None = None  # 3x4 OpenCV, scene units
+    mask: str | None = None  # PNG, moving = 255
+    disparity: str | None = None  # .npy (H, W) half, 1 / z-depth
+    disparity_confidence: str | None = None  # .npy (H, W) half, in [0, 1]
+    flow: dict[int, FlowFiles] = {}  # other frame's index -> flow towards it
+
+
+class Step(Strict):
+    """One finished step of `prepare`: what it did, and the hash of everything it depended on."""
+
+    done: bool = False
+    key: str = ""  # hash of settings and inputs; another key means the step is redone
+    provenance: Literal["estimated", "given", "absent"] = "estimated"
+    note: str = ""  # one sentence for people
+    seconds: float = 0.0
+    details: dict[str, Any] = {}
+
+
+class Manifest(Strict):
+    """`scene.json`."""
+
+    version: Literal[1] = VERSION
+    source: str  # the footage, as the user named it
+    inputs: dict[str, str] = {}  # input file name -> sha256
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fps: float = Field(default=24.0, gt=0)
+    cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
+    reference_bracket: int = Field(default=0, ge=0)  # the bracket whose gain is 1: the radiometric gauge
+    bracket_ev: list[float | None] = []  # per bracket: log2 exposure relative to the reference, None = to be learned
+    exposure_given: bool = False
+    parallax: Parallax = "full"
+    depth_kind: Literal["scene", "relative"] = "scene"  # disparity in 1 / scene units, or known up to scale and shift per frame
+    near: float | None = Field(default=None, gt=0)  # z-depth, scene units
+    far: float | None = Field(default=None, gt=0)
+    points: str | None = None  # .npy (P, 3) float, scene units
+    frames: list[FrameEntry] = []
+    steps: dict[str, Step] = {}
+
+    def save(self, folder: Path) -> None:
+        """Write `scene.json` atomically."""
+        write_json(folder / "scene.json", self.model_dump())
+
+    @staticmethod
+    def load(folder: Path) -> Manifest:
+        """Read `scene.json`; InputError in one sentence where it is missing or makes no sense."""
+        path = Path(folder) / "scene.json"
+        if not path.is_file():
+            raise InputError(f"{folder}: no scene.json here; make a scene folder with `hdr-nsff prepare CLIP {folder}`")
+        try:
+            return Manifest.model_validate(json.loads(path.read_text()))
+        except (ValidationError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            raise InputError(
+                f"{path}: not a valid scene ({first_problem(error)}); restore it or run `prepare` with `--redo frames`"
+            ) from error
+
+
+def first_problem(error: Exception) -> str:
+    """The first thing pydantic or json complained about, in a few words."""
+    if isinstance(error, ValidationError):
+        e = error.errors()[0]
+        return f"{'.'.join(str(p) for p in e['loc']) or 'top level'}: {e['msg']}"
+    return str(error)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame in memory."""
+
+    index: int  # in the manifest
+    time: float  # in frames
+    camera: Camera
+    camera_id: int
+    bracket: int
+    exposure: float | None  # EV relative to the reference bracket, None = unknown
+    image: Tensor  # (H, W, 3) recorded rgb in [0, 1]
+    neighbours: dict[int, int] = field(default_factory=dict)  # {+-1: position in `Scene.train`}, same physical camera
+    moving: Tensor | None = None  # (H, W) bool
+    disparity: Tensor | None = None  # (H, W)
+    disparity_confidence: Tensor | None = None  # (H, W) in [0, 1]
+    flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W, 2)} pixels
+    flow_valid: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W) bool}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A prepared clip in memory: what training reads."""
+
+    folder: Path
+    train: list[Frame]
+    test: list[Frame]  # frames of the clip kept out of training
+    near: float  # z-depth, scene units
+    far: float
+    points: Tensor  # (P, 3) static points, scene units
+    manifest: Manifest
+
+    @property
+    def times(self) -> Tensor:
+        """Distinct training times in order, (T,)."""
+        return torch.tensor(sorted({f.time for f in self.train}), dtype=torch.float64)
+
+    @staticmethod
+    def open(folder: Path | str) -> Scene:
+        """Read a prepared scene folder; InputError in one sentence where something is missing, short or of the wrong size."""
+        folder = Path(folder)
+        m = Manifest.load(folder)
+        if not m.frames:
+            raise InputError(f"{folder}: the scene has no frames; run `hdr-nsff prepare` again")
+        if m.near is None or m.far is None or any(f.c2w is None or f.K is None for f in m.frames):
+            raise InputError(
+                f"{folder}: the scene has no camera poses yet; run `hdr-nsff prepare` again, it goes on where it stopped"
+            )
+        train = [e for e in m.frames if e.split == "train"]
+        links = neighbours(train)
+        return Scene(
+            folder=folder,
+            train=[
+                load_frame(folder, m, e, {o: train[j].index for o, j in n.items()}, n) for e, n in zip(train, links, strict=True)
+            ],
+            test=[load_frame(folder, m, e, {}, {}) for e in m.frames if e.split == "test"],
+            near=m.near,
+            far=m.far,
+            points=torch.from_numpy(read_npy(inside(folder, m.points)).astype(np.float32)) if m.points else torch.zeros(0, 3),
+            manifest=m,
+        )
+
+
+def neighbours(entries: list[FrameEntry]) -> list[dict[int, int]]:
+    """For each frame the positions of the previous (-1) and next (+1) frame in time of the same physical camera."""
+    result: list[dict[int, int]] = [{} for _ in entries]
+    for camera_id in {e.camera_id for e in entries}:
+        order = sorted((i for i, e in enumerate(entries) if e.camera_id == camera_id), key=lambda i: entries[i].time)
+        for a, b in itertools.pairwise(order):
+            result[a][1] = b
+            result[b][-1] = a
+    return result
+
+
+def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[int, int], links: dict[int, int]) -> Frame:
+    """One frame with its maps, every size checked against the manifest."""
+    size = (m.height, m.width)
+
+    def checked(name: str | None, read: Callable[[Path], np.ndarray], what: str, channels: tuple[int, ...] = ()) -> Tensor | None:
+        if name is None:
+            return None
+        array = read(inside(folder, name))
+        if array.shape != size + channels:
+            raise InputError(
+                f"{folder / name}: {what} of frame {e.index} has shape {array.shape}, expected {size + channels}; run `prepare` with `--redo`"
+            )
+        if array.dtype != bool and not np.isfinite(array).all():
+            raise InputError(f"{folder / name}: {what} of frame {e.index} holds NaN or Inf; run `prepare` with `--redo`")
+        return torch.from_numpy(array if array.dtype == bool else array.astype(np.float32))
+
+    image = checked(e.image, read_image, "image", (3,))
+    assert image is not None
+    flows = {o: e.flow[i] for o, i in neighbour_index.items() if i in e.flow}
+    flow = {o: checked(f.flow, read_npy, "flow", (2,)) for o, f in flows.items()}
+    valid = {o: checked(f.valid, read_mask, "flow mask") for o, f in flows.items()}
+    return Frame(
+        index=e.index,
+        time=e.time,
+        camera=Camera(torch.tensor(e.K), torch.tensor(e.c2w), m.width, m.height),
+        camera_id=e.camera_id,
+        bracket=e.bracket,
+        exposure=e.ev,
+        image=image,
+        neighbours=links,
+        moving=checked(e.mask, read_mask, "mask"),
+        disparity=checked(e.disparity, read_npy, "disparity"),
+        disparity_confidence=checked(e.disparity_confidence, read_npy, "disparity confidence"),
+        flow={o: v for o, v in flow.items() if v is not None},
+        flow_valid={o: v for o, v in valid.items() if v is not None},
+    )
+
+
+def inside(folder: Path, name: str) -> Path:
+    """`folder / name`, refusing a name that leaves the folder."""
+    path = (Path(folder) / name).resolve()
+    if not path.is_relative_to(Path(folder).resolve()):
+        raise InputError(f"{folder}: the file name {name!r} points outside the scene folder; names must stay inside it")
+    return path

@@ -1,0 +1,34 @@
+"""Map a function over the tensors of a frozen dataclass, so that moving or slicing one is a single call."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+T = TypeVar("T")
+
+
+def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
+    """`value` with `function` applied to every tensor in it: dataclasses, dicts, lists and tuples are entered."""
+
+    def walk(v: Any) -> Any:
+        if isinstance(v, Tensor):
+            return function(v)
+        if dataclasses.is_dataclass(v) and not isinstance(v, type):
+            return dataclasses.replace(v, **{f.name: walk(getattr(v, f.name)) for f in dataclasses.fields(v)})
+        if isinstance(v, dict):
+            return {k: walk(x) for k, x in v.items()}
+        if isinstance(v, (list, tuple)):
+            return type(v)(walk(x) for x in v)
+        return v
+
+    return walk(value)
+
+
+def to_device(value: T, device: torch.device | str) -> T:
+    """`value` with every tensor on `device`."""
+    return tree_map(lambda t: t.to(device), value)
