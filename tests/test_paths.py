@@ -1,0 +1,111 @@
+"""Camera paths: they begin where they should, look where they should, and path files are read or refused in a sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import pytest
+import torch
+
+from hdr_nsff import paths
+from hdr_nsff.camera import Camera
+from hdr_nsff.errors import InputError
+
+K = torch.tensor([[50.0, 0, 16], [0, 50, 12], [0, 0, 1]])
+
+
+def pose(degrees: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> torch.Tensor:
+    """Turned about the y axis, then placed."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return torch.tensor([[c, 0, s, x], [0, 1, 0, y], [-s, 0, c, z]])
+
+
+def camera(*place: float) -> Camera:
+    return Camera(K, pose(*place), 32, 24)
+
+
+def test_bullet_time_starts_at_the_frame_and_keeps_the_focus_point_centred() -> None:
+    start = camera(20.0, 1.0, 2.0, 3.0)
+    views = paths.bullet_time(start, 7.0, 4.0, torch.tensor([0.5, 0.3, 0.2]), num_views=12)
+    focus = start.c2w[:, 3] + 4.0 * start.c2w[:, 2]
+    assert torch.allclose(views[0].camera.c2w, start.c2w, atol=1e-5)
+    for view in views:
+        pixels, _ = view.camera.project(focus)
+        assert torch.allclose(pixels, torch.tensor([16.0, 12.0]), atol=1e-3)
+        rotation = view.camera.c2w[:, :3]
+        assert torch.allclose(rotation.T @ rotation, torch.eye(3), atol=1e-5) and view.time == 7.0
+
+
+def test_bullet_time_stays_within_its_radius_and_uses_it() -> None:
+    radius = torch.tensor([0.5, 0.3, 0.2])
+    views = paths.bullet_time(camera(), 0.0, 4.0, radius, num_views=96)
+    centres = torch.stack([v.camera.c2w[:, 3] for v in views]).abs().amax(0)
+    assert (centres <= radius + 1e-6).all() and (centres > 0.6 * radius).all()
+
+
+def test_reach_is_half_the_range_in_the_axes_of_the_camera() -> None:
+    cameras = [camera(0.0, x, 0.0, 0.0) for x in torch.linspace(0, 1, 11).tolist()]  # 10th to 90th percentile: 0.1 to 0.9
+    assert torch.allclose(paths.reach(cameras, camera()), torch.tensor([0.4, 0, 0]), atol=1e-6)
+    assert torch.allclose(paths.reach(cameras, camera(90.0)), torch.tensor([0, 0, 0.4]), atol=1e-6)  # now it looks along x
+
+
+def test_slow_motion_divides_uneven_intervals_and_glides_the_camera() -> None:
+    views = paths.slow_motion([camera(), camera(30.0, 1.0), camera(30.0, 1.0)], [0.0, 1.0, 3.0], factor=2)
+    assert [v.time for v in views] == [0.0, 0.5, 1.0, 2.0, 3.0]
+    assert torch.allclose(views[1].camera.c2w, pose(15.0, 0.5), atol=1e-6)  # half the angle, half the way
+
+
+def test_training_path_and_fixed_camera_pair_cameras_with_times() -> None:
+    a, b = camera(), camera(5.0)
+    assert [(v.camera, v.time) for v in paths.training_path([a, b], [0, 2])] == [(a, 0.0), (b, 2.0)]
+    assert [(v.camera, v.time, v.ev) for v in paths.fixed(b, [0, 2])] == [(b, 0.0, None), (b, 2.0, None)]
+
+
+def test_resizing_a_view_keeps_what_it_sees() -> None:
+    small = paths.View(camera(), 1.0).resized(0.5).camera
+    point = torch.tensor([0.3, -0.2, 2.0])
+    assert (small.width, small.height) == (16, 12)
+    assert torch.allclose(small.project(point)[0] * 2, camera().project(point)[0])
+
+
+def test_path_file_is_read_back(tmp_path) -> None:
+    other = [[60.0, 0, 10], [0, 60, 9], [0, 0, 1]]
+    entries = [{"time": 0.5, "c2w": pose(10.0, 1.0).tolist()}, {"time": 2, "c2w": pose().tolist(), "K": other, "ev": -2}]
+    file = tmp_path / "weg übers Feld.json"
+    file.write_text(json.dumps(entries))
+    first, second = paths.from_json(file, camera())
+    assert first.time == 0.5 and first.ev is None and torch.equal(first.camera.K, K)
+    assert torch.allclose(first.camera.c2w, pose(10.0, 1.0))
+    assert second.ev == -2.0 and torch.equal(second.camera.K, torch.tensor(other)) and second.camera.width == 32
+
+
+GOOD = {"time": 0.0, "c2w": pose().tolist()}
+BAD = {
+    "not a JSON file": "time: 0",
+    "at least one": "[]",
+    "view 0 is not an object": "[3]",
+    "has no 'time'": json.dumps([{"c2w": GOOD["c2w"]}]),
+    "unknown key 'fov'": json.dumps([{**GOOD, "fov": 60}]),
+    "view 1: c2w must be 3x4": json.dumps([GOOD, {**GOOD, "c2w": [[1, 0, 0, 0]]}]),
+    "c2w must be 3x4 finite": json.dumps([{**GOOD, "c2w": [[math.nan] * 4] * 3}]),
+    "not a rotation": json.dumps([{**GOOD, "c2w": [[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0]]}]),
+    "positive focal": json.dumps([{**GOOD, "K": [[0, 0, 1], [0, 0, 1], [0, 0, 1]]}]),
+    "time must be one finite": json.dumps([{**GOOD, "time": "soon"}]),
+    "ev must be one finite": json.dumps([{**GOOD, "ev": [1, 2]}]),
+}
+
+
+@pytest.mark.parametrize("sentence", BAD)
+def test_bad_path_files_are_refused_in_a_sentence(tmp_path, sentence: str) -> None:
+    (tmp_path / "path.json").write_text(BAD[sentence])
+    with pytest.raises(InputError, match=sentence):
+        paths.from_json(tmp_path / "path.json", camera())
+
+
+def test_missing_and_binary_path_files_are_refused(tmp_path) -> None:
+    with pytest.raises(InputError, match="No such file"):
+        paths.from_json(tmp_path / "none.json", camera())
+    (tmp_path / "film.json").write_bytes(b"\xff\xfe\x00\x81")
+    with pytest.raises(InputError, match="not a JSON file"):
+        paths.from_json(tmp_path / "film.json", camera())
