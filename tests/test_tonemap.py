@@ -1,0 +1,244 @@
+"""Laws of the tone mapper: gauge, monotony, invertibility, the ends of eq. 11, and which gradients flow."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.tonemap import GAMMA, ToneMapConfig, ToneMapper, informative, leaky_ends, piecewise_linear
+
+EV = [-4.0, -2.0, 0.0]
+
+
+def mapper(ev=EV, cameras=(0, 0, 0, 0, 0, 0), **config):
+    return ToneMapper(ToneMapConfig(**config), [0, 1, 2, 0, 1, 2], list(cameras), ev, reference_bracket=2)
+
+
+def disturb(tonemapper, seed=0, scale=1.0):
+    generator = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for p in tonemapper.parameters():
+            p.add_(torch.randn(p.shape, generator=generator) * scale)
+    return tonemapper
+
+
+def grid(n=1001, top=1.0):
+    return torch.linspace(0, top, n)[:, None].expand(-1, 3).contiguous()
+
+
+@pytest.mark.parametrize("kind", ["shared", "per_image", "fixed"])
+@pytest.mark.parametrize("knots", ["gamma", "even"])
+def test_a_new_response_is_gamma(kind, knots):
+    rgb = mapper(kind=kind, knots=knots)(grid(), bracket=2, frame=2, leaky=False)
+    assert (rgb - grid() ** (1 / GAMMA)).abs().max() < (1e-4 if knots == "gamma" else 0.03)  # even knots starve the darks
+
+
+def test_gain_is_two_to_the_ev():
+    t = mapper()
+    dark, reference = t(grid() * 4, bracket=1), t(grid(), bracket=2)  # bracket 1 is two stops darker: a quarter of the light
+    torch.testing.assert_close(dark, reference, atol=1e-5, rtol=0)
+
+
+def test_reference_gain_stays_fixed():
+    t = disturb(mapper([None, None, None], cameras=(0, 1, 0, 1, 0, 1), residual=False))
+    assert torch.equal(t.log_gain(2, 0, None), torch.zeros(3))
+    assert t.exposures()[2] == 0 and t.exposures()[0] != 0
+    assert t.log_gain(2, 1, None).abs().min() > 0  # the second camera's white balance is free
+
+
+def test_residuals_cannot_carry_scale():
+    t = disturb(mapper())
+    residual = torch.stack([t.log_gain(b, 0, i) - t.log_gain(b, 0, None) for i, b in enumerate(t.frame_brackets)])
+    assert residual.abs().max() > 0.1
+    torch.testing.assert_close(residual.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
+
+
+def test_known_exposures_are_exact_and_not_learned():
+    t = mapper([-4.0, None, 0.0])
+    t.set_exposures([-9.0, -1.5, 7.0])
+    assert t.exposures().tolist() == [-4.0, -1.5, 0.0]
+    assert t.bracket_gain.learned_ev.shape == (1,)
+
+
+def test_unknown_exposure_learns_from_its_bracket():
+    t = mapper([-4.0, None, 0.0], residual=False)
+    t(grid(), bracket=1).sum().backward()
+    assert t.bracket_gain.learned_ev.grad.item() > 0
+    t.zero_grad()
+    t(grid(), bracket=0).sum().backward()
+    assert t.bracket_gain.learned_ev.grad.item() == 0
+
+
+@pytest.mark.parametrize("knots", ["gamma", "even"])
+def test_any_parameters_give_a_strictly_rising_curve_between_fixed_ends(knots):
+    t = disturb(mapper(knots=knots), scale=4.0)
+    _, y = t.curve()
+    assert (y[:, 0] == 0).all() and (y[:, -1] == 1).all()
+    assert (y.diff(dim=-1) > 0).all()
+
+
+@pytest.mark.parametrize("kind", ["shared", "fixed", "per_image"])
+def test_inverse_undoes_the_recording(kind):
+    t = mapper(kind=kind)
+    if kind == "shared":
+        disturb(t)
+    rgb = torch.linspace(0.05, 0.95, 50)[:, None].expand(-1, 3).contiguous()
+    radiance = t.inverse(rgb, bracket=0, frame=3)
+    torch.testing.assert_close(t(radiance, bracket=0, frame=3, leaky=False), rgb, atol=2e-4, rtol=0)
+
+
+def test_ends_are_eq_11_and_continuous():
+    x = torch.tensor([-2.0, -1e-7, 0.0, 1.0, 1 + 1e-6, 4.0, math.inf])
+    y = leaky_ends(x, x.clamp(0, 1), leak=0.01)
+    expected = torch.tensor([-0.02, 0.0, 0.0, 1.0, 1.0, 1 + 0.01 - 0.01 / 2, 1.01])  # -a / sqrt(4) + a + 1
+    torch.testing.assert_close(y, expected, atol=1e-6, rtol=0)
+
+
+def test_saturated_radiance_keeps_a_gradient_only_while_training():
+    radiance = torch.full((1, 3), 4.0, requires_grad=True)
+    (grad,) = torch.autograd.grad(mapper()(radiance, bracket=2).sum(), radiance)
+    torch.testing.assert_close(grad, torch.full((1, 3), 0.01 / 2 / 4**1.5))  # d/dx of -a / sqrt(x)
+    (grad,) = torch.autograd.grad(mapper()(radiance, bracket=2, leaky=False).sum(), radiance)
+    assert (grad == 0).all()
+
+
+@pytest.mark.parametrize("power", [1.0, 1 / GAMMA])
+def test_lookup_and_its_gradients_agree_with_numpy_interpolation(power):
+    generator = torch.Generator().manual_seed(0)
+    knots = torch.linspace(0, 1, 9, dtype=torch.float64) ** (1 / power)
+    values = torch.rand(3, 9, generator=generator, dtype=torch.float64, requires_grad=True)
+    x = torch.rand(40, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    y = piecewise_linear(x, values, knots, power)
+    slow = [torch.from_numpy(np.interp(x[:, c].detach(), knots, values[c].detach())) for c in range(3)]
+    torch.testing.assert_close(y, torch.stack(slow, -1))
+    assert torch.autograd.gradcheck(lambda a, b: piecewise_linear(a, b, knots, power), (x, values))
+
+
+def test_gamma_knots_resolve_what_even_knots_hide():
+    x = torch.full((1, 3), 1e-4)  # a fortieth of the first even cell
+    true = 1e-4 ** (1 / GAMMA)
+    fine, coarse = (mapper(knots=k)(x, bracket=2).max().item() for k in ("gamma", "even"))
+    assert abs(fine - true) < 2e-4 and abs(coarse - true) > 0.01
+
+
+@pytest.mark.parametrize("knots", ["gamma", "even"])
+def test_a_set_curve_is_reproduced(knots):
+    x = torch.linspace(0, 1, 500) ** 2.2
+    y = torch.stack([x**p / (x**p + 0.3 * (1 - x)) for p in (0.6, 0.7, 0.8)])  # rising, from 0 to 1
+    t = mapper(knots=knots)
+    t.set_curve(x, y)
+    at = x[:, None].expand(-1, 3)[100:]  # above even knots' blind first cells
+    assert (t(at, bracket=2, leaky=False).T - y[:, 100:]).abs().max() < (2e-3 if knots == "gamma" else 5e-3)
+
+
+def test_a_set_curve_that_falls_is_made_monotone():
+    x = torch.linspace(0, 1, 200)
+    y = (x + 0.2 * torch.sin(x * 4 * math.pi)).expand(3, -1)  # falls in the middle
+    t = mapper()
+    t.set_curve(x, y)
+    _, values = t.curve()
+    assert (values.diff(dim=-1) > 0).all()
+
+
+def test_cameras_have_curves_of_their_own():
+    t = mapper(cameras=(0, 1, 0, 1, 0, 1))
+    x = torch.linspace(0, 1, 100)
+    t.set_curve(x, x.expand(3, -1), camera_id=1)
+    torch.testing.assert_close(t(grid(), 2, camera_id=1, leaky=False), grid(), atol=2e-3, rtol=0)
+    torch.testing.assert_close(t(grid(), 2, camera_id=0, leaky=False), grid() ** (1 / GAMMA), atol=1e-4, rtol=0)
+
+
+def test_smoothness_is_the_sum_of_squared_second_differences():
+    t = disturb(mapper(kind="per_image", knots="even"), scale=0.1)
+    y = t.response.values(slice(None)).detach()
+    slow = sum((y[:, :, k + 1] - 2 * y[:, :, k] + y[:, :, k - 1]) ** 2 for k in range(1, 255)).mean()
+    torch.testing.assert_close(t.smoothness().detach(), slow)
+
+
+def test_gamma_costs_no_smoothness_on_gamma_knots():
+    assert mapper().smoothness().item() < 1e-10
+
+
+def test_the_anchor_pulls_back_and_is_saved_with_the_state():
+    t = mapper([None, None, None])
+    assert t.regularizers()["response_anchor"].item() == 0
+    t.anchor()
+    copy = mapper([None, None, None])
+    copy.load_state_dict(t.state_dict())
+    assert copy.regularizers()["response_anchor"].item() == 0
+    with torch.no_grad():
+        copy.bracket_gain.learned_ev.add_(1.0)  # two brackets drift by one stop: (2/3) ln(2)^2
+    distance = copy.regularizers()["response_anchor"]
+    assert distance.item() == pytest.approx(2 / 3 * math.log(2) ** 2, rel=1e-5)
+    distance.backward()
+    assert (copy.bracket_gain.learned_ev.grad > 0).all()
+
+
+def test_frozen_learns_nothing():
+    t = mapper([None, None, None])
+    t.freeze()
+    assert not t(grid(), bracket=1, frame=1).requires_grad
+    t.freeze(False)
+    assert t(grid(), bracket=1, frame=1).requires_grad
+
+
+def test_param_groups_hold_every_parameter_once():
+    t = mapper([None, None, None], cameras=(0, 1, 0, 1, 0, 1))
+    grouped = [id(p) for g in t.param_groups(1e-3) for p in g["params"]]
+    assert sorted(grouped) == sorted(id(p) for p in t.parameters())
+    assert mapper(kind="none").param_groups(1e-3) == []
+
+
+def test_develop_is_the_recording_of_a_bracket_at_its_ev():
+    t = disturb(mapper(residual=False))
+    torch.testing.assert_close(t.develop(grid(top=20), ev=-4.0), t(grid(top=20), bracket=0, leaky=False))
+    picture = t.develop(torch.rand(4, 5, 3), ev=1.5)
+    assert picture.shape == (4, 5, 3) and picture.min() >= 0 and picture.max() <= 1
+
+
+def test_the_papers_gain_is_free_but_for_the_reference_image():
+    t = disturb(mapper(kind="per_image", knots="even"), scale=0.3)
+    assert torch.equal(t.gains()[2], torch.zeros(3))  # frame 2 is the first of the reference bracket
+    assert (t.gains()[[0, 1, 3, 4, 5]].abs() > 0).all()
+    borrowed = t.log_gain(0, 0, None)
+    torch.testing.assert_close(borrowed, (t.log_gain(0, 0, 0) + t.log_gain(0, 0, 3)) / 2)  # frames 0 and 3 have bracket 0
+
+
+def test_none_takes_radiance_for_rgb():
+    t = mapper(kind="none")
+    radiance = torch.tensor([[-0.1, 0.5, 1.5]])
+    assert torch.equal(t(radiance, bracket=0), radiance)
+    assert torch.equal(t(radiance, bracket=0, leaky=False), radiance.clamp(0, 1))
+    assert t.regularizers() == {}
+
+
+def test_black_and_saturated_pixels_tell_nothing():
+    rgb = torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 1.0], [0.0, 0.5, 0.5]])
+    assert informative(rgb).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("ev", "reference", "word"), [([0.0, 1.0], 2, "reference"), ([0.0], 0, "lists only"), ([-2.0, 1.0], 1, "must be 0")]
+)
+def test_brackets_that_make_no_sense_are_refused(ev, reference, word):
+    with pytest.raises(InputError, match=word):
+        ToneMapper(ToneMapConfig(), [0, 1], [0, 0], ev, reference)
+
+
+def test_a_response_is_learned_from_known_exposures():
+    """Recordings of known radiance through an S-curve: the curve comes back to within 0.02 where it was seen."""
+    generator = torch.Generator().manual_seed(1)
+    truth = lambda x: (x**0.6 * (1.4 - 0.4 * x)).clamp(0, 1)  # noqa: E731
+    t = mapper(residual=False)
+    optimiser = torch.optim.Adam(t.param_groups(5e-2))
+    for _ in range(250):
+        radiance = 2.0 ** (torch.rand(512, 3, generator=generator) * 10 - 6)
+        bracket = int(torch.randint(3, (1,), generator=generator))
+        loss = (t(radiance, bracket) - truth((radiance * 2 ** EV[bracket]).clamp(0, 1))).abs().mean()
+        optimiser.zero_grad()
+        (loss + 1e-3 * t.smoothness()).backward()
+        optimiser.step()
+    x, y = t.curve()
+    assert (y - truth(x))[:, x > 0.002].square().mean().sqrt() < 0.02
