@@ -8,6 +8,7 @@ import os
 import tempfile
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -200,11 +201,44 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
                 raise InputError(f"{path}: no video stream in this file")
             for frame in container.decode(video=0):
                 deep = frame.format.components[0].bits > 8
-                array = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+                array = np.rot90(frame.to_ndarray(format="rgb48le" if deep else "rgb24"), round(frame.rotation / 90))
                 yield array.astype(np.float32) / np.float32(65535 if deep else 255), float(frame.time or 0.0)
     except (av.FFmpegError, OSError) as error:
         raise InputError(
-            f"{path}: not a readable video, or cut short ({str(error).split(':')[0]}); check that it plays, or copy it again"
+            f"{path}: not a readable video, or cut short ({error.strerror or type(error).__name__}); check that it plays, or copy it again"
+        ) from error
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video's header says."""
+
+    frames: int  # 0: not said
+    fps: float
+    seconds: float  # of the picture; 0: not said
+
+
+def video_info(path: Path | str) -> VideoInfo:
+    """The header of a video. InputError where the file is no video or cut short."""
+    import av
+
+    path = Path(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: no video stream in this file")
+            stream = container.streams.video[0]
+            end = max((entry.pos + entry.size for entry in stream.index_entries), default=0)
+            if end > path.stat().st_size:  # decoders stop at the cut without a word
+                raise InputError(f"{path}: the video is cut short; copy it again")
+            alone = len(container.streams) == 1  # else the sound may be what lasts longest
+            seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
+            if not seconds and alone and container.duration:
+                seconds = container.duration / 1e6
+            return VideoInfo(stream.frames, float(stream.average_rate or 24), seconds)
+    except (av.FFmpegError, OSError) as error:
+        raise InputError(
+            f"{path}: not a readable video, or cut short ({error.strerror or type(error).__name__}); check that it plays, or copy it again"
         ) from error
 
 
