@@ -8,55 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from fakes import DiscBeforeWall, H, W, WALL, camera
+
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import Render
 from hdr_nsff.interpolate import Layers, neighbours, render_at, splat_layer
 
-W, H, FOCAL = 48, 32, 40.0
-CAMERA = Camera(torch.tensor([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1]]), torch.eye(4)[:3], W, H)
-WALL, DISC = 4.0, 2.0  # z-depths
-SPEED = torch.tensor([0.4, 0.1, 0.0])  # scene units per frame: (8, 2) pixels at the disc
-
-
-class DiscBeforeWall:
-    """A red disc of 5 pixels radius before a wall of horizontal gradient, alone where `wall` is false; samples of both."""
-
-    def __init__(self, wall: bool = True, empty_moves: bool = False) -> None:
-        self.wall, self.empty_moves = wall, empty_moves
-
-    def layers(self, camera: Camera, time: float) -> Layers:
-        rays = camera.rays(camera.pixel_grid())
-        positions = torch.stack([rays.origins + z * rays.directions for z in (DISC, WALL)], 1)  # (S, 2, 3)
-        offset = positions[:, 0] - torch.tensor([-0.4, -0.2, DISC]) - time * SPEED
-        inside = (offset[:, :2].norm(dim=-1) * FOCAL / DISC < 5.0).float()
-        gradient = torch.stack([0.5 + positions[:, 1, 0] / 8] * 3, -1)
-        red = torch.tensor([100.0, 0, 0]).expand_as(gradient)
-        flow = torch.zeros_like(positions)
-        flow[:, 0] = SPEED * (1.0 if self.empty_moves else inside[:, None])
-        alpha = torch.stack([inside, torch.full_like(inside, float(self.wall))], -1)
-        motion = torch.tensor([1.0, 0.0]).expand_as(alpha)
-        return Layers(positions, alpha, torch.stack([red, gradient], 1), {1: flow, -1: -flow}, motion)
-
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
-        assert pixels is None
-        layers = self.layers(camera, time)
-        a, b = layers.alpha[:, 0, None], layers.alpha[:, 1, None]
-        near, far = a, (1 - a) * b
-        return Render(
-            radiance=near * layers.radiance[:, 0] + far * layers.radiance[:, 1],
-            depth=(near * DISC + far * WALL)[:, 0] / (near + far).clamp_min(1e-6)[:, 0],
-            opacity=(near + far)[:, 0],
-            motion=near[:, 0],
-        )
-
-    def __call__(self, batch):
-        raise AssertionError("not trained here")
-
-    def param_groups(self):
-        return []
-
-    def after_step(self, step: int) -> None:
-        del step
+CAMERA = camera()
 
 
 def red_centre(radiance: Tensor) -> Tensor:
@@ -120,8 +77,8 @@ def test_where_neither_time_shows_anything_the_nearer_one_stands() -> None:
     class Fleeing(DiscBeforeWall):
         """One opaque layer whose right half leaves the picture from either side."""
 
-        def layers(self, camera: Camera, time: float) -> Layers:
-            layers = super().layers(camera, time)
+        def layers(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Layers:
+            layers = super().layers(camera, time, pixels)
             right = (camera.pixel_grid()[:, 0] > W / 2).float()[:, None, None]
             flow = right * torch.tensor([[1000.0, 0, 0]] * 2)
             radiance = torch.full_like(layers.radiance, 1.0 + time)

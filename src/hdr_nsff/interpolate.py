@@ -54,7 +54,7 @@ class Picture:
     """A composited view; every quantity is premultiplied by opacity."""
 
     opacity: Tensor  # (S, 1)
-    colour: Tensor  # (S, C): radiance, z-depth, motion
+    colour: Tensor  # (S, C): radiance, disparity, motion
 
 
 def neighbours(time: float, times: Sequence[float]) -> tuple[float, float, float]:
@@ -93,15 +93,20 @@ def splat(layers: Layers, camera: Camera, direction: int, fraction: float) -> tu
     for i in range(num_layers):
         alpha, motion = layers.alpha[:, i, None], layers.motion[:, i, None]  # (S, 1)
         flow, position = layers.scene_flow[direction][:, i], layers.positions[:, i]  # (S, 3)
-        value = torch.cat([layers.radiance[:, i], camera.to_camera(position)[:, 2:], motion], -1)  # (S, 5)
+        value = torch.cat([layers.radiance[:, i], inverse(camera.to_camera(position)[:, 2:]), motion], -1)  # (S, 5)
         unmoved.add(alpha, value)
         if not flow.any():
             moved.add(alpha, value)
             continue
         pixels, depth = camera.project(position + fraction * flow)
-        value = torch.cat([layers.radiance[:, i], depth[:, None], motion], -1)
+        value = torch.cat([layers.radiance[:, i], inverse(depth[:, None]), motion], -1)
         moved.add(*splat_layer(pixels, alpha * (depth > 0)[:, None], value, camera.width, camera.height))
     return moved.picture(), unmoved.picture()
+
+
+def inverse(depth: Tensor) -> Tensor:
+    """Disparity of z-depths; 0 behind the camera."""
+    return torch.where(depth > 1e-6, 1 / depth.clamp_min(1e-6), 0.0)
 
 
 class Compositor:
@@ -160,4 +165,6 @@ def blend(moved: Sequence[Picture], nearer: Picture, unmoved: Sequence[Picture],
     opacity = (opacity * scale + lack * nearer.opacity).clamp(0, 1)  # (S, 1)
     colour = colour * scale + lack * nearer.colour  # (S, 5)
     rest = colour[:, 3:] / opacity.clamp_min(1e-6)
-    return Render(radiance=colour[:, :3], depth=rest[:, 0], opacity=opacity[:, 0], motion=rest[:, 1].clamp(0, 1))
+    return Render(
+        radiance=colour[:, :3], depth=1 / rest[:, 0].clamp_min(1e-6), opacity=opacity[:, 0], motion=rest[:, 1].clamp(0, 1)
+    )
