@@ -24,6 +24,8 @@ class PixelBatch:
     pixels: Tensor  # (N, 2) xy, centres at +0.5
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
+    seed: int = 0  # for the field's own randomness (jitter, noise): the same seed gives the same pass
+    chain: int = 0  # direction of the two-step warp: +1, -1, or 0 for none
     moving: Tensor | None = None  # (N,) bool
     disparity: Tensor | None = None  # (N,) 1 / scene units (or relative)
     disparity_confidence: Tensor | None = None  # (N,) in [0, 1]

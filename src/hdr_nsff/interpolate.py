@@ -20,24 +20,12 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import RadianceField, Render
+from hdr_nsff.fields.base import Layers, RadianceField, Render
 
 Mode = Literal["auto", "splat", "direct"]
 SAME_TIME = 1e-4  # frames: closer than this to a training time is that time
 SPREAD = 0.5  # smallest sum of weights that average splatting makes up for: samples spread to half their density
 FAINT = 0.1  # presence below this is topped up from the nearer training time
-
-
-@dataclass(frozen=True)
-class Layers:
-    """A view as L translucent layers, front to back. A layer holds one kind of content: a field with two branches interleaves
-    them (static, dynamic, static, ...), so that the static share stays where it is."""
-
-    positions: Tensor  # (S, L, 3) scene units; S = height * width, row by row
-    alpha: Tensor  # (S, L) in [0, 1]
-    radiance: Tensor  # (S, L, 3) linear HDR
-    scene_flow: dict[int, Tensor]  # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
-    motion: Tensor  # (S, L) in [0, 1]: share of dynamic content
 
 
 @runtime_checkable

@@ -39,6 +39,18 @@ class Render:
     dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch alone, while training
 
 
+@dataclass(frozen=True)
+class Layers:
+    """A view as L translucent layers, front to back. A layer holds one kind of content: a field with two branches interleaves
+    them (static, dynamic, static, ...), so that the static share stays where it is."""
+
+    positions: Tensor  # (S, L, 3) scene units; S = height * width, row by row
+    alpha: Tensor  # (S, L) in [0, 1]
+    radiance: Tensor  # (S, L, 3) linear HDR
+    scene_flow: dict[int, Tensor]  # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
+    motion: Tensor  # (S, L) in [0, 1]: share of dynamic content
+
+
 @runtime_checkable
 class RadianceField(Protocol):
     """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses by type."""

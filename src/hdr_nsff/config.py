@@ -1,0 +1,114 @@
+"""The settings of a training run, composed from each room's own, and the presets. Saved in the run; enough to rebuild it."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.fields.branches import GridConfig, MlpConfig
+from hdr_nsff.fields.nsff import NSFFConfig
+from hdr_nsff.objective import LossWeights
+from hdr_nsff.tonemap import ToneMapConfig
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Train a dynamic HDR radiance field from a prepared scene. Killed runs go on where they were."""
+
+    scene: Path = Path("scene")
+    """Scene folder, as `prepare` wrote it."""
+    out: Path = Path("run")
+    """Run folder: config, checkpoints, log, previews."""
+    field: NSFFConfig = dataclasses.field(default_factory=NSFFConfig)
+    tonemap: ToneMapConfig = dataclasses.field(default_factory=ToneMapConfig)
+    loss: LossWeights = dataclasses.field(default_factory=LossWeights)
+    steps: int | None = None
+    """Stop after this many steps. The same seed and steps give the same result, also through kills and restarts."""
+    minutes: float | None = 5.0
+    """Without `steps`: stop after this many minutes of training; learning rates and schedules follow the clock."""
+    rays: int = 1536
+    """Uniformly drawn pixels of a batch."""
+    moving_rays: int = 512
+    """More pixels of a batch, from the moving mask."""
+    moving_until: float = 1.0
+    """Share of the run (or phase, for `paper`) up to which moving pixels are added."""
+    batches: int = 2
+    """Batches (each of one random frame) of a step, over all devices together."""
+    period: float = 0.5
+    """The schedules' period K as a share of the run; 0: the published K = 1000 min(max(30, frames), 250) steps."""
+    lr_final: float = 0.05
+    """Learning rates fall exponentially to this share of their start over the run; 0: the published 0.1 per 300k steps."""
+    tonemap_lr: float = 2e-3
+    anchor_at: float = 0.4
+    """Share of the run after which response and exposures are held where they are (1: never)."""
+    squared: bool = False
+    """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
+    saturation: bool = True
+    """Trust recorded values near 0 and 1 less in the dynamic terms."""
+    bf16: bool = False
+    """Network layers in bfloat16 (matters for `paper` only)."""
+    seed: int = 0
+    device: str = "auto"
+    """auto, cpu or cuda."""
+    checkpoint_seconds: float = 60.0
+    """Seconds between checkpoints and preview pictures."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain data that `from_json` turns back."""
+        return asdict(self) | {"scene": str(self.scene), "out": str(self.out), "encoding": type(self.field.encoding).__name__}
+
+    @staticmethod
+    def from_json(data: dict[str, Any]) -> TrainConfig:
+        """The config of a run. InputError where a key is missing or unknown (another version)."""
+        data = dict(data)
+        try:
+            encodings = {"GridConfig": GridConfig, "MlpConfig": MlpConfig}
+            encoding = encodings[data.pop("encoding")](**data["field"]["encoding"])
+            parts = {
+                "field": NSFFConfig(**{**data["field"], "encoding": encoding}),
+                "tonemap": ToneMapConfig(**data["tonemap"]),
+                "loss": LossWeights(**data["loss"]),
+                "scene": Path(data["scene"]),
+                "out": Path(data["out"]),
+            }
+            return TrainConfig(**{**data, **parts})
+        except (KeyError, TypeError) as error:
+            raise InputError(
+                f"the run's config.json is from another version or damaged ({error}); train again into a new folder"
+            ) from error
+
+
+def paper() -> TrainConfig:
+    """The published settings: METHOD.md 2-3, the P column."""
+    weights = LossWeights(
+        temporal=1.0, chain=1.0, cycle=1.0, flow_magnitude=0.1, smoothness=0.1, kinetic=0.1, disocclusion=0.1,
+        blend_entropy=1e-3, depth=0.04, flow=0.02, mask=0.0, gain_residual=0.0, response_anchor=0.0,
+    )  # fmt: skip
+    network = NSFFConfig(
+        MlpConfig(),
+        samples=128,
+        render_samples=128,
+        compositing="blend",
+        radiance="sigmoid",
+        density="relu",
+        density_noise=1.0,
+        cull=False,
+    )
+    return TrainConfig(
+        field=network, tonemap=ToneMapConfig(kind="per_image", knots="even"), loss=weights, steps=250_000, minutes=None, rays=1024,
+        moving_rays=512, batches=1, period=0.0, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, checkpoint_seconds=600,
+    )  # fmt: skip
+
+
+def tiny() -> TrainConfig:
+    """Seconds on a CPU, for tests and for trying out."""
+    network = NSFFConfig(
+        GridConfig(finest=4.0, depth_cells=24, levels=2, max_rows=2**14), samples=16, render_samples=24, cull_after=20
+    )
+    return TrainConfig(field=network, steps=60, minutes=None, rays=192, moving_rays=64, batches=1)
+
+
+PRESETS: dict[str, TrainConfig] = {"grid": TrainConfig(), "paper": paper(), "tiny": tiny()}

@@ -1,0 +1,174 @@
+"""A run folder: config.json, checkpoints/ (safetensors, newest two kept), log.jsonl, previews/. `Run.open` rebuilds field and tone
+mapper from it alone. Nothing is unpickled; every write is atomic."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from hdr_nsff.config import TrainConfig
+from hdr_nsff.errors import InputError
+from hdr_nsff.fields import build_field
+from hdr_nsff.fields.base import RadianceField
+from hdr_nsff.io import atomic, write_json
+from hdr_nsff.progress import say
+from hdr_nsff.scene import Scene
+from hdr_nsff.tonemap import ToneMapper
+
+FORMAT = "hdr-nsff checkpoint 1"
+KEEP = 2
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What one checkpoint file holds."""
+
+    step: int
+    seconds: float  # of training so far
+    tensors: dict[str, Tensor]
+
+
+def save_checkpoint(folder: Path, step: int, seconds: float, tensors: dict[str, Tensor]) -> Path:
+    """Write checkpoints/step_XXXXXXXX.safetensors and drop all but the newest two."""
+    path = Path(folder) / "checkpoints" / f"step_{step:08d}.safetensors"
+    with atomic(path) as temporary:
+        cpu = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+        save_file(cpu, temporary, metadata={"format": FORMAT, "step": str(step), "seconds": repr(seconds)})
+    for old in sorted(path.parent.glob("step_*.safetensors"))[:-KEEP]:
+        old.unlink()
+    return path
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """One checkpoint file. InputError where it is cut short or from another version."""
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            meta = file.metadata() or {}
+            if meta.get("format") != FORMAT:
+                raise InputError(f"{path}: written by another version ({meta.get('format', 'unknown format')})")
+            return Checkpoint(int(meta["step"]), float(meta["seconds"]), {k: file.get_tensor(k) for k in file.keys()})  # noqa: SIM118
+    except (SafetensorError, OSError, KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{path}: the checkpoint is cut short or damaged ({type(error).__name__})") from error
+
+
+def latest_checkpoint(folder: Path) -> Checkpoint | None:
+    """The newest readable checkpoint, saying so where a newer one could not be read; None where there is none at all."""
+    problems = []
+    for path in sorted((Path(folder) / "checkpoints").glob("step_*.safetensors"), reverse=True):
+        try:
+            found = read_checkpoint(path)
+        except InputError as error:
+            problems.append(str(error))
+            continue
+        for problem in problems:
+            say(f"{problem}; going on from the one before, step {found.step}")
+        return found
+    if problems:
+        raise InputError(f"{folder}: no readable checkpoint ({problems[0]}); train again into a new folder")
+    return None
+
+
+def pack(modules: dict[str, torch.nn.Module], optimisers: dict[str, torch.optim.Optimizer]) -> dict[str, Tensor]:
+    """State of modules and optimisers as one flat dict of tensors."""
+    tensors = {f"{name}.{k}": v for name, module in modules.items() for k, v in module.state_dict().items()}
+    for name, optimiser in optimisers.items():
+        for index, state in optimiser.state_dict()["state"].items():
+            tensors |= {f"optimiser.{name}.{index}.{k}": torch.as_tensor(v) for k, v in state.items()}
+    return tensors
+
+
+def unpack(tensors: dict[str, Tensor], modules: dict[str, torch.nn.Module], optimisers: dict[str, torch.optim.Optimizer]) -> None:
+    """Put a packed state back."""
+    for name, module in modules.items():
+        own = {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
+        try:
+            module.load_state_dict(own)
+        except RuntimeError as error:
+            raise InputError(
+                f"the checkpoint does not fit this run's {name}; its scene or config was changed, train again into a new folder"
+            ) from error
+    for name, optimiser in optimisers.items():
+        state: dict[int, dict[str, Tensor]] = {}
+        for key, value in tensors.items():
+            if key.startswith(f"optimiser.{name}."):
+                index, field = key.removeprefix(f"optimiser.{name}.").split(".", 1)
+                state.setdefault(int(index), {})[field] = value
+        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+
+
+def pick_device(name: str) -> torch.device:
+    """The device of a `--device` flag; InputError where CUDA is asked for and missing."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise InputError("--device cuda: this torch sees no CUDA device; leave the flag out to use the CPU")
+    return torch.device(name)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained (or half-trained) field with its tone mapper."""
+
+    folder: Path
+    config: TrainConfig
+    scene: Scene
+    field: RadianceField
+    tonemapper: ToneMapper
+    step: int
+    seconds: float  # of training
+
+    @staticmethod
+    def open(folder: Path | str, device: str = "cpu") -> Run:
+        """Read a run folder; InputError in one sentence where it is none, unfinished or damaged."""
+        folder = Path(folder)
+        config = read_config(folder)
+        scene = Scene.open(config.scene)
+        found = latest_checkpoint(folder)
+        if found is None:
+            raise InputError(f"{folder}: no checkpoint yet; run `hdr-nsff train` to the first one")
+        field, tonemapper = build_field(config.field, scene), ToneMapper.for_scene(config.tonemap, scene)
+        unpack(found.tensors, {"field": field, "tonemapper": tonemapper}, {})
+        target = pick_device(device)
+        return Run(folder, config, scene, field.to(target).eval(), tonemapper.to(target).eval(), found.step, found.seconds)
+
+    def log(self) -> list[dict[str, Any]]:
+        """The lines of log.jsonl; a last line cut short by a kill is left out."""
+        return read_log(self.folder)
+
+
+def read_config(folder: Path) -> TrainConfig:
+    """The config of a run folder."""
+    path = Path(folder) / "config.json"
+    if not path.is_file():
+        raise InputError(f"{folder}: no config.json here; this is not a run folder, make one with `hdr-nsff train`")
+    try:
+        return TrainConfig.from_json(json.loads(path.read_text()))
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not readable JSON; restore it or train again into a new folder") from error
+
+
+def write_config(folder: Path, config: TrainConfig) -> None:
+    """Save the config of a run."""
+    write_json(Path(folder) / "config.json", config.to_json())
+
+
+def read_log(folder: Path) -> list[dict[str, Any]]:
+    """Complete lines of log.jsonl; where a resumed run wrote a step again, the last line of it counts."""
+    path = Path(folder) / "log.jsonl"
+    lines: dict[int, dict[str, Any]] = {}
+    for text in path.read_text().splitlines() if path.is_file() else []:
+        try:
+            line = json.loads(text)
+        except json.JSONDecodeError:
+            continue
+        lines[line["step"]] = line
+    return [lines[step] for step in sorted(lines)]

@@ -1,0 +1,248 @@
+"""Scene to run: the loop, on one screen. Draw, forward, losses, backward, step.
+
+Everything random is drawn from the seed, the step and the batch's place in it, so a killed run that resumes, or one spread over
+several processes (`torchrun`), does what an unbroken single one does."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from hdr_nsff import distributed
+from hdr_nsff.batch import PixelBatch, draw_pixels
+from hdr_nsff.config import TrainConfig
+from hdr_nsff.errors import InputError
+from hdr_nsff.fields import build_field
+from hdr_nsff.fields.encodings import TouchedAdam
+from hdr_nsff.io import write_png
+from hdr_nsff.objective import Objective
+from hdr_nsff.priors.response import initialise
+from hdr_nsff.progress import bar, say
+from hdr_nsff.run import latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
+from hdr_nsff.scene import Scene
+from hdr_nsff.tensors import to_device
+from hdr_nsff.tonemap import ToneMapper, informative
+
+LOG_EVERY = 25  # steps
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How far a run is."""
+
+    config: TrainConfig
+    num_frames: int
+    step: int
+    seconds: float
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0 to 1."""
+        if self.config.steps is not None:
+            return self.step / self.config.steps
+        assert self.config.minutes is not None
+        return min(self.seconds / (60 * self.config.minutes), 1.0)
+
+    @property
+    def phase(self) -> float:
+        """Time in units of the schedules' period K."""
+        if self.config.period:
+            return self.progress / self.config.period
+        return self.step / (1000 * min(max(30, self.num_frames), 250))
+
+    @property
+    def lr_share(self) -> float:
+        """Learning rates relative to their start."""
+        return self.config.lr_final**self.progress if self.config.lr_final else 0.1 ** (self.step / 300_000)
+
+
+def train(config: TrainConfig) -> Path:
+    """Train (or go on training) until the steps or minutes are spent; the run folder."""
+    if config.steps is None and config.minutes is None:
+        raise InputError("neither --steps nor --minutes: say how long to train")
+    with distributed.group() as ranks:
+        device = pick_device(config.device)
+        scene = to_device(Scene.open(config.scene), device)
+        if ranks.main:
+            open_folder(config)
+        trainer = Trainer(config, scene, device, ranks)
+        trainer.loop()
+    return config.out
+
+
+def open_folder(config: TrainConfig) -> None:
+    """Start a run folder, or make sure an existing one was started with the same settings."""
+    if (config.out / "config.json").exists():
+        before = read_config(config.out)
+        if replace(before, scene=config.scene, out=config.out, device=config.device) != config:
+            raise InputError(f"{config.out}: holds a run with other settings; choose another --out, or delete it to start over")
+        return
+    write_config(config.out, config)
+
+
+class Trainer:
+    """Field, tone mapper, optimisers and clock of one run."""
+
+    def __init__(self, config: TrainConfig, scene: Scene, device: torch.device, ranks: distributed.Ranks) -> None:
+        torch.manual_seed(config.seed)
+        self.config, self.scene, self.ranks = config, scene, ranks
+        self.field = build_field(config.field, scene).to(device)
+        self.tonemapper = ToneMapper.for_scene(config.tonemap, scene).to(device)
+        self.objective = Objective(config.loss, scene.manifest.depth_kind, scene.near, config.squared, config.saturation)
+        groups = self.field.param_groups()
+        dense = [g for g in groups if not g.get("touched")] + self.tonemapper.param_groups(config.tonemap_lr)
+        touched = [g for g in groups if g.get("touched")]
+        self.optimisers: dict[str, torch.optim.Optimizer] = {"dense": torch.optim.Adam(dense)}
+        if touched:
+            self.optimisers["touched"] = TouchedAdam(touched)
+        self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimisers.items()}
+        self.clock = Clock(config, len(scene.train), 0, 0.0)
+        self.resume_or_initialise()
+
+    @property
+    def modules(self) -> dict[str, torch.nn.Module]:
+        """What a checkpoint holds besides the optimisers."""
+        return {"field": self.field, "tonemapper": self.tonemapper}
+
+    def resume_or_initialise(self) -> None:
+        """Continue from the newest checkpoint, or start response and brightness from the recordings."""
+        found = latest_checkpoint(self.config.out)
+        if found is not None:
+            unpack(found.tensors, self.modules, self.optimisers)
+            self.clock = replace(self.clock, step=found.step, seconds=found.seconds)
+            self.report(f"going on at step {found.step}, {found.seconds:.0f} s into the training")
+            return
+        self.report(f"response curve: {initialise(self.tonemapper, self.scene)}")
+        self.field.bias.fill_(self.typical_log_radiance())
+
+    def report(self, message: str) -> None:
+        """A line for the person at the terminal, once however many processes there are."""
+        if self.ranks.main:
+            say(message)
+
+    @torch.no_grad()
+    def typical_log_radiance(self) -> float:
+        """Median log radiance of what the frames recorded without clipping."""
+        logs = []
+        for i, f in enumerate(self.scene.train):
+            rgb = f.image[::4, ::4].reshape(-1, 3)
+            rgb = rgb[informative(rgb)]
+            logs.append(self.tonemapper.inverse(rgb, f.bracket, f.camera_id, i).clamp_min(1e-6).log().flatten())
+        values = torch.cat(logs)
+        return float(values.median()) if len(values) else 0.0
+
+    def loop(self) -> None:
+        """Train until the clock runs out."""
+        started, before = time.monotonic(), self.clock.seconds
+        saved = started
+        if self.clock.step == 0 and self.ranks.main:
+            self.save()
+        with bar() as progress:
+            task = progress.add_task("train", total=1000, note="")
+            while self.clock.progress < 1:
+                values = self.step()
+                elapsed = self.ranks.agree(before + time.monotonic() - started)
+                self.clock = replace(self.clock, step=self.clock.step + 1, seconds=elapsed)
+                if self.clock.step % LOG_EVERY == 0 and self.ranks.main:
+                    self.log(values)
+                    note = f"{values['psnr']:.1f} dB"
+                    progress.update(task, completed=round(1000 * self.clock.progress), note=note)
+                if time.monotonic() - saved > self.config.checkpoint_seconds and self.ranks.main:
+                    self.save()
+                    self.preview()
+                    if not progress.live.is_started:
+                        say(f"train: {self.clock.progress:.0%}, step {self.clock.step}, {values['psnr']:.1f} dB")
+                    saved = time.monotonic()
+        if self.ranks.main:
+            self.save()
+            self.preview()
+
+    def step(self) -> dict[str, float]:
+        """One optimiser step over this process's share of the batches; the terms' values and the PSNR."""
+        clock, config = self.clock, self.config
+        self.field.train()
+        if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
+            self.tonemapper.anchor()
+        slots = range(self.ranks.rank, config.batches, self.ranks.world)
+        totals: dict[str, float] = {}
+        for slot in slots:
+            batch = self.draw(slot)
+            with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
+                render, own = self.field(batch)
+            terms = self.objective.terms(render, batch, self.tonemapper, clock.phase) | own | self.tonemapper.regularizers()
+            self.check(terms, batch, render.radiance)
+            (self.objective.total(terms) / config.batches).backward()
+            for name, value in terms.items():
+                totals[name] = totals.get(name, 0.0) + float(value.detach()) / len(slots)
+            with torch.no_grad():
+                rgb = self.tonemapper(render.radiance, batch.bracket, batch.camera_id, batch.frame, leaky=False)
+                totals["mse"] = totals.get("mse", 0.0) + float((rgb - batch.rgb)[batch.uniform].square().mean()) / len(slots)
+        parameters = [p for o in self.optimisers.values() for g in o.param_groups for p in g["params"]]
+        self.ranks.sum_gradients(parameters)
+        for name, optimiser in self.optimisers.items():
+            for group, lr in zip(optimiser.param_groups, self.base_lr[name], strict=True):
+                group["lr"] = lr * clock.lr_share
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=name == "dense")
+        self.ranks.max_buffers(self.field.shared_maxima())
+        self.field.after_step(clock.step + 1)
+        totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
+        return totals
+
+    def draw(self, slot: int) -> PixelBatch:
+        """The batch of a slot of this step."""
+        config, clock = self.config, self.clock
+        generator = torch.Generator().manual_seed(hash((config.seed, clock.step, slot)) & 0x7FFFFFFF)
+        frame = int(torch.randint(len(self.scene.train), (1,), generator=generator))
+        when = clock.progress if config.period else clock.phase
+        moving = config.moving_rays if when < config.moving_until else 0
+        batch = draw_pixels(self.scene, frame, config.rays, moving, generator)
+        chain = (1 if clock.step % 2 else -1) if clock.phase >= 2 and config.loss.chain else 0
+        return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), chain=chain)
+
+    def check(self, terms: dict[str, Tensor], batch: PixelBatch, radiance: Tensor) -> None:
+        """NaN and Inf are errors with the step, the term and the ray."""
+        bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+        if not bad:
+            return
+        rays = (~torch.isfinite(radiance).all(-1)).nonzero()[:, 0]
+        where = (
+            f"pixel {batch.pixels[rays[0]].tolist()} of frame {batch.frame}"
+            if len(rays)
+            else f"frame {batch.frame}, all radiance finite"
+        )
+        raise FloatingPointError(f"step {self.clock.step}: the terms {bad} are not finite; {where}")
+
+    def log(self, values: dict[str, float]) -> None:
+        """Append one line to log.jsonl."""
+        losses = {k: v for k, v in values.items() if k != "psnr"}
+        c, rays = self.clock, (self.config.rays + self.config.moving_rays) * self.config.batches
+        line = {
+            "step": c.step,
+            "seconds": round(c.seconds, 3),
+            "psnr": values["psnr"],
+            "rays_per_second": rays * c.step / c.seconds,
+            "losses": losses,
+        }
+        with open(self.config.out / "log.jsonl", "a") as file:
+            file.write(json.dumps(line) + "\n")
+
+    def save(self) -> None:
+        """A checkpoint of everything that counts."""
+        save_checkpoint(self.config.out, self.clock.step, self.clock.seconds, pack(self.modules, self.optimisers))
+
+    @torch.no_grad()
+    def preview(self) -> None:
+        """The middle frame as recorded and as rendered, side by side."""
+        i = len(self.scene.train) // 2
+        f = self.scene.train[i]
+        render = self.field.render(f.camera, f.time)
+        rgb = self.tonemapper(render.radiance, f.bracket, f.camera_id, i, leaky=False).view_as(f.image)
+        pair = torch.cat([f.image, rgb], 1).cpu().numpy()
+        write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)

@@ -1,0 +1,93 @@
+"""Grids: the numba kernels against their plain-torch twin, hand-worked interpolation, the touched-only optimiser."""
+
+import numpy as np
+import torch
+
+from hdr_nsff.fields.encodings import AdditiveGrid, TouchedAdam, frequencies
+
+SHAPES = [(4, 5, 6, 1), (9, 7, 8, 3), (20, 20, 20, 3)]
+
+
+def grid(max_rows: int = 2**10) -> AdditiveGrid:
+    g = AdditiveGrid(SHAPES, num_knots=5, max_rows=max_rows)
+    g.table.data.normal_(generator=torch.Generator().manual_seed(1))
+    return g
+
+
+def coords(n: int = 500) -> torch.Tensor:
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(2)) * 1.2 - 0.1  # a tenth outside on every side
+
+
+def test_kernels_equal_plain_torch_in_values_and_gradients_dense_and_hashed() -> None:
+    for knot in (0.0, 1.3, 4.0):
+        g, x = grid(), coords().requires_grad_()
+        out = g(x, knot)
+        weight = torch.randn(out.shape, generator=torch.Generator().manual_seed(3))
+        (out * weight).sum().backward()
+        table, point = g.table.grad.clone(), x.grad.clone()
+        g.table.grad = x.grad = None
+        twin = g.reference(x, *g.at(knot))
+        (twin * weight).sum().backward()
+        torch.testing.assert_close(out, twin, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(table, g.table.grad, atol=1e-4, rtol=1e-4)
+        torch.testing.assert_close(point, x.grad, atol=2e-3, rtol=1e-3)
+
+
+def test_twin_gradient_agrees_with_finite_differences() -> None:
+    g = grid().double()
+    x = torch.tensor([[0.31, 0.42, 0.53], [0.11, 0.77, 0.64]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p: g.reference(p, *g.at(1.3)), (x,), eps=1e-7, atol=1e-4)
+
+
+def test_a_linear_ramp_is_reproduced_exactly() -> None:
+    g = AdditiveGrid([(5, 4, 3, 1)])
+    for z in range(3):
+        for y in range(4):
+            for x in range(5):
+                g.table.data[(z * 4 + y) * 5 + x] = torch.tensor([x / 4, y / 3, z / 2, 1.0])
+    points = torch.tensor([[0.1, 0.2, 0.3], [0.9, 0.5, 0.77]])
+    torch.testing.assert_close(g(points), torch.cat([points, torch.ones(2, 1)], -1))
+
+
+def test_time_blends_two_slices_linearly_and_a_knot_reads_one() -> None:
+    g = AdditiveGrid([(4, 4, 4, 3)], num_knots=3)
+    g.table.data[:64], g.table.data[64:128], g.table.data[128:] = 1.0, 3.0, 7.0
+    point = torch.full((1, 3), 0.5)
+    assert float(g(point, 1.0)[0, 0].detach()) == 3.0
+    np.testing.assert_allclose(float(g(point, 1.25)[0, 0].detach()), 0.75 * 3 + 0.25 * 7)
+
+
+def test_gradients_add_up_over_several_uses_of_one_grid() -> None:
+    g, x = grid(), coords(50)
+    g(x, 0.0).sum().backward()
+    once = g.table.grad.clone()
+    g(x, 0.0).sum().backward()
+    torch.testing.assert_close(g.table.grad, 2 * once)
+
+
+def test_touched_adam_is_adam_where_every_entry_has_a_gradient() -> None:
+    a, b = torch.ones(3, 4, requires_grad=True), torch.ones(3, 4, requires_grad=True)
+    ours, theirs = TouchedAdam([a], lr=0.1, eps=1e-8), torch.optim.Adam([b], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+    for step in range(1, 4):
+        a.grad, b.grad = torch.full((3, 4), 0.5 * step), torch.full((3, 4), 0.5 * step)
+        ours.step()
+        theirs.step()
+    torch.testing.assert_close(a, b)
+
+
+def test_touched_adam_leaves_untouched_entries_and_their_moments_alone() -> None:
+    p = torch.ones(2, 4, requires_grad=True)
+    optimiser = TouchedAdam([p], lr=0.1)
+    for gradient in (torch.tensor([[1.0], [1.0]]), torch.tensor([[1.0], [0.0]])):
+        p.grad = gradient.expand(2, 4).clone()
+        before = p.detach().clone(), optimiser.state[p].get("exp_avg", torch.zeros(2, 4)).clone()
+        optimiser.step()
+    assert torch.equal(p[1], before[0][1]) and torch.equal(optimiser.state[p]["exp_avg"][1], before[1][1])
+    assert (p[0] < before[0][0]).all()
+
+
+def test_frequencies_hold_identity_sines_and_cosines() -> None:
+    x = torch.tensor([[0.5, -1.0]])
+    out = frequencies(x, 2)
+    expected = torch.tensor([[0.5, -1.0, np.sin(0.5), np.sin(-1.0), np.cos(0.5), np.cos(-1.0), np.sin(1.0), np.sin(-2.0), np.cos(1.0), np.cos(-2.0)]])
+    torch.testing.assert_close(out, expected.float())
