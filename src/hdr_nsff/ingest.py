@@ -198,6 +198,17 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
+def held_out(count: int, every: int, cycle: int) -> list[int]:
+    """Which of `count` frames are kept out of training: every `every`-th, never the first or the last; none for 0.
+
+    `every` grows until it has no common factor with the exposure cycle, so that all exposures are kept out in turn."""
+    if every <= 0:
+        return []
+    while math.gcd(every, cycle) > 1:
+        every += 1
+    return list(range(every // 2, count - 1, every))
+
+
 def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None:
     """The EV (log2 exposure) of each frame of one cycle from `--exposures 1/1000,1/250` (seconds) or `--ev -4,-2`, None for neither."""
     if exposures is None or exposures.strip() == "auto":

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import tempfile
@@ -38,6 +39,26 @@ def atomic(path: Path | str) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing_to(folder: Path | str) -> Iterator[None]:
+    """Turns a full disk and a folder that may not be written into an InputError. What was complete stays; nothing is half-written."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # OpenEXR and FFmpeg have types of their own for it
+        code = getattr(error, "errno", None)
+        if code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "No space left" in str(error):
+            raise InputError(
+                f"{folder}: the disk is full; free some space and run the same command again, it goes on where it was"
+            ) from error
+        if code in (errno.EACCES, errno.EPERM, errno.EROFS):
+            raise InputError(
+                f"{getattr(error, 'filename', None) or folder}: may not be read or written; check its permissions"
+            ) from error
+        raise
 
 
 def write_text(path: Path | str, text: str) -> None:

@@ -77,16 +77,56 @@ def detect_cycle(video: np.ndarray, max_cycle: int = MAX_CYCLE) -> Cycle:
     )
 
 
+def period(brackets: list[int]) -> int:
+    """The smallest p with `brackets[t] == brackets[t + p]` throughout and seen at least twice, else the number of brackets."""
+    n = len(brackets)
+    return next((p for p in range(1, n // 2 + 1) if brackets[p:] == brackets[: n - p]), len(set(brackets)))
+
+
+def by_value(ev: list[float]) -> tuple[list[int], list[float]]:
+    """Frames with the same EV (to 0.01) share a bracket, numbered as they appear: (bracket per frame, EV per bracket)."""
+    keys = [round(v, 2) for v in ev]
+    order = list(dict.fromkeys(keys))
+    return [order.index(k) for k in keys], [ev[keys.index(k)] for k in order]
+
+
+def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
+    """Per synchronized camera the bracket of each frame, such that equal brackets are equally bright in every camera."""
+    length = max({c.length for c in cycles}, key=[c.length for c in cycles].count)
+    lead = next(c for c in cycles if c.length == length)
+    same = [{p: lead.order[c.order.index(p)] for p in range(length)} if c.length == length else None for c in cycles]
+    return [[m[t % length] if m else t % length for t in range(len(c.brackets))] for c, m in zip(cycles, same, strict=True)]
+
+
+def doubts(video: np.ndarray, ev: list[float]) -> list[str]:
+    """What in `video` (T, H, W, 3), recorded, contradicts the given `ev` per frame: sentences, none where they agree."""
+    steps, given = brightness_steps(video), np.diff(ev)
+    alternates = np.abs(given) >= MIN_STEP
+    if not alternates.any():
+        cycle = detect_cycle(video)
+        return [] if cycle.length == 1 else [f"one exposure is given, but the brightness repeats every {cycle.length} frames"]
+    if np.abs(steps).mean() < MIN_STEP:
+        return [f"exposure steps of {np.abs(given).mean():.1f} EV are given, but all frames are about equally bright"]
+    sign = np.mean(np.sign(steps[alternates]) == np.sign(given[alternates]))
+    if sign < 0.8:
+        cycle = detect_cycle(video)
+        seen = (
+            f"; the brightness repeats every {cycle.length} frames, order from dark to bright {cycle.order}"
+            if cycle.length > 1
+            else ""
+        )
+        return [f"only {sign:.0%} of the exposure steps go the way the brightness goes{seen}"]
+    ratio = float(np.median(steps[alternates] / given[alternates]))
+    if not 0.5 < ratio < 2:
+        return [f"a step of 1 EV as given changes the brightness like {ratio:.1f} EV (measured with a gamma of 2.2)"]
+    return []
+
+
 def reference_bracket(video: np.ndarray, brackets: list[int]) -> int:
     """The bracket of `video` (T, H, W, 3) whose pixels are best exposed: the largest share between 0.05 and `HIGH` in recorded value."""
+    good = ((video > 0.05) & (video < HIGH)).mean((1, 2, 3))  # (T,)
     group = np.array(brackets)
-    share = [np.mean([well_exposed(video[t]) for t in np.flatnonzero(group == b)]) for b in range(group.max() + 1)]
-    return int(np.argmax(share))
-
-
-def well_exposed(image: np.ndarray) -> float:
-    """The share of recorded values of `image` (H, W, 3) that are neither dark nor saturated."""
-    return float(((image > 0.05) & (image < HIGH)).mean())
+    return int(np.argmax([good[group == b].mean() if (group == b).any() else 0.0 for b in range(group.max() + 1)]))
 
 
 def equalise(video: np.ndarray, groups: list[int], pool: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

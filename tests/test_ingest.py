@@ -1,0 +1,179 @@
+"""Reading footage: what counts as footage, in which order, and where its exposures are written down."""
+
+import math
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.ingest import (
+    held_out,
+    log2_seconds,
+    number,
+    open_footage,
+    parse_exposures,
+    read_exif_ev,
+    read_exposure_csv,
+    read_frames,
+    shrink,
+)
+from hdr_nsff.io import write_exr, write_png, write_video
+
+
+def picture(value: float, height: int = 24, width: int = 32) -> np.ndarray:
+    """A ramp of brightness around `value` (H, W, 3)."""
+    return np.clip(np.linspace(0.5, 1.5, width)[None, :, None] * np.full((height, 1, 3), value), 0, 1).astype(np.float32)
+
+
+def folder_of(path: Path, values: list[float], suffix: str = ".png") -> Path:
+    """Frames 1, 2, 3, ... with these values; the numbers are not padded."""
+    for i, value in enumerate(values, start=1):
+        write_png(path / f"f{i}{suffix}", picture(value))
+    return path
+
+
+def all_frames(path: Path, **choice) -> list:
+    """What `read_frames` gives, with everything chosen by default."""
+    return list(read_frames(open_footage(path), **{"start": 0, "end": None, "stride": 1, "max_size": 640, **choice}))
+
+
+def test_frames_come_in_the_order_of_their_numbers(tmp_path):
+    frames = all_frames(folder_of(tmp_path, [0.1 * k for k in range(1, 12)]))
+    assert [f.source for f in frames] == [f"f{i}.png" for i in range(1, 12)]
+    assert np.allclose([f.rgb.mean() for f in frames[:5]], [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.01)
+
+
+def test_range_and_stride_choose_frames_by_their_number(tmp_path):
+    folder_of(tmp_path, [0.5] * 10)
+    assert [f.number for f in all_frames(tmp_path, start=2, end=9, stride=3)] == [2, 5, 8]
+
+
+def test_a_folder_of_folders_is_a_rig(tmp_path):
+    for name in ("b", "a", "c"):
+        folder_of(tmp_path / name, [0.5] * 3)
+    frames = all_frames(tmp_path)
+    assert [(f.camera_id, f.number, f.source) for f in frames[:4]] == [
+        (0, 0, "a/f1.png"),
+        (0, 1, "a/f2.png"),
+        (0, 2, "a/f3.png"),
+        (1, 0, "b/f1.png"),
+    ]
+
+
+def test_cameras_of_a_rig_need_the_same_number_of_frames(tmp_path):
+    folder_of(tmp_path / "a", [0.5] * 3), folder_of(tmp_path / "b", [0.5] * 4)
+    with pytest.raises(InputError, match=r"4 frames, but .*a has 3"):
+        open_footage(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov"])
+def test_a_video_gives_its_frames_and_rate(tmp_path, suffix):
+    clip = tmp_path / f"clip{suffix}"
+    write_video(clip, [picture(0.1 * k) for k in range(1, 9)], fps=12)
+    frames = all_frames(clip, start=1, stride=2)
+    assert [f.source for f in frames] == [f"clip{suffix}#{k}" for k in (1, 3, 5, 7)]
+    assert np.allclose([f.rgb.mean() for f in frames], [0.2, 0.4, 0.6, 0.8], atol=0.03)
+    assert open_footage(clip).fps == 12
+
+
+def test_paths_may_hold_spaces_and_any_letters(tmp_path):
+    clip = tmp_path / "Žlutý kůň 夜 #1"
+    folder_of(clip / "kamera één", [0.3] * 3)
+    write_video(clip / "夜 film.mp4", [picture(0.5)] * 4)
+    assert len(all_frames(clip / "kamera één")) == 3
+    assert len(all_frames(clip / "夜 film.mp4")) == 4
+
+
+def test_sixteen_bit_tiff_and_jpeg_keep_their_values(tmp_path):
+    value = np.full((8, 8, 3), 12345, np.uint16)
+    cv2.imwrite(str(tmp_path / "1.tiff"), value)
+    Image.fromarray(np.full((8, 8, 3), 99, np.uint8)).save(tmp_path / "2.jpg", quality=100)
+    frames = all_frames(tmp_path)
+    assert np.allclose(frames[0].rgb, 12345 / 65535)
+    assert np.allclose(frames[1].rgb, 99 / 255, atol=1 / 255)
+
+
+def test_linear_frames_share_one_scale_and_are_encoded(tmp_path):
+    for i, level in enumerate((0.5, 2.0, 8.0)):
+        write_exr(tmp_path / f"{i}.exr", {"RGB": np.full((16, 16, 3), level, np.float32)})
+    decoded = [f.rgb.mean() ** 2.2 for f in all_frames(tmp_path)]
+    assert np.allclose(decoded, [0.5 / 8, 2 / 8, 1], rtol=0.01)
+
+
+def test_linear_frames_within_one_are_not_scaled(tmp_path):
+    write_exr(tmp_path / "0.exr", {"RGB": np.full((16, 16, 3), 0.25, np.float32)})
+    assert np.allclose(all_frames(tmp_path)[0].rgb, 0.25 ** (1 / 2.2), atol=1e-3)
+
+
+def test_shrinking_averages_and_keeps_the_shape():
+    image = np.arange(2 * 4 * 6 * 3, dtype=np.float32).reshape(8, 6, 3)
+    small = shrink(image, 4)
+    assert small.shape == (4, 3, 3)
+    assert np.allclose(small[0, 0], image[:2, :2].mean((0, 1)))
+    assert shrink(image, 8) is image
+
+
+def test_exposure_times_become_log2_seconds():
+    assert np.allclose(parse_exposures("1/1000, 1/250,0.25", None), [-math.log2(1000), -math.log2(250), -2])
+    assert parse_exposures(None, "-4,-2,0") == [-4, -2, 0]
+    assert parse_exposures("auto", None) is None and parse_exposures(None, None) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [("1/0", "divides by zero"), ("-1/60", "cannot be"), ("abc", "not a number"), ("inf", "not finite"), ("", "not a number")],
+)
+def test_an_impossible_exposure_is_named(text, what):
+    with pytest.raises(InputError, match=what):
+        log2_seconds(text, "--exposures")
+
+
+def test_both_kinds_of_list_at_once_are_refused():
+    with pytest.raises(InputError, match="both given"):
+        parse_exposures("1/60", "0")
+    with pytest.raises(InputError, match="divides by zero"):
+        number("3/0", "--ev")
+
+
+def test_a_csv_beside_the_frames_is_read(tmp_path):
+    folder_of(tmp_path, [0.5] * 2)
+    (tmp_path / "exposures.csv").write_text("file, exposure\nf1.png, 1/4\nf2.png, 1/2\n")
+    path, rows = read_exposure_csv(open_footage(tmp_path))
+    assert path.name == "exposures.csv"
+    assert rows == {"f1.png": -2, "f2.png": -1}
+
+
+def test_a_csv_beside_a_video_names_frames_by_number(tmp_path):
+    write_video(tmp_path / "clip.mp4", [picture(0.5)] * 2)
+    (tmp_path / "clip.csv").write_text("frame,ev\n0,-3\n1,1.5\n", encoding="utf-8-sig")
+    assert read_exposure_csv(open_footage(tmp_path / "clip.mp4"))[1] == {"#0": -3, "#1": 1.5}
+
+
+@pytest.mark.parametrize(
+    ("text", "what"), [("file,ev\nf1.png,1/0\n", "line 2"), ("name,value\n", "columns"), ("file,ev\nf1.png\n", "line 2")]
+)
+def test_a_csv_that_makes_no_sense_is_named(tmp_path, text, what):
+    folder_of(tmp_path, [0.5])
+    (tmp_path / "exposures.csv").write_text(text)
+    with pytest.raises(InputError, match=f"exposures.csv.*{what}"):
+        read_exposure_csv(open_footage(tmp_path))
+
+
+def test_exif_exposure_counts_time_sensitivity_and_aperture(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x829A: IFDRational(1, 64), 0x8827: 400, 0x829D: IFDRational(2, 1)})  # 1/64 s, ISO 400, f/2: -6 + 2 - 2
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    Image.new("RGB", (8, 8)).save(tmp_path / "b.jpg")
+    assert read_exif_ev(tmp_path / "a.jpg") == pytest.approx(-6)
+    assert read_exif_ev(tmp_path / "b.jpg") is None
+
+
+def test_held_out_frames_go_through_all_exposures():
+    chosen = held_out(100, 8, 4)
+    assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
+    assert {k % 4 for k in chosen} == {0, 1, 2, 3}
+    assert held_out(100, 0, 3) == [] and 0 not in held_out(9, 2, 1) and 8 not in held_out(9, 2, 1)
