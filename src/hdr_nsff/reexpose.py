@@ -21,7 +21,7 @@ from hdr_nsff import ingest
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_mask, write_exr, write_json, write_npy, write_png, writing_to
 from hdr_nsff.progress import say, track
-from hdr_nsff.recording import Noise, record, response_curve
+from hdr_nsff.recording import Curve, Noise, record, response_curve
 from hdr_nsff.truth import Truth, TruthView
 
 
@@ -113,12 +113,14 @@ def reexpose(config: ReexposeConfig) -> Path:
         footage = ingest.open_footage(config.clip)
         if len(footage.cameras) > 1:
             raise InputError(f"{config.clip}: {len(footage.cameras)} cameras; re-expose one camera's folder at a time")
-        claim(config, footage)
+        response = response_curve(config.response)
         numbers = [f.number for f in track(chosen(config, footage), "reading")]
         work = plan(len(numbers), len(evs), config.hold_out, remove=config.poses is not None)
-        size = write_frames(config, footage, work, evs)
-        poses = read_poses(config.poses, numbers).resized(*size) if config.poses is not None else None
-        write_truth(config, work, evs, numbers, poses)
+        poses = read_poses(config.poses, numbers) if config.poses is not None else None
+        masks = frame_masks(config.masks, work.test, numbers) if config.masks is not None else {}
+        claim(config, footage)  # once nothing can be wrong with the settings any more
+        size = write_frames(config, footage, work, evs, response)
+        write_truth(config.out, work, evs, response, poses.resized(*size) if poses is not None else None, masks)
     say(f"{len(work.kept)} frames in {config.out / 'clip'}, {len(work.test)} true views in {config.out / 'truth'}")
     given = f"--poses {config.out / 'poses_bounds.npy'} --hold-out 0" if poses else f"--hold-out {config.hold_out}"
     say(f"next: hdr-nsff prepare {config.out / 'clip'} SCENE --ev={config.ev} {given}")
@@ -167,7 +169,9 @@ def plan(count: int, cycle: int, hold_out: int, remove: bool) -> Plan:
     return Plan(bracket, test, kept)
 
 
-def write_frames(config: ReexposeConfig, footage: ingest.Footage, work: Plan, evs: list[float]) -> tuple[int, int]:
+def write_frames(
+    config: ReexposeConfig, footage: ingest.Footage, work: Plan, evs: list[float], response: Curve
+) -> tuple[int, int]:
     """Write the recorded frames and the radiance of the held-out ones, those not there yet; (width, height)."""
     response, noise = (
         response_curve(config.response),
@@ -186,13 +190,13 @@ def write_frames(config: ReexposeConfig, footage: ingest.Footage, work: Plan, ev
     return width, height
 
 
-def write_truth(config: ReexposeConfig, work: Plan, evs: list[float], numbers: list[int], poses: LlffPoses | None) -> None:
+def write_truth(
+    out: Path, work: Plan, evs: list[float], response: Curve, poses: LlffPoses | None, masks: dict[int, np.ndarray]
+) -> None:
     """Write `truth.json` with the masks it names, and the poses of the new footage."""
-    masks = frame_masks(config.masks, work.test, numbers) if config.masks is not None else {}
     for k, mask in masks.items():
-        write_png(config.out / f"truth/masks/{k:05d}.png", mask)
+        write_png(out / f"truth/masks/{k:05d}.png", mask)
     c2w = poses.c2w().tolist() if poses is not None else None
-    response = response_curve(config.response)
     views = [
         TruthView(
             name=f"{k:05d}",
@@ -214,9 +218,9 @@ def write_truth(config: ReexposeConfig, work: Plan, evs: list[float], numbers: l
         clip_c2w=[c2w[k] for k in work.kept] if c2w else None,
         views=views,
     )
-    write_json(config.out / "truth/truth.json", truth.model_dump())
+    write_json(out / "truth/truth.json", truth.model_dump())
     if poses is not None:
-        write_npy(config.out / "poses_bounds.npy", poses.rows()[work.kept])
+        write_npy(out / "poses_bounds.npy", poses.rows()[work.kept])
 
 
 def frame_masks(folder: Path, frames: list[int], numbers: list[int]) -> dict[int, np.ndarray]:

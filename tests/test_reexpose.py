@@ -1,0 +1,137 @@
+"""Re-exposed clips: what is recorded, what is kept aside, and what each says about the other."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_exr, read_image, read_npy, write_json, write_npy, write_png
+from hdr_nsff.priors.exposure import detect_cycle
+from hdr_nsff.recording import response_curve
+from hdr_nsff.reexpose import ReexposeConfig, plan, reexpose
+from hdr_nsff.truth import Truth
+
+
+def ordinary_clip(folder: Path, count: int = 20, width: int = 40) -> Path:
+    """A ramp that slides by a pixel per frame, 24 rows high."""
+    for t in range(count):
+        ramp = 0.15 + 0.7 * ((np.arange(width) + t) % width) / width
+        write_png(folder / f"{t:03d}.png", np.broadcast_to(ramp[None, :, None], (24, width, 3)))
+    return folder
+
+
+def llff(count: int, width: int = 40, height: int = 24) -> np.ndarray:
+    """poses_bounds rows (count, 17): axes of the world (columns down, right, back of an OpenCV identity), centre (t, 0, 0), focal 50."""
+    pose = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
+    rows = [np.concatenate([pose, [[t], [0], [0]], [[height], [width], [50]]], 1).ravel() for t in range(count)]
+    return np.concatenate([np.array(rows), np.full((count, 1), 1.0), np.full((count, 1), 9.0)], 1)
+
+
+def test_without_poses_truth_frames_stay_in_the_clip(tmp_path):
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out"))
+    truth = Truth.open(out / "truth")
+    assert len(list((out / "clip").glob("*.png"))) == 20
+    assert [(v.time, v.anchor, v.bracket, v.c2w) for v in truth.views] == [(4, 4, 1, None), (12, 12, 0, None)]
+
+
+def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbours(tmp_path):
+    write_npy(tmp_path / "poses_bounds.npy", llff(20))
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"))
+    truth = Truth.open(out / "truth")
+    assert len(list((out / "clip").glob("*.png"))) == 18
+    assert [(v.name, v.time, v.anchor) for v in truth.views] == [("00004", 3.5, 3), ("00012", 10.5, 10)]
+    assert truth.views[0].c2w == [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0]]
+    assert [pose[0][3] for pose in truth.clip_c2w] == [t for t in range(20) if t not in (4, 12)]
+    assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
+    assert read_npy(out / "poses_bounds.npy").shape == (18, 17)
+
+
+def test_recordings_follow_the_response_and_truth_is_the_clip(tmp_path):
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", noise=0))
+    radiance = read_exr(out / "truth/radiance/00004.exr")["RGB"]
+    assert np.allclose(radiance, read_image(tmp_path / "in/004.png") ** 2.2, rtol=2e-3)
+    expected = response_curve("film").apply(np.clip(radiance * 2.0**0, 0, 1))  # frame 4 is in bracket 1: EV 0
+    assert np.abs(read_image(out / "clip/00004.png") - expected).max() < 1.5 / 255
+
+
+def test_exposures_of_a_reexposed_clip_are_found_again(tmp_path):
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", ev="0,-3,-1"))
+    video = np.stack([read_image(f) for f in sorted((out / "clip").glob("*.png"))])
+    cycle = detect_cycle(video)
+    assert (cycle.length, cycle.order) == (3, [1, 2, 0])
+
+
+def test_the_cycle_runs_unbroken_over_the_recorded_frames():
+    work = plan(20, 3, 8, remove=True)
+    assert [work.bracket[k] for k in work.kept] == [n % 3 for n in range(18)]
+
+
+def test_noise_repeats_with_its_seed(tmp_path):
+    clip = ordinary_clip(tmp_path / "in", 4)
+    images = []
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        out = reexpose(ReexposeConfig(clip, tmp_path / name, seed=seed))
+        images.append(np.stack([read_image(f) for f in sorted((out / "clip").glob("*.png"))]))
+    assert np.array_equal(images[0], images[1])
+    assert not np.array_equal(images[0], images[2])
+
+
+def test_masks_of_the_clip_become_masks_of_the_truth(tmp_path):
+    for t in range(20):
+        write_png(tmp_path / f"masks/{t:03d}.png", np.full((24, 40), t == 12))
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", masks=tmp_path / "masks"))
+    views = Truth.open(out / "truth").views
+    assert [read_image(out / "truth" / v.mask).mean() for v in views] == [0, 1]
+
+
+def test_poses_shrink_with_the_frames(tmp_path):
+    write_json(tmp_path / "poses.json", {"poses": llff(20)[:, :15].reshape(20, 3, 5).tolist(), "bds": [[1, 9]] * 20})
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses.json", max_size=20))
+    assert Truth.open(out / "truth").K == [[25, 0, 10], [0, 25, 6], [0, 0, 1]]
+
+
+def test_an_interrupted_run_goes_on_and_a_finished_one_is_left_alone(tmp_path):
+    config = ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out")
+    out = reexpose(config)
+    before = {f: f.read_bytes() for f in out.rglob("*") if f.is_file()}
+    (out / "clip/00007.png").unlink(), (out / "truth/truth.json").unlink()
+    untouched = (out / "clip/00003.png").stat().st_mtime_ns
+    reexpose(config)
+    assert {f: f.read_bytes() for f in out.rglob("*") if f.is_file()} == before
+    assert (out / "clip/00003.png").stat().st_mtime_ns == untouched
+
+
+def test_output_of_another_clip_is_not_touched(tmp_path):
+    reexpose(ReexposeConfig(ordinary_clip(tmp_path / "a"), tmp_path / "out"))
+    told = (tmp_path / "out/reexpose.json").read_text()
+    with pytest.raises(InputError, match="other settings"):
+        reexpose(ReexposeConfig(tmp_path / "a", tmp_path / "out", ev="-1,1"))
+    with pytest.raises(InputError, match="another clip"):
+        reexpose(ReexposeConfig(ordinary_clip(tmp_path / "b", 19), tmp_path / "out"))
+    with pytest.raises(InputError, match="not made by reexpose"):
+        reexpose(ReexposeConfig(tmp_path / "a", tmp_path / "b"))
+    assert (tmp_path / "out/reexpose.json").read_text() == told and json.loads(told)["ev"] == "-2,0,2"
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        ({"ev": "1/0"}, "divides by zero"),
+        ({"ev": "auto"}, "list the log2 exposures"),
+        ({"response": "velvia"}, "unknown"),
+        ({"poses": Path("nowhere.npy")}, "not readable"),
+        ({"masks": Path("nowhere")}, "0 masks"),
+        ({"end": 2}, "at least 3"),
+    ],
+)
+def test_bad_settings_are_named(tmp_path, change, what):
+    with pytest.raises(InputError, match=what):
+        reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", **change))
+
+
+def test_too_few_poses_are_named(tmp_path):
+    write_npy(tmp_path / "poses_bounds.npy", llff(7))
+    with pytest.raises(InputError, match="7 poses for a clip of at least 20 frames"):
+        reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"))
