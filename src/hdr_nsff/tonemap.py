@@ -170,7 +170,7 @@ class ToneMapper(nn.Module):
         super().__init__()
         assert len(frame_brackets) == len(frame_cameras), (len(frame_brackets), len(frame_cameras))
         check_brackets(frame_brackets, bracket_ev, reference_bracket)
-        self.config = config
+        self.config, self.given_ev = config, tuple(bracket_ev)
         self.frame_brackets, self.frame_cameras = tuple(frame_brackets), tuple(frame_cameras)
         self.num_cameras = num_cameras or max(frame_cameras, default=0) + 1
         self.reference_frame = self.frame_brackets.index(reference_bracket) if reference_bracket in frame_brackets else 0
