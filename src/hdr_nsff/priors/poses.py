@@ -1,0 +1,350 @@
+"""Camera poses from frames alone: structure from motion on exposure-equalised frames with moving objects left out.
+
+Footage without parallax (tripod, pan) is recognised first and gets rotations instead (`rotation.py`). Otherwise pycolmap maps the
+frames (`sfm.py`): incrementally, then globally, with and without levelled contrast, until nine frames in ten register with a focal
+length that a lens can have. Poses are camera to world, OpenCV axes; the world's +z is the mean viewing direction, near is 1."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import encode
+from hdr_nsff.priors import sfm
+from hdr_nsff.priors.colmap import ColmapModel, read_model
+from hdr_nsff.priors.matching import camera_groups, keypoints, match_all, picture, spread_pairs, upsampling, usable, view_pairs
+from hdr_nsff.priors.rotation import Panorama, default_focal, homography_share, panorama
+from hdr_nsff.progress import say
+
+FOV = (25.0, 100.0)  # degrees across the image that an undistorted video camera plausibly sees
+ENOUGH, LEAST = 0.9, 0.6  # share of frames to be content with, and below which poses have failed
+PLANAR = 0.7  # share of matches a homography must explain before footage counts as without parallax
+STILL = 0.75  # pixels that a camera on a tripod may seem to move
+LOOK = 24  # frames looked at to decide about parallax
+ADVICE = (
+    "film with the camera moving sideways past textured, unmoving things, give masks of the moving objects (--masks FOLDER), "
+    "or import poses (--poses FOLDER or FILE)"
+)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Cameras of all frames of a clip, and the static points they were found from."""
+
+    K: np.ndarray  # (T, 3, 3) pixels
+    c2w: np.ndarray  # (T, 3, 4) OpenCV camera to world, scene units
+    registered: np.ndarray  # (T,) bool; the others are interpolated
+    parallax: Literal["full", "rotation", "none"]
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (P, 3) static, scene units
+    point_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (P,) mean reprojection error, pixels
+    tracks: np.ndarray = field(
+        default_factory=lambda: np.zeros((0, 4))
+    )  # (O, 4) one view of a point: frame, point, x, y in pixels
+    frame_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (T,) median reprojection error in pixels, NaN = none
+    near: float | None = None  # z-depth, scene units
+    far: float | None = None
+    notes: tuple[str, ...] = ()  # sentences for people
+
+
+@dataclass(frozen=True)
+class Views:
+    """The pictures to map: one per frame, but a single one for all frames of a camera that stands still."""
+
+    pictures: np.ndarray  # (V, H, W, 3) equalised rgb in [0, 1]
+    ignore: np.ndarray  # (V, H, W) bool
+    groups: list[list[int]]  # views of each physical camera
+    of_frame: np.ndarray  # (T,) which view shows each frame
+
+
+def estimate_poses(
+    video: np.ndarray,
+    masks: np.ndarray | None,
+    workdir: Path | str,
+    clipped: np.ndarray | None = None,
+    camera_ids: list[int] | None = None,
+    threads: int = 0,
+) -> Poses:
+    """Poses of every frame of `video` (T, H, W, 3), exposure-equalised rgb in [0, 1].
+
+    `masks` (T, H, W) bool moving; `clipped` (T, H, W) bool without information; `camera_ids` (T,) the physical camera of each frame
+    (each has its own focal length), by default one. Temporary files go into `workdir`. InputError where poses cannot be had."""
+    count = len(video)
+    if count < 3:
+        raise InputError(f"{count} frames are too few to estimate poses from; give at least 3, or import poses (--poses)")
+    ignore = np.any([m for m in (masks, clipped) if m is not None] or np.zeros((1, *video.shape[:3]), bool), 0)
+    groups = camera_groups(camera_ids or [0] * count)
+    if len(groups) == 1 and (share := parallax_share(video, ignore)) is not None and share >= PLANAR:
+        found = standing(video, ignore)
+        if found is not None:
+            return found
+    views = collapse(video, ignore, groups)
+    model, scale = best_model(views, Path(workdir), threads)
+    poses = assemble(model, views, scale, video.shape[1:3])
+    for note in poses.notes:
+        say(f"poses: {note}")
+    return poses
+
+
+def parallax_share(video: np.ndarray, ignore: np.ndarray) -> float | None:
+    """`homography_share` of up to 24 frames spread over the clip."""
+    chosen = np.unique(np.linspace(0, len(video) - 1, min(LOOK, len(video))).astype(int))
+    found = keypoints(video[chosen], ignore[chosen], 1000)
+    return homography_share(match_all(found, view_pairs([list(range(len(chosen)))])))
+
+
+def turning(video: np.ndarray, ignore: np.ndarray) -> Panorama | None:
+    """The rotations of one camera, all of its frames taken together."""
+    matches = match_all(keypoints(video, ignore, 1000), spread_pairs(len(video)))
+    return panorama(matches, len(video), video.shape[2], video.shape[1])
+
+
+def standing(video: np.ndarray, ignore: np.ndarray) -> Poses | None:
+    """Poses of a camera on a tripod or turning in place; None where rotations do not explain the footage after all."""
+    found = turning(video, ignore)
+    if found is None or found.explained < 0.8 or found.linked.mean() < LEAST:
+        return None
+    count, height, width = video.shape[:3]
+    still = found.motion < STILL
+    c2w = np.zeros((count, 3, 4))
+    c2w[:, :, :3] = np.eye(3) if still else found.rotations
+    notes = [
+        "no parallax: the camera "
+        + ("stands still" if still else f"turns in place (by up to {found.motion:.0f} px)")
+        + "; HDR video and in-between times work, novel viewpoints do not"
+    ]
+    notes.append(
+        f"focal length {found.focal:.0f} px, " + ("from the turn" if found.focal_known else "assumed: 60 degrees across")
+    )
+    for note in notes:
+        say(f"poses: {note}")
+    poses = Poses(
+        K=np.tile(intrinsics(found.focal, width, height), (count, 1, 1)),
+        c2w=c2w,
+        registered=found.linked | still,
+        parallax="none" if still else "rotation",
+        frame_errors=found.errors,
+        notes=tuple(notes),
+    )
+    return interpolate(poses, [list(range(count))])
+
+
+def intrinsics(focal: float, width: int, height: int) -> np.ndarray:
+    """K (3, 3) with the principal point in the middle."""
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+
+
+def collapse(video: np.ndarray, ignore: np.ndarray, groups: list[list[int]]) -> Views:
+    """One view per frame; of a rig's cameras that stand still, one view per camera: the median of its frames, free of most movers."""
+    if len(groups) == 1:
+        return Views(video, ignore, groups, np.arange(len(video)))
+    pictures: list[np.ndarray] = []
+    hidden: list[np.ndarray] = []
+    views: list[list[int]] = []
+    of_frame = np.zeros(len(video), int)
+    for group in groups:
+        chosen = [group[k] for k in np.unique(np.linspace(0, len(group) - 1, min(LOOK, len(group))).astype(int))]
+        found = turning(video[chosen], ignore[chosen]) if len(group) > 1 else None
+        first = len(pictures)
+        if found is not None and found.motion < STILL and found.explained > 0.8:
+            covered = ignore[chosen] & ~ignore[chosen].all(0)  # what is never free is taken as it is, and stays ignored
+            pictures.append(np.nanmedian(np.where(covered[..., None], np.nan, video[chosen]), 0))
+            hidden.append(np.all(ignore[chosen], 0))
+            of_frame[group] = first
+        else:
+            pictures += [video[t] for t in group]
+            hidden += [ignore[t] for t in group]
+            of_frame[group] = first + np.arange(len(group))
+        views.append(list(range(first, len(pictures))))
+    return Views(np.stack(pictures), np.stack(hidden), views, of_frame)
+
+
+def best_model(views: Views, workdir: Path, threads: int) -> tuple[ColmapModel, int]:
+    """The best reconstruction of the views, and how much larger than the views its pictures were. InputError where none will do."""
+    count = len(views.pictures)
+    best: ColmapModel | None = None
+    scale = upsampling(views.pictures.shape[2])
+    failures = []
+    for leftover in workdir.glob(".sfm-*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+    workdir.mkdir(parents=True, exist_ok=True)
+    for level in (True, False):
+        with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
+            job = write_job(Path(folder), views, scale, level, threads)
+            for mapping in ("incremental", "global"):
+                try:
+                    models = [read_model(p) for p in sfm.run(replace(job, mapping=mapping))]
+                except sfm.SfmError as error:
+                    failures.append(str(error))
+                    continue
+                best = max([m for m in (best, *models) if m is not None], key=lambda m: worth(m, count), default=None)
+                if best is not None and worth(best, count)[:2] == (True, True):
+                    return best, scale
+                got = 0 if best is None else len(best.images)
+                say(f"poses: {mapping} mapping ({'levelled' if level else 'plain'} contrast): at best {got} of {count} so far")
+    if best is None or not plausible(best) or len(best.images) < LEAST * count:
+        raise InputError(sentence(best, views, failures))
+    return best, scale
+
+
+def write_job(folder: Path, views: Views, scale: int, level: bool, threads: int) -> sfm.Job:
+    """The pictures and masks on disk, and what to do with them."""
+    names = [f"{v:05d}.png" for v in range(len(views.pictures))]
+    for v, name in enumerate(names):
+        encode(folder / "images" / name, picture(views.pictures[v], scale, level))
+        encode(folder / "masks" / f"{name}.png", usable(views.ignore[v], scale))
+    return sfm.Job(
+        folder=str(folder),
+        groups=[[names[v] for v in group] for group in views.groups],
+        pairs=[(names[a], names[b]) for a, b in view_pairs(views.groups)],
+        focal=default_focal(views.pictures.shape[2]) * scale,
+        mapping="incremental",
+        threads=threads,
+    )
+
+
+def plausible(model: ColmapModel) -> bool:
+    """Whether the focal lengths are those of real lenses."""
+    fov = [np.degrees(2 * np.arctan(c.width / 2 / c.K[0, 0])) for c in model.cameras.values()]
+    return all(FOV[0] <= f <= FOV[1] for f in fov)
+
+
+def worth(model: ColmapModel, count: int) -> tuple[bool, bool, int, int]:
+    """What makes one reconstruction better than another: a plausible lens, enough images, then more images, then more long tracks."""
+    return plausible(model), len(model.images) >= ENOUGH * count, len(model.images), int((model.track_lengths >= 3).sum())
+
+
+def sentence(model: ColmapModel | None, views: Views, failures: list[str]) -> str:
+    """Why there are no poses, for which frames, and what to do."""
+    count = len(views.of_frame)
+    if model is None:
+        why = f"; the last error was: {failures[-1]}" if failures else ""
+        return f"poses failed: no two frames could be tied together (no common texture seen from two places){why}; {ADVICE}"
+    have = {int(i.name[:5]) for i in model.images.values()}
+    missing = [t for t in range(count) if int(views.of_frame[t]) not in have]
+    if len(missing) <= (1 - LEAST) * count:
+        focal = next(iter(model.cameras.values())).K[0, 0] / upsampling(views.pictures.shape[2])
+        return f"poses failed: the focal length came out at an impossible {focal:.0f} px for {views.pictures.shape[2]} px wide frames; {ADVICE}"
+    return f"poses failed: {len(missing)} of {count} frames could not be placed (frames {ranges(missing)}); {ADVICE}"
+
+
+def ranges(numbers: list[int]) -> str:
+    """[1, 2, 3, 7] as "1-3, 7", shortened after eight ranges."""
+    runs: list[list[int]] = []
+    for n in numbers:
+        if runs and n == runs[-1][-1] + 1:
+            runs[-1] = [runs[-1][0], n]
+        else:
+            runs.append([n, n])
+    words = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
+    return ", ".join(words[:8]) + (", ..." if len(words) > 8 else "")
+
+
+def assemble(model: ColmapModel, views: Views, scale: int, size: tuple[int, int]) -> Poses:
+    """Poses of all frames from a reconstruction of the views, in a world of our own: mean camera at the origin, near 1."""
+    count, (height, width) = len(views.of_frame), size
+    image_of = {int(i.name[:5]): i for i in model.images.values()}
+    registered = np.array([int(v) in image_of for v in views.of_frame])
+    c2w = np.tile(np.eye(4)[:3], (count, 1, 1))
+    K = np.zeros((count, 3, 3))
+    for group in views.groups:
+        focals = {model.cameras[image_of[v].camera_id].K[0, 0] / scale for v in group if v in image_of}
+        if not focals:
+            raise InputError(f"poses failed: none of the frames of one camera could be placed (views {ranges(group)}); {ADVICE}")
+        K[np.isin(views.of_frame, group)] = intrinsics(focals.pop(), width, height)
+    for t in np.flatnonzero(registered):
+        c2w[t] = image_of[int(views.of_frame[t])].c2w
+    tracks = gather_tracks(model, views, scale)
+    poses = Poses(K, c2w, registered, "full", model.points, model.errors / scale, tracks)
+    poses = trusted_points(poses)
+    poses = interpolate(centred(poses), [list(np.flatnonzero(np.isin(views.of_frame, g))) for g in views.groups])
+    return replace(poses, notes=(*poses.notes, summary(poses)))
+
+
+def gather_tracks(model: ColmapModel, views: Views, scale: int) -> np.ndarray:
+    """All observations (O, 4): frame, row of the point, x, y in pixels of the frames. A view shared by many frames counts for its first."""
+    row = {int(key): r for r, key in enumerate(model.point_ids)}
+    first = {int(v): t for t, v in reversed(list(enumerate(views.of_frame)))}
+    seen = []
+    for image in model.images.values():
+        frame = first[int(image.name[:5])]
+        seen += [(frame, row[int(p)], *(xy / scale)) for xy, p in zip(image.xy, image.point_ids, strict=True) if p >= 0]
+    return np.array(seen, np.float64).reshape(-1, 4)
+
+
+def project(poses: Poses, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, 2) and z-depths (N,) of world `points` (N, 3), each in its own one of `frames` (N,)."""
+    local = np.einsum("nji,nj->ni", poses.c2w[frames, :, :3], points - poses.c2w[frames, :, 3])
+    pixels = np.einsum("nij,nj->ni", poses.K[frames], local)
+    return pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-9), local[:, 2]
+
+
+def trusted_points(poses: Poses, views: int = 3, error: float = 2.0) -> Poses:
+    """Without points of fewer than `views` views, of a larger mean `error` (pixels) or behind a camera; with every frame's error."""
+    frames, rows = poses.tracks[:, 0].astype(int), poses.tracks[:, 1].astype(int)
+    pixels, depth = project(poses, frames, poses.points[rows])
+    residual = np.linalg.norm(pixels - poses.tracks[:, 2:], axis=1)
+    size = len(poses.points)
+    good = (np.bincount(rows, minlength=size) >= views) & (poses.point_errors < error)
+    good &= np.bincount(rows, weights=depth <= 0, minlength=size) == 0
+    kept = good[rows]
+    errors = np.full(len(poses.c2w), np.nan)
+    for t in np.unique(frames[kept]):
+        errors[t] = np.median(residual[kept & (frames == t)])
+    tracks = poses.tracks[kept]
+    tracks[:, 1] = (np.cumsum(good) - 1)[rows[kept]]
+    return replace(poses, points=poses.points[good], point_errors=poses.point_errors[good], tracks=tracks, frame_errors=errors)
+
+
+def centred(poses: Poses) -> Poses:
+    """The same cameras and points with the mean registered camera at the origin looking along +z, scaled so that near is 1."""
+    if len(poses.points) < 10:
+        raise InputError(f"poses failed: only {len(poses.points)} static points could be placed; {ADVICE}")
+    placed = poses.c2w[poses.registered]
+    turn = Rotation.from_matrix(placed[:, :, :3]).mean().as_matrix()
+    centre = placed[:, :, 3].mean(0)
+    depth = project(poses, poses.tracks[:, 0].astype(int), poses.points[poses.tracks[:, 1].astype(int)])[1]
+    near, far = 0.7 * np.percentile(depth, 1), 1.3 * np.percentile(depth, 99)
+    moved = (poses.c2w[:, :, 3] - centre) @ turn / near
+    c2w = np.concatenate([turn.T @ poses.c2w[:, :, :3], moved[:, :, None]], 2)
+    return replace(poses, c2w=c2w, points=(poses.points - centre) @ turn / near, near=1.0, far=float(far / near))
+
+
+def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
+    """Poses of frames that did not register, between their registered neighbours of the same camera (held at the ends of the clip)."""
+    c2w, lost = poses.c2w.copy(), []
+    for group in groups:
+        known = [t for t in group if poses.registered[t]]
+        missing = [t for t in group if not poses.registered[t]]
+        if not missing:
+            continue
+        if not known:
+            raise InputError(
+                f"poses failed: none of the frames of one camera could be placed (frames {ranges(missing)}); {ADVICE}"
+            )
+        when = np.clip(missing, known[0], known[-1])
+        c2w[missing, :, 3] = np.stack([np.interp(when, known, c2w[known, k, 3]) for k in range(3)], -1)
+        turn = Rotation.from_matrix(c2w[known, :, :3])
+        c2w[missing, :, :3] = Slerp(known, turn)(when).as_matrix() if len(known) > 1 else c2w[known[0], :, :3]
+        lost += missing
+    if not lost:
+        return poses
+    note = f"{len(lost)} of {len(c2w)} frames did not register; their poses are interpolated (frames {ranges(sorted(lost))})"
+    return replace(poses, c2w=c2w, notes=(*poses.notes, note))
+
+
+def summary(poses: Poses) -> str:
+    """One sentence: frames, points, focal length, errors."""
+    focal = poses.K[:, 0, 0]
+    fov = np.degrees(2 * np.arctan(poses.K[:, 0, 2] / focal))
+    several = "" if np.ptp(focal) < 1e-6 else f" to {focal.max():.0f}"
+    return (
+        f"{int(poses.registered.sum())} of {len(focal)} frames registered, {len(poses.points)} static points, focal length "
+        f"{focal.min():.0f}{several} px ({fov.max():.0f} degrees across), median reprojection error {np.nanmedian(poses.frame_errors):.2f} px"
+    )

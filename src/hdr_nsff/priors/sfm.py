@@ -1,0 +1,202 @@
+"""Structure from motion by pycolmap, in a process of its own: `python -m hdr_nsff.priors.sfm JOB.json`.
+
+A separate process because pycolmap brings its own zlib, which breaks PNG and EXR writing in the process that imports it, and because
+native code that crashes must not take the user's run along. The worker extracts and matches keypoints once per job folder, maps, and
+leaves COLMAP models behind; the parent shows its progress and kills it when it is itself interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import IO, Literal
+
+from hdr_nsff.progress import track
+
+Mapping = Literal["incremental", "global"]
+CHUNKS = 24  # progress steps of matching
+
+
+@dataclass(frozen=True)
+class Job:
+    """One run of structure from motion; every path is inside `folder`."""
+
+    folder: str  # holds images/NAME.png, and masks/NAME.png.png where black pixels carry no keypoints
+    groups: list[list[str]]  # image names of each physical camera, which share intrinsics
+    pairs: list[tuple[str, str]]  # image names to match
+    focal: float  # first guess, pixels of the images
+    mapping: Mapping
+    threads: int = 0  # 0 = all cores
+
+
+class SfmError(RuntimeError):
+    """The worker ended without a result. The message is its last line."""
+
+
+def run(job: Job) -> list[Path]:
+    """Run `job` in a worker process, with progress; the folders of the models it found, largest first. SfmError when it breaks down."""
+    file = Path(job.folder) / "job.json"
+    file.write_text(json.dumps(asdict(job)))
+    log = Path(job.folder) / "worker.log"
+    with open(log, "w") as errors:
+        command = [sys.executable, "-m", "hdr_nsff.priors.sfm", str(file)]
+        worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
+        try:
+            assert worker.stdout is not None
+            follow(worker.stdout)
+            code = worker.wait()
+        finally:
+            worker.kill()
+            worker.wait()
+    if code != 0:
+        said = [line for line in log.read_text().splitlines() if line.strip()]
+        raise SfmError(said[-1] if said else f"pycolmap ended with code {code}")
+    return sorted(p for p in (Path(job.folder) / job.mapping).iterdir() if p.is_dir())
+
+
+def follow(lines: IO[str]) -> None:
+    """Show the worker's stages ("stage NAME TOTAL", then "tick" lines, then "end") as progress bars."""
+
+    def ticks() -> Iterator[None]:
+        for line in iter(lines.readline, ""):
+            if line.startswith("end"):
+                return
+            yield None
+
+    for line in iter(lines.readline, ""):
+        if line.startswith("stage "):
+            _, name, total = line.split()
+            for _ in track(ticks(), f"poses: {name}", int(total)):
+                pass
+
+
+def tell(*words: object) -> None:
+    """One line to the parent."""
+    print(*words, flush=True)
+
+
+def die_with_parent() -> None:
+    """End this process soon after its parent is gone (killed, too)."""
+    parent = os.getppid()
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(0.5)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def extract(job: Job, database: Path, threads: int) -> None:
+    """Keypoints of all images into the database, one camera per group."""
+    import pycolmap
+
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = "SIMPLE_PINHOLE"
+    masks = Path(job.folder) / "masks"
+    if masks.is_dir():
+        reading.mask_path = str(masks)
+    extraction = pycolmap.FeatureExtractionOptions()
+    extraction.num_threads = threads
+    extraction.sift.max_num_features = 4096
+    tell("stage keypoints", sum(len(g) for g in job.groups))
+    for group in job.groups:
+        for k in range(0, len(group), 6):
+            names = group[k : k + 6]
+            if k:
+                with pycolmap.Database.open(database) as db:
+                    reading.existing_camera_id = db.read_image_with_name(group[0]).camera_id
+            else:
+                reading.existing_camera_id = -1
+            pycolmap.extract_features(
+                database, Path(job.folder) / "images", names, pycolmap.CameraMode.SINGLE, reading, extraction, pycolmap.Device.cpu
+            )
+            for _ in names:
+                tell("tick")
+    tell("end")
+    with pycolmap.Database.open(database) as db:
+        for camera in db.read_all_cameras():
+            camera.focal_length = job.focal
+            db.update_camera(camera)
+
+
+def match(job: Job, database: Path, threads: int) -> None:
+    """Verified matches of the job's pairs into the database."""
+    import pycolmap
+
+    matching = pycolmap.FeatureMatchingOptions()
+    matching.num_threads = threads
+    pairing = pycolmap.ImportedPairingOptions()
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = 0
+    verification.ransac.max_error = 3.0
+    verification.detect_watermark = False  # a still camera is not a watermark
+    step = -(-len(job.pairs) // CHUNKS)
+    tell("stage matches", -(-len(job.pairs) // step))
+    for k in range(0, len(job.pairs), step):
+        file = Path(job.folder) / "pairs.txt"
+        file.write_text("".join(f"{a} {b}\n" for a, b in job.pairs[k : k + step]))
+        pairing.match_list_path = str(file)
+        pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
+        tell("tick")
+    tell("end")
+
+
+def reconstruct(job: Job, database: Path, threads: int) -> None:
+    """Map the matches; models are left in `<folder>/<mapping>/<n>`, with a last robust adjustment of everything."""
+    import pycolmap
+
+    out = Path(job.folder) / job.mapping
+    out.mkdir(exist_ok=True)
+    images = Path(job.folder) / "images"
+    tell("stage mapping", sum(len(g) for g in job.groups))
+    if job.mapping == "incremental":
+        options = pycolmap.IncrementalPipelineOptions()
+        options.num_threads = threads
+        options.random_seed = 0
+        options.extract_colors = False
+        options.max_num_models = 4
+        options.min_model_size = 3
+        models = pycolmap.incremental_mapping(database, images, out, options, next_image_callback=lambda: tell("tick"))
+    else:
+        whole = pycolmap.GlobalPipelineOptions()
+        whole.num_threads = threads
+        whole.random_seed = 0
+        pycolmap.calibrate_view_graph(database)
+        models = pycolmap.global_mapping(database, images, out, whole)
+    tell("end")
+    for key, model in models.items():
+        (out / str(key)).mkdir(exist_ok=True)
+        model.write_binary(out / str(key))
+
+
+def main() -> None:
+    """The worker."""
+    import zlib  # the system's zlib must be in place before pycolmap brings its own
+
+    import numpy as np
+
+    die_with_parent()
+    import pycolmap
+
+    assert zlib and np
+    pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
+    pycolmap.set_random_seed(0)
+    raw = json.loads(Path(sys.argv[1]).read_text())
+    job = Job(**raw)
+    threads = job.threads or os.cpu_count() or 1
+    database = Path(job.folder) / "database.db"
+    if not database.exists():
+        extract(job, database, threads)
+        match(job, database, threads)
+    reconstruct(job, database, threads)
+
+
+if __name__ == "__main__":
+    main()
