@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import logging
 import math
 import re
 from collections.abc import Iterator
@@ -265,6 +266,7 @@ def read_exif_ev(path: Path) -> float | None:
     """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF, None where it has no exposure time."""
     import exifread
 
+    logging.getLogger("exifread").setLevel(logging.ERROR)  # it warns of every picture without EXIF
     with open(path, "rb") as file:
         tags = exifread.process_file(file, details=False)
 
