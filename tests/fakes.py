@@ -10,8 +10,7 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.config import TrainConfig
-from hdr_nsff.fields.base import Render
-from hdr_nsff.interpolate import Layers
+from hdr_nsff.fields.base import Layers, Render
 from hdr_nsff.run import Run
 from hdr_nsff.scene import Frame, FrameEntry, Manifest, Scene, Step
 from hdr_nsff.tonemap import ToneMapConfig, ToneMapper

@@ -5,10 +5,10 @@
   fraction. Plain torch scatter-adds, any device.
 - `direct`: the field is asked at the fractional time itself.
 
-Splatting, layer by layer: bilinear weights w, alpha = sum(w * alpha) / clamp(sum(w), 0.5, 1), at most 1. Where samples spread
+Splatting, layer by layer: bilinear weights w, alpha = sum(w * alpha) / clamp(sum(w), 0.8, 1), at most 1. Where samples spread
 this is average splatting, so no cracks open; where they pile up, as a mover over empty samples that stand still, it is the
-sum, so a mover keeps its opacity; where hardly anything lands, alpha fades. Where one time shows nothing (the content moved away) the other fills in; where neither does, the
-nearer training time stands unmoved, so there are no holes."""
+sum, so a mover keeps its opacity; where hardly anything lands, alpha fades. Where one time shows nothing (the content moved
+away) the other fills in; where neither does, the nearer training time stands unmoved, so there are no holes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import Layers, RadianceField, Render
+from hdr_nsff.volume import transmittance, weighted_sum
 
 Mode = Literal["auto", "splat", "direct"]
 SAME_TIME = 1e-4  # frames: closer than this to a training time is that time
-SPREAD = 0.5  # smallest sum of weights that average splatting makes up for: samples spread to half their density
+EMPTY = 1e-4  # samples of less alpha hold nothing and stand still
+SPREAD = 0.8  # smallest sum of weights that average splatting makes up for: content that grows by a tenth along each side
 FAINT = 0.1  # presence below this is topped up from the nearer training time
 
 
@@ -75,63 +77,76 @@ def render_at(field: RadianceField, camera: Camera, time: float, times: Sequence
 
 
 def splat(layers: Layers, camera: Camera, direction: int, fraction: float) -> tuple[Picture, Picture]:
-    """The layers moved by `fraction` of their scene flow towards `direction` (+-1) and composited; and the same unmoved."""
-    num_layers = layers.alpha.shape[1]
-    moved, unmoved = Compositor(layers.alpha[:, :1]), Compositor(layers.alpha[:, :1])
-    for i in range(num_layers):
-        alpha, motion = layers.alpha[:, i, None], layers.motion[:, i, None]  # (S, 1)
-        flow, position = layers.scene_flow[direction][:, i], layers.positions[:, i]  # (S, 3)
-        value = torch.cat([layers.radiance[:, i], inverse(camera.to_camera(position)[:, 2:]), motion], -1)  # (S, 5)
-        unmoved.add(alpha, value)
-        if not flow.any():
-            moved.add(alpha, value)
-            continue
-        pixels, depth = camera.project(position + fraction * flow)
-        value = torch.cat([layers.radiance[:, i], inverse(depth[:, None]), motion], -1)
-        moved.add(*splat_layer(pixels, alpha * (depth > 0)[:, None], value, camera.width, camera.height))
-    return moved.picture(), unmoved.picture()
+    """The layers moved by `fraction` of their scene flow towards `direction` (+-1) and composited; and the same unmoved.
+
+    Samples without content (alpha below `EMPTY`) stand still. Only the samples that move, and those they leave or land on,
+    are computed anew; the rest of the picture is that of the unmoved layers."""
+    num_layers, flow = layers.alpha.shape[1], layers.scene_flow[direction]
+    value = torch.cat([layers.radiance, inverse(camera.to_camera(layers.positions)[..., 2:]), layers.motion[..., None]], -1)
+    alpha, value = layers.alpha.reshape(-1, 1), value.reshape(-1, 5)  # (S L, ...): sample = pixel * L + layer
+    moving = (alpha[:, 0] > EMPTY) & flow.reshape(-1, 3).any(-1)
+    source = moving.nonzero()[:, 0]
+    unmoved = composite(alpha, value, num_layers)
+    if not len(source):
+        return unmoved, unmoved
+    position = layers.positions.reshape(-1, 3)[source] + fraction * flow.reshape(-1, 3)[source]
+    pixels, depth = camera.project(position)
+    content = torch.cat([value[source, :3], inverse(depth[:, None]), value[source, 4:]], -1)
+    landing, weight = corners(pixels, camera.width, camera.height)  # (4 M,) pixel each, (4 M,)
+    target = landing * num_layers + (source % num_layers).repeat(4)
+    weight = weight * (depth > 0).repeat(4)
+    touched, place = torch.cat([source, target]).unique(return_inverse=True)
+    mass = masses(alpha[touched], value[touched]) * (~moving[touched])[:, None]  # what stands still there
+    arriving = masses(alpha[source], content).repeat(4, 1) * weight[:, None]
+    mass.index_add_(0, place[len(source) :], arriving)
+    return composite(alpha, value, num_layers, (touched, *settle(mass))), unmoved
+
+
+def masses(alpha: Tensor, value: Tensor) -> Tensor:
+    """What samples add up to, (M, 2 + C): presence, alpha, alpha * value."""
+    return torch.cat([torch.ones_like(alpha), alpha, alpha * value], -1)
+
+
+def settle(mass: Tensor) -> tuple[Tensor, Tensor]:
+    """Alpha (M, 1) and value (M, C) of summed masses (M, 2 + C)."""
+    landed, opaque, value = mass[:, :1], mass[:, 1:2], mass[:, 2:]
+    return (opaque / landed.clamp(SPREAD, 1.0)).clamp(0, 1), value / opaque.clamp_min(1e-6)
+
+
+def corners(pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """The four pixels around each of `pixels` (M, 2; centres at +0.5) as positions row by row (4 M,), and their bilinear weights
+    (4 M,), which add up to 1; weight 0 outside the picture."""
+    corner = (pixels - 0.5).floor()
+    share = (pixels - 0.5) - corner  # (M, 2) of the way to the next column, row
+    places, weights = [], []
+    for dx in (0, 1):
+        for dy in (0, 1):
+            column, row = corner[:, 0] + dx, corner[:, 1] + dy
+            weight = (share[:, 0] if dx else 1 - share[:, 0]) * (share[:, 1] if dy else 1 - share[:, 1])
+            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            places.append((row.clamp(0, height - 1) * width + column.clamp(0, width - 1)).long())
+            weights.append(weight * inside)
+    return torch.cat(places), torch.cat(weights)
+
+
+def composite(alpha: Tensor, value: Tensor, num_layers: int, changes: tuple[Tensor, Tensor, Tensor] | None = None) -> Picture:
+    """Samples of alpha (S L, 1) and value (S L, C) front to back; `changes` are samples (M,) that have another alpha (M, 1) and
+    value (M, C) instead."""
+    if changes is not None:
+        alpha = alpha.index_copy(0, changes[0], changes[1])
+    layers = alpha.view(-1, num_layers)
+    weights = transmittance(layers) * layers  # (S, L)
+    colour = weighted_sum(weights, value.view(-1, num_layers, value.shape[1]))
+    if changes is not None:
+        at, _, other = changes
+        difference = weights.view(-1, 1)[at] * (other - value[at])
+        colour = colour.index_add(0, torch.div(at, num_layers, rounding_mode="floor"), difference)
+    return Picture(weights.sum(-1, keepdim=True), colour)
 
 
 def inverse(depth: Tensor) -> Tensor:
     """Disparity of z-depths; 0 behind the camera."""
     return torch.where(depth > 1e-6, 1 / depth.clamp_min(1e-6), 0.0)
-
-
-class Compositor:
-    """Front-to-back compositing, one layer at a time."""
-
-    def __init__(self, like: Tensor) -> None:
-        self.transmittance = torch.ones_like(like)  # (S, 1)
-        self.colour: Tensor | float = 0.0
-
-    def add(self, alpha: Tensor, value: Tensor) -> None:
-        """Put a layer with `alpha` (S, 1) and `value` (S, C) behind what is there."""
-        self.colour = self.colour + self.transmittance * alpha * value
-        self.transmittance = self.transmittance * (1 - alpha)
-
-    def picture(self) -> Picture:
-        """What has been composited so far."""
-        assert isinstance(self.colour, Tensor), "no layers"
-        return Picture(1 - self.transmittance, self.colour)
-
-
-def splat_layer(pixels: Tensor, alpha: Tensor, value: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """Alpha (S, 1) and value (S, C) of one layer once its samples have moved to `pixels` (S, 2), centres at +0.5.
-
-    Bilinear scatter-add; what leaves the picture is lost. `value` is averaged with the weight of its alpha."""
-    mass = torch.cat([torch.ones_like(alpha), alpha, alpha * value], -1)  # (S, 2 + C)
-    total = mass.new_zeros(width * height, mass.shape[1])
-    corner = (pixels - 0.5).floor()
-    share = (pixels - 0.5) - corner  # (S, 2) of the way to the next column, row
-    for dx in (0, 1):
-        for dy in (0, 1):
-            column, row = corner[:, 0] + dx, corner[:, 1] + dy
-            weight = (share[:, 0] if dx else 1 - share[:, 0]) * (share[:, 1] if dy else 1 - share[:, 1])
-            inside = (column >= 0) & (column < width) & (row >= 0) & (row < height) & (weight > 0)
-            flat = (row[inside] * width + column[inside]).long()
-            total.index_add_(0, flat, mass[inside] * weight[inside, None])
-    landed, opaque, colour = total[:, :1], total[:, 1:2], total[:, 2:]
-    return (opaque / landed.clamp(SPREAD, 1.0)).clamp(0, 1), colour / opaque.clamp_min(1e-6)
 
 
 def sum_of(parts: Iterable[Tensor]) -> Tensor:
