@@ -1,0 +1,177 @@
+"""Metrics against closed forms and slow oracles (scikit-image, flip's own defaults, a plain-numpy AlexNet)."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from hdr_nsff import metrics
+from hdr_nsff.errors import InputError
+
+
+def pictures(height=40, width=50, seed=0):
+    """A smooth picture and a noisy copy."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:height, :width] / 10
+    truth = np.stack([0.5 + 0.4 * np.sin(x + c) * np.cos(y) for c in range(3)], -1)
+    noisy = (truth + 0.08 * rng.standard_normal(truth.shape)).clip(0, 1)
+    return torch.from_numpy(noisy), torch.from_numpy(truth)
+
+
+def test_psnr_of_a_known_error():
+    a = torch.zeros(4, 4, 3)
+    assert metrics.psnr(a, a + 0.1) == pytest.approx(20.0)  # 10 log10(1 / 0.01)
+    assert metrics.psnr(a, a + 1.0, peak=10.0) == pytest.approx(20.0)
+    assert metrics.psnr(a, a) == pytest.approx(100.0)
+
+
+def test_psnr_on_a_mask_sees_only_the_mask():
+    a, mask = torch.zeros(4, 4, 3), torch.zeros(4, 4, dtype=torch.bool)
+    b = a.clone()
+    b[0, 0], mask[0, 0] = 0.1, True
+    assert metrics.psnr(a, b, mask) == pytest.approx(20.0)
+    assert metrics.psnr(a, b) == pytest.approx(20 + 10 * math.log10(16))
+
+
+def test_psnr_and_ssim_agree_with_scikit_image():
+    measure = pytest.importorskip("skimage.metrics")
+    a, b = pictures()
+    assert metrics.psnr(a, b) == pytest.approx(measure.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1))
+    published = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": 2}
+    assert metrics.ssim(a, b) == pytest.approx(measure.structural_similarity(a.numpy(), b.numpy(), **published), abs=1e-9)
+
+
+def test_ssim_of_equal_pictures_is_one_and_a_mask_averages_the_map():
+    a, b = pictures()
+    assert metrics.ssim(b, b) == pytest.approx(1.0)
+    mixed = b.clone()
+    mixed[:, 30:] = a[:, 30:]
+    left = torch.zeros(40, 50, dtype=torch.bool)
+    left[:, :24] = True  # six columns away from what differs
+    assert metrics.ssim(mixed, b, left) == pytest.approx(1.0) and metrics.ssim(mixed, b, ~left) < 0.9
+
+
+def test_alignment_is_not_led_by_what_no_exposure_records():
+    rng = torch.Generator().manual_seed(0)
+    truth = torch.rand(1000, 3, generator=rng) + 0.1
+    radiance = truth / torch.tensor([2.0, 4.0, 8.0])
+    truth[:100] *= 500.0  # a lamp, predicted far too dark
+    recordable = torch.arange(1000) >= 100
+    torch.testing.assert_close(metrics.align(radiance, truth, recordable, per_channel=True), torch.tensor([2.0, 4.0, 8.0]))
+    assert metrics.align(radiance, truth, recordable).item() == pytest.approx(4.0)
+    least_squares = float((radiance * truth).sum() / radiance.square().sum())
+    assert least_squares > 20  # what the lamp would do
+
+
+def test_alignment_without_common_pixels_is_one():
+    assert metrics.align(torch.zeros(5, 3), torch.ones(5, 3), torch.ones(5, dtype=torch.bool)).item() == 1.0
+
+
+def test_mu_law_psnr_worked_by_hand():
+    truth = torch.full((2, 2, 3), 8.0)  # at the peak: 1 after the mu-law
+    radiance = torch.full((2, 2, 3), 8.0 / 50)  # log(2) / log(51)
+    expected = -20 * math.log10(1 - math.log(2) / math.log(51))
+    assert metrics.mu_law_psnr(radiance, truth, peak=8.0, mu=50.0) == pytest.approx(expected, rel=1e-6)
+    assert metrics.mu_law_psnr(truth * 3, truth, peak=8.0) == pytest.approx(100.0)  # beyond the peak nothing is told apart
+
+
+def test_pu21_psnr_is_of_codes_around_256():
+    truth = torch.full((2, 2, 3), 0.1, dtype=torch.float64)  # 100 cd/m^2 where the peak has 1000
+    dark = torch.zeros_like(truth)  # code 0
+    assert metrics.pu21_psnr(dark, truth, peak=1.0, nits=1000.0) == pytest.approx(0.0, abs=0.05)
+
+
+def hdr():
+    rng = np.random.default_rng(0)
+    truth = torch.from_numpy(rng.gamma(0.5, 2.0, (48, 64, 3)))
+    truth[:6, :6] = 60.0
+    return truth * 1.1, truth
+
+
+def test_the_flip_range_of_one_picture_is_flips_own():
+    flip = pytest.importorskip("flip_evaluator")
+    radiance, truth = hdr()
+    _, mean, used = flip.evaluate(truth.float().numpy(), radiance.float().numpy(), "HDR", applyMagma=False)
+    start, stop = metrics.flip_exposures([truth])
+    assert (start, stop) == pytest.approx((used["startExposure"], used["stopExposure"]), abs=1e-3)
+    assert metrics.hdr_flip(radiance, truth, (start, stop)) == pytest.approx(mean, abs=2e-4)
+
+
+def test_flip_of_equal_pictures_is_zero_also_on_a_mask():
+    pytest.importorskip("flip_evaluator")
+    radiance, truth = hdr()
+    mask = torch.zeros(48, 64, dtype=torch.bool)
+    mask[20:30] = True
+    assert metrics.hdr_flip(truth, truth, (-5.0, 2.0)) == pytest.approx(0.0, abs=1e-6)
+    mixed = torch.where(mask[..., None], radiance, truth)
+    assert metrics.hdr_flip(mixed, truth, (-5.0, 2.0), mask) > 2 * metrics.hdr_flip(mixed, truth, (-5.0, 2.0))
+
+
+def test_flip_is_none_where_it_is_not_installed(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "flip_evaluator", None)
+    radiance, truth = hdr()
+    assert metrics.hdr_flip(radiance, truth, (-5.0, 2.0)) is None
+
+
+def alexnet_weights(seed=0):
+    """Random weights under torchvision's and the LPIPS authors' names."""
+    rng = torch.Generator().manual_seed(seed)
+    shapes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
+    net, linear = {}, {}
+    for k, (at, (o, i, s)) in enumerate(shapes.items()):
+        net[f"features.{at}.weight"] = torch.randn(o, i, s, s, generator=rng) / math.sqrt(i * s * s)
+        net[f"features.{at}.bias"] = torch.randn(o, generator=rng) * 0.1
+        linear[f"lin{k}.model.1.weight"] = torch.rand(1, o, 1, 1, generator=rng)
+    return net | {"classifier.1.weight": torch.zeros(2, 2)}, linear
+
+
+def test_lpips_reads_one_file_or_two_and_equal_pictures_are_at_zero(tmp_path):
+    net, linear = alexnet_weights()
+    torch.save(net | linear, tmp_path / "both.pth")
+    (tmp_path / "pair").mkdir()
+    torch.save(net, tmp_path / "pair" / "alexnet.pth")
+    torch.save(linear, tmp_path / "pair" / "lin.pth")
+    one, two = metrics.Lpips(tmp_path / "both.pth"), metrics.Lpips(tmp_path / "pair")
+    a, b = (p.float() for p in pictures(80, 96))
+    assert one(a, b) == two(a, b) > 0
+    assert one(a, a) == 0.0
+    assert one(a, b) == pytest.approx(one(b, a))
+
+
+def test_lpips_agrees_with_a_network_written_out(tmp_path):
+    """torchvision's AlexNet, written as nn.Sequential, tapped after each ReLU."""
+    net, linear = alexnet_weights()
+    torch.save(net | linear, tmp_path / "w.pth")
+    c, r, p = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
+    layers = torch.nn.Sequential(
+        c(3, 64, 11, 4, 2), r(), p(3, 2), c(64, 192, 5, padding=2), r(), p(3, 2), c(192, 384, 3, padding=1), r(),
+        c(384, 256, 3, padding=1), r(), c(256, 256, 3, padding=1), r(),
+    )  # fmt: skip
+    layers.load_state_dict({k.removeprefix("features."): v for k, v in net.items() if k.startswith("features")})
+    a, b = (p.float() for p in pictures(80, 96))
+    seen = []
+    for x in (a, b):
+        x = (2 * x - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450])
+        x, taps = x.permute(2, 0, 1)[None], []
+        for i, layer in enumerate(layers):
+            x = layer(x)
+            if i in (1, 4, 7, 9, 11):
+                taps.append(x / x.square().sum(1, keepdim=True).sqrt())
+        seen.append(taps)
+    slow = sum(
+        ((x - y) ** 2 * linear[f"lin{k}.model.1.weight"]).sum(1).mean() for k, (x, y) in enumerate(zip(*seen, strict=True))
+    )
+    assert metrics.Lpips(tmp_path / "w.pth")(a, b) == pytest.approx(slow.item(), rel=1e-5)
+
+
+def test_lpips_without_its_linear_layers_is_refused_in_a_sentence(tmp_path):
+    net, _ = alexnet_weights()
+    torch.save(net, tmp_path / "half.pth")
+    with pytest.raises(InputError, match=r"importance\.0 is missing"):
+        metrics.Lpips(tmp_path / "half.pth")
+    (tmp_path / "text.pth").write_text("no weights")
+    with pytest.raises(InputError, match="not a readable torch state dict"):
+        metrics.Lpips(tmp_path / "text.pth")
+    with pytest.raises(InputError, match="no such weights file"):
+        metrics.Lpips(tmp_path / "nowhere.pth")
