@@ -41,7 +41,7 @@ def record(exposure, curve, rng):
     return np.rint(z * 255) / 255
 
 
-def points(curve, ev, num=1500, outliers=0.0, seed=0):
+def points(curve, ev, num=700, outliers=0.0, seed=0):
     rng = np.random.default_rng(seed)
     radiance = 2 ** rng.uniform(-7, 3, (num, 1, 1)) * 2 ** rng.normal(0, 0.5, (num, 1, 3))
     exposure = radiance * 2.0 ** np.array(ev)[:, None]
