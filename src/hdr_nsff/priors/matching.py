@@ -103,7 +103,7 @@ def camera_groups(camera_ids: list[int]) -> list[list[int]]:
     return [[t for t, c in enumerate(camera_ids) if c == camera] for camera in sorted(set(camera_ids))]
 
 
-def view_pairs(groups: list[list[int]], few: int = 45) -> list[tuple[int, int]]:
+def view_pairs(groups: list[list[int]], few: int = 30) -> list[tuple[int, int]]:
     """Which views to match: all of up to `few`; of more, those of one camera as `spread_pairs` says, and those of two cameras at the same time."""
     count = sum(len(g) for g in groups)
     if count <= few:

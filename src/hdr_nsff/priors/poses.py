@@ -20,12 +20,13 @@ from hdr_nsff.io import encode
 from hdr_nsff.priors import sfm
 from hdr_nsff.priors.colmap import ColmapModel, read_model
 from hdr_nsff.priors.matching import camera_groups, keypoints, match_all, picture, spread_pairs, upsampling, usable, view_pairs
-from hdr_nsff.priors.rotation import Panorama, default_focal, homography_share, panorama
+from hdr_nsff.priors.rotation import Panorama, default_focal, panorama, rotation_share
 from hdr_nsff.progress import say
 
 FOV = (25.0, 100.0)  # degrees across the image that an undistorted video camera plausibly sees
 ENOUGH, LEAST = 0.9, 0.6  # share of frames to be content with, and below which poses have failed
-PLANAR = 0.7  # share of matches a homography must explain before footage counts as without parallax
+ROTATION = 0.7  # share of static matches rotations must explain before footage counts as without parallax (measured: 0.84+ against 0.42-)
+PERHAPS = 0.5  # the same where structure from motion has failed
 STILL = 0.75  # pixels that a camera on a tripod may seem to move
 LOOK = 24  # frames looked at to decide about parallax
 ADVICE = (
@@ -80,23 +81,30 @@ def estimate_poses(
         raise InputError(f"{count} frames are too few to estimate poses from; give at least 3, or import poses (--poses)")
     ignore = np.any([m for m in (masks, clipped) if m is not None] or np.zeros((1, *video.shape[:3]), bool), 0)
     groups = camera_groups(camera_ids or [0] * count)
-    if len(groups) == 1 and (share := parallax_share(video, ignore)) is not None and share >= PLANAR:
-        found = standing(video, ignore)
-        if found is not None:
-            return found
-    views = collapse(video, ignore, groups)
-    model, scale = best_model(views, Path(workdir), threads)
-    poses = assemble(model, views, scale, video.shape[1:3])
-    for note in poses.notes:
+    share = turning_share(video, ignore) if len(groups) == 1 else None
+    found = standing(video, ignore) if share is not None and share >= ROTATION else None
+    if found is None:
+        views = collapse(video, ignore, groups)
+        try:
+            model, scale = best_model(views, Path(workdir), threads)
+            found = assemble(model, views, scale, video.shape[1:3])
+        except InputError as error:
+            found = standing(video, ignore) if share is not None and share >= PERHAPS else None
+            if found is None:
+                raise
+            found = replace(found, notes=(f"taken as a camera that turns in place, since {error}", *found.notes))
+    for note in found.notes:
         say(f"poses: {note}")
-    return poses
+    return found
 
 
-def parallax_share(video: np.ndarray, ignore: np.ndarray) -> float | None:
-    """`homography_share` of up to 24 frames spread over the clip."""
+def turning_share(video: np.ndarray, ignore: np.ndarray) -> float | None:
+    """`rotation_share` of up to 24 frames spread over the clip."""
     chosen = np.unique(np.linspace(0, len(video) - 1, min(LOOK, len(video))).astype(int))
-    found = keypoints(video[chosen], ignore[chosen], 1000)
-    return homography_share(match_all(found, view_pairs([list(range(len(chosen)))])))
+    matches = match_all(keypoints(video[chosen], ignore[chosen], 1000), view_pairs([list(range(len(chosen)))]))
+    height, width = video.shape[1:3]
+    found = panorama(matches, len(chosen), width, height)
+    return None if found is None else rotation_share(matches, found, width, height)
 
 
 def turning(video: np.ndarray, ignore: np.ndarray) -> Panorama | None:
@@ -122,8 +130,6 @@ def standing(video: np.ndarray, ignore: np.ndarray) -> Poses | None:
     notes.append(
         f"focal length {found.focal:.0f} px, " + ("from the turn" if found.focal_known else "assumed: 60 degrees across")
     )
-    for note in notes:
-        say(f"poses: {note}")
     poses = Poses(
         K=np.tile(intrinsics(found.focal, width, height), (count, 1, 1)),
         c2w=c2w,

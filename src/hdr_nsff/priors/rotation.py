@@ -54,20 +54,25 @@ def homography(p: np.ndarray, q: np.ndarray, threshold: float) -> tuple[np.ndarr
     return (None, np.zeros(len(p), bool)) if matrix is None else (matrix, inlier.ravel() > 0)
 
 
-def homography_share(matches: list[PairMatches], threshold: float = 1.0, least: int = 30) -> float | None:
-    """How much of what an epipolar geometry explains a homography explains as well, in [0, 1], over pairs far apart in time.
+def rotation_share(matches: list[PairMatches], found: Panorama, width: int, height: int, least: int = 30) -> float | None:
+    """How much of what an epipolar geometry explains these rotations explain as well, in [0, 1], over pairs far apart in time.
 
-    Near 1 without parallax, well below with it. None where too few pairs far apart match at all. `threshold` in pixels."""
+    Near 1 for a camera that only turns, well below with parallax; a flat scene does not deceive it. Explained means to 1.5 pixels,
+    or 0.4 % of the width. None where too few pairs far apart match at all."""
     wide = max((m.j - m.i for m in matches), default=0) / 6
-    planar = general = 0
+    centre, tolerance = np.array([width / 2, height / 2]), max(1.5, 0.004 * width)
+    rotational = general = 0
     for m in matches:
         if m.j - m.i < wide or len(m.p) < least:
             continue
-        explained = int(epipolar(m.p, m.q, threshold)[1].sum())
-        if explained >= least:
-            planar += int(homography(m.p, m.q, threshold)[1].sum())
-            general += explained
-    return planar / general if general >= 5 * least else None
+        static = epipolar(m.p, m.q, 1.0)[1]
+        if static.sum() < least:
+            continue
+        ends = np.tile([m.i, m.j], (int(static.sum()), 1))
+        predicted = turned(found.rotations, found.focal, ends, m.p[static] - centre)[0]
+        rotational += int((np.linalg.norm(predicted + centre - m.q[static], axis=1) < tolerance).sum())
+        general += int(static.sum())
+    return rotational / general if general >= 5 * least else None
 
 
 def panorama(matches: list[PairMatches], count: int, width: int, height: int) -> Panorama | None:
