@@ -1,0 +1,225 @@
+"""`hdr-nsff synth`: a path-traced room as alternating-exposure footage, with held-out truth that only `evaluate` reads.
+
+Writes, below the output folder:
+    clip.mp4, clip/*.png   what the camera recorded: the same frames as footage and without compression loss
+    truth/                 views and times the clip does not show: linear radiance and moving masks (see truth.py)
+    exact/*.exr            every rendered frame: radiance, z-depth `Z`, `body` (0 room, 1 box, 2 ball), exact optical flow
+    oracle/                with `--oracle`: a scene folder made from the truth, for measuring a field without estimated priors
+Every picture is cached in exact/: a run that was killed goes on where it was."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from hdr_nsff import io
+from hdr_nsff.errors import InputError
+from hdr_nsff.pathtracer import Tracer
+from hdr_nsff.progress import say, track
+from hdr_nsff.recording import Noise, record, response_curve
+from hdr_nsff.synth_oracle import write_oracle
+from hdr_nsff.synth_scene import build, camera_pose, intrinsics, moved, project
+from hdr_nsff.truth import Truth, TruthView
+
+VIDEO_CRF = 10  # finer than the recording's own noise
+WHITE_BALANCE = (1.12, 1.0, 0.87)
+OFF_PATH = ((0.06, -0.03, 0.03), (-0.05, 0.05, -0.02))  # metres in the camera's axes from the frame's pose
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """A path-traced room with a bright window, a lamp, a tumbling box and a swinging ball, filmed by a moving camera."""
+
+    out: Annotated[Path, tyro.conf.Positional]  # folder to write
+    size: str = "240x136"  # width x height in pixels
+    frames: int = 36
+    ev: str = "-4,-2,0"  # the exposures that alternate, in stops, in the order they are taken
+    response: str = "film"  # the camera's response curve: film, gamma or srgb
+    noise: float = 1.0  # times the noise of a small sensor; 0 is a perfect one
+    spp: int = 256  # paths per pixel
+    truth_spp: int = 768  # paths per pixel of the held-out views
+    seed: int = 0  # of textures, paths and noise
+    variant: str = "auto"  # Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb
+    oracle: bool = False  # also write a scene folder with exact poses and masks, depth and flow with a little noise
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A picture to render."""
+
+    name: str
+    time: float  # in frames
+    c2w: np.ndarray  # (3, 4)
+    spp: int
+    seed: int
+    anchor: int  # the clip's frame whose pose is the nearest
+    off_path: bool = False  # the pose is not exactly the anchor's
+
+
+def synth(config: SynthConfig) -> None:
+    """Render, record and write everything; InputError where the settings or the output folder make no sense."""
+    size, evs = parse_size(config.size), parse_ev(config.ev)
+    if config.frames < 12:
+        raise InputError(f"--frames {config.frames}: at least 12 are needed for held-out views far from the frames of their time")
+    clip = clip_shots(config.frames, config.spp, config.seed)
+    views = truth_shots(config.frames, config.truth_spp, config.seed)
+    K = intrinsics(*size)
+    claim(config)
+    render(clip + views, K, size, config)
+    reference = int(np.argsort(evs)[len(evs) // 2])
+    relative = [float(e - evs[reference]) for e in evs]
+    video = record_clip(clip, relative, config)
+    write_truth(clip, views, K, relative, reference, config)
+    if config.oracle:
+        write_oracle(
+            config.out, [exact(config.out, s) for s in clip], video, K, [s.c2w for s in clip], relative, reference, config.seed
+        )
+    say(
+        f"{config.out}/clip.mp4: {len(clip)} frames of {size[0]}x{size[1]}, exposures {config.ev}; {len(views)} held-out views in truth/"
+    )
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(width, height) of "WxH"."""
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) >= 16 and int(height) >= 16):
+        raise InputError(f"--size {text!r}: write it as WIDTHxHEIGHT, such as 240x136, at least 16x16")
+    return int(width), int(height)
+
+
+def parse_ev(text: str) -> list[float]:
+    """The exposures of a cycle, in stops."""
+    try:
+        evs = [float(e) for e in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"--ev {text!r}: write stops with commas between them, such as -4,-2,0") from error
+    if not np.isfinite(evs).all():
+        raise InputError(f"--ev {text!r}: the stops must be finite numbers")
+    return evs
+
+
+def clip_shots(frames: int, spp: int, seed: int) -> list[Shot]:
+    """The frames of the clip."""
+    return [Shot(f"clip_{t:05d}", float(t), camera_pose(t), spp, seed * 1000 + t, t) for t in range(frames)]
+
+
+def truth_shots(frames: int, spp: int, seed: int) -> list[Shot]:
+    """Held-out views: eight at whole times from the pose of a frame far away in time, six at half times, two off the path."""
+    shots: list[Shot] = []
+
+    def hold_out(kind: str, time: float, anchor: int, offset: tuple[float, float, float] | None = None) -> None:
+        c2w = camera_pose(anchor)
+        if offset is not None:
+            c2w[:, 3] += c2w[:, :3] @ np.asarray(offset)
+        name = f"{kind}_t{time:04.1f}_pose{anchor:02d}"
+        shots.append(Shot(name, time, c2w, spp, seed * 1000 + 500 + len(shots), anchor, offset is not None))
+
+    for time, rank in zip(np.linspace(1, frames - 2, 8).round().astype(int), np.linspace(0.3, 0.9, 8), strict=True):
+        hold_out("view", float(time), far_anchor(time, frames, rank))
+    for time, rank in zip(np.linspace(2, frames - 4, 6).round().astype(int), np.linspace(0.8, 0.3, 6), strict=True):
+        hold_out("time", time + 0.5, far_anchor(time, frames, rank))
+    for time, offset in zip((frames // 3, 2 * frames // 3), OFF_PATH, strict=True):
+        hold_out("off", float(time), time, offset)
+    return shots
+
+
+def far_anchor(time: int, frames: int, rank: float) -> int:
+    """A frame at least a quarter of the clip away from `time`: of all such, the one at `rank` in [0, 1] by distance."""
+    others = [k for k in range(frames) if abs(k - time) >= frames // 4]
+    others.sort(key=lambda k: float(np.linalg.norm(camera_pose(k)[:, 3] - camera_pose(time)[:, 3])))
+    return others[round(rank * (len(others) - 1))]
+
+
+def claim(config: SynthConfig) -> None:
+    """Mark the output folder with what it is rendered from; refuse one that holds something else."""
+    key = {k: v for k, v in asdict(config).items() if k in ("size", "frames", "spp", "truth_spp", "seed")}
+    digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
+    path = config.out / "exact" / "key.json"
+    if config.out.exists() and not config.out.is_dir():
+        raise InputError(f"{config.out}: is a file; name a folder to write")
+    if path.is_file() and digest not in path.read_text():
+        raise InputError(f"{config.out}: holds a room rendered with other settings; choose another folder or remove it")
+    io.write_json(path, {"digest": digest, **key})
+
+
+def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: SynthConfig) -> None:
+    """Path-trace what is not in exact/ yet."""
+    missing = [s for s in shots if not (config.out / "exact" / f"{s.name}.exr").is_file()]
+    if not missing:
+        return
+    tracer = Tracer(build(config.seed), config.variant)
+    for shot in track(missing, "path tracing"):
+        surface = tracer.surface(shot.time, K, shot.c2w, size)
+        channels = {"Z": surface.depth, "body": surface.bodies.astype(np.float32)}
+        if shot.name.startswith("clip"):
+            for side, name in ((1, "forward"), (-1, "backward")):
+                flow = exact_flow(surface.points, surface.bodies, shot.time, shot.time + side, K)
+                channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
+        channels["RGB"] = tracer.radiance(shot.time, K, shot.c2w, size, shot.spp, shot.seed)
+        io.write_exr(config.out / "exact" / f"{shot.name}.exr", channels, half=False)
+
+
+def exact_flow(points: np.ndarray, bodies: np.ndarray, t: float, other: float, K: np.ndarray) -> np.ndarray:
+    """Optical flow (H, W, 2) px of the surface at pixel centres from frame `t` to frame `other`, both cameras on the path."""
+    height, width = bodies.shape
+    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
+    return project(moved(points, bodies, t, other), K, camera_pose(other))[0] - pixels
+
+
+def exact(out: Path, shot: Shot) -> dict[str, np.ndarray]:
+    """The rendered channels of a shot."""
+    return io.read_exr(out / "exact" / f"{shot.name}.exr")
+
+
+def record_clip(clip: list[Shot], relative: list[float], config: SynthConfig) -> np.ndarray:
+    """Record every frame at its bracket's exposure; write clip/ and clip.mp4; the frames (T, H, W, 3)."""
+    curve = response_curve(config.response)
+    noise = Noise(1e-3 * config.noise, config.noise**2 / 6000) if config.noise > 0 else None
+    video = []
+    for t, shot in enumerate(clip):
+        rng = np.random.default_rng([config.seed, t])
+        radiance = exact(config.out, shot)["RGB"]
+        video.append(record(radiance, relative[t % len(relative)], WHITE_BALANCE, curve, noise, rng))
+        io.write_png(config.out / "clip" / f"{t:05d}.png", video[-1])
+    io.write_video(config.out / "clip.mp4", video, crf=VIDEO_CRF)
+    return np.stack(video)
+
+
+def write_truth(
+    clip: list[Shot], views: list[Shot], K: np.ndarray, relative: list[float], reference: int, config: SynthConfig
+) -> None:
+    """truth/: truth.json, radiance as half EXR, moving masks."""
+    folder, curve = config.out / "truth", response_curve(config.response)
+    entries = []
+    for k, shot in enumerate(views):
+        channels = exact(config.out, shot)
+        io.write_exr(folder / "radiance" / f"{shot.name}.exr", {"RGB": channels["RGB"]})
+        io.write_png(folder / "masks" / f"{shot.name}.png", channels["body"] > 0)
+        entries.append(
+            TruthView(
+                name=shot.name,
+                time=shot.time,
+                bracket=k % len(relative),
+                anchor=shot.anchor,
+                c2w=shot.c2w.tolist() if shot.off_path else None,
+                radiance=f"radiance/{shot.name}.exr",
+                mask=f"masks/{shot.name}.png",
+            )
+        )
+    truth = Truth(
+        bracket_ev=relative,
+        reference_bracket=reference,
+        response_x=curve.x.tolist(),
+        response_y=curve.y.tolist(),
+        white_balance=list(WHITE_BALANCE),
+        K=K.tolist(),
+        clip_c2w=[s.c2w.tolist() for s in clip],
+        views=entries,
+    )
+    io.write_json(folder / "truth.json", truth.model_dump())

@@ -1,0 +1,115 @@
+"""An oracle: a scene folder whose poses and masks are exact and whose depth and flow are exact up to a little noise.
+
+It measures a field and its training apart from the priors. It is made from the truth, says so in every step of its
+manifest, and is no input a user could have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hdr_nsff import io
+from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest, Step
+
+DEPTH_NOISE = 0.03  # relative, smooth over an eighth of the frame
+FLOW_NOISE = 0.3  # pixels, independent
+NOTE = "oracle: from truth"
+
+
+def write_oracle(
+    out: Path,
+    exact: list[dict[str, np.ndarray]],
+    video: np.ndarray,
+    K: np.ndarray,
+    c2w: list[np.ndarray],
+    ev: list[float],
+    reference: int,
+    seed: int,
+) -> None:
+    """`out`/oracle from the rendered channels of every frame, the recorded `video` (T, H, W, 3), poses and bracket exposures."""
+    folder, rng = out / "oracle", np.random.default_rng(seed)
+    count, height, width = video.shape[:3]
+    depths = np.stack([e["Z"] for e in exact])
+    entries = []
+    for i, channels in enumerate(exact):
+        entry = FrameEntry(
+            index=i,
+            image=f"images/{i:05d}.png",
+            source=f"clip/{i:05d}.png",
+            time=float(i),
+            bracket=i % len(ev),
+            ev=ev[i % len(ev)],
+            K=K.tolist(),
+            c2w=c2w[i].tolist(),
+            mask=f"masks/{i:05d}.png",
+            disparity=f"disparity/{i:05d}.npy",
+            disparity_confidence=f"disparity_confidence/{i:05d}.npy",
+            flow={
+                j: FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png")
+                for j in (i - 1, i + 1)
+                if 0 <= j < count
+            },
+        )
+        entries.append(entry)
+        smooth = cv2.resize(rng.normal(size=(8, 8)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        io.write_png(folder / entry.image, video[i])
+        io.write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
+        io.write_npy(folder / f"disparity/{i:05d}.npy", (np.exp(DEPTH_NOISE * smooth) / depths[i]).astype(np.float16))
+        io.write_npy(folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16))
+        for j, files in entry.flow.items():
+            flow = exact_flow(channels, j - i)
+            io.write_png(folder / files.valid, visible(flow, channels, depths[j]))
+            io.write_npy(folder / files.flow, (flow + FLOW_NOISE * rng.normal(size=flow.shape)).astype(np.float16))
+    io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
+    manifest = Manifest(
+        source="clip",
+        width=width,
+        height=height,
+        cycle=len(ev),
+        reference_bracket=reference,
+        bracket_ev=list(ev),
+        exposure_given=True,
+        near=float(depths.min()),
+        far=float(depths.max()),
+        points="points.npy",
+        frames=entries,
+        steps={
+            name: Step(done=True, provenance="given", note=NOTE)
+            for name in ("frames", "exposure", "poses", "mask", "flow", "depth")
+        },
+    )
+    manifest.save(folder)
+
+
+def exact_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
+    """The rendered flow (H, W, 2) px to the next (+1) or previous (-1) frame."""
+    name = {1: "forward", -1: "backward"}[side]
+    return np.stack([channels[f"{name}.u"], channels[f"{name}.v"]], -1)
+
+
+def visible(flow: np.ndarray, channels: dict[str, np.ndarray], depth: np.ndarray) -> np.ndarray:
+    """Where the surface is still in the frame and not hidden in the other one, (H, W) bool: its depth there, `depth`
+    (H, W), agrees within 4 % with its own at one of the four pixels around (in a frame's time depths change less)."""
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width), np.arange(height))
+    left, top = np.floor(x + flow[..., 0]).astype(int), np.floor(y + flow[..., 1]).astype(int)
+    inside = (left >= 0) & (top >= 0) & (left < width - 1) & (top < height - 1)
+    left, top = left.clip(0, width - 2), top.clip(0, height - 2)
+    around = np.stack([depth[top + dy, left + dx] for dy in (0, 1) for dx in (0, 1)])
+    return inside & (np.abs(around / channels["Z"] - 1).min(0) < 0.04)
+
+
+def static_points(
+    exact: list[dict[str, np.ndarray]], K: np.ndarray, c2w: list[np.ndarray], rng: np.random.Generator
+) -> np.ndarray:
+    """Points (P, 3) of what stands still, 200 from each frame, as structure from motion would give."""
+    points = []
+    for channels, pose in zip(exact, c2w, strict=True):
+        y, x = np.nonzero(channels["body"] == 0)
+        chosen = rng.choice(len(x), min(200, len(x)), replace=False)
+        x, y = x[chosen], y[chosen]
+        rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(x))], -1)
+        points.append(pose[:, 3] + channels["Z"][y, x][:, None] * (rays @ pose[:, :3].T))
+    return np.concatenate(points).astype(np.float32)

@@ -1,0 +1,275 @@
+"""The synthetic room: exact geometry, what is held out, resuming; one tiny picture where Mitsuba is installed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from hdr_nsff import io, pathtracer, synth_textures
+from hdr_nsff import synth as verb
+from hdr_nsff.camera import Camera
+from hdr_nsff.errors import InputError
+from hdr_nsff.pathtracer import Surface, Tracer, smooth
+from hdr_nsff.scene import Scene
+from hdr_nsff.synth import SynthConfig, clip_shots, exact_flow, parse_ev, parse_size, synth, truth_shots
+from hdr_nsff.synth_oracle import visible
+from hdr_nsff.synth_scene import BACK, CORD, FLOOR, PIVOT, body_pose, build, camera_pose, intrinsics, look_at, moved, project
+from hdr_nsff.truth import Truth
+
+ROOM, BOX, BALL = 0, 1, 2
+
+
+def test_camera_sees_57_degrees_across() -> None:
+    """Half of 240 pixels over tan(28.5 degrees) = 0.54296: focal 221.0."""
+    K = intrinsics(240, 136)
+    assert K[0, 0] == pytest.approx(221.0, abs=0.05) and K[1, 1] == K[0, 0]
+    pixel, depth = project(np.array([0.5, -0.25, 2.0]), K, np.eye(3, 4))
+    np.testing.assert_allclose(pixel, [120 + K[0, 0] / 4, 68 - K[0, 0] / 8])
+    assert depth == 2.0
+
+
+def test_camera_looks_at_its_target_level() -> None:
+    eye, target = np.array([0.3, -0.2, 0.1]), np.array([-0.1, 0.4, 3.0])
+    c2w = look_at(eye, target)
+    pixel, depth = project(target, intrinsics(240, 136), c2w)
+    np.testing.assert_allclose(pixel, [120, 68], atol=1e-9)
+    assert depth == pytest.approx(np.linalg.norm(target - eye))
+    np.testing.assert_allclose(c2w[:, :3].T @ c2w[:, :3], np.eye(3), atol=1e-12)
+    assert c2w[1, 0] == pytest.approx(0) and c2w[1, 1] > 0.9  # x horizontal, y down
+
+
+def test_projection_agrees_with_the_camera_of_the_package() -> None:
+    points, c2w, K = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (9, 3)), camera_pose(5.5), intrinsics(240, 136)
+    pixels, depth = project(points, K, c2w)
+    expected, expected_depth = Camera(torch.tensor(K), torch.tensor(c2w), 240, 136).project(torch.tensor(points))
+    np.testing.assert_allclose(pixels, expected.numpy(), atol=1e-9)
+    np.testing.assert_allclose(depth, expected_depth.numpy(), atol=1e-12)
+
+
+def test_ball_swings_on_a_circle_about_its_pivot() -> None:
+    """At angle a the ball hangs CORD cos(a) below the pivot and CORD sin(a) beside it."""
+    for t in (0.0, 3.5, 17.0):
+        centre = (body_pose("ball", t) @ [0, CORD, 0, 1])[:3] - PIVOT
+        angle = np.radians(18) * np.sin(2 * np.pi * (t + 4) / 30)
+        assert centre[1] == pytest.approx(CORD * np.cos(angle))
+        assert np.hypot(centre[0], centre[2]) == pytest.approx(CORD * abs(np.sin(angle)))
+
+
+def test_moved_carries_movers_rigidly_and_leaves_the_room() -> None:
+    rng = np.random.default_rng(0)
+    local = rng.normal(size=(5, 3))
+    start, end = (local @ body_pose("box", t)[:3, :3].T + body_pose("box", t)[:3, 3] for t in (4.0, 9.5))
+    points = np.concatenate([start, local])
+    result = moved(points, np.array([BOX] * 5 + [ROOM] * 5), 4.0, 9.5)
+    np.testing.assert_allclose(result[:5], end, atol=1e-12)
+    np.testing.assert_array_equal(result[5:], local)
+
+
+def test_flow_of_a_known_point_is_exact() -> None:
+    """A pixel that shows the ball's centre flows to where the next camera projects the next position of that centre."""
+    K, centre = intrinsics(240, 136), [0, CORD, 0, 1]
+    pixel, _ = project((body_pose("ball", 7) @ centre)[:3], K, camera_pose(7))
+    after, _ = project((body_pose("ball", 8) @ centre)[:3], K, camera_pose(8))
+    points = np.broadcast_to((body_pose("ball", 7) @ centre)[:3], (136, 240, 3))
+    x, y = np.floor(pixel).astype(int)
+    flow = exact_flow(points, np.full((136, 240), BALL), 7, 8, K)[y, x]
+    np.testing.assert_allclose(flow, after - (np.array([x, y]) + 0.5), atol=1e-9)
+
+
+def test_motion_between_frames_stays_within_ten_pixels() -> None:
+    K = intrinsics(240, 136)
+    for t in range(36):
+        for body, point in (("box", [0.1, 0.1, 0.1, 1]), ("ball", [0, CORD, 0, 1])):
+            (a, depth), (b, _) = (project((body_pose(body, s) @ point)[:3], K, camera_pose(s)) for s in (t, t + 1))
+            assert np.linalg.norm(b - a) < 10 and depth > 1
+            assert (a > 0).all() and (a < [240, 136]).all()  # always in the picture
+
+
+def test_held_out_views_are_never_frames_of_the_clip() -> None:
+    clip, views = clip_shots(36, 1, 0), truth_shots(36, 1, 0)
+    assert [v.name.split("_")[0] for v in views] == ["view"] * 8 + ["time"] * 6 + ["off"] * 2
+    for view in views:
+        same_time = [c for c in clip if c.time == view.time]
+        assert all(np.abs(c.c2w - view.c2w).max() > 0.01 for c in same_time)
+        at_anchor = np.linalg.norm(view.c2w[:, 3] - clip[view.anchor].c2w[:, 3])
+        assert (0.02 < at_anchor < 0.1) if view.off_path else at_anchor == 0
+    assert len({v.seed for v in clip + views}) == len(clip + views) == 52
+
+
+def test_textures_are_physical_albedos_and_the_seed_repeats_them() -> None:
+    for paint in (
+        synth_textures.bricks,
+        synth_textures.planks,
+        synth_textures.tiles,
+        synth_textures.poster,
+        synth_textures.books,
+    ):
+        a, b = (paint(60, 80, np.random.default_rng(3)) for _ in range(2))
+        assert a.shape == (60, 80, 3) and a.dtype == np.float32
+        assert a.min() > 0 and a.max() <= 0.82 and a.std() > 0.05
+        np.testing.assert_array_equal(a, b)
+
+
+def plane(height: int = 12, width: int = 16, depth: float = 2.0, bodies: int = ROOM) -> Surface:
+    """A wall at z = `depth` seen from the origin, pixels 1 cm apart."""
+    y, x = np.mgrid[:height, :width] * 0.01
+    points = np.stack([x, y, np.full_like(x, depth)], -1)
+    normals = np.broadcast_to([0.0, 0, -1], points.shape)
+    return Surface(points, normals, np.full((height, width), depth), np.full((height, width), bodies))
+
+
+def test_smoothing_keeps_even_light_and_lowers_noise() -> None:
+    surface = plane(40, 40)
+    np.testing.assert_allclose(smooth(np.full((40, 40, 3), 0.7), surface), 0.7, rtol=1e-5)
+    noisy = np.random.default_rng(0).normal(1, 0.2, (40, 40, 3))
+    # a Gaussian of 5 pixels averages 4 pi 25 = 314 independent values: 0.2 / 17.7 = 0.011; the cut at 9 pixels costs a little
+    assert 0.009 < smooth(noisy, surface)[15:25, 15:25].std() < 0.02
+
+
+def test_smoothing_does_not_cross_a_mover_or_a_corner() -> None:
+    light = np.zeros((12, 16, 3))
+    light[:, 8:] = 1
+    half = np.arange(16) >= 8
+    surface = plane()
+    other_body = replace(surface, bodies=np.where(half, BOX, ROOM) * np.ones((12, 1), int))
+    corner = replace(surface, normals=np.where(half[:, None], [1.0, 0, 0], [0, 0, -1.0]) * np.ones((12, 1, 1)))
+    for parted in (other_body, corner):
+        np.testing.assert_allclose(smooth(light, parted), light, atol=1e-6)
+    assert 0.2 < smooth(light, surface)[6, 7, 0] < 0.8
+
+
+def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
+    """Everything moves two pixels to the right, where a pole now stands in columns 4 and 5 of eight."""
+    flow = np.zeros((6, 8, 2))
+    flow[..., 0] = 2.0
+    there = np.full((6, 8), 3.0)
+    there[:, 4:6] = 1.0
+    seen = visible(flow, {"Z": np.full((6, 8), 3.0)}, there)
+    np.testing.assert_array_equal(seen[0], [True, True, False, True, True, False, False, False])
+
+
+class Flat:
+    """In Mitsuba's place: an even wall 3 m away, whatever the camera."""
+
+    rendered = 0
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def surface(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]) -> Surface:
+        surface = plane(size[1], size[0], 3.0)
+        return replace(surface, bodies=np.where(np.arange(size[0]) < 4, BOX, ROOM) * np.ones((size[1], 1), int))
+
+    def radiance(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int) -> np.ndarray:
+        Flat.rendered += 1
+        return np.full((size[1], size[0], 3), 0.25, np.float32)
+
+
+@pytest.fixture
+def flat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SynthConfig:
+    monkeypatch.setattr(verb, "Tracer", Flat)
+    Flat.rendered = 0
+    return SynthConfig(tmp_path / "room", size="16x16", frames=12, noise=0, oracle=True)
+
+
+def test_exposures_alternate_about_the_middle_bracket(flat: SynthConfig) -> None:
+    """EV -4, -2, 0: relative to the middle -2, 0, 2; green, radiance 0.25: exposures 1/16, 1/4, 1 (recorded 1)."""
+    synth(flat)
+    truth = Truth.open(flat.out / "truth")
+    assert truth.bracket_ev == [-2, 0, 2] and truth.reference_bracket == 1
+    greens = [float(io.read_image(flat.out / "clip" / f"{t:05d}.png")[0, 0, 1]) for t in range(6)]
+    assert greens[:3] == greens[3:] and greens[2] == 1
+    expected = np.interp([1 / 16, 1 / 4], truth.response_x, truth.response_y[1])
+    np.testing.assert_allclose(greens[:2], expected, atol=0.5 / 255)
+
+
+def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
+    synth(flat)
+    truth = Truth.open(flat.out / "truth")
+    assert len(truth.views) == 16 and len(truth.clip_c2w or []) == 12
+    view = truth.views[0]
+    np.testing.assert_array_equal(io.read_exr(flat.out / "truth" / view.radiance)["RGB"], np.full((16, 16, 3), 0.25))
+    assert io.read_mask(flat.out / "truth" / str(view.mask)).sum() == 4 * 16
+    assert sum(1 for _ in io.read_video(flat.out / "clip.mp4")) == 12
+
+
+def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig) -> None:
+    synth(flat)
+    scene = Scene.open(flat.out / "oracle")
+    assert {s.note for s in scene.manifest.steps.values()} == {"oracle: from truth"}
+    assert [f.bracket for f in scene.train] == [0, 1, 2] * 4
+    frame, k = scene.train[5], 5
+    pixels = np.stack(np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5), -1)
+    still = pixels[:, 4:]
+    points = plane(16, 16, 3.0).points
+    for side in (-1, 1):
+        exact = project(points, intrinsics(16, 16), camera_pose(k + side))[0][:, 4:] - still
+        error = frame.flow[side].numpy()[:, 4:] - exact
+        assert 0.2 < error.std() < 0.4 and abs(error.mean()) < 0.1  # 0.3 px of noise, no bias
+    assert frame.disparity is not None and abs(float(frame.disparity.log().mean() - np.log(1 / 3))) < 0.03
+
+
+def test_a_run_that_was_killed_renders_only_what_is_missing(flat: SynthConfig) -> None:
+    synth(flat)
+    assert Flat.rendered == 12 + 16
+    (flat.out / "exact" / "clip_00003.exr").unlink()
+    (flat.out / "clip.mp4").unlink()
+    synth(flat)
+    assert Flat.rendered == 12 + 16 + 1 and (flat.out / "clip.mp4").is_file()
+
+
+def test_other_settings_do_not_mix_into_a_folder(flat: SynthConfig) -> None:
+    synth(flat)
+    with pytest.raises(InputError, match="other settings"):
+        synth(replace(flat, seed=1))
+    synth(replace(flat, ev="0,-3", response="srgb"))  # recording the same room otherwise renders nothing
+    assert Flat.rendered == 12 + 16
+
+
+@pytest.mark.parametrize("text", ["240", "240x", "axb", "8x8", "-240x136"])
+def test_a_bad_size_is_refused_in_a_sentence(text: str) -> None:
+    with pytest.raises(InputError, match="WIDTHxHEIGHT"):
+        parse_size(text)
+
+
+@pytest.mark.parametrize("text", ["", "a,b", "1,,2", "nan,0", "inf"])
+def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
+    with pytest.raises(InputError, match="--ev"):
+        parse_ev(text)
+
+
+def test_a_missing_mitsuba_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
+    with pytest.raises(InputError, match=r"hdr-nsff\[synth\]"):
+        pathtracer.start("auto")
+
+
+@pytest.fixture(scope="module")
+def tracer() -> Tracer:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
+    return Tracer(build(0), "scalar_rgb")
+
+
+def test_a_tiny_picture_holds_the_range_it_promises(tracer: Tracer) -> None:
+    """The bulb's 700 and the window in view; shadows four decades below."""
+    size = (32, 18)
+    pictures = [tracer.radiance(t, intrinsics(*size), camera_pose(t), size, 2, 0) for t in (0, 1)]
+    for picture in pictures:
+        assert picture.shape == (18, 32, 3) and np.isfinite(picture).all() and picture.min() >= 0
+        assert picture.max() > 20 and np.percentile(picture, 5) < 0.05
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.1  # the room moves
+
+
+def test_surfaces_lie_on_the_rays_through_pixel_centres(tracer: Tracer) -> None:
+    size, c2w = (32, 18), camera_pose(3)
+    K = intrinsics(*size)
+    surface = tracer.surface(3.0, K, c2w, size)
+    pixels, depth = project(surface.points, K, c2w)
+    np.testing.assert_allclose(pixels, np.stack(np.meshgrid(np.arange(32) + 0.5, np.arange(18) + 0.5), -1), atol=1e-6)
+    np.testing.assert_allclose(depth, surface.depth, rtol=1e-6)
+    assert surface.points[..., 2].max() < BACK + 0.25 and surface.points[..., 1].max() < FLOOR + 1e-3
+    assert set(np.unique(surface.bodies)) == {ROOM, BOX, BALL}
+    ball = surface.points[surface.bodies == BALL] - (body_pose("ball", 3.0) @ [0, CORD, 0, 1])[:3]
+    assert np.abs(np.linalg.norm(ball, axis=1) - 0.165).min() < 0.003  # on the sphere, where it is no cord
