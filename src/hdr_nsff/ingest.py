@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -222,7 +221,8 @@ def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None
 def number(text: str, where: str) -> float:
     """A finite number written as 2, -0.5 or 1/3; InputError saying `where` otherwise."""
     try:
-        value = float(Fraction(text.strip())) if "/" in text else float(text)
+        above, _, below = text.partition("/")
+        value = float(above) / float(below or 1)
     except ZeroDivisionError as error:
         raise InputError(f"{where}: {text.strip()!r} divides by zero; write times like 1/250 and EV like -2") from error
     except ValueError as error:
