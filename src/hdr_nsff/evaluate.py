@@ -83,7 +83,8 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
     groups = {g: mean_of([v for v in views if v["group"] == g]) for g in dict.fromkeys(t.group for t in targets)}
     result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes, "headline": mean_of(views), "groups": groups}
     if truth is not None and gauge is not None:
-        result |= {"hdr_columns": HDR_COLUMNS, "scale": float(gauge.scale), "scale_per_channel": gauge.scales.tolist()}
+        result |= {"hdr_scores": HDR_SCORES, "scale": float(gauge.scale), "scale_per_channel": gauge.scales.tolist()}
+        result |= {"peak": gauge.peak, "recordable_peak": gauge.recordable_peak}
         result |= {"camera": camera_errors(run, truth), "poses": trajectory_errors(run, truth, targets)}
         if result["headline"].get("hdr_flip") is None:
             notes.append("HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)")
@@ -332,23 +333,24 @@ def exact_of(target: Target) -> Tensor:
     return target.radiance
 
 
-HDR_COLUMNS = {
-    "mu5000": ["μ-law 5000 PSNR", 2],
-    "mu5000_moving": ["moving", 2],
-    "mu50": ["μ-law 50 PSNR", 2],
-    "mu50_moving": ["moving", 2],
-    "mu5000_per_channel": ["5000, scale per channel", 2],
-    "mu50_per_channel": ["50, scale per channel", 2],
-    "mu5000_unaligned": ["5000, unaligned", 2],
-    "mu50_unaligned": ["50, unaligned", 2],
-    "mu5000_recordable": ["5000, recordable pixels", 2],
+HDR_SCORES = {  # what they are called, and digits after the point
+    "mu5000": ["μ-law 5000 PSNR, dB", 2],
+    "mu5000_moving": ["μ-law 5000 moving, dB", 2],
+    "mu5000_recordable": ["μ-law 5000, recordable pixels, dB", 2],
+    "mu5000_per_channel": ["μ-law 5000, one scale per channel, dB", 2],
+    "mu5000_unaligned": ["μ-law 5000, unaligned, dB", 2],
+    "mu50": ["μ-law 50 PSNR, dB", 2],
+    "mu50_moving": ["μ-law 50 moving, dB", 2],
+    "mu50_recordable": ["μ-law 50, recordable pixels, dB", 2],
+    "mu50_per_channel": ["μ-law 50, one scale per channel, dB", 2],
+    "mu50_unaligned": ["μ-law 50, unaligned, dB", 2],
     "hdr_flip": ["HDR-FLIP", 4],
-    "hdr_flip_moving": ["moving", 4],
+    "hdr_flip_moving": ["HDR-FLIP moving", 4],
 }
 
 
 def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, float | None]:
-    """Linear radiance (H, W, 3) against the exact one; names as in `HDR_COLUMNS`. Normalised by the largest exact radiance of all
+    """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`. Normalised by the largest exact radiance of all
     views; `recordable`: over recordable pixels only, normalised by the largest of them."""
     exact, known, moving = exact_of(target), recordable(target), moving_of(target)
     aligned = radiance * gauge.scale
@@ -359,8 +361,8 @@ def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, 
         scores[f"mu{mu}_unaligned"] = metrics.mu_law_psnr(radiance, exact, gauge.peak, mu)
         if moving is not None:
             scores[f"mu{mu}_moving"] = metrics.mu_law_psnr(aligned, exact, gauge.peak, mu, moving)
-    if known.any():
-        scores["mu5000_recordable"] = metrics.mu_law_psnr(aligned, exact, gauge.recordable_peak, 5000, known)
+        if known.any():
+            scores[f"mu{mu}_recordable"] = metrics.mu_law_psnr(aligned, exact, gauge.recordable_peak, mu, known)
     scores["hdr_flip"] = metrics.hdr_flip(aligned, exact, gauge.flip)
     if moving is not None:
         scores["hdr_flip_moving"] = metrics.hdr_flip(aligned, exact, gauge.flip, moving)
