@@ -65,29 +65,49 @@ def test_gradients_add_up_over_several_uses_of_one_grid() -> None:
     torch.testing.assert_close(g.table.grad, 2 * once)
 
 
-def test_touched_adam_is_adam_where_every_entry_has_a_gradient() -> None:
-    a, b = torch.ones(3, 4, requires_grad=True), torch.ones(3, 4, requires_grad=True)
-    ours, theirs = TouchedAdam([a], lr=0.1, eps=1e-8), torch.optim.Adam([b], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
+def marked(rows: int) -> torch.Tensor:
+    return torch.ones(rows, dtype=torch.uint8)
+
+
+def test_touched_adam_is_adam_where_every_row_has_a_gradient() -> None:
+    a, b, marks = torch.ones(3, 4, requires_grad=True), torch.ones(3, 4, requires_grad=True), marked(3)
+    ours, theirs = (
+        TouchedAdam([{"params": [a], "touched": [marks]}], lr=0.1, eps=1e-8),
+        torch.optim.Adam([b], lr=0.1, betas=(0.9, 0.99), eps=1e-8),
+    )
     for step in range(1, 4):
+        marks.fill_(1)
         a.grad, b.grad = torch.full((3, 4), 0.5 * step), torch.full((3, 4), 0.5 * step)
         ours.step()
         theirs.step()
     torch.testing.assert_close(a, b)
 
 
-def test_touched_adam_leaves_untouched_entries_and_their_moments_alone() -> None:
-    p = torch.ones(2, 4, requires_grad=True)
-    optimiser = TouchedAdam([p], lr=0.1)
-    for gradient in (torch.tensor([[1.0], [1.0]]), torch.tensor([[1.0], [0.0]])):
-        p.grad = gradient.expand(2, 4).clone()
-        before = p.detach().clone(), optimiser.state[p].get("exp_avg", torch.zeros(2, 4)).clone()
-        optimiser.step()
-    assert torch.equal(p[1], before[0][1]) and torch.equal(optimiser.state[p]["exp_avg"][1], before[1][1])
-    assert (p[0] < before[0][0]).all()
+def test_touched_adam_leaves_unmarked_rows_alone_and_clears_what_it_used() -> None:
+    p, marks = torch.ones(2, 4, requires_grad=True), marked(2)
+    optimiser = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
+    p.grad = torch.ones(2, 4)
+    optimiser.step()
+    assert float(p.grad.abs().sum()) == 0 and int(marks.sum()) == 0
+    before, moment = p.detach().clone(), optimiser.state[p]["exp_avg"].clone()
+    p.grad[0] = 1.0
+    marks[0] = 1
+    optimiser.step()
+    assert torch.equal(p[1], before[1]) and torch.equal(optimiser.state[p]["exp_avg"][1], moment[1])
+    assert (p[0] < before[0]).all()
+
+
+def test_backward_marks_every_row_with_a_gradient() -> None:
+    g = grid()
+    g(coords(20), 1.3).sum().backward()
+    has = (g.table.grad != 0).any(-1)
+    assert bool((g.touched[has] == 1).all()) and int(g.touched.sum()) < 0.5 * len(has)
 
 
 def test_frequencies_hold_identity_sines_and_cosines() -> None:
     x = torch.tensor([[0.5, -1.0]])
     out = frequencies(x, 2)
-    expected = torch.tensor([[0.5, -1.0, np.sin(0.5), np.sin(-1.0), np.cos(0.5), np.cos(-1.0), np.sin(1.0), np.sin(-2.0), np.cos(1.0), np.cos(-2.0)]])
+    expected = torch.tensor(
+        [[0.5, -1.0, np.sin(0.5), np.sin(-1.0), np.cos(0.5), np.cos(-1.0), np.sin(1.0), np.sin(-2.0), np.cos(1.0), np.cos(-2.0)]]
+    )
     torch.testing.assert_close(out, expected.float())

@@ -44,6 +44,8 @@ class TrainConfig:
     tonemap_lr: float = 2e-3
     anchor_at: float = 0.4
     """Share of the run after which response and exposures are held where they are (1: never)."""
+    paint: bool = True
+    """Start grids from the depth prior and the recorded colours."""
     squared: bool = False
     """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
     saturation: bool = True
@@ -99,7 +101,7 @@ def paper() -> TrainConfig:
     )
     return TrainConfig(
         field=network, tonemap=ToneMapConfig(kind="per_image", knots="even"), loss=weights, steps=250_000, minutes=None, rays=1024,
-        moving_rays=512, batches=1, period=0.0, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, checkpoint_seconds=600,
+        moving_rays=512, batches=1, paint=False, period=0.0, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, checkpoint_seconds=600,
     )  # fmt: skip
 
 

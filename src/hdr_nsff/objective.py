@@ -38,7 +38,7 @@ class LossWeights:
     """Depth prior; x0.1 every phase."""
     flow: float = 0.01
     """Optical-flow prior, in pixels; x0.1 every phase."""
-    mask: float = 0.02
+    mask: float = 0.2
     """Cross-entropy between rendered motion and the moving mask."""
     response_smoothness: float = 1e-3
     gain_residual: float = 1.0

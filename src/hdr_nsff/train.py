@@ -20,6 +20,7 @@ from hdr_nsff.config import TrainConfig
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field
 from hdr_nsff.fields.encodings import TouchedAdam
+from hdr_nsff.fields.paint import paint
 from hdr_nsff.io import write_png
 from hdr_nsff.objective import Objective
 from hdr_nsff.priors.response import initialise
@@ -68,10 +69,9 @@ def train(config: TrainConfig) -> Path:
         raise InputError("neither --steps nor --minutes: say how long to train")
     with distributed.group() as ranks:
         device = pick_device(config.device)
-        scene = to_device(Scene.open(config.scene), device)
         if ranks.main:
             open_folder(config)
-        trainer = Trainer(config, scene, device, ranks)
+        trainer = Trainer(config, Scene.open(config.scene), device, ranks)
         trainer.loop()
     return config.out
 
@@ -92,8 +92,8 @@ class Trainer:
     def __init__(self, config: TrainConfig, scene: Scene, device: torch.device, ranks: distributed.Ranks) -> None:
         torch.manual_seed(config.seed)
         self.config, self.scene, self.ranks = config, scene, ranks
-        self.field = build_field(config.field, scene).to(device)
-        self.tonemapper = ToneMapper.for_scene(config.tonemap, scene).to(device)
+        self.field = build_field(config.field, scene)
+        self.tonemapper = ToneMapper.for_scene(config.tonemap, scene)
         self.objective = Objective(config.loss, scene.manifest.depth_kind, scene.near, config.squared, config.saturation)
         groups = self.field.param_groups()
         dense = [g for g in groups if not g.get("touched")] + self.tonemapper.param_groups(config.tonemap_lr)
@@ -104,6 +104,11 @@ class Trainer:
         self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimisers.items()}
         self.clock = Clock(config, len(scene.train), 0, 0.0)
         self.resume_or_initialise()
+        self.scene = to_device(scene, device)
+        self.field.to(device)
+        self.tonemapper.to(device)
+        for optimiser in self.optimisers.values():
+            optimiser.load_state_dict(optimiser.state_dict())  # moments follow their parameters
 
     @property
     def modules(self) -> dict[str, torch.nn.Module]:
@@ -120,11 +125,18 @@ class Trainer:
             return
         self.report(f"response curve: {initialise(self.tonemapper, self.scene)}")
         self.field.bias.fill_(self.typical_log_radiance())
+        if self.config.paint and paint(self.field, self.scene.train, self.recorded_radiance):
+            self.report("field: painted from the depth prior")
 
     def report(self, message: str) -> None:
         """A line for the person at the terminal, once however many processes there are."""
         if self.ranks.main:
             say(message)
+
+    def recorded_radiance(self, rgb: Tensor, frame: int) -> Tensor:
+        """Radiance (N, 3) that training frame `frame` recorded as `rgb` (N, 3)."""
+        f = self.scene.train[frame]
+        return self.tonemapper.inverse(rgb, f.bracket, f.camera_id, frame)
 
     @torch.no_grad()
     def typical_log_radiance(self) -> float:
@@ -133,7 +145,7 @@ class Trainer:
         for i, f in enumerate(self.scene.train):
             rgb = f.image[::4, ::4].reshape(-1, 3)
             rgb = rgb[informative(rgb)]
-            logs.append(self.tonemapper.inverse(rgb, f.bracket, f.camera_id, i).clamp_min(1e-6).log().flatten())
+            logs.append(self.recorded_radiance(rgb, i).clamp_min(1e-6).log().flatten())
         values = torch.cat(logs)
         return float(values.median()) if len(values) else 0.0
 
@@ -189,7 +201,8 @@ class Trainer:
             for group, lr in zip(optimiser.param_groups, self.base_lr[name], strict=True):
                 group["lr"] = lr * clock.lr_share
             optimiser.step()
-            optimiser.zero_grad(set_to_none=name == "dense")
+            if name == "dense":  # the touched one clears what it used
+                optimiser.zero_grad()
         self.ranks.max_buffers(self.field.shared_maxima())
         self.field.after_step(clock.step + 1)
         totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))

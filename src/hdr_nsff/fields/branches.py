@@ -57,7 +57,7 @@ class Branches(Protocol):
         ...
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Parameter groups with learning rates; `touched=True` marks tables that only rays they crossed should move."""
+        """Parameter groups with learning rates; `touched` (row marks) comes with tables of which only marked rows should move."""
         ...
 
 
@@ -91,9 +91,10 @@ class GridBranches(nn.Module):
 
     def param_groups(self) -> list[dict[str, Any]]:
         c = self.config
+        appearance, motion = [self.static_grid, self.dynamic_grid], list(self.motion_grids)
         return [
-            {"params": [self.static_grid.table, self.dynamic_grid.table], "lr": c.lr, "touched": True},
-            {"params": [g.table for g in self.motion_grids], "lr": c.motion_lr, "touched": True},
+            {"params": [g.table for g in grids], "touched": [g.touched for g in grids], "lr": lr}
+            for grids, lr in ((appearance, c.lr), (motion, c.motion_lr))
         ]
 
 

@@ -35,6 +35,9 @@ class AdditiveGrid(nn.Module):
         self.offset = np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.int64)
         self.hashed = np.array([n > max_rows for n in points])
         self.table = nn.Parameter(torch.zeros(sum(rows), kernels.C))
+        self.register_buffer("touched", torch.zeros(sum(rows), dtype=torch.uint8), persistent=False)  # rows with a gradient
+
+    touched: Tensor
 
     def at(self, knot: float) -> tuple[np.ndarray, np.ndarray]:
         """The two time slices (L, 2) of every level around `knot` and their weights (L, 2)."""
@@ -53,8 +56,24 @@ class AdditiveGrid(nn.Module):
         """Values (N, 4) at `coords` (N, 3) in [0, 1] (outside values clamp) and one time, in knots."""
         slices, weights = self.at(knot)
         if coords.device.type == "cpu" and coords.dtype == torch.float32:
-            return GridFunction.apply(coords, self.table, self, slices, weights)
+            return GridFunction.apply(coords, self.table, self.touched, self, slices, weights)
         return self.reference(coords, slices, weights)
+
+    def spread_to(self, level: int, coords: Tensor, values: Tensor, knot: float = 0.0) -> Tensor:
+        """Sum of `values` (N, 4) over the rows of one level, each shared among its eight grid points by trilinear weight: (rows, 4). CPU only."""
+        slices, weights = self.at(knot)
+        one = slice(level, level + 1)
+        out = torch.zeros(int(self.size[level]), kernels.C)
+        layout = (self.res[one], np.zeros(1, np.int64), self.size[one], self.hashed[one], slices[one], weights[one])
+        kernels.backward_table(
+            coords.contiguous().numpy(), values.contiguous().numpy(), *layout, out.numpy(), np.zeros(len(out), np.uint8)
+        )
+        return out
+
+    def rows_of(self, level: int) -> Tensor:
+        """The rows of one level in the table, a view: (rows, 4)."""
+        start = int(self.offset[level])
+        return self.table.data[start : start + int(self.size[level])]
 
     def reference(self, coords: Tensor, slices: np.ndarray, weights: np.ndarray) -> Tensor:
         """The plain-torch twin of the kernels, for every device and dtype."""
@@ -92,9 +111,12 @@ class GridFunction(torch.autograd.Function):
     times, and a fresh gradient each time would cost more than the interpolation. Hence `backward()` only, not `torch.autograd.grad`."""
 
     @staticmethod
-    def forward(ctx: Any, coords: Tensor, table: Tensor, grid: AdditiveGrid, slices: np.ndarray, weights: np.ndarray) -> Tensor:
+    def forward(
+        ctx: Any, coords: Tensor, table: Tensor, touched: Tensor, grid: AdditiveGrid, slices: np.ndarray, weights: np.ndarray
+    ) -> Tensor:
         coords = coords.contiguous()
         ctx.save_for_backward(coords, table)
+        ctx.touched = touched
         ctx.layout = (grid.res, grid.offset, grid.size, grid.hashed, slices, weights)
         out = torch.empty(len(coords), table.shape[1])
         kernels.forward(coords.detach().numpy(), table.detach().numpy(), *ctx.layout, out.numpy())
@@ -108,15 +130,17 @@ class GridFunction(torch.autograd.Function):
         if ctx.needs_input_grad[1]:
             if table.grad is None:
                 table.grad = torch.zeros_like(table)
-            kernels.backward_table(coords.detach().numpy(), grad_out, *ctx.layout, table.grad.numpy())
+            kernels.backward_table(coords.detach().numpy(), grad_out, *ctx.layout, table.grad.numpy(), ctx.touched.numpy())
         if ctx.needs_input_grad[0]:
             grad_coords = torch.empty_like(coords)
             kernels.backward_coords(coords.detach().numpy(), table.detach().numpy(), grad_out, *ctx.layout, grad_coords.numpy())
-        return grad_coords, None, None, None, None
+        return grad_coords, None, None, None, None, None
 
 
 class TouchedAdam(torch.optim.Optimizer):
-    """Adam (Kingma & Ba 2015) that moves only entries with a gradient: a grid row no ray crossed keeps its value and moments."""
+    """Adam (Kingma & Ba 2015) that moves only table rows some ray crossed; the others keep their values and moments.
+
+    Each group carries `touched`, a list of (rows,) uint8 marks beside its parameters; a step clears marks and gradients."""
 
     def __init__(self, params: Any, lr: float = 1e-2, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-12) -> None:
         super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
@@ -127,7 +151,7 @@ class TouchedAdam(torch.optim.Optimizer):
         assert closure is None
         for group in self.param_groups:
             (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
-            for p in group["params"]:
+            for p, touched in zip(group["params"], group["touched"], strict=True):
                 if p.grad is None:
                     continue
                 state = self.state[p]
@@ -138,13 +162,14 @@ class TouchedAdam(torch.optim.Optimizer):
                 c1, c2 = 1 - beta1**t, 1 - beta2**t
                 m, v = state["exp_avg"], state["exp_avg_sq"]
                 if p.device.type == "cpu":
-                    arrays = [a.detach().reshape(-1).numpy() for a in (p, p.grad, m, v)]
-                    kernels.adam_touched(arrays[0], arrays[1], arrays[2], arrays[3], lr, beta1, beta2, eps, c1, c2)
+                    table, grad, first, second, marks = (a.detach().numpy() for a in (p, p.grad, m, v, touched))
+                    kernels.adam_rows(table, grad, first, second, marks, lr, beta1, beta2, eps, c1, c2)
                     continue
-                touched = p.grad != 0
-                m.copy_(torch.where(touched, beta1 * m + (1 - beta1) * p.grad, m))
-                v.copy_(torch.where(touched, beta2 * v + (1 - beta2) * p.grad**2, v))
-                p.sub_(torch.where(touched, lr * (m / c1) / ((v / c2).sqrt() + eps), torch.zeros_like(p)))
+                rows = (p.grad != 0).any(-1, keepdim=True)
+                m.copy_(torch.where(rows, beta1 * m + (1 - beta1) * p.grad, m))
+                v.copy_(torch.where(rows, beta2 * v + (1 - beta2) * p.grad**2, v))
+                p.sub_(torch.where(rows, lr * (m / c1) / ((v / c2).sqrt() + eps), torch.zeros_like(p)))
+                p.grad.zero_()
 
 
 def frequencies(x: Tensor, octaves: int) -> Tensor:

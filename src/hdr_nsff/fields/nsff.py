@@ -127,16 +127,16 @@ class NSFF(nn.Module):
         """The static branch at the samples `keep` (N, S) bool; empty space elsewhere."""
         index = keep.reshape(-1).nonzero()[:, 0]
         raw = self.branches.static(m.coords.reshape(-1, 3)[index], self.views(m, index))
-        return self.spread(raw, index, keep.shape, self.config_bias(static=True))
+        return self.spread(raw, index, keep.shape, self.density_bias(static=True))
 
     def dynamic_content(
         self, coords: Tensor, index: Tensor, shape: torch.Size, knot: float, views: Tensor, motion: bool
     ) -> tuple[Content, Tensor | None]:
         """The dynamic branch at `coords` (M, 3), which are samples `index` (M,) of rays of `shape` (N, S), and raw motion (M, 8)."""
         raw, raw_motion = self.branches.dynamic(coords, knot, views, motion)
-        return self.spread(raw, index, shape, self.config_bias(static=False)), raw_motion
+        return self.spread(raw, index, shape, self.density_bias(static=False)), raw_motion
 
-    def config_bias(self, static: bool) -> float:
+    def density_bias(self, static: bool) -> float:
         """Raw density at the start: a thin static fog, almost no dynamic one."""
         return 0.0 if static else -3.0
 
@@ -282,7 +282,9 @@ class NSFF(nn.Module):
         still = torch.zeros_like(flow[:, :, 0])
         flows = {o: interleave(flow[:, :, i], still) for i, o in enumerate((FORWARD, BACKWARD))}
         share = interleave(torch.ones_like(a_dy), torch.zeros_like(a_st))
-        return Layers(interleave(m.points, m.points), interleave(a_dy, a_st), interleave(dynamic.radiance, static.radiance), flows, share)
+        return Layers(
+            interleave(m.points, m.points), interleave(a_dy, a_st), interleave(dynamic.radiance, static.radiance), flows, share
+        )
 
     # Housekeeping
 

@@ -63,8 +63,8 @@ def forward(coords, table, res, offset, size, hashed, slices, slice_weights, out
 
 
 @numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
-def backward_table(coords, grad_out, res, offset, size, hashed, slices, slice_weights, grad_table):
-    """Add to grad_table what grad_out (N, C) says."""
+def backward_table(coords, grad_out, res, offset, size, hashed, slices, slice_weights, grad_table, touched):
+    """Add to grad_table what grad_out (N, C) says and mark the rows it touches."""
     for level in numba.prange(res.shape[0]):  # a level's rows belong to one thread: no race, and the same sum every time
         nx, ny, nz = res[level, 0], res[level, 1], res[level, 2]
         for i in range(coords.shape[0]):
@@ -84,6 +84,7 @@ def backward_table(coords, grad_out, res, offset, size, hashed, slices, slice_we
                             r = offset[level] + row_of(
                                 x + dx, y + dy, z + dz, slices[level, k], nx, ny, nz, hashed[level], size[level]
                             )
+                            touched[r] = 1
                             for c in range(C):
                                 grad_table[r, c] += w * grad_out[i, c]
 
@@ -124,13 +125,17 @@ def backward_coords(coords, table, grad_out, res, offset, size, hashed, slices, 
 
 
 @numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
-def adam_touched(p, g, m, v, lr, beta1, beta2, eps, correction1, correction2):
-    """One Adam step on the entries of flat arrays whose gradient is not zero; the others, moments included, stay as they are."""
-    for i in numba.prange(p.shape[0]):
-        d = g[i]
-        if d != F0:
-            a = beta1 * m[i] + (1 - beta1) * d
-            b = beta2 * v[i] + (1 - beta2) * d * d
-            m[i] = a
-            v[i] = b
-            p[i] -= lr * (a / correction1) / (np.sqrt(b / correction2) + eps)
+def adam_rows(p, g, m, v, touched, lr, beta1, beta2, eps, correction1, correction2):
+    """One Adam step on the marked rows of (rows, C) arrays; their gradients and marks are cleared. Other rows, moments included, stay."""
+    for r in numba.prange(p.shape[0]):
+        if touched[r] == 0:
+            continue
+        touched[r] = 0
+        for c in range(C):
+            d = g[r, c]
+            a = beta1 * m[r, c] + (1 - beta1) * d
+            b = beta2 * v[r, c] + (1 - beta2) * d * d
+            m[r, c] = a
+            v[r, c] = b
+            p[r, c] -= lr * (a / correction1) / (np.sqrt(b / correction2) + eps)
+            g[r, c] = F0
