@@ -1,0 +1,164 @@
+"""Depth of every frame: inverse z-depth (disparity) of every pixel in scene units, and how far it can be believed.
+
+A depth prior is a function `(K, c2w, flow, valid, pairs, moving, points, video, clipped) -> (disparity, confidence, near, far)`.
+`geometric_depth` is the offline default: the static scene by a plane sweep over the frames (`sweep.py`) between the disparities
+that structure from motion found, fused over all frames (`fuse.py`); moving objects by their path (`movers.py`). `read_depth` reads
+maps made by any other tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, Protocol
+
+import cv2
+import numpy as np
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_exr, read_image, read_npy
+from hdr_nsff.priors.flow import in_threads
+from hdr_nsff.priors.fuse import carry_over, clean, fill, vote
+from hdr_nsff.priors.movers import mover_depth
+from hdr_nsff.priors.parallax import Shots, choose_views, disparity_range, triangulate
+from hdr_nsff.priors.sweep import sweep
+from hdr_nsff.progress import say
+
+CANDIDATES = 64  # disparities tried per pixel
+VIEWS = 12  # other frames compared per frame
+LEAST_PARALLAX = 1.0  # pixels: below this, between any two frames, depth cannot be told
+LEAST_POINTS = 30
+GUESSED = 0.02  # weight of a disparity that no view supports: only smoothness spoke
+EDGE = 0.06  # relative step of disparity within two pixels that makes a pixel doubtful: which side of the edge is it on?
+AT_EDGE = 0.5  # its confidence is multiplied by this
+
+DepthKind = Literal["metric", "disparity", "relative"]
+
+
+class DepthPrior(Protocol):
+    """What `prepare` calls, whatever is behind it."""
+
+    def __call__(
+        self,
+        K: np.ndarray,
+        c2w: np.ndarray,
+        flow: np.ndarray,
+        valid: np.ndarray,
+        pairs: np.ndarray,
+        moving: np.ndarray,
+        points: np.ndarray,
+        video: np.ndarray,
+        clipped: np.ndarray,
+        times: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, float, float]:
+        """See `geometric_depth`."""
+        ...
+
+
+def geometric_depth(
+    K: np.ndarray,
+    c2w: np.ndarray,
+    flow: np.ndarray,
+    valid: np.ndarray,
+    pairs: np.ndarray,
+    moving: np.ndarray,
+    points: np.ndarray,
+    video: np.ndarray,
+    clipped: np.ndarray,
+    times: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Disparity (T, H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], near and far z-depth, from known poses.
+
+    `K` (3, 3) or (T, 3, 3) px, `c2w` (T, 3, 4) OpenCV; `flow` (P, H, W, 2) px, `valid` (P, H, W) of `pairs` (P, 2), both directions
+    of neighbours; `moving`, `clipped` (T, H, W) bool; `points` (N, 3) static, may be none; `video` (T, H, W, 3) equalised rgb;
+    `times` (T,) in frames, 0, 1, 2, ... if not given. Without parallax all is at distance 1, confidence 0."""
+    count, size = len(video), video.shape[1:3]
+    times = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, np.float64)
+    shots = Shots(
+        np.broadcast_to(np.asarray(K, np.float64), (count, 3, 3)), np.asarray(c2w, np.float64), times, video, clipped, moving
+    )
+    if sum(shots.project(i, points)[2].sum() for i in range(count)) < LEAST_POINTS * count:
+        points = np.concatenate([np.asarray(points).reshape(-1, 3), triangulate(shots, flow, valid, pairs)])
+    views, parallax = choose_views(shots, points, VIEWS) if len(points) >= LEAST_POINTS else ([], 0.0)
+    if parallax < LEAST_PARALLAX:
+        say(f"depth: {parallax:.1f} pixels of parallax between the frames are too few: everything is put at distance 1")
+        return np.ones((count, *size), np.float32), np.zeros((count, *size), np.float32), 0.5, 2.0
+    disparity, confidence = static_depth(shots, views, *disparity_range(shots, points))
+    with_movers, mover_confidence = mover_depth(shots, flow, valid, pairs, disparity)
+    seen_together = np.array([(times == t).sum() > 1 for t in times])[
+        :, None, None
+    ]  # synchronized cameras: the sweep saw movers too
+    own = moving & ~(seen_together & (confidence > mover_confidence))
+    disparity, confidence = np.where(own, with_movers, disparity), np.where(own, mover_confidence, confidence)
+    return disparity, confidence, *depth_range(disparity, confidence)
+
+
+def static_depth(shots: Shots, views: list[list[int]], low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
+    """Disparity of the static scene, also behind what moves, and its confidence (T, H, W), by sweep, fusion and cleaning."""
+    frames = list(range(len(views)))
+    candidates = np.linspace(low, high, CANDIDATES).astype(np.float32)
+    swept = in_threads(lambda i: sweep(shots, i, views[i], candidates), frames, "depth: plane sweep")
+    disparity, matched = (np.stack(x) for x in zip(*swept, strict=True))
+    disparity[(matched == 0).all((1, 2))] = np.sqrt(low * high)  # a frame that no view could match
+    weight = np.where(matched > 0, np.maximum(matched, GUESSED), np.where(shots.moving, GUESSED**2, GUESSED)).astype(np.float32)
+    fused = in_threads(lambda i: fuse(shots, i, views[i], disparity, weight), frames, "depth: fusion")
+    result, confidence = zip(*fused, strict=True)
+    return np.stack(result), np.stack(confidence)
+
+
+def fuse(shots: Shots, i: int, views: list[int], disparity: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Disparity and confidence (H, W) of frame `i` from its own map and those of its `views`, carried over."""
+    maps, weights = [disparity[i]], [weight[i]]
+    for j in views:
+        there, there_weight = np.empty_like(disparity[i]), np.empty_like(disparity[i])
+        carry_over(disparity[j], weight[j], *shots.transfer(j, i), there, there_weight)
+        maps.append(there)
+        weights.append(there_weight)
+    voted, agreeing, everything = vote(np.stack(maps), np.stack(weights))
+    confidence = agreeing / (everything + 1)
+    cleaned = clean(voted, confidence, np.ascontiguousarray(shots.video[i], np.float32))
+    square = np.ones((5, 5), np.uint8)
+    step = cv2.dilate(cleaned, square) / np.maximum(cv2.erode(cleaned, square), 1e-9) - 1
+    return cleaned, np.where(step > EDGE, AT_EDGE * confidence, confidence).astype(np.float32)
+
+
+def depth_range(disparity: np.ndarray, confidence: np.ndarray) -> tuple[float, float]:
+    """Near and far z-depth that hold what is believed, with room: movers and unbelieved pixels are somewhere in between."""
+    z = 1 / disparity[confidence >= np.quantile(confidence, 0.25)]
+    near, far = np.percentile(z, [0.5, 99.5])
+    return 0.8 * float(near), 1.2 * float(far)
+
+
+def read_depth(files: list[Path], kind: DepthKind, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Disparity and confidence (T, H, W) of depth maps made elsewhere, one file per frame (.npy, EXR, 16-bit PNG).
+
+    `kind` says what they hold: "metric" z-depth in scene units, "disparity" 1 / z-depth, "relative" disparity up to scale and shift.
+    Confidence is 1, and 0 where a metric map holds 0 or less (no measurement). InputError for another size, NaN, or an empty map."""
+    maps = [read_map(path) for path in files]
+    disparity, confidence = np.zeros((len(maps), *size), np.float32), np.ones((len(maps), *size), np.float32)
+    for k, (path, values) in enumerate(zip(files, maps, strict=True)):
+        if values.shape != size:
+            raise InputError(
+                f"{path}: a depth map of shape {values.shape}, the frames need {size}; make it at the size of the frames"
+            )
+        if not np.isfinite(values).all():
+            raise InputError(f"{path}: the depth map holds NaN or Inf; write 0 where depth is unknown")
+        known = values > 0
+        if kind != "relative" and not known.any():
+            raise InputError(f"{path}: no depth above 0 in this map; check that its kind is {kind!r}")
+        if kind == "metric":
+            disparity[k] = fill(1 / np.where(known, values, 1), known)
+            confidence[k] = known
+        else:
+            disparity[k] = values
+    return disparity, confidence
+
+
+def read_map(path: Path) -> np.ndarray:
+    """One depth or disparity map (H, W) float32: .npy, EXR channel Z (or the only one), or a PNG in [0, 1]."""
+    suffix = path.suffix.lower()
+    if suffix == ".npy":
+        return np.squeeze(np.array(read_npy(path), np.float32))
+    if suffix == ".exr":
+        channels = read_exr(path)
+        values = channels["Z"] if "Z" in channels else next(iter(channels.values()))
+        return values if values.ndim == 2 else values[..., 0]
+    return read_image(path)[..., 0]
