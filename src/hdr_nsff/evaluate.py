@@ -345,7 +345,6 @@ HDR_SCORES = {  # what they are called, and digits after the point
     "mu50_per_channel": ["μ-law 50, one scale per channel, dB", 2],
     "mu50_unaligned": ["μ-law 50, unaligned, dB", 2],
     "hdr_flip": ["HDR-FLIP", 4],
-    "hdr_flip_moving": ["HDR-FLIP moving", 4],
 }
 
 
@@ -364,8 +363,6 @@ def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, 
         if known.any():
             scores[f"mu{mu}_recordable"] = metrics.mu_law_psnr(aligned, exact, gauge.recordable_peak, mu, known)
     scores["hdr_flip"] = metrics.hdr_flip(aligned, exact, gauge.flip)
-    if moving is not None:
-        scores["hdr_flip_moving"] = metrics.hdr_flip(aligned, exact, gauge.flip, moving)
     return scores
 
 

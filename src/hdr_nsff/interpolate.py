@@ -25,7 +25,7 @@ from hdr_nsff.volume import transmittance, weighted_sum
 
 Mode = Literal["auto", "splat", "direct"]
 SAME_TIME = 1e-4  # frames: closer than this to a training time is that time
-EMPTY = 1e-4  # samples of less alpha hold nothing and stand still
+EMPTY = 1e-3  # samples of less alpha hold nothing and stand still
 SPREAD = 0.8  # smallest sum of weights that average splatting makes up for: content that grows by a tenth along each side
 FAINT = 0.1  # presence below this is topped up from the nearer training time
 
