@@ -111,3 +111,12 @@ def test_frequencies_hold_identity_sines_and_cosines() -> None:
         [[0.5, -1.0, np.sin(0.5), np.sin(-1.0), np.cos(0.5), np.cos(-1.0), np.sin(1.0), np.sin(-2.0), np.cos(1.0), np.cos(-2.0)]]
     )
     torch.testing.assert_close(out, expected.float())
+
+
+def test_marks_stay_the_grids_own_through_a_loaded_state() -> None:
+    p, marks = torch.ones(1, 4, requires_grad=True), marked(1)
+    optimiser = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
+    optimiser.load_state_dict(optimiser.state_dict())
+    p.grad = torch.ones(1, 4)
+    optimiser.step()
+    assert float(p.detach().max()) < 1 and int(marks.sum()) == 0

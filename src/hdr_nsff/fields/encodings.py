@@ -140,10 +140,13 @@ class GridFunction(torch.autograd.Function):
 class TouchedAdam(torch.optim.Optimizer):
     """Adam (Kingma & Ba 2015) that moves only table rows some ray crossed; the others keep their values and moments.
 
-    Each group carries `touched`, a list of (rows,) uint8 marks beside its parameters; a step clears marks and gradients."""
+    Each group comes with `touched`, a list of (rows,) uint8 marks beside its parameters; a step clears marks and gradients."""
 
     def __init__(self, params: Any, lr: float = 1e-2, betas: tuple[float, float] = (0.9, 0.99), eps: float = 1e-12) -> None:
-        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+        groups = [dict(g) for g in params]
+        # outside the groups: `load_state_dict` copies those, and the marks must stay the grids' own
+        self.marks = {p: marks for g in groups for p, marks in zip(g["params"], g.pop("touched"), strict=True)}
+        super().__init__(groups, {"lr": lr, "betas": betas, "eps": eps})
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
@@ -151,7 +154,7 @@ class TouchedAdam(torch.optim.Optimizer):
         assert closure is None
         for group in self.param_groups:
             (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
-            for p, touched in zip(group["params"], group["touched"], strict=True):
+            for p in group["params"]:
                 if p.grad is None:
                     continue
                 state = self.state[p]
@@ -162,7 +165,7 @@ class TouchedAdam(torch.optim.Optimizer):
                 c1, c2 = 1 - beta1**t, 1 - beta2**t
                 m, v = state["exp_avg"], state["exp_avg_sq"]
                 if p.device.type == "cpu":
-                    table, grad, first, second, marks = (a.detach().numpy() for a in (p, p.grad, m, v, touched))
+                    table, grad, first, second, marks = (a.detach().numpy() for a in (p, p.grad, m, v, self.marks[p]))
                     kernels.adam_rows(table, grad, first, second, marks, lr, beta1, beta2, eps, c1, c2)
                     continue
                 rows = (p.grad != 0).any(-1, keepdim=True)
