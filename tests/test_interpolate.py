@@ -54,7 +54,7 @@ def one_layer(alpha: Tensor, value: Tensor, shift: Tensor) -> Picture:
 
 def test_whole_pixels_of_flow_shift_the_picture_and_zero_flow_leaves_it() -> None:
     generator = torch.Generator().manual_seed(0)
-    alpha, value = torch.rand(W * H, generator=generator), torch.rand(W * H, generator=generator)
+    alpha, value = 0.1 + 0.9 * torch.rand(W * H, generator=generator), torch.rand(W * H, generator=generator)
     for dx, dy in ((0, 0), (3, -2)):
         moved = one_layer(alpha, value, torch.tensor([float(dx), float(dy)]).expand(W * H, 2))
         inside = slice(2, H - 2), slice(3, W)  # what came in from beyond the border is not known
