@@ -88,6 +88,7 @@ def geometric_depth(
     ]  # synchronized cameras: the sweep saw movers too
     own = moving & ~(seen_together & (confidence > mover_confidence))
     disparity, confidence = np.where(own, with_movers, disparity), np.where(own, mover_confidence, confidence)
+    confidence = np.stack([doubt_edges(d, c) for d, c in zip(disparity, confidence, strict=True)])
     return disparity, confidence, *depth_range(disparity, confidence)
 
 
@@ -115,9 +116,14 @@ def fuse(shots: Shots, i: int, views: list[int], disparity: np.ndarray, weight: 
     voted, agreeing, everything = vote(np.stack(maps), np.stack(weights))
     confidence = agreeing / (everything + 1)
     cleaned = clean(voted, confidence, np.ascontiguousarray(shots.video[i], np.float32))
+    return cleaned, confidence.astype(np.float32)
+
+
+def doubt_edges(disparity: np.ndarray, confidence: np.ndarray) -> np.ndarray:
+    """`confidence` (H, W), lower within two pixels of a step of `disparity` (H, W)."""
     square = np.ones((5, 5), np.uint8)
-    step = cv2.dilate(cleaned, square) / np.maximum(cv2.erode(cleaned, square), 1e-9) - 1
-    return cleaned, np.where(step > EDGE, AT_EDGE * confidence, confidence).astype(np.float32)
+    step = cv2.dilate(disparity, square) / np.maximum(cv2.erode(disparity, square), 1e-9) - 1
+    return np.where(step > EDGE, AT_EDGE * confidence, confidence).astype(np.float32)
 
 
 def depth_range(disparity: np.ndarray, confidence: np.ndarray) -> tuple[float, float]:
