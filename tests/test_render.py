@@ -127,11 +127,12 @@ def test_standard_set_is_complete_and_restarts_without_work(tmp_path: Path) -> N
     assert run.field.calls - before <= 1  # the focus depth of bullet time
 
 
-def test_budget_drops_frames_of_the_sequence_and_shrinks_videos() -> None:
-    assert cut([1.0] * 10, 20, shrink=True) == (1.0, list(range(10)))
-    assert cut([1.0] * 10, 6, shrink=True) == (0.75, list(range(10)))  # 10 * 0.75^2 = 5.6
-    assert cut([1.0] * 64, 2, shrink=True) == (0.25, list(range(16, 48)))  # a quarter: 4 s, so half of them, in the middle
-    assert cut([1.0] * 10, 5, shrink=False) == (1.0, [0, 2, 4, 7, 9])
+def test_budget_shrinks_videos_and_then_drops_views() -> None:
+    assert cut([1.0] * 10, 20, 0.25, thin=False) == (1.0, list(range(10)))
+    assert cut([1.0] * 10, 6, 0.25, thin=False) == (0.75, list(range(10)))  # 10 * 0.75^2 = 5.6
+    assert cut([1.0] * 64, 2, 0.25, thin=False) == (0.25, list(range(16, 48)))  # a quarter: 4 s, so half of them, in the middle
+    assert cut([1.0] * 16, 9, 1.0, thin=True) == (1.0, [0, 2, 4, 6, 8, 9, 11, 13, 15])  # 15 / 8 = 1.875 apart
+    assert cut([1.0] * 20, 1, 1.0, thin=True)[1][::7] == [0, 19]  # never fewer than 8
 
 
 def test_three_exposures_span_the_clip() -> None:

@@ -185,11 +185,14 @@ def standard_shots(run: Run, out: Path, budget: float, refused: list[str]) -> li
                 f"{name}: {len(chosen)} of {len(shot.views)} views at {scale:.0%} size, to keep to {budget:.0f} s; "
                 f"`hdr-nsff render {run.folder} --path {name}` makes them all"
             )
-        shots.append(Shot(name, [shot.views[i].resized(scale) for i in chosen], shot.fps))
+        fps = shot.fps * len(chosen) / len(shot.views) if name == "training" else shot.fps  # skipped frames do not make it faster
+        shots.append(Shot(name, [shot.views[i].resized(scale) for i in chosen], fps))
     return shots
 
 
 SHARE = {"training": 0.3, "fixed": 0.2, "bullet": 0.15, "slowmo": 0.35}  # of the budget
+SCALES = (1.0, 0.75, 0.67, 0.5, 0.35, 0.25)
+NARROWEST = 160  # pixels: videos do not shrink below this width
 
 
 def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -207,7 +210,8 @@ def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused
     plan = {}
     for shot in shots:
         costs = [speed.at if min(abs(v.time - t) for t in times) < 1e-3 else speed.between for v in shot.views]
-        scale, chosen = cut(costs, SHARE[shot.name] * budget, shrink=shot.name != "training")
+        smallest = 1.0 if shot.name == "training" else min(1.0, NARROWEST / shot.views[0].camera.width)
+        scale, chosen = cut(costs, SHARE[shot.name] * budget, smallest, thin=shot.name in ("training", "bullet"))
         plan[shot.name] = {"scale": scale, "views": chosen}
     told = {"seconds_at_a_time": speed.at, "seconds_between": speed.between, "refused": list(refused)}
     io.write_json(file, {"key": key, **told, "shots": plan})
@@ -228,18 +232,16 @@ def measure(run: Run) -> Speed:
     return Speed(*seconds)
 
 
-def cut(costs: Sequence[float], seconds: float, shrink: bool) -> tuple[float, list[int]]:
+def cut(costs: Sequence[float], seconds: float, smallest: float, thin: bool) -> tuple[float, list[int]]:
     """Scale and positions of the views that fit into `seconds`, given what each view costs at full size.
 
-    `shrink`: smaller pictures first (down to a quarter), then a window around the middle. Otherwise evenly chosen views."""
+    Smaller pictures first, down to the scale `smallest`; then fewer views: evenly chosen ones if `thin`, else those in the middle."""
     total, n = max(sum(costs), 1e-9), len(costs)
-    if total <= seconds:
-        return 1.0, list(range(n))
-    if not shrink:
-        count = min(n, max(4, int(n * seconds / total)))
-        return 1.0, sorted({round(i) for i in np.linspace(0, n - 1, count).tolist()})
-    scale = next((s for s in (0.75, 0.5, 0.35, 0.25) if total * s**2 <= seconds), 0.25)
-    count = min(n, max(8, int(n * seconds / (total * scale**2))))
+    scales = [s for s in SCALES if s >= smallest]
+    scale = next((s for s in scales if total * s**2 <= seconds), scales[-1])
+    count = min(n, max(8, int(n * seconds / (total * scale**2) + 1e-9)))
+    if thin:
+        return scale, sorted({round(i) for i in np.linspace(0, n - 1, count).tolist()})
     first = (n - count) // 2
     return scale, list(range(first, first + count))
 

@@ -277,9 +277,11 @@ def radiance(run: Run, renders: Path) -> str:
     for channel, colour, name in zip(range(3), COLOURS, ("red", "green", "blue"), strict=True):
         axes.hist(10 ** log[:, channel], bins=10**edges, histtype="step", color=colour, linewidth=1.2, label=name)
     x, y = (t.cpu() for t in run.tonemapper.curve(0))
-    dark = float(x[int(torch.searchsorted(y.mean(0), torch.tensor(3 / 255)).clamp(max=len(x) - 1))])
+    dark = float(x[int(torch.searchsorted(y.mean(0).contiguous(), torch.tensor(3 / 255)).clamp(1, len(x) - 1))])
+    exposures = sorted(run.tonemapper.exposures().tolist())
+    axes.set_xlim(left=min(10**low, dark / 2 ** exposures[-1]) / 20)  # room for the words
     top = axes.get_ylim()[1]
-    for i, ev in enumerate(sorted(run.tonemapper.exposures().tolist())):
+    for i, ev in enumerate(exposures):
         axes.plot([dark / 2**ev, 1 / 2**ev], [top * (1.04 + 0.06 * i)] * 2, color=GREY, linewidth=3, solid_capstyle="butt")
         axes.text(
             dark / 2**ev, top * (1.04 + 0.06 * i), f"EV {ev:+.1f} records  ", fontsize=7, va="center", ha="right", color=GREY
