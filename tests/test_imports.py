@@ -1,0 +1,84 @@
+"""The house's laws about imports, read from the source: one order (that of the README's tree), verbs apart, the truth out of
+training's sight, heavy libraries behind one door each."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "src" / "hdr_nsff"
+VERBS = {"prepare", "synth", "reexpose", "train", "render", "evaluate", "report"}
+TRUTH = {"evaluate", "synth", "reexpose"}  # who reads it, and the two that write it
+HEAVY = {"pycolmap", "mitsuba", "rawpy", "flip_evaluator"}
+
+
+def module_of(path: Path) -> str:
+    """`fields.base` for fields/base.py, `fields` for fields/__init__.py."""
+    return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
+
+
+def readme_order() -> list[str]:
+    """The modules as the README's tree lists them."""
+    listing = (ROOT / "README.md").read_text(encoding="utf-8").partition("\nsrc/hdr_nsff/\n")[2].partition("```")[0]
+    folders: list[str] = []
+    order = []
+    for line in listing.splitlines():
+        name = line.split()[0]
+        folders = folders[: (len(line) - len(line.lstrip())) // 2 - 1]
+        if name.endswith("/"):
+            folders.append(name)
+        else:
+            order.append(module_of(Path(*folders, name)))
+    return order
+
+
+def imports(tree: ast.AST) -> set[str]:
+    """Every dotted name imported anywhere in a file, but for what only a type checker reads."""
+    if isinstance(tree, ast.If) and ast.unparse(tree.test) == "TYPE_CHECKING":
+        return set()
+    if isinstance(tree, ast.Import):
+        return {a.name for a in tree.names}
+    if isinstance(tree, ast.ImportFrom):
+        assert tree.level == 0, f"line {tree.lineno}: write the import out, from hdr_nsff"
+        return {f"{tree.module}.{a.name}" for a in tree.names}
+    return {name for child in ast.iter_child_nodes(tree) for name in imports(child)}
+
+
+SOURCES = {module_of(p.relative_to(PACKAGE)): ast.parse(p.read_text(encoding="utf-8")) for p in PACKAGE.rglob("*.py")}
+ORDER = readme_order()
+
+
+def own_imports(module: str) -> set[str]:
+    """The modules of this package that a module imports."""
+    inner = [n.removeprefix("hdr_nsff").removeprefix(".") for n in imports(SOURCES[module]) if n.split(".")[0] == "hdr_nsff"]
+    return {next((m for m in (name, name.rpartition(".")[0]) if m in SOURCES), "__init__") for name in inner}
+
+
+def test_every_file_has_one_line_in_the_readme():
+    bare = {m for m, tree in SOURCES.items() if all(isinstance(node, ast.Expr) for node in tree.body)}  # a docstring at most
+    assert sorted(ORDER) == sorted(set(ORDER))
+    assert set(ORDER) - bare == set(SOURCES) - bare
+
+
+@pytest.mark.parametrize("module", sorted(SOURCES))
+def test_imports_point_up_the_tree(module: str):
+    above = set(ORDER[: ORDER.index(module)]) if module in ORDER else set()
+    assert own_imports(module) <= above
+
+
+@pytest.mark.parametrize("verb", sorted(VERBS))
+def test_verbs_never_import_each_other(verb: str):
+    assert not own_imports(verb) & VERBS
+
+
+def test_the_truth_is_read_by_evaluate_alone():
+    assert {m for m in SOURCES if "truth" in own_imports(m)} == TRUTH
+
+
+@pytest.mark.parametrize("library", sorted(HEAVY))
+def test_a_heavy_library_has_one_door_inside_a_function(library: str):
+    users = [m for m, tree in SOURCES.items() if library in {n.split(".")[0] for n in imports(tree)}]
+    assert len(users) == 1, f"{library} is imported by {users}"
+    top = [n for node in SOURCES[users[0]].body if isinstance(node, ast.Import | ast.ImportFrom) for n in imports(node)]
+    assert not any(n.startswith(library) for n in top), f"{users[0]} imports {library} before anyone needs it"
