@@ -161,6 +161,11 @@ def test_bad_requests_are_refused_in_a_sentence(tmp_path: Path) -> None:
         ("outside the clip", lambda: plan_shot(run, path_file(tmp_path, 0.0, 7.5))),
         ("leaves the clip's viewpoint", lambda: plan_shot(still, path_file(tmp_path, 0.5, 1.0))),
         ("camera 3: the run has learned cameras 0 to 0", lambda: render_shot(run, plan_shot(run, "fixed"), tmp_path, Output(camera_id=3))),
+        ("--scale 0: must be", lambda: render(RenderConfig(tmp_path, scale=0.0))),
+        ("--fps -1: must be", lambda: render(RenderConfig(tmp_path, fps=-1.0))),
+        ("--ev nan", lambda: render(RenderConfig(tmp_path, output=Output(ev=float("nan"))))),
+        ("nothing left to write", lambda: render(RenderConfig(tmp_path, output=Output(exr="none", png=False, video=False)))),
+        ("not a run folder", lambda: render(RenderConfig(tmp_path))),
         ("--exr none", lambda: render_all(run, tmp_path, output=Output(exr="none"))),
     ]  # fmt: skip
     for sentence, request in requests:

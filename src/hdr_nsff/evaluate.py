@@ -39,7 +39,7 @@ class EvaluateConfig:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     truth: Path | None = None
-    """Truth folder, as `synth` and `reexpose` write it; none: the frames that `prepare` held out."""
+    """Truth folder, as `synth` and `reexpose` write it; default: the frames that `prepare` held out."""
     lpips: str | None = None
     """LPIPS: a file with AlexNet weights, or `hub` to download them."""
     device: str = "auto"
@@ -62,7 +62,8 @@ class Target:
 
 def evaluate(config: EvaluateConfig) -> dict[str, Any]:
     """The verb: what `metrics.json` holds."""
-    return evaluate_run(Run.open(config.run, device=config.device), config.truth, config.lpips)
+    with io.writing_to(config.run):
+        return evaluate_run(Run.open(config.run, config.device), config.truth, config.lpips)
 
 
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,7 @@ import tyro
 
 from hdr_nsff import io, paths
 from hdr_nsff.errors import InputError
+from hdr_nsff.interpolate import LayeredField
 from hdr_nsff.paths import View
 from hdr_nsff.progress import say, track
 from hdr_nsff.run import Run
@@ -32,11 +34,11 @@ class RenderConfig:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     path: str = "all"
-    """training, fixed, bullet, slowmo, all of them as `run` makes them, or a JSON file with a camera path."""
+    """training, fixed, bullet, slowmo, or a JSON file with a camera path; all: the set that `run` makes (no frame, scale, factor, views, fps)."""
     out: Path | None = None
-    """Where to; none: RUN/render."""
+    """Where to; default: RUN/render."""
     frame: int | None = None
-    """Frame whose camera (fixed, bullet) and time (bullet) are used; none: the middle one."""
+    """Frame whose camera (fixed, bullet) and time (bullet) are used; default: the middle one."""
     scale: float = 1.0
     """Size of the pictures relative to the clip's."""
     factor: int = 4
@@ -44,7 +46,7 @@ class RenderConfig:
     views: int = 48
     """Bullet time: number of views."""
     fps: float | None = None
-    """Frames per second of videos; none: the clip's."""
+    """Frames per second of videos; default: the clip's."""
     budget: float = 90.0
     """For path `all`: seconds it may take; videos become smaller and shorter to fit."""
     device: str = "auto"
@@ -54,13 +56,30 @@ class RenderConfig:
 
 def render(config: RenderConfig) -> dict[str, Path]:
     """The verb: what was asked for, by name."""
-    run = Run.open(config.run, device=config.device)
+    check_settings(config)
+    run = Run.open(config.run, config.device)
+    if config.output.between == "splat" and not isinstance(run.field, LayeredField):
+        raise InputError("--between splat: this field has no layers to splat; use --between direct")
     out = config.out or Path(config.run) / "render"
-    if config.path == "all":
-        return render_all(run, out, config.budget, config.output)
-    shot = plan_shot(run, config.path, config.frame, config.factor, config.views)
-    shot = Shot(shot.name, [v.resized(config.scale) for v in shot.views], config.fps or shot.fps)
-    return {shot.name: render_shot(run, shot, out, config.output)}
+    with io.writing_to(out):
+        if config.path == "all":
+            return render_all(run, out, config.budget, config.output)
+        shot = plan_shot(run, config.path, config.frame, config.factor, config.views)
+        shot = Shot(shot.name, [v.resized(config.scale) for v in shot.views], config.fps or shot.fps)
+        return {shot.name: render_shot(run, shot, out, config.output)}
+
+
+def check_settings(config: RenderConfig) -> None:
+    """InputError for settings that make no sense whatever the run is."""
+    positive = {"scale": config.scale, "factor": config.factor, "views": config.views, "budget": config.budget}
+    for name, value in positive.items() | ({"fps": config.fps}.items() if config.fps is not None else set()):
+        if not (value > 0 and math.isfinite(value)):
+            raise InputError(f"--{name} {value:g}: must be a number above 0")
+    o = config.output
+    if o.ev is not None and not abs(o.ev) < 60:
+        raise InputError(f"--ev {o.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5")
+    if o.exr == "none" and not o.png and not o.video:
+        raise InputError("--exr none --no-png --no-video: nothing left to write; leave one of them out")
 
 
 def plan_shot(run: Run, path: str, frame: int | None = None, factor: int = 2, num_views: int = 24) -> Shot:

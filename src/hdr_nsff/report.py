@@ -32,14 +32,16 @@ class ReportConfig:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     out: Path | None = None
-    """The file; none: RUN/report.html."""
+    """The file; default: RUN/report.html."""
     renders: Path | None = None
-    """Where `render` wrote; none: RUN/render."""
+    """Where `render` wrote; default: RUN/render."""
 
 
 def report(config: ReportConfig) -> Path:
     """The verb: the path of the report."""
-    path = write_report(Run.open(config.run), config.out or config.run / "report.html", config.renders or config.run / "render")
+    out = config.out or config.run / "report.html"
+    with io.writing_to(out):
+        path = write_report(Run.open(config.run), out, config.renders or config.run / "render")
     say(f"report: {path}")
     return path
 

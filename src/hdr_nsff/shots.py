@@ -40,7 +40,7 @@ class Output:
     video: bool = True
     """8-bit H.264 MP4."""
     ev: float | None = None
-    """Develop at this exposure, relative to the reference; none: tone-map for a display."""
+    """Develop at this exposure, relative to the reference; default: tone-map for a display."""
     camera_id: int = 0
     """Whose learned response and white balance develop the picture (with --ev)."""
     between: Mode = "auto"
