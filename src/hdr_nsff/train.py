@@ -68,6 +68,8 @@ def train(config: TrainConfig) -> Path:
     if config.steps is None and config.minutes is None:
         raise InputError("neither --steps nor --minutes: say how long to train")
     with distributed.group() as ranks:
+        if ranks.world > config.batches:
+            raise InputError(f"{ranks.world} processes share {config.batches} batches a step; start fewer, or raise --batches")
         device = pick_device(config.device)
         if ranks.main:
             open_folder(config)
@@ -101,6 +103,7 @@ class Trainer:
         self.optimisers: dict[str, torch.optim.Optimizer] = {"dense": torch.optim.Adam(dense)}
         if touched:
             self.optimisers["touched"] = TouchedAdam(touched)
+        self.marks = [marks for g in touched for marks in g["touched"]]  # rows with a gradient, of any process
         self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimisers.items()}
         self.clock = Clock(config, len(scene.train), 0, 0.0)
         self.resume_or_initialise()
@@ -195,8 +198,8 @@ class Trainer:
             with torch.no_grad():
                 rgb = self.tonemapper(render.radiance, batch.bracket, batch.camera_id, batch.frame, leaky=False)
                 totals["mse"] = totals.get("mse", 0.0) + float((rgb - batch.rgb)[batch.uniform].square().mean()) / len(slots)
-        parameters = [p for o in self.optimisers.values() for g in o.param_groups for p in g["params"]]
-        self.ranks.sum_gradients(parameters)
+        self.ranks.sum_gradients(p for o in self.optimisers.values() for g in o.param_groups for p in g["params"])
+        self.ranks.max_buffers(self.marks)
         for name, optimiser in self.optimisers.items():
             for group, lr in zip(optimiser.param_groups, self.base_lr[name], strict=True):
                 group["lr"] = lr * clock.lr_share
@@ -243,8 +246,11 @@ class Trainer:
             "rays_per_second": rays * c.step / c.seconds,
             "losses": losses,
         }
-        with open(self.config.out / "log.jsonl", "a") as file:
-            file.write(json.dumps(line) + "\n")
+        with open(self.config.out / "log.jsonl", "ab+") as file:
+            end = file.seek(0, 2)
+            file.seek(max(end - 1, 0))
+            whole = file.read() in (b"", b"\n")  # a kill may have cut the line before short
+            file.write((b"" if whole else b"\n") + json.dumps(line).encode() + b"\n")
 
     def save(self) -> None:
         """A checkpoint of everything that counts."""

@@ -34,6 +34,11 @@ class Weights:
     static: Tensor  # (N, S)
     dynamic: Tensor  # (N, S)
 
+    @property
+    def opacity(self) -> Tensor:
+        """Of each ray (N,), in [0, 1]: eq. 6-7 let two contents in one place add up to more than everything."""
+        return (self.static + self.dynamic).sum(-1).clamp(max=1)
+
 
 def blend(static_density: Tensor, dynamic_density: Tensor, share: Tensor, deltas: Tensor) -> Weights:
     """Eq. 6-7: both densities in the same place, `share` (N, S) of the dynamic one. `a_dy = (1-exp(-s_t d)) b`,

@@ -155,12 +155,12 @@ class TouchedAdam(torch.optim.Optimizer):
         for group in self.param_groups:
             (beta1, beta2), lr, eps = group["betas"], group["lr"], group["eps"]
             for p in group["params"]:
-                if p.grad is None:
-                    continue
                 state = self.state[p]
                 if not state:
                     state.update(step=torch.zeros(()), exp_avg=torch.zeros_like(p), exp_avg_sq=torch.zeros_like(p))
-                state["step"] += 1
+                state["step"] += 1  # with or without a gradient, so that a resumed run counts like an unbroken one
+                if p.grad is None:
+                    continue
                 t = float(state["step"])
                 c1, c2 = 1 - beta1**t, 1 - beta2**t
                 m, v = state["exp_avg"], state["exp_avg_sq"]

@@ -68,13 +68,13 @@ class Motion:
         alone = volume.single(self.dynamic.density, m.deltas) if self.field.config.compositing == "blend" else None
         packed = w.dynamic.reshape(-1)[self.index]
         scene_flow = {o: self.gather(packed[:, None] * d) for o, d in self.displacement.items()}
-        warps = [self.warp(o, radiance, depth, both.sum(-1), scene_flow[o]) for o in self.offsets]
+        warps = [self.warp(o, radiance, depth, w.opacity, scene_flow[o]) for o in self.offsets]
         if self.batch.chain in self.moved:
             warps.append(self.chained(self.batch.chain, radiance))
         return Render(
             radiance,
             depth,
-            both.sum(-1),
+            w.opacity,
             w.dynamic.sum(-1),
             scene_flow,
             tuple(w for w in warps if w is not None),

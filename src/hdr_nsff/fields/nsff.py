@@ -218,7 +218,7 @@ class NSFF(nn.Module):
         radiance = volume.weighted_sum(w.static, static.radiance) + volume.weighted_sum(w.dynamic, dynamic.radiance)
         both = w.static + w.dynamic
         scene_flow = {o: volume.weighted_sum(w.dynamic, flow[:, :, i]) for i, o in enumerate((FORWARD, BACKWARD))}
-        return Render(radiance, volume.expected_depth(both, m.depths, self.far), both.sum(-1), w.dynamic.sum(-1), scene_flow)
+        return Render(radiance, volume.expected_depth(both, m.depths, self.far), w.opacity, w.dynamic.sum(-1), scene_flow)
 
     def dynamic_between(self, m: March, knot: float) -> tuple[Content, Tensor]:
         """Dynamic content at a knot, or between two: each neighbour's content moved along its scene flow and cross-faded.
@@ -240,7 +240,9 @@ class NSFF(nn.Module):
         """Dynamic content at an integer knot. With `moved` = (direction, fraction): what will be (0: forward) or was (1: backward)
         at the samples after that fraction of its scene flow, found by one backward step along the flow at the sample."""
         flat, shape = m.coords.reshape(-1, 3), m.depths.shape
-        keep = self.dynamic_cells.asks(flat, knot, 0.0, None) if self.config.cull else torch.ones(len(flat), dtype=torch.bool)
+        keep = (
+            self.dynamic_cells.asks(flat, knot, 0.0, None) if self.config.cull else torch.ones_like(flat[:, 0], dtype=torch.bool)
+        )
         index = keep.nonzero()[:, 0]
         coords, views = flat[index], self.views(m, index)
         if moved is not None and len(index):
@@ -268,7 +270,8 @@ class NSFF(nn.Module):
         return Layers(positions, alpha, radiance, flow, motion)
 
     def layers_of(self, camera: Camera, knot: float, pixels: Tensor) -> Layers:
-        """Layers of a few thousand pixels: two per sample, which together are exactly the sample's share of `render`."""
+        """Layers of a few thousand pixels: two per sample, the dynamic one in front. Together they stop what the sample stops in
+        `render` where densities add up; where both contents are dense in one sample, `render` shares it between them instead."""
         m = self.march(camera, pixels, self.config.render_samples, None)
         static = self.static_content(m, self.kept(m, knot, 0.0, None)[0])
         dynamic, flow = self.dynamic_at(m, round(knot), None)

@@ -42,7 +42,7 @@ def paint(field: NSFF, frames: list[Frame], to_radiance: Callable[[Tensor, int],
     `to_radiance(rgb (P, 3), i)` inverts the recording of frame `i`."""
     if not isinstance(field.branches, GridBranches) or any(f.disparity is None for f in frames):
         return False
-    splashes = [splash(field, f, lambda rgb, i=i: to_radiance(rgb, i)) for i, f in enumerate(track(frames, "painting"))]
+    splashes = [splash(field, f, i, to_radiance) for i, f in enumerate(track(frames, "painting"))]
     static, dynamic = field.branches.static_grid, field.branches.dynamic_grid
     paint_density(static, splashes, static_density_level(static), moving=False, bias=field.density_bias(static=True))
     paint_radiance(static, splashes, moving=False)
@@ -61,8 +61,8 @@ def static_density_level(grid: AdditiveGrid) -> int:
     return dense[-1] if dense else 0
 
 
-def splash(field: NSFF, f: Frame, to_radiance: Callable[[Tensor], Tensor]) -> Splash:
-    """Points, colours and crossed space of one frame."""
+def splash(field: NSFF, f: Frame, position: int, to_radiance: Callable[[Tensor, int], Tensor]) -> Splash:
+    """Points, colours and crossed space of the frame at `position` of the training frames."""
     assert f.disparity is not None
     rays = f.camera.rays(f.camera.pixel_grid())
     disparity = f.disparity.reshape(-1).clamp(1 / field.far, 1 / field.near)
@@ -74,7 +74,7 @@ def splash(field: NSFF, f: Frame, to_radiance: Callable[[Tensor], Tensor]) -> Sp
     confidence = torch.ones_like(disparity) if f.disparity_confidence is None else f.disparity_confidence.reshape(-1)
     return Splash(
         coords=coords,
-        log_radiance=to_radiance(rgb).clamp_min(1e-5).log() - field.bias,
+        log_radiance=to_radiance(rgb, position).clamp_min(1e-5).log() - field.bias,
         trust=(confidence + 0.02) * exposure_trust(rgb),
         moving=torch.zeros_like(disparity, dtype=torch.bool) if f.moving is None else f.moving.reshape(-1),
         crossed=crossed,
