@@ -204,12 +204,13 @@ def standard_shots(run: Run, out: Path, budget: float, refused: list[str]) -> li
                 f"{name}: {len(chosen)} of {len(shot.views)} views at {scale:.0%} size, to keep to {budget:.0f} s; "
                 f"`hdr-nsff render {run.folder} --path {name}` makes them all"
             )
-        fps = shot.fps * len(chosen) / len(shot.views) if name == "training" else shot.fps  # skipped frames do not make it faster
+        fps = shot.fps * len(chosen) / len(shot.views) if name in THINNED else shot.fps  # skipped views do not make it faster
         shots.append(Shot(name, [shot.views[i].resized(scale) for i in chosen], fps))
     return shots
 
 
 SHARE = {"training": 0.3, "fixed": 0.2, "bullet": 0.15, "slowmo": 0.35}  # of the budget
+THINNED = ("training", "bullet")  # cut to the budget by leaving out views all over; the others keep to the middle of the clip
 SCALES = (1.0, 0.75, 0.67, 0.5, 0.35, 0.25)
 NARROWEST = 160  # pixels: videos do not shrink below this width
 
@@ -230,7 +231,7 @@ def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused
     for shot in shots:
         costs = [speed.at if min(abs(v.time - t) for t in times) < 1e-3 else speed.between for v in shot.views]
         smallest = 1.0 if shot.name == "training" else min(1.0, NARROWEST / shot.views[0].camera.width)
-        scale, chosen = cut(costs, SHARE[shot.name] * budget, smallest, thin=shot.name in ("training", "bullet"))
+        scale, chosen = cut(costs, SHARE[shot.name] * budget, smallest, thin=shot.name in THINNED)
         plan[shot.name] = {"scale": scale, "views": chosen}
     told = {"seconds_at_a_time": speed.at, "seconds_between": speed.between, "refused": list(refused)}
     io.write_json(file, {"key": key, **told, "shots": plan})
