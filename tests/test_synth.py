@@ -273,3 +273,18 @@ def test_surfaces_lie_on_the_rays_through_pixel_centres(tracer: Tracer) -> None:
     assert set(np.unique(surface.bodies)) == {ROOM, BOX, BALL}
     ball = surface.points[surface.bodies == BALL] - (body_pose("ball", 3.0) @ [0, CORD, 0, 1])[:3]
     assert np.abs(np.linalg.norm(ball, axis=1) - 0.165).min() < 0.003  # on the sphere, where it is no cord
+
+
+def test_the_demo_is_whole_and_small_enough_for_git() -> None:
+    demo = Path(__file__).parents[1] / "demo"
+    assert sum(f.stat().st_size for f in demo.rglob("*") if f.is_file()) < 4_000_000
+    frames = np.stack([rgb for rgb, _ in io.read_video(demo / "clip.mp4")])
+    assert frames.shape == (36, 136, 240, 3)
+    means = frames.mean((1, 2, 3)).reshape(12, 3)
+    assert (np.diff(means, axis=1) > 0.1).all()  # dark, middle, bright, over and over
+    truth = Truth.open(demo / "truth")
+    for view in truth.views:
+        assert io.read_exr(demo / "truth" / view.radiance)["RGB"].shape == (136, 240, 3)
+        assert 0.02 < io.read_mask(demo / "truth" / str(view.mask)).mean() < 0.15
+    np.testing.assert_allclose(np.array(truth.clip_c2w), [s.c2w for s in clip_shots(36, 1, 0)])  # the code still makes this clip
+    assert [(v.name, v.time, v.anchor) for v in truth.views] == [(s.name, s.time, s.anchor) for s in truth_shots(36, 1, 0)]

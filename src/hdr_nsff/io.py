@@ -125,7 +125,7 @@ def read_image(path: Path | str) -> np.ndarray:
         raise InputError(f"{path}: not a readable image (PNG, JPEG or TIFF)")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: {image.dtype} pixels; convert to 8 or 16 bits, or to EXR for linear data")
-    return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / np.float32(np.iinfo(image.dtype).max)
+    return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / (255 if image.dtype == np.uint8 else 65535)
 
 
 def read_mask(path: Path | str) -> np.ndarray:
@@ -175,34 +175,34 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
     return channels
 
 
-def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float = 24.0, crf: int = 16) -> int:
+def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float = 24.0, crf: int = 16, footage: bool = False) -> int:
     """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4 (8 bits, Rec. 709 tags, fast start), atomically; the number of frames written.
 
+    `footage` keeps the colour of every pixel (4:4:4) and the grain: for video to be measured, browsers do not play it.
     Odd sizes lose their last row or column (4:2:0 needs even ones)."""
     import av
 
     count = 0
-    with atomic(path) as temporary:
-        with av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
-            stream: Any = None
-            for frame in frames:
-                h, w = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
-                if stream is None:
-                    stream = container.add_stream(
-                        "libx264", rate=Fraction(fps).limit_denominator(1001), options={"crf": str(crf)}
-                    )
-                    stream.width, stream.height, stream.pix_fmt = w, h, "yuv420p"
-                    tag(stream.codec_context)
-                data = np.rint(np.clip(frame[:h, :w], 0, 1) * 255).astype(np.uint8)
-                picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(data), format="rgb24").reformat(
-                    format="yuv420p", dst_colorspace="ITU709", dst_color_range="MPEG"
-                )
-                tag(picture)
-                container.mux(stream.encode(picture))
-                count += 1
+    pixels = "yuv444p" if footage else "yuv420p"
+    options = {"crf": str(crf)} | ({"tune": "grain", "preset": "slow"} if footage else {})
+    with atomic(path) as temporary, av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
+        stream: Any = None
+        for frame in frames:
+            h, w = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
             if stream is None:
-                raise InputError(f"{path}: no frames to write")
-            container.mux(stream.encode())
+                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=options)
+                stream.width, stream.height, stream.pix_fmt = w, h, pixels
+                tag(stream.codec_context)
+            data = np.rint(np.clip(frame[:h, :w], 0, 1) * 255).astype(np.uint8)
+            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(data), format="rgb24").reformat(
+                format=pixels, dst_colorspace="ITU709", dst_color_range="MPEG"
+            )
+            tag(picture)
+            container.mux(stream.encode(picture))
+            count += 1
+        if stream is None:
+            raise InputError(f"{path}: no frames to write")
+        container.mux(stream.encode())
     return count
 
 
