@@ -240,6 +240,24 @@ def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
         parse_ev(text)
 
 
+@pytest.mark.parametrize(
+    "change", [{"frames": 3}, {"seed": -1}, {"spp": 0}, {"noise": -1.0}, {"noise": float("nan")}, {"response": "kodak"}]
+)
+def test_bad_numbers_are_refused_before_anything_is_rendered(flat: SynthConfig, change: dict) -> None:
+    with pytest.raises(InputError):
+        synth(replace(flat, **change))
+    assert Flat.rendered == 0 and not flat.out.exists()
+
+
+def test_unusable_variants_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
+    monkeypatch.setattr(pathtracer, "newest_llvm", lambda: None)
+    with pytest.raises(InputError, match="libllvm19"):
+        pathtracer.start("llvm_ad_rgb")
+    with pytest.raises(InputError, match="use auto"):
+        pathtracer.start("fast")
+
+
 def test_a_missing_mitsuba_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mitsuba", None)
     with pytest.raises(InputError, match=r"hdr-nsff\[synth\]"):

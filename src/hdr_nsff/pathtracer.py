@@ -2,7 +2,7 @@
 (Mitsuba's own depth and position channels are averaged over the pixel, and its depth runs along the ray).
 
 Radiance is made in two parts, which gives a tenth of the plain path tracer's noise in the same time: light that comes
-straight from a lamp, one lamp at a time (as sharp as it is); and light that bounced, which is what full paths see beyond
+straight from a lamp, one lamp at a time, as sharp as it is; and light that bounced, which is what full paths see beyond
 that, divided by albedo, averaged over 5 cm of each surface, and multiplied by albedo again.
 
 The LLVM variant is some four times faster than the scalar one; it needs LLVM 16 or newer (Debian: `libllvm19`)."""
@@ -51,6 +51,10 @@ def start(variant: str) -> Any:
         variant = "llvm_ad_rgb" if library is not None else "scalar_rgb"
         if library is None:
             say("no LLVM 16 or newer found: rendering with scalar_rgb, about four times slower (Debian: apt install libllvm19)")
+    if variant not in mi.variants():
+        raise InputError(f"--variant {variant!r}: not one of Mitsuba's; use auto, scalar_rgb or llvm_ad_rgb")
+    if variant.startswith("llvm") and library is None:
+        raise InputError(f"--variant {variant}: no LLVM 16 or newer found; install one (Debian: libllvm19) or use scalar_rgb")
     mi.set_variant(variant)
     mi.set_log_level(mi.LogLevel.Error)
     return mi

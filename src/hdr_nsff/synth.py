@@ -42,7 +42,7 @@ class SynthConfig:
     ev: str = "-4,-2,0"  # the exposures that alternate, in stops, in the order they are taken
     response: str = "film"  # the camera's response curve: film, gamma or srgb
     noise: float = 1.0  # times the noise of a small sensor; 0 is a perfect one
-    spp: int = 256  # paths per pixel
+    spp: int = 256  # paths per pixel; above 64 rounded to a multiple of it
     truth_spp: int = 768  # paths per pixel of the held-out views
     seed: int = 0  # of textures, paths and noise
     variant: str = "auto"  # Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb
@@ -65,8 +65,7 @@ class Shot:
 def synth(config: SynthConfig) -> None:
     """Render, record and write everything; InputError where the settings or the output folder make no sense."""
     size, evs = parse_size(config.size), parse_ev(config.ev)
-    if config.frames < 12:
-        raise InputError(f"--frames {config.frames}: at least 12 are needed for held-out views far from the frames of their time")
+    check(config)
     clip = clip_shots(config.frames, config.spp, config.seed)
     views = truth_shots(config.frames, config.truth_spp, config.seed)
     K = intrinsics(*size)
@@ -83,6 +82,21 @@ def synth(config: SynthConfig) -> None:
     say(
         f"{config.out}/clip.mp4: {len(clip)} frames of {size[0]}x{size[1]}, exposures {config.ev}; {len(views)} held-out views in truth/"
     )
+
+
+def check(config: SynthConfig) -> None:
+    """InputError for numbers out of range, before anything is rendered."""
+    response_curve(config.response)
+    if not 12 <= config.frames <= 400:
+        raise InputError(
+            f"--frames {config.frames}: 12 to 400 can be made; fewer leave no views far from the frames of their time"
+        )
+    if not 0 <= config.seed < 1000:
+        raise InputError(f"--seed {config.seed}: must be from 0 to 999")
+    if min(config.spp, config.truth_spp) < 1:
+        raise InputError(f"--spp {config.spp} --truth-spp {config.truth_spp}: at least one path per pixel is needed")
+    if not 0 <= config.noise < 1000:
+        raise InputError(f"--noise {config.noise}: must be from 0 (a perfect sensor) to 1000")
 
 
 def parse_size(text: str) -> tuple[int, int]:
