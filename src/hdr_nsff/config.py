@@ -35,7 +35,7 @@ class TrainConfig:
     """More pixels of a batch, from the moving mask."""
     moving_until: float = 1.0
     """Share of the run (or phase, for `paper`) up to which moving pixels are added."""
-    batches: int = 2
+    batches: int = 1
     """Batches (each of one random frame) of a step, over all devices together."""
     period: float = 0.5
     """The schedules' period K as a share of the run; 0: the published K = 1000 min(max(30, frames), 250) steps."""

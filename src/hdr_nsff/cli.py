@@ -1,0 +1,110 @@
+"""The command line: one verb, one function, one config. Bad input is one sentence and exit code 2."""
+
+from __future__ import annotations
+
+import errno
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import tyro
+
+from hdr_nsff import __version__
+from hdr_nsff.config import PRESETS, TrainConfig
+from hdr_nsff.errors import InputError
+from hdr_nsff.evaluate import EvaluateConfig, evaluate
+from hdr_nsff.prepare import PrepareConfig, prepare
+from hdr_nsff.progress import say
+from hdr_nsff.reexpose import ReexposeConfig, reexpose
+from hdr_nsff.render import RenderConfig, render
+from hdr_nsff.report import ReportConfig, report
+from hdr_nsff.run_all import RunConfig, run_all
+from hdr_nsff.synth import SynthConfig, synth
+from hdr_nsff.train import train
+
+
+@dataclass(frozen=True)
+class Verb:
+    """What a word on the command line does."""
+
+    act: Callable[[Any], Any]
+    config: Any  # a config dataclass, or {preset name: default config}
+    summary: str
+
+
+VERBS = {
+    "run": Verb(run_all, RunConfig, "Footage to HDR in one go: prepare, train, render, evaluate, report."),
+    "prepare": Verb(prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."),
+    "train": Verb(train, PRESETS, "Train a radiance field from a scene folder: `train grid`, `train paper`, `train tiny`."),
+    "render": Verb(render, RenderConfig, "Views of a trained run: EXR, PNG, video; any path, time and exposure."),
+    "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
+    "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
+    "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),
+    "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
+}
+PRESET_HELP = {
+    "grid": "Additive grids, minutes on a CPU; the default of `run`.",
+    "paper": "The published network, losses and schedules; hours on a GPU.",
+    "tiny": "Seconds on a CPU, to try things out.",
+}
+
+
+def usage() -> str:
+    """What `hdr-nsff --help` prints."""
+    lines = [f"  {name:<10} {verb.summary}" for name, verb in VERBS.items()]
+    tail = "`hdr-nsff VERB --help` explains a verb; `hdr-nsff VERB --tyro-print-completion bash` prints its shell completion."
+    return "\n".join(
+        [
+            "usage: hdr-nsff [--version] VERB ...",
+            "",
+            "Alternating-exposure footage in, dynamic HDR radiance field out.",
+            "",
+            *lines,
+            "",
+            tail,
+        ]
+    )
+
+
+def parse(verb: Verb, name: str, arguments: Sequence[str]) -> Any:
+    """The config of a verb from its arguments; tyro prints help and typos itself and exits."""
+    if isinstance(verb.config, dict):
+        presets = {k: (PRESET_HELP[k], v) for k, v in verb.config.items()}
+        config = tyro.extras.overridable_config_cli(presets, prog=f"hdr-nsff {name}", args=arguments)
+        assert isinstance(config, TrainConfig)
+        return config
+    return tyro.cli(verb.config, prog=f"hdr-nsff {name}", args=arguments, config=(tyro.conf.OmitSubcommandPrefixes,))
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb; exits with 0, 2 (bad input) or 130 (Ctrl-C)."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if arguments[:1] == ["--version"]:
+        print(f"hdr-nsff {__version__}")
+        return
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(usage())
+        raise SystemExit(0 if arguments else 2)
+    if arguments[0] not in VERBS:
+        fail(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}")
+    verb = VERBS[arguments[0]]
+    try:
+        verb.act(parse(verb, arguments[0], arguments[1:]))
+    except InputError as error:
+        fail(str(error))
+    except KeyboardInterrupt:
+        say("stopped; the same command goes on where it was")
+        raise SystemExit(130) from None
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
+            raise
+        fail(
+            f"{error.filename or 'output'}: {error.strerror}; make room or choose another place, the same command goes on where it was"
+        )
+
+
+def fail(message: str) -> None:
+    """Print one sentence and exit with code 2."""
+    print(f"hdr-nsff: {message}", file=sys.stderr)
+    raise SystemExit(2)

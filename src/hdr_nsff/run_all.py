@@ -1,0 +1,73 @@
+"""Video to HDR in one go: prepare, train, render, evaluate, report. Each part keeps what it has done, so a killed run goes on."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from tyro.conf import Positional
+
+from hdr_nsff.config import PRESETS
+from hdr_nsff.evaluate import evaluate_run
+from hdr_nsff.prepare import PrepareConfig, prepare
+from hdr_nsff.progress import say
+from hdr_nsff.render import render_all
+from hdr_nsff.report import write_report
+from hdr_nsff.run import Run
+from hdr_nsff.train import train
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """Alternating-exposure footage in; linear HDR novel views at novel times out.
+
+    Does everything: exposures, poses, flow, masks and depth (`prepare`), training (`train`), EXR sequence, videos and LDR
+    views (`render`), held-out quality (`evaluate`), report.html. Killed? The same command goes on where it was."""
+
+    clip: Positional[Path]
+    """Footage: a video, a folder of frames, or a folder of such folders (one per synchronized camera)."""
+    out: Positional[Path]
+    """Folder for everything: scene/, run/, render/, report.html."""
+    exposures: str | None = None
+    """Exposure times of one cycle in seconds, e.g. 1/1000,1/250,1/60. Default: CSV beside the clip, EXIF, else learned."""
+    ev: str | None = None
+    """The same as log2 exposures, e.g. -4,-2,0."""
+    preset: Literal["grid", "paper", "tiny"] = "grid"
+    """grid: minutes on a CPU; paper: the published network (hours on a GPU); tiny: seconds, to try things out."""
+    minutes: float | None = None
+    """Training time instead of the preset's."""
+    truth: Path | None = None
+    """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the clip are trained on."""
+    poses: Path | None = None
+    """Given poses (COLMAP model, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    hold_out: int | None = None
+    """Keep every this many frames for `evaluate`; default 8, or 0 with a truth folder."""
+    max_size: int = 640
+    """Longest side in pixels; larger frames are shrunk."""
+    seed: int = 0
+    device: str = "auto"
+    """auto, cpu or cuda."""
+
+
+def run_all(config: RunConfig) -> None:
+    """The whole way from footage to report; prints where the results are."""
+    start = time.monotonic()
+    hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
+    scene = prepare(
+        PrepareConfig(
+            clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev,
+            max_size=config.max_size, hold_out=hold_out, poses=config.poses,
+        )
+    )  # fmt: skip
+    settings = replace(PRESETS[config.preset], scene=scene, out=config.out / "run", seed=config.seed, device=config.device)
+    if config.minutes is not None:
+        settings = replace(settings, minutes=config.minutes, steps=None)
+    run = Run.open(train(settings), config.device)
+    results = render_all(run, config.out / "render")
+    evaluate_run(run, config.truth)
+    results["report"] = write_report(run, config.out / "report.html", config.out / "render")
+    say(f"done in {(time.monotonic() - start) / 60:.1f} minutes; results:")
+    for name, path in results.items():
+        say(f"  {name:<16} {path}")
