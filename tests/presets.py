@@ -8,7 +8,7 @@ import torch
 from hdr_nsff import distributed
 from hdr_nsff.config import PRESETS, TrainConfig
 from hdr_nsff.fields import build_field
-from hdr_nsff.fields.branches import GridConfig, MlpConfig
+from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpConfig
 from hdr_nsff.fields.nsff import NSFF
 from hdr_nsff.scene import Scene
 from hdr_nsff.train import Trainer, open_folder
@@ -35,6 +35,8 @@ def random_field(preset: str, scene: Scene, seed: int = 0) -> NSFF:
     field = build_field(small(preset).field, scene)
     for p in field.parameters():
         p.data.add_(0.3 * torch.randn_like(p))
+    if isinstance(field.branches, GridBranches):
+        field.branches.dynamic_grid.table.data[:, 3] += 1.5  # movers that cover something
     return field
 
 

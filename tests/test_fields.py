@@ -95,7 +95,7 @@ def test_a_training_pass_has_warps_and_regularisers(field: NSFF, toy: Scene) -> 
     assert [w.offset for w in render.warps] == [1, -1, -2]
     for w in render.warps:
         assert w.flow.shape == (50, 2) and w.radiance is not None and w.radiance.shape == (50, 3)
-        assert 0 <= float(w.confidence.detach().min()) and float(w.confidence.detach().max()) <= 1
+        assert float(w.confidence.detach().min()) >= 0 and float(w.confidence.detach().max()) <= 1
     blended = field.config.compositing == "blend"
     assert set(own) == {"cycle", "kinetic", "smoothness", "disocclusion"} | ({"blend_entropy"} if blended else set())
     assert (render.dynamic_radiance is not None) == blended
