@@ -37,7 +37,7 @@ class TrainConfig:
     """Share of the run (or phase, for `paper`) up to which moving pixels are added."""
     batches: int = 1
     """Batches (each of one random frame) of a step, over all devices together."""
-    period: float = 0.5
+    period: float = 0.45
     """The schedules' period K as a share of the run; 0: the published K = 1000 min(max(30, frames), 250) steps."""
     lr_final: float = 0.05
     """Learning rates fall exponentially to this share of their start over the run; 0: the published 0.1 per 300k steps."""
@@ -65,8 +65,8 @@ class TrainConfig:
     @staticmethod
     def from_json(data: dict[str, Any]) -> TrainConfig:
         """The config of a run. InputError where a key is missing or unknown (another version)."""
-        data = dict(data)
         try:
+            data = dict(data)
             encodings = {"GridConfig": GridConfig, "MlpConfig": MlpConfig}
             encoding = encodings[data.pop("encoding")](**data["field"]["encoding"])
             parts = {
@@ -77,7 +77,7 @@ class TrainConfig:
                 "out": Path(data["out"]),
             }
             return TrainConfig(**{**data, **parts})
-        except (KeyError, TypeError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise InputError(
                 f"the run's config.json is from another version or damaged ({error}); train again into a new folder"
             ) from error

@@ -74,4 +74,4 @@ def optical_flow(flow: Tensor, target: Tensor, valid: Tensor, limit: float | Non
 def motion_mask(motion: Tensor, moving: Tensor) -> Tensor:
     """Cross-entropy between the rendered share of dynamic content (N,) and the moving mask (N,) bool, in float32."""
     inside = motion * (1 - 2e-4) + 1e-4  # not a clamp: a mover that is nowhere yet must feel the mask
-    return torch.nn.functional.binary_cross_entropy(inside, moving.to(motion))
+    return -torch.where(moving, inside, 1 - inside).log().mean()

@@ -111,7 +111,10 @@ def pick_device(name: str) -> torch.device:
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise InputError("--device cuda: this torch sees no CUDA device; leave the flag out to use the CPU")
-    return torch.device(name)
+    try:
+        return torch.device(name)
+    except RuntimeError as error:
+        raise InputError(f"--device {name}: no such device; choose auto, cpu or cuda") from error
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,7 @@ def piecewise_linear(x: Tensor, values: Tensor, knots: Tensor, power: float) -> 
     inside = x.clamp(0, 1)
     last = len(knots) - 2
     place = inside.detach() if power == 1 else inside.detach().pow(power)
-    bins = (place * (last + 1)).to(torch.int64).clamp_(max=last)  # (N, 3)
+    bins = (place * (last + 1)).to(torch.int64).clamp_(0, last)  # (N, 3); NaN has no bin and stays NaN
     share = (inside - knots[bins]) * (1 / (knots[1:] - knots[:-1]))[bins]
     columns = values.T
     left = columns.gather(0, bins)

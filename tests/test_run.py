@@ -1,0 +1,217 @@
+"""Run folders: what is written, what is kept, and what is said where something is damaged or from another version."""
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from presets import small, trainer
+from safetensors.torch import save_file
+
+from hdr_nsff.config import PRESETS, TrainConfig
+from hdr_nsff.errors import InputError
+from hdr_nsff.run import (
+    Run,
+    latest_checkpoint,
+    pick_device,
+    read_checkpoint,
+    read_config,
+    read_log,
+    save_checkpoint,
+    write_config,
+)
+from hdr_nsff.scene import Scene
+from hdr_nsff.train import train
+
+
+@pytest.fixture(scope="module")
+def finished(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two steps: checkpoints of step 0 and 2."""
+    return train(small("tiny", toy_folder, tmp_path_factory.mktemp("finished") / "run"))
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    """A copy to damage."""
+    return shutil.copytree(finished, tmp_path / "run")
+
+
+def newest(folder: Path) -> Path:
+    return max((folder / "checkpoints").glob("step_*.safetensors"))
+
+
+def test_a_run_opens_to_the_field_that_was_trained(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+    t = trainer(small("tiny", toy_folder, tmp_path / "run", 3), toy)
+    t.loop()
+    opened, camera = Run.open(tmp_path / "run"), toy.train[1].camera
+    assert opened.step == 3 and opened.seconds > 0
+    ours, theirs = t.field.render(camera, 1.5), opened.field.render(camera, 1.5)
+    assert torch.equal(ours.radiance, theirs.radiance) and torch.equal(ours.depth, theirs.depth)
+    a, b = (m.curve(0)[1] for m in (t.tonemapper, opened.tonemapper))
+    assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("preset", list(PRESETS))
+def test_every_preset_survives_json(preset: str) -> None:
+    config = PRESETS[preset]
+    assert TrainConfig.from_json(json.loads(json.dumps(config.to_json()))) == config
+
+
+def test_the_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
+    for step in (0, 9, 10, 100):
+        save_checkpoint(tmp_path, step, 0.5 * step, {"a": torch.full((2,), float(step))})
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == [
+        "step_00000010.safetensors",
+        "step_00000100.safetensors",
+    ]
+    found = latest_checkpoint(tmp_path)
+    assert found is not None and (found.step, found.seconds, found.tensors["a"].tolist()) == (100, 50.0, [100.0, 100.0])
+
+
+def test_a_failed_write_leaves_the_checkpoints_as_they_were(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    save_checkpoint(tmp_path, 1, 0.0, {"a": torch.ones(2)})
+
+    def full(tensors: object, path: Path, metadata: object) -> None:
+        path.write_bytes(b"half of it")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("hdr_nsff.run.save_file", full)
+    with pytest.raises(OSError, match="No space"):
+        save_checkpoint(tmp_path, 2, 0.0, {"a": torch.ones(2)})
+    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["step_00000001.safetensors"]
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def other_version(path: Path) -> None:
+    save_file({"a": torch.ones(1)}, path, metadata={"format": "hdr-nsff checkpoint 99", "step": "2", "seconds": "0"})
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+DAMAGE = {"cut short or damaged": cut, "another version": other_version, "cut short": empty}
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_a_bad_checkpoint_gives_way_to_the_one_before_and_that_is_said(
+    what: str, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    DAMAGE[what](newest(run))
+    opened = Run.open(run)
+    said = " ".join(capsys.readouterr().err.split())
+    assert opened.step == 0 and what in said and "going on from the one before, step 0" in said and newest(run).name in said
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_training_goes_on_from_the_one_before_too(what: str, run: Path, toy_folder: Path, finished: Path) -> None:
+    DAMAGE[what](newest(run))
+    train(replace(small("tiny", toy_folder, run)))
+    ours, theirs = read_checkpoint(newest(run)), read_checkpoint(newest(finished))
+    assert ours.step == 2 and all(torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items())
+
+
+def test_no_readable_checkpoint_is_an_error(run: Path) -> None:
+    for path in (run / "checkpoints").iterdir():
+        cut(path)
+    with pytest.raises(InputError, match=r"no readable checkpoint .*train again into a new folder"):
+        Run.open(run)
+
+
+def test_no_checkpoint_yet_is_an_error(run: Path) -> None:
+    shutil.rmtree(run / "checkpoints")
+    with pytest.raises(InputError, match="no checkpoint yet"):
+        Run.open(run)
+
+
+def change_config(run: Path, change: Callable[[dict], object]) -> None:
+    path = run / "config.json"
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+CONFIG_DAMAGE: dict[str, Callable[[dict], object]] = {
+    "unknown key": lambda d: d.update(sparkle=1),
+    "unknown key in a part": lambda d: d["field"].update(sparkle=1),
+    "missing part": lambda d: d.pop("tonemap"),
+    "unknown encoding": lambda d: d.update(encoding="SplatConfig"),
+    "part of another type": lambda d: d.update(field=7),
+    "nothing at all": lambda d: d.clear(),
+}
+
+
+@pytest.mark.parametrize("what", CONFIG_DAMAGE)
+def test_a_config_of_another_version_is_said_to_be_one(what: str, run: Path) -> None:
+    change_config(run, CONFIG_DAMAGE[what])
+    with pytest.raises(InputError, match="another version or damaged"):
+        Run.open(run)
+
+
+@pytest.mark.parametrize("text", ["{", "", "[]", "3", "\x00\x01"])
+def test_a_config_that_is_no_config_is_refused(text: str, run: Path) -> None:
+    (run / "config.json").write_text(text)
+    with pytest.raises(InputError, match=r"config\.json"):
+        Run.open(run)
+
+
+def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="not a run folder"):
+        Run.open(tmp_path)
+
+
+def test_a_scene_that_moved_away_is_named(run: Path) -> None:
+    change_config(run, lambda d: d.update(scene="/nowhere/scene"))
+    with pytest.raises(InputError, match=r"/nowhere/scene: no scene\.json here"):
+        Run.open(run)
+
+
+def test_a_checkpoint_of_another_network_does_not_fit(run: Path) -> None:
+    change_config(run, lambda d: d["field"]["encoding"].update(levels=3))
+    with pytest.raises(InputError, match="does not fit this run's field"):
+        Run.open(run)
+
+
+def test_a_log_line_cut_short_is_left_out_and_the_next_one_is_whole(run: Path, toy: Scene) -> None:
+    path = run / "log.jsonl"
+    path.write_text('{"step": 25, "psnr": 10.0}\n{"step": 50, "psn')
+    assert [line["step"] for line in read_log(run)] == [25]
+    t = trainer(replace(read_config(run), steps=2, out=run), toy)
+    t.log({"psnr": 20.0, "depth": 1.0})
+    t.clock = replace(t.clock, step=75)
+    t.log({"psnr": 30.0})
+    lines = read_log(run)
+    assert [line["step"] for line in lines] == [2, 25, 75] and lines[0]["losses"] == {"depth": 1.0}
+    assert path.read_text().count("\n") == 4
+
+
+def test_a_step_logged_twice_counts_once(run: Path) -> None:
+    (run / "log.jsonl").write_text('{"step": 25, "psnr": 1}\n{"step": 50, "psnr": 2}\n{"step": 25, "psnr": 3}\n')
+    assert [(line["step"], line["psnr"]) for line in read_log(run)] == [(25, 3), (50, 2)]
+
+
+def test_without_a_log_there_are_no_lines(tmp_path: Path) -> None:
+    assert read_log(tmp_path) == []
+
+
+def test_config_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+    write_config(tmp_path, PRESETS["tiny"])
+    assert read_config(tmp_path) == PRESETS["tiny"] and [p.name for p in tmp_path.iterdir()] == ["config.json"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_asking_for_cuda_where_there_is_none_is_an_error() -> None:
+    assert pick_device("auto") == pick_device("cpu") == torch.device("cpu")
+    with pytest.raises(InputError, match="no CUDA device"):
+        pick_device("cuda")
+
+
+def test_a_device_that_does_not_exist_is_an_error() -> None:
+    with pytest.raises(InputError, match="--device gpu7"):
+        pick_device("gpu7")

@@ -1,0 +1,211 @@
+"""The loop: same seed same parameters, killed and resumed like unbroken, two processes like one; clocks and schedules."""
+
+import contextlib
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from presets import small, trainer
+from safetensors.torch import load_file
+from torch import Tensor
+
+from hdr_nsff import distributed
+from hdr_nsff.config import PRESETS, TrainConfig
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import write_json
+from hdr_nsff.run import Run
+from hdr_nsff.scene import Scene
+from hdr_nsff.train import Clock, Trainer, train
+
+STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
+
+
+def config(scene: Path, out: Path, preset: str = "grid") -> TrainConfig:
+    return replace(small(preset, scene, out, STEPS), batches=2, seed=3)
+
+
+def final(run: Path) -> dict[str, Tensor]:
+    """The newest checkpoint: parameters, culling grids, moments."""
+    return load_file(max((run / "checkpoints").glob("step_*.safetensors")))
+
+
+def assert_same(a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
+    assert a.keys() == b.keys()
+    different = [k for k in a if not torch.equal(a[k], b[k])]
+    assert not different, different
+
+
+@pytest.fixture(scope="module")
+def unbroken(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of `STEPS` steps in one go."""
+    return train(config(toy_folder, tmp_path_factory.mktemp("unbroken") / "run"))
+
+
+def test_the_same_seed_gives_the_same_parameters_bit_for_bit(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+    again = final(train(config(toy_folder, tmp_path / "run")))
+    assert_same(final(unbroken), again)
+    assert any(k.startswith("optimiser.touched.") for k in again) and "field.static_cells.weight" in again
+
+
+def test_another_seed_gives_others(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+    other = final(train(replace(config(toy_folder, tmp_path / "run"), seed=4)))
+    name = "field.branches.static_grid.table"
+    assert not torch.equal(final(unbroken)[name], other[name])
+
+
+@pytest.mark.parametrize("preset", ["grid", "paper"])
+def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
+    preset: str, unbroken: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(config(toy_folder, tmp_path / "run", preset), checkpoint_seconds=0.0)
+    straight = final(
+        unbroken if preset == "grid" else train(replace(settings, out=tmp_path / "straight", checkpoint_seconds=1e9))
+    )
+    monkeypatch.setattr(Trainer, "preview", lambda self: None)
+    step = Trainer.step
+    for stop in (3, 17):  # before and after culling starts and the tone mapper is anchored
+
+        def stopping(self: Trainer, stop: int = stop) -> dict[str, float]:
+            if self.clock.step == stop:
+                raise KeyboardInterrupt
+            return step(self)
+
+        monkeypatch.setattr(Trainer, "step", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            train(settings)
+        assert max(p.name for p in (settings.out / "checkpoints").iterdir()) == f"step_{stop:08d}.safetensors"
+    monkeypatch.setattr(Trainer, "step", step)
+    assert_same(final(train(settings)), straight)
+
+
+def command(settings: TrainConfig, *launcher: str) -> subprocess.Popen[bytes]:
+    """`hdr-nsff train` in processes of its own."""
+    script = settings.out.parent / "again.py"
+    script.write_text(
+        "import json, sys\nfrom hdr_nsff.config import TrainConfig\nfrom hdr_nsff.train import Trainer, train\n"
+        "Trainer.preview = lambda self: None\n"
+        "train(TrainConfig.from_json(json.loads(open(sys.argv[1]).read())))\n"
+    )
+    given = settings.out.parent / "given.json"
+    write_json(given, settings.to_json())
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
+    arguments = [sys.executable, *launcher, str(script), str(given)]
+    return subprocess.Popen(arguments, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+
+
+def test_a_run_killed_outright_resumes_to_the_same_parameters(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+    settings = replace(config(toy_folder, tmp_path / "run"), checkpoint_seconds=0.0)
+    process = command(settings)
+    deadline = time.monotonic() + 120
+    while len(list(tmp_path.glob("run/checkpoints/step_0000000[2-9]*"))) == 0:
+        assert process.poll() is None and time.monotonic() < deadline, process.stderr and process.stderr.read().decode()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    assert process.wait() == -signal.SIGKILL
+    left = max(p.name for p in (settings.out / "checkpoints").glob("step_*"))
+    assert left < f"step_{STEPS:08d}.safetensors", "killed too late to show anything"
+    assert_same(final(train(settings)), final(unbroken))
+
+
+def test_two_processes_do_what_one_does_and_resume_too(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+    settings = replace(config(toy_folder, tmp_path / "run"), checkpoint_seconds=0.0)
+    launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
+    one = final(unbroken)
+    for _ in range(2):
+        process = command(settings, *launcher)
+        _, errors = process.communicate(timeout=240)
+        assert process.returncode == 0, errors.decode()[-3000:]
+        two = final(settings.out)
+        assert two.keys() == one.keys()
+        for name in one:
+            if name.startswith(("field.", "tonemapper.")):
+                torch.testing.assert_close(two[name], one[name], atol=2e-6, rtol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
+        max((settings.out / "checkpoints").glob("step_*")).unlink()  # the second round goes on from the step before
+
+
+def test_more_processes_than_batches_is_said(toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(distributed, "group", lambda: contextlib.nullcontext(distributed.Ranks(0, 4)))
+    with pytest.raises(InputError, match="4 processes share 2 batches"):
+        train(config(toy_folder, tmp_path / "run"))
+
+
+def test_training_lowers_the_error(toy_folder: Path, tmp_path: Path) -> None:
+    settings = replace(small("grid", toy_folder, tmp_path / "run", 75), rays=192, moving_rays=64)
+    run = Run.open(train(settings))
+    log = run.log()
+    assert [line["step"] for line in log] == [25, 50, 75] and run.step == 75
+    assert log[-1]["psnr"] > log[0]["psnr"] + 1
+    assert {"photometric", "dynamic", "temporal", "cycle", "response_smoothness"} <= set(log[-1]["losses"])
+    assert list((settings.out / "previews").glob("*.png"))
+
+
+def test_other_settings_in_the_same_folder_are_refused(unbroken: Path, toy_folder: Path) -> None:
+    with pytest.raises(InputError, match="other settings"):
+        train(replace(config(toy_folder, unbroken), rays=65))
+
+
+def test_a_finished_run_stays_finished(unbroken: Path, toy_folder: Path) -> None:
+    before = final(unbroken)
+    train(config(toy_folder, unbroken))
+    assert_same(before, final(unbroken))
+
+
+def test_neither_steps_nor_minutes_is_refused(toy_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--steps"):
+        train(replace(config(toy_folder, tmp_path / "run"), steps=None))
+
+
+def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:
+    settings = replace(config(toy_folder, tmp_path / "run"), steps=None, minutes=1.5 / 60)
+    run = Run.open(train(settings))
+    assert run.step > 3 and 1.5 <= run.seconds < 4
+
+
+def test_draws_depend_on_seed_step_and_slot_alone(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+    t = trainer(config(toy_folder, tmp_path / "run"), toy)
+    first, same, slot = t.draw(0), t.draw(0), t.draw(1)
+    assert torch.equal(first.pixels, same.pixels) and first.seed == same.seed
+    t.clock = replace(t.clock, step=1)
+    assert len({first.seed, slot.seed, t.draw(0).seed}) == 3
+    frames = {t.draw(s).frame for s in range(40)}
+    assert frames == set(range(6))
+
+
+def test_nan_names_the_step_and_the_term(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+    t = trainer(config(toy_folder, tmp_path / "run"), toy)
+    t.field.branches.static_grid.table.data.fill_(math.nan)
+    with pytest.raises(FloatingPointError, match=r"step 0: the terms \['photometric'.* are not finite; pixel \["):
+        t.step()
+
+
+def at(preset: str, step: int, frames: int = 24, **changes: float) -> Clock:
+    return Clock(replace(PRESETS[preset], **changes), frames, step, 0.0)
+
+
+def test_the_published_period_is_a_thousand_steps_per_frame_between_30_and_250_frames() -> None:
+    for frames, period in ((6, 30_000), (30, 30_000), (100, 100_000), (999, 250_000)):
+        assert at("paper", period, frames).phase == 1.0
+        assert at("paper", period // 2, frames).phase == 0.5
+
+
+def test_the_published_learning_rate_falls_by_a_tenth_in_300_000_steps() -> None:
+    assert at("paper", 0).lr_share == 1.0
+    assert math.isclose(at("paper", 300_000).lr_share, 0.1)
+
+
+def test_grid_schedules_follow_the_share_of_the_run() -> None:
+    clock = at("grid", 50, steps=100)
+    assert clock.progress == 0.5 and clock.phase == 1.0 and math.isclose(clock.lr_share, 0.05**0.5)
+
+
+def test_without_steps_the_clock_counts_minutes() -> None:
+    clock = Clock(PRESETS["grid"], 24, 10**6, 75.0)
+    assert clock.progress == 0.25 and clock.phase == 0.5
+    assert replace(clock, seconds=1e6).progress == 1.0
