@@ -9,7 +9,7 @@ from hdr_nsff.io import write_exr, write_npy
 from hdr_nsff.priors import depth as depth_module
 from hdr_nsff.priors.depth import geometric_depth, read_depth
 from hdr_nsff.priors.fuse import carry_over, clean, fill, vote
-from hdr_nsff.priors.movers import differences, link, mover_depth, regions, smoothest_path, split
+from hdr_nsff.priors.movers import differences, link, mover_depth, regions, smoothest_path, split, steps_in_time
 from hdr_nsff.priors.parallax import Shots, choose_views, triangulate
 from hdr_nsff.priors.sweep import aggregate, best_share, box
 
@@ -115,7 +115,9 @@ def test_a_moving_region_is_believed_little_and_never_behind_the_scene():
     video, depth = plane(SWEEPING, 4.0, 0.0)
     moving = np.zeros(video.shape[:3], bool)
     moving[:, 16:32, 24:40] = True
-    video[moving] = plane(SWEEPING, 3.0, 0.0, seed=5)[0][moving]
+    drifting = SWEEPING.copy()
+    drifting[:, 1, 3] += 0.3 * np.arange(7) ** 1.5  # as if its camera went elsewhere: no one depth explains it
+    video[moving] = plane(drifting, 3.0, 0.0, seed=5)[0][moving]
     disparity, confidence, *_ = solve(SWEEPING, video, depth, moving=moving)
     assert confidence[moving].max() <= 0.5 < np.median(confidence[~moving])
     assert disparity[moving].min() > 0.98 / 4.0
@@ -142,13 +144,12 @@ def test_without_parallax_everything_is_at_distance_one_and_it_is_said(monkeypat
     assert "parallax" in said[0]
 
 
-@pytest.mark.parametrize("where", ["moving", "clipped"])
-def test_frames_without_anything_to_match_do_not_crash(where):
-    """Only structure from motion's points are left; nothing is believed."""
+def test_frames_without_anything_to_match_do_not_crash():
+    """All is clipped: only structure from motion's points are left; nothing is believed."""
     video, depth = plane(SWEEPING, 4.0, 0.0)
     points = np.stack([RAYS[::4, ::4, 0] * 4, RAYS[::4, ::4, 1] * 4, np.full((12, 16), 4.0)], -1).reshape(-1, 3)
-    everything = {where: np.ones(video.shape[:3], bool)}
-    disparity, confidence, near, far = solve(SWEEPING, video, depth, points=points, **everything)
+    clipped = np.ones(video.shape[:3], bool)
+    disparity, confidence, near, far = solve(SWEEPING, video, depth, points=points, clipped=clipped)
     assert np.isfinite(disparity).all() and (disparity > 0).all() and confidence.max() < 0.5 and 0 < near < far
 
 
@@ -267,15 +268,14 @@ def test_a_smooth_camera_leaves_the_prior():
 
 
 def crossing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A large square drifts right, a small one left behind it; they touch in frames 2 and 3. Masks (6, H, W), flow, pairs."""
-    large, small = [10 + 3 * t for t in range(6)], [38 - 4 * t for t in range(6)]
+    """A large square drifts right in front of a small still one; they touch from frame 3. Masks (6, H, W), flow, pairs."""
     moving, owner = np.zeros((6, H, W), bool), np.zeros((6, H, W), int)
     for t in range(6):
-        owner[t, 20:28, small[t] : small[t] + 8] = 2
-        owner[t, 16:32, large[t] : large[t] + 16] = 1
+        owner[t, 20:28, 34:44] = 2
+        owner[t, 16:32, 10 + 3 * t : 26 + 3 * t] = 1
         moving[t] = owner[t] > 0
     pairs = neighbours(6)
-    speed = np.array([0, 3, -4])
+    speed = np.array([0, 3, 0])
     flow = np.zeros((len(pairs), H, W, 2), np.float32)
     for k, (i, j) in enumerate(pairs):
         flow[k, ..., 0] = speed[owner[i]] * (j - i)
@@ -284,13 +284,30 @@ def crossing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_regions_are_followed_and_touching_ones_stay_two():
     moving, flow, pairs = crossing()
-    labels, valid = regions(moving), np.ones(flow.shape[:3], bool)
-    assert labels[0].max() == 2 and labels[2].max() == 1
-    split(labels, [(t, t + 1, flow[2 * t], valid[2 * t]) for t in range(3)])
-    assert labels[2].max() == 2
-    tracks = link(labels, np.arange(6.0), flow, valid, pairs)
+    labels, steps = regions(moving), steps_in_time(np.arange(6.0), flow, np.ones(flow.shape[:3], bool), pairs)
+    assert labels[2].max() == 2 and labels[3].max() == 1
+    split(labels, steps)
+    assert labels[3].max() == 2
+    tracks = link(labels, np.arange(6.0), steps)
     longest = max(tracks, key=lambda t: len(t.frames))
     assert longest.frames == [0, 1, 2, 3, 4, 5] and np.allclose(longest.motions[0], [3, 0])
+
+
+def test_a_region_that_does_not_flow_back_is_another_object():
+    moving, flow, pairs = crossing()
+    flow[1::2] = 40.0  # all backward flow leads elsewhere
+    steps = steps_in_time(np.arange(6.0), flow, np.ones(flow.shape[:3], bool), pairs)
+    assert all(len(t.frames) == 1 for t in link(regions(moving), np.arange(6.0), steps))
+
+
+def test_a_mask_over_the_static_scene_is_seen_through():
+    """A region that was called moving but obeys the plane's depth in all frames gets the plane's disparity and its confidence."""
+    video, depth = plane(SWEEPING, 4.0, 0.0)
+    moving = np.zeros(video.shape[:3], bool)
+    moving[3, 16:32, 24:40] = True
+    disparity, confidence, *_ = solve(SWEEPING, video, depth, moving=moving)
+    assert np.median(np.abs(disparity * depth - 1)[moving]) < 0.01
+    assert np.median(confidence[moving]) > 0.6
 
 
 def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth():

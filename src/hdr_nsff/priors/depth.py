@@ -7,6 +7,7 @@ maps made by any other tool."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, Protocol
 
@@ -16,7 +17,7 @@ import numpy as np
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_exr, read_image, read_npy
 from hdr_nsff.priors.flow import in_threads
-from hdr_nsff.priors.fuse import carry_over, clean, fill, vote
+from hdr_nsff.priors.fuse import AGREE, carry_over, clean, fill, vote
 from hdr_nsff.priors.movers import mover_depth
 from hdr_nsff.priors.parallax import Shots, choose_views, disparity_range, triangulate
 from hdr_nsff.priors.sweep import sweep
@@ -27,6 +28,7 @@ VIEWS = 12  # other frames compared per frame
 LEAST_PARALLAX = 1.0  # pixels: below this, between any two frames, depth cannot be told
 LEAST_POINTS = 30
 GUESSED = 0.02  # weight of a disparity that no view supports: only smoothness spoke
+STILL, STILL_CONFIDENCE = 0.7, 0.5  # match and fused confidence of a pixel in a moving mask that stands still after all
 EDGE = 0.06  # relative step of disparity within two pixels that makes a pixel doubtful: which side of the edge is it on?
 AT_EDGE = 0.5  # its confidence is multiplied by this
 
@@ -81,28 +83,28 @@ def geometric_depth(
     if parallax < LEAST_PARALLAX:
         say(f"depth: {parallax:.1f} pixels of parallax between the frames are too few: everything is put at distance 1")
         return np.ones((count, *size), np.float32), np.zeros((count, *size), np.float32), 0.5, 2.0
-    disparity, confidence = static_depth(shots, views, *disparity_range(shots, points))
-    with_movers, mover_confidence = mover_depth(shots, flow, valid, pairs, disparity)
-    seen_together = np.array([(times == t).sum() > 1 for t in times])[
-        :, None, None
-    ]  # synchronized cameras: the sweep saw movers too
-    own = moving & ~(seen_together & (confidence > mover_confidence))
-    disparity, confidence = np.where(own, with_movers, disparity), np.where(own, mover_confidence, confidence)
+    disparity, confidence, still = static_depth(shots, views, *disparity_range(shots, points))
+    moves = moving & ~still
+    with_movers, mover_confidence = mover_depth(replace(shots, moving=moves), flow, valid, pairs, disparity)
+    disparity, confidence = np.where(moves, with_movers, disparity), np.where(moves, mover_confidence, confidence)
     confidence = np.stack([doubt_edges(d, c) for d, c in zip(disparity, confidence, strict=True)])
     return disparity, confidence, *depth_range(disparity, confidence)
 
 
-def static_depth(shots: Shots, views: list[list[int]], low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
-    """Disparity of the static scene, also behind what moves, and its confidence (T, H, W), by sweep, fusion and cleaning."""
+def static_depth(shots: Shots, views: list[list[int]], low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Disparity of the static scene, also behind what moves, its confidence, and which moving pixels stand still after all
+    (T, H, W): by sweep, fusion and cleaning."""
     frames = list(range(len(views)))
     candidates = np.linspace(low, high, CANDIDATES).astype(np.float32)
     swept = in_threads(lambda i: sweep(shots, i, views[i], candidates), frames, "depth: plane sweep")
     disparity, matched = (np.stack(x) for x in zip(*swept, strict=True))
     disparity[(matched == 0).all((1, 2))] = np.sqrt(low * high)  # a frame that no view could match
-    weight = np.where(matched > 0, np.maximum(matched, GUESSED), np.where(shots.moving, GUESSED**2, GUESSED)).astype(np.float32)
+    doubtful = shots.moving & (matched < STILL)
+    weight = np.where(doubtful, GUESSED**2, np.maximum(matched, GUESSED)).astype(np.float32)
     fused = in_threads(lambda i: fuse(shots, i, views[i], disparity, weight), frames, "depth: fusion")
-    result, confidence = zip(*fused, strict=True)
-    return np.stack(result), np.stack(confidence)
+    result, confidence = (np.stack(x) for x in zip(*fused, strict=True))
+    still = ~doubtful & (np.abs(disparity - result) < AGREE * result) & (confidence > STILL_CONFIDENCE)
+    return result, confidence, np.stack([cv2.medianBlur(s.astype(np.uint8), 5) > 0 for s in still])
 
 
 def fuse(shots: Shots, i: int, views: list[int], disparity: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

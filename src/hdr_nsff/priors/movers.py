@@ -17,11 +17,12 @@ from hdr_nsff.priors.parallax import Shots
 
 LEAST_AREA = 1e-3  # of the frame: smaller moving regions are no objects of their own
 DIFFERENT = 1.0  # pixels per step by which two objects in one region must move apart to be told apart
-LEAST_FLOW = 0.4  # share of a region whose flow must be valid for its motion to count
+LEAST_FLOW = 0.4  # share of a region's core whose flow must be valid for its motion to count
 NEARER = 1.1  # an object's expected disparity relative to the nearest static surface behind it
 PRIOR_SIGMA = 0.25  # of the logarithm of that
 CHANGE_SIGMA = 0.1  # how much an object's distance is expected to change, as a share of it, per polynomial order
 ORDER = 3  # differences: constant acceleration is free
+SAME_SIZE = 1.25  # how much an object may grow or shrink in a step whose motion is unknown
 LEAST_ROWS = 6  # third differences a path must have before it can speak
 TRUSTED = 0.5  # confidence of a mover whose distance is known to KNOWN or better ...
 KNOWN = 0.05
@@ -48,14 +49,31 @@ def regions(moving: np.ndarray) -> np.ndarray:
     return labels
 
 
-def neighbour_pairs(times: np.ndarray, pairs: np.ndarray) -> list[tuple[int, int, int, int | None]]:
-    """(frame, nearest later frame there is flow to, index of that pair, index of the reverse pair or None), in order of time."""
+@dataclass(frozen=True)
+class Step:
+    """Flow from frame `start` to frame `end` and back."""
+
+    start: int
+    end: int
+    flow: np.ndarray  # (H, W, 2) px
+    valid: np.ndarray  # (H, W) bool
+    back: np.ndarray
+    back_valid: np.ndarray
+
+    def reversed(self) -> Step:
+        """The same the other way round."""
+        return Step(self.end, self.start, self.back, self.back_valid, self.flow, self.valid)
+
+
+def steps_in_time(times: np.ndarray, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray) -> list[Step]:
+    """From each frame to the nearest later one there is flow to, and back, in order of time."""
     index = {(int(i), int(j)): k for k, (i, j) in enumerate(pairs)}
     after: dict[int, int] = {}
     for i, j in index:
-        if times[j] > times[i] and (i not in after or times[j] < times[after[i]]):
+        if times[j] > times[i] and (j, i) in index and (i not in after or times[j] < times[after[i]]):
             after[i] = j
-    return [(i, j, index[i, j], index.get((j, i))) for i, j in sorted(after.items(), key=lambda pair: times[pair[0]])]
+    both = [(i, j, index[i, j], index[j, i]) for i, j in sorted(after.items(), key=lambda pair: times[pair[0]])]
+    return [Step(i, j, flow[k], valid[k], flow[b], valid[b]) for i, j, k, b in both]
 
 
 def landed(region: np.ndarray, flow: np.ndarray) -> np.ndarray:
@@ -76,41 +94,45 @@ def landing(region: np.ndarray, flow: np.ndarray, other_labels: np.ndarray) -> i
     return best if votes[best] * 3 > region.sum() else 0
 
 
-def split(labels: np.ndarray, steps: list[tuple[int, int, np.ndarray, np.ndarray]]) -> None:
-    """Cut, in place, regions of `labels` (T, H, W) that two differently moving regions flow into, along `steps`: (from, to, flow,
-    valid) in the order of going. Objects that pass in front of each other stay two."""
+def split(labels: np.ndarray, steps: list[Step]) -> None:
+    """Cut, in place, regions of `labels` (T, H, W) that two differently moving regions flow into, along `steps` in the order of
+    going: objects that pass in front of each other stay two. A part counts where it also flows back to where it came from."""
     least = LEAST_AREA * labels[0].size
-    for i, j, flow, valid in steps:
-        sources: dict[
-            int, list[tuple[np.ndarray, np.ndarray]]
-        ] = {}  # landing region -> motion and landed pixels of what lands there
-        for n in range(1, labels[i].max() + 1):
-            region = labels[i] == n
-            sure = region & valid
-            target = landing(region, flow, labels[j]) if sure.sum() >= least else 0
+    for step in steps:
+        here, there = labels[step.start], labels[step.end]
+        arriving: dict[int, list[tuple[int, np.ndarray, np.ndarray]]] = {}  # region there -> label, motion, landed pixels
+        for n in range(1, here.max() + 1):
+            sure = (here == n) & step.valid
+            target = landing(here == n, step.flow, there) if sure.sum() >= least else 0
             if target:
-                sources.setdefault(target, []).append((np.median(flow[sure], axis=0), landed(sure, flow)))
-        for target, parts in sources.items():
-            parts.sort(key=lambda part: -int(part[1].sum()))
-            parts = [parts[0]] + [p for p in parts[1:] if np.linalg.norm(p[0] - parts[0][0]) > DIFFERENT]
-            distance = [cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, 3) for _, pixels in parts]
+                arriving.setdefault(target, []).append((n, np.median(step.flow[sure], axis=0), landed(sure, step.flow)))
+        for target, parts in arriving.items():
+            parts.sort(key=lambda part: -int(part[2].sum()))
+            parts = [parts[0]] + [p for p in parts[1:] if np.linalg.norm(p[1] - parts[0][1]) > DIFFERENT]
+            distance = [cv2.distanceTransform((~pixels).astype(np.uint8), cv2.DIST_L2, 3) for _, _, pixels in parts]
             owner = np.argmin(distance, axis=0)
-            for k in range(1, len(parts)):
-                own = (labels[j] == target) & (owner == k)
-                if own.sum() >= least:
-                    labels[j][own] = labels[j].max() + 1
+            for k, (n, _, _) in enumerate(parts[1:], start=1):
+                own = (there == target) & (owner == k)
+                if own.sum() >= least and landing(own, step.back, here) == n:
+                    there[own] = there.max() + 1
 
 
-def median_motion(samples: list[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> np.ndarray | None:
-    """Motion (2,) px of a region: the median flow over `(flow, valid, region)` of its frame and, reversed, of the next."""
-    inside = [flow[valid & region] for flow, valid, region in samples]
-    enough = sum(map(len, inside)) >= LEAST_FLOW * sum(region.sum() for _, _, region in samples)
-    return np.median(np.concatenate(inside), axis=0) if enough else None
+def core(region: np.ndarray) -> np.ndarray:
+    """The inner half of a region (H, W): masks are generous, and their rim shows the background."""
+    depth = cv2.distanceTransform(np.pad(region, 1).astype(np.uint8), cv2.DIST_L2, 3)[1:-1, 1:-1]
+    return region & (depth >= 0.5 * depth.max())
 
 
-def link(labels: np.ndarray, times: np.ndarray, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray) -> list[Track]:
-    """Regions followed through time by flow; where two flow into one, the larger goes on and the other ends."""
-    after = {i: (j, k, reverse) for i, j, k, reverse in neighbour_pairs(times, pairs)}
+def motion(step: Step, here: np.ndarray, there: np.ndarray) -> np.ndarray | None:
+    """Motion (2,) px of a region (masks `here`, `there`): the median of its flow and its reversed backward flow; None if few know."""
+    here, there = core(here), core(there)
+    samples = np.concatenate([step.flow[here & step.valid], -step.back[there & step.back_valid]])
+    return np.median(samples, axis=0) if len(samples) >= LEAST_FLOW * (here.sum() + there.sum()) else None
+
+
+def link(labels: np.ndarray, times: np.ndarray, steps: list[Step]) -> list[Track]:
+    """Regions followed through time by flow that leads there and back; where two flow into one, the larger goes on, the other ends."""
+    after = {step.start: step for step in steps}
     tracks: list[Track] = []
     current: dict[tuple[int, int], Track] = {}
     for i in (int(f) for f in np.argsort(times, kind="stable")):
@@ -123,14 +145,15 @@ def link(labels: np.ndarray, times: np.ndarray, flow: np.ndarray, valid: np.ndar
             track.frames.append(i)
             track.labels.append(int(n))
             track.motions.append(None)
-            j, k, reverse = after.get(i, (0, 0, None))
-            target = landing(labels[i] == n, flow[k], labels[j]) if i in after else 0
-            if target and (j, target) not in current:
-                current[j, target] = track
-                samples = [(flow[k], valid[k], labels[i] == n)]
-                if reverse is not None:
-                    samples.append((-flow[reverse], valid[reverse], labels[j] == target))
-                track.motions[-1] = median_motion(samples)
+            if i not in after:
+                continue
+            step, here, there = after[i], labels[i] == n, labels[after[i].end]
+            target = landing(here, step.flow, there)
+            if target and (step.end, target) not in current and landing(there == target, step.back, labels[i]) == n:
+                track.motions[-1] = motion(step, here, there == target)
+                growth = (there == target).sum() / here.sum()
+                if track.motions[-1] is not None or 1 / SAME_SIZE < growth < SAME_SIZE:  # else it may be another object
+                    current[step.end, target] = track
     return tracks
 
 
@@ -215,10 +238,10 @@ def mover_depth(
     `behind` (T, H, W): the static scene's disparity, also under the masks; `flow` (P, H, W, 2) px of `pairs` (P, 2)."""
     disparity, confidence = behind.copy(), np.where(shots.moving, np.float32(LEAST_CONFIDENCE), np.float32(0))
     labels = regions(shots.moving)
-    steps = neighbour_pairs(shots.times, pairs)
-    split(labels, [(i, j, flow[k], valid[k]) for i, j, k, _ in steps])
-    split(labels, [(j, i, flow[back], valid[back]) for i, j, _, back in steps[::-1] if back is not None])
-    for track in link(labels, shots.times, flow, valid, pairs):
+    steps = steps_in_time(shots.times, flow, valid, pairs)
+    split(labels, steps)
+    split(labels, [step.reversed() for step in steps[::-1]])
+    for track in link(labels, shots.times, steps):
         frames = np.array(track.frames)
         inside = [labels[f] == n for f, n in zip(frames, track.labels, strict=True)]
         wall = np.array([np.percentile(behind[f][m], 95) for f, m in zip(frames, inside, strict=True)])

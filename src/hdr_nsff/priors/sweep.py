@@ -21,6 +21,8 @@ UNKNOWN = 1.0  # cost where no view can tell: no correlation
 STEP_PENALTY, JUMP_PENALTY = 0.1, 2.0  # of a neighbour one candidate off, and of any further jump
 EDGE = 20.0  # how much an image edge lowers the price of a jump
 
+OUTSIDE = 3  # obstacle where a view does not look at all
+
 jit = numba.njit(cache=True, nogil=True, fastmath=True)
 
 
@@ -58,11 +60,11 @@ def box(image, radius, result):
 
 
 @jit
-def warp(image, blocked, rotation, shift, disparity, warped, seen):
-    """`image` read where the pixels of the first frame fall if all lie at `disparity`; `seen` False where outside or blocked."""
+def warp(image, obstacles, rotation, shift, disparity, warped, met):
+    """`image` read where the pixels of the first frame fall if all lie at `disparity`; `met`: the `obstacles` there, `OUTSIDE`."""
     h, w = image.shape
-    for y in range(seen.shape[0]):
-        for x in range(seen.shape[1]):
+    for y in range(met.shape[0]):
+        for x in range(met.shape[1]):
             u, v = x + 0.5, y + 0.5
             q = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2] + disparity * shift[2]
             px = (rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2] + disparity * shift[0]) / q - 0.5
@@ -75,7 +77,7 @@ def warp(image, blocked, rotation, shift, disparity, warped, seen):
             top = image[y0, x0] + fx * (image[y0, x0 + 1] - image[y0, x0])
             bottom = image[y0 + 1, x0] + fx * (image[y0 + 1, x0 + 1] - image[y0 + 1, x0])
             warped[y, x] = top + fy * (bottom - top)
-            seen[y, x] = inside and not blocked[int(py + 0.5), int(px + 0.5)]
+            met[y, x] = obstacles[int(py + 0.5), int(px + 0.5)] if inside else OUTSIDE
 
 
 @jit
@@ -112,11 +114,11 @@ def best_share(values, n):
 
 
 @jit
-def matching_costs(greys, others, usable, blocked, rotations, shifts, disparities):
+def matching_costs(greys, others, tolerance, obstacles, rotations, shifts, disparities):
     """Costs (H, W, D) of each candidate disparity over `n` views.
 
-    `greys` (n, H, W): the frame, cut to the range each view recorded too; `others` (n, H, W) the views; `usable` (n, H, W)
-    where the frame, `blocked` (n, H, W) where the view has (no) static information; pixels go to
+    `greys` (n, H, W): the frame, cut to the range each view recorded too; `others` (n, H, W) the views. A view counts for a pixel
+    where its obstacle (n, H, W) is below the pixel's `tolerance` (n, H, W): see `obstacles_of`. Pixels go to
     `rotations` (n, 3, 3) (x, y, 1) + disparity `shifts` (n, 3), homogeneous."""
     n, h, w = greys.shape
     costs = np.empty((h, w, len(disparities)), np.float32)
@@ -125,17 +127,17 @@ def matching_costs(greys, others, usable, blocked, rotations, shifts, disparitie
         box(greys[i], RADIUS, means[i])
         box(greys[i] * greys[i], RADIUS, squares[i])
     scratch = np.empty((3, h, w), np.float32)
-    warped, cost, seen = np.empty((h, w), np.float32), np.empty((n, h, w), np.float32), np.empty((n, h, w), np.bool_)
+    warped, cost, met = np.empty((h, w), np.float32), np.empty((n, h, w), np.float32), np.empty((n, h, w), np.uint8)
     values = np.empty(n, np.float32)
     for k in range(len(disparities)):
         for i in range(n):
-            warp(others[i], blocked[i], rotations[i], shifts[i], disparities[k], warped, seen[i])
+            warp(others[i], obstacles[i], rotations[i], shifts[i], disparities[k], warped, met[i])
             correlation_cost(greys[i], means[i], squares[i], warped, scratch, cost[i])
         for y in range(h):
             for x in range(w):
                 count = 0
                 for i in range(n):
-                    if seen[i, y, x] and usable[i, y, x]:
+                    if met[i, y, x] < tolerance[i, y, x]:
                         values[count] = cost[i, y, x]
                         count += 1
                 costs[y, x, k] = best_share(values, count)
@@ -186,18 +188,27 @@ def sweep(shots: Shots, i: int, views: list[int], disparities: np.ndarray) -> tu
     """Disparity (H, W) of frame `i` of the static scene, and how well it matched (H, W) in [0, 1], 0 where no view could tell."""
     if not views:
         return np.full(shots.size, disparities.mean(), np.float32), np.zeros(shots.size, np.float32)
-    greys, others, usable, blocked, geometry = [], [], [], [], []
+    greys, others, tolerance, obstacles, geometry = [], [], [], [], []
     for j in views:
         low, high = np.maximum(shots.ranges[i][0], shots.ranges[j][0]), np.minimum(shots.ranges[i][1], shots.ranges[j][1])
         greys.append(np.clip(shots.video[i], low, high) @ LUMA)  # what saturates in one frame looks saturated in the other too
         others.append(np.clip(shots.video[j], low, high) @ LUMA)
-        still = shots.times[i] == shots.times[j]  # two cameras at one instant: nothing moves between them
-        usable.append(~shots.clipped[i] & (still | ~shots.moving[i]))
-        blocked.append(shots.clipped[j] | (~still & shots.moving[j]))
+        frozen = bool(shots.times[i] == shots.times[j])  # two cameras at one instant: nothing moves between them
+        obstacles.append(obstacles_of(shots, j, frozen))
+        tolerance.append(np.uint8([1, 2, 0])[obstacles_of(shots, i, frozen)])
         geometry.append(shots.transfer(i, j))
     turns, shifts = (np.stack(x) for x in zip(*geometry, strict=True))
-    costs = matching_costs(*(np.stack(x) for x in (greys, others, usable, blocked)), turns, shifts, disparities)
+    costs = matching_costs(*(np.stack(x) for x in (greys, others, tolerance, obstacles)), turns, shifts, disparities)
     return winner(costs, shots.video[i] @ LUMA, disparities)
+
+
+def obstacles_of(shots: Shots, i: int, frozen: bool) -> np.ndarray:
+    """0 where frame `i` shows the static scene, 1 where it moves (unless `frozen`), 2 where clipped: (H, W) uint8.
+
+    Static pixels are compared with static ones only. Pixels in a moving mask may match anything: if one depth fits many views all the
+    same, the mask was wrong there."""
+    moving = np.zeros_like(shots.moving[i]) if frozen else shots.moving[i]
+    return np.where(shots.clipped[i], 2, moving).astype(np.uint8)
 
 
 def winner(costs: np.ndarray, guide: np.ndarray, disparities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
