@@ -21,11 +21,12 @@ from hdr_nsff.progress import say, track
 
 REACH = 6  # neighbours looked at on each side
 WORKING = 100_000  # pixels: larger frames are judged on a coarser grid
-QUIET, LOUD = 0.15, 1.0  # pixels: bounds of the noise of flow over one step
-LIKELY, SURE = 2.5, 5.0  # residual in units of noise: how far a moving object reaches, and what proves one
-HIGHEST = 8.0  # residuals beyond this many units of noise say no more than this
+QUIET, LOUD = 0.6, 1.0  # pixels: bounds of the noise of flow; the best flow still errs by so much beside edges
+LIKELY, SURE = 1.25, 2.5  # residual in units of noise: how far a moving object reaches, and what proves one
+HIGHEST = 4.0  # residuals beyond this many units of noise say no more than this
 TEXTURE = 0.6  # pixels: where image noise alone shifts a patch by more than this, it is asked little and its neighbours instead
 SMALLEST = 0.0012  # share of the frame below which nothing counts as an object
+HOLE = 0.05  # share of the frame below which what movers (and the frame's edge) enclose moves too
 LARGEST = 0.6  # share of a frame beyond which a mask is doubted
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 
@@ -288,5 +289,6 @@ def objects(scores: np.ndarray) -> np.ndarray:
     found = kept[labels].astype(np.uint8)
     radius = max(1, round(len(scores) / 68))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2))
-    found = ndimage.binary_fill_holes(found).astype(np.uint8)
+    holes, _ = ndimage.label(found == 0)
+    found |= (np.bincount(holes.ravel()) < HOLE * scores.size)[holes].astype(np.uint8)
     return cv2.dilate(found, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))) > 0
