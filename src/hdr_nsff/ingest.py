@@ -222,7 +222,7 @@ def number(text: str, where: str) -> float:
     """A finite number written as 2, -0.5 or 1/3; InputError saying `where` otherwise."""
     try:
         above, _, below = text.partition("/")
-        value = float(above) / float(below or 1)
+        value = float(above) / (float(below) if "/" in text else 1.0)
     except ZeroDivisionError as error:
         raise InputError(f"{where}: {text.strip()!r} divides by zero; write times like 1/250 and EV like -2") from error
     except ValueError as error:

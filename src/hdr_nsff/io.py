@@ -48,9 +48,9 @@ def writing_to(folder: Path | str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except Exception as error:  # OpenEXR and FFmpeg have types of their own for it
+    except Exception as error:  # OpenEXR, FFmpeg and safetensors have types of their own for it
         code = getattr(error, "errno", None)
-        if code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or "No space left" in str(error):
+        if code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or any(m in str(error) for m in ("No space left", "File too large")):
             raise InputError(
                 f"{folder}: the disk is full; free some space and run the same command again, it goes on where it was"
             ) from error

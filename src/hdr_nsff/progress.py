@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
 from rich.console import Console
@@ -30,7 +30,7 @@ def bar() -> Progress:
 
 def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
     """`items`, with a bar on a terminal or a line every ten seconds elsewhere."""
-    total = total if total is not None else (len(items) if hasattr(items, "__len__") else None)
+    total = len(items) if total is None and isinstance(items, Sized) else total
     start = last = time.monotonic()
     with bar() as progress:
         task = progress.add_task(description, total=total, note="")

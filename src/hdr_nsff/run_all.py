@@ -10,12 +10,13 @@ from typing import Literal
 from tyro.conf import Positional
 
 from hdr_nsff.config import PRESETS
+from hdr_nsff.errors import InputError
 from hdr_nsff.evaluate import evaluate_run
 from hdr_nsff.prepare import PrepareConfig, prepare
 from hdr_nsff.progress import say
 from hdr_nsff.render import render_all
 from hdr_nsff.report import write_report
-from hdr_nsff.run import Run
+from hdr_nsff.run import Run, pick_device
 from hdr_nsff.train import train
 
 
@@ -54,6 +55,9 @@ class RunConfig:
 def run_all(config: RunConfig) -> None:
     """The whole way from footage to report; prints where the results are."""
     start = time.monotonic()
+    pick_device(config.device)
+    if config.truth is not None and not config.truth.is_dir():
+        raise InputError(f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, or leave the option out")
     hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
     scene = prepare(
         PrepareConfig(

@@ -22,7 +22,6 @@ from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_image, read_mask, read_npy, write_json
 
-VERSION = 1
 Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
 
@@ -73,7 +72,7 @@ class Step(Strict):
 class Manifest(Strict):
     """`scene.json`."""
 
-    version: Literal[1] = VERSION
+    version: Literal[1] = 1
     source: str  # the footage, as the user named it
     inputs: dict[str, str] = {}  # input file name -> sha256
     width: int = Field(gt=0)

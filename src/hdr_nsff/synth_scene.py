@@ -203,7 +203,10 @@ def walls(b: Builder) -> None:
         (left, right, bottom, FLOOR),
     ]:
         ys, ye, xs, xe = (int(PER_METRE * v) for v in (y0 - TOP, y1 - TOP, x0 - LEFT, x1 - LEFT))
-        b.add(quad((x0, y0, BACK), (x1 - x0, 0, 0), (0, y1 - y0, 0)), np.ascontiguousarray(wall[ys:ye, xs:xe]))
+        b.add(
+            quad(np.array([x0, y0, BACK]), np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])),
+            np.ascontiguousarray(wall[ys:ye, xs:xe]),
+        )
     for x, y, w, h in [(0.05, -0.8, 0.42, 0.55), (0.62, -0.6, 0.55, 0.4), (0.1, -0.12, 0.36, 0.3), (-0.9, 0.3, 0.5, 0.34)]:
         b.panel((x, y, BACK - 0.015), (w, 0, 0), (0, h, 0), textures.poster)
     b.panel((RIGHT - 0.015, -0.55, 2.55), (0, 0, 0.7), (0, 0.75, 0), textures.poster)

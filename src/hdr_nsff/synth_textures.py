@@ -17,7 +17,7 @@ def noise(height: int, width: int, rng: np.random.Generator, cells: int = 4, oct
     for octave in range(octaves):
         n = cells * 2**octave
         grid = rng.random((max(2, n * height // width), n), dtype=np.float32)
-        total += cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC) / 2 ** (0.7 * octave)
+        total += np.asarray(cv2.resize(grid, (width, height), interpolation=cv2.INTER_CUBIC), np.float32) / 2 ** (0.7 * octave)
     low, high = np.percentile(total, [1, 99])
     return np.clip((total - low) / (high - low), 0, 1)
 
@@ -148,5 +148,5 @@ def sky(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 
 def grained(image: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
     """`image` times 1/f grain, kept a physical albedo."""
-    grain = noise(*image.shape[:2], rng, 12, 5)[..., None]
+    grain = noise(image.shape[0], image.shape[1], rng, 12, 5)[..., None]
     return np.clip(image * (1 + strength * (grain - 0.5)), DARK / 2, BRIGHT).astype(np.float32)

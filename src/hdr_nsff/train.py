@@ -21,7 +21,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field
 from hdr_nsff.fields.encodings import TouchedAdam
 from hdr_nsff.fields.paint import paint
-from hdr_nsff.io import write_png
+from hdr_nsff.io import write_png, writing_to
 from hdr_nsff.objective import Objective
 from hdr_nsff.priors.response import initialise
 from hdr_nsff.progress import bar, say
@@ -67,13 +67,14 @@ def train(config: TrainConfig) -> Path:
     """Train (or go on training) until the steps or minutes are spent; the run folder."""
     if config.steps is None and config.minutes is None:
         raise InputError("neither --steps nor --minutes: say how long to train")
-    with distributed.group() as ranks:
+    config = replace(config, scene=config.scene.resolve())  # the run can then be opened from anywhere
+    with writing_to(config.out), distributed.group() as ranks:
         if ranks.world > config.batches:
             raise InputError(f"{ranks.world} processes share {config.batches} batches a step; start fewer, or raise --batches")
-        device = pick_device(config.device)
+        device, scene = pick_device(config.device), Scene.open(config.scene)
         if ranks.main:
             open_folder(config)
-        trainer = Trainer(config, Scene.open(config.scene), device, ranks)
+        trainer = Trainer(config, scene, device, ranks)
         trainer.loop()
     return config.out
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -68,7 +68,7 @@ class ColmapModel:
 def read_model(folder: Path | str) -> ColmapModel:
     """The COLMAP model in `folder` (cameras, images, points3D; .bin before .txt). InputError where a file is missing or cut short."""
     folder = Path(folder)
-    parts = []
+    parts: list[Any] = []
     for name, readers in {
         "cameras": (cameras_bin, cameras_txt),
         "images": (images_bin, images_txt),

@@ -65,7 +65,7 @@ def keypoints(video: np.ndarray, ignore: np.ndarray, limit: int = 1500) -> list[
             found.append(Keypoints(np.zeros((0, 2)), np.zeros((0, 128), np.float32)))
             continue
         root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-        found.append(Keypoints((cv2.KeyPoint.convert(points) + 0.5) / scale, root))
+        found.append(Keypoints((np.asarray(cv2.KeyPoint.convert(points)) + 0.5) / scale, root))
     return found
 
 

@@ -111,7 +111,9 @@ def extract(job: Job, database: Path, threads: int) -> None:
             names = group[k : k + 6]
             if k:
                 with pycolmap.Database.open(database) as db:
-                    reading.existing_camera_id = db.read_image_with_name(group[0]).camera_id
+                    first = db.read_image_with_name(group[0])
+                    assert first is not None, group[0]
+                    reading.existing_camera_id = first.camera_id
             else:
                 reading.existing_camera_id = -1
             pycolmap.extract_features(

@@ -195,7 +195,7 @@ def sweep(shots: Shots, i: int, views: list[int], disparities: np.ndarray) -> tu
         others.append(np.clip(shots.video[j], low, high) @ LUMA)
         frozen = bool(shots.times[i] == shots.times[j])  # two cameras at one instant: nothing moves between them
         obstacles.append(obstacles_of(shots, j, frozen))
-        tolerance.append(np.uint8([1, 2, 0])[obstacles_of(shots, i, frozen)])
+        tolerance.append(np.array([1, 2, 0], np.uint8)[obstacles_of(shots, i, frozen)])
         geometry.append(shots.transfer(i, j))
     turns, shifts = (np.stack(x) for x in zip(*geometry, strict=True))
     costs = matching_costs(*(np.stack(x) for x in (greys, others, tolerance, obstacles)), turns, shifts, disparities)

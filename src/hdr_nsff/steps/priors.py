@@ -1,0 +1,229 @@
+"""The steps of `prepare` that find what training starts from: flow, poses, moving masks, depth; and the contact sheet of it all.
+
+Pixels of held-out frames are used for their own pose and mask only: nothing about a training frame depends on them but poses."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from hdr_nsff import ingest
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
+from hdr_nsff.priors.depth import geometric_depth, read_depth
+from hdr_nsff.priors.flow import flow, read_flow
+from hdr_nsff.priors.import_poses import import_poses
+from hdr_nsff.priors.mask import geometric_mask, rough_mask
+from hdr_nsff.priors.poses import Poses, estimate_poses
+from hdr_nsff.progress import say
+from hdr_nsff.scene import FlowFiles, FrameEntry, Step
+from hdr_nsff.steps.work import Work
+
+DEPTH_FILES = {".npy", ".exr", ".png"}
+SAME_MASKS = 0.75  # intersection over union from which masks count as the same
+FLOW_CHUNK = 128  # pairs between two savings
+SPHERE_NEAR, SPHERE_FAR = 0.5, 2.0  # around distance 1, where everything lies when there is no parallax
+
+
+def flow_pairs(frames: list[FrameEntry]) -> list[tuple[int, int]]:
+    """The pairs (from, to) that flow is wanted for, both directions side by side: neighbours in the clip, and neighbours among the
+    training frames, of each camera."""
+    pairs = dict.fromkeys(
+        pair
+        for camera in sorted({f.camera_id for f in frames})
+        for split in ({"train", "test"}, {"train"})
+        for pair in pairwise([f.index for f in frames if f.camera_id == camera and f.split in split])
+    )
+    return [p for i, j in pairs for p in ((i, j), (j, i))]
+
+
+def flow_step(work: Work) -> Step:
+    """Optical flow between neighbours, from a folder or estimated, a few pairs at a time so that a killed run keeps them."""
+    m, c = work.manifest, work.config
+    pairs = flow_pairs(m.frames)
+    names = {(i, j): FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png") for i, j in pairs}
+    missing = [p for p in pairs if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))]
+    for k in range(0, len(missing), FLOW_CHUNK):
+        chunk = missing[k : k + FLOW_CHUNK]
+        if c.flow is not None:
+            found, valid = read_flow(c.flow, chunk, (m.height, m.width))
+        else:
+            some = f" {k + 1}-{k + len(chunk)} of {len(missing)}" if len(missing) > FLOW_CHUNK else ""
+            found, valid = flow(*work.equalised, np.array(chunk), report=f"flow{some}")
+        for pair, f, v in zip(chunk, found, valid, strict=True):
+            write_npy(work.folder / names[pair].flow, f.astype(np.float16))
+            write_png(work.folder / names[pair].valid, v)
+    for f in m.frames:
+        f.flow = {j: names[i, j] for i, j in pairs if i == f.index}
+    share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
+    vars(work).pop("flows", None)
+    return Step(
+        provenance="estimated" if c.flow is None else "given",
+        note=f"{len(pairs)} pairs, {share:.0%} of the pixels pass the forward-backward check",
+        details={"valid_share": round(float(share), 4)},
+    )
+
+
+def poses_step(work: Work) -> Step:
+    """Cameras of all frames: given, or by structure from motion in two rounds, since poses need masks and good masks need poses.
+
+    The second round is left out where its masks are nearly those of the first. A killed run keeps the first round."""
+    c = work.config
+    if c.poses is not None:
+        store(work, import_poses(c.poses, [f.source for f in work.manifest.frames], (work.manifest.height, work.manifest.width)))
+    elif c.masks is not None:
+        store(work, estimate(work, given_masks(work)))
+    else:
+        first = work.folder / "poses" / "first_masks.npy"
+        if not first.is_file():
+            moving = rough_mask(*work.flows, work.equalised[0])
+            store(work, estimate(work, moving))
+            work.save()
+            write_npy(first, moving)
+        if work.manifest.parallax == "full":
+            before, moving = read_npy(first), geometric_mask(*work.flows, work.equalised[0], *work.cameras())
+            agreement = (before & moving).sum() / max((before | moving).sum(), 1)
+            again = agreement < SAME_MASKS
+            say(f"poses: masks from these poses agree to {agreement:.0%} with the first ones{': once more' if again else ''}")
+            if again:
+                store(work, estimate(work, moving))
+    details = work.manifest.steps["poses"].details
+    return Step(
+        provenance="estimated" if c.poses is None else "given",
+        note=f"{sum(details['registered'])} of {len(work.manifest.frames)} frames placed, parallax: {work.manifest.parallax}",
+    )
+
+
+def estimate(work: Work, moving: np.ndarray) -> Poses:
+    """Poses by structure from motion on equalised frames, leaving out what is `moving` (T, H, W) bool."""
+    video, clipped = work.equalised
+    return estimate_poses(video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames])
+
+
+def store(work: Work, poses: Poses) -> None:
+    """Put poses and static points into the manifest."""
+    m = work.manifest
+    for f, K, c2w in zip(m.frames, poses.K, poses.c2w, strict=True):
+        f.K, f.c2w = K.tolist(), c2w.tolist()
+    m.parallax = poses.parallax
+    m.near, m.far = (poses.near, poses.far) if poses.near and poses.far else (SPHERE_NEAR, SPHERE_FAR)
+    m.points = "points.npy" if len(poses.points) else None
+    if m.points:
+        write_npy(work.folder / m.points, poses.points.astype(np.float32))
+    m.steps["poses"].details.update(registered=poses.registered.tolist(), notes=list(poses.notes))
+
+
+def given_masks(work: Work) -> np.ndarray:
+    """The user's moving masks (T, H, W), one file per frame of the footage in order; InputError where one is missing or of another size."""
+    m, folder = work.manifest, work.config.masks
+    assert folder is not None
+    masks = []
+    for f, path in zip(m.frames, given_files(work, folder, ingest.RECORDED), strict=True):
+        mask = read_mask(path)
+        if mask.shape != (m.height, m.width):
+            raise InputError(
+                f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, frame {f.index} is {m.width}x{m.height}; make it that size"
+            )
+        masks.append(mask)
+    return np.stack(masks)
+
+
+def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
+    """The file for each frame in the user's folder of maps: as many files as frames, in order (of each camera, in a folder like the footage's)."""
+    folders = ingest.sorted_folders(folder) if len(work.footage.cameras) > 1 else [folder]
+    found = [p for d in folders for p in sorted(d.iterdir(), key=ingest.natural) if p.suffix.lower() in suffixes]
+    frames = work.manifest.frames
+    if len(found) != len(frames):
+        raise InputError(f"{folder}: {len(found)} maps for {len(frames)} frames; one per used frame, in order")
+    return found
+
+
+def mask_step(work: Work) -> Step:
+    """What moves, per frame. Training frames are judged by flow among training frames alone; held-out ones by all."""
+    m, c = work.manifest, work.config
+    if c.masks is not None:
+        moving = given_masks(work)
+    else:
+        found, valid, pairs = work.flows
+        train = np.array([f.split == "train" for f in m.frames])
+        among = train[pairs].all(1)
+        K, c2w = work.cameras()
+        moving = geometric_mask(found[among], valid[among], pairs[among], work.equalised[0], K, c2w)
+        if not train.all():
+            moving[~train] = geometric_mask(found, valid, pairs, work.equalised[0], K, c2w)[~train]
+    for f, mask in zip(m.frames, moving, strict=True):
+        f.mask = f"masks/{f.index:05d}.png"
+        write_png(work.folder / f.mask, mask)
+    return Step(provenance="estimated" if c.masks is None else "given", note=f"{moving.mean():.1%} of the pixels move")
+
+
+def depth_step(work: Work) -> Step:
+    """Disparity of the training frames and how far it can be believed."""
+    m, c = work.manifest, work.config
+    train = [f for f in m.frames if f.split == "train"]
+    index = np.array([f.index for f in train])
+    size = (m.height, m.width)
+    m.depth_kind = "scene"
+    if c.depth is not None:
+        disparity, confidence = read_depth(given_files(work, c.depth, DEPTH_FILES), c.depth_kind, size)
+        disparity, confidence = disparity[index], confidence[index]
+        m.depth_kind = "relative" if c.depth_kind == "relative" else "scene"
+        note = f"given ({c.depth_kind})"
+    elif m.parallax != "full":
+        disparity, confidence = np.ones((len(train), *size), np.float32), np.ones((len(train), *size), np.float32)
+        note = "everything at distance 1: without parallax there is no depth to find"
+    else:
+        disparity, confidence, m.near, m.far = dense_depth(work, index)
+        note = f"{(confidence > 0.5).mean():.0%} of the pixels well known, near {m.near:.2f}, far {m.far:.2f} scene units"
+    for f, d, w in zip(train, disparity, confidence, strict=True):
+        f.disparity, f.disparity_confidence = f"disparity/{f.index:05d}.npy", f"disparity_confidence/{f.index:05d}.npy"
+        write_npy(work.folder / f.disparity, d.astype(np.float16))
+        write_npy(work.folder / f.disparity_confidence, w.astype(np.float16))
+    return Step(provenance="estimated" if c.depth is None else "given", note=note)
+
+
+def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Depth of the frames `index` (increasing) from those frames alone."""
+    m = work.manifest
+    frames = [m.frames[i] for i in index]
+    found, valid, pairs = work.flows
+    among = np.isin(pairs, index).all(1)
+    video, clipped = work.equalised
+    K, c2w = work.cameras()
+    return geometric_depth(
+        K[index],
+        c2w[index],
+        found[among],
+        valid[among],
+        np.searchsorted(index, pairs[among]),
+        np.stack([read_mask(work.folder / f.mask) for f in frames if f.mask is not None]),
+        np.array(read_npy(work.folder / m.points)) if m.points else np.zeros((0, 3)),
+        video[index],
+        clipped[index],
+        np.array([f.time for f in frames]),
+    )
+
+
+def sheet_step(work: Work) -> Step:
+    """`contact_sheet.png`: a few training frames as recorded, equalised, with moving pixels red, flow to the next frame (from the last to the one before), and disparity."""
+    m = work.manifest
+    train = [f for f in m.frames if f.split == "train"]
+    some = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, 6).astype(int))]
+    disparity = [read_npy(work.folder / f.disparity).astype(np.float32) for f in some if f.disparity]
+    low, high = (float(v) for v in np.percentile(np.stack(disparity), [1, 99]))
+    rows: list[list[np.ndarray]] = [[], [], [], [], []]
+    for f, d in zip(some, disparity, strict=True):
+        shown = work.equalised[0][f.index]
+        moving = read_mask(work.folder / f.mask) if f.mask else np.zeros(d.shape, bool)
+        red = np.where(moving[..., None], 0.5 * shown + [0.5, 0, 0], shown)
+        names = f.flow[max(f.flow)]
+        flow_rgb = colorize_flow(read_npy(work.folder / names.flow).astype(np.float32))
+        flow_rgb = np.where(read_mask(work.folder / names.valid)[..., None], flow_rgb, 0.25)
+        for row, cell in zip(rows, (work.video[f.index], shown, red, flow_rgb, colorize(d, low, high)), strict=True):
+            row.append(cell.astype(np.float32))
+    if m.parallax != "full":
+        rows.pop()  # the same disparity everywhere
+    write_png(work.folder / "contact_sheet.png", contact_sheet(rows))
+    return Step(note="recorded, equalised, moving, flow (grey: not believed), disparity")

@@ -1,0 +1,104 @@
+"""The settings of `prepare`, and the scene folder in the making that its steps hand on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from tyro.conf import Positional
+
+from hdr_nsff import ingest
+from hdr_nsff.io import read_image, read_mask, read_npy
+from hdr_nsff.priors import exposure
+from hdr_nsff.scene import Manifest
+
+StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """Turn alternating-exposure footage into a scene folder: exposures, poses, optical flow, moving masks, depth.
+
+    Steps that are done are skipped, so the same command goes on where a killed one was."""
+
+    clip: Positional[Path]
+    """Footage: a video, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders, one per synchronized camera."""
+    out: Positional[Path]
+    """Scene folder to write."""
+    exposures: str | None = None
+    """Exposure times of one cycle in seconds, in the order of the frames: 1/1000,1/250,1/60. Default: a CSV beside the frames
+    (`exposures.csv`, for a video `CLIP.csv`; columns file or frame, and exposure or ev), else EXIF, else found from brightness."""
+    ev: str | None = None
+    """The same as log2 exposures: -4,-2,0."""
+    max_size: int = 640
+    """Longest side of the frames in pixels; larger ones are shrunk."""
+    start: int = 0
+    """First frame to use, counted from 0."""
+    end: int | None = None
+    """Frame to stop before."""
+    stride: int = 1
+    """Use every this many frames."""
+    hold_out: int | None = None
+    """Keep every this many frames out of training, for `evaluate`; 0 keeps all in. Default 8."""
+    poses: Path | None = None
+    """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    flow: Path | None = None
+    """Folder of given flow instead of estimating it: 00003_00004.npy (H, W, 2) pixels per pair of frames."""
+    masks: Path | None = None
+    """Folder of given moving masks instead of estimating them: one PNG per frame in order, moving = white."""
+    depth: Path | None = None
+    """Folder of given depth maps instead of estimating them, one .npy, EXR or PNG per frame in order."""
+    depth_kind: Literal["metric", "disparity", "relative"] = "metric"
+    """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth, or disparity up to scale and shift."""
+    redo: tuple[StepName, ...] = ()
+    """Steps to do again although they are done."""
+
+
+@dataclass
+class Work:
+    """The scene folder in the making."""
+
+    config: PrepareConfig
+    footage: ingest.Footage
+    manifest: Manifest
+
+    @property
+    def folder(self) -> Path:
+        """The scene folder."""
+        return self.config.out
+
+    def save(self) -> None:
+        """Write the manifest."""
+        self.manifest.save(self.folder)
+
+    @cached_property
+    def video(self) -> np.ndarray:
+        """All frames as recorded, (T, H, W, 3) float32 in [0, 1]."""
+        return np.stack([read_image(self.folder / f.image) for f in self.manifest.frames])
+
+    @cached_property
+    def equalised(self) -> tuple[np.ndarray, np.ndarray]:
+        """All frames at one brightness (T, H, W, 3) and where they say nothing (T, H, W); the histograms are those of training frames."""
+        frames = self.manifest.frames
+        groups = [f.camera_id * (1 + max(g.bracket for g in frames)) + f.bracket for f in frames]
+        return exposure.equalise(self.video, groups, np.array([f.split == "train" for f in frames]))
+
+    @cached_property
+    def flows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All flow: (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)."""
+        files = [(f.index, to, names) for f in self.manifest.frames for to, names in f.flow.items()]
+        found = np.stack([read_npy(self.folder / names.flow).astype(np.float32) for _, _, names in files])
+        valid = np.stack([read_mask(self.folder / names.valid) for _, _, names in files])
+        return found, valid, np.array([(i, j) for i, j, _ in files])
+
+    def cameras(self) -> tuple[np.ndarray, np.ndarray]:
+        """K (T, 3, 3) pixels and c2w (T, 3, 4) of all frames."""
+        return np.array([f.K for f in self.manifest.frames]), np.array([f.c2w for f in self.manifest.frames])
+
+    def camera_frames(self) -> list[list[int]]:
+        """Per camera the indices of its frames in time."""
+        frames = self.manifest.frames
+        return [[f.index for f in frames if f.camera_id == c] for c in sorted({f.camera_id for f in frames})]
