@@ -1,0 +1,244 @@
+"""Given poses in every convention: a known point in front of a known camera must land on its known pixel."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.priors.colmap import read_model
+from hdr_nsff.priors.import_poses import import_poses
+from hdr_nsff.priors.poses import project
+
+W, H, FOCAL = 64, 48, 50.0
+POINT = np.array([0.3, -0.2, 5.0])
+# cameras 0.5 apart, each turned by 0, 10, 20 degrees about the vertical
+TURNS = Rotation.from_euler("y", [[0], [10], [20]], degrees=True).as_matrix().reshape(3, 3, 3)
+C2W = np.concatenate([TURNS, np.array([[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]])[:, :, None]], 2)  # OpenCV: right, down, forward
+# camera 0 is the world: x = 32 + 50 * 0.3 / 5 = 35, y = 24 - 50 * 0.2 / 5 = 22
+PIXEL_0 = np.array([35.0, 22.0])
+NAMES = ["a_0.png", "a_1.png", "a_2.png"]
+
+
+def pixels(poses, point=POINT) -> np.ndarray:
+    """Where the three cameras see the point (3, 2)."""
+    return project(poses, np.arange(3), np.tile(point, (3, 1)))[0]
+
+
+def expected() -> np.ndarray:
+    """The same, by hand: rotate into each camera, divide, scale."""
+    local = np.stack([c[:, :3].T @ (POINT - c[:, 3]) for c in C2W])
+    return np.stack([W / 2 + FOCAL * local[:, 0] / local[:, 2], H / 2 + FOCAL * local[:, 1] / local[:, 2]], 1)
+
+
+def opengl(c2w: np.ndarray) -> list:
+    """A 4x4 with columns right, up, back."""
+    right, down, forward, centre = c2w.T
+    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(centre, 1)], 1).tolist()
+
+
+def llff_table() -> np.ndarray:
+    """poses_bounds (3, 17): columns down, right, back."""
+    rows = []
+    for c in C2W:
+        right, down, forward, centre = c.T
+        matrix = np.stack([down, right, -forward, centre, np.array([H, W, FOCAL])], 1)
+        rows.append(np.append(matrix.ravel(), [2.0, 10.0]))
+    return np.stack(rows)
+
+
+def colmap_text(folder, names=NAMES, camera="1 SIMPLE_PINHOLE 64 48 50 32 24") -> None:
+    """A COLMAP text model that saw the point with every camera."""
+    folder.mkdir(exist_ok=True)
+    (folder / "cameras.txt").write_text(f"# comment\n{camera}\n")
+    lines = ["# comment"]
+    for k, (c, name, xy) in enumerate(zip(C2W, names, expected(), strict=False), 1):
+        q = np.roll(Rotation.from_matrix(c[:, :3].T).as_quat(), 1)
+        t = -c[:, :3].T @ c[:, 3]
+        lines += [" ".join(map(str, [k, *q, *t, 1, name])), f"{xy[0]} {xy[1]} 7 1.0 2.0 -1"]
+    (folder / "images.txt").write_text("\n".join(lines) + "\n")
+    (folder / "points3D.txt").write_text("7 0.3 -0.2 5.0 10 20 30 0.25 1 0 2 0 3 0\n")
+
+
+def colmap_binary(folder) -> None:
+    """The same model in binary."""
+    folder.mkdir()
+    (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ3d", 1, 1, 0, W, H, FOCAL, 32, 24))
+    images = struct.pack("<Q", 3)
+    for k, (c, name, xy) in enumerate(zip(C2W, NAMES, expected(), strict=True), 1):
+        q = np.roll(Rotation.from_matrix(c[:, :3].T).as_quat(), 1)
+        images += struct.pack("<i7di", k, *q, *(-c[:, :3].T @ c[:, 3]), 1) + name.encode() + b"\0"
+        images += struct.pack("<Qddqddq", 2, *xy, 7, 1.0, 2.0, -1)
+    (folder / "images.bin").write_bytes(images)
+    point = struct.pack("<QQ3d3BdQ6i", 1, 7, *POINT, 10, 20, 30, 0.25, 3, 1, 0, 2, 0, 3, 0)
+    (folder / "points3D.bin").write_bytes(point)
+
+
+def transforms(**extra) -> dict:
+    """transforms.json with intrinsics for all frames."""
+    frames = [{"file_path": f"images/{n}", "transform_matrix": opengl(c)} for n, c in zip(NAMES, C2W, strict=True)]
+    return {"fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames, **extra}
+
+
+def write(path, document) -> None:
+    """JSON into a file."""
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_colmap_cameras_see_the_point_where_they_did(tmp_path, kind):
+    (colmap_text if kind == "text" else colmap_binary)(tmp_path / "sparse")
+    poses = import_poses(tmp_path, NAMES, (H, W))
+    assert np.allclose(pixels(poses)[0], PIXEL_0)
+    assert np.allclose(pixels(poses), expected())
+    assert np.allclose(poses.points, POINT[None]) and np.allclose(poses.point_errors, 0.25)
+    assert np.allclose(poses.tracks[:, 2:], expected())
+    assert np.allclose(poses.frame_errors, 0, atol=1e-6)
+
+
+def test_nerfstudio_axes(tmp_path):
+    write(tmp_path / "transforms.json", transforms())
+    assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H, W))), expected())
+
+
+def test_blender_angle_gives_the_focal_length(tmp_path):
+    frames = [{"file_path": f"./train/a_{k}", "transform_matrix": opengl(c)} for k, c in enumerate(C2W)]
+    angle = 2 * np.arctan(W / 2 / FOCAL)
+    write(tmp_path / "transforms_train.json", {"camera_angle_x": angle, "near": 2.0, "far": 6.0, "frames": frames})
+    poses = import_poses(tmp_path, NAMES, (H, W))
+    assert np.allclose(pixels(poses), expected())
+    assert (poses.near, poses.far) == (2.0, 6.0)
+
+
+def test_llff_axes_and_bounds(tmp_path):
+    np.save(tmp_path / "poses_bounds.npy", llff_table())
+    poses = import_poses(tmp_path / "poses_bounds.npy", NAMES, (H, W))
+    assert np.allclose(pixels(poses), expected())
+    assert poses.near == pytest.approx(0.8 * 2) and poses.far == pytest.approx(1.25 * 10)
+
+
+def test_json_of_llff_poses_has_columns_right_up_back(tmp_path):
+    matrices = [np.column_stack([np.array(opengl(c))[:3], [H, W, FOCAL]]).tolist() for c in C2W]
+    write(tmp_path / "precomputed.json", {"poses": matrices, "bds": [[2.0, 10.0]] * 3})
+    assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H, W))), expected())
+
+
+def test_smaller_frames_have_smaller_pixels(tmp_path):
+    write(tmp_path / "transforms.json", transforms())
+    assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H // 2, W // 2))), expected() / 2)
+
+
+def test_frames_are_matched_by_name_not_by_order(tmp_path):
+    document = transforms()
+    document["frames"] = document["frames"][::-1]
+    write(tmp_path / "transforms.json", document)
+    assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H, W))), expected())
+
+
+def test_cameras_with_the_same_file_names_are_told_apart_by_their_folder(tmp_path):
+    sources = ["left/0.png", "right/0.png", "up/0.png"]
+    colmap_text(tmp_path, [sources[0], sources[1], sources[2]])
+    order = [2, 0, 1]
+    poses = import_poses(tmp_path, [sources[k] for k in order], (H, W))
+    assert np.allclose(pixels(poses), expected()[order])
+
+
+def test_frames_of_a_video_are_matched_in_order(tmp_path):
+    write(tmp_path / "transforms.json", transforms())
+    poses = import_poses(tmp_path, [f"clip.mp4#{k}" for k in range(3)], (H, W))
+    assert np.allclose(pixels(poses), expected())
+
+
+def test_a_frame_that_colmap_left_out_lies_between_its_neighbours(tmp_path):
+    colmap_text(tmp_path)
+    text = (tmp_path / "images.txt").read_text().splitlines()
+    (tmp_path / "images.txt").write_text("\n".join(text[:3] + text[5:]) + "\n")  # without the second image
+    poses = import_poses(tmp_path, NAMES, (H, W))
+    assert poses.registered.tolist() == [True, False, True]
+    assert np.allclose(poses.c2w[1], C2W[1])  # midway in place and angle
+    assert "did not register" in poses.notes[-1]
+
+
+def test_still_cameras_have_no_parallax(tmp_path):
+    document = transforms()
+    for frame in document["frames"]:
+        frame["transform_matrix"] = opengl(np.concatenate([C2W[0][:, :3], C2W[0][:, 3:]], 1))
+    write(tmp_path / "transforms.json", document)
+    assert import_poses(tmp_path, NAMES, (H, W)).parallax == "none"
+
+
+def test_a_model_says_how_often_a_point_was_seen(tmp_path):
+    colmap_binary(tmp_path / "m")
+    model = read_model(tmp_path / "m")
+    assert model.track_lengths.tolist() == [3]
+    assert model.images[2].point_ids.tolist() == [7, -1]
+
+
+def bad_npy(folder):
+    np.save(folder / "poses_bounds.npy", llff_table()[:, :15])
+
+
+def bad_count(folder):
+    np.save(folder / "poses_bounds.npy", np.tile(llff_table(), (2, 1)))
+
+
+def bad_distortion(folder):
+    write(folder / "transforms.json", transforms(k1=0.3))
+
+
+def bad_shape(folder):
+    write(folder / "transforms.json", transforms(w=64, h=64))
+
+
+def bad_nan(folder):
+    table = llff_table()
+    table[1, 3] = np.nan
+    np.save(folder / "poses_bounds.npy", table)
+
+
+def bad_json(folder):
+    (folder / "transforms.json").write_text("{")
+
+
+def bad_missing_focal(folder):
+    document = transforms()
+    del document["fl_x"]
+    write(folder / "transforms.json", document)
+
+
+def bad_truncated(folder):
+    colmap_binary(folder / "0")
+    whole = (folder / "0" / "images.bin").read_bytes()
+    (folder / "0" / "images.bin").write_bytes(whole[:-5])
+
+
+def bad_empty(folder):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (bad_npy, "17"),
+        (bad_count, "6 poses for 3 frames"),
+        (bad_distortion, "distortion"),
+        (bad_shape, "another shape"),
+        (bad_nan, "NaN"),
+        (bad_json, "export them again"),
+        (bad_missing_focal, "focal length"),
+        (bad_truncated, "cut short"),
+        (bad_empty, "no poses here"),
+    ],
+)
+def test_poses_that_do_not_fit_are_refused_in_a_sentence(tmp_path, make, words):
+    make(tmp_path)
+    with pytest.raises(InputError, match=words):
+        import_poses(tmp_path, NAMES, (H, W))
+
+
+def test_most_frames_must_have_a_pose(tmp_path):
+    write(tmp_path / "transforms.json", transforms())
+    with pytest.raises(InputError, match=r"3 of 6 frames have no pose there \(frames 3-5\)"):
+        import_poses(tmp_path, [*NAMES, "b_0.png", "b_1.png", "b_2.png"], (H, W))
