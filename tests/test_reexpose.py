@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_exr, read_image, read_npy, write_json, write_npy, write_png
+from hdr_nsff.io import read_exr, read_image, write_npy, write_png
 from hdr_nsff.priors.exposure import detect_cycle
+from hdr_nsff.priors.import_poses import import_poses
 from hdr_nsff.recording import response_curve
 from hdr_nsff.reexpose import ReexposeConfig, plan, reexpose
 from hdr_nsff.truth import Truth
@@ -45,7 +46,8 @@ def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbours(tm
     assert truth.views[0].c2w == [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert [pose[0][3] for pose in truth.clip_c2w] == [t for t in range(20) if t not in (4, 12)]
     assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
-    assert read_npy(out / "poses_bounds.npy").shape == (18, 17)
+    again = import_poses(out / "poses_bounds.npy", [f"{k}.png" for k in range(18)], (24, 40))  # what `prepare --poses` will read
+    assert np.allclose(again.c2w, truth.clip_c2w) and np.allclose(again.K, truth.K)
 
 
 def test_recordings_follow_the_response_and_truth_is_the_clip(tmp_path):
@@ -87,8 +89,10 @@ def test_masks_of_the_clip_become_masks_of_the_truth(tmp_path):
 
 
 def test_poses_shrink_with_the_frames(tmp_path):
-    write_json(tmp_path / "poses.json", {"poses": llff(20)[:, :15].reshape(20, 3, 5).tolist(), "bds": [[1, 9]] * 20})
-    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses.json", max_size=20))
+    write_npy(tmp_path / "poses_bounds.npy", llff(20))
+    out = reexpose(
+        ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy", max_size=20)
+    )
     assert Truth.open(out / "truth").K == [[25, 0, 10], [0, 25, 6], [0, 0, 1]]
 
 
@@ -121,7 +125,7 @@ def test_output_of_another_clip_is_not_touched(tmp_path):
         ({"ev": "1/0"}, "divides by zero"),
         ({"ev": "auto"}, "list the log2 exposures"),
         ({"response": "velvia"}, "unknown"),
-        ({"poses": Path("nowhere.npy")}, "not readable"),
+        ({"poses": Path("nowhere.npy")}, "no such file"),
         ({"masks": Path("nowhere")}, "0 masks"),
         ({"end": 2}, "at least 3"),
     ],
@@ -133,5 +137,5 @@ def test_bad_settings_are_named(tmp_path, change, what):
 
 def test_too_few_poses_are_named(tmp_path):
     write_npy(tmp_path / "poses_bounds.npy", llff(7))
-    with pytest.raises(InputError, match="7 poses for a clip of at least 20 frames"):
+    with pytest.raises(InputError, match="7 poses for 20 frames"):
         reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +20,8 @@ from tyro.conf import Positional
 from hdr_nsff import ingest
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_mask, write_exr, write_json, write_npy, write_png, writing_to
+from hdr_nsff.priors.import_poses import import_poses
+from hdr_nsff.priors.poses import Poses
 from hdr_nsff.progress import say, track
 from hdr_nsff.recording import Curve, Noise, record, response_curve
 from hdr_nsff.truth import Truth, TruthView
@@ -42,7 +44,7 @@ class ReexposeConfig:
     hold_out: int = 8
     """Every this many frames are the truth."""
     poses: Path | None = None
-    """Camera poses of all frames of the clip, in order: poses_bounds.npy, or JSON with the same as `poses` (N, 3, 5) and `bds` (N, 2)."""
+    """Camera poses of all frames of the clip: COLMAP model folder, transforms.json, poses_bounds.npy, precomputed.json."""
     masks: Path | None = None
     """Folder of moving masks of all frames of the clip, in order, moving = white: `evaluate` then scores moving pixels too."""
     max_size: int = 640
@@ -55,35 +57,6 @@ class ReexposeConfig:
     """Use every this many frames."""
     seed: int = 0
     """Seed of the noise."""
-
-
-@dataclass(frozen=True)
-class LlffPoses:
-    """Poses in the LLFF layout."""
-
-    poses: np.ndarray  # (N, 3, 5): camera-to-world columns down, right, back, translation; then height, width, focal in pixels
-    bounds: np.ndarray  # (N, 2) near and far depth
-
-    def c2w(self) -> np.ndarray:
-        """(N, 3, 4) OpenCV."""
-        p = self.poses
-        return np.stack([p[..., 1], p[..., 0], -p[..., 2], p[..., 3]], -1)
-
-    def resized(self, width: int, height: int) -> LlffPoses:
-        """The same for frames of another size."""
-        p = self.poses.copy()
-        p[:, 2, 4] *= width / p[:, 1, 4]
-        p[:, 0, 4], p[:, 1, 4] = height, width
-        return LlffPoses(p, self.bounds)
-
-    def intrinsics(self) -> np.ndarray:
-        """(3, 3) pixels, of the first frame."""
-        height, width, focal = self.poses[0, :, 4]
-        return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-
-    def rows(self) -> np.ndarray:
-        """(N, 17) as in poses_bounds.npy."""
-        return np.concatenate([self.poses.reshape(-1, 15), self.bounds], 1)
 
 
 @dataclass(frozen=True)
@@ -114,13 +87,18 @@ def reexpose(config: ReexposeConfig) -> Path:
         if len(footage.cameras) > 1:
             raise InputError(f"{config.clip}: {len(footage.cameras)} cameras; re-expose one camera's folder at a time")
         response = response_curve(config.response)
-        numbers = [f.number for f in track(chosen(config, footage), "reading")]
+        numbers, size = [], (0, 0)
+        for frame in track(chosen(config, footage), "reading"):
+            numbers.append(frame.number)
+            size = (frame.rgb.shape[0], frame.rgb.shape[1])
         work = plan(len(numbers), len(evs), config.hold_out, remove=config.poses is not None)
-        poses = read_poses(config.poses, numbers) if config.poses is not None else None
+        poses = read_poses(config.poses, footage, numbers, size) if config.poses is not None else None
         masks = frame_masks(config.masks, work.test, numbers) if config.masks is not None else {}
         claim(config, footage)  # once nothing can be wrong with the settings any more
-        size = write_frames(config, footage, work, evs, response)
-        write_truth(config.out, work, evs, response, poses.resized(*size) if poses is not None else None, masks)
+        write_frames(config, footage, work, evs, response)
+        write_truth(config.out, work, evs, response, poses, masks)
+        if poses is not None:
+            write_npy(config.out / "poses_bounds.npy", llff_rows(poses, size)[work.kept])
     say(f"{len(work.kept)} frames in {config.out / 'clip'}, {len(work.test)} true views in {config.out / 'truth'}")
     given = f"--poses {config.out / 'poses_bounds.npy'} --hold-out 0" if poses else f"--hold-out {config.hold_out}"
     say(f"next: hdr-nsff prepare {config.out / 'clip'} SCENE --ev={config.ev} {given}")
@@ -169,34 +147,26 @@ def plan(count: int, cycle: int, hold_out: int, remove: bool) -> Plan:
     return Plan(bracket, test, kept)
 
 
-def write_frames(
-    config: ReexposeConfig, footage: ingest.Footage, work: Plan, evs: list[float], response: Curve
-) -> tuple[int, int]:
-    """Write the recorded frames and the radiance of the held-out ones, those not there yet; (width, height)."""
-    response, noise = (
-        response_curve(config.response),
-        Noise(1e-3 * config.noise, config.noise**2 / 6000) if config.noise else None,
-    )
-    width = height = 0
+def write_frames(config: ReexposeConfig, footage: ingest.Footage, work: Plan, evs: list[float], response: Curve) -> None:
+    """Write the recorded frames and the radiance of the held-out ones, those not there yet."""
+    noise = Noise(1e-3 * config.noise, config.noise**2 / 6000) if config.noise else None
     total = len(work.bracket)
     for k, frame in enumerate(track(chosen(config, footage), "frames", total)):
-        height, width = frame.rgb.shape[:2]
         radiance = frame.rgb.astype(np.float64) ** 2.2
         if k in work.kept and not (image := config.out / f"clip/{work.kept.index(k):05d}.png").is_file():
             rng = np.random.default_rng([config.seed, k])
             write_png(image, record(radiance, evs[work.bracket[k]], (1, 1, 1), response, noise, rng))
         if k in work.test and not (exr := config.out / f"truth/radiance/{k:05d}.exr").is_file():
             write_exr(exr, {"RGB": radiance.astype(np.float32)})
-    return width, height
 
 
 def write_truth(
-    out: Path, work: Plan, evs: list[float], response: Curve, poses: LlffPoses | None, masks: dict[int, np.ndarray]
+    out: Path, work: Plan, evs: list[float], response: Curve, poses: Poses | None, masks: dict[int, np.ndarray]
 ) -> None:
-    """Write `truth.json` with the masks it names, and the poses of the new footage."""
+    """Write `truth.json` with the masks it names."""
     for k, mask in masks.items():
         write_png(out / f"truth/masks/{k:05d}.png", mask)
-    c2w = poses.c2w().tolist() if poses is not None else None
+    c2w = poses.c2w.tolist() if poses is not None else None
     views = [
         TruthView(
             name=f"{k:05d}",
@@ -214,13 +184,11 @@ def write_truth(
         reference_bracket=int(np.argmin(np.abs(evs))),
         response_x=response.x.tolist(),
         response_y=response.y.tolist(),
-        K=poses.intrinsics().tolist() if poses is not None else None,
+        K=poses.K[0].tolist() if poses is not None else None,
         clip_c2w=[c2w[k] for k in work.kept] if c2w else None,
         views=views,
     )
     write_json(out / "truth/truth.json", truth.model_dump())
-    if poses is not None:
-        write_npy(out / "poses_bounds.npy", poses.rows()[work.kept])
 
 
 def frame_masks(folder: Path, frames: list[int], numbers: list[int]) -> dict[int, np.ndarray]:
@@ -233,23 +201,18 @@ def frame_masks(folder: Path, frames: list[int], numbers: list[int]) -> dict[int
     return {k: read_mask(files[numbers[k]]) for k in frames}
 
 
-def read_poses(path: Path, numbers: list[int]) -> LlffPoses:
-    """The LLFF poses of frames `numbers` of the clip; InputError for a file that does not hold them."""
-    try:
-        if path.suffix == ".npy":
-            rows = np.load(path, allow_pickle=False).astype(np.float64)
-            poses, bounds = rows[:, :15].reshape(-1, 3, 5), rows[:, 15:17]
-        else:
-            told = json.loads(path.read_text())
-            poses, bounds = np.array(told["poses"], np.float64), np.array(told["bds"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
-        raise InputError(f"--poses {path}: not readable as LLFF poses ({error}); give poses_bounds.npy") from error
-    if poses.shape[1:] != (3, 5) or bounds.shape != (len(poses), 2) or not np.isfinite(poses).all():
-        raise InputError(
-            f"--poses {path}: shapes {poses.shape} and {bounds.shape} are not (N, 3, 5) and (N, 2); give poses_bounds.npy"
-        )
-    if len(poses) <= max(numbers):
-        raise InputError(
-            f"--poses {path}: {len(poses)} poses for a clip of at least {max(numbers) + 1} frames; one per frame, in order"
-        )
-    return LlffPoses(poses[numbers], bounds[numbers])
+def read_poses(path: Path, footage: ingest.Footage, numbers: list[int], size: tuple[int, int]) -> Poses:
+    """The poses of frames `numbers` of the clip, for frames of `size` (height, width)."""
+    names = list(footage.files)
+    if footage.video:
+        names = [f"{footage.path.name}#{n}" for n in range(max(footage.count, max(numbers, default=0) + 1))]
+    given = import_poses(path, names, size)
+    return replace(given, K=given.K[numbers], c2w=given.c2w[numbers], registered=given.registered[numbers])
+
+
+def llff_rows(poses: Poses, size: tuple[int, int]) -> np.ndarray:
+    """(N, 17) as in poses_bounds.npy: 3x5 (columns down, right, back, centre, (height, width, focal)), then near and far (0: unknown)."""
+    c = poses.c2w
+    last = np.stack([np.full(len(c), size[0]), np.full(len(c), size[1]), poses.K[:, 0, 0]], -1)
+    matrices = np.stack([c[..., 1], c[..., 0], -c[..., 2], c[..., 3], last], -1)  # (N, 3, 5)
+    return np.concatenate([matrices.reshape(-1, 15), np.tile([poses.near or 0.0, poses.far or 0.0], (len(c), 1))], 1)
