@@ -163,6 +163,7 @@ class Scene:
             raise InputError(
                 f"{folder}: the scene has no camera poses yet; run `hdr-nsff prepare` again, it goes on where it stopped"
             )
+        check_frames(folder, m)
         train = [e for e in m.frames if e.split == "train"]
         links = neighbours(train)
         return Scene(
@@ -173,9 +174,53 @@ class Scene:
             test=[load_frame(folder, m, e, {}, {}) for e in m.frames if e.split == "test"],
             near=m.near,
             far=m.far,
-            points=torch.from_numpy(read_npy(inside(folder, m.points)).astype(np.float32)) if m.points else torch.zeros(0, 3),
+            points=load_points(folder, m.points) if m.points else torch.zeros(0, 3),
             manifest=m,
         )
+
+
+def check_frames(folder: Path, m: Manifest) -> None:
+    """InputError where indices, times, depth range or cameras make no sense together."""
+
+    def refuse(problem: str) -> None:
+        raise InputError(f"{folder / 'scene.json'}: {problem}; restore it or run `prepare` with `--redo poses`")
+
+    assert m.near is not None and m.far is not None
+    if not m.near < m.far < np.inf:
+        refuse(f"near {m.near:g} and far {m.far:g} are no range of depths")
+    if all(f.split != "train" for f in m.frames):
+        refuse("no training frames, all are held out")
+    if len({f.index for f in m.frames}) < len(m.frames):
+        refuse("two frames have the same index")
+    for f in m.frames:
+        if not np.isfinite(f.time):
+            refuse(f"frame {f.index} has time {f.time}")
+        for name, rows, shape, good in (("K", f.K, (3, 3), is_intrinsic), ("c2w", f.c2w, (3, 4), is_pose)):
+            assert rows is not None
+            matrix = np.array(rows) if len({len(row) for row in rows}) == 1 else np.zeros(0)
+            if matrix.shape != shape or not np.isfinite(matrix).all() or not good(matrix):
+                refuse(f"{name} of frame {f.index} is no {shape[0]}x{shape[1]} camera {'matrix' if name == 'K' else 'pose'}")
+
+
+def is_intrinsic(K: np.ndarray) -> bool:
+    """Whether (3, 3) numbers have focal lengths above 0 and a last row of 0 0 1."""
+    return bool(K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], [0, 0, 1]))
+
+
+def is_pose(c2w: np.ndarray) -> bool:
+    """Whether (3, 4) numbers start with a rotation."""
+    rotation = c2w[:, :3]
+    return bool(np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(rotation) > 0)
+
+
+def load_points(folder: Path, name: str) -> Tensor:
+    """Static points (P, 3)."""
+    points = read_npy(inside(folder, name))
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f" or not np.isfinite(points).all():
+        raise InputError(
+            f"{folder / name}: expected finite points of shape (P, 3), not {points.shape}; run `prepare` with `--redo poses`"
+        )
+    return torch.from_numpy(points.astype(np.float32))
 
 
 def neighbours(entries: list[FrameEntry]) -> list[dict[int, int]]:
@@ -201,12 +246,19 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
             raise InputError(
                 f"{folder / name}: {what} of frame {e.index} has shape {array.shape}, expected {size + channels}; run `prepare` with `--redo`"
             )
+        if array.dtype.kind not in "fiub":
+            raise InputError(f"{folder / name}: {what} of frame {e.index} holds no numbers; run `prepare` with `--redo`")
         if array.dtype != bool and not np.isfinite(array).all():
             raise InputError(f"{folder / name}: {what} of frame {e.index} holds NaN or Inf; run `prepare` with `--redo`")
         return torch.from_numpy(array if array.dtype == bool else array.astype(np.float32))
 
     image = checked(e.image, read_image, "image", (3,))
     assert image is not None
+    disparity = checked(e.disparity, read_npy, "disparity")
+    if disparity is not None and m.depth_kind == "scene" and float(disparity.min()) < 0:
+        raise InputError(
+            f"{folder / str(e.disparity)}: disparity of frame {e.index} is negative; run `prepare` with `--redo depth`"
+        )
     flows = {o: e.flow[i] for o, i in neighbour_index.items() if i in e.flow}
     flow = {o: checked(f.flow, read_npy, "flow", (2,)) for o, f in flows.items()}
     valid = {o: checked(f.valid, read_mask, "flow mask") for o, f in flows.items()}
@@ -220,7 +272,7 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
         image=image,
         neighbours=links,
         moving=checked(e.mask, read_mask, "mask"),
-        disparity=checked(e.disparity, read_npy, "disparity"),
+        disparity=disparity,
         disparity_confidence=checked(e.disparity_confidence, read_npy, "disparity confidence"),
         flow={o: v for o, v in flow.items() if v is not None},
         flow_valid={o: v for o, v in valid.items() if v is not None},

@@ -71,8 +71,8 @@ def write_oracle(
         reference_bracket=reference,
         bracket_ev=list(ev),
         exposure_given=True,
-        near=float(depths.min()),
-        far=float(depths.max()),
+        near=0.95 * float(depths.min()),
+        far=1.05 * float(depths.max()),
         points="points.npy",
         frames=entries,
         steps={

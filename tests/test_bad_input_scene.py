@@ -1,0 +1,181 @@
+"""A scene folder edited by hand into nonsense: one sentence each that names the file and what to do, never a traceback."""
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hdr_nsff import cli
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import write_npy, write_png
+from hdr_nsff.scene import Manifest, Scene
+from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+
+Change = Callable[[dict[str, Any]], object]
+
+
+@pytest.fixture
+def folder(toy_folder: Path, tmp_path: Path) -> Path:
+    """A copy to damage."""
+    return shutil.copytree(toy_folder, tmp_path / "scene")
+
+
+def edit(folder: Path, change: Change) -> None:
+    path = folder / "scene.json"
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+def sentence(folder: Path) -> str:
+    """What opening the scene, or making its tone mapper, says; one line."""
+    with pytest.raises(InputError) as caught:
+        ToneMapper.for_scene(ToneMapConfig(), Scene.open(folder))
+    text = str(caught.value)
+    assert "\n" not in text and len(text) < 400, text
+    return text
+
+
+def frame(key: str, value: object, number: int = 2) -> Change:
+    return lambda d: d["frames"][number].update({key: value})
+
+
+def top(key: str, value: object) -> Change:
+    return lambda d: d.update({key: value})
+
+
+TURNED = [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
+K = [[55.2, 0, 30.0], [0, 55.2, 17.0], [0, 0, 1.0]]
+
+NONSENSE: dict[str, tuple[Change, str]] = {
+    "a word for a width": (top("width", "wide"), "width"),
+    "no height": (lambda d: d.pop("height"), "height"),
+    "a width of nothing": (top("width", 0), "width"),
+    "a key nobody knows": (top("sparkle", 1), "sparkle"),
+    "a key nobody knows in a frame": (frame("sparkle", 1), "frames.2.sparkle"),
+    "another version": (top("version", 99), "version"),
+    "frames that are no list": (top("frames", "many"), "frames"),
+    "a frame that is no frame": (lambda d: d["frames"].append(7), "frames.6"),
+    "an unknown split": (frame("split", "both"), "frames.2.split"),
+    "a negative bracket": (frame("bracket", -1), "frames.2.bracket"),
+    "a negative depth": (top("near", -1.0), "near"),
+    "no frames at all": (top("frames", []), "no frames"),
+    "no training frames": (lambda d: [f.update(split="test") for f in d["frames"]], "no training frames"),
+    "no poses yet": (frame("c2w", None), "no camera poses yet"),
+    "a pose of the wrong shape": (frame("c2w", TURNED[:2]), "c2w"),
+    "a ragged pose": (frame("c2w", [[1.0], [0.0, 1.0], [0.0]]), "c2w"),
+    "a pose that is not a number": (frame("c2w", [*TURNED[:2], [0, 0, 1.0, float("nan")]]), "c2w"),
+    "a pose that is no rotation": (frame("c2w", [[2.0, 0, 0, 0], *TURNED[1:]]), "c2w"),
+    "a camera matrix of the wrong shape": (frame("K", K[:2]), "K"),
+    "a focal length of nothing": (frame("K", [[0.0, 0, 30.0], *K[1:]]), "K"),
+    "a time that is not a number": (frame("time", float("nan")), "time"),
+    "near beyond far": (top("near", 9.0), "near"),
+    "a bracket without an exposure": (frame("bracket", 3), "bracket"),
+    "a reference that is no bracket": (top("reference_bracket", 5), "bracket"),
+    "a reference that is not 0": (top("bracket_ev", [2.0, 1.0, -2.0]), "bracket"),
+    "two frames of one index": (frame("index", 1), "index"),
+    "a name that leaves the folder": (frame("image", "../image.png"), "outside the scene folder"),
+    "an absolute name": (frame("mask", "/etc/passwd"), "outside the scene folder"),
+    "points that leave the folder": (top("points", "../points.npy"), "outside the scene folder"),
+    "an image that is not there": (frame("image", "images/none.png"), "images/none.png"),
+    "a mask that is not there": (frame("mask", "masks/none.png"), "masks/none.png"),
+    "a depth that is not there": (frame("disparity", "disparity/none.npy"), "disparity/none.npy"),
+    "a flow that is not there": (lambda d: d["frames"][2]["flow"]["3"].update(flow="flow/none.npy"), "flow/none.npy"),
+    "a flow mask that is not there": (lambda d: d["frames"][2]["flow"]["3"].update(valid="flow/none.png"), "flow/none.png"),
+    "points that are not there": (top("points", "points.npy"), "points.npy"),
+}
+
+
+@pytest.mark.parametrize("what", NONSENSE)
+def test_nonsense_in_scene_json_is_named(what: str, folder: Path) -> None:
+    change, expected = NONSENSE[what]
+    edit(folder, change)
+    assert expected in sentence(folder)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '"scene"', "\x00"])
+def test_a_scene_json_that_is_no_scene_is_said_to_be_none(text: str, folder: Path) -> None:
+    (folder / "scene.json").write_text(text)
+    said = sentence(folder)
+    assert "scene.json: not a valid scene" in said and "--redo frames" in said
+
+
+def test_binary_rubbish_for_scene_json(folder: Path) -> None:
+    (folder / "scene.json").write_bytes(b"\xff\xfe\x00\x80")
+    assert "not a valid scene" in sentence(folder)
+
+
+def test_no_folder_and_no_scene_json(tmp_path: Path) -> None:
+    assert "no scene.json here; make a scene folder with `hdr-nsff prepare" in sentence(tmp_path)
+    assert "no scene.json here" in sentence(tmp_path / "nowhere")
+
+
+H, W = 34, 60
+MAPS: dict[str, tuple[str, Callable[[Path], None], str]] = {
+    "a small image": ("images/00002.png", lambda p: write_png(p, np.zeros((9, 9, 3))), "image of frame 2 has shape (9, 9, 3)"),
+    "a small mask": ("masks/00002.png", lambda p: write_png(p, np.zeros((H, 9), bool)), "mask of frame 2 has shape (34, 9)"),
+    "a small depth": ("disparity/00002.npy", lambda p: write_npy(p, np.ones((9, W))), "disparity of frame 2 has shape (9, 60)"),
+    "a flow without y": ("flow/00002_00003.npy", lambda p: write_npy(p, np.ones((H, W))), "flow of frame 2 has shape (34, 60)"),
+    "a small flow": ("flow/00002_00003.npy", lambda p: write_npy(p, np.ones((3, 3, 2))), "flow of frame 2 has shape (3, 3, 2)"),
+    "a small flow mask": ("flow/00002_00003_valid.png", lambda p: write_png(p, np.zeros((3, 3), bool)), "flow mask of frame 2"),
+    "a depth with NaN": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), np.nan)), "NaN or Inf"),
+    "a flow with Inf": ("flow/00002_00003.npy", lambda p: write_npy(p, np.full((H, W, 2), np.inf)), "NaN or Inf"),
+    "a depth behind the camera": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), -1.0)), "negative"),
+    "a depth of words": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), "far")), "disparity of frame 2"),
+    "an image cut short": ("images/00002.png", lambda p: p.write_bytes(p.read_bytes()[:200]) and None, "cut short"),
+    "a depth cut short": ("disparity/00002.npy", lambda p: p.write_bytes(p.read_bytes()[:200]) and None, "not a readable .npy"),
+    "a text file for a mask": ("masks/00002.png", lambda p: p.write_text("not a mask") and None, "cut short"),
+    "a pickle for a flow": (
+        "flow/00002_00003.npy",
+        lambda p: np.save(p, np.array([{}]), allow_pickle=True),
+        "not a readable .npy",
+    ),
+    "an empty image": ("images/00002.png", lambda p: p.write_bytes(b"") and None, "images/00002.png"),
+}
+
+
+@pytest.mark.parametrize("what", MAPS)
+def test_a_map_that_does_not_fit_is_named(what: str, folder: Path) -> None:
+    name, damage, expected = MAPS[what]
+    damage(folder / name)
+    said = sentence(folder)
+    assert name in said and expected in said
+
+
+def test_points_of_another_shape_are_named(folder: Path) -> None:
+    write_npy(folder / "points.npy", np.ones((5, 2)))
+    edit(folder, top("points", "points.npy"))
+    assert "points.npy" in sentence(folder)
+
+
+def test_a_link_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere.npy").write_bytes((folder / "disparity/00002.npy").read_bytes())
+    (folder / "disparity/00002.npy").unlink()
+    (folder / "disparity/00002.npy").symlink_to(tmp_path / "elsewhere.npy")
+    assert "outside the scene folder" in sentence(folder)
+
+
+def test_the_command_line_says_it_in_one_line_and_exits_with_2(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(folder, top("sparkle", 1))
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["train", "tiny", "--scene", str(folder), "--out", str(tmp_path / "run")])
+    error = capsys.readouterr().err
+    assert stop.value.code == 2 and len(error.strip().splitlines()) == 1 and "sparkle" in error
+
+
+def test_a_scene_with_a_single_frame_opens(folder: Path) -> None:
+    edit(folder, lambda d: d.update(frames=[{**d["frames"][1], "flow": {}}]))
+    scene = Scene.open(folder)
+    assert len(scene.train) == 1 and scene.train[0].neighbours == {}
+
+
+def test_a_manifest_survives_saving(folder: Path) -> None:
+    before = Manifest.load(folder)
+    before.save(folder)
+    assert Manifest.load(folder) == before
