@@ -20,6 +20,7 @@ DIFFERENT = 1.0  # pixels per step by which two objects in one region must move 
 LEAST_FLOW = 0.4  # share of a region's core whose flow must be valid for its motion to count
 NEARER = 1.1  # an object's expected disparity relative to the nearest static surface behind it
 PRIOR_SIGMA = 0.25  # of the logarithm of that
+MOST = 8.0  # times the surface behind it: no path is believed that brings an object nearer
 CHANGE_SIGMA = 0.1  # how much an object's distance is expected to change, as a share of it, per polynomial order
 ORDER = 3  # differences: constant acceleration is free
 SAME_SIZE = 1.25  # how much an object may grow or shrink in a step whose motion is unknown
@@ -253,7 +254,7 @@ def mover_depth(
         prior = 1 / (NEARER * np.maximum(wall, np.median(wall)))
         pose = shots.c2w[frames]
         z, sigma = smoothest_path(pose[..., 3], pose[..., 2], rays, shots.times[frames], known, prior)
-        for f, m, d, s in zip(frames, inside, np.where(z > 0, 1 / np.maximum(z, 1e-9), 0), sigma, strict=True):
-            disparity[f][m] = max(d, np.percentile(behind[f][m], 50))
+        for f, m, d, s, w in zip(frames, inside, 1 / np.maximum(z, 1e-9), sigma, wall, strict=True):
+            disparity[f][m] = np.clip(d, np.median(behind[f][m]), MOST * w)
             confidence[f][m] = np.clip(TRUSTED * KNOWN / max(s, KNOWN), LEAST_CONFIDENCE, TRUSTED)
     return disparity, confidence
