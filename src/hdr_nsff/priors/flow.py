@@ -25,8 +25,6 @@ TOLERANCE = 0.5  # pixels forward and backward flow may disagree by ...
 RELATIVE_TOLERANCE = 0.01  # ... plus this share of the flow's length (METHOD.md 5: the reference allows 50 %)
 SMALL = 100_000  # frames of fewer pixels are matched at twice their size
 
-Matcher = Callable[[np.ndarray, np.ndarray], np.ndarray]  # two grey uint8 (H, W) images -> flow (H, W, 2) px
-
 
 class FlowPrior(Protocol):
     """What `prepare` calls, whatever is behind it."""
