@@ -39,10 +39,12 @@ class TrainConfig:
     """Batches (each of one random frame) of a step, over all devices together."""
     period: float = 0.45
     """The schedules' period K as a share of the run; 0: the published K = 1000 min(max(30, frames), 250) steps."""
+    prior_fade: float = 1.0
+    """Depth and flow weights are multiplied by this every period (published: 0.1)."""
     lr_final: float = 0.05
     """Learning rates fall exponentially to this share of their start over the run; 0: the published 0.1 per 300k steps."""
     tonemap_lr: float = 2e-3
-    anchor_at: float = 0.4
+    anchor_at: float = 0.05
     """Share of the run after which response and exposures are held where they are (1: never)."""
     paint: bool = True
     """Start grids from the depth prior and the recorded colours."""
@@ -101,7 +103,7 @@ def paper() -> TrainConfig:
     )
     return TrainConfig(
         field=network, tonemap=ToneMapConfig(kind="per_image", knots="even"), loss=weights, steps=250_000, minutes=None, rays=1024,
-        moving_rays=512, batches=1, paint=False, period=0.0, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, checkpoint_seconds=600,
+        moving_rays=512, batches=1, paint=False, period=0.0, prior_fade=0.1, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, checkpoint_seconds=600,
     )  # fmt: skip
 
 

@@ -35,14 +35,14 @@ class LossWeights:
     disocclusion: float = 0.02
     blend_entropy: float = 0.0
     depth: float = 0.5
-    """Depth prior; x0.1 every phase."""
+    """Depth prior; fades, see `prior_fade`."""
     flow: float = 0.01
-    """Optical-flow prior, in pixels; x0.1 every phase."""
+    """Optical-flow prior, in pixels; fades, see `prior_fade`."""
     mask: float = 0.2
     """Cross-entropy between rendered motion and the moving mask."""
     response_smoothness: float = 1e-3
     gain_residual: float = 1.0
-    response_anchor: float = 10.0
+    response_anchor: float = 100.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,7 @@ class Objective:
     near: float  # z-depth, scene units
     squared: bool = False  # eq. 12-13 as printed; False: absolute, as the reference does
     saturation: bool = True  # trust recorded values near 0 and 1 less in the dynamic terms
+    fade: float = 0.1  # of the depth and flow terms, every phase
     flow_limit: float | None = 20.0  # pixels: an outlier of the flow prior costs no more than this
 
     def terms(self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
@@ -101,8 +102,8 @@ class Objective:
         return terms | ({"chain": torch.stack(double).mean()} if double else {})
 
     def priors(self, render: Render, batch: PixelBatch, phase: float) -> dict[str, Tensor]:
-        """Depth, optical flow and moving mask; depth and flow fade by 0.1 every phase."""
-        terms, fade = {}, 0.1 ** int(phase)
+        """Depth, optical flow and moving mask; depth and flow are multiplied by `fade` every phase."""
+        terms, fade = {}, self.fade ** int(phase)
         depth = render.depth if render.dynamic_depth is None else render.dynamic_depth
         if batch.disparity is not None:
             confidence = torch.ones_like(batch.disparity) if batch.disparity_confidence is None else batch.disparity_confidence

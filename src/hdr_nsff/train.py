@@ -97,7 +97,9 @@ class Trainer:
         self.config, self.scene, self.ranks = config, scene, ranks
         self.field = build_field(config.field, scene)
         self.tonemapper = ToneMapper.for_scene(config.tonemap, scene)
-        self.objective = Objective(config.loss, scene.manifest.depth_kind, scene.near, config.squared, config.saturation)
+        self.objective = Objective(
+            config.loss, scene.manifest.depth_kind, scene.near, config.squared, config.saturation, config.prior_fade
+        )
         groups = self.field.param_groups()
         dense = [g for g in groups if not g.get("touched")] + self.tonemapper.param_groups(config.tonemap_lr)
         touched = [g for g in groups if g.get("touched")]
@@ -155,6 +157,9 @@ class Trainer:
 
     def loop(self) -> None:
         """Train until the clock runs out."""
+        if self.clock.progress >= 1:
+            self.report(f"training was finished already, at step {self.clock.step}")
+            return
         started, before = time.monotonic(), self.clock.seconds
         saved = started
         if self.clock.step == 0 and self.ranks.main:
