@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import pytest
 import torch
@@ -20,8 +21,9 @@ from hdr_nsff import distributed
 from hdr_nsff.config import PRESETS, TrainConfig
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import write_json
-from hdr_nsff.run import Run
+from hdr_nsff.run import Run, read_log
 from hdr_nsff.scene import Scene
+from hdr_nsff.tonemap import ToneMapConfig
 from hdr_nsff.train import Clock, Trainer, train
 
 STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
@@ -209,3 +211,10 @@ def test_without_steps_the_clock_counts_minutes() -> None:
     clock = Clock(PRESETS["grid"], 24, 10**6, 75.0)
     assert clock.progress == 0.25 and clock.phase == 0.5
     assert replace(clock, seconds=1e6).progress == 1.0
+
+
+@pytest.mark.parametrize("kind", ["none", "fixed", "per_image"])
+def test_every_kind_of_tone_mapper_trains(kind: Literal["none", "fixed", "per_image"], toy_folder: Path, tmp_path: Path) -> None:
+    settings = replace(config(toy_folder, tmp_path / "run"), tonemap=ToneMapConfig(kind=kind))
+    log = read_log(train(replace(settings, steps=25)))
+    assert log[-1]["step"] == 25 and log[-1]["psnr"] > 5

@@ -103,7 +103,9 @@ class Trainer:
         groups = self.field.param_groups()
         dense = [g for g in groups if not g.get("touched")] + self.tonemapper.param_groups(config.tonemap_lr)
         touched = [g for g in groups if g.get("touched")]
-        self.optimisers: dict[str, torch.optim.Optimizer] = {"dense": torch.optim.Adam(dense)}
+        self.optimisers: dict[str, torch.optim.Optimizer] = {}
+        if dense:  # grids without a tone mapper have nothing dense
+            self.optimisers["dense"] = torch.optim.Adam(dense)
         if touched:
             self.optimisers["touched"] = TouchedAdam(touched)
         self.marks = [marks for g in touched for marks in g["touched"]]  # rows with a gradient, of any process
