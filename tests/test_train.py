@@ -203,12 +203,12 @@ def test_the_published_learning_rate_falls_by_a_tenth_in_300_000_steps() -> None
 
 
 def test_grid_schedules_follow_the_share_of_the_run() -> None:
-    clock = at("grid", 50, steps=100)
-    assert clock.progress == 0.5 and clock.phase == 1.0 and math.isclose(clock.lr_share, 0.05**0.5)
+    clock = at("grid", 50, steps=100, period=0.25, lr_final=0.05)
+    assert clock.progress == 0.5 and clock.phase == 2.0 and math.isclose(clock.lr_share, 0.05**0.5)
 
 
 def test_without_steps_the_clock_counts_minutes() -> None:
-    clock = Clock(PRESETS["grid"], 24, 10**6, 75.0)
+    clock = Clock(replace(PRESETS["grid"], steps=None, minutes=5.0, period=0.5), 24, 10**6, 75.0)
     assert clock.progress == 0.25 and clock.phase == 0.5
     assert replace(clock, seconds=1e6).progress == 1.0
 
