@@ -224,13 +224,17 @@ def load_points(folder: Path, name: str) -> Tensor:
 
 
 def neighbours(entries: list[FrameEntry]) -> list[dict[int, int]]:
-    """For each frame the positions of the previous (-1) and next (+1) frame in time of the same physical camera."""
+    """For each frame the positions of the frames at the previous (-1) and next (+1) training time of the same physical camera.
+
+    A camera that has no frame at that time has no neighbour there: fields know scene flow from one training time to the next."""
     result: list[dict[int, int]] = [{} for _ in entries]
+    place = {time: k for k, time in enumerate(sorted({e.time for e in entries}))}
     for camera_id in {e.camera_id for e in entries}:
         order = sorted((i for i, e in enumerate(entries) if e.camera_id == camera_id), key=lambda i: entries[i].time)
         for a, b in itertools.pairwise(order):
-            result[a][1] = b
-            result[b][-1] = a
+            if place[entries[b].time] - place[entries[a].time] == 1:
+                result[a][1] = b
+                result[b][-1] = a
     return result
 
 
