@@ -36,12 +36,12 @@ class FlowPrior(Protocol):
 
 
 def flow(
-    video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray, report: str = "optical flow"
+    video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray, report: str | None = "optical flow"
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flow (P, H, W, 2) float32 px and valid (P, H, W) bool of `pairs` (P, 2) by dense inverse search, checked against the reverse.
 
     `video` (T, H, W, 3) is exposure-equalised rgb in [0, 1], `clipped` (T, H, W) bool marks pixels without information.
-    The answer does not depend on the order of the pairs or on the number of cores."""
+    The answer does not depend on the order of the pairs or on the number of cores. `report` None shows no progress."""
     video, pairs = np.asarray(video, np.float32), np.asarray(pairs, np.int64).reshape(-1, 2)
     assert video.ndim == 4 and clipped.shape == video.shape[:3], f"video {video.shape}, clipped {clipped.shape}"
     assert pairs.size == 0 or (pairs.min() >= 0 and pairs.max() < len(video)), f"pairs reach beyond {len(video)} frames"
@@ -59,14 +59,16 @@ def flow(
     return np.stack(forward) if forward else np.zeros((0, *size, 2), np.float32), np.array(valid, bool).reshape(-1, *size)
 
 
-def in_threads(work: Callable, items: list, report: str) -> list:
+def in_threads(work: Callable, items: list, report: str | None) -> list:
     """`work` of every item, in order, on two threads with OpenCV's own threads off (its results depend on their number)."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
+    pool = ThreadPoolExecutor(2)
     try:
-        with ThreadPoolExecutor(2) as pool:
-            return list(track(pool.map(work, items), report, total=len(items)))
+        results = pool.map(work, items)
+        return list(results if report is None else track(results, report, total=len(items)))
     finally:
+        pool.shutdown(cancel_futures=True)  # Ctrl-C waits for what is under way, not for what is to come
         cv2.setNumThreads(before)
 
 

@@ -17,13 +17,13 @@ from hdr_nsff.priors.flow import flow, read_flow
 from hdr_nsff.priors.import_poses import import_poses
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
 from hdr_nsff.priors.poses import Poses, estimate_poses
-from hdr_nsff.progress import say
+from hdr_nsff.progress import say, track
 from hdr_nsff.scene import FlowFiles, FrameEntry, Step
 from hdr_nsff.steps.work import Work
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
 SAME_MASKS = 0.75  # intersection over union from which masks count as the same
-FLOW_CHUNK = 128  # pairs between two savings
+FLOW_CHUNK = 8  # pairs between two savings
 SPHERE_NEAR, SPHERE_FAR = 0.5, 2.0  # around distance 1, where everything lies when there is no parallax
 
 
@@ -45,13 +45,14 @@ def flow_step(work: Work) -> Step:
     pairs = flow_pairs(m.frames)
     names = {(i, j): FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png") for i, j in pairs}
     missing = [p for p in pairs if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))]
-    for k in range(0, len(missing), FLOW_CHUNK):
-        chunk = missing[k : k + FLOW_CHUNK]
+    size = FLOW_CHUNK if c.flow is None else max(len(missing), 1)
+    for chunk in track([missing[k : k + size] for k in range(0, len(missing), size)], "flow"):
         if c.flow is not None:
             found, valid = read_flow(c.flow, chunk, (m.height, m.width))
         else:
-            some = f" {k + 1}-{k + len(chunk)} of {len(missing)}" if len(missing) > FLOW_CHUNK else ""
-            found, valid = flow(*work.equalised, np.array(chunk), report=f"flow{some}")
+            some = np.unique(chunk)
+            video, clipped = work.equalised
+            found, valid = flow(video[some], clipped[some], np.searchsorted(some, chunk), report=None)
         for pair, f, v in zip(chunk, found, valid, strict=True):
             write_npy(work.folder / names[pair].flow, f.astype(np.float16))
             write_png(work.folder / names[pair].valid, v)
