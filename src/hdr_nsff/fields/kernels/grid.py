@@ -2,7 +2,9 @@
 
 One flat table holds all levels; row `offset[l] + ((s * Z + z) * Y + y) * X + x` of a dense level (x, y, z grid point, s time
 slice), or a hash of the four into `size[l]` (a power of two) rows of a hashed one. A level is read at up to two time slices
-with given weights; a static grid is the case of one slice. The plain-torch twin is in `encodings.py`; a test compares them."""
+with given weights; a static grid is the case of one slice. The plain-torch twin is in `encodings.py`; a test compares them.
+
+No `fastmath`: with it, code fresh from the compiler and code from its cache differed in the last bit, and it was no faster."""
 
 from __future__ import annotations
 
@@ -34,7 +36,7 @@ def row_of(x: Any, y: Any, z: Any, s: Any, nx: Any, ny: Any, nz: Any, hashed: An
     return np.int64(((s * nz + z) * ny + y) * nx + x)
 
 
-@numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def forward(coords, table, res, offset, size, hashed, slices, slice_weights, out):
     """Values (N, C) at coords (N, 3)."""
     for i in numba.prange(coords.shape[0]):
@@ -62,7 +64,7 @@ def forward(coords, table, res, offset, size, hashed, slices, slice_weights, out
                                 out[i, c] += w * table[r, c]
 
 
-@numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def backward_table(coords, grad_out, res, offset, size, hashed, slices, slice_weights, grad_table, touched):
     """Add to grad_table what grad_out (N, C) says and mark the rows it touches."""
     for level in numba.prange(res.shape[0]):  # a level's rows belong to one thread: no race, and the same sum every time
@@ -89,7 +91,7 @@ def backward_table(coords, grad_out, res, offset, size, hashed, slices, slice_we
                                 grad_table[r, c] += w * grad_out[i, c]
 
 
-@numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def backward_coords(coords, table, grad_out, res, offset, size, hashed, slices, slice_weights, grad_coords):
     """Gradient (N, 3) to the coordinates."""
     for i in numba.prange(coords.shape[0]):
@@ -124,7 +126,7 @@ def backward_coords(coords, table, grad_out, res, offset, size, hashed, slices, 
         grad_coords[i, 2] = gz if F0 < coords[i, 2] < F1 else F0
 
 
-@numba.njit(parallel=True, fastmath=True, nogil=True, cache=True)
+@numba.njit(parallel=True, nogil=True, cache=True)
 def adam_rows(p, g, m, v, touched, lr, beta1, beta2, eps, correction1, correction2):
     """One Adam step on the marked rows of (rows, C) arrays; their gradients and marks are cleared. Other rows, moments included, stay."""
     for r in numba.prange(p.shape[0]):
