@@ -38,7 +38,7 @@ def test_a_scene_holds_what_was_written(toy: Scene) -> None:
     truth = ToyScene()
     assert len(toy.train) == 6 and toy.test == [] and toy.times.tolist() == [0, 1, 2, 3, 4, 5]
     for f in toy.train:
-        radiance, moving, z = truth.see(f.time)
+        radiance, moving, _ = truth.see(f.time)
         assert f.exposure == EV[f.bracket] and f.moving is not None and f.disparity is not None
         recorded = np.clip(radiance * 2.0**f.exposure, 0, 1) ** (1 / 2.2)
         assert float(np.abs(f.image.numpy() - recorded).max()) <= 0.5 / 255 + 1e-6
