@@ -1,7 +1,7 @@
 """Sparse correspondences: SIFT keypoints on exposure-equalised frames, matched between chosen pairs of frames.
 
-Small frames are doubled and their local contrast is levelled first: PROTOTYPES-scale clips (240x136) give too few and too
-coarse keypoints otherwise. Positions are pixels of the frames as given, centres at +0.5."""
+Small frames are doubled and their local contrast is levelled first: at 240x136 there are too few keypoints otherwise, and too
+coarse ones. Positions are pixels of the frames as given, centres at +0.5."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def usable(ignore: np.ndarray, scale: int, margin: int = 2) -> np.ndarray:
 
 def keypoints(video: np.ndarray, ignore: np.ndarray, limit: int = 1500) -> list[Keypoints]:
     """The `limit` strongest keypoints of every frame of `video` (T, H, W, 3) in [0, 1], none in `ignore` (T, H, W) bool."""
-    sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.02)
+    sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.02, enable_precise_upscale=True)
     scale = upsampling(video.shape[2])
     found = []
     for t in track(range(len(video)), "keypoints"):

@@ -104,7 +104,8 @@ def turning_share(video: np.ndarray, ignore: np.ndarray) -> float | None:
     matches = match_all(keypoints(video[chosen], ignore[chosen], 1000), view_pairs([list(range(len(chosen)))]))
     height, width = video.shape[1:3]
     found = panorama(matches, len(chosen), width, height)
-    return None if found is None else rotation_share(matches, found, width, height)
+    share = None if found is None else rotation_share(matches, found, width, height)
+    return share if found is None or share is None or not found.slides else min(share, PERHAPS)
 
 
 def turning(video: np.ndarray, ignore: np.ndarray) -> Panorama | None:

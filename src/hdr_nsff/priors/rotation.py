@@ -26,6 +26,7 @@ class Panorama:
     linked: np.ndarray  # (T,) bool: enough matches tie this frame to the others
     focal: float  # pixels
     focal_known: bool  # else the default field of view
+    slides: bool  # a sideways shift before something flat explains the matches much better than any turn does
     explained: float  # share of the matches that these rotations explain to 2 px
     errors: np.ndarray  # (T,) median residual in pixels, NaN where not linked
     motion: float  # pixels: how far the image centre or a corner ever strays from where it lies in the middle frame
@@ -87,7 +88,10 @@ def panorama(matches: list[PairMatches], count: int, width: int, height: int) ->
     p, q = (np.concatenate(x) - centre for x in ([m.p for m in kept], [m.q for m in kept]))
     rotations, _, _ = refine(rotations, default_focal(width), ends, p, q, False)
     free, focal, spread = refine(rotations, default_focal(width), ends, p, q, True)
-    known = spread < 0.05 and 20 < np.degrees(2 * np.arctan(width / 2 / focal)) < 120
+    fov = np.degrees(2 * np.arctan(width / 2 / focal))
+    known = bool(spread < 0.05 and 25 < fov < 120)
+    # through an endlessly long lens a turn is a shift of the picture
+    slides = bool(fov <= 25) and cost(rotations, default_focal(width), ends, p, q) > 1.5 * cost(free, focal, ends, p, q)
     rotations, focal = (free, focal) if known else (rotations, default_focal(width))
     residual = np.linalg.norm(turned(rotations, focal, ends, p)[0] - q, axis=1)
     errors = np.full(count, np.nan)
@@ -99,6 +103,7 @@ def panorama(matches: list[PairMatches], count: int, width: int, height: int) ->
         linked=linked,
         focal=focal,
         focal_known=known,
+        slides=slides,
         explained=float((residual < 2).mean()),
         errors=errors,
         motion=stray(rotations[linked], focal, width, height),
@@ -127,8 +132,8 @@ def chain(
     K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
     edges = {(m.i, m.j): nearest_rotation(np.linalg.inv(K) @ h @ K) for m, h in zip(kept, homographies, strict=True)}  # R_j^T R_i
     i, j = np.array(list(edges)).T
-    cost = 1.0 / np.array([len(m.p) for m in kept]) * (1 + 0.01 * (j - i))
-    tree = minimum_spanning_tree(coo_matrix((cost, (i, j)), shape=(count, count)))
+    lengths = 1.0 / np.array([len(m.p) for m in kept]) * (1 + 0.01 * (j - i))
+    tree = minimum_spanning_tree(coo_matrix((lengths, (i, j)), shape=(count, count)))
     order, parent = max(
         (breadth_first_order(tree, int(t), directed=False) for t in np.unique(i)[:: max(1, len(np.unique(i)) // 8)]),
         key=lambda found: len(found[0]),
@@ -155,36 +160,55 @@ def turned(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray)
 
 
 def refine(
-    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray, free_focal: bool, steps: int = 20
+    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray, free_focal: bool, steps: int = 40
 ) -> tuple[np.ndarray, float, float]:
-    """Rotations and focal length with the least robust (Cauchy, 1 px) residual over all matches, by Gauss-Newton; and how uncertain
-    the logarithm of the focal length is (standard deviation).
+    """Rotations and focal length with the least robust (Cauchy, 1 px) residual over all matches, by Levenberg-Marquardt; and how
+    uncertain the logarithm of the focal length is (standard deviation).
 
     `rotations` (T, 3, 3) camera to world; `ends` (M, 2) the frames i, j of each match; `p`, `q` (M, 2) pixels from the image centre."""
-    count = len(rotations)
-    spread = np.inf
+    damping, least = 1e-4, cost(rotations, focal, ends, p, q)
+    normal, right = normal_equations(rotations, focal, ends, p, q, free_focal)
     for _ in range(steps):
-        predicted, seen = turned(rotations, focal, ends, p)
-        residual = q - predicted  # (M, 2)
-        weight = 1 / (1 + np.sum(residual**2, 1))
-        jacobian = derivatives(rotations, focal, ends, p, seen)  # (M, 2, 7)
-        columns = np.concatenate(
-            [3 * ends[:, :1] + np.arange(3), 3 * ends[:, 1:] + np.arange(3), np.full((len(p), 1), 3 * count)], 1
-        )
-        normal, right = np.zeros((3 * count + 1,) * 2), np.zeros(3 * count + 1)
-        blocks = np.einsum("mki,m,mkj->mij", jacobian, weight, jacobian)
-        np.add.at(normal, (columns[:, :, None], columns[:, None, :]), blocks)
-        np.add.at(right, columns, np.einsum("mki,m,mk->mi", jacobian, weight, residual))
-        normal[np.diag_indices(3 * count)] += 1e-3 * focal**2  # holds the free common turn and frames without matches
-        normal[-1, -1] += 1.0 if free_focal else 1e18
-        step = np.linalg.solve(normal, right)
-        rotations = rotations @ Rotation.from_rotvec(step[:-1].reshape(count, 3)).as_matrix()
-        focal = float(focal * np.exp(np.clip(step[-1], -0.3, 0.3)))
-        noise = 1.48 * np.median(np.linalg.norm(residual, axis=1))
-        spread = float(noise * np.sqrt(np.linalg.inv(normal)[-1, -1] * 10))  # a point is matched about ten times over
-        if np.abs(step[:-1]).max() * focal < 1e-3 and abs(step[-1]) < 1e-5:
+        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
+        turned_on = rotations @ Rotation.from_rotvec(step[:-1].reshape(-1, 3)).as_matrix()
+        longer = float(focal * np.exp(np.clip(step[-1], -0.3, 0.3)))
+        now = cost(turned_on, longer, ends, p, q)
+        if now >= least:
+            damping *= 10
+            if damping > 1e6:
+                break
+            continue
+        rotations, focal, damping = turned_on, longer, damping / 10
+        normal, right = normal_equations(rotations, focal, ends, p, q, free_focal)
+        if least - now < 1e-7 * least:
             break
-    return rotations, focal, spread
+        least = now
+    residual = np.linalg.norm(turned(rotations, focal, ends, p)[0] - q, axis=1)
+    # a point is matched about ten times over: those errors are one error
+    return rotations, focal, float(1.48 * np.median(residual) * np.sqrt(np.linalg.inv(normal)[-1, -1] * 10))
+
+
+def normal_equations(
+    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray, free_focal: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """J^T W J (3T + 1, 3T + 1) and J^T W r (3T + 1) of the matches; unknowns are three turns per frame and the logarithm of the focal length."""
+    count = len(rotations)
+    predicted, seen = turned(rotations, focal, ends, p)
+    residual = q - predicted  # (M, 2)
+    weight = 1 / (1 + np.sum(residual**2, 1))
+    jacobian = derivatives(rotations, focal, ends, p, seen)  # (M, 2, 7)
+    columns = np.concatenate([3 * ends[:, :1] + np.arange(3), 3 * ends[:, 1:] + np.arange(3), np.full((len(p), 1), 3 * count)], 1)
+    normal, right = np.zeros((3 * count + 1,) * 2), np.zeros(3 * count + 1)
+    np.add.at(normal, (columns[:, :, None], columns[:, None, :]), np.einsum("mki,m,mkj->mij", jacobian, weight, jacobian))
+    np.add.at(right, columns, np.einsum("mki,m,mk->mi", jacobian, weight, residual))
+    normal[np.diag_indices(3 * count)] += 1e-3 * focal**2  # holds the common turn, which is free, and frames without matches
+    normal[-1, -1] += 1.0 if free_focal else 1e18
+    return normal, right
+
+
+def cost(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray) -> float:
+    """The mean robust residual that `refine` lowers, `log(1 + r^2)`, of matches in pixels from the image centre."""
+    return float(np.mean(np.log1p(np.sum((turned(rotations, focal, ends, p)[0] - q) ** 2, 1))))
 
 
 def derivatives(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, seen: np.ndarray) -> np.ndarray:
