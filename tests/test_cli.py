@@ -18,7 +18,11 @@ from hdr_nsff.config import PRESETS, TrainConfig
 from hdr_nsff.errors import InputError
 from hdr_nsff.run import Run
 
-COMMAND = [sys.executable, "-c", "from hdr_nsff.cli import main; main()"]
+COMMAND = [
+    sys.executable,
+    "-c",
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from hdr_nsff.cli import main; main()",
+]
 
 
 def call(*arguments: str) -> int:
