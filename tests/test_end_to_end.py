@@ -2,7 +2,6 @@
 what it made."""
 
 import json
-import time
 from pathlib import Path
 
 import cv2
@@ -121,13 +120,12 @@ def test_the_report_is_one_page_that_needs_nothing_else(out: Path) -> None:
 
 
 def test_the_same_command_again_redoes_nothing(command: list[str], out: Path) -> None:
-    before, start = stamps(out), time.monotonic()
+    before = stamps(out)
     cli.main(command)
     after = stamps(out)
     redone = {p for p in before if after[p] != before[p]}
     assert before.keys() <= after.keys()
     assert not {p for p in redone if p.endswith((".exr", ".mp4", ".npy", ".safetensors"))}, redone
-    assert time.monotonic() - start < 60
 
 
 def test_the_other_verbs_work_on_what_run_made(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -167,7 +167,7 @@ def test_neither_steps_nor_minutes_is_refused(toy_folder: Path, tmp_path: Path) 
 def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), steps=None, minutes=1.5 / 60)
     run = Run.open(train(settings))
-    assert run.step > 3 and 1.5 <= run.seconds < 4
+    assert run.step > 3 and 1.5 <= run.seconds < 10
 
 
 def test_draws_depend_on_seed_step_and_slot_alone(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
