@@ -165,7 +165,9 @@ def test_a_csv_that_makes_no_sense_is_named(tmp_path, text, what):
 
 def test_exif_exposure_counts_time_sensitivity_and_aperture(tmp_path):
     exif = Image.Exif()
-    exif.get_ifd(0x8769).update({0x829A: IFDRational(1, 64), 0x8827: 400, 0x829D: IFDRational(2, 1)})  # 1/64 s, ISO 400, f/2: -6 + 2 - 2
+    exif.get_ifd(0x8769).update(
+        {0x829A: IFDRational(1, 64), 0x8827: 400, 0x829D: IFDRational(2, 1)}
+    )  # 1/64 s, ISO 400, f/2: -6 + 2 - 2
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
     Image.new("RGB", (8, 8)).save(tmp_path / "b.jpg")
     assert read_exif_ev(tmp_path / "a.jpg") == pytest.approx(-6)
@@ -177,3 +179,43 @@ def test_held_out_frames_go_through_all_exposures():
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
     assert {k % 4 for k in chosen} == {0, 1, 2, 3}
     assert held_out(100, 0, 3) == [] and 0 not in held_out(9, 2, 1) and 8 not in held_out(9, 2, 1)
+
+
+def write_dng(path: Path, level: float) -> None:
+    """A small raw photograph of a grey card, its upper half at half `level` of the sensor's range."""
+    tifffile = pytest.importorskip("tifffile")
+    raw = np.full((64, 96), int(level * 65535), np.uint16)
+    raw[:32] //= 2
+    matrix = (3.1339, -1.6169, -0.4906, -0.9785, 1.9160, 0.0333, 0.0720, -0.2290, 1.4057)  # XYZ to the camera's own colours
+
+    def ratios(values: tuple[float, ...]) -> tuple[int, ...]:
+        return tuple(n for v in values for n in (round(v * 10000), 10000))
+
+    tags = [
+        (50706, "B", 4, (1, 4, 0, 0)),  # DNG version
+        (50708, "s", 5, "Test"),  # camera
+        (33421, "H", 2, (2, 2)),  # a Bayer pattern ...
+        (33422, "B", 4, (0, 1, 1, 2)),  # ... of red green / green blue
+        (50721, "2i", 9, ratios(matrix)),
+        (50728, "2I", 3, ratios((1, 1, 1))),  # neutral as shot
+        (50778, "H", 1, 21),  # under daylight
+        (50717, "H", 1, 65535),  # white level
+    ]
+    tifffile.imwrite(path, raw, photometric=32803, extratags=[(*t, True) for t in tags])
+
+
+def test_raw_photographs_are_linear_and_share_a_white_balance(tmp_path):
+    pytest.importorskip("rawpy")
+    for i, level in enumerate((0.1, 0.4)):
+        write_dng(tmp_path / f"{i}.dng", level)
+    dark, bright = (f.rgb[48, 48] ** 2.2 for f in all_frames(tmp_path))
+    assert np.allclose(bright / dark, 4, rtol=0.01)
+    half = all_frames(tmp_path)[1].rgb[16, 48] ** 2.2
+    assert np.allclose(bright / half, 2, rtol=0.01)
+
+
+def test_a_broken_raw_photograph_is_named(tmp_path):
+    pytest.importorskip("rawpy")
+    (tmp_path / "a.dng").write_bytes(b"II*\x00 not a photograph")
+    with pytest.raises(InputError, match=r"a.dng: not a readable DNG"):
+        all_frames(tmp_path)

@@ -62,4 +62,8 @@ def test_optical_flow_counts_valid_pixels_only_and_caps_outliers() -> None:
 
 def test_a_right_motion_mask_costs_next_to_nothing() -> None:
     moving = torch.tensor([True, False])
-    assert float(losses.motion_mask(torch.tensor([1.0, 0.0]), moving)) < 1e-3 < float(losses.motion_mask(torch.tensor([0.0, 1.0]), moving))
+    assert (
+        float(losses.motion_mask(torch.tensor([1.0, 0.0]), moving))
+        < 1e-3
+        < float(losses.motion_mask(torch.tensor([0.0, 1.0]), moving))
+    )

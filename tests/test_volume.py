@@ -50,7 +50,9 @@ def test_blend_agrees_with_a_slow_loop() -> None:
     for i in range(5):
         a_dy = (1 - math.exp(-d[0, i] * deltas[0, i])) * b[0, i]
         a_st = (1 - math.exp(-s[0, i] * deltas[0, i])) * (1 - b[0, i])
-        assert math.isclose(float(w.dynamic[0, i]), t * a_dy, rel_tol=1e-4) and math.isclose(float(w.static[0, i]), t * a_st, rel_tol=1e-4)
+        assert math.isclose(float(w.dynamic[0, i]), t * a_dy, rel_tol=1e-4) and math.isclose(
+            float(w.static[0, i]), t * a_st, rel_tol=1e-4
+        )
         t *= (1 - a_dy) * (1 - a_st)
 
 

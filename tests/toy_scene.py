@@ -22,7 +22,9 @@ def card_offset(t: float) -> np.ndarray:
 
 def textures(seed: int = 0) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
-    return [cv2.GaussianBlur(np.kron(rng.random((40, 60, 3)), np.ones((4, 4, 1))), (0, 0), 1.5).astype(np.float32) for _ in range(2)]
+    return [
+        cv2.GaussianBlur(np.kron(rng.random((40, 60, 3)), np.ones((4, 4, 1))), (0, 0), 1.5).astype(np.float32) for _ in range(2)
+    ]
 
 
 class ToyScene:
@@ -42,8 +44,15 @@ class ToyScene:
 
         def plane(z: float, offset: np.ndarray, texture: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             px, py = centre[0] + self.dx * z - offset[0], centre[1] + self.dy * z - offset[1]
-            u, v = (px / size + 0.5) * texture.shape[1], (py / size * texture.shape[1] / texture.shape[0] + 0.5) * texture.shape[0]
-            return cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP), px, py
+            u, v = (
+                (px / size + 0.5) * texture.shape[1],
+                (py / size * texture.shape[1] / texture.shape[0] + 0.5) * texture.shape[0],
+            )
+            return (
+                cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP),
+                px,
+                py,
+            )
 
         wall, _, _ = plane(WALL, np.zeros(2), self.textures[0], 6.0)
         card, px, py = plane(CARD, card_offset(t), self.textures[1], 2.0)

@@ -290,5 +290,5 @@ def objects(scores: np.ndarray) -> np.ndarray:
     radius = max(1, round(len(scores) / 68))
     found = cv2.morphologyEx(found, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2))
     holes, _ = ndimage.label(found == 0)
-    found |= (np.bincount(holes.ravel()) < HOLE * scores.size)[holes].astype(np.uint8)
+    found = np.where((np.bincount(holes.ravel()) < HOLE * scores.size)[holes], 1, found).astype(np.uint8)
     return cv2.dilate(found, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (3, 3))) > 0
