@@ -30,7 +30,7 @@ class NSFFConfig:
     """A neural scene flow field."""
 
     encoding: GridConfig | MlpConfig = field(default_factory=GridConfig)
-    samples: int = 40
+    samples: int = 32
     """Samples along a ray while training."""
     render_samples: int = 64
     """Samples along a ray when rendering."""
