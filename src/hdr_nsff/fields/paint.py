@@ -20,6 +20,7 @@ from hdr_nsff.progress import track
 from hdr_nsff.scene import Frame
 
 CROSSINGS = 24  # places along a ray where its passing is counted
+SWEEPS = 4  # over the finest level
 HARDEST, SOFTEST = 5.0, -4.0  # bounds of painted raw density
 
 
@@ -90,8 +91,9 @@ def exposure_trust(rgb: Tensor) -> Tensor:
 
 
 def paint_radiance(grid: AdditiveGrid, splashes: list[Splash], moving: bool) -> None:
-    """Coarse to fine, every level the trust-weighted mean of what is left."""
-    for level in range(len(grid.res)):
+    """Coarse to fine, every level the trust-weighted mean of what is left; the finest one several times, as one mean blurs."""
+    finest = len(grid.res) - 1
+    for level in [*range(finest), *[finest] * SWEEPS]:
         total = torch.zeros(int(grid.size[level]), 4)
         for s in splashes:
             chosen = s.moving == moving
@@ -100,7 +102,7 @@ def paint_radiance(grid: AdditiveGrid, splashes: list[Splash], moving: bool) -> 
                 left = s.log_radiance[chosen] - grid(coords, s.knot)[:, :3]
             total += grid.spread_to(level, coords, torch.cat([left * trust, trust], -1), s.knot)
         weight = total[:, 3:]
-        grid.rows_of(level)[:, :3] = total[:, :3] / (weight + 0.05 * weight[weight > 0].mean().nan_to_num(1.0) + 1e-9)
+        grid.rows_of(level)[:, :3] += total[:, :3] / (weight + 0.05 * weight[weight > 0].mean().nan_to_num(1.0) + 1e-9)
 
 
 def paint_density(grid: AdditiveGrid, splashes: list[Splash], level: int, moving: bool, bias: float) -> None:
