@@ -67,10 +67,7 @@ def forward(coords, table, res, offset, size, hashed, slices, slice_weights, out
 @numba.njit(parallel=True, nogil=True, cache=True)
 def backward_table(coords, grad_out, res, offset, size, hashed, slices, slice_weights, grad_table, touched):
     """Add to grad_table what grad_out (N, C) says and mark the rows it touches."""
-    levels = res.shape[0]
-    for turn in numba.prange(levels):  # a level's rows belong to one thread: no race, and the same sum every time
-        # threads take contiguous shares: coarse levels (in cache) and fine ones (not) in turn make these weigh alike
-        level = turn // 2 if turn % 2 == 0 else levels - 1 - turn // 2
+    for level in numba.prange(res.shape[0]):  # a level's rows belong to one thread: no race, and the same sum every time
         nx, ny, nz = res[level, 0], res[level, 1], res[level, 2]
         for i in range(coords.shape[0]):
             x, fx = cell_of(coords[i, 0], nx)
