@@ -11,8 +11,9 @@ from presets import random_field, small, trainer
 from hdr_nsff.batch import PixelBatch, gather
 from hdr_nsff.fields import build_field
 from hdr_nsff.fields.branches import GridConfig
+from hdr_nsff.fields.encodings import AdditiveGrid
 from hdr_nsff.fields.nsff import NSFF
-from hdr_nsff.fields.paint import exposure_trust, paint
+from hdr_nsff.fields.paint import Splash, exposure_trust, paint, paint_radiance
 from hdr_nsff.scene import Scene
 from hdr_nsff.train import Trainer
 
@@ -97,3 +98,22 @@ def test_every_frame_is_inverted_by_its_own_recording(toy: Scene) -> None:
 def test_clipped_recordings_are_hardly_trusted() -> None:
     trust = exposure_trust(torch.tensor([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]))
     torch.testing.assert_close(trust, torch.tensor([0.5, 1e-3, 1e-3, 0.2]))
+
+
+def left_over(sweeps: int, monkeypatch: pytest.MonkeyPatch) -> float:
+    """RMS of what painting leaves of a chequered wall, three cells to a square."""
+    monkeypatch.setattr("hdr_nsff.fields.paint.SWEEPS", sweeps)
+    axis = (torch.arange(64) + 0.5) / 64
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    coords = torch.stack([x, y, torch.full_like(x, 0.5)], -1).reshape(-1, 3)
+    squares = ((coords[:, 0] * 64 // 3 + coords[:, 1] * 64 // 3) % 2)[:, None].expand(-1, 3)
+    n = len(coords)
+    wall = Splash(coords, squares, torch.ones(n), torch.zeros(n, dtype=torch.bool), torch.zeros(n, 1, 3), torch.zeros(n), 0.0)
+    grid = AdditiveGrid([(16, 16, 4, 1), (32, 32, 4, 1), (64, 64, 4, 1)])
+    paint_radiance(grid, [wall], moving=False)
+    return float((grid(coords).detach()[:, :3] - squares).square().mean().sqrt())
+
+
+def test_more_sweeps_sharpen_what_one_leaves_blurred(monkeypatch: pytest.MonkeyPatch) -> None:
+    one, four = left_over(1, monkeypatch), left_over(4, monkeypatch)
+    assert four < 0.75 * one < 0.75 * 0.5  # half is what painting nothing but the mean would leave
