@@ -7,13 +7,15 @@ import torch
 
 from hdr_nsff import distributed
 from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.fields import build_field
+from hdr_nsff.fields import build_field, start_field
 from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpConfig
 from hdr_nsff.fields.nsff import NSFF
+from hdr_nsff.fields.splat import Splat, SplatConfig
 from hdr_nsff.scene import Scene
 from hdr_nsff.train import Trainer, open_folder
 
-NETWORKS = {
+NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig] = {
+    "splat": SplatConfig(static=400, moving=150, bases=2),
     "grid": GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12),
     "paper": MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2),
     "tiny": GridConfig(finest=6.0, depth_cells=16, levels=2, max_rows=2**12),
@@ -23,16 +25,29 @@ NETWORKS = {
 def small(preset: str, scene: Path = Path("scene"), out: Path = Path("run"), steps: int = 2) -> TrainConfig:
     """A preset with a small network, few samples and few rays."""
     config = PRESETS[preset]
-    field = replace(config.field, encoding=NETWORKS[preset], samples=12, render_samples=16, cull_after=4)
+    network = NETWORKS[preset]
+    field = (
+        network
+        if isinstance(network, SplatConfig)
+        else replace(config.field, encoding=network, samples=12, render_samples=16, cull_after=4)
+    )
+    rays = {"rays": 64, "moving_rays": 16} if config.rays else {}
     return replace(
-        config, field=field, scene=scene, out=out, steps=steps, minutes=None, rays=64, moving_rays=16, checkpoint_seconds=1e9, device="cpu"
-    )  # fmt: skip
+        config, field=field, scene=scene, out=out, steps=steps, minutes=None, checkpoint_seconds=1e9, device="cpu", **rays
+    )
 
 
-def random_field(preset: str, scene: Scene, seed: int = 0) -> NSFF:
+def random_field(preset: str, scene: Scene, seed: int = 0) -> NSFF | Splat:
     """An untrained field with something in every branch."""
     torch.manual_seed(seed)
     field = build_field(small(preset).field, scene)
+    if isinstance(field, Splat):
+        start_field(field, scene, lambda rgb, i: rgb + 0.1, 0.0, True)
+        for p in field.trajectories.parameters():
+            p.data.add_(0.02 * torch.randn_like(p))
+        for p in (field.moving.offsets, field.static.offsets, field.mixture_logits):
+            p.data.add_(0.3 * torch.randn_like(p))
+        return field
     for p in field.parameters():
         p.data.add_(0.3 * torch.randn_like(p))
     if isinstance(field.branches, GridBranches):

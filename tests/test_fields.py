@@ -10,7 +10,8 @@ from presets import NETWORKS, random_field, small, trainer
 from hdr_nsff.batch import draw_pixels
 from hdr_nsff.config import PRESETS
 from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.fields.nsff import NSFF
+from hdr_nsff.fields.nsff import NSFF, NSFFConfig
+from hdr_nsff.fields.splat import Splat
 from hdr_nsff.scene import Scene
 from hdr_nsff.volume import transmittance, weighted_sum
 
@@ -18,15 +19,22 @@ every_preset = pytest.mark.parametrize("preset", list(PRESETS))
 
 
 @pytest.fixture(scope="module", params=list(PRESETS))
-def field(request: pytest.FixtureRequest, toy: Scene) -> NSFF:
+def field(request: pytest.FixtureRequest, toy: Scene) -> NSFF | Splat:
     return random_field(request.param, toy)
+
+
+@pytest.fixture(scope="module", params=[name for name, config in PRESETS.items() if isinstance(config.field, NSFFConfig)])
+def nsff(request: pytest.FixtureRequest, toy: Scene) -> NSFF:
+    field = random_field(request.param, toy)
+    assert isinstance(field, NSFF)
+    return field
 
 
 def test_every_preset_is_tested() -> None:
     assert set(NETWORKS) == set(PRESETS)
 
 
-def test_a_render_has_the_promised_shapes_and_ranges(field: NSFF, toy: Scene) -> None:
+def test_a_render_has_the_promised_shapes_and_ranges(field: NSFF | Splat, toy: Scene) -> None:
     camera = toy.train[2].camera
     assert isinstance(field, RadianceField)
     for time in (2.0, 2.4):
@@ -42,7 +50,7 @@ def test_a_render_has_the_promised_shapes_and_ranges(field: NSFF, toy: Scene) ->
         assert float(r.motion.max()) > 0.01 and float(r.scene_flow[1].abs().max()) > 1e-4
 
 
-def test_rendering_in_chunks_changes_nothing(field: NSFF, toy: Scene) -> None:
+def test_rendering_in_chunks_changes_nothing(field: NSFF | Splat, toy: Scene) -> None:
     camera = toy.train[1].camera.resized(112, 80)  # 8960 pixels: the chunks end within the picture
     pixels = camera.pixel_grid()
     whole, part = field.render(camera, 1.3), field.render(camera, 1.3, pixels[8100:8300])
@@ -51,7 +59,7 @@ def test_rendering_in_chunks_changes_nothing(field: NSFF, toy: Scene) -> None:
     torch.testing.assert_close(whole.scene_flow[-1][8100:8300], part.scene_flow[-1], atol=1e-5, rtol=1e-4)
 
 
-def test_rendering_leaves_the_field_as_it_was(field: NSFF, toy: Scene) -> None:
+def test_rendering_leaves_the_field_as_it_was(field: NSFF | Splat, toy: Scene) -> None:
     before = {k: v.clone() for k, v in field.state_dict().items()}
     field.train()
     first = field.render(toy.train[0].camera, 0.5)
@@ -60,7 +68,7 @@ def test_rendering_leaves_the_field_as_it_was(field: NSFF, toy: Scene) -> None:
     torch.testing.assert_close(first.radiance, field.render(toy.train[0].camera, 0.5).radiance, atol=0, rtol=0)
 
 
-def test_time_is_continuous_at_and_between_training_times(field: NSFF, toy: Scene) -> None:
+def test_time_is_continuous_at_and_between_training_times(field: NSFF | Splat, toy: Scene) -> None:
     camera = toy.train[2].camera
     at, after, before, half = (field.render(camera, t).radiance for t in (2.0, 2.0005, 1.9995, 2.5))
     torch.testing.assert_close(after, at, atol=2e-3, rtol=2e-2)
@@ -68,48 +76,48 @@ def test_time_is_continuous_at_and_between_training_times(field: NSFF, toy: Scen
     assert float((half - at).abs().max()) > 1e-3
 
 
-def test_outside_its_times_the_field_stands_still(field: NSFF, toy: Scene) -> None:
+def test_outside_its_times_the_field_stands_still(field: NSFF | Splat, toy: Scene) -> None:
     camera, last = toy.train[0].camera, toy.train[-1].time
     torch.testing.assert_close(field.render(camera, last + 3).radiance, field.render(camera, last).radiance)
     torch.testing.assert_close(field.render(camera, -3.0).radiance, field.render(camera, 0.0).radiance)
 
 
-def test_layers_composite_to_the_render(field: NSFF, toy: Scene) -> None:
+def test_layers_composite_to_the_render(nsff: NSFF, toy: Scene) -> None:
     camera = toy.train[3].camera
-    layers, render = field.layers(camera, 3.0), field.render(camera, 3.0)
+    layers, render = nsff.layers(camera, 3.0), nsff.render(camera, 3.0)
     weights = transmittance(layers.alpha) * layers.alpha
     radiance, motion = weighted_sum(weights, layers.radiance), (weights * layers.motion).sum(-1)
     assert float(layers.alpha.min()) >= 0 and float(layers.alpha.max()) <= 1
     still = layers.motion == 0
     assert float(layers.scene_flow[1][still].abs().max()) == 0 < float(layers.scene_flow[1].abs().max())
     # where both contents fill one sample, layers put the dynamic one in front and the render shares it: hence a few per cent
-    assert float((weights.sum(-1) - render.opacity).abs().max()) < (1e-4 if field.config.compositing == "add" else 0.05)
+    assert float((weights.sum(-1) - render.opacity).abs().max()) < (1e-4 if nsff.config.compositing == "add" else 0.05)
     assert float((radiance - render.radiance).abs().mean() / render.radiance.mean()) < 0.03
     assert float((motion - render.motion).abs().mean()) < 0.03
 
 
-def test_a_training_pass_has_warps_and_regularisers(field: NSFF, toy: Scene) -> None:
+def test_a_training_pass_has_warps_and_regularisers(nsff: NSFF, toy: Scene) -> None:
     batch = replace(draw_pixels(toy, 3, 40, 10, torch.Generator().manual_seed(0)), seed=1, chain=-1)
-    field.train()
-    render, own = field(batch)
+    nsff.train()
+    render, own = nsff(batch)
     assert [w.offset for w in render.warps] == [1, -1, -2]
     for w in render.warps:
         assert w.flow.shape == (50, 2) and w.radiance is not None and w.radiance.shape == (50, 3)
         assert float(w.confidence.detach().min()) >= 0 and float(w.confidence.detach().max()) <= 1
-    blended = field.config.compositing == "blend"
+    blended = nsff.config.compositing == "blend"
     assert set(own) == {"cycle", "kinetic", "smoothness", "disocclusion"} | ({"blend_entropy"} if blended else set())
     assert (render.dynamic_radiance is not None) == blended
     assert all(v.requires_grad and torch.isfinite(v) for v in own.values())
 
 
-def test_a_pass_is_told_by_its_seed(field: NSFF, toy: Scene) -> None:
+def test_a_pass_is_told_by_its_seed(nsff: NSFF, toy: Scene) -> None:
     batch = draw_pixels(toy, 3, 40, 0, torch.Generator().manual_seed(0))
-    field.train()
-    one, same, other = (field(replace(batch, seed=s))[0].radiance for s in (1, 1, 2))
+    nsff.train()
+    one, same, other = (nsff(replace(batch, seed=s))[0].radiance for s in (1, 1, 2))
     assert torch.equal(one, same) and not torch.equal(one, other)
 
 
-def test_at_the_ends_of_the_clip_there_is_one_neighbour(field: NSFF, toy: Scene) -> None:
+def test_at_the_ends_of_the_clip_there_is_one_neighbour(field: NSFF | Splat, toy: Scene) -> None:
     for frame, offset in ((0, 1), (len(toy.train) - 1, -1)):
         batch = replace(draw_pixels(toy, frame, 20, 0, torch.Generator().manual_seed(0)), chain=-offset)
         assert [w.offset for w in field(batch)[0].warps] == [offset]

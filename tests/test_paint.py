@@ -13,7 +13,7 @@ from hdr_nsff.fields import build_field
 from hdr_nsff.fields.branches import GridConfig
 from hdr_nsff.fields.encodings import AdditiveGrid
 from hdr_nsff.fields.nsff import NSFF
-from hdr_nsff.fields.paint import Splash, exposure_trust, paint, paint_radiance
+from hdr_nsff.fields.painting import Splash, exposure_trust, paint, paint_radiance
 from hdr_nsff.scene import Scene
 from hdr_nsff.train import Trainer
 
@@ -102,7 +102,7 @@ def test_clipped_recordings_are_hardly_trusted() -> None:
 
 def left_over(sweeps: int, monkeypatch: pytest.MonkeyPatch) -> float:
     """RMS of what painting leaves of a chequered wall, three cells to a square."""
-    monkeypatch.setattr("hdr_nsff.fields.paint.SWEEPS", sweeps)
+    monkeypatch.setattr("hdr_nsff.fields.painting.SWEEPS", sweeps)
     axis = (torch.arange(64) + 0.5) / 64
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     coords = torch.stack([x, y, torch.full_like(x, 0.5)], -1).reshape(-1, 3)

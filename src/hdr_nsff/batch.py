@@ -60,6 +60,13 @@ def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = No
     )
 
 
+def whole_frame(scene: Scene, frame: int) -> PixelBatch:
+    """The batch of every pixel of training frame `frame`, row by row."""
+    h, w = scene.train[frame].image.shape[:2]
+    flat = torch.arange(h * w, device=scene.train[frame].image.device)
+    return gather(scene, frame, torch.stack([flat % w, flat // w], -1))
+
+
 def draw_pixels(scene: Scene, frame: int, num_uniform: int, num_moving: int, generator: torch.Generator) -> PixelBatch:
     """`num_uniform` random pixels of training frame `frame`, and `num_moving` more from its moving mask (none where nothing moves)."""
     f = scene.train[frame]

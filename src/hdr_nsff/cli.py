@@ -44,6 +44,7 @@ VERBS = {
     "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
 }
 PRESET_HELP = {
+    "splat": "4D Gaussians, minutes on a CPU and real-time pictures.",
     "grid": "Additive grids, minutes on a CPU; the default of `run`.",
     "paper": "The published network, losses and schedules; hours on a GPU.",
     "tiny": "Seconds on a CPU, to try things out.",

@@ -10,6 +10,7 @@ from typing import Any
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields.branches import GridConfig, MlpConfig
 from hdr_nsff.fields.nsff import NSFFConfig
+from hdr_nsff.fields.splat import SplatConfig
 from hdr_nsff.objective import LossWeights
 from hdr_nsff.tonemap import ToneMapConfig
 
@@ -22,7 +23,7 @@ class TrainConfig:
     """Scene folder, as `prepare` wrote it."""
     out: Path = Path("run")
     """Run folder: config, checkpoints, log, previews."""
-    field: NSFFConfig = dataclasses.field(default_factory=NSFFConfig)
+    field: NSFFConfig | SplatConfig = dataclasses.field(default_factory=NSFFConfig)
     tonemap: ToneMapConfig = dataclasses.field(default_factory=ToneMapConfig)
     loss: LossWeights = dataclasses.field(default_factory=LossWeights)
     steps: int | None = None
@@ -30,7 +31,7 @@ class TrainConfig:
     minutes: float | None = 5.0
     """Without `steps`: stop after this many minutes of training; learning rates and schedules follow the clock."""
     rays: int = 1536
-    """Uniformly drawn pixels of a batch."""
+    """Uniformly drawn pixels of a batch; 0: the whole frame."""
     moving_rays: int = 512
     """More pixels of a batch, from the moving mask."""
     moving_until: float = 1.0
@@ -47,7 +48,7 @@ class TrainConfig:
     anchor_at: float = 0.05
     """Share of the run after which response and exposures are held where they are (1: never)."""
     paint: bool = True
-    """Start grids from the depth prior and the recorded colours."""
+    """Start the field from the depth prior and the recorded colours (no effect on the published network)."""
     squared: bool = False
     """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
     saturation: bool = True
@@ -62,17 +63,18 @@ class TrainConfig:
 
     def to_json(self) -> dict[str, Any]:
         """Plain data that `from_json` turns back."""
-        return asdict(self) | {"scene": str(self.scene), "out": str(self.out), "encoding": type(self.field.encoding).__name__}
+        kinds = [type(self.field).__name__]
+        if isinstance(self.field, NSFFConfig):
+            kinds.append(type(self.field.encoding).__name__)
+        return asdict(self) | {"scene": str(self.scene), "out": str(self.out), "kinds": kinds}
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> TrainConfig:
         """The config of a run. InputError where a key is missing or unknown (another version)."""
         try:
             data = dict(data)
-            encodings = {"GridConfig": GridConfig, "MlpConfig": MlpConfig}
-            encoding = encodings[data.pop("encoding")](**data["field"]["encoding"])
             parts = {
-                "field": NSFFConfig(**{**data["field"], "encoding": encoding}),
+                "field": read_field(data.pop("kinds"), data["field"]),
                 "tonemap": ToneMapConfig(**data["tonemap"]),
                 "loss": LossWeights(**data["loss"]),
                 "scene": Path(data["scene"]),
@@ -83,6 +85,22 @@ class TrainConfig:
             raise InputError(
                 f"the run's config.json is from another version or damaged ({error}); train again into a new folder"
             ) from error
+
+
+def read_field(kinds: list[str], values: dict[str, Any]) -> NSFFConfig | SplatConfig:
+    """The field's settings from plain data; `kinds` names their types, outermost first."""
+    known: dict[str, Any] = {c.__name__: c for c in (NSFFConfig, SplatConfig, GridConfig, MlpConfig)}
+    if len(kinds) > 1:
+        values = {**values, "encoding": known[kinds[1]](**values["encoding"])}
+    field = known[kinds[0]](**values)
+    assert isinstance(field, NSFFConfig | SplatConfig)
+    return field
+
+
+def splat() -> TrainConfig:
+    """4D Gaussians: minutes to train on a CPU, pictures in real time."""
+    weights = LossWeights(dynamic=0.0, temporal=0.0, chain=0.0, cycle=0.0, flow_magnitude=0.0, depth=0.2, flow=0.01, mask=0.1)
+    return TrainConfig(field=SplatConfig(), loss=weights, rays=0, moving_rays=0, lr_final=0.03)
 
 
 def paper() -> TrainConfig:
@@ -115,4 +133,4 @@ def tiny() -> TrainConfig:
     return TrainConfig(field=network, steps=60, minutes=None, rays=192, moving_rays=64, batches=1)
 
 
-PRESETS: dict[str, TrainConfig] = {"grid": TrainConfig(), "paper": paper(), "tiny": tiny()}
+PRESETS: dict[str, TrainConfig] = {"splat": splat(), "grid": TrainConfig(), "paper": paper(), "tiny": tiny()}

@@ -40,6 +40,16 @@ class LossWeights:
     """Optical-flow prior, in pixels; fades, see `prior_fade`."""
     mask: float = 0.2
     """Cross-entropy between rendered motion and the moving mask."""
+    opacity: float = 0.01
+    """Mean opacity of Gaussians: what is not needed fades and is used elsewhere."""
+    scale: float = 0.01
+    """Mean scale of Gaussians, in units of the near depth."""
+    trajectory: float = 1.0
+    """Third differences of the shared motions."""
+    shade: float = 0.01
+    """Square of static Gaussians' changes of log radiance in time."""
+    colour_change: float = 0.01
+    """Square of moving Gaussians' changes of log radiance from one colour knot to the next."""
     response_smoothness: float = 1e-3
     gain_residual: float = 1.0
     response_anchor: float = 100.0

@@ -15,12 +15,11 @@ import torch
 from torch import Tensor
 
 from hdr_nsff import distributed
-from hdr_nsff.batch import PixelBatch, draw_pixels
+from hdr_nsff.batch import PixelBatch, draw_pixels, whole_frame
 from hdr_nsff.config import TrainConfig
 from hdr_nsff.errors import InputError
-from hdr_nsff.fields import build_field
+from hdr_nsff.fields import build_field, start_field
 from hdr_nsff.fields.encodings import TouchedAdam
-from hdr_nsff.fields.paint import paint
 from hdr_nsff.io import write_png, writing_to
 from hdr_nsff.objective import Objective
 from hdr_nsff.priors.response import initialise
@@ -111,6 +110,7 @@ class Trainer:
         self.marks = [marks for g in touched for marks in g["touched"]]  # rows with a gradient, of any process
         self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimisers.items()}
         self.clock = Clock(config, len(scene.train), 0, 0.0)
+        self.frames: dict[int, PixelBatch] = {}
         self.resume_or_initialise()
         self.scene = to_device(scene, device)
         self.field.to(device)
@@ -132,9 +132,9 @@ class Trainer:
             self.report(f"going on at step {found.step}, {found.seconds:.0f} s into the training")
             return
         self.report(f"response curve: {initialise(self.tonemapper, self.scene)}")
-        self.field.bias.fill_(self.typical_log_radiance())
-        if self.config.paint and paint(self.field, self.scene.train, self.recorded_radiance):
-            self.report("field: painted from the depth prior")
+        told = start_field(self.field, self.scene, self.recorded_radiance, self.typical_log_radiance(), self.config.paint)
+        if told:
+            self.report(told)
 
     def report(self, message: str) -> None:
         """A line for the person at the terminal, once however many processes there are."""
@@ -226,9 +226,15 @@ class Trainer:
         frame = int(torch.randint(len(self.scene.train), (1,), generator=generator))
         when = clock.progress if config.period else clock.phase
         moving = config.moving_rays if when < config.moving_until else 0
-        batch = draw_pixels(self.scene, frame, config.rays, moving, generator)
+        batch = draw_pixels(self.scene, frame, config.rays, moving, generator) if config.rays else self.whole_frame(frame)
         chain = (1 if clock.step % 2 else -1) if clock.phase >= 2 and config.loss.chain else 0
         return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), chain=chain)
+
+    def whole_frame(self, frame: int) -> PixelBatch:
+        """The batch of all pixels of a frame, made once."""
+        if frame not in self.frames:
+            self.frames[frame] = whole_frame(self.scene, frame)
+        return self.frames[frame]
 
     def check(self, terms: dict[str, Tensor], batch: PixelBatch, radiance: Tensor) -> None:
         """NaN and Inf are errors with the step, the term and the ray."""

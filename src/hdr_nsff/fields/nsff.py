@@ -17,6 +17,7 @@ from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import Layers, Render
 from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpBranches, MlpConfig
+from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.motion import Motion
 from hdr_nsff.fields.occupancy import Occupancy
 from hdr_nsff.fields.samples import Content, March
@@ -105,11 +106,7 @@ class NSFF(nn.Module):
 
     def knot(self, time: float) -> float:
         """Position of a time (in frames) on the list of training times."""
-        t = self.times
-        i = int(torch.searchsorted(t, torch.tensor(time, dtype=t.dtype, device=t.device)).clamp(1, max(len(t) - 1, 1)))
-        if len(t) == 1:
-            return 0.0
-        return float(i - 1 + ((time - t[i - 1]) / (t[i] - t[i - 1])).clamp(0, 1))
+        return knot_of(self.times, time)
 
     def march(self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None) -> March:
         """Samples along the rays of `pixels` (N, 2), evenly in disparity; jittered where a generator is given."""

@@ -6,7 +6,6 @@ branch, moving pixels their own time's slice of the dynamic one. Training refine
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +14,7 @@ from torch import Tensor
 from hdr_nsff.fields.branches import GridBranches
 from hdr_nsff.fields.encodings import AdditiveGrid
 from hdr_nsff.fields.nsff import NSFF
-from hdr_nsff.losses import saturation_weight
+from hdr_nsff.fields.surface import ToRadiance, exposure_trust
 from hdr_nsff.progress import track
 from hdr_nsff.scene import Frame
 
@@ -37,7 +36,7 @@ class Splash:
     knot: float
 
 
-def paint(field: NSFF, frames: list[Frame], to_radiance: Callable[[Tensor, int], Tensor]) -> bool:
+def paint(field: NSFF, frames: list[Frame], to_radiance: ToRadiance) -> bool:
     """Paint `field` from the frames' depth priors; False where it has no grids or the frames no depth in scene units.
 
     `to_radiance(rgb (P, 3), i)` inverts the recording of frame `i`."""
@@ -62,7 +61,7 @@ def static_density_level(grid: AdditiveGrid) -> int:
     return dense[-1] if dense else 0
 
 
-def splash(field: NSFF, f: Frame, position: int, to_radiance: Callable[[Tensor, int], Tensor]) -> Splash:
+def splash(field: NSFF, f: Frame, position: int, to_radiance: ToRadiance) -> Splash:
     """Points, colours and crossed space of the frame at `position` of the training frames."""
     assert f.disparity is not None
     rays = f.camera.rays(f.camera.pixel_grid())
@@ -82,12 +81,6 @@ def splash(field: NSFF, f: Frame, position: int, to_radiance: Callable[[Tensor, 
         lengths=(crossed[:, -1] - crossed[:, 0]).norm(dim=-1) / (CROSSINGS - 1),
         knot=field.knot(f.time),
     )
-
-
-def exposure_trust(rgb: Tensor) -> Tensor:
-    """How much a recorded value (P, 3) says about radiance: next to nothing where a channel clips, less in the darks: (P,)."""
-    clipped = ((rgb > 0.97) | (rgb < 0.01)).any(-1)
-    return torch.where(clipped, torch.tensor(1e-3), saturation_weight(rgb).amin(-1) * rgb.mean(-1).clamp(0.05, 1))
 
 
 def paint_radiance(grid: AdditiveGrid, splashes: list[Splash], moving: bool) -> None:

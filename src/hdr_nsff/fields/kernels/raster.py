@@ -1,0 +1,385 @@
+"""Numba kernels of the Gaussian rasteriser on the CPU: projection, tiles, compositing, and all of it backwards by hand.
+
+A projected Gaussian is a pixel centre, a conic (inverse 2D covariance: a, b, c of a dx^2 / 2 + b dx dy + c dy^2 / 2), a z-depth, an
+opacity and D features. Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing,
+above 0.999 as 0.999 (Kerbl et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come
+behind. Each (Gaussian, tile) pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and
+the same result whatever the number of threads. The plain-torch twin is `rasterize.dense`.
+
+Loops over the pixels of a tile are written so that LLVM vectorises them: flat arrays, unsigned ranges, no library call, no maximum
+carried along. `FAST` lets it reorder sums; NaN and Inf stay what they are."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+TILE_X, TILE_Y = 16, 8  # pixels
+PIXELS = TILE_X * TILE_Y
+MOMENTS = 6  # gradients of a pair before its features: sums of u, u dx, u dy, u dx^2, u dx dy, u dy^2
+F0, F1, HALF = np.float32(0), np.float32(1), np.float32(0.5)
+ALPHA_MIN, ALPHA_MAX = np.float32(1 / 255), np.float32(0.999)
+SPENT = np.float32(1e-4)  # transmittance below which a tile is finished
+DEEPEST = np.float32(6.0)  # exponents beyond this are below the cut for every opacity <= 1
+NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn
+BLUR = 0.3  # pixels^2 added to 2D variances, so that no Gaussian falls between pixels
+MARGIN = 0.3  # of half the picture: how far outside it the projection is still linearised where the Gaussian is
+EIGHTH = np.float32(0.125)
+E2, E3, E4, E5 = (np.float32(1 / n) for n in (2, 6, 24, 120))
+FAST = {"contract", "reassoc", "nsz"}
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def exp_minus(s):
+    """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three times; vectorises, unlike a library call."""
+    x = -s * EIGHTH
+    y = F1 + x * (F1 + x * (E2 + x * (E3 + x * (E4 + x * E5))))
+    y = y * y
+    y = y * y
+    return y * y
+
+
+@numba.njit(cache=True)
+def rotation(q):
+    """Unit quaternion (w, x, y, z), its rotation matrix row by row, and the length it had."""
+    n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) + 1e-12
+    w, x, y, z = q[0] / n, q[1] / n, q[2] / n, q[3] / n
+    r = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+    return (w, x, y, z), r, n
+
+
+@numba.njit(cache=True)
+def limited(x, z, low, high):
+    """x moved so that x / z lies within [low, high], and whether it had to be."""
+    ratio = x / z
+    if ratio < low:
+        return z * low, True
+    if ratio > high:
+        return z * high, True
+    return x, False
+
+
+@numba.njit(cache=True)
+def footprint(m, q, s, v, k, width, height):
+    """A Gaussian in the picture: camera point t, projection T = J W (2, 3), half-axes M = R S (3, 3), 2D covariance (xx, xy, yy)."""
+    t = (
+        v[0, 0] * m[0] + v[0, 1] * m[1] + v[0, 2] * m[2] + v[0, 3],
+        v[1, 0] * m[0] + v[1, 1] * m[1] + v[1, 2] * m[2] + v[1, 3],
+        v[2, 0] * m[0] + v[2, 1] * m[1] + v[2, 2] * m[2] + v[2, 3],
+    )
+    z = t[2] if t[2] > NEAREST else NEAREST
+    fx, fy, cx, cy = k[0], k[1], k[2], k[3]
+    edge_x, edge_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
+    x, held_x = limited(t[0], z, -cx / fx - edge_x, (width - cx) / fx + edge_x)
+    y, held_y = limited(t[1], z, -cy / fy - edge_y, (height - cy) / fy + edge_y)
+    j00, j02, j11, j12 = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)
+    t0 = (j00 * v[0, 0] + j02 * v[2, 0], j00 * v[0, 1] + j02 * v[2, 1], j00 * v[0, 2] + j02 * v[2, 2])
+    t1 = (j11 * v[1, 0] + j12 * v[2, 0], j11 * v[1, 1] + j12 * v[2, 1], j11 * v[1, 2] + j12 * v[2, 2])
+    unit, r, n = rotation(q)
+    a0, a1, a2 = (
+        (t0[0] * r[0][0] + t0[1] * r[1][0] + t0[2] * r[2][0]) * s[0],
+        (t0[0] * r[0][1] + t0[1] * r[1][1] + t0[2] * r[2][1]) * s[1],
+        (t0[0] * r[0][2] + t0[1] * r[1][2] + t0[2] * r[2][2]) * s[2],
+    )
+    b0, b1, b2 = (
+        (t1[0] * r[0][0] + t1[1] * r[1][0] + t1[2] * r[2][0]) * s[0],
+        (t1[0] * r[0][1] + t1[1] * r[1][1] + t1[2] * r[2][1]) * s[1],
+        (t1[0] * r[0][2] + t1[1] * r[1][2] + t1[2] * r[2][2]) * s[2],
+    )
+    covariance = (a0 * a0 + a1 * a1 + a2 * a2 + BLUR, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2 + BLUR)
+    return t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), ((a0, a1, a2), (b0, b1, b2)), covariance
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def project(means, quaternions, scales, opacities, w2c, k, width, height, centres, depths, conics, rows, boxes):
+    """Fill pixel `centres` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G, 2) and tile `boxes` (G, 4: x0, y0, x1, y1, ends
+    excluded; empty where nothing shows) of world Gaussians seen by `w2c` (3, 4) and `k` = (fx, fy, cx, cy). Lengths in scene units."""
+    tiles_x, tiles_y = (width + TILE_X - 1) // TILE_X, (height + TILE_Y - 1) // TILE_Y
+    for g in numba.prange(means.shape[0]):
+        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+        q = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
+        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+        t, _, _, _, _, (xx, xy, yy) = footprint(m, q, s, w2c, k, width, height)
+        depths[g] = t[2]
+        boxes[g, 0] = boxes[g, 1] = boxes[g, 2] = boxes[g, 3] = 0
+        rows[g, 0] = rows[g, 1] = 0
+        centres[g, 0] = centres[g, 1] = conics[g, 0] = conics[g, 1] = conics[g, 2] = F0
+        o = float(opacities[g])
+        if not t[2] > NEAREST or o < ALPHA_MIN:
+            continue
+        x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
+        reach = math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
+        rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
+        if not (x + rx > 0 and y + ry > 0 and x - rx < width and y - ry < height):
+            continue  # outside, or not a number
+        det = xx * yy - xy * xy
+        if not det > 0:
+            continue  # too long and thin for float64
+        centres[g, 0], centres[g, 1] = x, y
+        conics[g, 0], conics[g, 1], conics[g, 2] = yy / det, -xy / det, xx / det
+        left, right, top, bottom = max(x - rx, 0.0), min(x + rx, float(width)), max(y - ry, 0.0), min(y + ry, float(height))
+        rows[g, 0], rows[g, 1] = int(top), math.ceil(bottom)
+        boxes[g, 0], boxes[g, 1] = int(left) // TILE_X, int(top) // TILE_Y
+        boxes[g, 2] = min(int(right) // TILE_X + 1, tiles_x)
+        boxes[g, 3] = min(int(bottom) // TILE_Y + 1, tiles_y)
+
+
+@numba.njit(cache=True, nogil=True)
+def bin_tiles(boxes, order, tiles_x, tiles_y):
+    """Lists of Gaussians per tile, front to back as `order` (G,) says.
+
+    Returns `starts` (tiles + 1,), `members` (P,) the Gaussian of every list entry, `places` (P,) the entry's own place for
+    gradients, and `owned` (G + 1,) where each Gaussian's places begin."""
+    count = boxes.shape[0]
+    owned = np.zeros(count + 1, np.int64)
+    starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
+    for g in range(count):
+        owned[g + 1] = owned[g] + (boxes[g, 2] - boxes[g, 0]) * (boxes[g, 3] - boxes[g, 1])
+        for ty in range(boxes[g, 1], boxes[g, 3]):
+            for tx in range(boxes[g, 0], boxes[g, 2]):
+                starts[ty * tiles_x + tx + 1] += 1
+    for t in range(tiles_x * tiles_y):
+        starts[t + 1] += starts[t]
+    at = starts[:-1].copy()
+    members, places = np.empty(owned[count], np.int32), np.empty(owned[count], np.int32)
+    for g in order:
+        place = owned[g]
+        for ty in range(boxes[g, 1], boxes[g, 3]):
+            for tx in range(boxes[g, 0], boxes[g, 2]):
+                t = ty * tiles_x + tx
+                members[at[t]], places[at[t]] = g, place
+                at[t] += 1
+                place += 1
+    return starts, members, places, owned
+
+
+@numba.njit(cache=True)
+def pixel_centres(tile, tiles_x):
+    """First column and row of a tile, and its pixel centres x and y (PIXELS,), row by row."""
+    x0, y0 = (tile % tiles_x) * TILE_X, (tile // tiles_x) * TILE_Y
+    px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+    for p in range(PIXELS):
+        px[p], py[p] = np.float32(x0 + p % TILE_X) + HALF, np.float32(y0 + p // TILE_X) + HALF
+    return x0, y0, px, py
+
+
+@numba.njit(cache=True)
+def span(rows, g, y0):
+    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows; unsigned, or LLVM would not vectorise over them."""
+    first = max((rows[g, 0] - y0) // 2 * (2 * TILE_X), 0)
+    last = min((rows[g, 1] - y0 + 1) // 2 * (2 * TILE_X), PIXELS)
+    return np.uint64(first), np.uint64(max(first, last))
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def spent(left):
+    """Whether nothing behind can be seen any more."""
+    most = F0
+    for p in range(PIXELS):
+        most = max(most, left[p])
+    return most < SPENT
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def forward(starts, members, centres, conics, opacities, features, rows, maps, alpha):
+    """Composite features (G, D) into `maps` (D, H, W) and `alpha` (H, W)."""
+    height, width = alpha.shape
+    channels = features.shape[1]
+    tiles_x = (width + TILE_X - 1) // TILE_X
+    for tile in numba.prange(len(starts) - 1):
+        x0, y0, px, py = pixel_centres(tile, tiles_x)
+        left, w = np.ones(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        total = np.zeros((channels, PIXELS), np.float32)
+        for i in range(starts[tile], starts[tile + 1]):
+            g = members[i]
+            cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
+            a, b, c = conics[g, 0] * HALF, conics[g, 1], conics[g, 2] * HALF
+            first, last = span(rows, g, y0)
+            for p in range(first, last):
+                dx, dy = px[p] - cx, py[p] - cy
+                s = min(max(a * dx * dx + c * dy * dy + b * dx * dy, F0), DEEPEST)
+                q = min(o * exp_minus(s), ALPHA_MAX)
+                q = q if q >= ALPHA_MIN else F0
+                v = q * left[p]
+                w[p] = v
+                left[p] -= v
+            for d in range(channels):
+                f, sums = features[g, d], total[d]
+                for p in range(first, last):
+                    sums[p] += f * w[p]
+            if i % 16 == 0 and spent(left):
+                break
+        for y in range(min(TILE_Y, height - y0)):
+            for x in range(min(TILE_X, width - x0)):
+                alpha[y0 + y, x0 + x] = F1 - left[y * TILE_X + x]
+                for d in range(channels):
+                    maps[d, y0 + y, x0 + x] = total[d, y * TILE_X + x]
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+def backward(starts, members, places, centres, conics, opacities, features, rows, maps, alpha, grad_maps, grad_alpha, out):
+    """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its pixels, then its features."""
+    height, width = alpha.shape
+    channels = features.shape[1]
+    tiles_x = (width + TILE_X - 1) // TILE_X
+    for tile in numba.prange(len(starts) - 1):
+        x0, y0, px, py = pixel_centres(tile, tiles_x)
+        left, w, u, value = (
+            np.ones(PIXELS, np.float32),
+            np.empty(PIXELS, np.float32),
+            np.empty(PIXELS, np.float32),
+            np.empty(PIXELS, np.float32),
+        )
+        grads, grad_a = np.zeros((channels, PIXELS), np.float32), np.zeros(PIXELS, np.float32)
+        behind = np.zeros(PIXELS, np.float32)  # sum of weight * value from here on
+        for y in range(min(TILE_Y, height - y0)):
+            for x in range(min(TILE_X, width - x0)):
+                p = y * TILE_X + x
+                grad_a[p] = grad_alpha[y0 + y, x0 + x]
+                behind[p] = grad_a[p] * alpha[y0 + y, x0 + x]
+                for d in range(channels):
+                    grads[d, p] = grad_maps[d, y0 + y, x0 + x]
+                    behind[p] += grads[d, p] * maps[d, y0 + y, x0 + x]
+        done = False
+        for i in range(starts[tile], starts[tile + 1]):
+            g, grad = members[i], out[places[i]]
+            if done:
+                grad[:] = F0
+                continue
+            cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
+            a, b, c = conics[g, 0] * HALF, conics[g, 1], conics[g, 2] * HALF
+            first, last = span(rows, g, y0)
+            for p in range(first, last):
+                value[p] = grad_a[p]
+            for d in range(channels):
+                f, sums = features[g, d], grads[d]
+                for p in range(first, last):
+                    value[p] += f * sums[p]
+            for p in range(first, last):
+                dx, dy = px[p] - cx, py[p] - cy
+                s = min(max(a * dx * dx + c * dy * dy + b * dx * dy, F0), DEEPEST)
+                full = o * exp_minus(s)
+                q = min(full, ALPHA_MAX)
+                q = q if q >= ALPHA_MIN else F0
+                v = q * left[p]
+                w[p] = v
+                behind[p] -= v * value[p]
+                slope = left[p] * value[p] - behind[p] / (F1 - q)  # dL / d alpha
+                free = q if full <= ALPHA_MAX else F0
+                u[p] = -slope * free
+                left[p] -= v
+            m0 = m1 = m2 = m3 = m4 = m5 = F0
+            for p in range(first, last):
+                dx, dy = px[p] - cx, py[p] - cy
+                ux, uy = u[p] * dx, u[p] * dy
+                m0 += u[p]
+                m1 += ux
+                m2 += uy
+                m3 += ux * dx
+                m4 += ux * dy
+                m5 += uy * dy
+            grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = m0, m1, m2, m3, m4, m5
+            for d in range(channels):
+                sums, total = grads[d], F0
+                for p in range(first, last):
+                    total += sums[p] * w[p]
+                grad[MOMENTS + d] = total
+            if i % 16 == 0:
+                done = spent(left)
+
+
+@numba.njit(parallel=True, cache=True, nogil=True)
+def project_backward(
+    means, quaternions, scales, opacities, w2c, k, width, height, conics, owned, pairs,
+    grad_means, grad_quaternions, grad_scales, grad_opacities, grad_features, grad_pose,
+):  # fmt: skip
+    """Add up the pairs' gradients and carry them to the world: everything `(G, ...)`; `grad_pose` (G, 12) per Gaussian, or (0, 12) if
+    not wanted. The last feature is the z-depth."""
+    channels = pairs.shape[1] - MOMENTS
+    for g in numba.prange(means.shape[0]):
+        first, last = owned[g], owned[g + 1]
+        if first == last:
+            grad_means[g, :], grad_quaternions[g, :], grad_scales[g, :], grad_features[g, :] = F0, F0, F0, F0
+            grad_opacities[g] = F0
+            if len(grad_pose):
+                grad_pose[g, :] = F0
+            continue
+        for d in range(channels):
+            total = F0
+            for i in range(first, last):
+                total += pairs[i, MOMENTS + d]
+            grad_features[g, d] = total
+        u0 = u1 = u2 = u3 = u4 = u5 = 0.0
+        for i in range(first, last):
+            u0 += pairs[i, 0]
+            u1 += pairs[i, 1]
+            u2 += pairs[i, 2]
+            u3 += pairs[i, 3]
+            u4 += pairs[i, 4]
+            u5 += pairs[i, 5]
+        grad_opacities[g] = -u0 / opacities[g]
+        a, b, c = float(conics[g, 0]), float(conics[g, 1]), float(conics[g, 2])
+        gx, gy = -(a * u1 + b * u2), -(b * u1 + c * u2)  # pixel centre
+        # conic -> 2D covariance: G = -Q (dL / dQ) Q, dL / dQ = half the second moments
+        p0, p1, p2, p3 = a * u3 + b * u4, a * u4 + b * u5, b * u3 + c * u4, b * u4 + c * u5
+        g00, g01, g11 = -0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c)
+        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+        quaternion = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
+        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+        t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), (v0, v1), _ = footprint(m, quaternion, s, w2c, k, width, height)
+        # covariance = V V^T + blur, V = T M: dV = 2 G V, dM = T^T dV, dT = dV M^T
+        d0 = (2 * (g00 * v0[0] + g01 * v1[0]), 2 * (g00 * v0[1] + g01 * v1[1]), 2 * (g00 * v0[2] + g01 * v1[2]))
+        d1 = (2 * (g01 * v0[0] + g11 * v1[0]), 2 * (g01 * v0[1] + g11 * v1[1]), 2 * (g01 * v0[2] + g11 * v1[2]))
+        dt0, dt1, dr = np.zeros(3), np.zeros(3), np.zeros((3, 3))
+        for j in range(3):
+            slope = 0.0
+            for i in range(3):
+                dm = t0[i] * d0[j] + t1[i] * d1[j]
+                slope += dm * r[i][j]
+                dr[i, j] = dm * s[j]
+                dt0[i] += d0[j] * r[i][j] * s[j]
+                dt1[i] += d1[j] * r[i][j] * s[j]
+            grad_scales[g, j] = slope
+        quaternion_gradient(unit, n, dr, grad_quaternions[g])
+        # T = J W
+        dj00 = dt0[0] * w2c[0, 0] + dt0[1] * w2c[0, 1] + dt0[2] * w2c[0, 2]
+        dj02 = dt0[0] * w2c[2, 0] + dt0[1] * w2c[2, 1] + dt0[2] * w2c[2, 2]
+        dj11 = dt1[0] * w2c[1, 0] + dt1[1] * w2c[1, 1] + dt1[2] * w2c[1, 2]
+        dj12 = dt1[0] * w2c[2, 0] + dt1[1] * w2c[2, 1] + dt1[2] * w2c[2, 2]
+        fx, fy = k[0], k[1]
+        dz = (
+            -(fx * dj00 + fy * dj11) / (z * z)
+            - (fx * t[0] * gx + fy * t[1] * gy) / (z * z)
+            + float(grad_features[g, channels - 1])
+        )
+        dx, dy = fx / z * gx, fy / z * gy
+        dz += (fx * x * dj02 / (z * z * z)) * (1.0 if held_x else 2.0) + (fy * y * dj12 / (z * z * z)) * (1.0 if held_y else 2.0)
+        dx -= 0.0 if held_x else fx * dj02 / (z * z)
+        dy -= 0.0 if held_y else fy * dj12 / (z * z)
+        for j in range(3):
+            grad_means[g, j] = w2c[0, j] * dx + w2c[1, j] * dy + w2c[2, j] * dz
+        if len(grad_pose):
+            j00, j02, j11, j12 = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)
+            for j in range(3):
+                grad_pose[g, j] = dx * m[j] + j00 * dt0[j]
+                grad_pose[g, 4 + j] = dy * m[j] + j11 * dt1[j]
+                grad_pose[g, 8 + j] = dz * m[j] + j02 * dt0[j] + j12 * dt1[j]
+            grad_pose[g, 3], grad_pose[g, 7], grad_pose[g, 11] = dx, dy, dz
+
+
+@numba.njit(cache=True)
+def quaternion_gradient(unit, n, dr, out):
+    """From dL / dR (3, 3) to the quaternion before it was made a unit one."""
+    w, x, y, z = unit
+    gw = 2 * (x * (dr[2, 1] - dr[1, 2]) + y * (dr[0, 2] - dr[2, 0]) + z * (dr[1, 0] - dr[0, 1]))
+    gx = 2 * (-2 * x * (dr[1, 1] + dr[2, 2]) + y * (dr[0, 1] + dr[1, 0]) + z * (dr[0, 2] + dr[2, 0]) + w * (dr[2, 1] - dr[1, 2]))
+    gy = 2 * (x * (dr[0, 1] + dr[1, 0]) - 2 * y * (dr[0, 0] + dr[2, 2]) + z * (dr[1, 2] + dr[2, 1]) + w * (dr[0, 2] - dr[2, 0]))
+    gz = 2 * (x * (dr[0, 2] + dr[2, 0]) + y * (dr[1, 2] + dr[2, 1]) - 2 * z * (dr[0, 0] + dr[1, 1]) + w * (dr[1, 0] - dr[0, 1]))
+    along = gw * w + gx * x + gy * y + gz * z
+    out[0], out[1], out[2], out[3] = (gw - along * w) / n, (gx - along * x) / n, (gy - along * y) / n, (gz - along * z) / n

@@ -1,0 +1,136 @@
+"""3D Gaussians to feature maps, differentiable in everything, the camera's pose included (EWA splatting; Zwicker et al. 2001, Kerbl
+et al. 2023). One call, twins behind it: numba kernels on the CPU and `dense`, the plain-torch one, slow and obviously right."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hdr_nsff.camera import Camera
+from hdr_nsff.fields.kernels import raster as kernels
+
+
+class Maps(NamedTuple):
+    """What the camera sees."""
+
+    features: Tensor  # (H, W, D) sum of weight * feature, premultiplied by opacity
+    depth: Tensor  # (H, W) sum of weight * z-depth, premultiplied as well, scene units
+    alpha: Tensor  # (H, W) in [0, 1]: sum of weights
+
+
+def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: Camera) -> Maps:
+    """Composite G Gaussians front to back by the z-depth of their means.
+
+    `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units, `quaternions` (G, 4) w x y z of any length,
+    `opacities` (G,) in [0, 1], `features` (G, D) anything. Float32 on the CPU; every other dtype and device takes `dense`."""
+    w2c = world_to_camera(camera)
+    if means.device.type == "cpu" and means.dtype == torch.float32:
+        maps, alpha = Rasterize.apply(means, quaternions, scales, opacities, features, w2c, camera)
+        return Maps(maps[:-1].permute(1, 2, 0), maps[-1], alpha)
+    return dense(means, quaternions, scales, opacities, features, camera)
+
+
+def world_to_camera(camera: Camera) -> Tensor:
+    """(3, 4), differentiable in the pose."""
+    rotation = camera.c2w[:, :3].T
+    return torch.cat([rotation, -rotation @ camera.c2w[:, 3:]], 1)
+
+
+def rotation_matrices(quaternions: Tensor) -> Tensor:
+    """(G, 3, 3) from (G, 4) w x y z of any length."""
+    w, x, y, z = (quaternions / (quaternions.norm(dim=-1, keepdim=True) + 1e-12)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+
+
+def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixel centres (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,)."""
+    w2c, K = world_to_camera(camera), camera.K
+    t = means @ w2c[:, :3].T + w2c[:, 3]
+    z = t[:, 2].clamp_min(kernels.NEAREST)
+    size = torch.tensor([camera.width, camera.height]).to(means)
+    focal, centre = K[[0, 1], [0, 1]], K[:2, 2]
+    edge = kernels.MARGIN * 0.5 * size / focal
+    xy = z[:, None] * torch.minimum(torch.maximum(t[:, :2] / z[:, None], -centre / focal - edge), (size - centre) / focal + edge)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [focal[0] / z, zero, -focal[0] * xy[:, 0] / z**2, zero, focal[1] / z, -focal[1] * xy[:, 1] / z**2], -1
+    ).unflatten(-1, (2, 3))
+    half_axes = rotation_matrices(quaternions) * scales[:, None]
+    spread = jacobian @ w2c[:, :3] @ half_axes
+    covariance = spread @ spread.mT + kernels.BLUR * torch.eye(2).to(means)
+    return t[:, :2] / z[:, None] * focal + centre, covariance, t[:, 2]
+
+
+def dense(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: Camera, cut: bool = True
+) -> Maps:
+    """The plain-torch twin: every Gaussian at every pixel, any dtype and device. Without `cut`, no alpha is too small to count."""
+    centres, covariance, z = project(means, quaternions, scales, camera)
+    order = torch.argsort(z.detach(), stable=True)
+    order = order[z.detach()[order] > kernels.NEAREST]
+    d = camera.pixel_grid().to(means)[:, None] - centres[order]  # (S, G, 2)
+    s = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance[order]) @ d[..., None])[..., 0, 0]
+    alpha = (opacities[order] * torch.exp(-s)).clamp_max(float(kernels.ALPHA_MAX))
+    if cut:
+        alpha = torch.where(alpha >= float(kernels.ALPHA_MIN), alpha, torch.zeros_like(alpha))
+    left = torch.cumprod(1 - alpha, 1)
+    weights = alpha * torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
+    shape = (camera.height, camera.width)
+    seen = (weights @ torch.cat([features, z[:, None]], 1)[order]).unflatten(0, shape)
+    return Maps(seen[..., :-1], seen[..., -1], weights.sum(1).unflatten(0, shape))
+
+
+class Rasterize(torch.autograd.Function):
+    """The numba twin. Returns maps (D + 1, H, W), the last one z-depth, and alpha (H, W)."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quaternions: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        features: Tensor,
+        w2c: Tensor,
+        camera: Camera,
+    ) -> tuple[Tensor, Tensor]:
+        arrays = [t.detach().contiguous().numpy() for t in (means, quaternions, scales, opacities)]
+        pose = w2c.detach().double().numpy()
+        k = camera.K.detach().double().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
+        count, size = len(means), (camera.width, camera.height)
+        centres, depths, conics = (np.empty(s, np.float32) for s in ((count, 2), count, (count, 3)))
+        rows, boxes = np.empty((count, 2), np.int64), np.empty((count, 4), np.int64)
+        kernels.project(*arrays, pose, k, *size, centres, depths, conics, rows, boxes)
+        order = np.argsort(depths, kind="stable")
+        tiles = -(-size[0] // kernels.TILE_X), -(-size[1] // kernels.TILE_Y)
+        starts, members, places, owned = kernels.bin_tiles(boxes, order, *tiles)
+        values = np.concatenate([features.detach().numpy(), depths[:, None]], 1)
+        maps = torch.empty(values.shape[1], size[1], size[0])
+        alpha = torch.empty(size[1], size[0])
+        drawn = (starts, members, centres, conics, arrays[3], values, rows)
+        kernels.forward(*drawn, maps.numpy(), alpha.numpy())
+        ctx.kept = (arrays, pose, k, size, drawn, places, owned)
+        ctx.save_for_backward(maps, alpha)
+        return maps, alpha
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        maps, alpha = ctx.saved_tensors
+        arrays, pose, k, size, (starts, members, *drawn), places, owned = ctx.kept
+        values, conics = drawn[3], drawn[1]
+        pairs = np.empty((len(members), kernels.MOMENTS + values.shape[1]), np.float32)
+        seen = maps.numpy(), alpha.numpy()
+        kernels.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
+        out = [torch.empty(a.shape) for a in (*arrays, values)]
+        poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
+        kernels.project_backward(*arrays, pose, k, *size, conics, owned, pairs, *(t.numpy() for t in out), poses.numpy())
+        grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
+        return *out[:4], out[4][:, :-1], grad_pose, None

@@ -1,0 +1,213 @@
+"""Dynamic radiance as 4D Gaussians in linear HDR: static ones, and moving ones on shared trajectories. Colour is the exponential of
+a log radiance, unbounded; movers' changes in time, and static ones' brightens or darkens slowly (shadows of movers).
+
+The number of Gaussians is fixed: ones that fade away are given new places where the error is (`relocate.py`)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from hdr_nsff.batch import PixelBatch
+from hdr_nsff.camera import Camera
+from hdr_nsff.fields.base import Render, Warp
+from hdr_nsff.fields.knots import knot_of, linear
+from hdr_nsff.fields.rasterize import Maps, rasterize
+from hdr_nsff.fields.trajectories import Trajectories
+
+BRIGHTEST = 16.0  # log radiance beyond this is held: exp stays finite
+FAINTEST = 0.003  # opacity below which a Gaussian draws nothing
+
+
+@dataclass(frozen=True)
+class SplatConfig:
+    """A field of 4D Gaussians."""
+
+    static: int = 18000
+    """Static Gaussians."""
+    moving: int = 5000
+    """Moving Gaussians."""
+    bases: int = 6
+    """Shared rigid motions that the moving ones mix."""
+    colour_knots: int = 7
+    """Times at which a moving Gaussian has a colour of its own."""
+    shade_knots: int = 5
+    """Times at which a static Gaussian has a brightness of its own (1: none)."""
+    lr: float = 1.0
+    """Multiplies all learning rates below."""
+    place_lr: float = 2e-3
+    """Of positions, per typical scale of the scene (its near depth)."""
+    pose_lr: float = 2e-3
+    colour_lr: float = 2e-2
+    shape_lr: float = 2e-2
+    opacity_lr: float = 5e-2
+
+
+class Gaussians(nn.Module):
+    """`count` Gaussians at rest, with `knots` log-radiance offsets in time of `channels` (3: colours, 1: brightness)."""
+
+    def __init__(self, count: int, knots: int, channels: int) -> None:
+        super().__init__()
+        self.means = nn.Parameter(torch.zeros(count, 3))  # scene units
+        self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))  # w x y z
+        self.log_scales = nn.Parameter(torch.full((count, 3), -5.0))  # log of standard deviations in scene units
+        self.logits = nn.Parameter(torch.full((count,), -10.0))  # of opacity
+        self.log_radiance = nn.Parameter(torch.zeros(count, 3))
+        self.offsets = nn.Parameter(torch.zeros(knots, count, channels))  # of log radiance, over the clip's time
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def radiance(self, share: float) -> Tensor:
+        """Radiance (G, 3) at a share in [0, 1] of the clip's time."""
+        log = self.log_radiance + linear(self.offsets, share * (len(self.offsets) - 1))
+        return log.clamp_max(BRIGHTEST).exp()
+
+
+class Splat(nn.Module):
+    """See the module. `times` (T,) are the training times; `near` is the scene's typical length."""
+
+    times: Tensor
+    background: Tensor
+
+    def __init__(self, config: SplatConfig, times: Tensor, near: float, far: float) -> None:
+        super().__init__()
+        self.config, self.unit, self.near, self.far = config, near, near, far
+        self.register_buffer("times", times.double())
+        self.static = Gaussians(config.static, config.shade_knots, 1)
+        self.moving = Gaussians(config.moving, config.colour_knots, 3)
+        self.mixture_logits = nn.Parameter(torch.zeros(config.bases, config.moving))
+        self.trajectories = Trajectories(config.bases, len(times))
+        self.background = nn.Parameter(torch.zeros(3))  # log radiance where no Gaussian is
+
+    def knot(self, time: float) -> float:
+        """Position of a time (in frames) on the list of training times."""
+        return knot_of(self.times, time)
+
+    def share(self, knot: float) -> float:
+        """A knot as a share of the clip."""
+        return knot / max(len(self.times) - 1, 1)
+
+    def draw(self, camera: Camera, knot: float, extra: list[Tensor]) -> Maps:
+        """Rasterise radiance (3), motion (1) and `extra` features (G, ...) at a knot."""
+        mixture = self.mixture_logits.softmax(0)
+        moved = self.trajectories.move(self.moving.means, mixture, knot)
+        turned = self.trajectories.turn(self.moving.quaternions, mixture, knot)
+        still, moving, share = self.static, self.moving, self.share(knot)
+        radiance = torch.cat([still.radiance(share), moving.radiance(share)])
+        return rasterize(
+            torch.cat([still.means, moved]),
+            torch.cat([still.quaternions, turned]),
+            torch.cat([still.log_scales, moving.log_scales]).exp(),
+            torch.cat([still.logits, moving.logits]).sigmoid(),
+            torch.cat([radiance, self.is_moving(), *extra], 1),
+            camera,
+        )
+
+    def is_moving(self) -> Tensor:
+        """(G, 1): 1 for moving Gaussians."""
+        ones = self.moving.means.new_ones(len(self.moving), 1)
+        return torch.cat([ones.new_zeros(len(self.static), 1), ones])
+
+    def positions(self, knot: float) -> Tensor:
+        """Means (G, 3) of all Gaussians at a knot."""
+        mixture = self.mixture_logits.softmax(0)
+        return torch.cat([self.static.means, self.trajectories.move(self.moving.means, mixture, knot)])
+
+    def composed(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,)."""
+        alpha = maps.alpha.reshape(-1)
+        seen = maps.features.flatten(0, 1)
+        radiance = seen[:, :3] + (1 - alpha)[:, None] * self.background.clamp_max(BRIGHTEST).exp()
+        depth = maps.depth.reshape(-1) / alpha.clamp_min(1e-3)
+        depth = torch.where(alpha > 1e-3, depth, torch.full_like(depth, self.far))
+        return radiance, depth.clamp_min(1e-3 * self.unit), alpha, seen[:, 3]
+
+    @torch.no_grad()
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+        """Every pixel of `camera` (row by row) or the ones `pixels` (S, 2) lie in, at `time` in frames, without gradients.
+        Scene flow is the displacement to one training interval later and earlier; at the clip's ends it goes straight on."""
+        knot = self.knot(time)
+        here = self.positions(knot)
+        flow = [torch.zeros_like(here), torch.zeros_like(here)]
+        last = len(self.times) - 1
+        for i, o in enumerate((1, -1)):
+            inside = 0 <= knot + o <= last
+            if inside or 0 <= knot - o <= last:
+                flow[i] = self.positions(knot + o) - here if inside else here - self.positions(knot - o)
+        maps = self.draw(camera, knot, flow)
+        radiance, depth, opacity, motion = self.composed(maps)
+        depth = depth.clamp(self.near, self.far)
+        seen = maps.features.flatten(0, 1)
+        render = Render(radiance, depth, opacity, motion, {1: seen[:, 4:7], -1: seen[:, 7:10]})
+        return render if pixels is None else picked(render, camera, pixels)
+
+    def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
+        """A training render of the whole frame, read off at the batch's pixels; flow to the neighbours as warps; regularisers."""
+        knot = self.knot(batch.time)
+        wanted = [o for o in batch.neighbours if o in batch.flow]
+        here = batch.camera.project(self.positions(knot))[0]
+        flows = []
+        for o in wanted:
+            there = batch.neighbours[o].project(self.positions(min(max(knot + o, 0), len(self.times) - 1)))[0]
+            flows.append((there - here).clamp(-2 * batch.camera.width, 2 * batch.camera.width))
+        maps = self.draw(batch.camera, knot, flows)
+        radiance, depth, opacity, motion = self.composed(maps)
+        seen = maps.features.flatten(0, 1)
+        scale = 1 / opacity.clamp_min(1e-3)[:, None]
+        warps = tuple(
+            Warp(o, seen[:, 4 + 2 * i : 6 + 2 * i] * scale, torch.ones_like(opacity), None) for i, o in enumerate(wanted)
+        )
+        render = Render(radiance, depth, opacity, motion, {}, warps)
+        self.trajectories.mark(knot)
+        return picked(render, batch.camera, batch.pixels), self.regularizers(knot)
+
+    def regularizers(self, knot: float) -> dict[str, Tensor]:
+        """Terms of the field's own: opacities and scales (Kheradmand et al. 2024), smooth poses, slow colours."""
+        still, moving = self.static, self.moving
+        logits = torch.cat([still.logits, moving.logits])
+        scales = torch.cat([still.log_scales, moving.log_scales]).exp()
+        alive = logits.detach().sigmoid() > FAINTEST
+        return {
+            "opacity": (logits.sigmoid() * alive).mean(),
+            "scale": (scales * alive[:, None]).mean() / self.unit,
+            "trajectory": self.trajectories.roughness(knot),
+            "shade": still.offsets.square().mean(),
+            "colour_change": moving.offsets.diff(dim=0).square().mean() + 0.01 * moving.offsets.square().mean(),
+        }
+
+    def param_groups(self) -> list[dict[str, Any]]:
+        """Groups by kind of parameter; only the poses near the drawn frame move."""
+        c, both = self.config, (self.static, self.moving)
+        rates = {
+            "means": c.place_lr * self.unit, "quaternions": c.shape_lr, "log_scales": c.shape_lr, "logits": c.opacity_lr,
+            "log_radiance": c.colour_lr, "offsets": c.colour_lr,
+        }  # fmt: skip
+        groups: list[dict[str, Any]] = [
+            {"params": [getattr(g, name) for g in both], "lr": c.lr * rate, "eps": 1e-15} for name, rate in rates.items()
+        ]
+        groups.append({"params": [self.mixture_logits, self.background], "lr": c.lr * c.colour_lr, "eps": 1e-15})
+        t = self.trajectories
+        touched = [t.turns_touched, t.shifts_touched]
+        groups.append({"params": [t.turns, t.shifts], "lr": c.lr * c.pose_lr, "touched": touched})
+        return groups
+
+    def after_step(self, step: int) -> None:
+        """Nothing yet."""
+
+    def shared_maxima(self) -> list[Tensor]:
+        """Nothing that several processes must agree on besides gradients."""
+        return []
+
+
+def picked(render: Render, camera: Camera, pixels: Tensor) -> Render:
+    """The render at the pixels (S, 2) alone; the whole frame in order stays as it is."""
+    index = pixels[:, 1].long() * camera.width + pixels[:, 0].long()
+    if len(index) == camera.width * camera.height and bool((index.diff() == 1).all()):
+        return render
+    warps = tuple(Warp(w.offset, w.flow[index], w.confidence[index], None) for w in render.warps)
+    flow = {o: f[index] for o, f in render.scene_flow.items()}
+    return Render(render.radiance[index], render.depth[index], render.opacity[index], render.motion[index], flow, warps)

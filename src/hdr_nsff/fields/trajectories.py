@@ -1,0 +1,74 @@
+"""How moving Gaussians move: a few shared rigid motions over the training times; each Gaussian follows its own mixture of them.
+
+Basis b turns by R_b(t) about its centre c_b and shifts by s_b(t): x(t) = sum_b w_b (R_b(t) (x - c_b) + c_b + s_b(t)). Poses are kept
+at the training times (knots) and interpolated by a cubic with continuous velocity, so any time between can be asked for."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from hdr_nsff.fields.knots import catmull_rom
+from hdr_nsff.fields.rasterize import rotation_matrices
+
+WINDOW = 3  # knots on either side whose smoothness a step may change
+
+
+class Trajectories(nn.Module):
+    """`num_bases` rigid motions over `num_knots` training times."""
+
+    centres: Tensor
+    turns_touched: Tensor
+    shifts_touched: Tensor
+
+    def __init__(self, num_bases: int, num_knots: int) -> None:
+        super().__init__()
+        self.num_bases, self.num_knots = num_bases, num_knots
+        still = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num_knots * num_bases, 1)
+        self.turns = nn.Parameter(still)  # (T * B, 4) quaternions w x y z of any length
+        self.shifts = nn.Parameter(torch.zeros(num_knots * num_bases, 4))  # (T * B, 3) scene units, and one unused column
+        self.register_buffer("centres", torch.zeros(num_bases, 3))  # scene units
+        for name in ("turns_touched", "shifts_touched"):  # rows with a gradient
+            self.register_buffer(name, torch.zeros(num_knots * num_bases, dtype=torch.uint8), persistent=False)
+
+    def pose(self, knot: float) -> tuple[Tensor, Tensor]:
+        """Unit quaternions (B, 4) and shifts (B, 3) at a knot."""
+        q = catmull_rom(self.turns.view(self.num_knots, self.num_bases, 4), knot)
+        s = catmull_rom(self.shifts.view(self.num_knots, self.num_bases, 4), knot)
+        return nn.functional.normalize(q, dim=-1), s[:, :3]
+
+    def move(self, points: Tensor, mixture: Tensor, knot: float) -> Tensor:
+        """Where canonical `points` (G, 3) are at a knot, given each one's `mixture` (B, G) of the bases."""
+        q, s = self.pose(knot)
+        r = rotation_matrices(q)  # (B, 3, 3)
+        offset = self.centres + s - (r @ self.centres[..., None])[..., 0]
+        moved = torch.matmul(points, r.mT) + offset[:, None]  # (B, G, 3)
+        return (mixture[..., None] * moved).sum(0)
+
+    def turn(self, quaternions: Tensor, mixture: Tensor, knot: float) -> Tensor:
+        """Orientations (G, 4) at a knot of Gaussians with canonical `quaternions` (G, 4): the mixture's mean turn, then their own."""
+        q, _ = self.pose(knot)
+        return quaternion_product(mixture.T @ q, quaternions)
+
+    def mark(self, knot: float, reach: int = WINDOW) -> None:
+        """Say that a step touches the poses near `knot` only."""
+        low, high = max(int(knot) - reach, 0), min(int(knot) + 1 + reach, self.num_knots)
+        for touched in (self.turns_touched, self.shifts_touched):
+            touched.view(self.num_knots, self.num_bases)[low:high] = 1
+
+    def roughness(self, knot: float) -> Tensor:
+        """Mean square third difference of the poses near a knot (quaternions; shifts in scene units): 0 for constant acceleration."""
+        low, high = max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
+        turns = nn.functional.normalize(self.turns.view(self.num_knots, self.num_bases, 4)[low:high], dim=-1)
+        if high - low < 4:
+            return turns.sum() * 0
+        shifts = self.shifts.view(self.num_knots, self.num_bases, 4)[low:high]
+        return turns.diff(n=3, dim=0).square().sum(-1).mean() + shifts.diff(n=3, dim=0).square().sum(-1).mean()
+
+
+def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
+    """Hamilton product a b of (..., 4) w x y z: first b turns, then a."""
+    w, u = a[..., :1], a[..., 1:]
+    v, x = b[..., :1], b[..., 1:]
+    real = w * v - (u * x).sum(-1, keepdim=True)
+    return torch.cat([real, w * x + v * u + torch.linalg.cross(u, x)], -1)
