@@ -200,7 +200,7 @@ def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
     flow[..., 0] = 2.0
     there = np.full((6, 8), 3.0)
     there[:, 4:6] = 1.0
-    seen = visible(flow, {"Z": np.full((6, 8), 3.0)}, there)
+    seen = visible(flow, np.full((6, 8), 3.0), there)
     np.testing.assert_array_equal(seen[0], [True, True, False, True, True, False, False, False])
 
 
@@ -325,6 +325,7 @@ def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
     "change",
     [
         *({"frames": 3}, {"seed": -1}, {"spp": 0}, {"noise": -1.0}, {"noise": float("nan")}, {"response": "kodak"}),
+        *({"depth_noise": 1.0}, {"depth_grain": -0.1}, {"flow_noise": float("nan")}),
     ],
 )
 def test_bad_numbers_are_refused_before_anything_is_rendered(flat: SynthConfig, change: dict) -> None:

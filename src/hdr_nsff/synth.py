@@ -28,7 +28,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.pathtracer import Tracer
 from hdr_nsff.progress import say, track
 from hdr_nsff.recording import Noise, record, response_curve
-from hdr_nsff.synth_oracle import write_oracle
+from hdr_nsff.synth_oracle import OracleNoise, write_oracle
 from hdr_nsff.synth_scene import POSES, RIG, build, camera_pose, intrinsics, moved, project
 from hdr_nsff.truth import Truth, TruthView
 
@@ -53,6 +53,9 @@ class SynthConfig:
     seed: int = 0  # of textures, paths and noise
     variant: str = "auto"  # Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb
     oracle: bool = False  # also write a scene folder with exact poses and masks, depth and flow with a little noise
+    depth_noise: float = 0.03  # of the oracle's depth: relative, smooth over an eighth of the frame
+    depth_grain: float = 0.0  # of the oracle's depth: relative, every pixel for itself
+    flow_noise: float = 0.3  # of the oracle's flow, in pixels
 
 
 @dataclass(frozen=True)
@@ -84,8 +87,9 @@ def synth(config: SynthConfig) -> None:
         list_exposures(evs, config)
     write_truth(clip, views, K, relative, reference, config)
     if config.oracle:
+        noise = OracleNoise(config.depth_noise, config.depth_grain, config.flow_noise, config.seed)
         frames, poses = [exact(config.out, s) for s in clip], [s.c2w for s in clip]
-        write_oracle(config.out, frames, video, K, poses, relative, reference, config.seed)
+        write_oracle(config.out, frames, video, K, poses, relative, reference, noise)
     say(
         f"{config.out}/clip.mp4: {len(clip)} frames of {size[0]}x{size[1]}, exposures {config.ev}; {len(views)} held-out views in truth/"
     )
@@ -104,6 +108,10 @@ def check(config: SynthConfig) -> None:
         raise InputError(f"--spp {config.spp} --truth-spp {config.truth_spp}: at least one path per pixel is needed")
     if not 0 <= config.noise < 1000:
         raise InputError(f"--noise {config.noise}: must be from 0 (a perfect sensor) to 1000")
+    if not (0 <= config.depth_noise < 1 and 0 <= config.depth_grain < 1):
+        raise InputError(f"--depth-noise {config.depth_noise} --depth-grain {config.depth_grain}: must be from 0 (exact) to 1")
+    if not 0 <= config.flow_noise < 100:
+        raise InputError(f"--flow-noise {config.flow_noise}: must be from 0 (exact) to 100 pixels")
 
 
 def parse_size(text: str) -> tuple[int, int]:
