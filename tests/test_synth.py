@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -11,11 +12,28 @@ from hdr_nsff import io, pathtracer, synth_textures
 from hdr_nsff import synth as verb
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
+from hdr_nsff.ingest import open_footage, read_exposure_csv
 from hdr_nsff.pathtracer import Surface, Tracer, smooth
 from hdr_nsff.scene import Scene
 from hdr_nsff.synth import SynthConfig, clip_shots, exact_flow, parse_ev, parse_size, synth, truth_shots
 from hdr_nsff.synth_oracle import visible
-from hdr_nsff.synth_scene import BACK, CORD, FLOOR, PIVOT, body_pose, build, camera_pose, intrinsics, look_at, moved, project
+from hdr_nsff.synth_scene import (
+    BACK,
+    CORD,
+    FLOOR,
+    PIVOT,
+    POSES,
+    RIG,
+    RIG_TARGET,
+    body_pose,
+    build,
+    camera_pose,
+    intrinsics,
+    look_at,
+    moved,
+    project,
+    rig_pose,
+)
 from hdr_nsff.truth import Truth
 
 ROOM, BOX, BALL = 0, 1, 2
@@ -74,7 +92,7 @@ def test_flow_of_a_known_point_is_exact() -> None:
     after, _ = project((body_pose("ball", 8) @ centre)[:3], K, camera_pose(8))
     points = np.broadcast_to((body_pose("ball", 7) @ centre)[:3], (136, 240, 3))
     x, y = np.floor(pixel).astype(int)
-    flow = exact_flow(points, np.full((136, 240), BALL), 7, 8, K)[y, x]
+    flow = exact_flow(points, np.full((136, 240), BALL), 7, 8, K, camera_pose(8))[y, x]
     np.testing.assert_allclose(flow, after - (np.array([x, y]) + 0.5), atol=1e-9)
 
 
@@ -96,6 +114,42 @@ def test_held_out_views_are_never_frames_of_the_clip() -> None:
         at_anchor = np.linalg.norm(view.c2w[:, 3] - clip[view.anchor].c2w[:, 3])
         assert (0.02 < at_anchor < 0.1) if view.off_path else at_anchor == 0
     assert len({v.seed for v in clip + views}) == len(clip + views) == 52
+
+
+def test_the_rig_is_two_rows_of_cameras_that_look_at_one_place() -> None:
+    eyes = np.array([rig_pose(k)[:, 3] for k in range(9)])
+    assert np.ptp(eyes, axis=0) == pytest.approx([1.2, 0.28, 0])
+    assert sorted(np.unique(eyes[:, 1], return_counts=True)[1]) == [4, 5]
+    beside = np.linalg.norm(eyes - np.roll(eyes, 1, axis=0), axis=1)
+    assert beside.max() < 0.35  # whoever records next stands beside, also after the last
+    for k in range(9):
+        np.testing.assert_allclose(project(np.array(RIG_TARGET), intrinsics(240, 136), rig_pose(k))[0], [120, 68], atol=1e-9)
+
+
+def test_every_camera_of_the_rig_always_sees_both_movers() -> None:
+    K = intrinsics(240, 136)
+    centres = [(body_pose(b, t) @ p)[:3] for t in range(36) for b, p in (("box", [0, 0, 0, 1]), ("ball", [0, CORD, 0, 1]))]
+    for k in range(9):
+        pixels, depth = project(np.array(centres), K, rig_pose(k))
+        assert (pixels > 20).all() and (pixels < [220, 116]).all() and (depth > 1.5).all()
+
+
+def test_frame_i_of_a_rig_is_what_camera_i_modulo_nine_records() -> None:
+    for t, shot in enumerate(clip_shots(20, 1, 0, "rig")):
+        assert shot.time == t and shot.anchor == t
+        np.testing.assert_allclose(shot.c2w[:, 3], RIG[t % 9])
+
+
+@pytest.mark.parametrize("frames", [12, 36])
+def test_a_rig_holds_out_other_cameras_than_the_one_that_records_then(frames: int) -> None:
+    clip, views = clip_shots(frames, 1, 0, "rig"), truth_shots(frames, 1, 0, "rig")
+    assert len({v.name for v in views}) == 16 and sum(v.time % 1 == 0.5 for v in views) == 6
+    for view in views:
+        recording = clip[int(view.time)]
+        apart = np.linalg.norm(view.c2w[:, 3] - recording.c2w[:, 3])
+        assert (0.02 < apart < 0.1) if view.off_path else apart > 0.3
+        assert view.off_path or np.array_equal(view.c2w, clip[view.anchor].c2w)
+    assert frames < 36 or len({v.anchor % 9 for v in views}) == 9  # every camera is asked for something
 
 
 def test_textures_are_physical_albedos_and_the_seed_repeats_them() -> None:
@@ -146,7 +200,7 @@ def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
     flow[..., 0] = 2.0
     there = np.full((6, 8), 3.0)
     there[:, 4:6] = 1.0
-    seen = visible(flow, {"Z": np.full((6, 8), 3.0)}, there)
+    seen = visible(flow, np.full((6, 8), 3.0), there)
     np.testing.assert_array_equal(seen[0], [True, True, False, True, True, False, False, False])
 
 
@@ -195,8 +249,9 @@ def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
     assert sum(1 for _ in io.read_video(flat.out / "clip.mp4")) == 12
 
 
-def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig) -> None:
-    synth(flat)
+@pytest.mark.parametrize("views", ["mono", "rig"])
+def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig, views: Literal["mono", "rig"]) -> None:
+    synth(replace(flat, views=views))
     scene = Scene.open(flat.out / "oracle")
     assert {s.note for s in scene.manifest.steps.values()} == {"oracle: from truth"}
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 4
@@ -205,7 +260,7 @@ def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig) -> None:
     still = pixels[:, 4:]
     points = plane(16, 16, 3.0).points
     for side in (-1, 1):
-        exact = project(points, intrinsics(16, 16), camera_pose(k + side))[0][:, 4:] - still
+        exact = project(points, intrinsics(16, 16), POSES[views](k + side))[0][:, 4:] - still
         error = frame.flow[side].numpy()[:, 4:] - exact
         assert 0.2 < error.std() < 0.4 and abs(error.mean()) < 0.1  # 0.3 px of noise, no bias
     assert frame.disparity is not None and abs(float(frame.disparity.log().mean() - np.log(1 / 3))) < 0.03
@@ -228,6 +283,32 @@ def test_other_settings_do_not_mix_into_a_folder(flat: SynthConfig) -> None:
     assert Flat.rendered == 12 + 16
 
 
+def test_a_rig_lists_its_exposures_for_prepare(flat: SynthConfig) -> None:
+    synth(replace(flat, views="rig"))
+    for footage in ("clip.mp4", "clip"):
+        table = read_exposure_csv(open_footage(flat.out / footage))
+        assert table is not None and [table[1][f"#{t}"] for t in range(12)] == [-4, -2, 0] * 4
+
+
+def test_the_poses_of_a_rig_are_in_its_truth_and_its_oracle(flat: SynthConfig) -> None:
+    synth(replace(flat, views="rig"))
+    poses = np.array([rig_pose(t) for t in range(12)])
+    np.testing.assert_allclose(np.array(Truth.open(flat.out / "truth").clip_c2w), poses)
+    np.testing.assert_allclose([e.c2w for e in Scene.open(flat.out / "oracle").manifest.frames], poses)
+
+
+def test_a_rig_goes_on_after_a_kill_and_does_not_mix_with_one_camera(flat: SynthConfig) -> None:
+    rig = replace(flat, views="rig")
+    synth(rig)
+    before = io.read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy")
+    (rig.out / "exact" / "clip_00003.exr").unlink()
+    synth(rig)
+    assert Flat.rendered == 12 + 16 + 1
+    np.testing.assert_array_equal(io.read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy"), before)
+    with pytest.raises(InputError, match="other settings"):
+        synth(flat)
+
+
 @pytest.mark.parametrize("text", ["240", "240x", "axb", "8x8", "-240x136"])
 def test_a_bad_size_is_refused_in_a_sentence(text: str) -> None:
     with pytest.raises(InputError, match="WIDTHxHEIGHT"):
@@ -241,7 +322,11 @@ def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "change", [{"frames": 3}, {"seed": -1}, {"spp": 0}, {"noise": -1.0}, {"noise": float("nan")}, {"response": "kodak"}]
+    "change",
+    [
+        *({"frames": 3}, {"seed": -1}, {"spp": 0}, {"noise": -1.0}, {"noise": float("nan")}, {"response": "kodak"}),
+        *({"depth_noise": 1.0}, {"depth_grain": -0.1}, {"flow_noise": float("nan")}),
+    ],
 )
 def test_bad_numbers_are_refused_before_anything_is_rendered(flat: SynthConfig, change: dict) -> None:
     with pytest.raises(InputError):

@@ -1,10 +1,12 @@
 """An oracle: a scene folder whose poses and masks are exact and whose depth and flow are exact up to a little noise.
 
 It measures a field and its training apart from the priors. It is made from the truth, says so in every step of its
-manifest, and is no input a user could have."""
+manifest, and is no input a user could have. Flow goes from a frame to the ones before and after, whichever cameras they are of:
+`scene.neighbours` links consecutive times of one `camera_id`, so the cameras of a rig that take turns share id 0."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,10 +14,20 @@ import numpy as np
 
 from hdr_nsff import io
 from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest, Step
+from hdr_nsff.synth_scene import back_project, moved, project
 
-DEPTH_NOISE = 0.03  # relative, smooth over an eighth of the frame
-FLOW_NOISE = 0.3  # pixels, independent
 NOTE = "oracle: from truth"
+SAME = 0.02  # relative depth: how far apart two views of one surface may be
+
+
+@dataclass(frozen=True)
+class OracleNoise:
+    """How far depth and flow are from exact, in standard deviations."""
+
+    depth: float = 0.03  # relative, smooth over an eighth of the frame
+    grain: float = 0.0  # relative, every pixel for itself
+    flow: float = 0.3  # pixels, every pixel for itself
+    seed: int = 0
 
 
 def write_oracle(
@@ -26,10 +38,10 @@ def write_oracle(
     c2w: list[np.ndarray],
     ev: list[float],
     reference: int,
-    seed: int,
+    noise: OracleNoise,
 ) -> None:
     """`out`/oracle from the rendered channels of every frame, the recorded `video` (T, H, W, 3), poses and bracket exposures."""
-    folder, rng = out / "oracle", np.random.default_rng(seed)
+    folder, rng = out / "oracle", np.random.default_rng(noise.seed)
     count, height, width = video.shape[:3]
     depths = np.stack([e["Z"] for e in exact])
     entries = []
@@ -53,15 +65,15 @@ def write_oracle(
             },
         )
         entries.append(entry)
-        smooth = cv2.resize(rng.normal(size=(8, 8)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
+        error = depth_error(noise, (height, width), rng, i)
         io.write_png(folder / entry.image, video[i])
         io.write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
-        io.write_npy(folder / f"disparity/{i:05d}.npy", (np.exp(DEPTH_NOISE * smooth) / depths[i]).astype(np.float16))
+        io.write_npy(folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16))
         io.write_npy(folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16))
         for j, files in entry.flow.items():
             flow = exact_flow(channels, j - i)
-            io.write_png(folder / files.valid, visible(flow, channels, depths[j]))
-            io.write_npy(folder / files.flow, (flow + FLOW_NOISE * rng.normal(size=flow.shape)).astype(np.float16))
+            io.write_png(folder / files.valid, visible(flow, depth_there(channels, K, c2w, i, j), depths[j]))
+            io.write_npy(folder / files.flow, (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16))
     io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
     manifest = Manifest(
         source="clip",
@@ -83,22 +95,34 @@ def write_oracle(
     manifest.save(folder)
 
 
+def depth_error(noise: OracleNoise, size: tuple[int, int], rng: np.random.Generator, frame: int) -> np.ndarray:
+    """The error (H, W) of a frame's log disparity: smooth, and grain from a generator of its own."""
+    smooth = cv2.resize(rng.normal(size=(8, 8)).astype(np.float32), size[::-1], interpolation=cv2.INTER_CUBIC)
+    return noise.depth * smooth + noise.grain * np.random.default_rng([noise.seed, frame, 1]).normal(size=size)
+
+
 def exact_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
     """The rendered flow (H, W, 2) px to the next (+1) or previous (-1) frame."""
     name = {1: "forward", -1: "backward"}[side]
     return np.stack([channels[f"{name}.u"], channels[f"{name}.v"]], -1)
 
 
-def visible(flow: np.ndarray, channels: dict[str, np.ndarray], depth: np.ndarray) -> np.ndarray:
-    """Where the surface is still in the frame and not hidden in the other one, (H, W) bool: its depth there, `depth`
-    (H, W), agrees within 4 % with its own at one of the four pixels around (in a frame's time depths change less)."""
+def depth_there(channels: dict[str, np.ndarray], K: np.ndarray, c2w: list[np.ndarray], i: int, j: int) -> np.ndarray:
+    """Z-depth (H, W) of what frame `i` shows, where it is at the time of frame `j` and in the camera of frame `j`."""
+    points = moved(back_project(channels["Z"], K, c2w[i]), channels["body"].astype(int), i, j)
+    return project(points, K, c2w[j])[1]
+
+
+def visible(flow: np.ndarray, expected: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Where the surface is still in the frame and not hidden in the other one, (H, W) bool: the depth `expected` (H, W) of
+    it there agrees with the other frame's `depth` (H, W) at one of the four pixels around."""
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     left, top = np.floor(x + flow[..., 0]).astype(int), np.floor(y + flow[..., 1]).astype(int)
     inside = (left >= 0) & (top >= 0) & (left < width - 1) & (top < height - 1)
     left, top = left.clip(0, width - 2), top.clip(0, height - 2)
     around = np.stack([depth[top + dy, left + dx] for dy in (0, 1) for dx in (0, 1)])
-    return inside & (np.abs(around / channels["Z"] - 1).min(0) < 0.04)
+    return inside & (np.abs(around / expected - 1).min(0) < SAME)
 
 
 def static_points(
@@ -109,7 +133,5 @@ def static_points(
     for channels, pose in zip(exact, c2w, strict=True):
         y, x = np.nonzero(channels["body"] == 0)
         chosen = rng.choice(len(x), min(200, len(x)), replace=False)
-        x, y = x[chosen], y[chosen]
-        rays = np.stack([(x + 0.5 - K[0, 2]) / K[0, 0], (y + 0.5 - K[1, 2]) / K[1, 1], np.ones(len(x))], -1)
-        points.append(pose[:, 3] + channels["Z"][y, x][:, None] * (rays @ pose[:, :3].T))
+        points.append(back_project(channels["Z"], K, pose)[y[chosen], x[chosen]])
     return np.concatenate(points).astype(np.float32)

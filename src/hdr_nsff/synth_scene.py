@@ -1,4 +1,4 @@
-"""The synthetic room: meshes, lights, the motion of its two movers and of the camera, as plain arrays of a time in frames.
+"""The synthetic room: meshes, lights, the motion of its two movers, its cameras, as plain arrays of a time in frames.
 
 World axes are the camera's at rest (OpenCV: +x right, +y down, +z forward), metres. Every part belongs to a rigid body;
 `body_pose(body, t)` carries body coordinates to the world, so a surface point's motion is known exactly."""
@@ -18,6 +18,8 @@ LEFT, RIGHT, TOP, FLOOR, FRONT, BACK = -1.45, 1.45, -1.15, 0.95, -1.6, 3.4  # th
 WINDOW = (-1.0, -0.25, -0.72, 0.12)  # left, right, top, bottom in the back wall
 PIVOT = np.array([0.26, TOP, 2.65])  # of the pendulum
 CORD = 0.98  # metres from the pivot to the ball's centre
+RIG = [*((0.3 * k, -0.2, 0.0) for k in range(-2, 3)), *((0.45 - 0.3 * k, 0.08, 0.0) for k in range(4))]  # cameras, once around
+RIG_TARGET = (0.0, 0.02, 3.0)
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,16 @@ def camera_pose(t: float) -> np.ndarray:
     return look_at(eye, target)
 
 
+def rig_pose(t: float) -> np.ndarray:
+    """Camera to world, (3, 4) OpenCV, of the rig's camera `t` modulo nine, which records frame `t`.
+
+    Two rows of cameras that stand still, 1.2 metres from end to end, numbered around: whoever records next stands beside."""
+    return look_at(np.array(RIG[round(t) % len(RIG)]), np.array(RIG_TARGET))
+
+
+POSES: dict[str, Callable[[float], np.ndarray]] = {"mono": camera_pose, "rig": rig_pose}  # of the clip's frames
+
+
 def intrinsics(width: int, height: int) -> np.ndarray:
     """K (3, 3) in pixels of a camera that sees 57 degrees across."""
     focal = width / 2 / np.tan(np.radians(57 / 2))
@@ -85,6 +97,14 @@ def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndar
     local = (points - c2w[:, 3]) @ c2w[:, :3]
     depth = local[..., 2]
     return local[..., :2] / depth[..., None] * K[[0, 1], [0, 1]] + K[:2, 2], depth
+
+
+def back_project(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
+    """World points (H, W, 3) at z-depth (H, W) on the rays through the pixel centres."""
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    return c2w[:, 3] + depth[..., None] * (rays @ c2w[:, :3].T)
 
 
 def moved(points: np.ndarray, bodies: np.ndarray, t: float, other: float) -> np.ndarray:
