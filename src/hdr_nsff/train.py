@@ -104,7 +104,7 @@ class Trainer:
         touched = [g for g in groups if g.get("touched")]
         self.optimisers: dict[str, torch.optim.Optimizer] = {}
         if dense:  # grids without a tone mapper have nothing dense
-            self.optimisers["dense"] = torch.optim.Adam(dense)
+            self.optimisers["dense"] = torch.optim.Adam(dense, fused=True)
         if touched:
             self.optimisers["touched"] = TouchedAdam(touched)
         self.marks = [marks for g in touched for marks in g["touched"]]  # rows with a gradient, of any process
@@ -163,7 +163,7 @@ class Trainer:
             self.report(f"training was finished already, at step {self.clock.step}")
             return
         started, before = time.monotonic(), self.clock.seconds
-        saved = started
+        saved, note = started, ""
         if self.clock.step == 0 and self.ranks.main:
             self.save()
         with bar() as progress:
@@ -180,14 +180,14 @@ class Trainer:
                     self.save()
                     self.preview()
                     if not progress.live.is_started:
-                        say(f"train: {self.clock.progress:.0%}, step {self.clock.step}, {values['psnr']:.1f} dB")
+                        say(f"train: {self.clock.progress:.0%}, step {self.clock.step}, {note}")
                     saved = time.monotonic()
         if self.ranks.main:
             self.save()
             self.preview()
 
     def step(self) -> dict[str, float]:
-        """One optimiser step over this process's share of the batches; the terms' values and the PSNR."""
+        """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
         clock, config = self.clock, self.config
         self.field.train()
         if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
@@ -203,9 +203,8 @@ class Trainer:
             (self.objective.total(terms) / config.batches).backward()
             for name, value in terms.items():
                 totals[name] = totals.get(name, 0.0) + float(value.detach()) / len(slots)
-            with torch.no_grad():
-                rgb = self.tonemapper(render.radiance, batch.bracket, batch.camera_id, batch.frame, leaky=False)
-                totals["mse"] = totals.get("mse", 0.0) + float((rgb - batch.rgb)[batch.uniform].square().mean()) / len(slots)
+            if (clock.step + 1) % LOG_EVERY == 0:
+                totals["mse"] = totals.get("mse", 0.0) + self.squared_error(render.radiance.detach(), batch) / len(slots)
         self.ranks.sum_gradients(p for o in self.optimisers.values() for g in o.param_groups for p in g["params"])
         self.ranks.max_buffers(self.marks)
         for name, optimiser in self.optimisers.items():
@@ -216,8 +215,15 @@ class Trainer:
                 optimiser.zero_grad()
         self.ranks.max_buffers(self.field.shared_maxima())
         self.field.after_step(clock.step + 1)
-        totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
+        if "mse" in totals:
+            totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
+
+    @torch.no_grad()
+    def squared_error(self, radiance: Tensor, batch: PixelBatch) -> float:
+        """Mean square difference of the recorded and the rendered rgb at the uniformly drawn pixels."""
+        rgb = self.tonemapper(radiance, batch.bracket, batch.camera_id, batch.frame, leaky=False)
+        return float((rgb - batch.rgb)[batch.uniform].square().mean())
 
     def draw(self, slot: int) -> PixelBatch:
         """The batch of a slot of this step."""

@@ -3,20 +3,27 @@ rigid motion over the clip by robust fits (Kabsch 1976, with iteratively reweigh
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
+from scipy.cluster.vq import kmeans2
+from scipy.sparse import coo_matrix, diags
+from scipy.sparse.linalg import eigsh
 from scipy.spatial import cKDTree
 
 STRIDE = 3  # pixels between tracks
 STARTS = 12  # frames in which tracks start
 SHORTEST = 3  # frames a track must last
 LINK = 6.0  # pixels: neighbours in a picture
-PARTING = 1.5  # pixels a frame: neighbours that never part faster belong together
-SMALLEST = 0.04  # of all tracks: smaller groups join the nearest one
+PARTING = 1.0  # pixels a frame: neighbours that part faster hardly belong together
+PARTS = 10  # the graph is cut into, before joining
+WORSE = 1.3  # times the residual that two groups have alone is still one motion
+RELIEF = 0.03  # of a thing's size: what wrong depth may add to a residual
+MOST = 1000  # tracks that groups are found from
+GAP = 6  # frames a thing may be out of sight
+SMALLEST = 0.04  # of all tracks: smaller groups are left out
 ROUNDS = 4  # of fitting poses to canonical points and back
 
 
@@ -48,6 +55,7 @@ class Group:
     shifts: np.ndarray  # (T, 3): x(t) = R (x - centre) + centre + shift
     centre: np.ndarray  # (3,) canonical
     members: np.ndarray  # indices of its tracks
+    known: np.ndarray  # (T,) bool: times at which enough of it was seen; poses between are interpolated, outer ones held
 
     def canonical(self, points: np.ndarray, t: int) -> np.ndarray:
         """Where `points` (P, 3) of time t are canonically."""
@@ -95,50 +103,108 @@ def advance(view: View, following: View, step: int, at: np.ndarray) -> np.ndarra
     return np.where((inside & landed)[:, None], out, np.nan)
 
 
-def gather(tracks: Tracks) -> list[np.ndarray]:
-    """Tracks that move together: neighbours in a picture that never part, joined. Largest first; crumbs join the nearest."""
+def gather(tracks: Tracks) -> list[Group]:
+    """Things that move as one, largest first: parts of the graph of neighbouring tracks, joined again where one rigid motion explains both."""
+    label = parts(tracks)
+    few = np.unique(np.linspace(0, len(label) - 1, MOST).astype(int))  # enough to tell motions apart
+    members = [np.nonzero(label == k)[0] for k in range(label.max() + 1)]
+    groups = [fit(tracks, np.intersect1d(m, few)) for m in members if len(np.intersect1d(m, few)) >= 3]
+    cost: dict[tuple[int, int], float] = {}  # by the groups' identities: most pairs survive a round
+    while pair := best_pair(tracks, groups, cost):
+        a, b = pair
+        both = fit(tracks, np.concatenate([groups[a].members, groups[b].members]))
+        groups = [*(g for k, g in enumerate(groups) if k not in (a, b)), both]
+    everyone = [np.nonzero(np.isin(label, label[g.members]))[0] for g in groups]
+    large = [m for m in everyone if len(m) >= SMALLEST * len(label)] or everyone[:1]
+    return [fit(tracks, m) for m in sorted(large, key=len, reverse=True)]
+
+
+def best_pair(tracks: Tracks, groups: list[Group], cost: dict[tuple[int, int], float]) -> tuple[int, int] | None:
+    """The two groups that one motion explains best compared to their own; None where none does nearly as well."""
+    pairs = list(itertools.combinations(range(len(groups)), 2))
+    for a, b in pairs:
+        key = id(groups[a]), id(groups[b])
+        if key not in cost:
+            cost[key] = excess(tracks, groups[a], groups[b]) if meet(tracks, groups[a], groups[b]) else np.inf
+    best = min(pairs, key=lambda ab: cost[id(groups[ab[0]]), id(groups[ab[1]])], default=None)
+    return best if best is not None and cost[id(groups[best[0]]), id(groups[best[1]])] < 1 else None
+
+
+def excess(tracks: Tracks, a: Group, b: Group) -> float:
+    """What one motion for two groups costs: its worst residual over what is allowed."""
+    both = fit(tracks, np.concatenate([a.members, b.members]))
+    ratios, size = [], min(size_of(tracks, a), size_of(tracks, b))
+    for g in (a, b):
+        alone, joint = (np.nanmedian(residuals(tracks, m, g.members)) for m in (g, both))
+        ratios.append(joint / (WORSE * alone + RELIEF * size + 1e-9))
+    return float(max(ratios))
+
+
+def size_of(tracks: Tracks, group: Group) -> float:
+    """Median distance of a group's points from their middle, scene units."""
+    points = tracks.points[group.members]
+    return float(np.nanmedian(np.linalg.norm(points - np.nanmedian(points, 0), axis=-1)))
+
+
+def parts(tracks: Tracks) -> np.ndarray:
+    """A part (N,) for every track: normalised cuts (Shi & Malik 2000) through the graph of neighbours, too many rather than too few."""
     n, num = tracks.trust.shape
     found = [np.zeros((0, 2), int)]
     for t in range(num):
         seen = np.nonzero(tracks.trust[:, t])[0]
         if len(seen):
             found.append(seen[cKDTree(tracks.pixels[seen, t]).query_pairs(LINK, output_type="ndarray")])
-    links = np.unique(np.concatenate(found), axis=0)
-    links = links[parting(tracks, links) < PARTING]
-    graph = coo_matrix((np.ones(len(links)), links.T), (n, n))
-    _, label = connected_components(graph, directed=False)
-    groups = sorted((np.nonzero(label == k)[0] for k in np.unique(label)), key=len, reverse=True)
-    large = [g for g in groups if len(g) >= SMALLEST * n] or groups[:1]
-    return absorb(tracks, large, [g for g in groups if not any(g is k for k in large)])
+    pairs = np.unique(np.concatenate(found), axis=0)
+    strength = affinity(tracks, pairs)
+    graph = coo_matrix((strength, pairs.T), (n, n)).tocsr()
+    graph = graph + graph.T + diags(np.full(n, 1e-6))
+    count = min(PARTS, n)
+    if count < 2 or n < 3 * PARTS:
+        return np.zeros(n, int)
+    scale = diags(1 / np.sqrt(np.asarray(graph.sum(1)).ravel()))
+    start = np.random.default_rng(0).standard_normal(n)
+    _, vectors = eigsh(scale @ graph @ scale, count, which="LA", v0=start)
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
+    return kmeans2(vectors, count, minit="++", rng=np.random.default_rng(0))[1]
 
 
-def parting(tracks: Tracks, pairs: np.ndarray) -> np.ndarray:
-    """How far (P,), in pixels a frame, the tracks of each pair (P, 2) move against each other at worst; infinite if seen together too briefly."""
-    out = np.full(len(pairs), np.inf)
+def affinity(tracks: Tracks, pairs: np.ndarray) -> np.ndarray:
+    """How sure (P,) it is that two tracks belong together: frames they share, less the faster they part."""
+    out = np.zeros(len(pairs))
     for some in np.array_split(np.arange(len(pairs)), max(len(pairs) // 20000, 1)):
         apart = tracks.pixels[pairs[some, 0]] - tracks.pixels[pairs[some, 1]]  # (P, T, 2)
         speed = np.linalg.norm(np.diff(apart, axis=1), axis=-1)
         together = np.isfinite(speed)
         worst = np.where(together, speed, 0).max(1)
-        out[some] = np.where(together.sum(1) >= min(SHORTEST, tracks.trust.shape[1]) - 1, worst, np.inf)
+        out[some] = together.sum(1) * np.exp(-((worst / PARTING) ** 2))
     return out
 
 
-def absorb(tracks: Tracks, large: list[np.ndarray], crumbs: list[np.ndarray]) -> list[np.ndarray]:
-    """Each crumb added to the group whose mean pixel comes closest to its own at some time both are seen."""
-    num = tracks.trust.shape[1]
+def residuals(tracks: Tracks, group: Group, members: np.ndarray) -> np.ndarray:
+    """Median distance (N,) of each of some tracks from where a group's motion puts its canonical place, scene units; NaN if never known."""
+    points, trust = tracks.points[members], tracks.trust[members] * group.known
+    canonical = canonical_points(points - group.centre, trust, group.rotations, group.shifts, group.known)
+    moved = np.einsum("tij,nj->nti", group.rotations, canonical) + group.shifts + group.centre
+    distance = np.where(trust > 0, np.linalg.norm(moved - points, axis=-1), np.nan)
+    out = np.full(len(members), np.nan)
+    enough = (trust > 0).sum(1) >= 0.7 * (tracks.trust[members] > 0).sum(1)
+    out[enough] = np.nanmedian(distance[enough], 1)
+    return out
 
-    def middle(g: np.ndarray) -> np.ndarray:
-        seen = tracks.trust[g] > 0
-        total = np.where(seen[..., None], tracks.pixels[g], 0).sum(0)
-        return np.where(seen.sum(0)[:, None] > 0, total / np.maximum(seen.sum(0), 1)[:, None], np.nan).reshape(num, 2)
 
-    centres = [middle(g) for g in large]
-    extra: list[list[np.ndarray]] = [[] for _ in large]
-    for crumb in crumbs:
-        distance = [np.nan_to_num(np.linalg.norm(c - middle(crumb), axis=-1), nan=np.inf).min() for c in centres]
-        extra[int(np.argmin(distance))].append(crumb)
-    return [np.concatenate([g, *e]) for g, e in zip(large, extra, strict=True)]
+def meet(tracks: Tracks, a: Group, b: Group) -> bool:
+    """Whether two groups are seen together, or one where the other left off."""
+    seen_a, seen_b = ((tracks.trust[g.members] > 0).sum(0) >= 3 for g in (a, b))
+    if (seen_a & seen_b).sum() >= SHORTEST:
+        return True
+    times_a, times_b = np.nonzero(seen_a)[0], np.nonzero(seen_b)[0]
+    if not len(times_a) or not len(times_b):
+        return False
+    i, j = min(itertools.product(times_a, times_b), key=lambda ij: abs(ij[0] - ij[1]))
+    here, there = tracks.points[a.members, i], tracks.points[b.members, j]
+    gap = np.linalg.norm(np.nanmedian(here, 0) - np.nanmedian(there, 0))
+    size = np.nanmedian(np.linalg.norm(here - np.nanmedian(here, 0), axis=-1))
+    return bool(gap < 3 * size and abs(int(i) - int(j)) <= GAP)
 
 
 def rigid(source: np.ndarray, target: np.ndarray, weight: np.ndarray, rounds: int = 5) -> tuple[np.ndarray, np.ndarray]:
@@ -177,7 +243,7 @@ def fit(tracks: Tracks, members: np.ndarray) -> Group:
     for _ in range(ROUNDS):
         rotations, shifts = refit(points, trust, rotations, shifts, known)
         rotations, shifts = smoothed(rotations, shifts, known)
-    return Group(rotations, shifts, centre, members)
+    return Group(rotations, shifts, centre, members, known)
 
 
 def canonical_points(

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hdr_nsff.fields.groups import Group, Tracks, View, fit, follow, gather
+from hdr_nsff.fields.groups import Group, Tracks, View, follow, gather
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat import Gaussians, Splat
@@ -105,7 +105,7 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
     if not any(v.moving.any() for v in views):
         return 0, 0
     tracks = follow(views)
-    groups = [fit(tracks, members) for members in gather(tracks)][: field.config.bases] if len(tracks.trust) else []
+    groups = gather(tracks)[: field.config.bases] if len(tracks.trust) else []
     groups = groups or [drift(views)]
     seen = [t for t, v in enumerate(views) if v.moving.any()]
     key = sorted({seen[round(i)] for i in np.linspace(0, len(seen) - 1, min(KEY_FRAMES, len(seen))).tolist()})
@@ -162,7 +162,7 @@ def drift(views: list[View]) -> Group:
     at, times = np.nonzero(np.isfinite(centres[:, 0]))[0], np.arange(len(views))
     centres = np.stack([np.interp(times, at, c[at]) for c in centres.T], 1)
     centres = ndimage.gaussian_filter1d(centres, 1.0, axis=0, mode="nearest")
-    return Group(np.tile(np.eye(3), (len(views), 1, 1)), centres - centres[0], centres[0], np.zeros(0, int))
+    return Group(np.tile(np.eye(3), (len(views), 1, 1)), centres - centres[0], centres[0], np.zeros(0, int), np.isin(times, at))
 
 
 def owner_of(f: Frame, t: int, tracks: Tracks, groups: list[Group]) -> np.ndarray:

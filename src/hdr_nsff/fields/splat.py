@@ -146,14 +146,11 @@ class Splat(nn.Module):
         return render if pixels is None else picked(render, camera, pixels)
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A training render of the whole frame, read off at the batch's pixels; flow to the neighbours as warps; regularisers."""
+        """A training render of the whole frame, read off at the batch's pixels; flow to one neighbour as a warp; regularisers."""
         knot = self.knot(batch.time)
-        wanted = [o for o in batch.neighbours if o in batch.flow]
-        here = batch.camera.project(self.positions(knot))[0]
-        flows = []
-        for o in wanted:
-            there = batch.neighbours[o].project(self.positions(min(max(knot + o, 0), len(self.times) - 1)))[0]
-            flows.append((there - here).clamp(-2 * batch.camera.width, 2 * batch.camera.width))
+        sides = [o for o in batch.neighbours if o in batch.flow]
+        wanted = [sides[batch.seed % len(sides)]] if sides else []  # one side a step is half the work
+        flows = [self.displacements(batch, knot, o) for o in wanted]
         maps = self.draw(batch.camera, knot, flows)
         radiance, depth, opacity, motion = self.composed(maps)
         seen = maps.features.flatten(0, 1)
@@ -164,6 +161,12 @@ class Splat(nn.Module):
         render = Render(radiance, depth, opacity, motion, {}, warps)
         self.trajectories.mark(knot)
         return picked(render, batch.camera, batch.pixels), self.regularizers(knot)
+
+    def displacements(self, batch: PixelBatch, knot: float, offset: int) -> Tensor:
+        """Pixels (G, 2) from where the batch's camera sees each Gaussian to where the neighbour sees it at its time."""
+        here = batch.camera.project(self.positions(knot))[0]
+        there = batch.neighbours[offset].project(self.positions(min(max(knot + offset, 0), len(self.times) - 1)))[0]
+        return (there - here).clamp(-2 * batch.camera.width, 2 * batch.camera.width)
 
     def regularizers(self, knot: float) -> dict[str, Tensor]:
         """Terms of the field's own: opacities and scales (Kheradmand et al. 2024), smooth poses, slow colours."""
