@@ -7,8 +7,7 @@ Held-out truth of a synthetic scene lives outside, see `truth.py`; nothing here 
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,16 +19,18 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_image, read_mask, read_npy, write_json
+from hdr_nsff.io import read_image, read_json, read_mask, read_npy, write_json
 
 Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
+LARGEST = 1e9  # numbers beyond it, or depths below 1 / it, are no measurement and would overflow in single precision
+LARGEST_EV = 60.0  # stops from the reference
 
 
 class Strict(BaseModel):
-    """A model that refuses what it does not know."""
+    """A model that refuses what it does not know, and NaN and Inf."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class FlowFiles(Strict):
@@ -77,7 +78,7 @@ class Manifest(Strict):
     inputs: dict[str, str] = {}  # input file name -> sha256
     width: int = Field(gt=0)
     height: int = Field(gt=0)
-    fps: float = Field(default=24.0, gt=0)
+    fps: float = Field(default=24.0, gt=0, le=1e6)
     cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
     reference_bracket: int = Field(default=0, ge=0)  # the bracket whose gain is 1: the radiometric gauge
     bracket_ev: list[float | None] = []  # per bracket: log2 exposure relative to the reference, None = to be learned
@@ -101,8 +102,8 @@ class Manifest(Strict):
         if not path.is_file():
             raise InputError(f"{folder}: no scene.json here; make a scene folder with `hdr-nsff prepare CLIP {folder}`")
         try:
-            return Manifest.model_validate(json.loads(path.read_text()))
-        except (ValidationError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            return Manifest.model_validate(read_json(path))
+        except ValueError as error:
             raise InputError(
                 f"{path}: not a valid scene ({first_problem(error)}); restore it or run `prepare` with `--redo frames`"
             ) from error
@@ -186,25 +187,47 @@ def check_frames(folder: Path, m: Manifest) -> None:
         raise InputError(f"{folder / 'scene.json'}: {problem}; restore it or run `prepare` with `--redo poses`")
 
     assert m.near is not None and m.far is not None
-    if not m.near < m.far < np.inf:
+    if not 1 / LARGEST < m.near < m.far < LARGEST:
         refuse(f"near {m.near:g} and far {m.far:g} are no range of depths")
     if all(f.split != "train" for f in m.frames):
         refuse("no training frames, all are held out")
     if len({f.index for f in m.frames}) < len(m.frames):
         refuse("two frames have the same index")
+    if len({(f.camera_id, f.time) for f in m.frames}) < len(m.frames):
+        refuse("two frames of one camera have the same time")
+    brackets = [f.bracket for f in m.frames]
+    if problem := bracket_problem(
+        brackets, m.bracket_ev or [None] * (min(max(brackets), len(brackets)) + 1), m.reference_bracket
+    ):
+        refuse(problem)
     for f in m.frames:
-        if not np.isfinite(f.time):
-            refuse(f"frame {f.index} has time {f.time}")
+        if f.camera_id >= len(m.frames):
+            refuse(f"frame {f.index} has camera_id {f.camera_id}, but cameras are counted from 0")
+        if abs(f.time) > LARGEST:
+            refuse(f"frame {f.index} has time {f.time:g}")
         for name, rows, shape, good in (("K", f.K, (3, 3), is_intrinsic), ("c2w", f.c2w, (3, 4), is_pose)):
             assert rows is not None
             matrix = np.array(rows) if len({len(row) for row in rows}) == 1 else np.zeros(0)
-            if matrix.shape != shape or not np.isfinite(matrix).all() or not good(matrix):
+            if matrix.shape != shape or np.abs(matrix).max() > LARGEST or not good(matrix):
                 refuse(f"{name} of frame {f.index} is no {shape[0]}x{shape[1]} camera {'matrix' if name == 'K' else 'pose'}")
 
 
+def bracket_problem(brackets: Sequence[int], bracket_ev: Sequence[float | None], reference: int) -> str | None:
+    """What does not fit together in the brackets of frames and the exposures of brackets (a scene.json edited by hand); None where all does."""
+    if not 0 <= reference < len(bracket_ev):
+        return f"reference bracket {reference} is not one of the {len(bracket_ev)} brackets in bracket_ev"
+    if max(brackets, default=0) >= len(bracket_ev):
+        return f"a frame has bracket {max(brackets)}, but bracket_ev lists only {len(bracket_ev)}"
+    if bracket_ev[reference]:
+        return f"bracket_ev must be 0 at the reference bracket, not {bracket_ev[reference]}"
+    if (extreme := next((ev for ev in bracket_ev if ev is not None and abs(ev) > LARGEST_EV), None)) is not None:
+        return f"bracket_ev holds {extreme:g}, which is no exposure in stops"
+    return None
+
+
 def is_intrinsic(K: np.ndarray) -> bool:
-    """Whether (3, 3) numbers have focal lengths above 0 and a last row of 0 0 1."""
-    return bool(K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], [0, 0, 1]))
+    """Whether (3, 3) numbers have focal lengths above 0, no skew and a last row of 0 0 1."""
+    return bool(min(K[0, 0], K[1, 1]) > 1 / LARGEST and K[0, 1] == K[1, 0] == 0 and np.allclose(K[2], [0, 0, 1]))
 
 
 def is_pose(c2w: np.ndarray) -> bool:
@@ -284,8 +307,12 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder / name`, refusing a name that leaves the folder."""
-    path = (Path(folder) / name).resolve()
+    """`folder / name`, refusing a name that leaves the folder or that no file can have."""
+    try:
+        path = (Path(folder) / name).resolve()
+        path.is_file()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, NUL, half a character, links in a circle
+        raise InputError(f"{folder}: {name[:60]!r} cannot be the name of a file; restore scene.json or truth.json") from error
     if not path.is_relative_to(Path(folder).resolve()):
         raise InputError(f"{folder}: the file name {name!r} points outside the scene folder; names must stay inside it")
     return path

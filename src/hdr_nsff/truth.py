@@ -5,13 +5,13 @@ truth's own world; a view names the clip frame nearest to it in space, so that i
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_json
 from hdr_nsff.scene import first_problem
 
 
@@ -51,6 +51,8 @@ class Truth(BaseModel):
         if not path.is_file():
             raise InputError(f"{folder}: no truth.json here; leave `--truth` out to evaluate on held-out frames of the clip")
         try:
-            return Truth.model_validate(json.loads(path.read_text()))
-        except (ValidationError, json.JSONDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"{path}: not a valid truth file ({first_problem(error)})") from error
+            return Truth.model_validate(read_json(path))
+        except ValueError as error:
+            raise InputError(
+                f"{path}: not a valid truth file ({first_problem(error)}); restore it, or make the truth anew"
+            ) from error
