@@ -23,7 +23,7 @@ from hdr_nsff.io import read_image, read_json, read_mask, read_npy, write_json
 
 Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
-LARGEST = 1e9  # numbers beyond it, or depths below 1 / it, are no measurement and would overflow in single precision
+LARGEST = 1e15  # numbers beyond it, or depths below 1 / it, are no measurement and would overflow in single precision
 LARGEST_EV = 60.0  # stops from the reference
 
 
@@ -57,6 +57,12 @@ class FrameEntry(Strict):
     disparity: str | None = None  # .npy (H, W) half, 1 / z-depth
     disparity_confidence: str | None = None  # .npy (H, W) half, in [0, 1]
     flow: dict[int, FlowFiles] = {}  # other frame's index -> flow towards it
+
+    @property
+    def files(self) -> list[str]:
+        """The names of all files of this frame."""
+        flow = [n for f in self.flow.values() for n in (f.flow, f.valid)]
+        return [n for n in (self.image, self.mask, self.disparity, self.disparity_confidence, *flow) if n is not None]
 
 
 class Step(Strict):
@@ -102,11 +108,13 @@ class Manifest(Strict):
         if not path.is_file():
             raise InputError(f"{folder}: no scene.json here; make a scene folder with `hdr-nsff prepare CLIP {folder}`")
         try:
-            return Manifest.model_validate(read_json(path))
+            manifest = Manifest.model_validate(read_json(path))
         except ValueError as error:
             raise InputError(
                 f"{path}: not a valid scene ({first_problem(error)}); restore it or run `prepare` with `--redo frames`"
             ) from error
+        check_manifest(Path(folder), manifest)
+        return manifest
 
 
 def first_problem(error: Exception) -> str:
@@ -164,7 +172,6 @@ class Scene:
             raise InputError(
                 f"{folder}: the scene has no camera poses yet; run `hdr-nsff prepare` again, it goes on where it stopped"
             )
-        check_frames(folder, m)
         train = [e for e in m.frames if e.split == "train"]
         links = neighbours(train)
         return Scene(
@@ -180,36 +187,54 @@ class Scene:
         )
 
 
-def check_frames(folder: Path, m: Manifest) -> None:
-    """InputError where indices, times, depth range or cameras make no sense together."""
+def check_manifest(folder: Path, m: Manifest) -> None:
+    """InputError where what the manifest holds so far makes no sense together."""
 
     def refuse(problem: str) -> None:
-        raise InputError(f"{folder / 'scene.json'}: {problem}; restore it or run `prepare` with `--redo poses`")
+        raise InputError(f"{folder / 'scene.json'}: {problem}; restore it or run `prepare` with `--redo frames`")
 
-    assert m.near is not None and m.far is not None
-    if not 1 / LARGEST < m.near < m.far < LARGEST:
+    if m.near is not None and m.far is not None and not 1 / LARGEST < m.near < m.far < LARGEST:
         refuse(f"near {m.near:g} and far {m.far:g} are no range of depths")
+    if any(not isinstance(step.details.get("attempt", 0), int) for step in m.steps.values()):
+        refuse("a step has an `attempt` that is no number")
+    if not m.frames:
+        return
     if all(f.split != "train" for f in m.frames):
         refuse("no training frames, all are held out")
     if len({f.index for f in m.frames}) < len(m.frames):
         refuse("two frames have the same index")
     if len({(f.camera_id, f.time) for f in m.frames}) < len(m.frames):
         refuse("two frames of one camera have the same time")
+    if sorted({f.camera_id for f in m.frames}) != list(range(len({f.camera_id for f in m.frames}))):
+        refuse("the camera_ids of the frames are not counted from 0 without gaps")
     brackets = [f.bracket for f in m.frames]
-    if problem := bracket_problem(
-        brackets, m.bracket_ev or [None] * (min(max(brackets), len(brackets)) + 1), m.reference_bracket
-    ):
+    if problem := bracket_problem(brackets, m.bracket_ev or [None] * (min(max(brackets), len(brackets)) + 1), m.reference_bracket):
         refuse(problem)
     for f in m.frames:
-        if f.camera_id >= len(m.frames):
-            refuse(f"frame {f.index} has camera_id {f.camera_id}, but cameras are counted from 0")
-        if abs(f.time) > LARGEST:
-            refuse(f"frame {f.index} has time {f.time:g}")
-        for name, rows, shape, good in (("K", f.K, (3, 3), is_intrinsic), ("c2w", f.c2w, (3, 4), is_pose)):
-            assert rows is not None
-            matrix = np.array(rows) if len({len(row) for row in rows}) == 1 else np.zeros(0)
-            if matrix.shape != shape or np.abs(matrix).max() > LARGEST or not good(matrix):
-                refuse(f"{name} of frame {f.index} is no {shape[0]}x{shape[1]} camera {'matrix' if name == 'K' else 'pose'}")
+        if problem := frame_problem(f, {g.index for g in m.frames}):
+            refuse(f"frame {f.index} has {problem}")
+    for name in [m.points, *(n for f in m.frames for n in f.files)]:
+        if name is not None:
+            inside(folder, name)
+
+
+def frame_problem(f: FrameEntry, known: set[int]) -> str | None:
+    """What makes no sense in a frame of a scene whose frames have the indices `known`; None where all does."""
+    if abs(f.time) > LARGEST:
+        return f"time {f.time:g}"
+    if lost := set(f.flow) - known:
+        return f"flow to frame {min(lost)}, which the scene does not have"
+    if f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic):
+        return "a K that is no 3x3 camera matrix"
+    if f.c2w is not None and not is_matrix(f.c2w, (3, 4), is_pose):
+        return "a c2w that is no 3x4 camera pose"
+    return None
+
+
+def is_matrix(rows: list[list[float]], shape: tuple[int, int], good: Callable[[np.ndarray], bool]) -> bool:
+    """Whether `rows` are a matrix of that shape, with numbers in range, that is `good`."""
+    matrix = np.array(rows) if len({len(row) for row in rows}) == 1 else np.zeros(0)
+    return matrix.shape == shape and bool(np.abs(matrix).max() <= LARGEST) and good(matrix)
 
 
 def bracket_problem(brackets: Sequence[int], bracket_ev: Sequence[float | None], reference: int) -> str | None:
