@@ -7,21 +7,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import tyro
+try:
+    import tyro
 
-from hdr_nsff import __version__
-from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import EvaluateConfig, evaluate
-from hdr_nsff.io import writing_to
-from hdr_nsff.prepare import PrepareConfig, prepare
-from hdr_nsff.progress import say
-from hdr_nsff.reexpose import ReexposeConfig, reexpose
-from hdr_nsff.render import RenderConfig, render
-from hdr_nsff.report import ReportConfig, report
-from hdr_nsff.run_all import RunConfig, run_all
-from hdr_nsff.synth import SynthConfig, synth
-from hdr_nsff.train import train
+    from hdr_nsff import __version__
+    from hdr_nsff.config import PRESETS, TrainConfig
+    from hdr_nsff.errors import InputError
+    from hdr_nsff.evaluate import EvaluateConfig, evaluate
+    from hdr_nsff.io import writing_to
+    from hdr_nsff.prepare import PrepareConfig, prepare
+    from hdr_nsff.progress import say
+    from hdr_nsff.reexpose import ReexposeConfig, reexpose
+    from hdr_nsff.render import RenderConfig, render
+    from hdr_nsff.report import ReportConfig, report
+    from hdr_nsff.run_all import RunConfig, run_all
+    from hdr_nsff.synth import SynthConfig, synth
+    from hdr_nsff.train import train
+except KeyboardInterrupt:  # while the libraries load, which takes seconds
+    raise SystemExit(130) from None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -106,9 +107,10 @@ def read_note(path: Path | str) -> dict[str, Any]:
 
 def write_npy(path: Path | str, array: np.ndarray) -> None:
     """Write an array, atomically."""
-    with atomic(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, array, allow_pickle=False)
-        file.flush()
+    buffer = BytesIO()  # numpy writing to a file itself forgets why it could not
+    np.save(buffer, array, allow_pickle=False)
+    with atomic(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_npy(path: Path | str) -> np.ndarray:

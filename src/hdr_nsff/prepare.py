@@ -54,7 +54,7 @@ def begin(config: PrepareConfig) -> Work:
     footage = ingest.open_footage(config.clip)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
-    if found is not None and found.inputs != inputs and not any(step.done for step in found.steps.values()):
+    if found is not None and found.inputs != inputs and not found.frames:
         found = None  # nothing to lose
     if found is not None and found.inputs != inputs and found.source != str(config.clip):
         raise InputError(f"{config.out}: holds the scene of other footage ({found.source}); choose another folder")
@@ -85,7 +85,9 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
     try:
         found = Manifest.load(config.out)
         if [f.index for f in found.frames] != list(range(len(found.frames))):
-            raise InputError(f"{config.out / 'scene.json'}: frames are missing or out of order; restore it or use `--redo frames`")
+            raise InputError(
+                f"{config.out / 'scene.json'}: frames are missing or out of order; restore it or use `--redo frames`"
+            )
         return found
     except InputError:
         if "frames" not in config.redo:

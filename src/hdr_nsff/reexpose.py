@@ -96,7 +96,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         poses = read_poses(config.poses, footage, numbers, size) if config.poses is not None else None
         if (colour := exposure.all_clipped(extents)) is not None:
             raise InputError(f"{config.clip}: all frames are {colour}; re-exposed they stay so, choose another clip")
-        masks = frame_masks(config.masks, work.test, numbers) if config.masks is not None else {}
+        masks = frame_masks(config.masks, work.test, numbers, size) if config.masks is not None else {}
         claim(config, footage)  # once nothing can be wrong with the settings any more
         write_frames(config, footage, work, evs, response)
         write_truth(config.out, work, evs, response, poses, masks)
@@ -194,14 +194,20 @@ def write_truth(
     write_json(out / "truth/truth.json", truth.model_dump())
 
 
-def frame_masks(folder: Path, frames: list[int], numbers: list[int]) -> dict[int, np.ndarray]:
-    """The masks (H, W) bool of the held-out `frames`, from a folder with one image for every frame of the clip."""
+def frame_masks(folder: Path, frames: list[int], numbers: list[int], size: tuple[int, int]) -> dict[int, np.ndarray]:
+    """The masks of `size` (H, W) bool of the held-out `frames`, from a folder with one image for every frame of the clip."""
     files = ingest.frame_files(folder) if folder.is_dir() else []
     if len(files) <= max(numbers):
         raise InputError(
             f"--masks {folder}: {len(files)} masks for a clip of at least {max(numbers) + 1} frames; one per frame, in order"
         )
-    return {k: read_mask(files[numbers[k]]) for k in frames}
+    masks = {k: read_mask(files[numbers[k]]) for k in frames}
+    for k, mask in masks.items():
+        if mask.shape != size:
+            raise InputError(
+                f"{files[numbers[k]]}: the mask is {mask.shape[1]}x{mask.shape[0]}, the frames are {size[1]}x{size[0]}; make it that size"
+            )
+    return masks
 
 
 def read_poses(path: Path, footage: ingest.Footage, numbers: list[int], size: tuple[int, int]) -> Poses:

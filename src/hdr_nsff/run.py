@@ -174,6 +174,6 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
         try:
             line = json.loads(text)
             lines[int(line["step"])] = line
-        except (ValueError, TypeError, KeyError):
+        except (ValueError, TypeError, KeyError, RecursionError):
             continue
     return [lines[step] for step in sorted(lines)]

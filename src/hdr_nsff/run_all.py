@@ -11,7 +11,7 @@ from tyro.conf import Positional
 
 from hdr_nsff.config import PRESETS
 from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import evaluate_run
+from hdr_nsff.evaluate import check_truth, evaluate_run
 from hdr_nsff.io import writing_to
 from hdr_nsff.prepare import PrepareConfig, prepare
 from hdr_nsff.progress import say
@@ -59,6 +59,8 @@ def run_all(config: RunConfig) -> None:
     pick_device(config.device)
     if config.truth is not None and not config.truth.is_dir():
         raise InputError(f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, or leave the option out")
+    if config.truth is not None:
+        check_truth(config.truth)
     check_place(config.out / "report.html")
     hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
     scene = prepare(

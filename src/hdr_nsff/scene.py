@@ -208,7 +208,9 @@ def check_manifest(folder: Path, m: Manifest) -> None:
     if sorted({f.camera_id for f in m.frames}) != list(range(len({f.camera_id for f in m.frames}))):
         refuse("the camera_ids of the frames are not counted from 0 without gaps")
     brackets = [f.bracket for f in m.frames]
-    if problem := bracket_problem(brackets, m.bracket_ev or [None] * (min(max(brackets), len(brackets)) + 1), m.reference_bracket):
+    if problem := bracket_problem(
+        brackets, m.bracket_ev or [None] * (min(max(brackets), len(brackets)) + 1), m.reference_bracket
+    ):
         refuse(problem)
     for f in m.frames:
         if problem := frame_problem(f, {g.index for g in m.frames}):

@@ -36,7 +36,7 @@ def extent(rgb: np.ndarray) -> tuple[float, float]:
 
 
 def all_clipped(extents: list[tuple[float, float]]) -> str | None:
-    """"black" or "white" where every frame is that and nothing else, else None; `extents` as of `extent`, one per frame."""
+    """ "black" or "white" where every frame is that and nothing else, else None; `extents` as of `extent`, one per frame."""
     if max(high for _, high in extents) < LOW:
         return "black"
     return "white" if min(low for low, _ in extents) > HIGH else None
