@@ -87,6 +87,27 @@ NONSENSE: dict[str, tuple[Change, str]] = {
     "a flow that is not there": (lambda d: d["frames"][2]["flow"]["3"].update(flow="flow/none.npy"), "flow/none.npy"),
     "a flow mask that is not there": (lambda d: d["frames"][2]["flow"]["3"].update(valid="flow/none.png"), "flow/none.png"),
     "points that are not there": (top("points", "points.npy"), "points.npy"),
+    "a held-out frame without an exposure": (lambda d: d["frames"][2].update(split="test", bracket=3), "bracket 3"),
+    "an exposure with NaN": (top("bracket_ev", [2.0, 0.0, float("nan")]), "bracket_ev.2"),
+    "an exposure beyond all light": (top("bracket_ev", [2.0, 0.0, 1e9]), "bracket_ev holds 1e+09"),
+    "brackets without end": (lambda d: (d.update(bracket_ev=[]), d["frames"][2].update(bracket=10**12)), "bracket 1000000000000"),
+    "cameras without end": (frame("camera_id", 10**12), "camera_ids"),
+    "a camera that is left out": (frame("camera_id", 2), "camera_ids"),
+    "two frames at one time": (frame("time", 1.0), "same time"),
+    "a time without end": (frame("time", 1e300), "time 1e+300"),
+    "a pose out of this world": (frame("c2w", [[1.0, 0, 0, 1e300], *TURNED[1:]]), "c2w"),
+    "a skewed camera": (frame("K", [[55.2, 3.0, 30.0], *K[1:]]), "K"),
+    "a depth of nearly nothing": (top("near", 1e-300), "near 1e-300"),
+    "a depth without end": (top("far", 1e300), "far 1e+300"),
+    "more frames a second than a video can have": (top("fps", 1e30), "fps"),
+    "flow to a frame that is not there": (
+        lambda d: d["frames"][2]["flow"].update({"77": d["frames"][2]["flow"]["3"]}),
+        "frame 77",
+    ),
+    "a name with a NUL": (frame("image", "a\0.png"), "cannot be the name of a file"),
+    "a name without end": (frame("image", "x" * 5000), "cannot be the name of a file"),
+    "a name with half a character": (frame("image", "\ud800.png"), "cannot be the name of a file"),
+    "a step counted in words": (top("steps", {"flow": {"details": {"attempt": "first"}}}), "attempt"),
 }
 
 

@@ -2,26 +2,29 @@
 
 from __future__ import annotations
 
-import errno
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import tyro
+try:
+    import tyro
 
-from hdr_nsff import __version__
-from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import EvaluateConfig, evaluate
-from hdr_nsff.prepare import PrepareConfig, prepare
-from hdr_nsff.progress import say
-from hdr_nsff.reexpose import ReexposeConfig, reexpose
-from hdr_nsff.render import RenderConfig, render
-from hdr_nsff.report import ReportConfig, report
-from hdr_nsff.run_all import RunConfig, run_all
-from hdr_nsff.synth import SynthConfig, synth
-from hdr_nsff.train import train
+    from hdr_nsff import __version__
+    from hdr_nsff.config import PRESETS, TrainConfig
+    from hdr_nsff.errors import InputError
+    from hdr_nsff.evaluate import EvaluateConfig, evaluate
+    from hdr_nsff.io import writing_to
+    from hdr_nsff.prepare import PrepareConfig, prepare
+    from hdr_nsff.progress import say
+    from hdr_nsff.reexpose import ReexposeConfig, reexpose
+    from hdr_nsff.render import RenderConfig, render
+    from hdr_nsff.report import ReportConfig, report
+    from hdr_nsff.run_all import RunConfig, run_all
+    from hdr_nsff.synth import SynthConfig, synth
+    from hdr_nsff.train import train
+except KeyboardInterrupt:  # while the libraries load, which takes seconds
+    raise SystemExit(130) from None
 
 
 @dataclass(frozen=True)
@@ -90,22 +93,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if arguments[0] not in VERBS:
         fail(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}")
     verb = VERBS[arguments[0]]
+    if foreign := next((a for a in arguments if a.encode(errors="ignore").decode() != a), None):
+        fail(f"{foreign!r}: a name that is no UTF-8 text; rename the file or folder")
     try:
-        verb.act(parse(verb, arguments[0], arguments[1:]))
+        with writing_to("output"):
+            verb.act(parse(verb, arguments[0], arguments[1:]))
     except InputError as error:
         fail(str(error))
     except KeyboardInterrupt:
         say("stopped; the same command goes on where it was")
         raise SystemExit(130) from None
-    except OSError as error:
-        if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS):
-            raise
-        fail(
-            f"{error.filename or 'output'}: {error.strerror}; make room or choose another place, the same command goes on where it was"
-        )
 
 
 def fail(message: str) -> None:
     """Print one sentence and exit with code 2."""
-    print(f"hdr-nsff: {message}", file=sys.stderr)
+    print(f"hdr-nsff: {' '.join(message.splitlines())}", file=sys.stderr)
     raise SystemExit(2)

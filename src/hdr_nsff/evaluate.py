@@ -66,6 +66,11 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         return evaluate_run(Run.open(config.run, config.device), config.truth, config.lpips)
 
 
+def check_truth(folder: Path) -> None:
+    """InputError where `folder` is no truth folder, for those who will need it later."""
+    Truth.open(folder)
+
+
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:
     """Measure, write `metrics.json` and `evaluation/*.png` into the run folder, and give back what was written."""
     start = time.monotonic()
@@ -162,8 +167,11 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
         say(note)
     if not targets:
         raise InputError(
-            f"{folder}: no view of this truth can be compared with the run ({notes[0] if notes else 'it lists none'})"
+            f"{folder}: no view of this truth can be compared with the run ({notes[0] if notes else 'it lists none'}); "
+            "check that it is the truth of this clip"
         )
+    if not any(exact_of(t).any() for t in targets):
+        raise InputError(f"{folder}: the radiance of every view is 0; make the truth anew")
     return targets, notes
 
 
@@ -172,11 +180,13 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     exact = io.read_exr(inside(folder, view.radiance)).get("RGB")
     if exact is None:
         raise InputError(f"{folder / view.radiance}: no R, G and B channels in this truth image")
-    if not 0 <= view.bracket < len(truth.bracket_ev):
-        raise InputError(f"{folder}: view {view.name} has bracket {view.bracket}, but bracket_ev lists {len(truth.bracket_ev)}")
+    if exact.min() < 0:
+        raise InputError(f"{folder / view.radiance}: negative radiance; clip at zero before writing the truth")
     anchor = next((e for e in run.scene.manifest.frames if e.index == view.anchor), None)
     if anchor is None or anchor.c2w is None or anchor.K is None:
-        raise InputError(f"{folder}: view {view.name} is anchored at frame {view.anchor}, which the scene does not have")
+        raise InputError(
+            f"{folder}: view {view.name} is anchored at frame {view.anchor}, which the scene does not have; prepare the whole clip"
+        )
     pose = np.array(anchor.c2w)
     if view.c2w is not None:
         assert truth.clip_c2w is not None, "world_scale refuses this"

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -41,24 +42,39 @@ def atomic(path: Path | str) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
+IMPOSSIBLE = (errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP)
+
+
 @contextmanager
-def writing_to(folder: Path | str) -> Iterator[None]:
-    """Turns a full disk and a folder that may not be written into an InputError. What was complete stays; nothing is half-written."""
+def writing_to(place: Path | str) -> Iterator[None]:
+    """Turns a full disk, and a place that cannot or may not be read or written, into an InputError. What was complete stays;
+    nothing is half-written."""
     try:
         yield
     except InputError:
         raise
+    except UnicodeEncodeError as error:
+        raise InputError(f"{place}: a file name that is no UTF-8 text ({error.object[:80]!r}); rename the file") from error
     except Exception as error:  # OpenEXR, FFmpeg and safetensors have types of their own for it
-        code = getattr(error, "errno", None)
-        if code in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) or any(m in str(error) for m in ("No space left", "File too large")):
-            raise InputError(
-                f"{folder}: the disk is full; free some space and run the same command again, it goes on where it was"
-            ) from error
-        if code in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise InputError(
-                f"{getattr(error, 'filename', None) or folder}: may not be read or written; check its permissions"
-            ) from error
-        raise
+        if (sentence := about_the_disk(error, place)) is None:
+            raise
+        raise InputError(sentence) from error
+
+
+def about_the_disk(error: Exception, place: Path | str) -> str | None:
+    """What to say where the disk, not this program, is the cause of `error`; None for any other error."""
+    code, text = getattr(error, "errno", None), getattr(error, "strerror", None) or str(error).partition("\n")[0]
+    named = Path(getattr(error, "filename", None) or place)
+    named = named.parent if named.name.startswith(".partial-") else named
+    if code in FULL or any(m in str(error) for m in ("No space left", "File too large")):
+        return f"{named}: the disk is full ({text}); free some space and run the same command again, it goes on where it was"
+    if code in FORBIDDEN:
+        return f"{named}: may not be read or written ({text}); check its permissions, or choose another place"
+    if code in IMPOSSIBLE:
+        return f"{str(named)[:200]}: cannot be read or written ({text}); mend the path, or choose another place"
+    return None
 
 
 def write_text(path: Path | str, text: str) -> None:
@@ -72,11 +88,29 @@ def write_json(path: Path | str, value: Any) -> None:
     write_text(path, json.dumps(value, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
 
 
+def read_json(path: Path | str) -> Any:
+    """What a JSON file holds; ValueError where it holds none."""
+    try:
+        return json.loads(Path(path).read_text(encoding="utf-8"))
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+
+
+def read_note(path: Path | str) -> dict[str, Any]:
+    """The object in a JSON file of our own making; empty where there is none that can be read, so that it is made again."""
+    try:
+        note = read_json(path)
+    except (OSError, ValueError):
+        return {}
+    return note if isinstance(note, dict) else {}
+
+
 def write_npy(path: Path | str, array: np.ndarray) -> None:
     """Write an array, atomically."""
-    with atomic(path) as temporary, open(temporary, "wb") as file:
-        np.save(file, array, allow_pickle=False)
-        file.flush()
+    buffer = BytesIO()  # numpy writing to a file itself forgets why it could not
+    np.save(buffer, array, allow_pickle=False)
+    with atomic(path) as temporary:
+        temporary.write_bytes(buffer.getbuffer())
 
 
 def read_npy(path: Path | str) -> np.ndarray:
@@ -111,7 +145,7 @@ def read_image(path: Path | str) -> np.ndarray:
     """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path}: no such image")
+        raise InputError(f"{path}: no such image; put it back or mend the name")
     raw = np.frombuffer(path.read_bytes(), np.uint8)
     if path.suffix.lower() == ".png" and not raw.tobytes().rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
         raise InputError(f"{path}: the PNG is cut short; copy it again")
@@ -122,7 +156,7 @@ def read_image(path: Path | str) -> np.ndarray:
     except cv2.error:
         image = None
     if image is None:
-        raise InputError(f"{path}: not a readable image (PNG, JPEG or TIFF)")
+        raise InputError(f"{path}: not a readable image (PNG, JPEG or TIFF); copy it again")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: {image.dtype} pixels; convert to 8 or 16 bits, or to EXR for linear data")
     return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / (255 if image.dtype == np.uint8 else 65535)
@@ -151,13 +185,26 @@ def write_exr(path: Path | str, channels: dict[str, np.ndarray], header: dict[st
         file.write(str(temporary))
 
 
+@contextmanager
+def silent() -> Iterator[None]:
+    """Keeps what C libraries print of their own to stderr away from the terminal: the error that is raised says it."""
+    with open(os.devnull, "wb") as nowhere:
+        stderr = os.dup(2)
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
 def read_exr(path: Path | str) -> dict[str, np.ndarray]:
     """Channels of an EXR as float32: {"RGB": (H, W, 3)} and {name: (H, W)} for the others. InputError for a file cut short, NaN or Inf."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
-        with OpenEXR.File(str(path)) as file:
+        with silent(), OpenEXR.File(str(path)) as file:
             if not file.parts:
                 raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")
             channels = {n: np.array(c.pixels, dtype=np.float32) for n, c in file.channels().items()}
@@ -165,7 +212,7 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
         raise
     except Exception as error:  # OpenEXR raises several unrelated types
         raise InputError(
-            f"{path}: not a readable EXR ({str(error).splitlines()[0] if str(error) else type(error).__name__})"
+            f"{path}: not a readable EXR ({str(error).partition(chr(10))[0] or type(error).__name__}); copy it again"
         ) from error
     if "RGB" not in channels and "RGBA" in channels:
         channels["RGB"] = np.ascontiguousarray(channels["RGBA"][..., :3])

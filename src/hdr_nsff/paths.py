@@ -10,7 +10,6 @@ A path file is JSON, a list with one object per view:
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_json
 
 
 @dataclass(frozen=True)
@@ -107,10 +107,10 @@ def from_json(path: Path | str, like: Camera) -> list[View]:
     """The views of a path file (format above); `like` gives the frame size, and `K` where a view names none. InputError in one
     sentence for anything that is not such a file."""
     try:
-        entries = json.loads(Path(path).read_text(encoding="utf-8"))
+        entries = read_json(path)
     except OSError as error:
         raise InputError(f"{path}: no readable camera path file ({error.strerror}); check the name") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise InputError(f"{path}: not a JSON file ({error}); write a list of {{time, c2w}} objects") from error
     if not isinstance(entries, list) or not entries:
         raise InputError(f"{path}: a camera path is a list with at least one {{time, c2w}} object; this holds none")

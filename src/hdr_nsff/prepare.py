@@ -19,7 +19,7 @@ from hdr_nsff import ingest
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import writing_to
 from hdr_nsff.progress import say, track
-from hdr_nsff.scene import FrameEntry, Manifest, Split, Step
+from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
 from hdr_nsff.steps import priors as on_priors
 from hdr_nsff.steps.work import PrepareConfig, StepName, Work
@@ -54,7 +54,7 @@ def begin(config: PrepareConfig) -> Work:
     footage = ingest.open_footage(config.clip)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
-    if found is not None and found.inputs != inputs and not any(step.done for step in found.steps.values()):
+    if found is not None and found.inputs != inputs and not found.frames:
         found = None  # nothing to lose
     if found is not None and found.inputs != inputs and found.source != str(config.clip):
         raise InputError(f"{config.out}: holds the scene of other footage ({found.source}); choose another folder")
@@ -83,7 +83,12 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
             raise InputError(f"{config.out}: holds other files and no scene; choose an empty or new folder")
         return None
     try:
-        return Manifest.load(config.out)
+        found = Manifest.load(config.out)
+        if [f.index for f in found.frames] != list(range(len(found.frames))):
+            raise InputError(
+                f"{config.out / 'scene.json'}: frames are missing or out of order; restore it or use `--redo frames`"
+            )
+        return found
     except InputError:
         if "frames" not in config.redo:
             raise
@@ -159,17 +164,11 @@ def remove(path: Path) -> None:
 def present(work: Work, name: StepName) -> bool:
     """Whether every file that the manifest names for this step is there."""
     named = (
-        [f for e in work.manifest.frames for f in named_files(e)]
+        [f for e in work.manifest.frames for f in e.files]
         + ["contact_sheet.png"]
         + ([work.manifest.points] if work.manifest.points else [])
     )
     return all((work.folder / n).is_file() for n in named if n.split("/")[0] in STEPS[name].outputs)
-
-
-def named_files(e: FrameEntry) -> list[str]:
-    """All files of one frame."""
-    flow = [n for f in e.flow.values() for n in (f.flow, f.valid)]
-    return [n for n in (e.image, e.mask, e.disparity, e.disparity_confidence, *flow) if n is not None]
 
 
 def all_have(field: str, split: Split | None = None) -> Callable[[Manifest], bool]:

@@ -9,7 +9,6 @@ could say where a missing frame was seen from, so they stay in the footage and `
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +18,8 @@ from tyro.conf import Positional
 
 from hdr_nsff import ingest
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_mask, write_exr, write_json, write_npy, write_png, writing_to
+from hdr_nsff.io import read_json, read_mask, write_exr, write_json, write_npy, write_png, writing_to
+from hdr_nsff.priors import exposure
 from hdr_nsff.priors.import_poses import import_poses
 from hdr_nsff.priors.poses import Poses
 from hdr_nsff.progress import say, track
@@ -87,13 +87,16 @@ def reexpose(config: ReexposeConfig) -> Path:
         if len(footage.cameras) > 1:
             raise InputError(f"{config.clip}: {len(footage.cameras)} cameras; re-expose one camera's folder at a time")
         response = response_curve(config.response)
-        numbers, size = [], (0, 0)
+        numbers, extents, size = [], [], (0, 0)
         for frame in track(chosen(config, footage), "reading"):
             numbers.append(frame.number)
+            extents.append(exposure.extent(frame.rgb))
             size = (frame.rgb.shape[0], frame.rgb.shape[1])
         work = plan(len(numbers), len(evs), config.hold_out, remove=config.poses is not None)
         poses = read_poses(config.poses, footage, numbers, size) if config.poses is not None else None
-        masks = frame_masks(config.masks, work.test, numbers) if config.masks is not None else {}
+        if (colour := exposure.all_clipped(extents)) is not None:
+            raise InputError(f"{config.clip}: all frames are {colour}; re-exposed they stay so, choose another clip")
+        masks = frame_masks(config.masks, work.test, numbers, size) if config.masks is not None else {}
         claim(config, footage)  # once nothing can be wrong with the settings any more
         write_frames(config, footage, work, evs, response)
         write_truth(config.out, work, evs, response, poses, masks)
@@ -121,7 +124,7 @@ def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
     path = config.out / "reexpose.json"
     if path.is_file():
         try:
-            same = {**json.loads(path.read_text()), "clip": ""} == {**told, "clip": ""}
+            same = {**read_json(path), "clip": ""} == {**told, "clip": ""}
         except (ValueError, TypeError):
             same = False
         if not same:
@@ -141,7 +144,7 @@ def plan(count: int, cycle: int, hold_out: int, remove: bool) -> Plan:
     kept = [k for k in range(count) if not (remove and k in test)]
     if len(kept) < 3:
         raise InputError(
-            f"{len(kept)} frames left for the footage; at least 3 are needed, so give a longer clip or another --hold-out"
+            f"{len(kept)} frame{'s' * (len(kept) != 1)} left for the footage; at least 3 are needed, so give a longer clip or another --hold-out"
         )
     bracket = [sum(j < k for j in kept) % cycle for k in range(count)]
     return Plan(bracket, test, kept)
@@ -191,14 +194,20 @@ def write_truth(
     write_json(out / "truth/truth.json", truth.model_dump())
 
 
-def frame_masks(folder: Path, frames: list[int], numbers: list[int]) -> dict[int, np.ndarray]:
-    """The masks (H, W) bool of the held-out `frames`, from a folder with one image for every frame of the clip."""
+def frame_masks(folder: Path, frames: list[int], numbers: list[int], size: tuple[int, int]) -> dict[int, np.ndarray]:
+    """The masks of `size` (H, W) bool of the held-out `frames`, from a folder with one image for every frame of the clip."""
     files = ingest.frame_files(folder) if folder.is_dir() else []
     if len(files) <= max(numbers):
         raise InputError(
             f"--masks {folder}: {len(files)} masks for a clip of at least {max(numbers) + 1} frames; one per frame, in order"
         )
-    return {k: read_mask(files[numbers[k]]) for k in frames}
+    masks = {k: read_mask(files[numbers[k]]) for k in frames}
+    for k, mask in masks.items():
+        if mask.shape != size:
+            raise InputError(
+                f"{files[numbers[k]]}: the mask is {mask.shape[1]}x{mask.shape[0]}, the frames are {size[1]}x{size[0]}; make it that size"
+            )
+    return masks
 
 
 def read_poses(path: Path, footage: ingest.Footage, numbers: list[int], size: tuple[int, int]) -> Poses:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Sequence
@@ -75,6 +74,8 @@ def check_settings(config: RenderConfig) -> None:
     for name, value in positive.items() | ({"fps": config.fps}.items() if config.fps is not None else set()):
         if not (value > 0 and math.isfinite(value)):
             raise InputError(f"--{name} {value:g}: must be a number above 0")
+    if config.fps is not None and config.fps > 1000:
+        raise InputError(f"--fps {config.fps:g}: no player shows that many; use 1000 at most")
     o = config.output
     if o.ev is not None and not abs(o.ev) < 60:
         raise InputError(f"--ev {o.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5")
@@ -174,6 +175,10 @@ def render_all(run: Run, out: Path, budget: float = 90.0, output: Output | None 
     output = output or Output()
     if output.exr == "none":
         raise InputError("--exr none: the standard set is made from its EXR sequence; choose --exr half or float")
+    if not any((out / name).is_file() for name in ("plan.json", "views.json")):
+        foreign = next((out / name for name in ("overview.png", "ldr", "depth", "scene_flow") if (out / name).exists()), None)
+        if foreign is not None:
+            raise InputError(f"{foreign}: is there already and was not made by render; choose another --out")
     refused: list[str] = []
     shots = standard_shots(run, out, budget, refused)
     for sentence in refused:
@@ -219,11 +224,10 @@ def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused
     """Per shot the scale and the positions of the views to make: what `plan.json` says for this checkpoint, else measured anew."""
     file, key = out / "plan.json", fingerprint(run, budget)
     if file.is_file():
-        try:
-            found = json.loads(file.read_text())
-            if found["key"] == key and set(found["shots"]) == {s.name for s in shots}:
-                return found["shots"]
-        except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError):
+        found = io.read_note(file)
+        if found.get("key") == key and set(found.get("shots", {})) == {s.name for s in shots}:
+            return found["shots"]
+        if not found:
             say(f"{file}: unreadable, measuring the speed again")
     speed = measure(run)
     times = run.scene.times.tolist()
@@ -282,7 +286,7 @@ def write_views(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
     evs = three_exposures(run.tonemapper.exposures().tolist())
     key = fingerprint(run, shot.views, evs)
     results = {f"LDR at EV {ev:+.1f}": out / "ldr" / f"ev{ev:+.1f}" for ev in evs} | {"depth": out / "depth"}
-    done = json.loads(note.read_text()) if note.is_file() else {}
+    done = io.read_note(note)
     if done.get("key") != key:
         near, far, fastest, moves = ranges(sources)
         for i, source in enumerate(track(sources, "LDR, depth and motion pictures")):

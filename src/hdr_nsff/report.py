@@ -18,6 +18,7 @@ import torch
 import tyro
 
 from hdr_nsff import __version__, io
+from hdr_nsff.errors import InputError
 from hdr_nsff.page import COLOURS, GREY, details, document, figure, legend, missing, number, plot, svg, table, video
 from hdr_nsff.progress import say
 from hdr_nsff.run import Run
@@ -40,6 +41,8 @@ class ReportConfig:
 def report(config: ReportConfig) -> Path:
     """The verb: the path of the report."""
     out = config.out or config.run / "report.html"
+    if config.renders is not None and not config.renders.is_dir():
+        raise InputError(f"--renders {config.renders}: no such folder; mend the path, or leave the option out for RUN/render")
     with io.writing_to(out):
         path = write_report(Run.open(config.run), out, config.renders or config.run / "render")
     say(f"report: {path}")
@@ -48,7 +51,10 @@ def report(config: ReportConfig) -> Path:
 
 def write_report(run: Run, path: Path, renders: Path) -> Path:
     """Write the report of `run` with the pictures in `renders` to `path`."""
+    check_place(path)
     metrics = read_json(run.folder / "metrics.json")
+    if metrics is not None and not {"headline", "groups", "views", "kind", "notes"} <= metrics.keys():
+        metrics = None  # of another version
     log = run.log()
     sections = [
         ("Results", headline(metrics)),
@@ -71,12 +77,17 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
     return path
 
 
+def check_place(path: Path) -> None:
+    """InputError where `path` is a folder, or a file that is no report, so that writing one would destroy it."""
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name the file to write, such as {path / 'report.html'}")
+    if path.is_file() and b"HDR-NSFF report" not in path.read_bytes()[:1000]:
+        raise InputError(f"{path}: is there already and is no report; choose another place for the report")
+
+
 def read_json(path: Path) -> dict[str, Any] | None:
     """A JSON file, or None where there is none or it cannot be read."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None
+    return io.read_note(path) or None
 
 
 def headline(metrics: dict[str, Any] | None) -> str:

@@ -17,7 +17,7 @@ from hdr_nsff.config import TrainConfig
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field
 from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.io import atomic, write_json
+from hdr_nsff.io import atomic, read_json, write_json
 from hdr_nsff.progress import say
 from hdr_nsff.scene import Scene
 from hdr_nsff.tonemap import ToneMapper
@@ -154,8 +154,10 @@ def read_config(folder: Path) -> TrainConfig:
     if not path.is_file():
         raise InputError(f"{folder}: no config.json here; this is not a run folder, make one with `hdr-nsff train`")
     try:
-        return TrainConfig.from_json(json.loads(path.read_text()))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        return TrainConfig.from_json(read_json(path))
+    except InputError:
+        raise
+    except ValueError as error:
         raise InputError(f"{path}: not readable JSON; restore it or train again into a new folder") from error
 
 
@@ -168,10 +170,10 @@ def read_log(folder: Path) -> list[dict[str, Any]]:
     """Complete lines of log.jsonl; where a resumed run wrote a step again, the last line of it counts."""
     path = Path(folder) / "log.jsonl"
     lines: dict[int, dict[str, Any]] = {}
-    for text in path.read_text().splitlines() if path.is_file() else []:
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []:
         try:
             line = json.loads(text)
-        except json.JSONDecodeError:
+            lines[int(line["step"])] = line
+        except (ValueError, TypeError, KeyError, RecursionError):
             continue
-        lines[line["step"]] = line
     return [lines[step] for step in sorted(lines)]

@@ -11,11 +11,12 @@ from tyro.conf import Positional
 
 from hdr_nsff.config import PRESETS
 from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import evaluate_run
+from hdr_nsff.evaluate import check_truth, evaluate_run
+from hdr_nsff.io import writing_to
 from hdr_nsff.prepare import PrepareConfig, prepare
 from hdr_nsff.progress import say
 from hdr_nsff.render import render_all
-from hdr_nsff.report import write_report
+from hdr_nsff.report import check_place, write_report
 from hdr_nsff.run import Run, pick_device
 from hdr_nsff.train import train
 
@@ -58,6 +59,9 @@ def run_all(config: RunConfig) -> None:
     pick_device(config.device)
     if config.truth is not None and not config.truth.is_dir():
         raise InputError(f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, or leave the option out")
+    if config.truth is not None:
+        check_truth(config.truth)
+    check_place(config.out / "report.html")
     hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
     scene = prepare(
         PrepareConfig(
@@ -68,10 +72,11 @@ def run_all(config: RunConfig) -> None:
     settings = replace(PRESETS[config.preset], scene=scene, out=config.out / "run", seed=config.seed, device=config.device)
     if config.minutes is not None:
         settings = replace(settings, minutes=config.minutes, steps=None)
-    run = Run.open(train(settings), config.device)
-    results = render_all(run, config.out / "render")
-    evaluate_run(run, config.truth)
-    results["report"] = write_report(run, config.out / "report.html", config.out / "render")
+    with writing_to(config.out):
+        run = Run.open(train(settings), config.device)
+        results = render_all(run, config.out / "render")
+        evaluate_run(run, config.truth)
+        results["report"] = write_report(run, config.out / "report.html", config.out / "render")
     say(f"done in {(time.monotonic() - start) / 60:.1f} minutes; results:")
     for name, path in results.items():
         say(f"  {name:<16} {path}")

@@ -7,8 +7,7 @@ Held-out truth of a synthetic scene lives outside, see `truth.py`; nothing here 
 from __future__ import annotations
 
 import itertools
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -20,16 +19,18 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_image, read_mask, read_npy, write_json
+from hdr_nsff.io import read_image, read_json, read_mask, read_npy, write_json
 
 Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
+LARGEST = 1e15  # numbers beyond it, or depths below 1 / it, are no measurement and would overflow in single precision
+LARGEST_EV = 60.0  # stops from the reference
 
 
 class Strict(BaseModel):
-    """A model that refuses what it does not know."""
+    """A model that refuses what it does not know, and NaN and Inf."""
 
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
 
 class FlowFiles(Strict):
@@ -57,6 +58,12 @@ class FrameEntry(Strict):
     disparity_confidence: str | None = None  # .npy (H, W) half, in [0, 1]
     flow: dict[int, FlowFiles] = {}  # other frame's index -> flow towards it
 
+    @property
+    def files(self) -> list[str]:
+        """The names of all files of this frame."""
+        flow = [n for f in self.flow.values() for n in (f.flow, f.valid)]
+        return [n for n in (self.image, self.mask, self.disparity, self.disparity_confidence, *flow) if n is not None]
+
 
 class Step(Strict):
     """One finished step of `prepare`: what it did, and the hash of everything it depended on."""
@@ -77,7 +84,7 @@ class Manifest(Strict):
     inputs: dict[str, str] = {}  # input file name -> sha256
     width: int = Field(gt=0)
     height: int = Field(gt=0)
-    fps: float = Field(default=24.0, gt=0)
+    fps: float = Field(default=24.0, gt=0, le=1e6)
     cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
     reference_bracket: int = Field(default=0, ge=0)  # the bracket whose gain is 1: the radiometric gauge
     bracket_ev: list[float | None] = []  # per bracket: log2 exposure relative to the reference, None = to be learned
@@ -101,11 +108,13 @@ class Manifest(Strict):
         if not path.is_file():
             raise InputError(f"{folder}: no scene.json here; make a scene folder with `hdr-nsff prepare CLIP {folder}`")
         try:
-            return Manifest.model_validate(json.loads(path.read_text()))
-        except (ValidationError, json.JSONDecodeError, UnicodeDecodeError) as error:
+            manifest = Manifest.model_validate(read_json(path))
+        except ValueError as error:
             raise InputError(
                 f"{path}: not a valid scene ({first_problem(error)}); restore it or run `prepare` with `--redo frames`"
             ) from error
+        check_manifest(Path(folder), manifest)
+        return manifest
 
 
 def first_problem(error: Exception) -> str:
@@ -163,7 +172,6 @@ class Scene:
             raise InputError(
                 f"{folder}: the scene has no camera poses yet; run `hdr-nsff prepare` again, it goes on where it stopped"
             )
-        check_frames(folder, m)
         train = [e for e in m.frames if e.split == "train"]
         links = neighbours(train)
         return Scene(
@@ -179,32 +187,74 @@ class Scene:
         )
 
 
-def check_frames(folder: Path, m: Manifest) -> None:
-    """InputError where indices, times, depth range or cameras make no sense together."""
+def check_manifest(folder: Path, m: Manifest) -> None:
+    """InputError where what the manifest holds so far makes no sense together."""
 
     def refuse(problem: str) -> None:
-        raise InputError(f"{folder / 'scene.json'}: {problem}; restore it or run `prepare` with `--redo poses`")
+        raise InputError(f"{folder / 'scene.json'}: {problem}; restore it or run `prepare` with `--redo frames`")
 
-    assert m.near is not None and m.far is not None
-    if not m.near < m.far < np.inf:
+    if m.near is not None and m.far is not None and not 1 / LARGEST < m.near < m.far < LARGEST:
         refuse(f"near {m.near:g} and far {m.far:g} are no range of depths")
+    if any(not isinstance(step.details.get("attempt", 0), int) for step in m.steps.values()):
+        refuse("a step has an `attempt` that is no number")
+    if not m.frames:
+        return
     if all(f.split != "train" for f in m.frames):
         refuse("no training frames, all are held out")
     if len({f.index for f in m.frames}) < len(m.frames):
         refuse("two frames have the same index")
+    if len({(f.camera_id, f.time) for f in m.frames}) < len(m.frames):
+        refuse("two frames of one camera have the same time")
+    if sorted({f.camera_id for f in m.frames}) != list(range(len({f.camera_id for f in m.frames}))):
+        refuse("the camera_ids of the frames are not counted from 0 without gaps")
+    brackets = [f.bracket for f in m.frames]
+    if problem := bracket_problem(
+        brackets, m.bracket_ev or [None] * (min(max(brackets), len(brackets)) + 1), m.reference_bracket
+    ):
+        refuse(problem)
     for f in m.frames:
-        if not np.isfinite(f.time):
-            refuse(f"frame {f.index} has time {f.time}")
-        for name, rows, shape, good in (("K", f.K, (3, 3), is_intrinsic), ("c2w", f.c2w, (3, 4), is_pose)):
-            assert rows is not None
-            matrix = np.array(rows) if len({len(row) for row in rows}) == 1 else np.zeros(0)
-            if matrix.shape != shape or not np.isfinite(matrix).all() or not good(matrix):
-                refuse(f"{name} of frame {f.index} is no {shape[0]}x{shape[1]} camera {'matrix' if name == 'K' else 'pose'}")
+        if problem := frame_problem(f, {g.index for g in m.frames}):
+            refuse(f"frame {f.index} has {problem}")
+    for name in [m.points, *(n for f in m.frames for n in f.files)]:
+        if name is not None:
+            inside(folder, name)
+
+
+def frame_problem(f: FrameEntry, known: set[int]) -> str | None:
+    """What makes no sense in a frame of a scene whose frames have the indices `known`; None where all does."""
+    if abs(f.time) > LARGEST:
+        return f"time {f.time:g}"
+    if lost := set(f.flow) - known:
+        return f"flow to frame {min(lost)}, which the scene does not have"
+    if f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic):
+        return "a K that is no 3x3 camera matrix"
+    if f.c2w is not None and not is_matrix(f.c2w, (3, 4), is_pose):
+        return "a c2w that is no 3x4 camera pose"
+    return None
+
+
+def is_matrix(rows: list[list[float]], shape: tuple[int, int], good: Callable[[np.ndarray], bool]) -> bool:
+    """Whether `rows` are a matrix of that shape, with numbers in range, that is `good`."""
+    matrix = np.array(rows) if len({len(row) for row in rows}) == 1 else np.zeros(0)
+    return matrix.shape == shape and bool(np.abs(matrix).max() <= LARGEST) and good(matrix)
+
+
+def bracket_problem(brackets: Sequence[int], bracket_ev: Sequence[float | None], reference: int) -> str | None:
+    """What does not fit together in the brackets of frames and the exposures of brackets (a scene.json edited by hand); None where all does."""
+    if not 0 <= reference < len(bracket_ev):
+        return f"reference bracket {reference} is not one of the {len(bracket_ev)} brackets in bracket_ev"
+    if max(brackets, default=0) >= len(bracket_ev):
+        return f"a frame has bracket {max(brackets)}, but bracket_ev lists only {len(bracket_ev)}"
+    if bracket_ev[reference]:
+        return f"bracket_ev must be 0 at the reference bracket, not {bracket_ev[reference]}"
+    if (extreme := next((ev for ev in bracket_ev if ev is not None and abs(ev) > LARGEST_EV), None)) is not None:
+        return f"bracket_ev holds {extreme:g}, which is no exposure in stops"
+    return None
 
 
 def is_intrinsic(K: np.ndarray) -> bool:
-    """Whether (3, 3) numbers have focal lengths above 0 and a last row of 0 0 1."""
-    return bool(K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], [0, 0, 1]))
+    """Whether (3, 3) numbers have focal lengths above 0, no skew and a last row of 0 0 1."""
+    return bool(min(K[0, 0], K[1, 1]) > 1 / LARGEST and K[0, 1] == K[1, 0] == 0 and np.allclose(K[2], [0, 0, 1]))
 
 
 def is_pose(c2w: np.ndarray) -> bool:
@@ -284,8 +334,12 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
 
 
 def inside(folder: Path, name: str) -> Path:
-    """`folder / name`, refusing a name that leaves the folder."""
-    path = (Path(folder) / name).resolve()
+    """`folder / name`, refusing a name that leaves the folder or that no file can have."""
+    try:
+        path = (Path(folder) / name).resolve()
+        path.is_file()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, NUL, half a character, links in a circle
+        raise InputError(f"{folder}: {name[:60]!r} cannot be the name of a file; restore scene.json or truth.json") from error
     if not path.is_relative_to(Path(folder).resolve()):
         raise InputError(f"{folder}: the file name {name!r} points outside the scene folder; names must stay inside it")
     return path

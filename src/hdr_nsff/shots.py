@@ -137,7 +137,8 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     if not 0 <= output.camera_id < run.tonemapper.num_cameras:
         raise InputError(f"camera {output.camera_id}: the run has learned cameras 0 to {run.tonemapper.num_cameras - 1}")
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
-    note = open_sequence(run, shot, folder, output, [video])
+    sheet = out / f"{shot.name}_sheet.png"
+    note = open_sequence(run, shot, folder, output, [video, sheet])
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
     wanted = [p.with_suffix(".exr") for p in pictures] * (output.exr != "none") + pictures * output.png + [video] * output.video
@@ -151,7 +152,7 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
         io.write_video(video, (io.read_image(p) for p in pictures), note["fps"])
     chosen = sorted({round(i) for i in np.linspace(0, len(pictures) - 1, min(12, len(pictures)))})
     cells = [io.read_image(pictures[i]) for i in chosen]
-    io.write_png(out / f"{shot.name}_sheet.png", io.contact_sheet([cells[i : i + 4] for i in range(0, len(cells), 4)]))
+    io.write_png(sheet, io.contact_sheet([cells[i : i + 4] for i in range(0, len(cells), 4)]))
     if not output.png:
         for picture in pictures:
             picture.unlink(missing_ok=True)
@@ -165,14 +166,13 @@ def open_sequence(run: Run, shot: Shot, folder: Path, output: Output, products: 
     key = fingerprint(run, shot.views, shot.fps, output)
     sidecar = folder / "sequence.json"
     if sidecar.is_file():
-        try:
-            found = json.loads(sidecar.read_text())
-        except (json.JSONDecodeError, UnicodeDecodeError):
-            found = {}
-        if isinstance(found, dict) and found.get("key") == key:
+        found = io.read_note(sidecar)
+        if found.get("key") == key:
             return found
         say(f"{shot.name}: settings or checkpoint changed, rendering again")
     stale = [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}] if folder.is_dir() else []
+    if not sidecar.is_file() and (foreign := [p for p in [*stale, *products] if p.exists()]):
+        raise InputError(f"{foreign[0]}: is there already and was not made by render; choose another --out")
     for path in [*stale, *products]:
         path.unlink(missing_ok=True)
     exposure = display_exposure(run, shot.views)

@@ -12,15 +12,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 
 from hdr_nsff.errors import InputError
-
-if TYPE_CHECKING:
-    from hdr_nsff.scene import Scene
+from hdr_nsff.scene import Scene, bracket_problem
 
 NUM_POINTS = 256
 GAMMA = 2.2
@@ -169,7 +167,8 @@ class ToneMapper(nn.Module):
         """`frame_brackets` and `frame_cameras` give each training frame's bracket and camera; `bracket_ev` the known EVs, None = to be learned."""
         super().__init__()
         assert len(frame_brackets) == len(frame_cameras), (len(frame_brackets), len(frame_cameras))
-        check_brackets(frame_brackets, bracket_ev, reference_bracket)
+        if problem := bracket_problem(frame_brackets, bracket_ev, reference_bracket):
+            raise InputError(f"scene.json: {problem}")
         self.config, self.given_ev = config, tuple(bracket_ev)
         self.frame_brackets, self.frame_cameras = tuple(frame_brackets), tuple(frame_cameras)
         self.num_cameras = num_cameras or max(frame_cameras, default=0) + 1
@@ -389,13 +388,3 @@ class ToneMapper(nn.Module):
 def informative(rgb: Tensor, low: float = 3 / 255, high: float = 250 / 255) -> Tensor:
     """True (N,) where recorded `rgb` (N, 3) tells its radiance: every channel away from black and from saturation."""
     return ((rgb >= low) & (rgb <= high)).all(-1)
-
-
-def check_brackets(frame_brackets: Sequence[int], bracket_ev: Sequence[float | None], reference: int) -> None:
-    """InputError where brackets and exposures do not fit together (a scene.json edited by hand)."""
-    if not 0 <= reference < len(bracket_ev):
-        raise InputError(f"scene.json: reference bracket {reference} is not one of the {len(bracket_ev)} brackets in bracket_ev")
-    if max(frame_brackets, default=0) >= len(bracket_ev):
-        raise InputError(f"scene.json: a frame has bracket {max(frame_brackets)}, but bracket_ev lists only {len(bracket_ev)}")
-    if bracket_ev[reference]:
-        raise InputError(f"scene.json: bracket_ev must be 0 at the reference bracket, not {bracket_ev[reference]}")

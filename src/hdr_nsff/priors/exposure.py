@@ -29,6 +29,19 @@ class Cycle:
     confidence: float  # in [0, 1]: the share of the brightness changes between frames that the cycle explains
 
 
+def extent(rgb: np.ndarray) -> tuple[float, float]:
+    """The recorded values between which nearly all of a frame (H, W, 3) lies."""
+    low, high = np.percentile(rgb[::2, ::2], [1, 99])
+    return float(low), float(high)
+
+
+def all_clipped(extents: list[tuple[float, float]]) -> str | None:
+    """ "black" or "white" where every frame is that and nothing else, else None; `extents` as of `extent`, one per frame."""
+    if max(high for _, high in extents) < LOW:
+        return "black"
+    return "white" if min(low for low, _ in extents) > HIGH else None
+
+
 def brightness_steps(video: np.ndarray) -> np.ndarray:
     """EV from each frame of `video` (T, H, W, 3) recorded to the next, (T-1,).
 

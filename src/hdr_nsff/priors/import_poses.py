@@ -4,7 +4,6 @@ with centres at +0.5. The world and its units stay the giver's."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import dataclass, replace
@@ -14,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_json
 from hdr_nsff.priors.colmap import ColmapCamera, ColmapModel, read_model
 from hdr_nsff.priors.poses import LEAST, Poses, interpolate, project, ranges, trusted_points
 
@@ -149,13 +149,13 @@ def llff(poses: np.ndarray, bounds: np.ndarray, columns: np.ndarray) -> Given:
 def from_json(path: Path) -> Given:
     """`transforms.json`, or the JSON with `poses` and `bds` of non-rigid NeRF (LLFF's matrices with columns right, up, back)."""
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        document = read_json(path)
         if isinstance(document, dict) and "frames" in document:
             return from_transforms(path, document)
         if isinstance(document, dict) and "poses" in document and "bds" in document:
             poses = np.array(document["poses"], np.float64).reshape(-1, 3, 5)
             return llff(poses, np.array(document["bds"], np.float64).reshape(len(poses), 2), FROM_OPENGL)
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
         raise InputError(f"{path}: not readable as poses ({type(error).__name__}: {error}); export them again") from error

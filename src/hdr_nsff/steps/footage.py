@@ -23,7 +23,7 @@ def frames_step(work: Work) -> Step:
     c, m = work.config, work.manifest
     total = len(range(c.start, c.end or work.footage.count, c.stride)) * len(work.footage.cameras) if work.footage.count else None
     entries: list[FrameEntry] = []
-    darkest, brightest = 1.0, 0.0
+    extents = []
     for frame in track(ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size), "frames", total):
         entry = FrameEntry(
             index=len(entries),
@@ -37,16 +37,13 @@ def frames_step(work: Work) -> Step:
             exact = np.rint(frame.rgb * 255) / 255
             write_png(work.folder / entry.image, frame.rgb, bits=8 if np.abs(frame.rgb - exact).max() < 1e-6 else 16)
         m.height, m.width = frame.rgb.shape[:2]
-        low, high = np.percentile(frame.rgb[::2, ::2], [1, 99])
-        darkest, brightest = min(darkest, low), max(brightest, high)
+        extents.append(exposure.extent(frame.rgb))
         entries.append(entry)
     times = len({e.time for e in entries})
     if times < MIN_FRAMES:
         raise InputError(f"{c.clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are needed to see motion")
-    if brightest < exposure.LOW or darkest > exposure.HIGH:
-        raise InputError(
-            f"{c.clip}: all frames are {'black' if brightest < exposure.LOW else 'white'}; nothing can be learned from them"
-        )
+    if (colour := exposure.all_clipped(extents)) is not None:
+        raise InputError(f"{c.clip}: all frames are {colour}; nothing can be learned from them, choose other frames")
     m.frames, m.fps = entries, work.footage.fps / c.stride
     vars(work).pop("video", None)
     linear = "; linear frames, scaled by one constant and encoded as x^(1/2.2)" if work.footage.linear else ""
