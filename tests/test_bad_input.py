@@ -573,3 +573,19 @@ def test_json_that_overwhelms_the_parser_is_refused_like_any_other(text: str, ru
     assert "not a valid scene" in refused(capsys, *training(run.parent / "scene", out, 1))
     (run / "config.json").write_text(text)
     assert "config.json" in refused(capsys, "report", run)
+
+
+def test_checkpoints_without_their_config_are_not_taken_over(run: Path, capsys: Capture, tmp_path: Path) -> None:
+    lone = tmp_path / "run"
+    shutil.copytree(run, lone)
+    (lone / "config.json").unlink()
+    before = snapshot(lone)
+    assert "no config.json" in refused(capsys, *training(run.parent / "scene", lone, 3))
+    assert snapshot(lone) == before
+
+
+def test_a_room_is_not_rendered_into_a_folder_of_something_else(capsys: Capture, tmp_path: Path) -> None:
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
+    assert "holds something else" in refused(capsys, "synth", str(tmp_path), "--size", "16x8", "--frames", "3")
+    assert (tmp_path / "clip" / "00000.png").read_bytes() == b"mine"

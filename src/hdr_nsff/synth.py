@@ -183,8 +183,10 @@ def claim(config: SynthConfig) -> None:
     path = config.out / "exact" / "key.json"
     if config.out.exists() and not config.out.is_dir():
         raise InputError(f"{config.out}: is a file; name a folder to write")
-    if path.is_file() and digest not in path.read_text():
+    if path.is_file() and digest not in path.read_text(encoding="utf-8", errors="replace"):
         raise InputError(f"{config.out}: holds a room rendered with other settings; choose another folder or remove it")
+    if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
+        raise InputError(f"{config.out}: holds something else; choose a new or an empty folder")
     io.write_json(path, {"digest": digest, **key})
 
 

@@ -85,6 +85,8 @@ def open_folder(config: TrainConfig) -> None:
         if replace(before, scene=config.scene, out=config.out, device=config.device) != config:
             raise InputError(f"{config.out}: holds a run with other settings; choose another --out, or delete it to start over")
         return
+    if any((config.out / "checkpoints").glob("step_*.safetensors")):
+        raise InputError(f"{config.out}: holds checkpoints but no config.json; choose another --out, or delete it to start over")
     write_config(config.out, config)
 
 
