@@ -25,7 +25,8 @@ def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Ten
     """Composite G Gaussians front to back by the z-depth of their means.
 
     `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units, `quaternions` (G, 4) w x y z of any length,
-    `opacities` (G,) in [0, 1], `features` (G, D) anything. Float32 on the CPU; every other dtype and device takes `dense`."""
+    `opacities` (G,) in [0, 1], `features` (G, D) anything. Gaussians whose shape or opacity is no finite number
+    are not drawn. Float32 on the CPU; every other dtype and device takes `dense`."""
     w2c = world_to_camera(camera)
     if means.device.type == "cpu" and means.dtype == torch.float32:
         maps, alpha = Rasterize.apply(means, quaternions, scales, opacities, features, w2c, camera)
@@ -73,6 +74,8 @@ def dense(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: Camera, cut: bool = True
 ) -> Maps:
     """The plain-torch twin: every Gaussian at every pixel, any dtype and device. Without `cut`, no alpha is too small to count."""
+    known = torch.cat([means, quaternions, scales, opacities[:, None]], 1).isfinite().all(1)
+    means, quaternions, scales, opacities, features = (t[known] for t in (means, quaternions, scales, opacities, features))
     centres, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > kernels.NEAREST]
@@ -132,12 +135,12 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> Any:
         maps, alpha = ctx.saved_tensors
         arrays, pose, k, size, (starts, members, *drawn), places, owned = ctx.kept
-        values, conics = drawn[3], drawn[1]
+        values = drawn[3]
         pairs = np.empty((len(members), kernels.MOMENTS + values.shape[1]), np.float32)
         seen = maps.numpy(), alpha.numpy()
         kernels.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
         out = [torch.empty(a.shape) for a in (*arrays, values)]
         poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
-        kernels.project_backward(*arrays, pose, k, *size, conics, owned, pairs, *(t.numpy() for t in out), poses.numpy())
+        kernels.project_backward(*arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy())
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
         return *out[:4], out[4][:, :-1], grad_pose, None

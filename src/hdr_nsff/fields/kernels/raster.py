@@ -111,8 +111,8 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         rows[g, 0] = rows[g, 1] = 0
         centres[g, 0] = centres[g, 1] = conics[g, 0] = conics[g, 1] = conics[g, 2] = F0
         o = float(opacities[g])
-        if not t[2] > NEAREST or o < ALPHA_MIN:
-            continue
+        if not (t[2] > NEAREST and o >= ALPHA_MIN):
+            continue  # behind, too faint, or not a number
         x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
         reach = math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
         rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
@@ -296,7 +296,7 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
 
 @numba.njit(parallel=True, cache=True, nogil=True)
 def project_backward(
-    means, quaternions, scales, opacities, w2c, k, width, height, conics, owned, pairs,
+    means, quaternions, scales, opacities, w2c, k, width, height, owned, pairs,
     grad_means, grad_quaternions, grad_scales, grad_opacities, grad_features, grad_pose,
 ):  # fmt: skip
     """Add up the pairs' gradients and carry them to the world: everything `(G, ...)`; `grad_pose` (G, 12) per Gaussian, or (0, 12) if
@@ -324,15 +324,18 @@ def project_backward(
             u4 += pairs[i, 4]
             u5 += pairs[i, 5]
         grad_opacities[g] = -u0 / opacities[g]
-        a, b, c = float(conics[g, 0]), float(conics[g, 1]), float(conics[g, 2])
+        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+        quaternion = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
+        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+        t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), (v0, v1), (xx, xy, yy) = footprint(
+            m, quaternion, s, w2c, k, width, height
+        )
+        det = xx * yy - xy * xy
+        a, b, c = yy / det, -xy / det, xx / det  # in float64: needles thousands of pixels long need it
         gx, gy = -(a * u1 + b * u2), -(b * u1 + c * u2)  # pixel centre
         # conic -> 2D covariance: G = -Q (dL / dQ) Q, dL / dQ = half the second moments
         p0, p1, p2, p3 = a * u3 + b * u4, a * u4 + b * u5, b * u3 + c * u4, b * u4 + c * u5
         g00, g01, g11 = -0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c)
-        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
-        quaternion = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
-        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
-        t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), (v0, v1), _ = footprint(m, quaternion, s, w2c, k, width, height)
         # covariance = V V^T + blur, V = T M: dV = 2 G V, dM = T^T dV, dT = dV M^T
         d0 = (2 * (g00 * v0[0] + g01 * v1[0]), 2 * (g00 * v0[1] + g01 * v1[1]), 2 * (g00 * v0[2] + g01 * v1[2]))
         d1 = (2 * (g01 * v0[0] + g11 * v1[0]), 2 * (g01 * v0[1] + g11 * v1[1]), 2 * (g01 * v0[2] + g11 * v1[2]))
