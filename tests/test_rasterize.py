@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.camera import Camera
+from hdr_nsff.fields import rasterize_cuda
 from hdr_nsff.fields.kernels import raster as kernels
 from hdr_nsff.fields.rasterize import Maps, dense, project, rasterize, rotation_matrices
 
@@ -262,3 +263,36 @@ def test_the_result_is_the_same_to_the_bit_for_any_number_of_threads() -> None:
     said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     hashes = said.stdout.split()
     assert len(hashes) == 4 and len(set(hashes)) == 1
+
+
+def test_a_missing_gsplat_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    monkeypatch.setattr(rasterize_cuda, "say", said.append)
+    rasterize_cuda.available.cache_clear()
+    assert not rasterize_cuda.available() and not rasterize_cuda.available()
+    assert len(said) == 1 and "hdr-nsff[gpu]" in said[0]
+    rasterize_cuda.available.cache_clear()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+@pytest.mark.parametrize("channels", [1, 4, 17, 40])
+@pytest.mark.parametrize("installed", [True, False])
+def test_cuda_equals_plain_torch(channels: int, installed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    if installed:
+        pytest.importorskip("gsplat")
+    monkeypatch.setattr(rasterize_cuda, "available", lambda: installed)
+    view = camera()
+    gaussians = scene(0, view, channels=channels)
+    weight = (
+        torch.randn(27, 41, channels + 2, generator=torch.Generator().manual_seed(99)).double() * sure(gaussians, view)[..., None]
+    )
+    leaves = [t.float().cuda().requires_grad_() for t in gaussians]
+    pose = view.c2w.float().cuda().requires_grad_()
+    seen = everything(rasterize(*leaves, Camera(view.K.float().cuda(), pose, view.width, view.height)))
+    (seen * weight.cuda()).sum().backward()
+    expected, gradients = drawn(dense, gaussians, view, weight)
+    off = (seen.detach().cpu() - expected).abs() * sure(gaussians, view)[..., None]
+    assert float(off.max()) < 1e-3 * float(expected.abs().max())
+    for a, b in zip((*leaves, pose), gradients, strict=True):
+        assert float((a.grad.cpu() - b).abs().max()) < 5e-3 * float(b.abs().max())

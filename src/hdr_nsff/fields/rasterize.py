@@ -1,5 +1,6 @@
 """3D Gaussians to feature maps, differentiable in everything, the camera's pose included (EWA splatting; Zwicker et al. 2001, Kerbl
-et al. 2023). One call, twins behind it: numba kernels on the CPU and `dense`, the plain-torch one, slow and obviously right."""
+et al. 2023). One call, twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`, the plain-torch one, slow and
+obviously right."""
 
 from __future__ import annotations
 
@@ -10,7 +11,9 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.camera import Camera
+from hdr_nsff.fields import rasterize_cuda
 from hdr_nsff.fields.kernels import raster as kernels
+from hdr_nsff.tensors import to_device
 
 
 class Maps(NamedTuple):
@@ -26,12 +29,20 @@ def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Ten
 
     `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units, `quaternions` (G, 4) w x y z of any length,
     `opacities` (G,) in [0, 1], `features` (G, D) anything. Gaussians whose shape or opacity is no finite number
-    are not drawn. Float32 on the CPU; every other dtype and device takes `dense`."""
-    w2c = world_to_camera(camera)
-    if means.device.type == "cpu" and means.dtype == torch.float32:
-        maps, alpha = Rasterize.apply(means, quaternions, scales, opacities, features, w2c, camera)
-        return Maps(maps[:-1].permute(1, 2, 0), maps[-1], alpha)
-    return dense(means, quaternions, scales, opacities, features, camera)
+    are not drawn. Float32 on the CPU or on CUDA; every other dtype and device takes `dense`."""
+    gaussians = means, quaternions, scales, opacities, features
+    match means.device.type if means.dtype == torch.float32 else None:
+        case "cpu":
+            maps, alpha = Rasterize.apply(*gaussians, world_to_camera(camera), camera)
+            return Maps(maps[:-1].permute(1, 2, 0), maps[-1], alpha)
+        case "cuda" if rasterize_cuda.available():
+            rules = camera.width, camera.height, kernels.NEAREST, kernels.BLUR
+            return Maps(*rasterize_cuda.composite(*gaussians, world_to_camera(camera), camera.K, *rules))
+        case "cuda":  # `dense` would hold every Gaussian at every pixel: too much for a real picture
+            seen = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
+            return Maps(*(m.to(means.device) for m in seen))
+        case _:
+            return dense(*gaussians, camera)
 
 
 def world_to_camera(camera: Camera) -> Tensor:
