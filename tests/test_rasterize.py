@@ -140,6 +140,18 @@ def test_kernels_equal_plain_torch_on_needles(length: float) -> None:
     compare(gaussians, view)
 
 
+def test_kernels_show_needles_whose_centre_is_far_outside_as_plain_torch_does() -> None:
+    view, g = camera().moved(torch.eye(4, dtype=torch.float64)[:3]), torch.Generator().manual_seed(7)
+    angle, z = 6.28 * torch.rand(60, generator=g), 2 + torch.rand(60, 1, generator=g)
+    through = (torch.rand(60, 2, generator=g) - 0.5) * z  # a point in the frame that the needle passes, 30 units from its centre
+    gaussians = scene(5, view)
+    gaussians[0] = torch.cat([through + 30 * torch.stack([angle.cos(), angle.sin()], 1), z], 1)
+    gaussians[1] = torch.stack([(angle / 2).cos(), 0 * angle, 0 * angle, (angle / 2).sin()], 1)
+    gaussians[2] = torch.tensor([30, 1e-3, 1e-3]).expand(60, 3)
+    seen = compare([t.float().double() for t in gaussians], view, gradients=0.1)  # moments of gradients still cancel
+    assert float(seen[..., -1].mean()) > 0.2
+
+
 @pytest.mark.parametrize("size", [1e-6, 1000.0])
 def test_kernels_equal_plain_torch_on_dust_and_on_giants(size: float) -> None:
     view = camera()

@@ -1,10 +1,11 @@
 """Numba kernels of the Gaussian rasteriser on the CPU: projection, tiles, compositing, and all of it backwards by hand.
 
-A projected Gaussian is a pixel centre, a conic (inverse 2D covariance: a, b, c of a dx^2 / 2 + b dx dy + c dy^2 / 2), a z-depth, an
-opacity and D features. Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing,
-above 0.999 as 0.999 (Kerbl et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come
-behind. Each (Gaussian, tile) pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and
-the same result whatever the number of threads. The plain-torch twin is `rasterize.dense`.
+A projected Gaussian is a pixel centre, a conic, a z-depth, an opacity and D features. The conic is the inverse 2D covariance in
+factors, alpha = opacity * exp(-(a dx)^2 - (b dx + c dy)^2): multiplied out, float32 would lose needles whose centre is far away.
+Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing, above 0.999 as 0.999 (Kerbl
+et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come behind. Each (Gaussian, tile)
+pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and the same result whatever the
+number of threads. The plain-torch twin is `rasterize.dense`.
 
 Loops over the pixels of a tile are written so that LLVM vectorises them: flat arrays, unsigned ranges, no library call, no maximum
 carried along. `FAST` lets it reorder sums; NaN and Inf stay what they are."""
@@ -122,7 +123,8 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         if not det > 0:
             continue  # too long and thin for float64
         centres[g, 0], centres[g, 1] = x, y
-        conics[g, 0], conics[g, 1], conics[g, 2] = yy / det, -xy / det, xx / det
+        across = math.sqrt(0.5 * xx / det)
+        conics[g, 0], conics[g, 1], conics[g, 2] = math.sqrt(0.5 / xx), -xy / xx * across, across
         left, right, top, bottom = max(x - rx, 0.0), min(x + rx, float(width)), max(y - ry, 0.0), min(y + ry, float(height))
         rows[g, 0], rows[g, 1] = int(top), math.ceil(bottom)
         boxes[g, 0], boxes[g, 1] = int(left) // TILE_X, int(top) // TILE_Y
@@ -199,11 +201,12 @@ def forward(starts, members, centres, conics, opacities, features, rows, maps, a
         for i in range(starts[tile], starts[tile + 1]):
             g = members[i]
             cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
-            a, b, c = conics[g, 0] * HALF, conics[g, 1], conics[g, 2] * HALF
+            a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
             for p in range(first, last):
                 dx, dy = px[p] - cx, py[p] - cy
-                s = min(max(a * dx * dx + c * dy * dy + b * dx * dy, F0), DEEPEST)
+                e0, e1 = a * dx, b * dx + c * dy
+                s = min(e0 * e0 + e1 * e1, DEEPEST)
                 q = min(o * exp_minus(s), ALPHA_MAX)
                 q = q if q >= ALPHA_MIN else F0
                 v = q * left[p]
@@ -253,7 +256,7 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
                 grad[:] = F0
                 continue
             cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
-            a, b, c = conics[g, 0] * HALF, conics[g, 1], conics[g, 2] * HALF
+            a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
             for p in range(first, last):
                 value[p] = grad_a[p]
@@ -263,7 +266,8 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
                     value[p] += f * sums[p]
             for p in range(first, last):
                 dx, dy = px[p] - cx, py[p] - cy
-                s = min(max(a * dx * dx + c * dy * dy + b * dx * dy, F0), DEEPEST)
+                e0, e1 = a * dx, b * dx + c * dy
+                s = min(e0 * e0 + e1 * e1, DEEPEST)
                 full = o * exp_minus(s)
                 q = min(full, ALPHA_MAX)
                 q = q if q >= ALPHA_MIN else F0
