@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 
 import numba
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -15,7 +16,7 @@ from torch import Tensor
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields import rasterize_cuda
 from hdr_nsff.fields.kernels import raster as kernels
-from hdr_nsff.fields.rasterize import Maps, dense, project, rasterize, rotation_matrices
+from hdr_nsff.fields.rasterize import Maps, dense, front_to_back, project, rasterize, rotation_matrices
 
 FOCAL = 40.0
 NAMES = ("means", "quaternions", "scales", "opacities", "features", "c2w")
@@ -223,6 +224,17 @@ def test_gaussians_on_one_line_of_sight_composite_front_to_back(twin: Callable[.
 def test_of_coincident_gaussians_the_first_is_in_front(twin: Callable[..., Maps]) -> None:
     gaussians, view = facing(0.6, 0.5, z=(2.0, 2.0))
     assert float(twin(*gaussians, view).features[3, 4, 0]) == pytest.approx(0.6 * 1 + 0.4 * 0.5 * 2)
+
+
+def test_the_depth_order_is_a_stable_sort_of_all_that_is_drawn() -> None:
+    g = np.random.default_rng(0)
+    depths = np.concatenate([g.random(500), g.integers(1, 9, 500), 10.0 ** g.uniform(-2, 30, 200), [-1.0, 0.0, np.nan, np.inf]])
+    depths = g.permutation(depths).astype(np.float32)
+    order = front_to_back(depths)
+    assert sorted(order.tolist()) == list(range(len(depths)))
+    drawn = order[depths[order] > kernels.NEAREST]
+    expected = np.argsort(depths, kind="stable")
+    assert drawn.tolist() == expected[depths[expected] > kernels.NEAREST].tolist()
 
 
 def test_opacity_never_exceeds_1_however_many_there_are() -> None:
