@@ -6,7 +6,6 @@ radiance. The background is left out."""
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -132,7 +131,7 @@ def open_folder(run: Run, folder: Path, times: list[float], look: Look) -> dict[
     foreign = next((p for p in there if not ply.is_ours(p)), None)
     if foreign is not None:
         raise InputError(f"{foreign}: is there already and was not made by export; choose another folder")
-    found = read_note(sidecar)
+    found = io.read_note(sidecar)
     if found.get("key") == key:
         return found
     if there:
@@ -142,15 +141,6 @@ def open_folder(run: Run, folder: Path, times: list[float], look: Look) -> dict[
     note = {"key": key, "step": run.step, "times": times, "display_exposure": exposure_of(run, look)}
     io.write_json(sidecar, note)
     return note
-
-
-def read_note(path: Path) -> dict[str, Any]:
-    """The sidecar of a sequence, empty where there is none that can be read."""
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def gaussian_field(run: Run, look: Look) -> GaussianField:
