@@ -14,6 +14,7 @@ try:
     from hdr_nsff.config import PRESETS, TrainConfig
     from hdr_nsff.errors import InputError
     from hdr_nsff.evaluate import EvaluateConfig, evaluate
+    from hdr_nsff.export import ExportConfig, export
     from hdr_nsff.io import writing_to
     from hdr_nsff.prepare import PrepareConfig, prepare
     from hdr_nsff.progress import say
@@ -41,6 +42,7 @@ VERBS = {
     "prepare": Verb(prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."),
     "train": Verb(train, PRESETS, "Train a radiance field from a scene folder: `train grid`, `train paper`, `train tiny`."),
     "render": Verb(render, RenderConfig, "Views of a trained run: EXR, PNG, video; any path, time and exposure."),
+    "export": Verb(export, ExportConfig, "The Gaussians of a splat run as PLY, at any time, for viewers and other programs."),
     "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
     "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
     "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),

@@ -51,6 +51,18 @@ class Layers:
     motion: Tensor  # (S, L) in [0, 1]: share of dynamic content
 
 
+@dataclass(frozen=True)
+class GaussianCloud:
+    """G Gaussians at one time."""
+
+    means: Tensor  # (G, 3) scene units
+    quaternions: Tensor  # (G, 4) w x y z of any length
+    scales: Tensor  # (G, 3) standard deviations, scene units
+    opacities: Tensor  # (G,) in [0, 1]
+    radiance: Tensor  # (G, 3) linear HDR, >= 0
+    motion: Tensor  # (G,) in [0, 1]: share of dynamic content
+
+
 @runtime_checkable
 class RadianceField(Protocol):
     """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses by type."""

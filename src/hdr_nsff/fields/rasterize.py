@@ -1,5 +1,6 @@
 """3D Gaussians to feature maps, differentiable in everything, the camera's pose included (EWA splatting; Zwicker et al. 2001, Kerbl
-et al. 2023). One call, twins behind it: numba kernels on the CPU and `dense`, the plain-torch one, slow and obviously right."""
+et al. 2023). One call, twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`, the plain-torch one, slow and
+obviously right."""
 
 from __future__ import annotations
 
@@ -10,7 +11,9 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.camera import Camera
+from hdr_nsff.fields import rasterize_cuda
 from hdr_nsff.fields.kernels import raster as kernels
+from hdr_nsff.tensors import to_device
 
 
 class Maps(NamedTuple):
@@ -25,12 +28,21 @@ def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Ten
     """Composite G Gaussians front to back by the z-depth of their means.
 
     `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units, `quaternions` (G, 4) w x y z of any length,
-    `opacities` (G,) in [0, 1], `features` (G, D) anything. Float32 on the CPU; every other dtype and device takes `dense`."""
-    w2c = world_to_camera(camera)
-    if means.device.type == "cpu" and means.dtype == torch.float32:
-        maps, alpha = Rasterize.apply(means, quaternions, scales, opacities, features, w2c, camera)
-        return Maps(maps[:-1].permute(1, 2, 0), maps[-1], alpha)
-    return dense(means, quaternions, scales, opacities, features, camera)
+    `opacities` (G,) in [0, 1], `features` (G, D) anything. Gaussians whose shape or opacity is no finite number
+    are not drawn. Float32 on the CPU or on CUDA; every other dtype and device takes `dense`."""
+    gaussians = means, quaternions, scales, opacities, features
+    match means.device.type if means.dtype == torch.float32 else None:
+        case "cpu":
+            maps, alpha = Rasterize.apply(*gaussians, world_to_camera(camera), camera)
+            return Maps(maps[:-1].permute(1, 2, 0), maps[-1], alpha)
+        case "cuda" if rasterize_cuda.available():
+            rules = camera.width, camera.height, kernels.NEAREST, kernels.BLUR
+            return Maps(*rasterize_cuda.composite(*gaussians, world_to_camera(camera), camera.K, *rules))
+        case "cuda":  # `dense` would hold every Gaussian at every pixel: too much for a real picture
+            seen = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
+            return Maps(*(m.to(means.device) for m in seen))
+        case _:
+            return dense(*gaussians, camera)
 
 
 def world_to_camera(camera: Camera) -> Tensor:
@@ -73,6 +85,8 @@ def dense(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: Camera, cut: bool = True
 ) -> Maps:
     """The plain-torch twin: every Gaussian at every pixel, any dtype and device. Without `cut`, no alpha is too small to count."""
+    known = torch.cat([means, quaternions, scales, opacities[:, None]], 1).isfinite().all(1)
+    means, quaternions, scales, opacities, features = (t[known] for t in (means, quaternions, scales, opacities, features))
     centres, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > kernels.NEAREST]
@@ -132,12 +146,12 @@ class Rasterize(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> Any:
         maps, alpha = ctx.saved_tensors
         arrays, pose, k, size, (starts, members, *drawn), places, owned = ctx.kept
-        values, conics = drawn[3], drawn[1]
+        values = drawn[3]
         pairs = np.empty((len(members), kernels.MOMENTS + values.shape[1]), np.float32)
         seen = maps.numpy(), alpha.numpy()
         kernels.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
         out = [torch.empty(a.shape) for a in (*arrays, values)]
         poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
-        kernels.project_backward(*arrays, pose, k, *size, conics, owned, pairs, *(t.numpy() for t in out), poses.numpy())
+        kernels.project_backward(*arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy())
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
         return *out[:4], out[4][:, :-1], grad_pose, None

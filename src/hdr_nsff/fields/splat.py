@@ -13,10 +13,11 @@ from torch import Tensor, nn
 
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import Render, Warp
+from hdr_nsff.fields.base import GaussianCloud, Render, Warp
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.rasterize import Maps, rasterize
 from hdr_nsff.fields.trajectories import Trajectories
+from hdr_nsff.tensors import tree_map
 
 BRIGHTEST = 16.0  # log radiance beyond this is held: exp stays finite
 FAINTEST = 0.003  # opacity below which a Gaussian draws nothing
@@ -116,6 +117,21 @@ class Splat(nn.Module):
         """Means (G, 3) of all Gaussians at a knot."""
         mixture = self.mixture_logits.softmax(0)
         return torch.cat([self.static.means, self.trajectories.move(self.moving.means, mixture, knot)])
+
+    @torch.no_grad()
+    def gaussians(self, time: float) -> GaussianCloud:
+        """All that draw anything, static ones first, at `time` in frames: what `render` composites over the background."""
+        knot, still, moving = self.knot(time), self.static, self.moving
+        turned = self.trajectories.turn(moving.quaternions, self.mixture_logits.softmax(0), knot)
+        cloud = GaussianCloud(
+            self.positions(knot),
+            torch.cat([still.quaternions, turned]),
+            torch.cat([still.log_scales, moving.log_scales]).exp(),
+            torch.cat([still.logits, moving.logits]).sigmoid(),
+            torch.cat([g.radiance(self.share(knot)) for g in (still, moving)]),
+            self.is_moving()[:, 0],
+        )
+        return tree_map(lambda t: t[cloud.opacities > FAINTEST], cloud)
 
     def composed(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,)."""

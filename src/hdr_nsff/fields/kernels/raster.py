@@ -1,10 +1,11 @@
 """Numba kernels of the Gaussian rasteriser on the CPU: projection, tiles, compositing, and all of it backwards by hand.
 
-A projected Gaussian is a pixel centre, a conic (inverse 2D covariance: a, b, c of a dx^2 / 2 + b dx dy + c dy^2 / 2), a z-depth, an
-opacity and D features. Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing,
-above 0.999 as 0.999 (Kerbl et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come
-behind. Each (Gaussian, tile) pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and
-the same result whatever the number of threads. The plain-torch twin is `rasterize.dense`.
+A projected Gaussian is a pixel centre, a conic, a z-depth, an opacity and D features. The conic is the inverse 2D covariance in
+factors, alpha = opacity * exp(-(a dx)^2 - (b dx + c dy)^2): multiplied out, float32 would lose needles whose centre is far away.
+Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing, above 0.999 as 0.999 (Kerbl
+et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come behind. Each (Gaussian, tile)
+pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and the same result whatever the
+number of threads. The plain-torch twin is `rasterize.dense`.
 
 Loops over the pixels of a tile are written so that LLVM vectorises them: flat arrays, unsigned ranges, no library call, no maximum
 carried along. `FAST` lets it reorder sums; NaN and Inf stay what they are."""
@@ -111,8 +112,8 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         rows[g, 0] = rows[g, 1] = 0
         centres[g, 0] = centres[g, 1] = conics[g, 0] = conics[g, 1] = conics[g, 2] = F0
         o = float(opacities[g])
-        if not t[2] > NEAREST or o < ALPHA_MIN:
-            continue
+        if not (t[2] > NEAREST and o >= ALPHA_MIN):
+            continue  # behind, too faint, or not a number
         x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
         reach = math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
         rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
@@ -122,7 +123,8 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         if not det > 0:
             continue  # too long and thin for float64
         centres[g, 0], centres[g, 1] = x, y
-        conics[g, 0], conics[g, 1], conics[g, 2] = yy / det, -xy / det, xx / det
+        across = math.sqrt(0.5 * xx / det)
+        conics[g, 0], conics[g, 1], conics[g, 2] = math.sqrt(0.5 / xx), -xy / xx * across, across
         left, right, top, bottom = max(x - rx, 0.0), min(x + rx, float(width)), max(y - ry, 0.0), min(y + ry, float(height))
         rows[g, 0], rows[g, 1] = int(top), math.ceil(bottom)
         boxes[g, 0], boxes[g, 1] = int(left) // TILE_X, int(top) // TILE_Y
@@ -199,11 +201,12 @@ def forward(starts, members, centres, conics, opacities, features, rows, maps, a
         for i in range(starts[tile], starts[tile + 1]):
             g = members[i]
             cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
-            a, b, c = conics[g, 0] * HALF, conics[g, 1], conics[g, 2] * HALF
+            a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
             for p in range(first, last):
                 dx, dy = px[p] - cx, py[p] - cy
-                s = min(max(a * dx * dx + c * dy * dy + b * dx * dy, F0), DEEPEST)
+                e0, e1 = a * dx, b * dx + c * dy
+                s = min(e0 * e0 + e1 * e1, DEEPEST)
                 q = min(o * exp_minus(s), ALPHA_MAX)
                 q = q if q >= ALPHA_MIN else F0
                 v = q * left[p]
@@ -253,7 +256,7 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
                 grad[:] = F0
                 continue
             cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
-            a, b, c = conics[g, 0] * HALF, conics[g, 1], conics[g, 2] * HALF
+            a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
             for p in range(first, last):
                 value[p] = grad_a[p]
@@ -263,7 +266,8 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
                     value[p] += f * sums[p]
             for p in range(first, last):
                 dx, dy = px[p] - cx, py[p] - cy
-                s = min(max(a * dx * dx + c * dy * dy + b * dx * dy, F0), DEEPEST)
+                e0, e1 = a * dx, b * dx + c * dy
+                s = min(e0 * e0 + e1 * e1, DEEPEST)
                 full = o * exp_minus(s)
                 q = min(full, ALPHA_MAX)
                 q = q if q >= ALPHA_MIN else F0
@@ -296,7 +300,7 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
 
 @numba.njit(parallel=True, cache=True, nogil=True)
 def project_backward(
-    means, quaternions, scales, opacities, w2c, k, width, height, conics, owned, pairs,
+    means, quaternions, scales, opacities, w2c, k, width, height, owned, pairs,
     grad_means, grad_quaternions, grad_scales, grad_opacities, grad_features, grad_pose,
 ):  # fmt: skip
     """Add up the pairs' gradients and carry them to the world: everything `(G, ...)`; `grad_pose` (G, 12) per Gaussian, or (0, 12) if
@@ -324,15 +328,18 @@ def project_backward(
             u4 += pairs[i, 4]
             u5 += pairs[i, 5]
         grad_opacities[g] = -u0 / opacities[g]
-        a, b, c = float(conics[g, 0]), float(conics[g, 1]), float(conics[g, 2])
+        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+        quaternion = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
+        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+        t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), (v0, v1), (xx, xy, yy) = footprint(
+            m, quaternion, s, w2c, k, width, height
+        )
+        det = xx * yy - xy * xy
+        a, b, c = yy / det, -xy / det, xx / det  # in float64: needles thousands of pixels long need it
         gx, gy = -(a * u1 + b * u2), -(b * u1 + c * u2)  # pixel centre
         # conic -> 2D covariance: G = -Q (dL / dQ) Q, dL / dQ = half the second moments
         p0, p1, p2, p3 = a * u3 + b * u4, a * u4 + b * u5, b * u3 + c * u4, b * u4 + c * u5
         g00, g01, g11 = -0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c)
-        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
-        quaternion = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
-        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
-        t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), (v0, v1), _ = footprint(m, quaternion, s, w2c, k, width, height)
         # covariance = V V^T + blur, V = T M: dV = 2 G V, dM = T^T dV, dT = dV M^T
         d0 = (2 * (g00 * v0[0] + g01 * v1[0]), 2 * (g00 * v0[1] + g01 * v1[1]), 2 * (g00 * v0[2] + g01 * v1[2]))
         d1 = (2 * (g01 * v0[0] + g11 * v1[0]), 2 * (g01 * v0[1] + g11 * v1[1]), 2 * (g01 * v0[2] + g11 * v1[2]))

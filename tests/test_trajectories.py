@@ -1,0 +1,106 @@
+"""Shared rigid motions: rotations about a centre, mixtures of shifts, quaternions against rotation matrices."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.fields.rasterize import rotation_matrices
+from hdr_nsff.fields.trajectories import WINDOW, Trajectories, quaternion_product
+
+KNOTS = 10
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def turning(angle: float) -> Trajectories:
+    """One basis that turns by `angle` (radians) per knot about the z axis through its centre."""
+    t = Trajectories(1, KNOTS)
+    t.centres[:] = torch.tensor([1.0, 2.0, 3.0])
+    half = 0.5 * angle * torch.arange(KNOTS)
+    t.turns.data = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
+    return t
+
+
+def about_z(angle: float) -> Tensor:
+    c, s = math.cos(angle), math.sin(angle)
+    return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def test_nothing_moves_before_training() -> None:
+    t, points, quaternions = Trajectories(3, KNOTS), random(20, 3), random(20, 4)
+    t.centres[:] = random(3, 3, seed=1)
+    mixture = random(3, 20, seed=2).softmax(0)
+    for knot in (0.0, 3.7, 9.0):
+        torch.testing.assert_close(t.move(points, mixture, knot), points)
+        torch.testing.assert_close(t.turn(quaternions, mixture, knot), quaternions)
+
+
+def test_a_pure_rotation_turns_about_its_centre() -> None:
+    t, points = turning(0.3), random(20, 3)
+    for knot in (0, 2, 9):
+        expected = (points - t.centres) @ about_z(0.3 * knot).T + t.centres
+        torch.testing.assert_close(t.move(points, torch.ones(1, 20), float(knot)), expected)
+
+
+def test_between_knots_a_rotation_stays_rigid_and_nearly_even() -> None:
+    t, points = turning(0.3), random(20, 3)
+    moved = t.move(points, torch.ones(1, 20), 4.5)
+    torch.testing.assert_close(torch.cdist(moved, moved), torch.cdist(points, points), atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(moved, (points - t.centres) @ about_z(0.3 * 4.5).T + t.centres, atol=1e-4, rtol=1e-3)
+
+
+def test_a_gaussian_turns_as_its_place_does() -> None:
+    t, quaternions = turning(0.3), random(20, 4)
+    turned = rotation_matrices(t.turn(quaternions, torch.ones(1, 20), 3.0))
+    torch.testing.assert_close(turned, about_z(0.9) @ rotation_matrices(quaternions))
+
+
+def test_a_mixture_of_two_shifts_is_their_weighted_mean() -> None:
+    t, points = Trajectories(2, KNOTS), random(3, 3)
+    shifts = t.shifts.data.view(KNOTS, 2, 4)
+    shifts[:, 0, 0] = torch.arange(KNOTS)  # one knot after another along x
+    shifts[:, 1, 1] = 2.0 * torch.arange(KNOTS)  # twice as far along y
+    mixture = torch.tensor([[1.0, 0.0, 0.25], [0.0, 1.0, 0.75]])
+    expected = torch.tensor([[3.5, 0, 0], [0, 7, 0], [0.25 * 3.5, 0.75 * 7, 0]])
+    torch.testing.assert_close(t.move(points, mixture, 3.5) - points, expected)
+
+
+def test_quaternions_multiply_as_rotation_matrices_do() -> None:
+    a, b = random(20, 4), random(20, 4, seed=1)
+    torch.testing.assert_close(
+        rotation_matrices(quaternion_product(a, b)), rotation_matrices(a) @ rotation_matrices(b), atol=1e-5, rtol=1e-4
+    )
+
+
+def test_rotation_matrices_turn_and_do_not_mirror() -> None:
+    r = rotation_matrices(random(20, 4))
+    torch.testing.assert_close(r @ r.mT, torch.eye(3).expand(20, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(r), torch.ones(20))
+
+
+def test_constant_acceleration_is_smooth_and_a_jump_is_not() -> None:
+    t = Trajectories(2, KNOTS)
+    shifts = t.shifts.data.view(KNOTS, 2, 4)
+    shifts[:, 0, 0] = torch.arange(KNOTS) ** 2
+    assert float(t.roughness(4.0).detach()) == 0
+    shifts[5, 1, 2] = 1.0
+    assert float(t.roughness(4.0).detach()) > 0.1
+    assert float(t.roughness(0.0).detach()) == 0  # the jump is too far away to be seen from there
+
+
+def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
+    t = Trajectories(2, 20)
+    t.turns.data += 0.1 * random(40, 4)
+    mixture = random(2, 5, seed=1).softmax(0)
+    knot = 9.3
+    t.mark(knot)
+    (
+        t.move(random(5, 3), mixture, knot).square().sum() + t.turn(random(5, 4), mixture, knot)[:, 1].sum() + t.roughness(knot)
+    ).backward()
+    for values, touched in ((t.turns, t.turns_touched), (t.shifts, t.shifts_touched)):
+        has = (values.grad != 0).any(1)
+        assert bool(has.any()) and bool((touched[has] == 1).all())
+    assert t.turns_touched.view(20, 2)[:, 0].nonzero()[:, 0].tolist() == list(range(9 - WINDOW, 10 + WINDOW))
