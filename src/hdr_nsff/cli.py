@@ -40,7 +40,9 @@ class Verb:
 VERBS = {
     "run": Verb(run_all, RunConfig, "Footage to HDR in one go: prepare, train, render, evaluate, report."),
     "prepare": Verb(prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."),
-    "train": Verb(train, PRESETS, "Train a radiance field from a scene folder: `train grid`, `train paper`, `train tiny`."),
+    "train": Verb(
+        train, PRESETS, "Train a radiance field from a scene folder: `train splat`, `train grid`, `train paper`, `train tiny`."
+    ),
     "render": Verb(render, RenderConfig, "Views of a trained run: EXR, PNG, video; any path, time and exposure."),
     "export": Verb(export, ExportConfig, "The Gaussians of a splat run as PLY, at any time, for viewers and other programs."),
     "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
@@ -49,8 +51,8 @@ VERBS = {
     "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
 }
 PRESET_HELP = {
-    "splat": "4D Gaussians, minutes on a CPU and real-time pictures.",
-    "grid": "Additive grids, minutes on a CPU; the default of `run`.",
+    "splat": "4D Gaussians, minutes on a CPU, pictures in real time; the default of `run`.",
+    "grid": "A scene flow field on additive grids, minutes on a CPU.",
     "paper": "The published network, losses and schedules; hours on a GPU.",
     "tiny": "Seconds on a CPU, to try things out.",
 }

@@ -58,6 +58,8 @@ class TrainConfig:
     seed: int = 0
     device: str = "auto"
     """auto, cpu or cuda."""
+    torch_threads: int = 1
+    """Threads of torch beside the kernels' own, which do the work: waking more for small operations costs more than they give. 0: all."""
     checkpoint_seconds: float = 60.0
     """Seconds between checkpoints and preview pictures."""
 
@@ -121,7 +123,7 @@ def paper() -> TrainConfig:
     )
     return TrainConfig(
         field=network, tonemap=ToneMapConfig(kind="per_image", knots="even"), loss=weights, steps=250_000, minutes=None, rays=1024,
-        moving_rays=512, batches=1, paint=False, period=0.0, prior_fade=0.1, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, checkpoint_seconds=600,
+        moving_rays=512, batches=1, paint=False, period=0.0, prior_fade=0.1, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, torch_threads=0, checkpoint_seconds=600,
     )  # fmt: skip
 
 

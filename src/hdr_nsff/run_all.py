@@ -36,8 +36,8 @@ class RunConfig:
     """Exposure times of one cycle in seconds, e.g. 1/1000,1/250,1/60. Default: CSV beside the clip, EXIF, else learned."""
     ev: str | None = None
     """The same as log2 exposures, e.g. -4,-2,0."""
-    preset: Literal["splat", "grid", "paper", "tiny"] = "grid"
-    """splat: 4D Gaussians; grid: minutes on a CPU; paper: the published network (hours on a GPU); tiny: seconds, to try things out."""
+    preset: Literal["splat", "grid", "paper", "tiny"] = "splat"
+    """splat: 4D Gaussians, minutes on a CPU; grid: a scene flow field on grids, likewise; paper: the published network (hours on a GPU); tiny: seconds, to try things out."""
     minutes: float | None = None
     """Training time instead of the preset's."""
     truth: Path | None = None

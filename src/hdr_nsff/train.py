@@ -71,6 +71,8 @@ def train(config: TrainConfig) -> Path:
         if ranks.world > config.batches:
             raise InputError(f"{ranks.world} processes share {config.batches} batches a step; start fewer, or raise --batches")
         device, scene = pick_device(config.device), Scene.open(config.scene)
+        if config.torch_threads:
+            torch.set_num_threads(config.torch_threads)
         if ranks.main:
             open_folder(config)
         trainer = Trainer(config, scene, device, ranks)
@@ -260,7 +262,8 @@ class Trainer:
     def log(self, values: dict[str, float]) -> None:
         """Append one line to log.jsonl."""
         losses = {k: v for k, v in values.items() if k != "psnr"}
-        c, rays = self.clock, (self.config.rays + self.config.moving_rays) * self.config.batches
+        c, drawn = self.clock, self.config.rays + self.config.moving_rays or self.scene.train[0].image[..., 0].numel()
+        rays = drawn * self.config.batches
         line = {
             "step": c.step,
             "seconds": round(c.seconds, 3),

@@ -20,7 +20,7 @@ LINK = 6.0  # pixels: neighbours in a picture
 PARTING = 1.0  # pixels a frame: neighbours that part faster hardly belong together
 PARTS = 10  # the graph is cut into, before joining
 WORSE = 1.3  # times the residual that two groups have alone is still one motion
-RELIEF = 0.03  # of a thing's size: what wrong depth may add to a residual
+RELIEF = 0.1  # of a thing's size: what wrong depth may add to a residual
 MOST = 1000  # tracks that groups are found from
 GAP = 6  # frames a thing may be out of sight
 SMALLEST = 0.04  # of all tracks: smaller groups are left out
@@ -45,6 +45,7 @@ class Tracks:
     pixels: np.ndarray  # (N, T, 2) xy, NaN where unseen
     points: np.ndarray  # (N, T, 3) scene units, NaN where unseen
     trust: np.ndarray  # (N, T), 0 where unseen
+    patch: np.ndarray  # (N, T) which connected patch of moving pixels it lies in, 0 where unseen
 
 
 @dataclass(frozen=True)
@@ -68,12 +69,14 @@ def follow(views: list[View]) -> Tracks:
     parts = [chain(views, s) for s in sorted({round(i) for i in np.linspace(0, num - 1, min(STARTS, num)).tolist()})]
     pixels = np.concatenate(parts)
     points, trust = np.full((*pixels.shape[:2], 3), np.nan), np.zeros(pixels.shape[:2])
+    patch = np.zeros(pixels.shape[:2], int)
     for t, view in enumerate(views):
         seen = np.isfinite(pixels[:, t, 0])
         x, y = pixels[seen, t].astype(int).T
         points[seen, t], trust[seen, t] = view.points[y, x], view.trust[y, x] + 0.02
+        patch[seen, t] = ndimage.label(view.moving)[0][y, x]
     lasting = (trust > 0).sum(1) >= min(SHORTEST, num)
-    return Tracks(pixels[lasting], points[lasting], trust[lasting])
+    return Tracks(pixels[lasting], points[lasting], trust[lasting], patch[lasting])
 
 
 def chain(views: list[View], start: int) -> np.ndarray:
@@ -108,26 +111,25 @@ def gather(tracks: Tracks) -> list[Group]:
     label = parts(tracks)
     few = np.unique(np.linspace(0, len(label) - 1, MOST).astype(int))  # enough to tell motions apart
     members = [np.nonzero(label == k)[0] for k in range(label.max() + 1)]
-    groups = [fit(tracks, np.intersect1d(m, few)) for m in members if len(np.intersect1d(m, few)) >= 3]
-    cost: dict[tuple[int, int], float] = {}  # by the groups' identities: most pairs survive a round
+    found = [np.intersect1d(m, few) for m in members]
+    groups = {k: fit(tracks, m) for k, m in enumerate(m for m in found if len(m) >= 3)}
+    cost: dict[tuple[int, int], float] = {}  # most pairs survive a round
     while pair := best_pair(tracks, groups, cost):
-        a, b = pair
-        both = fit(tracks, np.concatenate([groups[a].members, groups[b].members]))
-        groups = [*(g for k, g in enumerate(groups) if k not in (a, b)), both]
-    everyone = [np.nonzero(np.isin(label, label[g.members]))[0] for g in groups]
+        a, b = (groups.pop(k) for k in pair)
+        groups[max(*groups, *pair) + 1] = fit(tracks, np.concatenate([a.members, b.members]))
+    everyone = [np.nonzero(np.isin(label, label[g.members]))[0] for g in groups.values()]
     large = [m for m in everyone if len(m) >= SMALLEST * len(label)] or everyone[:1]
     return [fit(tracks, m) for m in sorted(large, key=len, reverse=True)]
 
 
-def best_pair(tracks: Tracks, groups: list[Group], cost: dict[tuple[int, int], float]) -> tuple[int, int] | None:
-    """The two groups that one motion explains best compared to their own; None where none does nearly as well."""
-    pairs = list(itertools.combinations(range(len(groups)), 2))
+def best_pair(tracks: Tracks, groups: dict[int, Group], cost: dict[tuple[int, int], float]) -> tuple[int, int] | None:
+    """The two groups that one motion explains best compared to their own; None where none does nearly as well. Fills `cost`."""
+    pairs = list(itertools.combinations(sorted(groups), 2))
     for a, b in pairs:
-        key = id(groups[a]), id(groups[b])
-        if key not in cost:
-            cost[key] = excess(tracks, groups[a], groups[b]) if meet(tracks, groups[a], groups[b]) else np.inf
-    best = min(pairs, key=lambda ab: cost[id(groups[ab[0]]), id(groups[ab[1]])], default=None)
-    return best if best is not None and cost[id(groups[best[0]]), id(groups[best[1]])] < 1 else None
+        if (a, b) not in cost:
+            cost[a, b] = excess(tracks, groups[a], groups[b]) if meet(tracks, groups[a], groups[b]) else np.inf
+    best = min(pairs, key=lambda ab: cost[ab], default=None)
+    return best if best is not None and cost[best] < 1 else None
 
 
 def excess(tracks: Tracks, a: Group, b: Group) -> float:
@@ -135,14 +137,16 @@ def excess(tracks: Tracks, a: Group, b: Group) -> float:
     both = fit(tracks, np.concatenate([a.members, b.members]))
     ratios, size = [], min(size_of(tracks, a), size_of(tracks, b))
     for g in (a, b):
-        alone, joint = (np.nanmedian(residuals(tracks, m, g.members)) for m in (g, both))
-        ratios.append(joint / (WORSE * alone + RELIEF * size + 1e-9))
+        alone, joint = residuals(tracks, g, g.members), residuals(tracks, both, g.members)
+        told = np.isfinite(alone) & np.isfinite(joint)
+        ratios.append(np.median(joint[told]) / (WORSE * np.median(alone[told]) + RELIEF * size + 1e-9) if told.any() else np.inf)
     return float(max(ratios))
 
 
 def size_of(tracks: Tracks, group: Group) -> float:
-    """Median distance of a group's points from their middle, scene units."""
+    """Median distance of a group's points from their middle at the time, scene units."""
     points = tracks.points[group.members]
+    points = points[:, np.isfinite(points[..., 0]).any(0)]
     return float(np.nanmedian(np.linalg.norm(points - np.nanmedian(points, 0), axis=-1)))
 
 
@@ -192,8 +196,21 @@ def residuals(tracks: Tracks, group: Group, members: np.ndarray) -> np.ndarray:
     return out
 
 
+def apart(tracks: Tracks, a: Group, b: Group) -> bool:
+    """Whether two groups lie in different patches of moving pixels too often to be one thing."""
+    different = together = 0
+    for t in range(tracks.trust.shape[1]):
+        seen = [tracks.patch[g.members, t][tracks.trust[g.members, t] > 0] for g in (a, b)]
+        if min(len(s) for s in seen) >= 3:
+            together += 1
+            different += np.bincount(seen[0]).argmax() != np.bincount(seen[1]).argmax()
+    return different >= 2 and different > 0.3 * together
+
+
 def meet(tracks: Tracks, a: Group, b: Group) -> bool:
-    """Whether two groups are seen together, or one where the other left off."""
+    """Whether two groups are seen together, or one where the other left off, and may be one thing."""
+    if apart(tracks, a, b):
+        return False
     seen_a, seen_b = ((tracks.trust[g.members] > 0).sum(0) >= 3 for g in (a, b))
     if (seen_a & seen_b).sum() >= SHORTEST:
         return True
@@ -240,9 +257,12 @@ def fit(tracks: Tracks, members: np.ndarray) -> Group:
                 r, s = rigid(points[both, last], points[both, t], np.minimum(trust[both, last], trust[both, t]))
                 rotations[t], shifts[t], known[t] = r @ rotations[last], r @ shifts[last] + s, True
                 last = t
+            elif (trust[:, t] > 0).sum() >= 6:  # nothing links the two times: the thing has not turned, its middle has moved on
+                here, before = (np.nanmedian(points[:, k], 0) for k in (t, last))
+                rotations[t], shifts[t], known[t] = rotations[last], shifts[last] + here - before, True
+                last = t
     for _ in range(ROUNDS):
-        rotations, shifts = refit(points, trust, rotations, shifts, known)
-        rotations, shifts = smoothed(rotations, shifts, known)
+        rotations, shifts = smoothed(*refit(points, trust, rotations, shifts, known), known)
     return Group(rotations, shifts, centre, members, known)
 
 

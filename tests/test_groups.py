@@ -1,0 +1,83 @@
+"""Moving things found from tracks: rigid fits, parts, and motions of known bodies."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.fields.groups import Tracks, View, advance, fit, gather, rigid
+
+TIMES = 14
+
+
+def body(
+    seed: int, start: np.ndarray, velocity: np.ndarray, spin: float, count: int = 120
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points (count, TIMES, 3) of a turning, moving body; its rotations (TIMES, 3, 3) and places (TIMES, 3)."""
+    local = np.random.default_rng(seed).uniform(-0.25, 0.25, (count, 3))
+    rotations = Rotation.from_rotvec(np.outer(np.arange(TIMES) * spin, [0.3, 1.0, 0.2])).as_matrix()
+    places = start + np.outer(np.arange(TIMES), velocity)
+    return np.einsum("tij,nj->nti", rotations, local) + places, rotations, places
+
+
+def tracked(points: np.ndarray, noise: float = 0.0, seed: int = 0) -> Tracks:
+    """Tracks of points seen by a camera at the origin (focal length 200 px), each over a part of the time, with noisy depth."""
+    rng = np.random.default_rng(seed)
+    pixels = 200 * points[..., :2] / points[..., 2:] + 100
+    points = points * (1 + noise * rng.standard_normal(points.shape[:2]))[..., None]
+    first = rng.integers(0, TIMES // 2, len(points))[:, None]
+    seen = (np.arange(TIMES) >= first) & (np.arange(TIMES) < first + TIMES // 2)
+    hide = np.where(seen, 1.0, np.nan)[..., None]
+    return Tracks(pixels * hide, points * hide, seen.astype(float), seen.astype(int))
+
+
+def test_a_rigid_fit_survives_a_third_of_wrong_points() -> None:
+    rng = np.random.default_rng(0)
+    source, r = rng.standard_normal((60, 3)), Rotation.from_rotvec([0.2, -0.4, 0.1]).as_matrix()
+    target = source @ r.T + [1.0, 2.0, 3.0]
+    target[:20] += rng.uniform(1, 3, (20, 3))
+    found, shift = rigid(source, target, np.ones(60), rounds=30)
+    assert abs(found - r).max() < 1e-3 and abs(shift - [1, 2, 3]).max() < 1e-3
+
+
+def test_a_rigid_fit_never_mirrors() -> None:
+    source = np.random.default_rng(0).standard_normal((20, 3))
+    found, _ = rigid(source, source * [1, 1, -1], np.ones(20))
+    assert np.linalg.det(found) == pytest.approx(1)
+
+
+def test_few_points_give_a_shift_without_rotation() -> None:
+    source = np.random.default_rng(0).standard_normal((4, 3))
+    found, shift = rigid(source, source @ Rotation.from_rotvec([0, 0, 1.0]).as_matrix().T + 5, np.ones(4))
+    assert np.array_equal(found, np.eye(3)) and abs(shift - 5).max() < 2
+
+
+def test_the_motion_of_one_body_is_found_from_tracks_that_come_and_go() -> None:
+    points, rotations, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0.01]), 0.1)
+    tracks = tracked(points, noise=0.01)
+    group = fit(tracks, np.arange(len(points)))
+    middle = slice(2, TIMES - 2)  # smoothing shortens the ends
+    relative = group.rotations @ group.rotations[TIMES // 2].T
+    assert abs(relative - rotations @ rotations[TIMES // 2].T)[middle].max() < 0.06
+    for t in range(2, TIMES - 2):
+        back = group.canonical(points[:, t], t)
+        assert np.linalg.norm(back - group.canonical(points[:, TIMES // 2], TIMES // 2), axis=-1).max() < 0.06
+
+
+def test_two_bodies_that_touch_are_told_apart() -> None:
+    one, _, _ = body(0, np.array([-0.4, 0, 3.0]), np.array([0.06, 0, 0]), 0.12)
+    two, _, _ = body(1, np.array([0.5, 0.1, 3.2]), np.array([-0.04, 0.01, 0]), -0.08)
+    groups = gather(tracked(np.concatenate([one, two]), noise=0.005))
+    assert len(groups) == 2
+    for g in groups:
+        share = (g.members < len(one)).mean()
+        assert min(share, 1 - share) < 0.05
+
+
+def test_a_track_ends_where_flow_is_not_believed_or_leaves_the_moving_pixels() -> None:
+    moving = np.zeros((8, 8), bool)
+    moving[2:6, 2:6] = True
+    flow, valid = np.full((8, 8, 2), 1.0), np.ones((8, 8), bool)
+    valid[3, 3] = False
+    view = View(moving, np.zeros((8, 8, 3)), np.ones((8, 8)), {1: flow}, {1: valid})
+    out = advance(view, view, 1, np.array([[2.5, 2.5], [3.5, 3.5], [5.5, 5.5], [np.nan, np.nan]]))
+    assert out[0].tolist() == [3.5, 3.5] and np.isnan(out[1:]).all()
