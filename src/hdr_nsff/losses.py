@@ -66,7 +66,8 @@ def depth_scene(depth: Tensor, prior_disparity: Tensor, confidence: Tensor, near
 
 def optical_flow(flow: Tensor, target: Tensor, valid: Tensor, limit: float | None = None) -> Tensor:
     """Masked mean absolute difference in pixels, (N, 2) each; 0 where nothing is valid. `limit` caps an outlier's error."""
-    error = (flow - target).abs().sum(-1)
+    x, y = (flow - target).abs().unbind(-1)  # `sum` is slow over an axis of two
+    error = x + y
     error = error if limit is None else error.clamp(max=limit)
     return (error * valid).sum() / valid.sum().clamp_min(1)
 

@@ -70,7 +70,7 @@ class Objective:
     def terms(self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
         """All terms that need only the render, unweighted."""
         rgb = self.recorded(render.radiance, batch, tonemap)
-        uniform = batch.uniform[:, None].to(rgb)
+        uniform = None if batch.uniform.all() else batch.uniform[:, None].to(rgb)
         terms = {"photometric": losses.photometric(rgb, batch.rgb, uniform, self.squared)}
         terms |= self.dynamic(render, rgb, batch, tonemap, phase)
         terms |= self.warped(render, batch, tonemap, phase)
@@ -83,21 +83,28 @@ class Objective:
         """What the batch's camera would have recorded of `radiance` (N, 3)."""
         return tonemap(radiance, batch.bracket, batch.camera_id, batch.frame, leaky=True)
 
+    def trust(self, batch: PixelBatch) -> Tensor:
+        """Trust (N, 3) in the recorded values where what is compared to them is the dynamic content."""
+        return losses.saturation_weight(batch.rgb) if self.saturation else torch.ones_like(batch.rgb)
+
     def dynamic(self, render: Render, rgb: Tensor, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
         """The dynamic branch against the recording: everywhere in the first phase, later by its share of the ray."""
-        trust = losses.saturation_weight(batch.rgb) if self.saturation else torch.ones_like(batch.rgb)
+        if render.dynamic_radiance is None and batch.uniform.all():
+            return {}
+        trust = self.trust(batch)
         if render.dynamic_radiance is not None:
             alone = self.recorded(render.dynamic_radiance, batch, tonemap)
             share = render.motion.detach()[:, None] if phase >= 1 else torch.ones_like(trust)
             return {"dynamic": losses.photometric(alone, batch.rgb, trust * share, self.squared)}
-        if batch.uniform.all():
-            return {}
         extra = (~batch.uniform)[:, None].to(trust)
         return {"dynamic": losses.photometric(rgb, batch.rgb, trust * extra, self.squared)}
 
     def warped(self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
         """Eq. 13 for the neighbours, and through two steps from phase 2 on; weighted by what is not disoccluded."""
-        trust = losses.saturation_weight(batch.rgb) if self.saturation else torch.ones_like(batch.rgb)
+        seen = [w for w in render.warps if w.radiance is not None]
+        if not seen:
+            return {}
+        trust = self.trust(batch)
         share = render.motion.detach() if phase >= 1 else torch.ones_like(render.motion)
 
         def term(w: Warp) -> Tensor:
@@ -105,7 +112,6 @@ class Objective:
             rgb = self.recorded(w.radiance, batch, tonemap)
             return losses.photometric(rgb, batch.rgb, trust * (w.confidence * share)[:, None], self.squared)
 
-        seen = [w for w in render.warps if w.radiance is not None]
         single = [term(w) for w in seen if abs(w.offset) == 1]
         double = [term(w) for w in seen if abs(w.offset) == 2 and phase >= 2]
         terms = {"temporal": torch.stack(single).mean()} if single else {}

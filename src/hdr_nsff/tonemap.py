@@ -18,6 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.errors import InputError
+from hdr_nsff.response_kernel import Respond, bin_table
 from hdr_nsff.scene import Scene, bracket_problem
 
 NUM_POINTS = 256
@@ -176,6 +177,7 @@ class ToneMapper(nn.Module):
         self.power = 1 / GAMMA if config.knots == "gamma" else 1.0
         knots = knot_positions(config.knots)
         self.register_buffer("knots", knots, persistent=False)
+        self.register_buffer("bins", bin_table(knots), persistent=False)
         self.register_buffer("fixed_curve", (knots ** (1 / GAMMA)).expand(3, -1).contiguous(), persistent=False)
         self.register_buffer("anchored", torch.zeros((), dtype=torch.bool))
         residuals = len(frame_brackets) if config.kind == "shared" and config.residual else 0
@@ -199,6 +201,7 @@ class ToneMapper(nn.Module):
                 self.response = None
 
     knots: Tensor
+    bins: Tensor
     fixed_curve: Tensor
     free: Tensor
     anchored: Tensor
@@ -224,8 +227,8 @@ class ToneMapper(nn.Module):
         radiance = radiance.float()
         if self.config.kind == "none":
             return radiance if leaky else radiance.clamp(0, 1)
-        x = radiance * self.log_gain(bracket, camera_id, frame).exp()
-        return self.respond(x, self.curve_values(bracket, camera_id, frame), leaky)
+        gain = self.log_gain(bracket, camera_id, frame).exp()
+        return self.respond(radiance, gain, self.curve_values(bracket, camera_id, frame), leaky)
 
     def develop(self, radiance: Tensor, ev: float, camera_id: int = 0) -> Tensor:
         """The picture (..., 3) in [0, 1] that camera `camera_id` would record of `radiance` (..., 3) at `ev` relative to the reference bracket.
@@ -239,13 +242,16 @@ class ToneMapper(nn.Module):
                     return radiance.clamp(0, 1).reshape(shape)
                 case "per_image":
                     values = self.curve_values(0, camera_id, self.reference_frame)
-                    return self.respond(radiance * 2.0**ev, values, leaky=False).reshape(shape)
+                    return self.respond(radiance, values.new_full((3,), 2.0**ev), values, leaky=False).reshape(shape)
                 case _:
                     gain = (self.bracket_gain.log_white_balance(camera_id) + ev * LN2).exp()
-                    return self.respond(radiance * gain, self.curve_values(0, camera_id, None), leaky=False).reshape(shape)
+                    return self.respond(radiance, gain, self.curve_values(0, camera_id, None), leaky=False).reshape(shape)
 
-    def respond(self, x: Tensor, values: Tensor, leaky: bool) -> Tensor:
-        """g(x) (N, 3) for exposures x (N, 3) and a curve (3, 256), with the ends of eq. 11 or clamped."""
+    def respond(self, radiance: Tensor, gain: Tensor, values: Tensor, leaky: bool) -> Tensor:
+        """g(gain * radiance) (N, 3) for radiance (N, 3), gain (3,) and a curve (3, 256), with the ends of eq. 11 or clamped."""
+        if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (radiance, gain, values)):
+            return Respond.apply(radiance, gain, values, self.knots, self.bins, self.config.leak if leaky else None)
+        x = radiance * gain
         y = piecewise_linear(x, values, self.knots, self.power)
         return leaky_ends(x, y, self.config.leak) if leaky else y
 
