@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.fields.groups import Tracks, View, advance, fit, gather, rigid
+from hdr_nsff.priors.groups import Tracks, View, advance, fit, gather, rigid
 
 TIMES = 14
 

@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hdr_nsff.fields.groups import Group, Tracks, View, follow, gather
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat import Gaussians, Splat
 from hdr_nsff.fields.surface import Points, ToRadiance, joined, lift, thinned_to
+from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather
 from hdr_nsff.scene import Frame, Scene
 
 DEPTH_CELLS = 12.0  # a cell is this many times longer along the view than across, as shares of the frustum

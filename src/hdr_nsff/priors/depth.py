@@ -20,6 +20,7 @@ from hdr_nsff.priors.flow import in_threads
 from hdr_nsff.priors.fuse import AGREE, carry_over, clean, fill, vote
 from hdr_nsff.priors.movers import mover_depth
 from hdr_nsff.priors.parallax import Shots, choose_views, disparity_range, triangulate
+from hdr_nsff.priors.relief import relief
 from hdr_nsff.priors.sweep import sweep
 from hdr_nsff.progress import say
 
@@ -87,6 +88,7 @@ def geometric_depth(
     moves = moving & ~still
     with_movers, mover_confidence = mover_depth(replace(shots, moving=moves), flow, valid, pairs, disparity)
     disparity, confidence = np.where(moves, with_movers, disparity), np.where(moves, mover_confidence, confidence)
+    disparity, confidence = relief(replace(shots, moving=moves), flow, valid, pairs, disparity, confidence)
     confidence = np.stack([doubt_edges(d, c) for d, c in zip(disparity, confidence, strict=True)])
     return disparity, confidence, *depth_range(disparity, confidence)
 

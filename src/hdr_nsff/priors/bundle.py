@@ -1,0 +1,249 @@
+"""Bundle adjustment of one moving thing: its shape and its rigid motion from tracks in cameras with known poses.
+
+A thing that turns, or that a moving camera goes round, shows its relief as a static scene does; only how far away it is as a whole
+stays a matter of the prior. Levenberg-Marquardt with the points eliminated (Triggs et al., "Bundle adjustment: a modern synthesis",
+1999), Huber weights, weak priors on the mean z-depth of every time, on the path's third differences and on the shape."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.priors.groups import Group, Tracks, canonical_points
+
+ITERATIONS = 25
+REVERSALS = 4  # rounds of looking for reversed depth
+SPLIT = 3  # frames between the times tried
+QUICK = 8  # iterations that tell whether a try is better
+BETTER = 0.98  # of the cost: what a reversal must gain
+MOST = 400  # tracks that poses are found from
+NOISE = 0.7  # pixels: standard deviation of a track
+FAR_SIGMA = 0.01  # how well the mean z-depth of a time is known, as a share of it
+PATH_SIGMA = 0.02  # of the path's third differences, as a share of z-depth
+TURN_SIGMA = np.radians(4.0)  # of the second differences of its turning
+SHAPE_SIGMA = 2.0  # of a point's canonical place, as a share of the thing's size
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Known cameras of the tracks' times."""
+
+    K: np.ndarray  # (T, 3, 3) pixels
+    c2w: np.ndarray  # (T, 3, 4) OpenCV, scene units
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A group with the place of every one of its tracks."""
+
+    group: Group
+    points: np.ndarray  # (N, 3) canonical, scene units; NaN where unknown
+    error: float  # median reprojection error, pixels
+
+    def at(self, t: int) -> np.ndarray:
+        """World points (N, 3) at a time."""
+        g = self.group
+        return (self.points - g.centre) @ g.rotations[t].T + g.centre + g.shifts[t]
+
+
+def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
+    """The shape and motion that explain the tracks' pixels best, from those that depth alone gave."""
+    group = without_turning(tracks, group)
+    longest = np.argsort(-(tracks.trust[group.members] > 0).sum(1), kind="stable")[:MOST]
+    some = replace(group, members=group.members[np.sort(longest)])
+    problem = Problem(tracks, some, cameras)
+    state, cost = problem.solve(State(problem.start, group.rotations, group.shifts), ITERATIONS)
+    state = problem.unreversed(state, cost)
+    every = Problem(tracks, group, cameras)
+    state = every.points_for(state)
+    points = np.full((len(group.members), 3), np.nan)
+    points[every.use] = state.points + group.centre
+    error = np.linalg.norm(every.residuals(state)[0], axis=-1)[every.seen]
+    return Shape(replace(group, rotations=state.rotations, shifts=state.shifts), points, float(np.median(error)))
+
+
+def without_turning(tracks: Tracks, group: Group) -> Group:
+    """The group's path as its tracks' median steps tell it, without rotation: rotations fitted to flat depth would mislead."""
+    points, trust = tracks.points[group.members], tracks.trust[group.members] > 0
+    num, seen = trust.shape[1], trust.sum(0) >= 3
+    start = int(np.argmax(trust.sum(0)))
+    shifts = np.zeros((num, 3))
+    for step in (1, -1):
+        last = start
+        for t in range(start + step, num if step > 0 else -1, step):
+            both = trust[:, t] & trust[:, last]
+            shifts[t] = shifts[t - step]
+            if both.sum() >= 3:
+                shifts[t], last = shifts[last] + np.median(points[both, t] - points[both, last], 0), t
+            elif seen[t]:
+                shifts[t], last = shifts[last] + np.nanmedian(points[:, t], 0) - np.nanmedian(points[:, last], 0), t
+    return replace(group, rotations=np.tile(np.eye(3), (num, 1, 1)), shifts=shifts, known=seen)
+
+
+@dataclass(frozen=True)
+class State:
+    """What is looked for, about the group's centre."""
+
+    points: np.ndarray  # (N, 3)
+    rotations: np.ndarray  # (T, 3, 3)
+    shifts: np.ndarray  # (T, 3)
+
+
+class Problem:
+    """Residuals, their derivatives and a damped step."""
+
+    def __init__(self, tracks: Tracks, group: Group, cameras: Cameras) -> None:
+        seen = (tracks.trust[group.members] > 0) & group.known
+        points = tracks.points[group.members] - group.centre
+        start = canonical_points(points, seen.astype(float), group.rotations, group.shifts, group.known)
+        use = np.isfinite(start[:, 0]) & (seen.sum(1) >= 2)
+        seen, start, self.use = seen[use], start[use], use  # which members can be placed at all
+        self.pixels = np.nan_to_num(tracks.pixels[group.members][use])  # (N, T, 2)
+        self.seen, self.start, self.K = seen, start, cameras.K
+        self.w2c = np.swapaxes(cameras.c2w[:, :, :3], 1, 2)  # (T, 3, 3)
+        self.eye = cameras.c2w[:, :, 3] - group.centre
+        self.size = np.median(np.linalg.norm(start - np.median(start, 0), axis=-1)) + 1e-9 if len(start) else 1.0
+        prior = np.einsum("tj,ntj->nt", self.w2c[:, 2], tracks.points[group.members][use] - group.centre - self.eye)
+        count = np.maximum(seen.sum(0), 1)
+        self.mean_depth = np.where(seen, np.nan_to_num(prior), 0).sum(0) / count  # (T,)
+        self.told = seen.sum(0) >= 3
+        self.second = np.diff(np.eye(len(self.K)), n=2, axis=0) if len(self.K) > 2 else np.zeros((0, len(self.K)))
+        self.third = np.diff(np.eye(len(self.K)), n=3, axis=0) if len(self.K) > 3 else np.zeros((0, len(self.K)))
+        self.unit = np.median(self.mean_depth[self.told]) if self.told.any() else 1.0
+
+    def solve(self, state: State, iterations: int) -> tuple[State, float]:
+        """The best state nearby and its cost."""
+        cost, damping = self.cost(state), 1e-3
+        for _ in range(iterations):
+            trial = self.step(state, damping)
+            new = self.cost(trial)
+            state, cost, damping = (trial, new, damping / 4) if new < cost else (state, cost, damping * 8)
+            if damping > 1e6:
+                break
+        return state, cost
+
+    def points_for(self, state: State) -> State:
+        """The same poses with all of this problem's points placed as they say."""
+        state = replace(state, points=self.start)
+        for _ in range(ITERATIONS):
+            error, turned, local = self.residuals(state)
+            _, point, weight = self.slopes(error, turned, local, state)
+            V = np.einsum("ntij,ntik->njk", point * weight[..., None], point) + np.eye(3) / (SHAPE_SIGMA * self.size) ** 2
+            slope = np.einsum("ntij,nti->nj", point * weight[..., None], error)
+            slope += (state.points - self.start) / (SHAPE_SIGMA * self.size) ** 2
+            state = replace(state, points=state.points - np.linalg.solve(V, slope[..., None])[..., 0])
+        return state
+
+    def unreversed(self, state: State, cost: float) -> State:
+        """The state with depth no longer reversed: seen from afar, a thing turning one way and its mirror image turning the other look
+        alike (Necker 1832), and a start without relief may take either, a different one at different times. Perspective tells."""
+        num = len(self.K)
+        for _ in range(REVERSALS):
+            splits = [*range(SPLIT, num - SPLIT // 2, SPLIT), num]
+            tries = [self.solve(self.reversed(state, k), QUICK) for k in splits]
+            best, lowest = min(tries, key=lambda t: t[1])
+            if lowest > BETTER * cost:
+                break
+            state, cost = self.solve(best, ITERATIONS)
+        return state
+
+    def reversed(self, s: State, split: int) -> State:
+        """The state with its depth mirrored before the time `split`, joined there to what follows."""
+        k = min(split, len(self.K) - 1)
+        view = s.shifts[k] - self.eye[k]
+        view = view / np.linalg.norm(view)
+        mirror = np.eye(3) - 2 * np.outer(view, view)
+        joined = s.rotations[k].T @ mirror @ s.rotations[k]
+        rotations, points = s.rotations.copy(), s.points.copy()
+        rotations[:split] = mirror @ s.rotations[:split] @ joined
+        before = self.seen[:, :split].sum(1) > 0.5 * self.seen.sum(1)
+        middle = np.median(points[before], 0) if before.any() else np.zeros(3)
+        points[before] = (points[before] - middle) @ joined + middle
+        return State(points, rotations, s.shifts)
+
+    def residuals(self, s: State) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Reprojection errors (N, T, 2) px, the turned points (N, T, 3), camera points (N, T, 3)."""
+        turned = np.einsum("tij,nj->nti", s.rotations, s.points)
+        local = np.einsum("tij,ntj->nti", self.w2c, turned + s.shifts - self.eye)
+        z = np.maximum(local[..., 2:], 1e-3 * self.unit)
+        focal, centre = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
+        return np.where(self.seen[..., None], local[..., :2] / z * focal + centre - self.pixels, 0), turned, local
+
+    def priors(self, s: State, local: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Residuals in standard deviations: mean z-depth (T,), third differences of the path (T - 3, 3), second ones of the turning
+        (T - 2, 3), shape (N, 3)."""
+        turns = Rotation.from_matrix(s.rotations[1:] @ np.swapaxes(s.rotations[:-1], 1, 2)).as_rotvec()
+        turning = np.diff(turns, axis=0) / TURN_SIGMA
+        mean = np.where(self.seen, local[..., 2], 0).sum(0) / np.maximum(self.seen.sum(0), 1)
+        far = np.where(self.told, (mean - self.mean_depth) / (FAR_SIGMA * self.unit), 0)
+        path = self.third @ s.shifts / (PATH_SIGMA * self.unit)
+        return far, path, turning, (s.points - self.start) / (SHAPE_SIGMA * self.size)
+
+    def cost(self, s: State) -> float:
+        """Huber cost of everything."""
+        error, _, local = self.residuals(s)
+        length = np.linalg.norm(error, axis=-1) / NOISE
+        huber = np.where(length < 1, 0.5 * length**2, length - 0.5)[self.seen].sum()
+        return float(huber + 0.5 * sum((r**2).sum() for r in self.priors(s, local)))
+
+    def slopes(
+        self, error: np.ndarray, turned: np.ndarray, local: np.ndarray, s: State
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of the reprojection errors by pose (N, T, 2, 6: turn, shift) and by point (N, T, 2, 3), and weights (N, T, 1)."""
+        length = np.linalg.norm(error, axis=-1, keepdims=True) / NOISE
+        weight = self.seen[..., None] / np.maximum(length, 1) / NOISE**2  # (N, T, 1)
+        z = np.maximum(local[..., 2], 1e-3 * self.unit)
+        fx, fy = self.K[:, 0, 0], self.K[:, 1, 1]
+        zero = np.zeros_like(z)
+        projection = np.stack([fx / z, zero, -fx * local[..., 0] / z**2, zero, fy / z, -fy * local[..., 1] / z**2], -1)
+        to_world = projection.reshape(*z.shape, 2, 3) @ self.w2c  # (N, T, 2, 3)
+        pose = np.concatenate([-to_world @ cross(turned), to_world], -1)  # (N, T, 2, 6)
+        point = to_world @ s.rotations  # (N, T, 2, 3)
+        return pose, point, weight
+
+    def step(self, s: State, damping: float) -> State:
+        """The state after one damped Gauss-Newton step; the points' 3x3 blocks are eliminated."""
+        error, turned, local = self.residuals(s)
+        far, path, turning, shape = self.priors(s, local)
+        n, num = self.seen.shape
+        pose, point, weight = self.slopes(error, turned, local, s)
+        wp, wx = pose * weight[..., None], point * weight[..., None]
+        U = np.einsum("ntij,ntik->tjk", wp, pose)
+        V = np.einsum("ntij,ntik->njk", wx, point)
+        W = np.einsum("ntij,ntik->ntjk", wp, point)  # (N, T, 6, 3)
+        gp = np.einsum("ntij,nti->tj", wp, error)
+        gx = np.einsum("ntij,nti->nj", wx, error)
+        V = V + np.eye(3) / (SHAPE_SIGMA * self.size) ** 2
+        gx = gx + shape / (SHAPE_SIGMA * self.size)
+        row = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1) / (FAR_SIGMA * self.unit) * self.told[:, None]
+        U, gp = U + row[:, :, None] * row[:, None], gp + row * far[:, None]
+        full = np.zeros((num, 6, num, 6))
+        full[np.arange(num), :, np.arange(num)] = U
+        smooth = self.third.T @ self.third / (PATH_SIGMA * self.unit) ** 2
+        for axis in range(3):
+            full[:, 3 + axis, :, 3 + axis] += smooth
+            full[:, axis, :, axis] += self.second.T @ self.second / TURN_SIGMA**2
+        gp[:, :3] += self.second.T @ turning / TURN_SIGMA
+        gp[:, 3:] += self.third.T @ path / (PATH_SIGMA * self.unit)
+        full, gp = full.reshape(6 * num, 6 * num), gp.reshape(-1)
+        full[np.diag_indices(6 * num)] *= 1 + damping
+        full[np.diag_indices(6 * num)] += 1e-9 * np.trace(full) / len(full) + 1e-12
+        V[:, np.arange(3), np.arange(3)] *= 1 + damping
+        inverse = np.linalg.inv(V)
+        flat = W.reshape(n, num * 6, 3)
+        carried = flat @ inverse  # (N, 6T, 3)
+        reduced = full - np.tensordot(carried, flat, ((0, 2), (0, 2)))
+        delta = np.linalg.solve(reduced, -gp + np.einsum("nij,nj->i", carried, gx))
+        moved = -np.einsum("nij,nj->ni", inverse, gx + np.einsum("nij,i->nj", flat, delta))
+        turn, shift = delta.reshape(num, 6)[:, :3], delta.reshape(num, 6)[:, 3:]
+        rotations = Rotation.from_rotvec(turn).as_matrix() @ s.rotations
+        return State(s.points + moved, rotations, s.shifts + shift)
+
+
+def cross(v: np.ndarray) -> np.ndarray:
+    """Matrices (..., 3, 3) that take the cross product with `v` (..., 3) from the left."""
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
+    return np.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).reshape(*v.shape[:-1], 3, 3)
