@@ -25,7 +25,7 @@ def build_field(config: FieldConfig, scene: Scene) -> NSFF | Splat:
             field.allow_motion(scene.train)
             return field
         case SplatConfig():
-            return Splat(config, scene.times, scene.near, scene.far)
+            return Splat(config, scene.times, scene.near, scene.far, scene.manifest.width * scene.manifest.height)
         case _:
             assert_never(config)
 

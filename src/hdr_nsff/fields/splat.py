@@ -27,10 +27,10 @@ FAINTEST = 0.003  # opacity below which a Gaussian draws nothing
 class SplatConfig:
     """A field of 4D Gaussians."""
 
-    static: int = 18000
-    """Static Gaussians."""
-    moving: int = 5000
-    """Moving Gaussians."""
+    static: int | None = None
+    """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
+    moving: int | None = None
+    """Moving Gaussians; default: 0.15 for every pixel of a frame, at most 20,000."""
     bases: int = 6
     """Shared rigid motions that the moving ones mix."""
     colour_knots: int = 7
@@ -45,6 +45,13 @@ class SplatConfig:
     colour_lr: float = 2e-2
     shape_lr: float = 2e-2
     opacity_lr: float = 5e-2
+
+
+    def counts(self, num_pixels: int) -> tuple[int, int]:
+        """How many static and moving Gaussians for frames of `num_pixels`."""
+        static = min(round(0.55 * num_pixels), 80_000) if self.static is None else self.static
+        moving = min(round(0.15 * num_pixels), 20_000) if self.moving is None else self.moving
+        return static, moving
 
 
 class Gaussians(nn.Module):
@@ -69,18 +76,19 @@ class Gaussians(nn.Module):
 
 
 class Splat(nn.Module):
-    """See the module. `times` (T,) are the training times; `near` is the scene's typical length."""
+    """See the module. `times` (T,) are the training times; `near` is the scene's typical length; frames have `num_pixels`."""
 
     times: Tensor
     background: Tensor
 
-    def __init__(self, config: SplatConfig, times: Tensor, near: float, far: float) -> None:
+    def __init__(self, config: SplatConfig, times: Tensor, near: float, far: float, num_pixels: int) -> None:
         super().__init__()
         self.config, self.unit, self.near, self.far = config, near, near, far
         self.register_buffer("times", times.double())
-        self.static = Gaussians(config.static, config.shade_knots, 1)
-        self.moving = Gaussians(config.moving, config.colour_knots, 3)
-        self.mixture_logits = nn.Parameter(torch.zeros(config.bases, config.moving))
+        static, moving = config.counts(num_pixels)
+        self.static = Gaussians(static, config.shade_knots, 1)
+        self.moving = Gaussians(moving, config.colour_knots, 3)
+        self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
         self.trajectories = Trajectories(config.bases, len(times))
         self.background = nn.Parameter(torch.zeros(3))  # log radiance where no Gaussian is
 
