@@ -48,6 +48,8 @@ class LossWeights:
     """Third differences of the shared motions."""
     shade: float = 0.01
     """Square of static Gaussians' changes of log radiance in time."""
+    presence: float = 1e-3
+    """Square of moving Gaussians' changes of opacity logit from one knot to the next."""
     colour_change: float = 0.01
     """Square of moving Gaussians' changes of log radiance from one colour knot to the next."""
     response_smoothness: float = 1e-3

@@ -24,6 +24,7 @@ FILL = 0.95  # of the places are used at once; the rest go where the error is
 OVERLAP = 0.6  # standard deviation relative to the distance to the neighbours
 OPACITY = 0.7
 KEY_FRAMES = 12  # times whose moving pixels become Gaussians
+ABSENT = -6.0  # logit offset of what is not seen
 OWN = 4.0  # logit of the nearest basis over the others
 
 
@@ -117,7 +118,9 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
     kept = thinned_to(points, points.positions / unit + apart, limit)
     count = place(field.moving, kept)
     nearest = cKDTree((points.positions / unit).numpy()).query((kept.positions / unit).numpy())[1]
-    share_bases(field, groups, kept.positions[:count], owner[torch.from_numpy(nearest)][:count])
+    owners = owner[torch.from_numpy(nearest)][:count]
+    hide_unseen(field, tracks, groups, owners)
+    share_bases(field, groups, kept.positions[:count], owners)
     return len(groups), count
 
 
@@ -179,6 +182,19 @@ def owner_of(f: Frame, t: int, tracks: Tracks, groups: list[Group]) -> np.ndarra
         return np.zeros(len(x), np.int64)
     nearest = cKDTree(np.concatenate(at)).query(np.stack([x, y], -1) + 0.5)[1]
     return np.array(label, np.int64)[nearest]
+
+
+def hide_unseen(field: Splat, tracks: Tracks, groups: list[Group], owner: Tensor) -> None:
+    """Make moving Gaussians invisible at the times their group (P,) is not seen: it has left, or is hidden."""
+    knots, num = len(field.presence), field.trajectories.num_knots
+    for g, group in enumerate(groups):
+        if not len(group.members):
+            continue
+        seen = (tracks.trust[group.members] > 0).any(0)
+        for k in range(knots):
+            low, high = (int(np.clip(round((k + o) / max(knots - 1, 1) * (num - 1)), 0, num - 1)) for o in (-1, 1))
+            if not seen[low : high + 1].any():
+                field.presence[k, : len(owner)][owner == g] = ABSENT
 
 
 def share_bases(field: Splat, groups: list[Group], points: Tensor, owner: Tensor) -> None:

@@ -37,6 +37,8 @@ class SplatConfig:
     """Times at which a moving Gaussian has a colour of its own."""
     shade_knots: int = 5
     """Times at which a static Gaussian has a brightness of its own (1: none)."""
+    presence_knots: int = 13
+    """Times at which a moving Gaussian has an opacity of its own: things come and go."""
     lr: float = 1.0
     """Multiplies all learning rates below."""
     place_lr: float = 2e-3
@@ -88,6 +90,7 @@ class Splat(nn.Module):
         static, moving = config.counts(num_pixels)
         self.static = Gaussians(static, config.shade_knots, 1)
         self.moving = Gaussians(moving, config.colour_knots, 3)
+        self.presence = nn.Parameter(torch.zeros(config.presence_knots, moving))  # offsets to the moving ones' opacity logits
         self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
         self.trajectories = Trajectories(config.bases, len(times))
         self.background = nn.Parameter(torch.zeros(3))  # log radiance where no Gaussian is
@@ -111,10 +114,15 @@ class Splat(nn.Module):
             torch.cat([still.means, moved]),
             torch.cat([still.quaternions, turned]),
             torch.cat([still.log_scales, moving.log_scales]).exp(),
-            torch.cat([still.logits, moving.logits]).sigmoid(),
+            self.opacities(share),
             torch.cat([radiance, self.is_moving(), *extra], 1),
             camera,
         )
+
+    def opacities(self, share: float) -> Tensor:
+        """(G,) in [0, 1] at a share of the clip."""
+        present = linear(self.presence, share * (len(self.presence) - 1))
+        return torch.cat([self.static.logits, self.moving.logits + present]).sigmoid()
 
     def is_moving(self) -> Tensor:
         """(G, 1): 1 for moving Gaussians."""
@@ -135,7 +143,7 @@ class Splat(nn.Module):
             self.positions(knot),
             torch.cat([still.quaternions, turned]),
             torch.cat([still.log_scales, moving.log_scales]).exp(),
-            torch.cat([still.logits, moving.logits]).sigmoid(),
+            self.opacities(self.share(knot)),
             torch.cat([g.radiance(self.share(knot)) for g in (still, moving)]),
             self.is_moving()[:, 0],
         )
@@ -195,14 +203,15 @@ class Splat(nn.Module):
     def regularizers(self, knot: float) -> dict[str, Tensor]:
         """Terms of the field's own: opacities and scales (Kheradmand et al. 2024), smooth poses, slow colours."""
         still, moving = self.static, self.moving
-        logits = torch.cat([still.logits, moving.logits])
+        opacities = self.opacities(self.share(knot))
         scales = torch.cat([still.log_scales, moving.log_scales]).exp()
-        alive = logits.detach().sigmoid() > FAINTEST
+        alive = opacities.detach() > FAINTEST
         return {
-            "opacity": (logits.sigmoid() * alive).mean(),
+            "opacity": (opacities * alive).mean(),
             "scale": (scales * alive[:, None]).mean() / self.unit,
             "trajectory": self.trajectories.roughness(knot),
             "shade": still.offsets.square().mean(),
+            "presence": self.presence.diff(dim=0).square().mean(),
             "colour_change": moving.offsets.diff(dim=0).square().mean() + 0.01 * moving.offsets.square().mean(),
         }
 
@@ -216,6 +225,7 @@ class Splat(nn.Module):
         groups: list[dict[str, Any]] = [
             {"params": [getattr(g, name) for g in both], "lr": c.lr * rate, "eps": 1e-15} for name, rate in rates.items()
         ]
+        groups.append({"params": [self.presence], "lr": c.lr * c.opacity_lr, "eps": 1e-15})
         groups.append({"params": [self.mixture_logits, self.background], "lr": c.lr * c.colour_lr, "eps": 1e-15})
         t = self.trajectories
         touched = [t.turns_touched, t.shifts_touched]
