@@ -140,3 +140,15 @@ def test_the_other_verbs_work_on_what_run_made(out: Path, tmp_path: Path, capsys
     assert len(list((tmp_path / "problem/clip").glob("*.png"))) >= 20 and list(
         (tmp_path / "problem/truth/radiance").glob("*.exr")
     )
+
+
+def test_gaussians_trained_on_the_same_scene_come_closer_and_move_between_frames(out: Path, tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    cli.main(["train", "splat", "--scene", str(out / "scene"), "--out", str(run), "--steps", "250", "--device", "cpu"])
+    cli.main(["evaluate", str(run), "--device", "cpu"])
+    psnr = [json.loads((r / "metrics.json").read_text())["headline"]["psnr"] for r in (out / "run", run)]
+    assert psnr[1] > psnr[0] + 1, psnr
+    cli.main(["render", str(run), "--path", "slowmo", "--factor", "2", "--no-video", "--device", "cpu"])
+    moving = [io.read_exr(p)["motion"] for p in sorted((run / "render/slowmo").glob("*.exr"))[4:9]]
+    columns = [float((m * np.arange(m.shape[1])).sum() / m.sum()) for m in moving]
+    assert all(m.max() > 0.5 for m in moving) and columns == sorted(columns), "the card moves to the right, half frames between"

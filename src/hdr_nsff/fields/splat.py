@@ -48,7 +48,6 @@ class SplatConfig:
     shape_lr: float = 2e-2
     opacity_lr: float = 5e-2
 
-
     def counts(self, num_pixels: int) -> tuple[int, int]:
         """How many static and moving Gaussians for frames of `num_pixels`."""
         static = min(round(0.55 * num_pixels), 80_000) if self.static is None else self.static
