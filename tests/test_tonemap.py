@@ -242,3 +242,14 @@ def test_a_response_is_learned_from_known_exposures():
         optimiser.step()
     x, y = t.curve()
     assert (y - truth(x))[:, x > 0.002].square().mean().sqrt() < 0.02
+
+
+def test_neutral_gains_make_a_grey_recording_grey() -> None:
+    t = ToneMapper(ToneMapConfig(), [0, 1], [0, 0], [0.0, -2.0])
+    x = torch.linspace(0, 1, 64)
+    t.set_curve(x, torch.stack([x ** (1 / 2.2), x ** (1 / 1.6), x ** (1 / 3.0)]))
+    radiance = t.inverse(torch.full((1, 3), 0.5), 0)[0]  # 0.5^2.2, 0.5^1.6, 0.5^3: far from grey
+    seen = radiance * t.neutral()
+    assert float(radiance.max() / radiance.min()) > 2
+    torch.testing.assert_close(seen, seen.mean().expand(3), rtol=1e-4, atol=0)
+    assert float(t.neutral().prod()) == pytest.approx(1, rel=1e-4)

@@ -97,7 +97,7 @@ def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
 def develop(run: Run, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float) -> np.ndarray:
     """An rgb picture (H, W, 3) in [0, 1]: recorded by a learned camera at `ev`, or (None) tone-mapped for a display."""
     if ev is None:
-        return color.display(radiance, exposure)
+        return color.display(radiance * run.tonemapper.neutral(camera_id).cpu().numpy(), exposure)
     return run.tonemapper.develop(torch.from_numpy(radiance).to(device_of(run)), ev, camera_id).cpu().numpy()
 
 

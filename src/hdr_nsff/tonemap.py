@@ -267,6 +267,15 @@ class ToneMapper(nn.Module):
             x = torch.lerp(self.knots[right - 1], self.knots[right], (y - y0) / (y1 - y0).clamp_min(1e-12))
             return x.T * (-self.log_gain(bracket, camera_id, frame)).exp()
 
+    def neutral(self, camera_id: int = 0) -> Tensor:
+        """Gains (3,), geometric mean 1, that make neutral what the camera records as mid grey at the reference exposure.
+
+        Radiance is in the camera's own units, per channel (the gauge): for looking at, its white balance has to be put in."""
+        bracket = self.frame_brackets[self.reference_frame]
+        frame = self.reference_frame if self.config.kind == "per_image" else None
+        grey = self.inverse(torch.full((1, 3), 0.5, device=self.knots.device), bracket, camera_id, frame)[0].clamp_min(1e-9)
+        return grey.log().mean().exp() / grey
+
     def log_gain(self, bracket: int, camera_id: int, frame: int | None) -> Tensor:
         """Natural log gain (3,), eq. 10. per_image without a frame borrows the mean of the bracket's training images."""
         if self.config.kind == "per_image":
