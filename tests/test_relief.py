@@ -166,14 +166,14 @@ def test_of_several_frames_of_one_time_the_first_speaks(short: Clip) -> None:
 
 def test_a_pixel_takes_the_depth_of_the_tracks_near_it_unless_it_differs_much(short: Clip) -> None:
     disparity, confidence = np.full((H, W), 0.4, np.float32), np.zeros((H, W), np.float32)
-    disparity[32, 50], disparity[32, 51] = 0, 0.3
+    disparity[32, 50], disparity[32, 51], confidence[32, 49] = 0, 0.3, 0.9
     points = EYES[:1] + RAYS[32, 48] * 2.2  # a track whose disparity is 1 / 2.2 = 0.455
     place = np.array([[[48.5, 32.5]]])
     tracks = Tracks(place, points[None], np.ones((1, 1)), np.ones((1, 1), int))
     group = Group(np.eye(3)[None], np.zeros((1, 3)), np.zeros(3), np.array([0]), np.array([True]))
     apply(short.shots, 0, 0, tracks, [Shape(group, points, 0.1)], disparity, confidence)
     assert disparity[32, [48, 49, 50, 51, 57]] == pytest.approx([1 / 2.2, 1 / 2.2, 0, 0.3, 0.4])  # 57 is out of reach
-    assert confidence[32, [48, 50, 57]] == pytest.approx([0.7, 0, 0])
+    assert confidence[32, [48, 49, 50, 57]] == pytest.approx([0.7, 0.9, 0, 0])
 
 
 def test_wild_flow_is_no_error(short: Clip) -> None:

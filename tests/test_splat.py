@@ -104,6 +104,19 @@ def test_flow_to_the_neighbour_is_the_projected_displacement(offset: int) -> Non
     torch.testing.assert_close(warp.flow.detach()[0], wall_flow, atol=0.1, rtol=0)
 
 
+def test_flow_through_a_faint_card_is_the_same() -> None:
+    field = card_field()
+    field.static.logits.data[:] = -20.0
+    full, faint = [], []
+    for logit, flows in ((6.0, full), (-3.0, faint)):
+        field.moving.logits.data[:] = logit
+        render = field(batch_of(4, 1))[0]
+        flows += [render.warps[0].flow.detach(), render.opacity.detach()]
+    at = pixel_of(torch.tensor([0.0, 0, 2]) + 4 * STEP)
+    assert float(full[1][at]) > 0.99 and 0.1 < float(faint[1][at]) < 0.6
+    torch.testing.assert_close(faint[0][at], full[0][at], atol=0.1, rtol=0)
+
+
 def test_one_side_a_step_is_drawn_and_the_seed_tells_which() -> None:
     batch = batch_of(4, 1)
     both = replace(batch, neighbours={1: BESIDE, -1: BESIDE}, flow={o: batch.flow[1] for o in (1, -1)})
@@ -154,9 +167,9 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(toy: Scene, toy_folder
     field = t.field
     assert isinstance(field, Splat)
     trajectories = field.trajectories
-    t.draw = lambda slot: whole_frame(t.scene, 2)  # type: ignore[method-assign]
-    before = [p.detach().clone() for p in (trajectories.turns, trajectories.shifts)]
-    for _ in range(2):
+    for frame in (10, 2):  # the first step leaves momentum behind, which the second must not act on
+        before = [p.detach().clone() for p in (trajectories.turns, trajectories.shifts)]
+        t.draw = lambda slot, k=frame: whole_frame(t.scene, k)  # type: ignore[method-assign, misc]
         t.step()
     for p, old in zip((trajectories.turns, trajectories.shifts), before, strict=True):
         moved = (p.detach() != old).view(12, -1).any(1).nonzero()[:, 0].tolist()
