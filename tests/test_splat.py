@@ -27,7 +27,7 @@ BESIDE = CAMERA.moved(torch.tensor([[1.0, 0, 0, 0.2], [0, 1, 0, -0.1], [0, 0, 1,
 
 def card_field(bases: int = 2) -> Splat:
     """A card of opaque Gaussians at z = 2 that moves by `STEP`, in front of a wall at z = 4 that fills the view."""
-    field = Splat(SplatConfig(static=33 * 25, moving=121, bases=bases), torch.arange(TIMES), 1.0, 6.0)
+    field = Splat(SplatConfig(static=33 * 25, moving=121, bases=bases), torch.arange(TIMES), 1.0, 6.0, 1200)
     with torch.no_grad():
         for gaussians, wide, high, z, space in ((field.static, 33, 25, 4.0, 0.1), (field.moving, 11, 11, 2.0, 0.04)):
             y, x = torch.meshgrid(torch.arange(high) - high // 2, torch.arange(wide) - wide // 2, indexing="ij")
@@ -58,7 +58,7 @@ def pixel_of(point: Tensor) -> int:
 
 def scattered(seed: int = 0, static: int = 40, moving: int = 30) -> Splat:
     """Anything anywhere in view, with something in every parameter."""
-    field = Splat(SplatConfig(static=static, moving=moving, bases=3), torch.arange(TIMES), 1.0, 6.0)
+    field = Splat(SplatConfig(static=static, moving=moving, bases=3), torch.arange(TIMES), 1.0, 6.0, 1200)
     generator = torch.Generator().manual_seed(seed)
     for p in field.parameters():
         p.data.add_(0.1 * torch.randn(p.shape, generator=generator))
@@ -198,6 +198,23 @@ def test_the_regularisers_of_a_plain_field_by_hand() -> None:
     assert float(field.regularizers(3.0)["colour_change"].detach()) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
 
 
+@pytest.mark.parametrize("config", [{"moving": 0}, {"static": 0}, {"colour_knots": 1, "presence_knots": 1, "shade_knots": 1}])
+def test_a_field_may_lack_a_kind_of_gaussian_or_all_change(config: dict[str, int]) -> None:
+    field = Splat(replace(SplatConfig(static=20, moving=20), **config), torch.arange(TIMES), 1.0, 6.0, 1200)
+    render, own = field(batch_of(4, 1))
+    (render.radiance.sum() + sum(own.values())).backward()
+    assert all(torch.isfinite(v) for v in own.values())
+    assert all(p.grad is None or torch.isfinite(p.grad).all() for p in field.parameters())
+
+
+def test_moving_gaussians_come_and_go() -> None:
+    field = card_field()
+    field.presence.data[:7] = -20.0  # 13 knots over 10 times: gone until the middle
+    before, after = field.render(CAMERA, 3.0), field.render(CAMERA, 8.0)
+    assert float(before.motion.max()) < 0.01 and float(after.motion.max()) > 0.99
+    assert field.gaussians(3.0).motion.sum() == 0 and field.gaussians(8.0).motion.sum() == 121
+
+
 def test_chosen_pixels_are_the_whole_picture_at_them() -> None:
     field, pixels = scattered(), torch.tensor([[39.5, 29.5], [0.5, 0.5], [7.5, 12.5], [7.5, 12.5]])
     index = torch.tensor([1199, 0, 12 * 40 + 7, 12 * 40 + 7])
@@ -218,7 +235,7 @@ def test_the_whole_picture_out_of_order_is_put_in_order_asked_for() -> None:
 
 
 def test_the_background_shows_where_nothing_is() -> None:
-    field = Splat(SplatConfig(static=5, moving=5), torch.arange(TIMES), 1.0, 6.0)
+    field = Splat(SplatConfig(static=5, moving=5), torch.arange(TIMES), 1.0, 6.0, 1200)
     field.background.data = torch.tensor([0.3, 1.0, 20.0]).log()
     render = field.render(CAMERA, 2.0)
     torch.testing.assert_close(render.radiance, torch.tensor([0.3, 1.0, 20.0]).expand(1200, 3))
@@ -256,7 +273,7 @@ def test_the_cloud_is_what_render_draws() -> None:
 
 
 def test_one_training_time_has_no_flow() -> None:
-    field = Splat(SplatConfig(static=20, moving=20, bases=1), torch.zeros(1), 1.0, 6.0)
+    field = Splat(SplatConfig(static=20, moving=20, bases=1), torch.zeros(1), 1.0, 6.0, 1200)
     for g in (field.static, field.moving):
         g.means.data[:, 2], g.logits.data[:], g.log_scales.data[:] = 2.0, 0.0, -2.0
     assert isinstance(field, RadianceField)
@@ -277,7 +294,7 @@ def test_colours_change_over_the_clip_and_static_ones_in_brightness_only() -> No
 
 
 def test_a_trained_start_knows_the_cards_flow(toy: Scene) -> None:
-    field = Splat(SplatConfig(static=1500, moving=400, bases=2), toy.times, toy.near, toy.far)
+    field = Splat(SplatConfig(static=1500, moving=400, bases=2), toy.times, toy.near, toy.far, 60 * 34)
     start_field(field, toy, lambda rgb, i: rgb + 0.1, 0.0, True)
     f = toy.train[2]
     offset = card_offset(2.0)
