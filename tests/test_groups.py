@@ -1,10 +1,12 @@
 """Moving things found from tracks: rigid fits, parts, and motions of known bodies."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.groups import Tracks, View, advance, fit, gather, rigid
+from hdr_nsff.priors.groups import PARTS, Tracks, View, advance, fit, gather, parts, rigid
 
 TIMES = 14
 
@@ -81,3 +83,20 @@ def test_a_track_ends_where_flow_is_not_believed_or_leaves_the_moving_pixels() -
     view = View(moving, np.zeros((8, 8, 3)), np.ones((8, 8)), {1: flow}, {1: valid})
     out = advance(view, view, 1, np.array([[2.5, 2.5], [3.5, 3.5], [5.5, 5.5], [np.nan, np.nan]]))
     assert out[0].tolist() == [3.5, 3.5] and np.isnan(out[1:]).all()
+
+
+def test_tracks_without_neighbours_are_parts_by_themselves() -> None:
+    points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1, count=12)
+    near = tracked(points)
+    far = [replace(near, pixels=near.pixels + 1000.0 * k) for k in range(12)]
+    every = Tracks(*(np.concatenate([getattr(t, f) for t in far]) for f in ("pixels", "points", "trust", "patch")))
+    assert len(np.unique(parts(every))) == PARTS
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_time_is_no_error() -> None:
+    points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1)
+    pixels = 200 * points[:, :1, :2] / points[:, :1, 2:] + 100
+    once = np.ones((len(points), 1))
+    groups = gather(Tracks(pixels, points[:, :1], once, once.astype(int)))
+    assert len(groups) == 1 and abs(groups[0].shifts).max() < 1e-12

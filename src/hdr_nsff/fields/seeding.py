@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat import Gaussians, Splat
-from hdr_nsff.fields.surface import Points, ToRadiance, joined, lift, thinned_to
+from hdr_nsff.fields.surface import CELLS, Points, ToRadiance, cells_for, joined, lift, thinned, thinned_to
 from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather
 from hdr_nsff.scene import Frame, Scene
 
@@ -113,14 +113,11 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
     parts = [mover_points(scene, frames[t], t, tracks, groups, to_radiance) for t in key]
     points, owner = joined([p for p, _ in parts]), torch.cat([o for _, o in parts])
     limit = int(FILL * len(field.moving))
-    apart = owner[:, None].float() * 1e3  # groups never share a cell
-    unit = float(points.positions.std().clamp_min(1e-6))
-    kept = thinned_to(points, points.positions / unit + apart, limit)
+    cell = cells_for(points.positions, owner, limit)  # groups never share one
+    kept, kept_owner = thinned(points, cell), torch.unique(cell) // CELLS
     count = place(field.moving, kept)
-    nearest = cKDTree((points.positions / unit).numpy()).query((kept.positions / unit).numpy())[1]
-    owners = owner[torch.from_numpy(nearest)][:count]
-    hide_unseen(field, tracks, groups, owners)
-    share_bases(field, groups, kept.positions[:count], owners)
+    hide_unseen(field, tracks, groups, kept_owner[:count])
+    share_bases(field, groups, kept.positions[:count], kept_owner[:count])
     return len(groups), count
 
 
@@ -153,8 +150,8 @@ def views_of(field: Splat, scene: Scene) -> tuple[list[View], list[int]]:
         rays = f.camera.rays(f.camera.pixel_grid())
         points = rays.origins + rays.directions / f.disparity.reshape(-1, 1).clamp(1 / scene.far, 1 / scene.near)
         trust = np.ones(shape) if f.disparity_confidence is None else f.disparity_confidence.numpy()
-        flow = {o: v.numpy() for o, v in f.flow.items()}
-        valid = {o: v.numpy() for o, v in f.flow_valid.items()}
+        leads = [o for o in f.flow if chosen.get(k + o) == f.neighbours.get(o)]  # to a frame that speaks for its time
+        flow, valid = ({o: v[o].numpy() for o in leads} for v in (f.flow, f.flow_valid))
         views.append(View(moving, points.view(*shape, 3).double().numpy(), trust, flow, valid))
     return views, [chosen[k] for k in sorted(chosen)]
 

@@ -209,9 +209,9 @@ class Splat(nn.Module):
             "opacity": (opacities * alive).mean(),
             "scale": (scales * alive[:, None]).mean() / self.unit,
             "trajectory": self.trajectories.roughness(knot),
-            "shade": still.offsets.square().mean(),
-            "presence": self.presence.diff(dim=0).square().mean(),
-            "colour_change": moving.offsets.diff(dim=0).square().mean() + 0.01 * moving.offsets.square().mean(),
+            "shade": mean_square(still.offsets),
+            "presence": mean_square(self.presence.diff(dim=0)),
+            "colour_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),
         }
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -237,6 +237,11 @@ class Splat(nn.Module):
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""
         return []
+
+
+def mean_square(values: Tensor) -> Tensor:
+    """Mean of the squares; 0 of nothing."""
+    return values.square().sum() / max(values.numel(), 1)
 
 
 def picked(render: Render, camera: Camera, pixels: Tensor) -> Render:

@@ -12,6 +12,8 @@ from torch import Tensor
 from hdr_nsff.losses import saturation_weight
 from hdr_nsff.scene import Frame
 
+CELLS = 2**57  # that `cells_for` tells apart
+
 ToRadiance = Callable[[Tensor, int], Tensor]  # recorded rgb (P, 3) of training frame i -> radiance (P, 3)
 
 
@@ -63,7 +65,7 @@ def thinned(points: Points, cell: Tensor) -> Points:
     total = torch.zeros(count, dtype=torch.float64).index_add_(0, cell, weight)
 
     def mean(values: Tensor) -> Tensor:
-        wide = values.double().reshape(len(values), -1) * weight[:, None]
+        wide = values.double().unsqueeze(-1).flatten(1) * weight[:, None]
         summed = torch.zeros(count, wide.shape[1], dtype=torch.float64).index_add_(0, cell, wide)
         return (summed / total[:, None]).to(values).reshape(count, *values.shape[1:])
 
@@ -71,14 +73,24 @@ def thinned(points: Points, cell: Tensor) -> Points:
 
 
 def thinned_to(points: Points, coords: Tensor, limit: int) -> Points:
-    """Thinned in unit cells of `coords` (P, 3) divided finely enough, but so that at most `limit` points are left."""
+    """Thinned in cubic cells of `coords` (P, 3), as fine as leaves at most `limit` points."""
+    return thinned(points, cells_for(coords, torch.zeros(len(points), dtype=torch.long), limit))
+
+
+def cells_for(coords: Tensor, kind: Tensor, limit: int) -> Tensor:
+    """Which cubic cell of `coords` (P, 3) every point lies in, (P,): `kind` (P,; integers from 0 to 62) * `CELLS` + a number below
+    `CELLS`, so that kinds share none. As fine as leaves at most `limit` cells, or one per kind."""
+    if not len(coords):
+        return kind
+    inside = (coords - coords.amin(0)).double()
+    inside = inside / inside.max().clamp_min(1e-30)
 
     def cells(fineness: float) -> Tensor:
-        x, y, z = ((coords - coords.amin(0)) * fineness).double().floor().long().unbind(-1)
-        return (x * 2**21 + y) * 2**21 + z
+        x, y, z = (inside * fineness).long().unbind(-1)
+        return kind * CELLS + (x * 2**19 + y) * 2**19 + z
 
-    low, high = 1e-3, 1e4
+    low, high = 0.5, 2.0**18  # cells along the longest side
     while high / low > 1.01:
         middle = (low * high) ** 0.5
         low, high = (middle, high) if len(torch.unique(cells(middle))) <= limit else (low, middle)
-    return thinned(points, cells(low))
+    return cells(low)

@@ -40,7 +40,7 @@ class Shape:
 
     group: Group
     points: np.ndarray  # (N, 3) canonical, scene units; NaN where unknown
-    error: float  # median reprojection error, pixels
+    error: float  # median reprojection error, pixels; inf where no track could be placed
 
     def at(self, t: int) -> np.ndarray:
         """World points (N, 3) at a time."""
@@ -51,14 +51,15 @@ class Shape:
 def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
     """The shape and motion that explain the tracks' pixels best, from those that depth alone gave."""
     group = without_turning(tracks, group)
+    points, every = np.full((len(group.members), 3), np.nan), Problem(tracks, group, cameras)
+    if not every.use.any():
+        return Shape(group, points, np.inf)
     longest = np.argsort(-(tracks.trust[group.members] > 0).sum(1), kind="stable")[:MOST]
     some = replace(group, members=group.members[np.sort(longest)])
     problem = Problem(tracks, some, cameras)
     state, cost = problem.solve(State(problem.start, group.rotations, group.shifts), ITERATIONS)
     state = problem.unreversed(state, cost)
-    every = Problem(tracks, group, cameras)
     state = every.points_for(state)
-    points = np.full((len(group.members), 3), np.nan)
     points[every.use] = state.points + group.centre
     error = np.linalg.norm(every.residuals(state)[0], axis=-1)[every.seen]
     return Shape(replace(group, rotations=state.rotations, shifts=state.shifts), points, float(np.median(error)))

@@ -10,7 +10,8 @@ import numpy as np
 from scipy import ndimage
 from scipy.cluster.vq import kmeans2
 from scipy.sparse import coo_matrix, diags
-from scipy.sparse.linalg import eigsh
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 from scipy.spatial import cKDTree
 
 STRIDE = 3  # pixels between tracks
@@ -19,6 +20,7 @@ SHORTEST = 3  # frames a track must last
 LINK = 6.0  # pixels: neighbours in a picture
 PARTING = 1.0  # pixels a frame: neighbours that part faster hardly belong together
 PARTS = 10  # the graph is cut into, before joining
+CUTTING = 1000  # iterations; a graph that holds together takes ten
 WORSE = 1.3  # times the residual that two groups have alone is still one motion
 RELIEF = 0.1  # of a thing's size: what wrong depth may add to a residual
 MOST = 1000  # tracks that groups are found from
@@ -153,6 +155,8 @@ def size_of(tracks: Tracks, group: Group) -> float:
 def parts(tracks: Tracks) -> np.ndarray:
     """A part (N,) for every track: normalised cuts (Shi & Malik 2000) through the graph of neighbours, too many rather than too few."""
     n, num = tracks.trust.shape
+    if num < 2 or n < 3 * PARTS:
+        return np.zeros(n, int)
     found = [np.zeros((0, 2), int)]
     for t in range(num):
         seen = np.nonzero(tracks.trust[:, t])[0]
@@ -162,14 +166,16 @@ def parts(tracks: Tracks) -> np.ndarray:
     strength = affinity(tracks, pairs)
     graph = coo_matrix((strength, pairs.T), (n, n)).tocsr()
     graph = graph + graph.T + diags(np.full(n, 1e-6))
-    count = min(PARTS, n)
-    if count < 2 or n < 3 * PARTS:
-        return np.zeros(n, int)
     scale = diags(1 / np.sqrt(np.asarray(graph.sum(1)).ravel()))
     start = np.random.default_rng(0).standard_normal(n)
-    _, vectors = eigsh(scale @ graph @ scale, count, which="LA", v0=start)
+    try:
+        _, vectors = eigsh(scale @ graph @ scale, PARTS, which="LA", v0=start, maxiter=CUTTING)
+    except ArpackNoConvergence:  # the graph lies in pieces, which are parts already
+        piece = connected_components(graph)[1]
+        rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"))
+        return np.minimum(rank[piece], PARTS - 1)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
-    return kmeans2(vectors, count, minit="++", rng=np.random.default_rng(0))[1]
+    return kmeans2(vectors, PARTS, minit="++", rng=np.random.default_rng(0))[1]
 
 
 def affinity(tracks: Tracks, pairs: np.ndarray) -> np.ndarray:

@@ -86,7 +86,7 @@ def apply(
     distance, nearest = distance.reshape(len(y), -1), nearest.reshape(len(y), -1)
     weight = (label[nearest] == label[nearest[:, :1]]) / (distance + 0.5) ** 2
     found = (weight * value[nearest]).sum(1) / weight.sum(1)
-    near = (distance[:, 0] < REACH) & (np.abs(np.log(found / disparity[y, x])) < np.log(CHANGE))
+    near = (distance[:, 0] < REACH) & (np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9))) < np.log(CHANGE))
     y, x = y[near], x[near]
     disparity[y, x] = found[near]
     confidence[y, x] = np.maximum(confidence[y, x], SURE * np.exp(-((distance[near, 0] / REACH) ** 2)))
