@@ -16,7 +16,7 @@ LEAST_TRACKS = 60  # of a group that can be adjusted
 GOOD = 0.8  # pixels: median reprojection error of a shape that is believed
 NEIGHBOURS = 4  # tracks that a pixel's depth is taken from
 REACH = 8.0  # pixels to the nearest of them
-SURE = 0.7  # confidence right at a track
+SURE = 0.5  # confidence right at a track: its distance as a whole is the prior's
 CHANGE = 1.5  # a pixel's depth may change by this factor
 
 
