@@ -116,7 +116,7 @@ def test_nothing_changes_outside_the_masks(clip: Clip, found: tuple[np.ndarray, 
 def test_confidence_grows_at_tracks_and_never_falls(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
     confidence = found[1]
     assert (confidence >= clip.confidence).all()
-    assert 0.65 < np.median(confidence[clip.moving]) <= confidence[clip.moving].max() <= 0.7
+    assert 0.46 < np.median(confidence[clip.moving]) <= confidence[clip.moving].max() <= 0.5
 
 
 def test_what_was_given_stays_as_it_was(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
@@ -173,7 +173,7 @@ def test_a_pixel_takes_the_depth_of_the_tracks_near_it_unless_it_differs_much(sh
     group = Group(np.eye(3)[None], np.zeros((1, 3)), np.zeros(3), np.array([0]), np.array([True]))
     apply(short.shots, 0, 0, tracks, [Shape(group, points, 0.1)], disparity, confidence)
     assert disparity[32, [48, 49, 50, 51, 57]] == pytest.approx([1 / 2.2, 1 / 2.2, 0, 0.3, 0.4])  # 57 is out of reach
-    assert confidence[32, [48, 49, 50, 57]] == pytest.approx([0.7, 0.9, 0, 0])
+    assert confidence[32, [48, 49, 50, 57]] == pytest.approx([0.5, 0.9, 0, 0])
 
 
 def test_wild_flow_is_no_error(short: Clip) -> None:
