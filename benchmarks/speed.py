@@ -34,6 +34,7 @@ def main() -> None:
     parser.add_argument("--bf16", action="store_true")
     args = parser.parse_args()
     device = pick_device(args.device)
+    torch.set_num_threads(PRESETS[args.preset].torch_threads or torch.get_num_threads())
     total = args.warm_up + args.steps
     with tempfile.TemporaryDirectory() as folder:
         config = replace(PRESETS[args.preset], scene=args.scene, out=Path(folder), steps=2 * total, minutes=None, bf16=args.bf16)
@@ -50,14 +51,14 @@ def main() -> None:
 
         run(args.warm_up)
         seconds = run(args.steps)
-    rays = (config.rays + config.moving_rays) * config.batches
+    rays = (config.rays + config.moving_rays or trainer.scene.train[0].image[..., 0].numel()) * config.batches
     result = {
         "preset": args.preset,
         "device": torch.cuda.get_device_name()
         if device.type == "cuda"
         else f"{platform.machine()}, {torch.get_num_threads()} threads",
         "torch": torch.__version__,
-        "samples": config.field.samples,
+        "samples": getattr(config.field, "samples", None),  # Gaussians have none
         "steps_per_second": round(args.steps / seconds, 3),
         "rays_per_second": round(rays * args.steps / seconds),
         "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),

@@ -1,7 +1,7 @@
 """Dynamic radiance as 4D Gaussians in linear HDR: static ones, and moving ones on shared trajectories. Colour is the exponential of
 a log radiance, unbounded; movers' changes in time, and static ones' brightens or darkens slowly (shadows of movers).
 
-The number of Gaussians is fixed: ones that fade away are given new places where the error is (`relocate.py`)."""
+The number of Gaussians is fixed by the settings; ones that fade away draw nothing and cost next to nothing."""
 
 from __future__ import annotations
 
@@ -232,7 +232,7 @@ class Splat(nn.Module):
         return groups
 
     def after_step(self, step: int) -> None:
-        """Nothing yet."""
+        """Nothing to do between steps."""
 
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""
