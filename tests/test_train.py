@@ -62,7 +62,7 @@ def test_another_seed_gives_others(unbroken: Path, toy_folder: Path, tmp_path: P
     assert not torch.equal(final(unbroken)[name], other[name])
 
 
-@pytest.mark.parametrize("preset", ["grid", "paper"])
+@pytest.mark.parametrize("preset", ["splat", "grid", "paper"])
 def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
     preset: str, unbroken: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
