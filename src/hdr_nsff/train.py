@@ -194,6 +194,10 @@ class Trainer:
         """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
         clock, config = self.clock, self.config
         self.field.train()
+        if config.torch_threads:
+            torch.set_num_threads(
+                config.torch_threads
+            )  # again: numba's kernels set the count of the OpenMP library that both share
         if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)
