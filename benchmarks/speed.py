@@ -34,7 +34,6 @@ def main() -> None:
     parser.add_argument("--bf16", action="store_true")
     args = parser.parse_args()
     device = pick_device(args.device)
-    torch.set_num_threads(PRESETS[args.preset].torch_threads or torch.get_num_threads())
     total = args.warm_up + args.steps
     with tempfile.TemporaryDirectory() as folder:
         config = replace(PRESETS[args.preset], scene=args.scene, out=Path(folder), steps=2 * total, minutes=None, bf16=args.bf16)

@@ -71,8 +71,6 @@ def train(config: TrainConfig) -> Path:
         if ranks.world > config.batches:
             raise InputError(f"{ranks.world} processes share {config.batches} batches a step; start fewer, or raise --batches")
         device, scene = pick_device(config.device), Scene.open(config.scene)
-        if config.torch_threads:
-            torch.set_num_threads(config.torch_threads)
         if ranks.main:
             open_folder(config)
         trainer = Trainer(config, scene, device, ranks)
@@ -194,10 +192,8 @@ class Trainer:
         """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
         clock, config = self.clock, self.config
         self.field.train()
-        if config.torch_threads:
-            torch.set_num_threads(
-                config.torch_threads
-            )  # again: numba's kernels set the count of the OpenMP library that both share
+        if config.torch_threads:  # every step: numba's kernels set the count of the OpenMP library that both share
+            torch.set_num_threads(config.torch_threads)
         if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)

@@ -35,7 +35,7 @@ def seed(field: Splat, scene: Scene, to_radiance: ToRadiance, typical: float, fr
         field.background.fill_(typical)
         if not from_priors or any(f.disparity is None for f in frames):
             scatter(field, scene, typical)
-            return "Gaussians start at random places, without a depth prior in scene units"
+            return "static Gaussians start at random places and moving ones not at all, without a depth prior in scene units"
         static = joined([lift(f, i, still(f), scene.near, scene.far, to_radiance) for i, f in enumerate(frames)])
         count = place(field.static, thin(static, scene, int(FILL * len(field.static))))
         groups, moving = movers(field, scene, to_radiance)
@@ -225,7 +225,8 @@ def share_bases(field: Splat, groups: list[Group], points: Tensor, owner: Tensor
 
 
 def spread(points: Tensor, count: int, centre: Tensor) -> Tensor:
-    """`count` places (count, 3) spread over points by farthest-point choice and a few rounds of k-means; one is the given centre."""
+    """`count` places (count, 3) spread over points by farthest-point choice and a few rounds of k-means; the given
+    centre where one is enough, or the points are too few."""
     if count == 1 or len(points) < count:
         return centre.expand(count, 3).clone()
     chosen = [points[(points - points.mean(0)).norm(dim=-1).argmax()]]
