@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import torch
@@ -35,36 +36,40 @@ class PixelBatch:
 
 def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = None) -> PixelBatch:
     """The batch of integer `pixels` (N, 2; column, row) of training frame `frame`."""
-    f: Frame = scene.train[frame]
     column, row = pixels[:, 0], pixels[:, 1]
+    return read_off(scene, frame, pixels + 0.5, lambda image: image[row, column], uniform)
 
-    def at(image: Tensor | None) -> Tensor | None:
-        return None if image is None else image[row, column]
 
-    neighbours = {o: scene.train[j].camera for o, j in f.neighbours.items()}
+def whole_frame(scene: Scene, frame: int) -> PixelBatch:
+    """The batch of every pixel of training frame `frame`, row by row: views of its images, not copies."""
+    return read_off(scene, frame, scene.train[frame].camera.pixel_grid(), lambda image: image.flatten(0, 1))
+
+
+def read_off(
+    scene: Scene, frame: int, pixels: Tensor, at: Callable[[Tensor], Tensor], uniform: Tensor | None = None
+) -> PixelBatch:
+    """The batch of `pixels` (N, 2; centres at +0.5) of training frame `frame`; `at` takes an image (H, W, ...) to its values there."""
+    f: Frame = scene.train[frame]
+
+    def maybe(image: Tensor | None) -> Tensor | None:
+        return None if image is None else at(image)
+
     return PixelBatch(
         frame=frame,
         time=f.time,
         camera=f.camera,
         camera_id=f.camera_id,
         bracket=f.bracket,
-        neighbours=neighbours,
-        pixels=pixels.to(f.image) + 0.5,
-        rgb=f.image[row, column],
-        uniform=torch.ones(len(pixels), dtype=torch.bool, device=pixels.device) if uniform is None else uniform,
-        moving=at(f.moving),
-        disparity=at(f.disparity),
-        disparity_confidence=at(f.disparity_confidence),
-        flow={o: v[row, column] for o, v in f.flow.items()},
-        flow_valid={o: v[row, column] for o, v in f.flow_valid.items()},
+        neighbours={o: scene.train[j].camera for o, j in f.neighbours.items()},
+        pixels=pixels.to(f.image),
+        rgb=at(f.image),
+        uniform=torch.ones(len(pixels), dtype=torch.bool, device=f.image.device) if uniform is None else uniform,
+        moving=maybe(f.moving),
+        disparity=maybe(f.disparity),
+        disparity_confidence=maybe(f.disparity_confidence),
+        flow={o: at(v) for o, v in f.flow.items()},
+        flow_valid={o: at(v) for o, v in f.flow_valid.items()},
     )
-
-
-def whole_frame(scene: Scene, frame: int) -> PixelBatch:
-    """The batch of every pixel of training frame `frame`, row by row."""
-    h, w = scene.train[frame].image.shape[:2]
-    flat = torch.arange(h * w, device=scene.train[frame].image.device)
-    return gather(scene, frame, torch.stack([flat % w, flat // w], -1))
 
 
 def draw_pixels(scene: Scene, frame: int, num_uniform: int, num_moving: int, generator: torch.Generator) -> PixelBatch:

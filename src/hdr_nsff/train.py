@@ -112,7 +112,6 @@ class Trainer:
         self.marks = [marks for g in touched for marks in g["touched"]]  # rows with a gradient, of any process
         self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimisers.items()}
         self.clock = Clock(config, len(scene.train), 0, 0.0)
-        self.frames: dict[int, PixelBatch] = {}
         self.resume_or_initialise()
         self.scene = to_device(scene, device)
         self.field.to(device)
@@ -236,15 +235,9 @@ class Trainer:
         frame = int(torch.randint(len(self.scene.train), (1,), generator=generator))
         when = clock.progress if config.period else clock.phase
         moving = config.moving_rays if when < config.moving_until else 0
-        batch = draw_pixels(self.scene, frame, config.rays, moving, generator) if config.rays else self.whole_frame(frame)
+        batch = draw_pixels(self.scene, frame, config.rays, moving, generator) if config.rays else whole_frame(self.scene, frame)
         chain = (1 if clock.step % 2 else -1) if clock.phase >= 2 and config.loss.chain else 0
         return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), chain=chain)
-
-    def whole_frame(self, frame: int) -> PixelBatch:
-        """The batch of all pixels of a frame, made once."""
-        if frame not in self.frames:
-            self.frames[frame] = whole_frame(self.scene, frame)
-        return self.frames[frame]
 
     def check(self, terms: dict[str, Tensor], batch: PixelBatch, radiance: Tensor) -> None:
         """NaN and Inf are errors with the step, the term and the ray."""

@@ -102,31 +102,30 @@ class Splat(nn.Module):
         """A knot as a share of the clip."""
         return knot / max(len(self.times) - 1, 1)
 
-    def draw(self, camera: Camera, knot: float, extra: list[Tensor]) -> Maps:
-        """Rasterise radiance (3), motion (1) and `extra` features (G, ...) at a knot."""
-        mixture = self.mixture_logits.softmax(0)
-        moved = self.trajectories.move(self.moving.means, mixture, knot)
-        turned = self.trajectories.turn(self.moving.quaternions, mixture, knot)
-        still, moving, share = self.static, self.moving, self.share(knot)
-        radiance = torch.cat([still.radiance(share), moving.radiance(share)])
-        return rasterize(
+    def cloud(self, knot: float) -> GaussianCloud:
+        """All Gaussians at a knot, static ones first, differentiable in everything."""
+        mixture, share = self.mixture_logits.softmax(0), self.share(knot)
+        still, moving = self.static, self.moving
+        moved = self.trajectories.move(moving.means, mixture, knot)
+        turned = self.trajectories.turn(moving.quaternions, mixture, knot)
+        return GaussianCloud(
             torch.cat([still.means, moved]),
             torch.cat([still.quaternions, turned]),
             torch.cat([still.log_scales, moving.log_scales]).exp(),
             self.opacities(share),
-            torch.cat([radiance, self.is_moving(), *extra], 1),
-            camera,
+            torch.cat([still.radiance(share), moving.radiance(share)]),
+            torch.cat([still.means.new_zeros(len(still)), still.means.new_ones(len(moving))]),
         )
+
+    def draw(self, camera: Camera, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
+        """Rasterise radiance (3), motion (1) and `extra` features (G, ...)."""
+        features = torch.cat([cloud.radiance, cloud.motion[:, None], *extra], 1)
+        return rasterize(cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features, camera)
 
     def opacities(self, share: float) -> Tensor:
         """(G,) in [0, 1] at a share of the clip."""
         present = linear(self.presence, share * (len(self.presence) - 1))
         return torch.cat([self.static.logits, self.moving.logits + present]).sigmoid()
-
-    def is_moving(self) -> Tensor:
-        """(G, 1): 1 for moving Gaussians."""
-        ones = self.moving.means.new_ones(len(self.moving), 1)
-        return torch.cat([ones.new_zeros(len(self.static), 1), ones])
 
     def positions(self, knot: float) -> Tensor:
         """Means (G, 3) of all Gaussians at a knot."""
@@ -136,16 +135,7 @@ class Splat(nn.Module):
     @torch.no_grad()
     def gaussians(self, time: float) -> GaussianCloud:
         """All that draw anything, static ones first, at `time` in frames: what `render` composites over the background."""
-        knot, still, moving = self.knot(time), self.static, self.moving
-        turned = self.trajectories.turn(moving.quaternions, self.mixture_logits.softmax(0), knot)
-        cloud = GaussianCloud(
-            self.positions(knot),
-            torch.cat([still.quaternions, turned]),
-            torch.cat([still.log_scales, moving.log_scales]).exp(),
-            self.opacities(self.share(knot)),
-            torch.cat([g.radiance(self.share(knot)) for g in (still, moving)]),
-            self.is_moving()[:, 0],
-        )
+        cloud = self.cloud(self.knot(time))
         return tree_map(lambda t: t[cloud.opacities > FAINTEST], cloud)
 
     def composed(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -162,14 +152,15 @@ class Splat(nn.Module):
         """Every pixel of `camera` (row by row) or the ones `pixels` (S, 2) lie in, at `time` in frames, without gradients.
         Scene flow is the displacement to one training interval later and earlier; at the clip's ends it goes straight on."""
         knot = self.knot(time)
-        here = self.positions(knot)
+        cloud = self.cloud(knot)
+        here = cloud.means
         flow = [torch.zeros_like(here), torch.zeros_like(here)]
         last = len(self.times) - 1
         for i, o in enumerate((1, -1)):
             inside = 0 <= knot + o <= last
             if inside or 0 <= knot - o <= last:
                 flow[i] = self.positions(knot + o) - here if inside else here - self.positions(knot - o)
-        maps = self.draw(camera, knot, flow)
+        maps = self.draw(camera, cloud, flow)
         radiance, depth, opacity, motion = self.composed(maps)
         depth = depth.clamp(self.near, self.far)
         seen = maps.features.flatten(0, 1)
@@ -181,8 +172,9 @@ class Splat(nn.Module):
         knot = self.knot(batch.time)
         sides = [o for o in batch.neighbours if o in batch.flow]
         wanted = [sides[batch.seed % len(sides)]] if sides else []  # one side a step is half the work
-        flows = [self.displacements(batch, knot, o) for o in wanted]
-        maps = self.draw(batch.camera, knot, flows)
+        cloud = self.cloud(knot)
+        flows = [self.displacements(batch, cloud.means, knot, o) for o in wanted]
+        maps = self.draw(batch.camera, cloud, flows)
         radiance, depth, opacity, motion = self.composed(maps)
         seen = maps.features.flatten(0, 1)
         scale = 1 / opacity.clamp_min(1e-3)[:, None]
@@ -193,9 +185,9 @@ class Splat(nn.Module):
         self.trajectories.mark(knot)
         return picked(render, batch.camera, batch.pixels), self.regularizers(knot)
 
-    def displacements(self, batch: PixelBatch, knot: float, offset: int) -> Tensor:
-        """Pixels (G, 2) from where the batch's camera sees each Gaussian to where the neighbour sees it at its time."""
-        here = batch.camera.project(self.positions(knot))[0]
+    def displacements(self, batch: PixelBatch, means: Tensor, knot: float, offset: int) -> Tensor:
+        """Pixels (G, 2) from where the batch's camera sees each Gaussian's mean (G, 3) to where the neighbour sees it at its time."""
+        here = batch.camera.project(means)[0]
         there = batch.neighbours[offset].project(self.positions(min(max(knot + offset, 0), len(self.times) - 1)))[0]
         return (there - here).clamp(-2 * batch.camera.width, 2 * batch.camera.width)
 
