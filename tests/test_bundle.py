@@ -34,7 +34,7 @@ def tracked(pixels: np.ndarray, far: float = 1.0, lasting: int = 10) -> Tracks:
     depth = far * (PLACES - EYES)[:, 2:]
     points = np.concatenate([(pixels - [160, 100]) / FOCAL * depth, np.broadcast_to(depth, (*pixels.shape[:2], 1))], -1) + EYES
     hide = np.where(seen, 1.0, np.nan)[..., None]
-    return Tracks(pixels * hide, points * hide, seen.astype(float), seen.astype(int))
+    return Tracks(pixels * hide, points * hide, seen.astype(float), seen.astype(int), np.zeros(seen.shape, int))
 
 
 @cache
@@ -139,7 +139,18 @@ def test_far_off_tracks_weigh_less() -> None:
     s = true_state(problem)
     error, turned, local = problem.residuals(s)
     weight = problem.slopes(error + np.array([7.0, 0.0]), turned, local, s)[2][problem.seen]
-    assert weight == pytest.approx(0.7 / 7.0 / 0.7**2)  # Huber beyond 0.7 px: 1 / length
+    assert weight == pytest.approx(0.4 / 7.0 / 0.4**2)  # Huber beyond 0.4 px: 1 / length
+
+
+def test_old_tracks_weigh_less() -> None:
+    young = tracked(pixels_of(TRUE))
+    old = replace(young, age=np.full(young.age.shape, 3))
+    group = without_turning(young, fit(young, np.arange(COUNT)))
+    weights = []
+    for problem in (Problem(young, group, CAMERAS), Problem(old, group, CAMERAS)):
+        s = true_state(problem)
+        weights.append(problem.slopes(*problem.residuals(s), s)[2][problem.seen])
+    assert weights[0] == pytest.approx(4 * weights[1])  # the errors of three more steps have four times the variance
 
 
 def test_points_are_placed_by_known_poses() -> None:
@@ -170,7 +181,7 @@ def test_a_tenth_of_wrong_tracks_does_not_spoil_the_others(spread: float) -> Non
 def test_noisy_tracks_still_tell() -> None:
     tracks = tracked(pixels_of(TRUE) + np.random.default_rng(6).normal(0, 0.5, (COUNT, TIMES, 2)))
     shape = adjust(tracks, fit(tracks, np.arange(COUNT)), CAMERAS)
-    assert 0.3 < shape.error < 0.7  # half a pixel in x and y has a median length of 0.59
+    assert 0.3 < 0.4 * shape.error < 0.7  # half a pixel in x and y has a median length of 0.59; the unit is 0.4 pixels
     assert likeness(of_shape(shape)).min() > 0.98
 
 
@@ -194,7 +205,7 @@ def test_short_tracks_are_no_error(lasting: int) -> None:
 def test_few_times_are_no_error(times: int) -> None:
     full, some = tracked(pixels_of(TRUE)), slice(4, 4 + times)
     seen = (full.trust[:, some] > 0).any(1)
-    tracks = Tracks(*(a[seen, some] for a in (full.pixels, full.points, full.trust, full.patch)))
+    tracks = Tracks(*(a[seen, some] for a in (full.pixels, full.points, full.trust, full.patch, full.age)))
     shape = adjust(tracks, fit(tracks, np.arange(seen.sum())), Cameras(K[some], CAMERAS.c2w[some]))
     assert np.isfinite(shape.group.rotations).all() and (np.isinf(shape.error) if times == 1 else shape.error < 1)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.groups import PARTS, Tracks, View, advance, fit, gather, parts, rigid
+from hdr_nsff.priors.groups import PARTS, Tracks, View, advance, fit, follow, gather, parts, rigid, settled
 
 TIMES = 14
 
@@ -29,7 +29,7 @@ def tracked(points: np.ndarray, noise: float = 0.0, seed: int = 0) -> Tracks:
     first = rng.integers(0, TIMES // 2, len(points))[:, None]
     seen = (np.arange(TIMES) >= first) & (np.arange(TIMES) < first + TIMES // 2)
     hide = np.where(seen, 1.0, np.nan)[..., None]
-    return Tracks(pixels * hide, points * hide, seen.astype(float), seen.astype(int))
+    return Tracks(pixels * hide, points * hide, seen.astype(float), seen.astype(int), np.zeros(seen.shape, int))
 
 
 def test_a_rigid_fit_survives_a_third_of_wrong_points() -> None:
@@ -85,11 +85,44 @@ def test_a_track_ends_where_flow_is_not_believed_or_leaves_the_moving_pixels() -
     assert out[0].tolist() == [3.5, 3.5] and np.isnan(out[1:]).all()
 
 
+def test_flow_is_averaged_over_what_moves_alike_and_is_believed() -> None:
+    flow = np.random.default_rng(0).normal(0, 0.3, (30, 40, 2)).astype(np.float32)
+    flow[:, 20:] += [9.0, 0.0]  # another thing
+    told = np.ones((30, 40), bool)
+    told[10, 10], flow[10, 10] = False, 100
+    found = settled(flow, told)
+    assert np.isnan(found[10, 10]).all()
+    error = found - np.where(np.arange(40)[:, None] < 20, [0.0, 0.0], [9.0, 0.0])
+    assert np.nanstd(error) < 0.3 / 3 and np.nanmax(abs(error)) < 0.6  # nothing leaks across
+
+
+def test_tracks_follow_a_flow_between_pixels_and_count_their_steps() -> None:
+    moving = np.ones((20, 60), bool)
+    flow = np.full((20, 60, 2), [1.25, 0.0], np.float32)
+    both = {1: flow, -1: -flow}
+    views = [View(moving, np.zeros((20, 60, 3)), moving.astype(float), both, {1: moving, -1: moving}) for _ in range(4)]
+    tracks = follow(views)
+    begun = np.argmin(tracks.age, 1)
+    here = np.take_along_axis(tracks.pixels[..., 0], begun[:, None], 1)
+    expected = here + 1.25 * (np.arange(4) - begun[:, None])
+    seen = tracks.trust > 0
+    assert np.allclose(tracks.pixels[..., 0][seen], expected[seen], atol=1e-4)
+    assert np.array_equal(tracks.age, abs(np.arange(4) - begun[:, None]))
+
+
+def test_tracks_end_between_two_things() -> None:
+    moving = np.ones((9, 40), bool)
+    flow = np.where(np.arange(40)[None, :, None] < 20, np.float32([6.0, 0.0]), np.float32([-3.0, 0.0])).repeat(9, 0)
+    view = View(moving, np.zeros((9, 40, 3)), moving.astype(float), {1: flow}, {1: moving})
+    out = advance(view, view, 1, np.array([[19.0, 4.5], [20.0, 4.5], [21.2, 4.5]]))  # the border is at x = 20
+    assert out[0, 0] == pytest.approx(25) and np.isnan(out[1, 0]) and out[2, 0] == pytest.approx(18.2)
+
+
 def test_tracks_without_neighbours_are_parts_by_themselves() -> None:
     points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1, count=12)
     near = tracked(points)
     far = [replace(near, pixels=near.pixels + 1000.0 * k) for k in range(12)]
-    every = Tracks(*(np.concatenate([getattr(t, f) for t in far]) for f in ("pixels", "points", "trust", "patch")))
+    every = Tracks(*(np.concatenate([getattr(t, f) for t in far]) for f in ("pixels", "points", "trust", "patch", "age")))
     assert len(np.unique(parts(every))) == PARTS
 
 
@@ -98,5 +131,5 @@ def test_one_time_is_no_error() -> None:
     points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1)
     pixels = 200 * points[:, :1, :2] / points[:, :1, 2:] + 100
     once = np.ones((len(points), 1))
-    groups = gather(Tracks(pixels, points[:, :1], once, once.astype(int)))
+    groups = gather(Tracks(pixels, points[:, :1], once, once.astype(int), once.astype(int)))
     assert len(groups) == 1 and abs(groups[0].shifts).max() < 1e-12

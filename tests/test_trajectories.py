@@ -85,10 +85,10 @@ def test_constant_acceleration_is_smooth_and_a_jump_is_not() -> None:
     t = Trajectories(2, KNOTS)
     shifts = t.shifts.data.view(KNOTS, 2, 4)
     shifts[:, 0, 0] = torch.arange(KNOTS) ** 2
-    assert float(t.roughness(4.0).detach()) == 0
+    assert float(t.roughness(4.0, 1.0).detach()) == 0
     shifts[5, 1, 2] = 1.0
-    assert float(t.roughness(4.0).detach()) > 0.1
-    assert float(t.roughness(0.0).detach()) == 0  # the jump is too far away to be seen from there
+    assert float(t.roughness(4.0, 1.0).detach()) > 0.1
+    assert float(t.roughness(0.0, 1.0).detach()) == 0  # the jump is too far away to be seen from there
 
 
 def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
@@ -98,7 +98,9 @@ def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
     knot = 9.3
     t.mark(knot)
     (
-        t.move(random(5, 3), mixture, knot).square().sum() + t.turn(random(5, 4), mixture, knot)[:, 1].sum() + t.roughness(knot)
+        t.move(random(5, 3), mixture, knot).square().sum()
+        + t.turn(random(5, 4), mixture, knot)[:, 1].sum()
+        + t.roughness(knot, 1.0)
     ).backward()
     for values, touched in ((t.turns, t.turns_touched), (t.shifts, t.shifts_touched)):
         has = (values.grad != 0).any(1)

@@ -44,8 +44,8 @@ class LossWeights:
     """Mean opacity of Gaussians: what is not needed fades and is used elsewhere."""
     scale: float = 0.01
     """Mean scale of Gaussians, in units of the near depth."""
-    trajectory: float = 1.0
-    """Third differences of the shared motions."""
+    trajectory: float = 30.0
+    """Square of third differences of the shared motions, in units of the near depth."""
     shade: float = 0.01
     """Square of static Gaussians' changes of log radiance in time."""
     presence: float = 1e-3

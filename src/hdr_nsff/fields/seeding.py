@@ -4,6 +4,7 @@ rigid motions that flow and depth tell, in the radiance that the initial respons
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -16,7 +17,9 @@ from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat import Gaussians, Splat
 from hdr_nsff.fields.surface import CELLS, Points, ToRadiance, cells_for, joined, lift, thinned, thinned_to
+from hdr_nsff.priors.bundle import Cameras, Shape
 from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather
+from hdr_nsff.priors.relief import apply, shape_of
 from hdr_nsff.scene import Frame, Scene
 
 DEPTH_CELLS = 12.0  # a cell is this many times longer along the view than across, as shares of the frustum
@@ -102,15 +105,20 @@ def scatter(field: Splat, scene: Scene, typical: float) -> None:
 
 def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, int]:
     """Fit groups and their motions, share out the bases, place moving Gaussians; how many groups and Gaussians."""
-    views, frames = views_of(field, scene)
+    views, frame_of = views_of(field, scene)
+    frames = [scene.train[i] for i in frame_of]
     if not any(v.moving.any() for v in views):
         return 0, 0
     tracks = follow(views)
-    groups = gather(tracks)[: field.config.bases] if len(tracks.trust) else []
-    groups = groups or [drift(views)]
+    found = gather(tracks)[: field.config.bases] if len(tracks.trust) else []
+    cameras = [f.camera for f in frames]
+    known = Cameras(*(torch.stack(m).double().numpy() for m in ([c.K for c in cameras], [c.c2w for c in cameras])))
+    shapes = [shape_of(tracks, g, known) for g in found]
+    groups = [s.group if s else g for g, s in zip(found, shapes, strict=True)] or [drift(views)]
+    frames = [relieved(f, t, tracks, [s for s in shapes if s]) for t, f in enumerate(frames)]
     seen = [t for t, v in enumerate(views) if v.moving.any()]
     key = sorted({seen[round(i)] for i in np.linspace(0, len(seen) - 1, min(KEY_FRAMES, len(seen))).tolist()})
-    parts = [mover_points(scene, frames[t], t, tracks, groups, to_radiance) for t in key]
+    parts = [mover_points(scene, frames[t], frame_of[t], t, tracks, groups, to_radiance) for t in key]
     points, owner = joined([p for p, _ in parts]), torch.cat([o for _, o in parts])
     limit = int(FILL * len(field.moving))
     cell = cells_for(points.positions, owner, limit)  # groups never share one
@@ -122,10 +130,9 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
 
 
 def mover_points(
-    scene: Scene, i: int, t: int, tracks: Tracks, groups: list[Group], to_radiance: ToRadiance
+    scene: Scene, f: Frame, i: int, t: int, tracks: Tracks, groups: list[Group], to_radiance: ToRadiance
 ) -> tuple[Points, Tensor]:
-    """The moving pixels of frame `i` (training time `t`) as points at their canonical places, and the group of each (P,)."""
-    f = scene.train[i]
+    """The moving pixels of a frame (the `i`-th of training, at time `t`) as points at their canonical places, and the group of each (P,)."""
     assert f.moving is not None
     points = lift(f, i, f.moving.reshape(-1), scene.near, scene.far, to_radiance)
     owner = owner_of(f, t, tracks, groups)
@@ -134,6 +141,15 @@ def mover_points(
         canonical[owner == g] = group.canonical(canonical[owner == g], t)
     positions = torch.from_numpy(canonical).float()
     return Points(positions, points.log_radiance, points.trust, points.footprint), torch.from_numpy(owner)
+
+
+def relieved(f: Frame, t: int, tracks: Tracks, shapes: list[Shape]) -> Frame:
+    """The frame of time `t` with the depth that the movers' shapes tell."""
+    assert f.disparity is not None and f.moving is not None
+    disparity = f.disparity.numpy().copy()
+    confidence = np.ones_like(disparity) if f.disparity_confidence is None else f.disparity_confidence.numpy().copy()
+    apply(f.moving.numpy(), f.camera.c2w.double().numpy(), t, tracks, shapes, disparity, confidence)
+    return replace(f, disparity=torch.from_numpy(disparity), disparity_confidence=torch.from_numpy(confidence))
 
 
 def views_of(field: Splat, scene: Scene) -> tuple[list[View], list[int]]:

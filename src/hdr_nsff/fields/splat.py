@@ -200,7 +200,7 @@ class Splat(nn.Module):
         return {
             "opacity": (opacities * alive).mean(),
             "scale": (scales * alive[:, None]).mean() / self.unit,
-            "trajectory": self.trajectories.roughness(knot),
+            "trajectory": self.trajectories.roughness(knot, self.unit),
             "shade": mean_square(still.offsets),
             "presence": mean_square(self.presence.diff(dim=0)),
             "colour_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),

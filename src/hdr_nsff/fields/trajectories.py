@@ -56,14 +56,14 @@ class Trajectories(nn.Module):
         for touched in (self.turns_touched, self.shifts_touched):
             touched.view(self.num_knots, self.num_bases)[low:high] = 1
 
-    def roughness(self, knot: float) -> Tensor:
-        """Mean square third difference of the poses near a knot (quaternions; shifts in scene units): 0 for constant acceleration."""
+    def roughness(self, knot: float, unit: float) -> Tensor:
+        """Mean square third difference of the poses near a knot (quaternions; shifts in `unit`): 0 for constant acceleration."""
         low, high = max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
         turns = nn.functional.normalize(self.turns.view(self.num_knots, self.num_bases, 4)[low:high], dim=-1)
         if high - low < 4:
             return turns.sum() * 0
         shifts = self.shifts.view(self.num_knots, self.num_bases, 4)[low:high]
-        return turns.diff(n=3, dim=0).square().sum(-1).mean() + shifts.diff(n=3, dim=0).square().sum(-1).mean()
+        return turns.diff(n=3, dim=0).square().sum(-1).mean() + (shifts / unit).diff(n=3, dim=0).square().sum(-1).mean()
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:

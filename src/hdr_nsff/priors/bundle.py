@@ -19,10 +19,11 @@ SPLIT = 3  # frames between the times tried
 QUICK = 8  # iterations that tell whether a try is better
 BETTER = 0.98  # of the cost: what a reversal must gain
 MOST = 400  # tracks that poses are found from
-NOISE = 0.7  # pixels: standard deviation of a track
-FAR_SIGMA = 0.01  # how well the mean z-depth of a time is known, as a share of it
-PATH_SIGMA = 0.02  # of the path's third differences, as a share of z-depth
-TURN_SIGMA = np.radians(4.0)  # of the second differences of its turning
+FEWEST = 3
+NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbours share their errors
+FAR_SIGMA = 0.02  # how well the mean z-depth of a time is known, as a share of it
+PATH_SIGMA = 0.002  # of the path's third differences, as a share of z-depth
+TURN_SIGMA = np.radians(2.0)  # of the second differences of its turning
 SHAPE_SIGMA = 2.0  # of a point's canonical place, as a share of the thing's size
 
 
@@ -40,7 +41,7 @@ class Shape:
 
     group: Group
     points: np.ndarray  # (N, 3) canonical, scene units; NaN where unknown
-    error: float  # median reprojection error, pixels; inf where no track could be placed
+    error: float  # median reprojection error in its standard deviations; inf where no track could be placed
 
     def at(self, t: int) -> np.ndarray:
         """World points (N, 3) at a time."""
@@ -49,20 +50,23 @@ class Shape:
 
 
 def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
-    """The shape and motion that explain the tracks' pixels best, from those that depth alone gave."""
-    group = without_turning(tracks, group)
-    points, every = np.full((len(group.members), 3), np.nan), Problem(tracks, group, cameras)
-    if not every.use.any():
-        return Shape(group, points, np.inf)
+    """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better."""
+    points = np.full((len(group.members), 3), np.nan)
     longest = np.argsort(-(tracks.trust[group.members] > 0).sum(1), kind="stable")[:MOST]
-    some = replace(group, members=group.members[np.sort(longest)])
-    problem = Problem(tracks, some, cameras)
-    state, cost = problem.solve(State(problem.start, group.rotations, group.shifts), ITERATIONS)
+    some, solved = group.members[np.sort(longest)], []
+    for start in (group, without_turning(tracks, group)):
+        problem = Problem(tracks, replace(start, members=some), cameras)
+        if problem.use.sum() >= FEWEST:
+            solved.append((*problem.solve(State(problem.start, start.rotations, start.shifts), ITERATIONS), problem, start))
+    if not solved:
+        return Shape(group, points, np.inf)
+    state, cost, problem, start = min(solved, key=lambda s: s[1])
     state = problem.unreversed(state, cost)
+    every = Problem(tracks, start, cameras)
     state = every.points_for(state)
     points[every.use] = state.points + group.centre
-    error = np.linalg.norm(every.residuals(state)[0], axis=-1)[every.seen]
-    return Shape(replace(group, rotations=state.rotations, shifts=state.shifts), points, float(np.median(error)))
+    error = (np.linalg.norm(every.residuals(state)[0], axis=-1) / every.noise)[every.seen]
+    return Shape(replace(start, rotations=state.rotations, shifts=state.shifts), points, float(np.median(error)))
 
 
 def without_turning(tracks: Tracks, group: Group) -> Group:
@@ -103,6 +107,7 @@ class Problem:
         seen, start, self.use = seen[use], start[use], use  # which members can be placed at all
         self.pixels = np.nan_to_num(tracks.pixels[group.members][use])  # (N, T, 2)
         self.seen, self.start, self.K = seen, start, cameras.K
+        self.noise = NOISE * np.sqrt(1.0 + tracks.age[group.members][use])  # (N, T) pixels
         self.w2c = np.swapaxes(cameras.c2w[:, :, :3], 1, 2)  # (T, 3, 3)
         self.eye = cameras.c2w[:, :, 3] - group.centre
         self.size = np.median(np.linalg.norm(start - np.median(start, 0), axis=-1)) + 1e-9 if len(start) else 1.0
@@ -185,7 +190,7 @@ class Problem:
     def cost(self, s: State) -> float:
         """Huber cost of everything."""
         error, _, local = self.residuals(s)
-        length = np.linalg.norm(error, axis=-1) / NOISE
+        length = np.linalg.norm(error, axis=-1) / self.noise
         huber = np.where(length < 1, 0.5 * length**2, length - 0.5)[self.seen].sum()
         return float(huber + 0.5 * sum((r**2).sum() for r in self.priors(s, local)))
 
@@ -193,8 +198,8 @@ class Problem:
         self, error: np.ndarray, turned: np.ndarray, local: np.ndarray, s: State
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Derivatives of the reprojection errors by pose (N, T, 2, 6: turn, shift) and by point (N, T, 2, 3), and weights (N, T, 1)."""
-        length = np.linalg.norm(error, axis=-1, keepdims=True) / NOISE
-        weight = self.seen[..., None] / np.maximum(length, 1) / NOISE**2  # (N, T, 1)
+        length = np.linalg.norm(error, axis=-1) / self.noise
+        weight = (self.seen / np.maximum(length, 1) / self.noise**2)[..., None]  # (N, T, 1)
         z = np.maximum(local[..., 2], 1e-3 * self.unit)
         fx, fy = self.K[:, 0, 0], self.K[:, 1, 1]
         zero = np.zeros_like(z)

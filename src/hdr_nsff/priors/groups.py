@@ -4,7 +4,7 @@ rigid motion over the clip by robust fits (Kabsch 1976, with iteratively reweigh
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -16,6 +16,8 @@ from scipy.spatial import cKDTree
 
 STRIDE = 3  # pixels between tracks
 STARTS = 12  # frames in which tracks start
+AVERAGE = 2  # pixels: how far around flow is averaged before it is followed
+UNLIKE = 2.0  # pixels: flows that differ more are of different things
 SHORTEST = 3  # frames a track must last
 LINK = 6.0  # pixels: neighbours in a picture
 PARTING = 1.0  # pixels a frame: neighbours that part faster hardly belong together
@@ -48,6 +50,7 @@ class Tracks:
     points: np.ndarray  # (N, T, 3) scene units, NaN where unseen
     trust: np.ndarray  # (N, T), 0 where unseen
     patch: np.ndarray  # (N, T) which connected patch of moving pixels it lies in, 0 where unseen
+    age: np.ndarray  # (N, T) steps of flow since its start: errors add up
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,10 @@ class Group:
 def follow(views: list[View]) -> Tracks:
     """Chains of flow through moving pixels, both ways from a few starting frames."""
     num = len(views)
-    parts = [chain(views, s) for s in sorted({round(i) for i in np.linspace(0, num - 1, min(STARTS, num)).tolist()})]
+    starts = sorted({round(i) for i in np.linspace(0, num - 1, min(STARTS, num)).tolist()})
+    views = [replace(view, flow={o: settled(f, view.valid[o] & view.moving) for o, f in view.flow.items()}) for view in views]
+    parts = [chain(views, s) for s in starts]
+    age = np.concatenate([np.tile(np.abs(np.arange(num) - s), (len(p), 1)) for s, p in zip(starts, parts, strict=True)])
     pixels = np.concatenate(parts)
     points, trust = np.full((*pixels.shape[:2], 3), np.nan), np.zeros(pixels.shape[:2])
     patch = np.zeros(pixels.shape[:2], int)
@@ -78,7 +84,20 @@ def follow(views: list[View]) -> Tracks:
         points[seen, t], trust[seen, t] = view.points[y, x], view.trust[y, x] + 0.02
         patch[seen, t] = ndimage.label(view.moving)[0][y, x]
     lasting = (trust > 0).sum(1) >= min(SHORTEST, num)
-    return Tracks(pixels[lasting], points[lasting], trust[lasting], patch[lasting])
+    return Tracks(pixels[lasting], points[lasting], trust[lasting], patch[lasting], age[lasting])
+
+
+def settled(flow: np.ndarray, told: np.ndarray) -> np.ndarray:
+    """`flow` (H, W, 2) averaged over the pixels around that are `told` (H, W) and move alike; NaN where none tell."""
+    reach = range(-AVERAGE, AVERAGE + 1)
+    flow, told = np.where(told[..., None], flow, 0).astype(np.float32), told.astype(np.float32)
+    weight, total = np.zeros_like(told), np.zeros_like(flow)
+    for shift in itertools.product(reach, reach):
+        other = np.roll(flow, shift, (0, 1))
+        alike = np.roll(told, shift, (0, 1)) * told * (np.abs(other - flow).max(-1) < UNLIKE)
+        weight += alike
+        total += other * alike[..., None]
+    return np.where((weight > 0)[..., None], total / np.maximum(weight, 1)[..., None], np.nan)
 
 
 def chain(views: list[View], start: int) -> np.ndarray:
@@ -101,7 +120,10 @@ def advance(view: View, following: View, step: int, at: np.ndarray) -> np.ndarra
     h, w = view.moving.shape
     seen = np.isfinite(at[:, 0])
     x, y = np.where(seen, at[:, 0], 0).astype(int), np.where(seen, at[:, 1], 0).astype(int)
-    out = at + view.flow[step][y, x]
+    places = np.where(seen[:, None], at, 0.5)[:, ::-1].T - 0.5
+    moved = np.stack([ndimage.map_coordinates(view.flow[step][..., c], places, order=1, mode="nearest") for c in (0, 1)], -1)
+    parted = np.abs(moved - view.flow[step][y, x]).max(-1) > 0.5 * UNLIKE  # between two things
+    out = np.where(parted[:, None], np.nan, at + moved)
     nx, ny = np.nan_to_num(out[:, 0], nan=-1), np.nan_to_num(out[:, 1], nan=-1)
     inside = seen & view.valid[step][y, x] & (nx >= 0) & (ny >= 0) & (nx < w) & (ny < h)
     landed = following.moving[ny.clip(0, h - 1).astype(int), nx.clip(0, w - 1).astype(int)]

@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from hdr_nsff.priors.bundle import Cameras, Shape, adjust
-from hdr_nsff.priors.groups import Tracks, View, follow, gather
+from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather
 from hdr_nsff.priors.movers import steps_in_time
 from hdr_nsff.priors.parallax import Shots
 from hdr_nsff.progress import say
 
 LEAST_TRACKS = 60  # of a group that can be adjusted
-GOOD = 0.8  # pixels: median reprojection error of a shape that is believed
+GOOD = 1.5  # standard deviations: median reprojection error of a shape that is believed
 NEIGHBOURS = 4  # tracks that a pixel's depth is taken from
 REACH = 8.0  # pixels to the nearest of them
 SURE = 0.5  # confidence right at a track: its distance as a whole is the prior's
@@ -34,12 +34,20 @@ def relief(
         return disparity, confidence
     cameras = Cameras(shots.K[frames], shots.c2w[frames])
     groups = [g for g in gather(tracks) if len(g.members) >= LEAST_TRACKS]
-    shapes = [s for s in (adjust(tracks, g, cameras) for g in groups) if s.error < GOOD]
+    shapes = [s for g in groups if (s := shape_of(tracks, g, cameras))]
     say(f"depth: the shape of {len(shapes)} of {len(groups)} moving things found from {len(tracks.trust)} tracks")
     disparity, confidence = disparity.copy(), confidence.copy()
     for t, f in enumerate(frames):
-        apply(shots, f, t, tracks, shapes, disparity[f], confidence[f])
+        apply(shots.moving[f], shots.c2w[f], t, tracks, shapes, disparity[f], confidence[f])
     return disparity, confidence
+
+
+def shape_of(tracks: Tracks, group: Group, cameras: Cameras) -> Shape | None:
+    """The group's shape and motion where its tracks tell them."""
+    if len(group.members) < LEAST_TRACKS or len(cameras.K) < 4:
+        return None
+    shape = adjust(tracks, group, cameras)
+    return shape if shape.error < GOOD else None
 
 
 def views_in_time(
@@ -67,19 +75,26 @@ def views_in_time(
 
 
 def apply(
-    shots: Shots, f: int, t: int, tracks: Tracks, shapes: list[Shape], disparity: np.ndarray, confidence: np.ndarray
+    moving: np.ndarray,
+    c2w: np.ndarray,
+    t: int,
+    tracks: Tracks,
+    shapes: list[Shape],
+    disparity: np.ndarray,
+    confidence: np.ndarray,
 ) -> None:
-    """Put the shapes' depth into one frame's maps (H, W), in place: every moving pixel near a track, from the tracks of its thing."""
+    """Put the shapes' depth into the maps (H, W) of time `t`, in place: every `moving` pixel near a track, from the tracks of its thing,
+    as the camera at `c2w` (3, 4) sees it."""
     at, inverse, owner = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0, int)]
     for k, shape in enumerate(shapes):
         pixels, points = tracks.pixels[shape.group.members, t], shape.at(t)
-        depth = (points - shots.c2w[f, :, 3]) @ shots.c2w[f, :, 2]
+        depth = (points - c2w[:, 3]) @ c2w[:, 2]
         told = np.isfinite(pixels[:, 0]) & np.isfinite(depth) & (depth > 1e-6)
         at.append(pixels[told])
         inverse.append(1 / depth[told])
         owner.append(np.full(int(told.sum()), k))
     place, value, label = np.concatenate(at), np.concatenate(inverse), np.concatenate(owner)
-    y, x = np.nonzero(shots.moving[f])
+    y, x = np.nonzero(moving)
     if not len(place) or not len(y):
         return
     distance, nearest = cKDTree(place).query(np.stack([x, y], -1) + 0.5, min(NEIGHBOURS, len(place)))
