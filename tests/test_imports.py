@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
 VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report"}
-TRUTH = {"evaluate", "synth", "reexpose"}  # who reads it, and the two that write it
+TRUTH = {"evaluate", "synth", "reexpose", "datasets.held_out"}  # who reads it, and those that write it
 HEAVY = {"pycolmap", "mitsuba", "rawpy", "flip_evaluator", "gsplat"}
 
 
@@ -74,6 +74,26 @@ def test_verbs_never_import_each_other(verb: str):
 
 def test_the_truth_is_read_by_evaluate_alone():
     assert {m for m in SOURCES if "truth" in own_imports(m)} == TRUTH
+
+
+def reached(module: str) -> set[str]:
+    """Every module of this package that a module imports, by itself or through others."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        for name in own_imports(waiting.pop()) - found:
+            found.add(name)
+            waiting.append(name)
+    return found
+
+
+@pytest.mark.parametrize("module", ["train", "steps.footage", "steps.priors", "datasets", "scene", "batch", "render"])
+def test_nothing_that_learns_or_prepares_can_reach_held_out_truth(module: str):
+    assert not reached(module) & {"truth", "datasets.held_out"}
+
+
+def test_only_prepare_writes_what_data_sets_keep_back():
+    assert {m for m in SOURCES if "datasets.held_out" in own_imports(m)} == {"prepare"}
 
 
 @pytest.mark.parametrize("library", sorted(HEAVY))

@@ -1,5 +1,5 @@
-"""A run against what it has never seen: held-out views with exact radiance (a truth folder), else held-out frames of the clip,
-else, named as such, its own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
+"""A run against what it has never seen: held-out views with exact radiance or as recorded (a truth folder), else held-out frames of
+the clip, else, named as such, its own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
 
 Recorded rgb is compared at the view's own exposure (the headline) and at all exposures of the clip; radiance after one scale
 for all views (METHOD.md 7): LDR recordings alone leave it free. Moving-only numbers average over the moving mask."""
@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from hdr_nsff.run import Run
 from hdr_nsff.scene import inside
 from hdr_nsff.shots import fingerprint, take
 from hdr_nsff.tonemap import informative
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff.truth import Truth, TruthView, match_brackets, scene_brackets, true_pictures
 
 SMALLEST_LPIPS = 64  # pixels
 
@@ -58,6 +58,7 @@ class Target:
     rgb: dict[int, Tensor]  # {bracket: (H, W, 3)} what the camera would record (or did) in [0, 1]
     radiance: Tensor | None  # (H, W, 3) exact, where known, in the camera's white balance: the unit of a run's radiance
     moving: Tensor | None  # (H, W) bool
+    novel: dict[float, Tensor] = field(default_factory=dict)  # {EV: (H, W, 3)} recorded at exposures that no bracket has
 
 
 def evaluate(config: EvaluateConfig) -> dict[str, Any]:
@@ -80,18 +81,21 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
     say(f"evaluating on {len(targets)} {kind}")
     folder = run.folder / "evaluation"
     radiance = predict(run, targets, folder)
-    gauge = find_gauge(targets, radiance) if truth else None
+    exact = [(t, r) for t, r in zip(targets, radiance, strict=True) if t.radiance is not None]
+    gauge = find_gauge([t for t, _ in exact], [r for _, r in exact]) if exact else None
     views = []
     for target, predicted in zip(targets, track(radiance, "measuring"), strict=True):
         scores = score_rgb(run, target, predicted, perceptual)
-        views.append(scores | (score_radiance(target, predicted, gauge) if gauge else {}))
+        views.append(scores | (score_radiance(target, predicted, gauge) if gauge and target.radiance is not None else {}))
     write_pictures(run, targets, radiance, gauge, folder)
     groups = {g: mean_of([v for v in views if v["group"] == g]) for g in dict.fromkeys(t.group for t in targets)}
     result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes, "headline": mean_of(views), "groups": groups}
-    if truth is not None and gauge is not None:
+    if truth is not None:
+        result |= {"camera": camera_errors(run, truth)} if truth.response_x is not None else {}
+        result |= {"poses": trajectory_errors(run, truth, targets)}
+    if gauge is not None:
         result |= {"hdr_scores": HDR_SCORES, "scale": float(gauge.scale), "scale_per_channel": gauge.scales.tolist()}
         result |= {"peak": gauge.peak, "recordable_peak": gauge.recordable_peak}
-        result |= {"camera": camera_errors(run, truth), "poses": trajectory_errors(run, truth, targets)}
         if result["headline"].get("hdr_flip") is None:
             notes.append("HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)")
     result |= {"lpips": lpips_note(lpips, views), "views": views, "seconds": round(time.monotonic() - start, 2)}
@@ -126,7 +130,8 @@ def choose_targets(run: Run, truth: Truth | None, folder: Path | None) -> tuple[
     """What the targets are, in words; the targets; sentences about what had to be left out."""
     if truth is not None and folder is not None:
         targets, notes = truth_targets(run, truth, folder)
-        return "held-out views with exact radiance", targets, notes
+        exact = any(t.radiance is not None for t in targets)
+        return "held-out views with exact radiance" if exact else "held-out views as recorded", targets, notes
     if run.scene.test:
         return "held-out frames", frame_targets(run, test=True), []
     note = "nothing was held out (`prepare --hold-out 8` does that): these numbers are of frames the field was trained on"
@@ -170,18 +175,16 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
             f"{folder}: no view of this truth can be compared with the run ({notes[0] if notes else 'it lists none'}); "
             "check that it is the truth of this clip"
         )
-    if not any(exact_of(t).any() for t in targets):
+    exact = [t.radiance for t in targets if t.radiance is not None]
+    if exact and not any(e.any() for e in exact):
         raise InputError(f"{folder}: the radiance of every view is 0; make the truth anew")
     return targets, notes
 
 
 def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: float) -> Target:
     """One view of a truth folder; InputError where its files do not fit together."""
-    exact = io.read_exr(inside(folder, view.radiance)).get("RGB")
-    if exact is None:
-        raise InputError(f"{folder / view.radiance}: no R, G and B channels in this truth image")
-    if exact.min() < 0:
-        raise InputError(f"{folder / view.radiance}: negative radiance; clip at zero before writing the truth")
+    exact, true = true_pictures(truth, view, folder)
+    pictures = {b: torch.from_numpy(rgb) for b, rgb in true.items()}
     anchor = next((e for e in run.scene.manifest.frames if e.index == view.anchor), None)
     if anchor is None or anchor.c2w is None or anchor.K is None:
         raise InputError(
@@ -191,17 +194,22 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     if view.c2w is not None:
         assert truth.clip_c2w is not None, "world_scale refuses this"
         pose = alignment.carry(pose, np.array(truth.clip_c2w[view.anchor]), np.array(view.c2w), scale)
-    height, width = exact.shape[:2]
+    height, width = pictures[view.bracket].shape[:2]
     m = run.scene.manifest
-    match = match_brackets(truth.bracket_ev, run.tonemapper.exposures().tolist())
+    match = scene_brackets(truth, run.scene.manifest.frames, run.tonemapper.exposures().tolist())
     camera = Camera(torch.tensor(anchor.K), torch.from_numpy(pose).float(), m.width, m.height).resized(width, height)
-    rgb = {match[b]: record(truth, exact, b) for b in range(len(truth.bracket_ev))}
+    if view.K is not None:
+        camera = Camera(torch.tensor(view.K), camera.c2w, width, height)
+    if view.bracket not in match:
+        raise InputError(f"{folder}: view {view.name} is of an exposure that the scene does not have; prepare it again")
     at_frame = min(abs(view.time - t) for t in run.scene.times.tolist()) < 1e-6
     group = "off-path" if view.c2w is not None else "view" if at_frame else "view+time"
     return Target(
-        view.name, group, View(camera, view.time), match[view.bracket], anchor.camera_id, rgb,
-        torch.from_numpy(exact * np.array(truth.white_balance, np.float32)),
+        view.name, group, View(camera, view.time), match[view.bracket], anchor.camera_id,
+        {match[b]: rgb for b, rgb in pictures.items() if b in match},
+        None if exact is None else torch.from_numpy(exact * np.array(truth.white_balance, np.float32)),
         moving_mask(run, view, folder, (height, width)),
+        {ev: rgb for b, rgb in pictures.items() if b not in match and (ev := truth.bracket_ev[b]) is not None},
     )  # fmt: skip
 
 
@@ -210,27 +218,11 @@ def moving_mask(run: Run, view: TruthView, folder: Path, size: tuple[int, int]) 
     if view.mask is not None:
         mask = io.read_mask(inside(folder, view.mask))
         if mask.shape != size:
-            raise InputError(f"{folder / view.mask}: a mask of {mask.shape}, but the radiance of {view.name} is {size}")
+            raise InputError(f"{folder / view.mask}: a mask of {mask.shape}, but the pictures of {view.name} are {size}")
         return torch.from_numpy(mask)
     frames = [f for f in run.scene.train + run.scene.test if f.index == view.anchor and f.time == view.time and view.c2w is None]
     own = frames[0].moving if frames else None
     return own if own is not None and own.shape == size else None
-
-
-def match_brackets(true_ev: Sequence[float], learned_ev: Sequence[float]) -> dict[int, int]:
-    """{bracket of the truth: bracket of the scene}, by rank of exposure; where their numbers differ, by distance from the brightest."""
-    if len(true_ev) == len(learned_ev):
-        order = zip(np.argsort(true_ev, kind="stable"), np.argsort(learned_ev, kind="stable"), strict=True)
-        return {int(b): int(s) for b, s in order}
-    learned = np.array(learned_ev) - max(learned_ev)
-    return {b: int(np.abs(learned - (ev - max(true_ev))).argmin()) for b, ev in enumerate(true_ev)}
-
-
-def record(truth: Truth, radiance: np.ndarray, bracket: int) -> Tensor:
-    """What the true camera records (H, W, 3) of `radiance` (H, W, 3) at a bracket, without noise."""
-    exposure = radiance * 2.0 ** truth.bracket_ev[bracket] * np.array(truth.white_balance)
-    rgb = np.stack([np.interp(exposure[..., c], truth.response_x, truth.response_y[c]) for c in range(3)], -1)
-    return torch.from_numpy(rgb.astype(np.float32))
 
 
 def trajectories(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray] | None:
@@ -299,6 +291,10 @@ def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: Any) -> di
         scores["lpips"] = perceptual(own, truth)
     every = [(recorded(run, target, radiance, b), rgb) for b, rgb in target.rgb.items()]
     scores["psnr_all_exposures"] = float(np.mean([metrics.psnr(p, t) for p, t in every]))
+    if target.novel:
+        there = radiance.to(run.tonemapper.knots.device)
+        novel = [(run.tonemapper.develop(there, ev, target.camera_id).cpu(), rgb) for ev, rgb in target.novel.items()]
+        scores["psnr_novel_exposures"] = float(np.mean([metrics.psnr(p, t) for p, t in novel]))
     if moving is not None:
         scores["psnr_moving_all_exposures"] = float(np.mean([metrics.psnr(p, t, moving) for p, t in every]))
     return scores
@@ -392,6 +388,7 @@ def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
 
     `response_rmse`: recorded value, over exposures evenly spaced in x^(1/2.2). `power` p: where exposures are learned, radiance is known
     up to a power only; p is what the learned exposures are of the true ones, `response_rmse_after_power` the error once it is undone."""
+    assert truth.response_x is not None and truth.response_y is not None, "only for a known response"
     x, y = (t.cpu().double().numpy() for t in run.tonemapper.curve(0))
     at = np.linspace(0, 1, 256) ** 2.2
     true = np.stack([np.interp(at, truth.response_x, c) for c in truth.response_y])
@@ -400,9 +397,10 @@ def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
         return float(np.sqrt(np.mean((np.stack([np.interp(at**p, x, c) for c in y]) - true) ** 2)))
 
     ev = run.tonemapper.exposures().cpu().double().numpy()
-    match = match_brackets(truth.bracket_ev, ev.tolist())
+    match = scene_brackets(truth, run.scene.manifest.frames, run.tonemapper.exposures().tolist())
     reference = truth.reference_bracket
-    known = np.array(truth.bracket_ev) - truth.bracket_ev[reference]
+    true_ev = np.array(truth.bracket_ev, np.float64)
+    known = true_ev - true_ev[reference]
     learned = np.array([ev[match[b]] - ev[match[reference]] for b in range(len(known))])
     power = float(learned @ known / (known @ known)) if known.any() else 1.0
     power = power if power > 0 else 1.0
@@ -437,10 +435,11 @@ def trajectory_errors(run: Run, truth: Truth, targets: Sequence[Target]) -> dict
 
 def write_pictures(run: Run, targets: Sequence[Target], radiance: Sequence[Tensor], gauge: Gauge | None, folder: Path) -> None:
     """Per view prediction | truth | 4 x error, as recorded and, where the radiance is known, tone-mapped for a display."""
-    exposure = color.auto_exposure(torch.cat([exact_of(t).reshape(-1, 3) for t in targets])) if gauge else 1.0
+    known = [t.radiance.reshape(-1, 3) for t in targets if t.radiance is not None]
+    exposure = color.auto_exposure(torch.cat(known)) if known else 1.0
     for target, predicted in zip(targets, radiance, strict=True):
         pairs = [(recorded(run, target, predicted, target.bracket), target.rgb[target.bracket])]
-        if gauge:
+        if gauge and target.radiance is not None:
             pairs.append((color.display(predicted * gauge.scale, exposure), color.display(exact_of(target), exposure)))
         rows = [[p.numpy(), t.numpy(), (4 * (p - t).abs()).clip(0, 1).numpy()] for p, t in pairs]
         io.write_png(folder / f"{target.name}.png", io.contact_sheet(rows))

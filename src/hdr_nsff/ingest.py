@@ -36,6 +36,7 @@ class Footage:
     count: int  # frames per camera; 0 where a video's header does not say
     fps: float
     linear: bool  # EXR or DNG
+    over: float | None = None  # grey that shows through transparent pixels; None: transparency is not looked at
 
     @property
     def files(self) -> dict[str, Path]:
@@ -129,7 +130,7 @@ def decode(footage: Footage, files: list[Path], chosen: range) -> Iterator[tuple
         yield from decode_video(files[0], chosen)
         return
     for number in chosen[: len(files[chosen.start : chosen.stop : chosen.step])]:
-        yield number, files[number].relative_to(footage.path).as_posix(), read_frame(files[number])
+        yield number, files[number].relative_to(footage.path).as_posix(), read_frame(files[number], footage.over)
 
 
 def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
@@ -145,13 +146,13 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
         raise InputError(f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); copy it again")
 
 
-def read_frame(path: Path) -> np.ndarray:
-    """One frame file as float32 (H, W, 3): recorded rgb, or linear radiance for EXR and DNG."""
+def read_frame(path: Path, over: float | None = None) -> np.ndarray:
+    """One frame file as float32 (H, W, 3): recorded rgb (`over` the grey that shows through it), or linear radiance for EXR and DNG."""
     suffix = path.suffix.lower()
     if suffix == ".dng":
         return read_dng(path)
     if suffix != ".exr":
-        return read_image(path)
+        return read_image(path, over)
     channels = read_exr(path)
     if "RGB" not in channels:
         if "Y" not in channels:

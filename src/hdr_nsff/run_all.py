@@ -13,7 +13,7 @@ from hdr_nsff.config import PRESETS
 from hdr_nsff.errors import InputError
 from hdr_nsff.evaluate import check_truth, evaluate_run
 from hdr_nsff.io import writing_to
-from hdr_nsff.prepare import PrepareConfig, prepare
+from hdr_nsff.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.progress import say
 from hdr_nsff.render import render_all
 from hdr_nsff.report import check_place, write_report
@@ -29,7 +29,8 @@ class RunConfig:
     views (`render`), held-out quality (`evaluate`), report.html. Killed? The same command goes on where it was."""
 
     clip: Positional[Path]
-    """Footage: a video, a folder of frames, or a folder of such folders (one per synchronized camera)."""
+    """Footage: a video, a folder of frames, or a folder of such folders (one per synchronized camera); or a public data set, see
+    `prepare --help`."""
     out: Positional[Path]
     """Folder for everything: scene/, run/, render/, report.html."""
     exposures: str | None = None
@@ -41,7 +42,8 @@ class RunConfig:
     minutes: float | None = None
     """Training time instead of the preset's."""
     truth: Path | None = None
-    """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the clip are trained on."""
+    """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the clip are trained on. A public data set with
+    held-out views brings its own."""
     poses: Path | None = None
     """Given poses (COLMAP model, transforms.json, poses_bounds.npy) instead of structure from motion."""
     hold_out: int | None = None
@@ -63,19 +65,19 @@ def run_all(config: RunConfig) -> None:
         check_truth(config.truth)
     check_place(config.out / "report.html")
     hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
-    scene = prepare(
-        PrepareConfig(
-            clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev,
-            max_size=config.max_size, hold_out=hold_out, poses=config.poses,
-        )
+    footage = PrepareConfig(
+        clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev,
+        max_size=config.max_size, hold_out=hold_out, poses=config.poses,
     )  # fmt: skip
+    scene = prepare(footage)
+    truth = config.truth or held_out_truth(footage)
     settings = replace(PRESETS[config.preset], scene=scene, out=config.out / "run", seed=config.seed, device=config.device)
     if config.minutes is not None:
         settings = replace(settings, minutes=config.minutes, steps=None)
     with writing_to(config.out):
         run = Run.open(train(settings), config.device)
         results = render_all(run, config.out / "render")
-        evaluate_run(run, config.truth)
+        evaluate_run(run, truth)
         results["report"] = write_report(run, config.out / "report.html", config.out / "render")
     say(f"done in {(time.monotonic() - start) / 60:.1f} minutes; results:")
     for name, path in results.items():

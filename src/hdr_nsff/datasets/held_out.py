@@ -1,0 +1,360 @@
+"""What a public data set keeps back for testing -> a truth folder outside the scene, which `evaluate` alone reads.
+
+The only file of the package that opens held-out pictures, masks and radiance; `prepare` calls it once the scene is whole, and nothing
+that it learns goes back. Poses are those of the data set, so they fit the scene as they are, or are carried over where the scene's own
+were estimated. What a view recorded is tied to a bracket of the scene through a training picture of the same exposure."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdr_nsff.datasets import blender, hdr_nerf, llff, maps, nerfstudio
+from hdr_nsff.datasets.capture import Capture, Clock, named_file, parse_extra, read_document, reorder
+from hdr_nsff.errors import InputError
+from hdr_nsff.ingest import hash_file, shrink
+from hdr_nsff.io import read_exr, read_image, read_note, write_exr, write_json, write_png
+from hdr_nsff.priors.import_poses import Given, placed
+from hdr_nsff.priors.poses import Poses
+from hdr_nsff.progress import say, track
+from hdr_nsff.scene import FrameEntry, Manifest
+from hdr_nsff.truth import Truth, TruthView
+
+NOTE = "made_of.json"
+SAME_EV = 0.01  # stops between two exposures that are one
+Exposure = float | list[str] | None  # stored EV, or training pictures exposed like it, or not known
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One view that a data set keeps back."""
+
+    name: str
+    time: float | None  # in frames of the set; None: nothing moves
+    recorded: list[tuple[Path, Exposure]]  # pictures of it
+    radiance: Path | None = None
+    mask: Path | None = None
+    anchor: str | None = None  # the training picture whose pose it has exactly
+
+
+def truth_folder(place: Path) -> Path | None:
+    """`place` where it holds a finished truth, else None."""
+    return place if (place / "truth.json").is_file() and (place / NOTE).is_file() else None
+
+
+def read(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """The views that a set keeps back, and their poses, row by row. InputError where something is missing or short."""
+    root = capture.root
+    if hdr_nerf.recognised(root):
+        return from_hdr_nerf(capture)
+    if blender.recognised(root):
+        return from_blender(capture)
+    return from_nerfstudio(capture) if nerfstudio.recognised(root) else from_llff(capture)
+
+
+def from_blender(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """`transforms_test.json`; radiance where `exr_file_path` names it."""
+    root, path = capture.root, capture.root / blender.TEST
+    train = read_document(root / blender.TRAIN, "the training pictures and their poses")["frames"]
+    clock = Clock.of(blender.training_times(root / blender.TRAIN, train))
+    document = read_document(path, "the held-out views and their poses")
+    views = []
+    for k, (frame, stored) in enumerate(zip(document["frames"], blender.training_times(path, document["frames"]), strict=True)):
+        file = named_file(root, frame["file_path"], f"held-out view {k} of {blender.TEST}")
+        ev = blender.exposure(path, frame, blender.layout(train))
+        like: Exposure = [p.source for p in capture.pictures] if ev is None else ev
+        exr = frame.get("exr_file_path")
+        radiance = named_file(root, exr, f"the radiance of held-out view {k}") if isinstance(exr, str) else None
+        time = None if capture.still else clock(stored)
+        views.append(HeldOut(f"{k:04d}", time, [(file, like)], radiance))
+    return views, blender.poses(path, document)
+
+
+def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """All five exposures of every test view, and its radiance where `test_hdr/hdr_<number>.exr` is there."""
+    root, path = capture.root, capture.root / blender.TEST
+    document = read_document(path, "the held-out views and their poses")
+    table = hdr_nerf.exposures(root, "test")
+    views = []
+    for k, frame in enumerate(document["frames"]):
+        pictures: list[tuple[Path, Exposure]] = [
+            (
+                named_file(root, f"{frame['file_path']}_{e}.png", f"exposure {e} of held-out view {k}"),
+                hdr_nerf.ev_of(root, "test", table, frame, e),
+            )
+            for e in range(hdr_nerf.COUNT)
+        ]
+        exr = root / "test_hdr" / f"hdr_{k:03d}.exr"
+        views.append(HeldOut(f"{k:04d}", None, pictures, exr if exr.is_file() else None))
+    return views, blender.poses(path, document)
+
+
+def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """The frames that `val_filenames` and `test_filenames` name."""
+    root, path = capture.root, capture.root / nerfstudio.NAME
+    document = read_document(path, "the pictures and their poses")
+    outside = nerfstudio.held_out_names(path, document)
+    frames = document["frames"]
+    kept = [k for k, f in enumerate(frames) if f["file_path"] in outside]
+    times = nerfstudio.stored_times(path, frames)
+    clock = Clock.of([t for t, f in zip(times, frames, strict=True) if f["file_path"] not in outside])
+    names = [f["file_path"] for f in frames]
+    extra = parse_extra(path, document[nerfstudio.EXTRA], names) if nerfstudio.EXTRA in document else None
+    views = []
+    for k in kept:
+        file = named_file(root, names[k], f"a held-out view of {nerfstudio.NAME}")
+        name = re.sub(r"[^A-Za-z0-9._-]", "_", Path(names[k]).with_suffix("").as_posix())
+        if extra is None:
+            views.append(HeldOut(name, clock(times[k]), [(file, None)]))
+            continue
+        own = extra.frames[names[k]]
+        like: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
+        views.append(HeldOut(name, own.time, [(file, like)], mask=root / own.moving if own.moving else None))
+    return views, reorder(blender.poses(path, document), kept)
+
+
+def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """`mv_images/<time>/<camera>.png` of the cameras that no training picture of that time is from, `mv_images_time/` half a frame
+    later, their masks in `mv_masks/` and `mv_masks_time/`."""
+    assert capture.poses is not None
+    count = len(capture.pictures)
+    views, rows = [], []
+    for name, later in zip(llff.MULTI_VIEW, (0.0, 0.5), strict=True):
+        if (folder := llff.multi_view(capture.root, name)) is None:
+            continue
+        masks = llff.multi_view(capture.root, name.replace("images", "masks"))
+        steps = range(count if later == 0 else count - 1)
+        cameras = cameras_of(folder, steps)
+        for t in steps:
+            for k in range(cameras):
+                if later == 0 and t % cameras == k:
+                    continue  # the training picture
+                view = multi_view(capture, folder, masks, t, k, cameras, later)
+                views.append(view)
+                rows.append(k)
+    return views, reorder(capture.poses, rows)
+
+
+def cameras_of(folder: Path, steps: range) -> int:
+    """How many cameras there are; InputError where a time is missing."""
+    lost = next((t for t in steps if not (folder / f"{t:05d}").is_dir()), None)
+    if lost is not None:
+        raise InputError(f"{folder / f'{lost:05d}'}: missing; it holds what every camera saw at time {lost}, copy it again")
+    return max(len(list((folder / f"{t:05d}").glob("[0-9]*.png"))) for t in steps)
+
+
+def multi_view(capture: Capture, folder: Path, masks: Path | None, t: int, k: int, cameras: int, later: float) -> HeldOut:
+    """What camera `k` (from 0) saw at time `t`; its pose is that of training picture `k`, its exposure that of its own pictures."""
+    name = f"{t:05d}/{k + 1:05d}.png"
+    if not (folder / name).is_file():
+        raise InputError(f"{folder / name}: missing; it is what camera {k + 1} saw at time {t}, copy it again")
+    mask = masks / name if masks is not None else None
+    if mask is not None and not mask.is_file():
+        raise InputError(f"{mask}: missing; it is the moving mask of held-out view {folder.name}/{name}, copy it again")
+    if k >= len(capture.pictures):
+        raise InputError(f"{folder / name}: camera {k + 1} has no training picture and so no pose; copy the pictures again")
+    own: Exposure = [capture.pictures[i].source for i in range(k, len(capture.pictures), cameras)]
+    label = f"t{t + later:07.1f}_camera{k + 1}"
+    return HeldOut(label, t + later, [(folder / name, own)], mask=mask, anchor=capture.pictures[k].source)
+
+
+# The truth folder
+
+
+def write_truth(
+    capture: Capture, manifest: Manifest, own_time: Callable[[float], float], out: Path, max_size: int
+) -> Path | None:
+    """Write the held-out views whose time is within the scene's to the truth folder `out`; what is there and right stays.
+
+    `own_time` turns frames of the set into frames of the scene; pictures are shrunk as the frames were. None where no view is left."""
+    views, given = read(capture)
+    times = [f.time for f in manifest.frames if f.split == "train"]
+    inside = [k for k, v in enumerate(views) if v.time is None or min(times) - 1e-6 <= own_time(v.time) <= max(times) + 1e-6]
+    if len(inside) < len(views):
+        say(
+            f"truth: {len(views) - len(inside)} of {len(views)} held-out views are of times that no training picture surrounds: left out"
+        )
+    brackets = Brackets.of(capture, manifest)
+    kept = [(k, brackets.of_pictures(views[k])) for k in inside]
+    kept = [(k, pictures) for k, pictures in kept if pictures]
+    if len(kept) < len(inside):
+        say(f"truth: the exposure of {len(inside) - len(kept)} held-out views is not known: left out")
+    if not kept:
+        say("truth: no held-out view is left to compare with")
+        return None
+    claim(out, key_of(views, kept, manifest, max_size, given))
+    rows = reorder(given, [k for k, _ in kept])
+    shown = [(views[k], pictures) for k, pictures in kept]
+    size = write_pictures(out, capture, shown, max_size)
+    poses = placed(capture.root, rows, list(range(len(shown))), size)
+    clip = clip_poses(capture, manifest, size)
+    entries = {f.source: f for f in manifest.frames}
+    records = []
+    for (view, pictures), K, c2w in zip(shown, poses.K, poses.c2w, strict=True):
+        exact = entries.get(view.anchor or "")
+        anchor = exact or nearest(manifest.frames, clip.c2w, c2w)
+        records.append(
+            TruthView(
+                name=view.name,
+                time=anchor.time if view.time is None else own_time(view.time),
+                bracket=manifest.reference_bracket if manifest.reference_bracket in pictures else min(pictures),
+                anchor=anchor.index,
+                c2w=None if exact else c2w.tolist(),
+                K=None if np.allclose(K, clip.K[anchor.index]) else K.tolist(),
+                radiance=f"radiance/{view.name}.exr" if view.radiance else None,
+                recorded={b: recording(view, b) for b in pictures},
+                mask=f"masks/{view.name}.png" if view.mask else None,
+            )
+        )
+    truth = Truth(
+        bracket_ev=brackets.ev,
+        reference_bracket=manifest.reference_bracket,
+        bracket_frame=brackets.frame,
+        K=clip.K[0].tolist(),
+        clip_c2w=clip.c2w.tolist(),
+        views=records,
+    )
+    write_json(out / "truth.json", truth.model_dump())
+    say(f"truth: {len(records)} held-out views in {out}; `hdr-nsff evaluate RUN --truth {out}`")
+    return out
+
+
+def recording(view: HeldOut, bracket: int) -> str:
+    """The file of what a view recorded at a bracket."""
+    return f"recorded/{view.name}_{bracket}.png"
+
+
+@dataclass
+class Brackets:
+    """The brackets of the scene, and behind them exposures that only held-out views have."""
+
+    capture: Capture
+    entries: list[FrameEntry]
+    ev: list[float | None]
+    frame: list[int | None]  # a frame of the scene for each, None for exposures that no training picture has
+
+    @staticmethod
+    def of(capture: Capture, m: Manifest) -> Brackets:
+        """Those of a scene."""
+        count = len(m.bracket_ev)
+        frames = [next((f.index for f in m.frames if f.bracket == b), None) for b in range(count)]
+        return Brackets(capture, m.frames, list(m.bracket_ev), frames)
+
+    def of_pictures(self, view: HeldOut) -> dict[int, Path]:
+        """The pictures of a view by bracket; those whose exposure cannot be told are left out."""
+        found = {}
+        for path, exposure in view.recorded:
+            bracket = self.of_exposure(exposure)
+            if bracket is not None:
+                found[bracket] = path
+        return found
+
+    def of_exposure(self, exposure: Exposure) -> int | None:
+        """The bracket of an exposure; None where it cannot be told."""
+        if exposure is None:
+            return 0 if len(self.ev) == 1 else None
+        stored = {f.source: self.capture.by_source[f.source].ev for f in self.entries}
+        if isinstance(exposure, list):
+            return next((f.bracket for f in self.entries if f.source in set(exposure)), None)
+        for f in self.entries:
+            own = stored[f.source]
+            if own is not None and abs(own - exposure) < SAME_EV:
+                return f.bracket
+        return self.novel(exposure, stored)
+
+    def novel(self, exposure: float, stored: dict[str, float | None]) -> int | None:
+        """The bracket of an exposure that no training picture has; None where the scene's exposures are not known."""
+        for f in self.entries:
+            own, relative = stored[f.source], self.ev[f.bracket]
+            if own is None or relative is None:
+                continue
+            value = exposure - own + relative
+            for b, ev in enumerate(self.ev):
+                if ev is not None and abs(ev - value) < SAME_EV:
+                    return b
+            self.ev.append(value)
+            self.frame.append(None)
+            return len(self.ev) - 1
+        return None
+
+
+def key_of(
+    views: Sequence[HeldOut], kept: Sequence[tuple[int, dict[int, Path]]], m: Manifest, max_size: int, given: Given
+) -> str:
+    """The hash of all that a truth folder depends on."""
+
+    def hashed(path: Path | None) -> str | None:
+        return None if path is None else hash_file(path)
+
+    files: list[Any] = [
+        (
+            views[k].name,
+            views[k].time,
+            hashed(views[k].radiance),
+            hashed(views[k].mask),
+            {b: hashed(p) for b, p in pictures.items()},
+        )
+        for k, pictures in track(kept, "held-out views")
+    ]
+    scene = [(f.source, f.time, f.bracket) for f in m.frames]
+    poses = [given.K.tolist(), given.c2w.tolist()]
+    return hashlib.sha256(json.dumps([files, scene, m.bracket_ev, m.reference_bracket, max_size, poses]).encode()).hexdigest()
+
+
+def claim(out: Path, key: str) -> None:
+    """Note what the truth folder is made of; files of another make are removed. InputError where it holds something else."""
+    if read_note(out / NOTE).get("key") == key:
+        return
+    if out.exists() and not (out / NOTE).is_file() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"{out}: is there already and was not made by prepare; choose another place with --truth-out")
+    (out / "truth.json").unlink(missing_ok=True)
+    for name in ("recorded", "radiance", "masks"):
+        shutil.rmtree(out / name, ignore_errors=True)
+    write_json(out / NOTE, {"key": key})
+
+
+def write_pictures(
+    out: Path, capture: Capture, shown: Sequence[tuple[HeldOut, dict[int, Path]]], max_size: int
+) -> tuple[int, int]:
+    """Write what the views recorded, their radiance and masks, those not there yet; the size (H, W) that all have."""
+    size: tuple[int, int] | None = None
+    for view, pictures in track(shown, "truth"):
+        for bracket, path in pictures.items():
+            rgb = shrink(read_image(path, capture.over), max_size)
+            size = size or rgb.shape[:2]
+            if rgb.shape[:2] != size:
+                raise InputError(f"{path}: another size than the other held-out views; all must have one")
+            exact = np.abs(rgb - np.rint(rgb * 255) / 255).max() < 1e-6
+            if not (out / recording(view, bracket)).is_file():
+                write_png(out / recording(view, bracket), rgb, bits=8 if exact else 16)
+        assert size is not None, view.name
+        if view.mask is not None:
+            write_png(out / f"masks/{view.name}.png", maps.moving_mask(view.mask, size, capture.white_moves))
+        if view.radiance is not None and not (exr := out / f"radiance/{view.name}.exr").is_file():
+            radiance = read_exr(view.radiance).get("RGB")
+            if radiance is None:
+                raise InputError(f"{view.radiance}: no R, G and B channels; it is the radiance of a held-out view, copy it again")
+            write_exr(exr, {"RGB": maps.fitted(view.radiance, radiance, size, maps.AREA)}, half=False)
+    assert size is not None
+    return size
+
+
+def clip_poses(capture: Capture, m: Manifest, size: tuple[int, int]) -> Poses:
+    """The data set's poses of the scene's frames, K for pictures of `size`."""
+    assert capture.poses is not None
+    return placed(capture.root, capture.poses, [capture.row[f.source] for f in m.frames], size)
+
+
+def nearest(frames: Sequence[FrameEntry], clip: np.ndarray, c2w: np.ndarray) -> FrameEntry:
+    """The frame whose camera is nearest: in place, and among those as near in direction."""
+    distance = np.linalg.norm(clip[:, :, 3] - c2w[:, 3], axis=1)
+    turn = 1 - clip[:, :, 2] @ c2w[:, 2]
+    return frames[int(np.lexsort((turn, np.round(distance, 9)))[0])]
