@@ -27,7 +27,7 @@ from hdr_nsff.run import Run
 from hdr_nsff.scene import inside
 from hdr_nsff.shots import fingerprint, take
 from hdr_nsff.tonemap import informative
-from hdr_nsff.truth import Truth, TruthView, match_brackets, scene_brackets, true_pictures
+from hdr_nsff.truth import Truth, TruthView, scene_brackets, true_pictures
 
 SMALLEST_LPIPS = 64  # pixels
 
@@ -239,6 +239,8 @@ def world_scale(run: Run, truth: Truth) -> float | None:
         if any(v.c2w is not None for v in truth.views):
             raise InputError("truth.json: views have poses of their own, but clip_c2w is missing; they cannot be carried over")
         return None
+    if np.allclose(*paths):
+        return 1.0  # given poses: one world
     fit = alignment.umeyama(paths[0][:, :, 3], paths[1][:, :, 3])
     return None if fit is None else fit.scale
 

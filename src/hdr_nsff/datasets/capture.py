@@ -133,6 +133,7 @@ class Extra(Strict):
     near: float
     far: float
     depth_kind: Literal["scene", "relative"]
+    points: str | None = None  # .npy (P, 3) static, scene units
     frames: dict[str, ExtraFrame]  # by name of the picture
 
     def exposures(self) -> Exposures:

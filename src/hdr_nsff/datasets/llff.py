@@ -77,7 +77,7 @@ def read(folder: Path) -> Capture:
         depth_kind="disparity" if kind == "disparity" else "metric",
         depth_units="own",
         sightings={n: s for n, s in zip(names, sightings(model, files, bounds), strict=True)},
-        points=trusted(model),
+        points=model.points if extra and model else trusted(model),
         notes=(f"pictures of {files[0].parent.name}/", *flow_notes, *([f"depth of {depth[0].parent.name}/"] if depth else [])),
     )
     return with_note(capture, extra, [f.name for f in files]) if extra else capture

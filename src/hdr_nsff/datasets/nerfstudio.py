@@ -9,6 +9,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hdr_nsff.datasets.blender import poses
 from hdr_nsff.datasets.capture import (
     Capture,
@@ -25,7 +27,7 @@ from hdr_nsff.datasets.capture import (
 )
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import natural
-from hdr_nsff.io import read_json
+from hdr_nsff.io import read_json, read_npy
 from hdr_nsff.priors.import_poses import Given
 
 NAME = "transforms.json"
@@ -152,6 +154,7 @@ def exported(folder: Path, frames: list[dict[str, Any]], given: Given, extra: Ex
         poses=Given(poses.names, poses.K, poses.c2w, poses.size, extra.near, extra.far),
         withheld=withheld,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
+        points=None if extra.points is None else np.array(read_npy(folder / extra.points)),
         exposures=extra.exposures(),
         fps=extra.fps,
     )
