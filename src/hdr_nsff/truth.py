@@ -32,6 +32,11 @@ class TruthView(Strict):
     recorded: dict[int, str] = Field(default_factory=dict)  # bracket -> PNG, what a camera recorded
     mask: str | None = None  # PNG, moving = 255
 
+    @property
+    def files(self) -> list[str]:
+        """The names of all files of this view."""
+        return [n for n in (self.radiance, *self.recorded.values(), self.mask) if n is not None]
+
     def problem(self, num_brackets: int, response: bool) -> str | None:
         """What makes no sense in this view; None where all does. `response`: whether recordings can be made from radiance."""
         if self.name in ("", ".", "..") or len(self.name) > 100 or set(self.name) & set("/\\\0"):

@@ -22,7 +22,7 @@ TRAINED = (0, 2, 4)
 
 def recognised(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
-    return (folder / TRAIN).is_file() and (folder / "exposure_train.json").is_file()
+    return (folder / TRAIN).is_file() and any((folder / f"exposure_{split}.json").is_file() for split in ("train", "test"))
 
 
 def read(folder: Path) -> Capture:

@@ -190,7 +190,8 @@ def write_truth(
     if not kept:
         say("truth: no held-out view is left to compare with")
         return None
-    claim(out, key_of(views, kept, manifest, max_size, given))
+    if claim(out, key_of(views, kept, manifest, max_size, given)):
+        return out
     rows = reorder(given, [k for k, _ in kept])
     shown = [(views[k], pictures) for k, pictures in kept]
     size = write_pictures(out, capture, shown, max_size)
@@ -309,16 +310,18 @@ def key_of(
     return hashlib.sha256(json.dumps([files, scene, m.bracket_ev, m.reference_bracket, max_size, poses]).encode()).hexdigest()
 
 
-def claim(out: Path, key: str) -> None:
-    """Note what the truth folder is made of; files of another make are removed. InputError where it holds something else."""
+def claim(out: Path, key: str) -> bool:
+    """Whether the truth folder of that make is whole. Otherwise notes what it is made of, and removes files of another make.
+    InputError where it holds something else."""
     if read_note(out / NOTE).get("key") == key:
-        return
+        return (out / "truth.json").is_file() and all((out / n).is_file() for v in Truth.open(out).views for n in v.files)
     if out.exists() and not (out / NOTE).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there already and was not made by prepare; choose another place with --truth-out")
     (out / "truth.json").unlink(missing_ok=True)
     for name in ("recorded", "radiance", "masks"):
         shutil.rmtree(out / name, ignore_errors=True)
     write_json(out / NOTE, {"key": key})
+    return False
 
 
 def write_pictures(
@@ -336,7 +339,7 @@ def write_pictures(
             if not (out / recording(view, bracket)).is_file():
                 write_png(out / recording(view, bracket), rgb, bits=8 if exact else 16)
         assert size is not None, view.name
-        if view.mask is not None:
+        if view.mask is not None and not (out / f"masks/{view.name}.png").is_file():
             write_png(out / f"masks/{view.name}.png", maps.moving_mask(view.mask, size, capture.white_moves))
         if view.radiance is not None and not (exr := out / f"radiance/{view.name}.exr").is_file():
             radiance = read_exr(view.radiance).get("RGB")

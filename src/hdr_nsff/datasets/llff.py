@@ -54,7 +54,11 @@ def read(folder: Path) -> Capture:
     dense = dense_folder(folder)
     given, bounds = poses(dense)
     count = len(given.c2w)
-    files = same_number(dense / "poses_bounds.npy", pictures(dense), count, "the camera poses, a row per picture")
+    files = pictures(dense)
+    if len(files) != count:
+        raise InputError(
+            f"{files[0].parent}: {len(files)} pictures, but poses_bounds.npy holds the camera poses of {count}; copy both again"
+        )
     root = folder
     names = [source_of(root, f) for f in files]
     extra = noted(dense, [f.name for f in files])

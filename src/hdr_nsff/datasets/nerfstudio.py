@@ -37,14 +37,15 @@ MILLIMETRES = 1000.0  # a unit of the poses in what depth files hold
 
 
 def recognised(folder: Path) -> bool:
-    """Whether `folder` holds this layout: poses, and the pictures that they are of."""
-    try:
-        document = read_json(folder / NAME)
-    except (OSError, ValueError):
+    """Whether `folder` holds this layout: poses, and the pictures that they are of. Poses of pictures elsewhere are for `--poses`; a
+    file cut short is one, so that somebody says so."""
+    if not (folder / NAME).is_file():
         return False
-    frames = document.get("frames") if isinstance(document, dict) else None
-    names = [f.get("file_path") for f in frames if isinstance(f, dict)] if isinstance(frames, list) else []
-    return any(isinstance(n, str) and n and (folder / n).parent.is_dir() for n in names)
+    try:
+        names = [f["file_path"] for f in read_json(folder / NAME)["frames"]]
+    except (OSError, ValueError, TypeError, KeyError):
+        return True
+    return not names or any(isinstance(n, str) and (folder / n).parent.is_dir() for n in names)
 
 
 def read(folder: Path) -> Capture:
