@@ -20,7 +20,7 @@ from typing import Any
 
 from hdr_nsff import ingest
 from hdr_nsff.datasets import recognise
-from hdr_nsff.datasets.capture import Capture, Picture
+from hdr_nsff.datasets.capture import Picture
 from hdr_nsff.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import writing_to
@@ -28,7 +28,7 @@ from hdr_nsff.progress import say, track
 from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
 from hdr_nsff.steps import priors as on_priors
-from hdr_nsff.steps.work import PrepareConfig, StepName, Work
+from hdr_nsff.steps.work import Part, PrepareConfig, StepName, Work
 
 __all__ = ["PrepareConfig", "prepare"]
 
@@ -48,6 +48,7 @@ def prepare(config: PrepareConfig) -> Path:
     """Do every step that is not done; the scene folder. InputError where the footage or a setting is at fault."""
     with writing_to(config.out):
         work = begin(config)
+        introduce(work)
         for name in STEPS:
             do(work, name)
         if work.capture is not None and work.capture.withheld:
@@ -70,7 +71,7 @@ def begin(config: PrepareConfig) -> Work:
     """Look at the footage and at the scene folder; InputError where they do not belong together."""
     check_settings(config)
     capture = recognise(config.clip)
-    footage = introduce(config, capture) if capture else ingest.open_footage(config.clip)
+    footage = capture.footage() if capture else ingest.open_footage(config.clip)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
     if found is not None and found.inputs != inputs and not found.frames:
@@ -91,17 +92,18 @@ def begin(config: PrepareConfig) -> Work:
     return work
 
 
-def introduce(config: PrepareConfig, capture: Capture) -> ingest.Footage:
-    """Say which data set was recognised and what it gives; its pictures as footage."""
-    given = [name for name, there in capture.parts().items() if there and name not in config.estimate]
-    kept = f", held-out views for {truth_place(config)}" if capture.withheld else ""
-    text = f"{config.clip}: {capture.layout}, {len(capture.pictures)} pictures"
-    say(f"{text}, with its own {', '.join(given) or 'pictures alone'}{kept}")
+def introduce(work: Work) -> None:
+    """Say which data set was recognised, if it is one, and what of it is used."""
+    capture, clip = work.capture, work.config.clip
+    if capture is None:
+        return
+    stored = ["exposures"] if capture.parts()["exposures"] else []
+    parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
+    given = [*stored, *(part for part in parts if work.gives(part))]
+    kept = f", held-out views for {truth_place(work.config)}" if capture.withheld else ""
+    say(f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}")
     for note in capture.notes:
-        say(f"{config.clip}: {note}")
-    if config.truth_out is not None and config.truth_out.resolve().is_relative_to(config.out.resolve()):
-        raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
-    return capture.footage()
+        say(f"{clip}: {note}")
 
 
 def found_manifest(config: PrepareConfig) -> Manifest | None:
@@ -138,6 +140,8 @@ def check_settings(config: PrepareConfig) -> None:
     if config.hold_out is not None and (config.hold_out < 0 or config.hold_out == 1):
         raise InputError(f"--hold-out {config.hold_out}: leaves nothing to train on; use 0, or 2 and more")
     ingest.parse_exposures(config.exposures, config.ev)
+    if truth_place(config).resolve().is_relative_to(config.out.resolve()):
+        raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
     for option, path in (("poses", config.poses), ("flow", config.flow), ("masks", config.masks), ("depth", config.depth)):
         if path is not None and not path.exists():
             raise InputError(f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate")

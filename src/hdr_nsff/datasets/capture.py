@@ -19,7 +19,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import FRAMES, LINEAR, Footage
 from hdr_nsff.io import read_json
 from hdr_nsff.priors.import_poses import Given
-from hdr_nsff.scene import Strict, first_problem
+from hdr_nsff.scene import Strict, bracket_problem, first_problem, is_intrinsic, is_matrix
 
 SNAP = 1e-3  # frames: a time this near to a whole number is one, since files store rounded fractions
 
@@ -113,8 +113,8 @@ class ExtraFrame(Strict):
     """What neither layout can say of a frame."""
 
     time: float
-    camera_id: int = 0
-    bracket: int = 0
+    camera_id: int = Field(default=0, ge=0)
+    bracket: int = Field(default=0, ge=0)
     K: list[list[float]] | None = None  # 3x3 pixels
     flow: dict[str, str] = Field(default_factory=dict)  # name of another picture -> flow file
     disparity: str | None = None
@@ -126,12 +126,12 @@ class Extra(Strict):
     """What `export` writes beside a public layout, so that reading it again gives the same scene."""
 
     version: Literal[1] = 1
-    fps: float
+    fps: float = Field(gt=0)
     reference_bracket: int
     bracket_ev: list[float | None]
     exposure_given: bool
-    near: float
-    far: float
+    near: float = Field(gt=0)
+    far: float = Field(gt=0)
     depth_kind: Literal["scene", "relative"]
     points: str | None = None  # .npy (P, 3) static, scene units
     frames: dict[str, ExtraFrame]  # by name of the picture
@@ -149,8 +149,11 @@ def parse_extra(path: Path, value: Any, names: Sequence[str]) -> Extra:
         raise InputError(f"{path}: what `export` noted there is damaged ({first_problem(error)}); export again") from error
     if lost := [n for n in names if n not in extra.frames]:
         raise InputError(f"{path}: no entry for picture {lost[0]}, which holds its time and exposure; export again")
-    if not all(0 <= f.bracket < len(extra.bracket_ev) for f in extra.frames.values()):
-        raise InputError(f"{path}: a picture has a bracket that bracket_ev does not list; export again")
+    problem = bracket_problem([f.bracket for f in extra.frames.values()], extra.bracket_ev, extra.reference_bracket)
+    if any(f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic) for f in extra.frames.values()):
+        problem = "a K is no 3x3 camera matrix"
+    if problem is not None:
+        raise InputError(f"{path}: {problem}; export again")
     return extra
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from hdr_nsff.datasets import blender, hdr_nerf, llff, maps, nerfstudio
+from hdr_nsff.datasets import blender, hdr_nerf, layout_of, llff, maps, nerfstudio
 from hdr_nsff.datasets.capture import Capture, Clock, named_file, parse_extra, read_document, reorder
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import hash_file, shrink
@@ -52,12 +52,10 @@ def truth_folder(place: Path) -> Path | None:
 
 def read(capture: Capture) -> tuple[list[HeldOut], Given]:
     """The views that a set keeps back, and their poses, row by row. InputError where something is missing or short."""
-    root = capture.root
-    if hdr_nerf.recognised(root):
-        return from_hdr_nerf(capture)
-    if blender.recognised(root):
-        return from_blender(capture)
-    return from_nerfstudio(capture) if nerfstudio.recognised(root) else from_llff(capture)
+    readers = {"nerfstudio": from_nerfstudio, "hdr-nerf": from_hdr_nerf, "blender": from_blender, "hdr-gopro": from_llff}
+    name = layout_of(capture.root)
+    assert name is not None, capture.root
+    return readers[name](capture)
 
 
 def from_blender(capture: Capture) -> tuple[list[HeldOut], Given]:
@@ -124,7 +122,6 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
 def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
     """`mv_images/<time>/<camera>.png` of the cameras that no training picture of that time is from, `mv_images_time/` half a frame
     later, their masks in `mv_masks/` and `mv_masks_time/`."""
-    assert capture.poses is not None
     count = len(capture.pictures)
     views, rows = [], []
     for name, later in zip(llff.MULTI_VIEW, (0.0, 0.5), strict=True):
@@ -140,7 +137,7 @@ def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
                 view = multi_view(capture, folder, masks, t, k, cameras, later)
                 views.append(view)
                 rows.append(k)
-    return views, reorder(capture.poses, rows)
+    return views, reorder(capture_poses(capture), rows)
 
 
 def cameras_of(folder: Path, steps: range) -> int:
@@ -176,56 +173,78 @@ def write_truth(
 
     `own_time` turns frames of the set into frames of the scene; pictures are shrunk as the frames were. None where no view is left."""
     views, given = read(capture)
-    times = [f.time for f in manifest.frames if f.split == "train"]
-    inside = [k for k, v in enumerate(views) if v.time is None or min(times) - 1e-6 <= own_time(v.time) <= max(times) + 1e-6]
-    if len(inside) < len(views):
-        say(
-            f"truth: {len(views) - len(inside)} of {len(views)} held-out views are of times that no training picture surrounds: left out"
-        )
     brackets = Brackets.of(capture, manifest)
-    kept = [(k, brackets.of_pictures(views[k])) for k in inside]
-    kept = [(k, pictures) for k, pictures in kept if pictures]
-    if len(kept) < len(inside):
-        say(f"truth: the exposure of {len(inside) - len(kept)} held-out views is not known: left out")
-    if not kept:
+    shown = comparable(views, manifest, own_time, brackets)
+    if not shown:
         say("truth: no held-out view is left to compare with")
         return None
-    if claim(out, key_of(views, kept, manifest, max_size, given)):
+    rows = reorder(given, [row for row, _ in shown])
+    chosen = [(views[row], pictures) for row, pictures in shown]
+    if claim(out, key_of(chosen, manifest, max_size, rows)):
         return out
-    rows = reorder(given, [k for k, _ in kept])
-    shown = [(views[k], pictures) for k, pictures in kept]
-    size = write_pictures(out, capture, shown, max_size)
-    poses = placed(capture.root, rows, list(range(len(shown))), size)
-    clip = clip_poses(capture, manifest, size)
-    entries = {f.source: f for f in manifest.frames}
-    records = []
-    for (view, pictures), K, c2w in zip(shown, poses.K, poses.c2w, strict=True):
-        exact = entries.get(view.anchor or "")
-        anchor = exact or nearest(manifest.frames, clip.c2w, c2w)
-        records.append(
-            TruthView(
-                name=view.name,
-                time=anchor.time if view.time is None else own_time(view.time),
-                bracket=manifest.reference_bracket if manifest.reference_bracket in pictures else min(pictures),
-                anchor=anchor.index,
-                c2w=None if exact else c2w.tolist(),
-                K=None if np.allclose(K, clip.K[anchor.index]) else K.tolist(),
-                radiance=f"radiance/{view.name}.exr" if view.radiance else None,
-                recorded={b: recording(view, b) for b in pictures},
-                mask=f"masks/{view.name}.png" if view.mask else None,
-            )
-        )
+    size = write_pictures(out, capture, chosen, max_size)
+    poses = placed(capture.root, rows, list(range(len(chosen))), size)
+    clip = placed(capture.root, capture_poses(capture), [capture.row[f.source] for f in manifest.frames], size)
     truth = Truth(
         bracket_ev=brackets.ev,
         reference_bracket=manifest.reference_bracket,
         bracket_frame=brackets.frame,
         K=clip.K[0].tolist(),
         clip_c2w=clip.c2w.tolist(),
-        views=records,
+        views=[
+            truth_view(view, sorted(pictures), manifest, own_time, clip, K, c2w)
+            for (view, pictures), K, c2w in zip(chosen, poses.K, poses.c2w, strict=True)
+        ],
     )
     write_json(out / "truth.json", truth.model_dump())
-    say(f"truth: {len(records)} held-out views in {out}; `hdr-nsff evaluate RUN --truth {out}`")
+    say(f"truth: {len(chosen)} held-out views in {out}; `hdr-nsff evaluate RUN --truth {out}`")
     return out
+
+
+def comparable(
+    views: Sequence[HeldOut], manifest: Manifest, own_time: Callable[[float], float], brackets: Brackets
+) -> list[tuple[int, dict[int, Path]]]:
+    """Which views a run of this scene can be compared with, and their pictures by bracket; says what is left out."""
+    times = [f.time for f in manifest.frames if f.split == "train"]
+    inside = [k for k, v in enumerate(views) if v.time is None or min(times) <= own_time(v.time) <= max(times)]
+    if lost := len(views) - len(inside):
+        say(f"truth: {lost} of {len(views)} held-out views are of times that no training pictures surround: left out")
+    kept = [(k, brackets.of_pictures(views[k])) for k in inside]
+    kept = [(k, pictures) for k, pictures in kept if any(brackets.frame[b] is not None for b in pictures)]
+    if lost := len(inside) - len(kept):
+        say(f"truth: {lost} held-out views are of exposures that the training pictures do not tell: left out")
+    return kept
+
+
+def truth_view(
+    view: HeldOut,
+    brackets: Sequence[int],
+    manifest: Manifest,
+    own_time: Callable[[float], float],
+    clip: Poses,
+    K: np.ndarray,
+    c2w: np.ndarray,
+) -> TruthView:
+    """The record of a view with pictures of `brackets`; `clip` are the set's poses of the scene's frames."""
+    exact = next((f for f in manifest.frames if f.source == view.anchor), None)
+    anchor = exact or nearest(manifest.frames, clip.c2w, c2w)
+    return TruthView(
+        name=view.name,
+        time=anchor.time if view.time is None else own_time(view.time),
+        bracket=manifest.reference_bracket if manifest.reference_bracket in brackets else brackets[0],
+        anchor=anchor.index,
+        c2w=None if exact else c2w.tolist(),
+        K=None if np.allclose(K, clip.K[anchor.index]) else K.tolist(),
+        radiance=f"radiance/{view.name}.exr" if view.radiance else None,
+        recorded={b: recording(view, b) for b in brackets},
+        mask=f"masks/{view.name}.png" if view.mask else None,
+    )
+
+
+def capture_poses(capture: Capture) -> Given:
+    """The poses of the training pictures."""
+    assert capture.poses is not None, "every layout with held-out views has poses"
+    return capture.poses
 
 
 def recording(view: HeldOut, bracket: int) -> str:
@@ -287,23 +306,15 @@ class Brackets:
         return None
 
 
-def key_of(
-    views: Sequence[HeldOut], kept: Sequence[tuple[int, dict[int, Path]]], m: Manifest, max_size: int, given: Given
-) -> str:
+def key_of(chosen: Sequence[tuple[HeldOut, dict[int, Path]]], m: Manifest, max_size: int, given: Given) -> str:
     """The hash of all that a truth folder depends on."""
 
     def hashed(path: Path | None) -> str | None:
         return None if path is None else hash_file(path)
 
     files: list[Any] = [
-        (
-            views[k].name,
-            views[k].time,
-            hashed(views[k].radiance),
-            hashed(views[k].mask),
-            {b: hashed(p) for b, p in pictures.items()},
-        )
-        for k, pictures in track(kept, "held-out views")
+        (v.name, v.time, v.anchor, hashed(v.radiance), hashed(v.mask), {b: hashed(p) for b, p in pictures.items()})
+        for v, pictures in track(chosen, "held-out views")
     ]
     scene = [(f.source, f.time, f.bracket) for f in m.frames]
     poses = [given.K.tolist(), given.c2w.tolist()]
@@ -348,12 +359,6 @@ def write_pictures(
             write_exr(exr, {"RGB": maps.fitted(view.radiance, radiance, size, maps.AREA)}, half=False)
     assert size is not None
     return size
-
-
-def clip_poses(capture: Capture, m: Manifest, size: tuple[int, int]) -> Poses:
-    """The data set's poses of the scene's frames, K for pictures of `size`."""
-    assert capture.poses is not None
-    return placed(capture.root, capture.poses, [capture.row[f.source] for f in m.frames], size)
 
 
 def nearest(frames: Sequence[FrameEntry], clip: np.ndarray, c2w: np.ndarray) -> FrameEntry:

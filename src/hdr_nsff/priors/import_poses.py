@@ -51,8 +51,6 @@ def import_poses(path: Path | str, sources: list[str], size: tuple[int, int]) ->
         given = from_llff(path)
     else:
         given = from_json(path)
-    if not (np.isfinite(given.K).all() and np.isfinite(given.c2w).all()):
-        raise InputError(f"{path}: poses hold NaN or Inf; export them again")
     chosen = arrange(path, given.names, len(given.c2w), sources)
     poses = placed(path, given, chosen, size)
     if model is not None:
@@ -231,6 +229,8 @@ def path_key(parts: int) -> Any:
 
 def placed(path: Path, given: Given, chosen: list[int | None], size: tuple[int, int]) -> Poses:
     """The chosen poses, rescaled to frames of `size` (height, width)."""
+    if not (np.isfinite(given.K).all() and np.isfinite(given.c2w).all()):
+        raise InputError(f"{path}: poses hold NaN or Inf; export them again")
     height, width = size
     K, c2w = np.tile(np.eye(3), (len(chosen), 1, 1)), np.tile(np.eye(4)[:3], (len(chosen), 1, 1))
     for t, k in enumerate(chosen):
