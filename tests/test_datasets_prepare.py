@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -300,6 +301,16 @@ def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimetres(tmp_path: Pa
     )
     view = Truth.open(tmp_path / "scene_truth").views[0]
     assert (view.name, view.time) == ("images_frame_00004", 4.0)
+
+
+def test_depth_in_16_bit_pictures_is_in_millimetres_too(tmp_path: Path) -> None:
+    root = mini.nerfstudio(tmp_path / "set")
+    for path in (root / "depth").glob("*.npy"):
+        write_png(path.with_suffix(".png"), np.full((H, W, 3), 1000 * mini.WALL / 65535), bits=16)
+    text = (root / "transforms.json").read_text()
+    (root / "transforms.json").write_text(re.sub(r"depth/(\d)\.npy", r"depth/\1.png", text))
+    scene = Scene.open(prepare(PrepareConfig(root, tmp_path / "scene", max_size=W)))
+    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(mini.WALL, rel=1e-3)
 
 
 def test_a_list_of_held_out_names_that_is_wrong_is_one_sentence(tmp_path: Path) -> None:

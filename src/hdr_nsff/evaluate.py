@@ -39,7 +39,7 @@ class EvaluateConfig:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     truth: Path | None = None
-    """Truth folder, as `synth` and `reexpose` write it; default: the frames that `prepare` held out."""
+    """Truth folder, as `synth`, `reexpose`, and `prepare` of a public data set write it; default: the frames that `prepare` held out."""
     lpips: str | None = None
     """LPIPS: a file with AlexNet weights, or `hub` to download them."""
     device: str = "auto"

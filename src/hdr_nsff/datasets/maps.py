@@ -74,7 +74,8 @@ def disparities(capture: Capture, chosen: Sequence[Picture], size: tuple[int, in
     maps = np.stack([depth_map(path, size) for path in paths])
     kind = capture.depth_kind
     if kind == "metric":
-        maps *= np.float32(capture.depth_scale)
+        whole = [65535.0 if path.suffix.lower() == ".png" else 1.0 for path in paths]  # pictures are read as shares of white
+        maps *= np.array(whole, np.float32)[:, None, None] * np.float32(capture.depth_scale)
     for path, values in zip(paths, maps, strict=True):
         if kind != "relative" and not (values > 0).any():
             raise InputError(f"{path}: nothing above 0 in this depth map; copy it again")
