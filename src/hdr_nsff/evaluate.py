@@ -2,7 +2,8 @@
 else, named as such, its own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
 
 Recorded rgb is compared at the view's own exposure (the headline) and at all exposures of the clip; radiance after one scale
-for all views (METHOD.md 7): LDR recordings alone leave it free. Moving-only numbers average over the moving mask."""
+for all views: LDR recordings alone leave it free. Moving-only numbers average over the moving mask. Every score has its definition,
+range and source in docs/metrics.md and at the function that computes it."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -20,11 +21,14 @@ from torch import Tensor
 from hdr_nsff import color, io, metrics
 from hdr_nsff.progress import say, track
 from hdr_nsff.run import Run
+from hdr_nsff.scene import Protocol
 from hdr_nsff.scores.camera import camera_errors, trajectory_errors
-from hdr_nsff.scores.predictions import predict, recorded
+from hdr_nsff.scores.geometry import GEOMETRY_SCORES, Units, find_units, score_geometry
+from hdr_nsff.scores.predictions import predict, radiance_of, recorded
 from hdr_nsff.scores.radiance import HDR_SCORES, Gauge, find_gauge, score_radiance
 from hdr_nsff.scores.rgb import SMALLEST_LPIPS, score_rgb
-from hdr_nsff.scores.targets import Target, choose_targets, exact_of
+from hdr_nsff.scores.stability import stability
+from hdr_nsff.scores.targets import Target, choose_targets, exact_of, world_scale
 from hdr_nsff.truth import Truth
 
 
@@ -60,26 +64,95 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
     truth = Truth.open(truth_folder) if truth_folder else None
     kind, targets, notes = choose_targets(run, truth, truth_folder)
     say(f"evaluating on {len(targets)} {kind}")
-    folder = run.folder / "evaluation"
-    radiance = predict(run, targets, folder)
+    folder, views = run.folder / "evaluation", {t.name: t.view for t in targets}
+    with_motion = any(t.geometry is not None for t in targets)
+    files = predict(run, views, folder, "rendering held-out views", with_motion)
+    radiance = [radiance_of(f) for f in files]
     gauge = find_gauge(targets, radiance) if truth else None
-    views = []
-    for target, predicted in zip(targets, track(radiance, "measuring"), strict=True):
-        scores = score_rgb(run, target, predicted, perceptual)
-        views.append(scores | (score_radiance(target, predicted, gauge) if gauge else {}))
+    units = find_units(targets, files, world_scale(run, truth)) if truth else None
+    scores = []
+    for target, predicted, file in zip(targets, track(radiance, "measuring"), files, strict=True):
+        of_view = describe(run, target) | score_rgb(run, target, predicted, perceptual)
+        of_view |= score_radiance(target, predicted, gauge) if gauge else {}
+        scores.append(of_view | (score_geometry(target, file, units) if units else {}))
     write_pictures(run, targets, radiance, gauge, folder)
-    groups = {g: mean_of([v for v in views if v["group"] == g]) for g in dict.fromkeys(t.group for t in targets)}
-    result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes, "headline": mean_of(views), "groups": groups}
+    result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes} | summary(run, scores, notes)
     if truth is not None and gauge is not None:
-        result |= {"hdr_scores": HDR_SCORES, "scale": float(gauge.scale), "scale_per_channel": gauge.scales.tolist()}
-        result |= {"peak": gauge.peak, "recordable_peak": gauge.recordable_peak}
+        result |= told_of_radiance(gauge) | told_of_geometry(units)
         result |= {"camera": camera_errors(run, truth), "poses": trajectory_errors(run, truth, targets)}
-        if result["headline"].get("hdr_flip") is None:
-            notes.append("HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)")
-    result |= {"lpips": lpips_note(lpips, views), "views": views, "seconds": round(time.monotonic() - start, 2)}
+        notes += absences(result["headline"], units)
+    result |= {"stability": stability(run, folder / "path"), "lpips": lpips_note(lpips, scores)}
+    if not result["stability"]:
+        notes.append("HDR-TAE: absent, the scene has no optical flow between training frames")
+    result |= {"views": scores, "seconds": round(time.monotonic() - start, 2)}
     io.write_json(run.folder / "metrics.json", result)
     tell(result)
     return result
+
+
+def describe(run: Run, target: Target) -> dict[str, Any]:
+    """What a view is."""
+    protocol = target.protocol(run.scene.times.tolist())
+    return {"name": target.name, "group": target.group, "protocol": protocol, "time": target.view.time, "bracket": target.bracket}
+
+
+NOT_SCORES = ("name", "group", "protocol", "time", "bracket")
+
+
+def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict[str, Any]:
+    """Means of the views: `headline`, `groups`, `protocols`. The headline is that of the protocol the scene was prepared for, else of all views
+    the run was not trained on, else of all."""
+    protocol = run.scene.manifest.protocol
+    wanted = [v for v in views if v["protocol"] is not None and v["protocol"] == (protocol or v["protocol"])]
+    if protocol is not None and not wanted:
+        notes.append(
+            f"no view to be compared belongs to the protocol {protocol} that the scene was prepared for; the headline is of others"
+        )
+    held_out = wanted or [v for v in views if v["protocol"] is not None]
+    return {
+        "protocol": protocol,
+        "headline": mean_of(held_out or views),
+        "groups": {g: mean_of([v for v in views if v["group"] == g]) for g in dict.fromkeys(v["group"] for v in views)},
+        "protocols": {
+            p: mean_of([v for v in views if v["protocol"] == p])
+            for p in get_args(Protocol)
+            if any(v["protocol"] == p for v in views)
+        },
+    }
+
+
+def told_of_radiance(gauge: Gauge) -> dict[str, Any]:
+    """What belongs beside the scores of radiance."""
+    return {
+        "hdr_scores": HDR_SCORES,
+        "scale": float(gauge.scale),
+        "scale_per_channel": gauge.scales.tolist(),
+        "peak": gauge.peak,
+        "recordable_peak": gauge.recordable_peak,
+        "pu21": {"white": gauge.white, "nits": metrics.PU21_NITS},
+        "flip_exposures": list(gauge.flip),
+    }
+
+
+def told_of_geometry(units: Units | None) -> dict[str, Any]:
+    """What belongs beside the scores of depth and motion."""
+    if units is None:
+        return {}
+    return {"geometry_scores": GEOMETRY_SCORES, "depth_scale": units.depth, "world_scale": units.world}
+
+
+def absences(headline: dict[str, Any], units: Units | None) -> list[str]:
+    """Sentences about scores that a truth with radiance could have, and this one or this run has not."""
+    notes = []
+    if "hdr_flip" not in headline:
+        notes.append("HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)")
+    if units is None:
+        notes.append("depth and motion: absent, this truth folder holds none (`synth` writes them)")
+    elif "flow_epe" not in headline:
+        notes.append("motion: absent, this field tells no scene flow")
+    elif units.world is None:
+        notes.append("scene flow in three dimensions: absent, the estimated cameras fix no scale")
+    return notes
 
 
 def lpips_note(weights: str | None, views: Sequence[dict[str, Any]]) -> str:
@@ -103,7 +176,7 @@ def tell(result: dict[str, Any]) -> None:
 
 def mean_of(views: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Means of every score over the views that have it, and their number."""
-    names = dict.fromkeys(k for v in views for k in v if k not in ("name", "group", "time", "bracket"))
+    names = dict.fromkeys(k for v in views for k in v if k not in NOT_SCORES)
     means = {k: [v[k] for v in views if v.get(k) is not None] for k in names}
     return {"views": len(views)} | {k: float(np.mean(x)) for k, x in means.items() if x}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,6 +21,7 @@ class Gauge:
     scales: Tensor  # (3,) the same per channel
     peak: float  # largest exact radiance
     recordable_peak: float  # the same of pixels that at least one exposure records unclipped
+    white: float  # luminance that PU21 takes for 1000 cd/m^2
     flip: tuple[float, float]  # exposure range of HDR-FLIP, log2
 
 
@@ -33,38 +35,45 @@ def find_gauge(targets: Sequence[Target], radiance: Sequence[Tensor]) -> Gauge:
         scales=metrics.align(predicted, exact, known, per_channel=True),
         peak=float(exact.max()),
         recordable_peak=float(exact[known].max() if known.any() else exact.max()),
+        white=metrics.pu21_white(truths),
         flip=metrics.flip_exposures(truths),
     )
 
 
 HDR_SCORES = {  # what they are called, and digits after the point
-    "mu5000": ["μ-law 5000 PSNR, dB", 2],
-    "mu5000_moving": ["μ-law 5000 moving, dB", 2],
-    "mu5000_recordable": ["μ-law 5000, recordable pixels, dB", 2],
-    "mu5000_per_channel": ["μ-law 5000, one scale per channel, dB", 2],
-    "mu5000_unaligned": ["μ-law 5000, unaligned, dB", 2],
-    "mu50": ["μ-law 50 PSNR, dB", 2],
-    "mu50_moving": ["μ-law 50 moving, dB", 2],
-    "mu50_recordable": ["μ-law 50, recordable pixels, dB", 2],
-    "mu50_per_channel": ["μ-law 50, one scale per channel, dB", 2],
-    "mu50_unaligned": ["μ-law 50, unaligned, dB", 2],
+    f"mu{mu}{key}": [f"μ-law {mu} PSNR{label}, dB", 2]
+    for mu in (5000, 50)
+    for key, label in {
+        "": "",
+        "_moving": " moving",
+        "_recordable": ", recordable pixels",
+        "_per_channel": ", one scale per channel",
+        "_per_channel_moving": " moving, one scale per channel",
+        "_unaligned": ", unaligned",
+        "_unaligned_moving": " moving, unaligned",
+    }.items()
+} | {
+    "pu21": ["PU21 PSNR, dB", 2],
+    "pu21_moving": ["PU21 PSNR moving, dB", 2],
     "hdr_flip": ["HDR-FLIP", 4],
+    "hdr_flip_moving": ["HDR-FLIP moving", 4],
 }
 
 
-def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, float | None]:
+def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, float]:
     """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`. Normalised by the largest exact radiance of all
     views; `recordable`: over recordable pixels only, normalised by the largest of them."""
     exact, known, moving = exact_of(target), recordable(target), moving_of(target)
-    aligned = radiance * gauge.scale
-    scores: dict[str, float | None] = {}
-    for mu in (5000, 50):
-        scores[f"mu{mu}"] = metrics.mu_law_psnr(aligned, exact, gauge.peak, mu)
-        scores[f"mu{mu}_per_channel"] = metrics.mu_law_psnr(radiance * gauge.scales, exact, gauge.peak, mu)
-        scores[f"mu{mu}_unaligned"] = metrics.mu_law_psnr(radiance, exact, gauge.peak, mu)
-        if moving is not None:
-            scores[f"mu{mu}_moving"] = metrics.mu_law_psnr(aligned, exact, gauge.peak, mu, moving)
-        if known.any():
-            scores[f"mu{mu}_recordable"] = metrics.mu_law_psnr(aligned, exact, gauge.recordable_peak, mu, known)
-    scores["hdr_flip"] = metrics.hdr_flip(aligned, exact, gauge.flip)
+    regions = {"": None} | ({} if moving is None else {"_moving": moving})
+    ways = {"": radiance * gauge.scale, "_per_channel": radiance * gauge.scales, "_unaligned": radiance}
+    scores: dict[str, float] = {}
+    for mu, (way, values), (where, mask) in itertools.product((5000, 50), ways.items(), regions.items()):
+        scores[f"mu{mu}{way}{where}"] = metrics.mu_law_psnr(values, exact, gauge.peak, mu, mask)
+    for mu in (5000, 50) if known.any() else ():
+        scores[f"mu{mu}_recordable"] = metrics.mu_law_psnr(ways[""], exact, gauge.recordable_peak, mu, known)
+    visible = metrics.hdr_flip_map(ways[""], exact, gauge.flip)
+    for where, mask in regions.items():
+        scores[f"pu21{where}"] = metrics.pu21_psnr(ways[""], exact, gauge.white, mask)
+        if visible is not None:
+            scores[f"hdr_flip{where}"] = float(visible.mean() if mask is None else visible[mask].mean())
     return scores

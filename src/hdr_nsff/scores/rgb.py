@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from torch import Tensor
 
@@ -15,17 +13,18 @@ from hdr_nsff.scores.targets import Target, moving_of
 SMALLEST_LPIPS = 64  # pixels
 
 
-def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: Any) -> dict[str, Any]:
+def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lpips | None) -> dict[str, float]:
     """Recorded rgb at the view's own exposure, and PSNR averaged over all exposures; moving-only numbers where there is a mask with
     something in it."""
     moving = moving_of(target)
     own, truth = recorded(run, target, radiance, target.bracket), target.rgb[target.bracket]
-    scores: dict[str, Any] = {"name": target.name, "group": target.group, "time": target.view.time, "bracket": target.bracket}
-    scores |= {"psnr": metrics.psnr(own, truth), "ssim": metrics.ssim(own, truth)}
+    scores: dict[str, float] = {"psnr": metrics.psnr(own, truth), "ssim": metrics.ssim(own, truth)}
     if moving is not None:
         scores |= {"psnr_moving": metrics.psnr(own, truth, moving), "ssim_moving": metrics.ssim(own, truth, moving)}
     if perceptual is not None and min(own.shape[:2]) >= SMALLEST_LPIPS:
         scores["lpips"] = perceptual(own, truth)
+        if moving is not None:
+            scores["lpips_moving"] = perceptual.on_mask(own, truth, moving)
     every = [(recorded(run, target, radiance, b), rgb) for b, rgb in target.rgb.items()]
     scores["psnr_all_exposures"] = float(np.mean([metrics.psnr(p, t) for p, t in every]))
     if moving is not None:

@@ -16,9 +16,20 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.paths import View
 from hdr_nsff.progress import say
 from hdr_nsff.run import Run
-from hdr_nsff.scene import inside
+from hdr_nsff.scene import Protocol, inside
 from hdr_nsff.tonemap import informative
 from hdr_nsff.truth import Truth, TruthView
+
+SEEN = "training view"  # the group of views that were trained on
+
+
+@dataclass(frozen=True)
+class GeometryFile:
+    """Where a view's true depth and motion are."""
+
+    path: Path
+    size: tuple[int, int]  # (H, W)
+    turn: np.ndarray  # (3, 3): axes of the truth to those of the scene, as the view's two poses have it
 
 
 @dataclass(frozen=True)
@@ -33,6 +44,13 @@ class Target:
     rgb: dict[int, Tensor]  # {bracket: (H, W, 3)} what the camera would record (or did) in [0, 1]
     radiance: Tensor | None  # (H, W, 3) exact, where known, in the camera's white balance: the unit of a run's radiance
     moving: Tensor | None  # (H, W) bool
+    geometry: GeometryFile | None = None  # where known
+
+    def protocol(self, times: Sequence[float]) -> Protocol | None:
+        """Which of the published comparisons the view belongs to, of a run trained at `times`; None where it was trained on."""
+        if self.group == SEEN:
+            return None
+        return "novel-view" if min(abs(self.view.time - t) for t in times) < 1e-6 else "novel-view-time"
 
 
 def moving_of(target: Target) -> Tensor | None:
@@ -70,7 +88,7 @@ def choose_targets(run: Run, truth: Truth | None, folder: Path | None) -> tuple[
 def frame_targets(run: Run, test: bool) -> list[Target]:
     """Recorded frames: those held out, or up to 12 training frames."""
     frames = run.scene.test if test else run.scene.train[:: max(1, -(-len(run.scene.train) // 12))]
-    group = "held-out frame" if test else "training view"
+    group = "held-out frame" if test else SEEN
     return [
         Target(
             f"{f.index:05d}", group, View(f.camera, f.time), f.bracket, f.camera_id, {f.bracket: f.image.cpu()}, None, f.moving
@@ -96,6 +114,8 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
             notes.append(f"{view.name}: left out, its time {view.time:g} is outside the training frames")
         else:
             targets.append(truth_target(run, truth, view, folder, scale or 1.0))
+    if seen := [t.name for t in targets if t.group == SEEN]:
+        notes.append(f"{len(seen)} views, {seen[0]} first, are frames that the run was trained on; they are no held-out views")
     for note in notes:
         say(note)
     if not targets:
@@ -129,13 +149,30 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     match = match_brackets(truth.bracket_ev, run.tonemapper.exposures().tolist())
     camera = Camera(torch.tensor(anchor.K), torch.from_numpy(pose).float(), m.width, m.height).resized(width, height)
     rgb = {match[b]: record(truth, exact, b) for b in range(len(truth.bracket_ev))}
-    at_frame = min(abs(view.time - t) for t in run.scene.times.tolist()) < 1e-6
-    group = "off-path" if view.c2w is not None else "view" if at_frame else "view+time"
     return Target(
-        view.name, group, View(camera, view.time), match[view.bracket], anchor.camera_id, rgb,
+        view.name, group_of(run, view), View(camera, view.time), match[view.bracket], anchor.camera_id, rgb,
         torch.from_numpy(exact * np.array(truth.white_balance, np.float32)),
         moving_mask(run, view, folder, (height, width)),
+        geometry_file(truth, view, folder, (height, width), pose),
     )  # fmt: skip
+
+
+def group_of(run: Run, view: TruthView) -> str:
+    """What kind of view it is to this run."""
+    if view.c2w is not None:
+        return "off-path"
+    if any(f.index == view.anchor and abs(f.time - view.time) < 1e-6 for f in run.scene.train):
+        return SEEN
+    return "view" if min(abs(view.time - t) for t in run.scene.times.tolist()) < 1e-6 else "view+time"
+
+
+def geometry_file(truth: Truth, view: TruthView, folder: Path, size: tuple[int, int], pose: np.ndarray) -> GeometryFile | None:
+    """Where depth and motion of a truth view are, whose `pose` (3, 4) in the scene is known."""
+    if view.geometry is None:
+        return None
+    assert truth.clip_c2w is not None, "Truth.problem refuses this"
+    true = np.array(view.c2w or truth.clip_c2w[view.anchor])
+    return GeometryFile(inside(folder, view.geometry), size, pose[:, :3] @ true[:, :3].T)
 
 
 def moving_mask(run: Run, view: TruthView, folder: Path, size: tuple[int, int]) -> Tensor | None:
