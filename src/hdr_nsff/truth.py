@@ -13,15 +13,12 @@ from typing import Literal
 from pydantic import Field
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_json
+from hdr_nsff.io import SIDES, read_json
 from hdr_nsff.scene import LARGEST_EV, Strict, first_problem, is_intrinsic, is_matrix, is_pose
 
-GEOMETRY = {  # channels of a view's geometry, all of the ray through the pixel's centre
-    "Z": "z-depth in true units; 0 where the ray hits nothing, and nothing else is known there",
-    "forward.u, forward.v": "pixels that the surface moves in this camera, standing still, within one frame from the view's time on",
-    "forward.x, forward.y, forward.z": "the same in the truth's world, in true units",
-    "backward.*": "the same until one frame earlier",
-}
+# Channels of a view's geometry, of the ray through each pixel's centre: z-depth in true units (0 where it hits nothing); pixels that the surface
+# moves in this camera, standing still, until one frame later and one frame earlier; the same in the truth's world, in true units.
+GEOMETRY = ("Z", *(f"{side}.{axis}" for side in SIDES.values() for axis in "uvxyz"))
 
 
 class TruthView(Strict):

@@ -15,6 +15,7 @@ from hdr_nsff import io, metrics
 from hdr_nsff.errors import InputError
 from hdr_nsff.scores.predictions import Geometry, geometry_of
 from hdr_nsff.scores.targets import GeometryFile, Target, moving_of
+from hdr_nsff.truth import GEOMETRY
 
 GEOMETRY_SCORES = {  # what they are called, and digits after the point
     "depth_abs_rel": ["depth, AbsRel", 4],
@@ -41,8 +42,7 @@ class Units:
 def true_geometry(file: GeometryFile) -> Geometry:
     """Depth and motion of a truth file, in true units along the axes of the scene."""
     channels = io.read_exr(file.path)
-    names = ["Z", *(f"{n}.{a}" for n in io.SIDES.values() for a in "uvxyz")]
-    if lost := [n for n in names if n not in channels]:
+    if lost := [n for n in GEOMETRY if n not in channels]:
         raise InputError(f"{file.path}: no channel {lost[0]} in this truth file; make the truth anew")
     if channels["Z"].shape != file.size:
         raise InputError(f"{file.path}: depth of {channels['Z'].shape}, but the radiance of that view is {file.size}")

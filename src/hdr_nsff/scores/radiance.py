@@ -47,6 +47,7 @@ HDR_SCORES = {  # what they are called, and digits after the point
         "": "",
         "_moving": " moving",
         "_recordable": ", recordable pixels",
+        "_recordable_moving": " moving, recordable pixels",
         "_per_channel": ", one scale per channel",
         "_per_channel_moving": " moving, one scale per channel",
         "_unaligned": ", unaligned",
@@ -69,8 +70,10 @@ def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, 
     scores: dict[str, float] = {}
     for mu, (way, values), (where, mask) in itertools.product((5000, 50), ways.items(), regions.items()):
         scores[f"mu{mu}{way}{where}"] = metrics.mu_law_psnr(values, exact, gauge.peak, mu, mask)
-    for mu in (5000, 50) if known.any() else ():
-        scores[f"mu{mu}_recordable"] = metrics.mu_law_psnr(ways[""], exact, gauge.recordable_peak, mu, known)
+    for mu, (where, mask) in itertools.product((5000, 50), regions.items()):
+        region = known if mask is None else known & mask
+        if region.any():
+            scores[f"mu{mu}_recordable{where}"] = metrics.mu_law_psnr(ways[""], exact, gauge.recordable_peak, mu, region)
     visible = metrics.hdr_flip_map(ways[""], exact, gauge.flip)
     for where, mask in regions.items():
         scores[f"pu21{where}"] = metrics.pu21_psnr(ways[""], exact, gauge.white, mask)
