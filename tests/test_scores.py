@@ -322,6 +322,12 @@ def test_a_frame_that_was_trained_on_is_no_held_out_view(tmp_path: Path) -> None
     result = evaluate_run(run, folder)
     assert views_of(result)["own"]["group"] == "training view" and views_of(result)["own"]["protocol"] is None
     assert result["headline"]["views"] == 3 and any("trained on" in note for note in result["notes"])
+    assert result["kind"] == "held-out views with exact radiance"
+    io.write_json(folder / "truth.json", truth.model_copy(update={"views": [own]}).model_dump())
+    result = evaluate_run(run, folder)
+    assert (
+        result["kind"] == "training views with exact radiance" and result["headline"]["views"] == 1 and result["protocols"] == {}
+    )
 
 
 def test_a_scene_whose_protocol_no_view_belongs_to_says_so(tmp_path: Path) -> None:

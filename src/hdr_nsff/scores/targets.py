@@ -77,7 +77,8 @@ def choose_targets(run: Run, truth: Truth | None, folder: Path | None) -> tuple[
     """What the targets are, in words; the targets; sentences about what had to be left out."""
     if truth is not None and folder is not None:
         targets, notes = truth_targets(run, truth, folder)
-        return "held-out views with exact radiance", targets, notes
+        held_out = any(t.group != SEEN for t in targets)
+        return f"{'held-out' if held_out else 'training'} views with exact radiance", targets, notes
     if run.scene.test:
         return "held-out frames", frame_targets(run, test=True), []
     note = "nothing was held out (`prepare --hold-out 8` does that): these numbers are of frames the field was trained on"
