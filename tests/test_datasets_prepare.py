@@ -135,6 +135,26 @@ def test_every_second_frame_leaves_the_others_to_be_tested(gopro: PrepareConfig)
     assert provenance(gopro.out)["flow"] == "estimated"  # the set has flow between neighbours alone
 
 
+def test_a_protocol_splits_a_data_set_and_keeps_its_times(gopro: PrepareConfig) -> None:
+    prepare(replace(gopro, protocol="novel-view-time"))
+    scene, truth = Scene.open(gopro.out), Truth.open(gopro.out.with_name("scene_truth"))
+    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8] and [f.time for f in scene.test] == [1, 3, 5, 7]
+    assert scene.manifest.protocol == "novel-view-time"
+    assert {v.time for v in truth.views} == {t / 2 for t in range(0, 17)}  # all, to be told apart by `evaluate`
+    flow = Manifest.load(gopro.out).steps["flow"].note
+    assert "24 pairs" in flow and "16 given, 8 estimated" in flow  # the set has flow between neighbours alone
+    prepare(replace(gopro, protocol="novel-view"))
+    assert len(Scene.open(gopro.out).train) == 9
+
+
+def test_a_truth_of_other_settings_does_not_stay(gopro: PrepareConfig) -> None:
+    """The first three frames are of cameras 1 to 3; when only these times are used, views later than that go."""
+    prepare(gopro)
+    prepare(replace(gopro, end=3, redo=("frames",)))
+    folder = held_out_truth(gopro)
+    assert folder is not None and {v.time for v in Truth.open(folder).views} == {0.0, 0.5, 1.0, 1.5, 2.0}
+
+
 def test_parts_can_be_estimated_although_they_are_given(gopro: PrepareConfig) -> None:
     prepare(replace(gopro, estimate=("flow",)))
     assert provenance(gopro.out)["flow"] == "estimated" and provenance(gopro.out)["mask"] == "given"

@@ -18,6 +18,7 @@ from hdr_nsff.progress import say
 from hdr_nsff.render import render_all
 from hdr_nsff.report import check_place, write_report
 from hdr_nsff.run import Run, pick_device
+from hdr_nsff.scene import Protocol
 from hdr_nsff.train import train
 
 
@@ -46,8 +47,10 @@ class RunConfig:
     held-out views brings its own."""
     poses: Path | None = None
     """Given poses (COLMAP model, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    protocol: Protocol | None = None
+    """Split the clip as the published tables do, see `prepare --help`; instead of --hold-out, and with held-out views to be evaluated on."""
     hold_out: int | None = None
-    """Keep every this many frames for `evaluate`; default 8, or 0 with a truth folder."""
+    """Keep every this many frames for `evaluate`; default 8; with a truth folder, or where a data set brings held-out views, 0."""
     max_size: int = 640
     """Longest side in pixels; larger frames are shrunk."""
     seed: int = 0
@@ -64,10 +67,10 @@ def run_all(config: RunConfig) -> None:
     if config.truth is not None:
         check_truth(config.truth)
     check_place(config.out / "report.html")
-    hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
+    hold_out = 0 if config.hold_out is None and config.truth and config.protocol is None else config.hold_out
     footage = PrepareConfig(
-        clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev,
-        max_size=config.max_size, hold_out=hold_out, poses=config.poses,
+        clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev, max_size=config.max_size,
+        hold_out=hold_out, protocol=config.protocol, poses=config.poses,
     )  # fmt: skip
     scene = prepare(footage)
     truth = config.truth or held_out_truth(footage)

@@ -1,8 +1,9 @@
 """Held-out truth: views and times that no clip shows, read by `evaluate` only (an import test holds this).
 
 A truth folder holds `truth.json` and, per held-out view, linear radiance (EXR), or what a camera recorded of it at one exposure or
-several (PNG), or both, and a moving mask (PNG). Poses are in the truth's own world; a view names the clip frame nearest to it in
-space, so that it can be carried over to estimated poses. Where the response is known, recordings are made from the radiance."""
+several (PNG), or both, a moving mask (PNG) and, where they are known, depth and motion (EXR). Poses are in the truth's own world; a
+view names the clip frame nearest to it in space, so that it can be carried over to estimated poses. Where the response is known,
+recordings are made from the radiance."""
 
 from __future__ import annotations
 
@@ -15,8 +16,13 @@ import numpy as np
 from pydantic import Field
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_exr, read_image, read_json
+from hdr_nsff.io import SIDES, read_exr, read_image, read_json
+from hdr_nsff.recording import Curve
 from hdr_nsff.scene import LARGEST_EV, FrameEntry, Strict, first_problem, inside, is_intrinsic, is_matrix, is_pose
+
+# Channels of a view's geometry, of the ray through each pixel's centre: z-depth in true units (0 where it hits nothing); pixels that the surface
+# moves in this camera, standing still, until one frame later and one frame earlier; the same in the truth's world, in true units.
+GEOMETRY = ("Z", *(f"{side}.{axis}" for side in SIDES.values() for axis in "uvxyz"))
 
 
 class TruthView(Strict):
@@ -31,11 +37,12 @@ class TruthView(Strict):
     radiance: str | None = None  # EXR, linear, relative path
     recorded: dict[int, str] = Field(default_factory=dict)  # bracket -> PNG, what a camera recorded
     mask: str | None = None  # PNG, moving = 255
+    geometry: str | None = None  # EXR: depth and motion, see `GEOMETRY`
 
     @property
     def files(self) -> list[str]:
         """The names of all files of this view."""
-        return [n for n in (self.radiance, *self.recorded.values(), self.mask) if n is not None]
+        return [n for n in (self.radiance, *self.recorded.values(), self.mask, self.geometry) if n is not None]
 
     def problem(self, num_brackets: int, response: bool) -> str | None:
         """What makes no sense in this view; None where all does. `response`: whether recordings can be made from radiance."""
@@ -72,6 +79,11 @@ class Truth(Strict):
     )
     views: list[TruthView]
 
+    @property
+    def response(self) -> Curve | None:
+        """The response curve, where it is known."""
+        return None if self.response_x is None else Curve(np.array(self.response_x), np.array(self.response_y))
+
     @staticmethod
     def open(folder: Path | str) -> Truth:
         """Read `truth.json`; InputError in one sentence where it is missing or makes no sense."""
@@ -97,6 +109,8 @@ class Truth(Strict):
             return "an exposure is unknown, and bracket_frame does not say which frames have it"
         if self.bracket_frame is not None and len(self.bracket_frame) != num:
             return f"bracket_frame lists {len(self.bracket_frame)} brackets, bracket_ev {num}"
+        if self.bracket_frame is not None and self.bracket_frame[self.reference_bracket] is None:
+            return f"bracket_frame names no frame of the reference exposure {self.reference_bracket}"
         if problem := self.response_problem():
             return problem
         if len(self.white_balance) != 3 or min(self.white_balance) <= 0:
@@ -105,6 +119,8 @@ class Truth(Strict):
             return "K is no 3x3 camera matrix"
         if not all(is_matrix(c2w, (3, 4), is_pose) for c2w in self.clip_c2w or []):
             return "clip_c2w are no 3x4 camera poses"
+        if self.clip_c2w is None and any(v.geometry is not None for v in self.views):
+            return "views have depth and motion, but clip_c2w is missing, so that nobody knows which way they point"
         if len({v.name for v in self.views}) < len(self.views):
             return "two views have the same name"
         return next(
@@ -134,7 +150,7 @@ def true_pictures(truth: Truth, view: TruthView, folder: Path) -> tuple[np.ndarr
         if exact.min() < 0:
             raise InputError(f"{folder / view.radiance}: negative radiance; clip at zero before writing the truth")
     pictures = {b: read_image(inside(folder, name)) for b, name in view.recorded.items()}
-    if exact is not None and truth.response_x is not None:
+    if exact is not None and truth.response is not None:
         pictures = {b: record(truth, exact, b) for b in range(len(truth.bracket_ev))} | pictures
     sizes = {p.shape[:2] for p in pictures.values()} | ({exact.shape[:2]} if exact is not None else set())
     if len(sizes) > 1:
@@ -144,11 +160,9 @@ def true_pictures(truth: Truth, view: TruthView, folder: Path) -> tuple[np.ndarr
 
 def record(truth: Truth, radiance: np.ndarray, bracket: int) -> np.ndarray:
     """What the true camera records (H, W, 3) of `radiance` (H, W, 3) at a bracket, without noise."""
-    ev = truth.bracket_ev[bracket]
-    assert ev is not None and truth.response_x is not None and truth.response_y is not None, "`Truth.problem` refuses this"
-    exposure = radiance * 2.0**ev * np.array(truth.white_balance)
-    rgb = np.stack([np.interp(exposure[..., c], truth.response_x, truth.response_y[c]) for c in range(3)], -1)
-    return rgb.astype(np.float32)
+    ev, response = truth.bracket_ev[bracket], truth.response
+    assert ev is not None and response is not None, "`Truth.problem` refuses this"
+    return response.apply(radiance * 2.0**ev * np.array(truth.white_balance)).astype(np.float32)
 
 
 def match_brackets(true_ev: Sequence[float], learned_ev: Sequence[float]) -> dict[int, int]:
@@ -162,8 +176,14 @@ def match_brackets(true_ev: Sequence[float], learned_ev: Sequence[float]) -> dic
 
 def scene_brackets(truth: Truth, frames: Sequence[FrameEntry], learned_ev: Sequence[float]) -> dict[int, int]:
     """{bracket of the truth: bracket of the scene} for a scene of these `frames`, whose brackets have the exposures `learned_ev`;
-    without exposures of the truth that no frame of the scene has."""
+    without exposures of the truth that no frame of the scene has. InputError where that of reference is among those."""
     if truth.bracket_frame is None:
         return match_brackets([ev for ev in truth.bracket_ev if ev is not None], learned_ev)  # all: `Truth.problem` sees to it
     brackets = {e.index: e.bracket for e in frames}
-    return {b: brackets[f] for b, f in enumerate(truth.bracket_frame) if f is not None and f in brackets}
+    match = {b: brackets[f] for b, f in enumerate(truth.bracket_frame) if f is not None and f in brackets}
+    if truth.reference_bracket not in match:
+        frame = truth.bracket_frame[truth.reference_bracket]
+        raise InputError(
+            f"truth.json: frame {frame} shows the reference exposure, and the scene has none; prepare the whole clip"
+        )
+    return match

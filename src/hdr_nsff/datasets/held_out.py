@@ -177,6 +177,8 @@ def write_truth(
     shown = comparable(views, manifest, own_time, brackets)
     if not shown:
         say("truth: no held-out view is left to compare with")
+        if truth_folder(out) is not None:  # of other settings
+            (out / "truth.json").unlink()
         return None
     rows = reorder(given, [row for row, _ in shown])
     chosen = [(views[row], pictures) for row, pictures in shown]

@@ -12,7 +12,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.io import write_png
 from hdr_nsff.priors import exposure
 from hdr_nsff.progress import say, track
-from hdr_nsff.scene import FrameEntry, Step
+from hdr_nsff.scene import FrameEntry, Protocol, Step
 from hdr_nsff.steps.work import Work
 
 MIN_FRAMES = 3
@@ -76,8 +76,10 @@ def exposure_step(work: Work) -> Step:
     gauge = values[m.reference_bracket]
     m.bracket_ev = [None if v is None or gauge is None else v - gauge for v in values]
     m.exposure_given = stored.given if stored else given is not None
-    every = held_out_every(work)
-    test = {frames[k] for frames in cameras for k in ingest.held_out(len(frames), every, m.cycle)}
+    m.protocol = work.config.protocol
+    test = kept_out(work)
+    if m.protocol is not None:
+        check_protocol(m.protocol, brackets, test)
     for f, bracket in zip(m.frames, brackets, strict=True):
         f.bracket, f.ev, f.split = bracket, m.bracket_ev[bracket], "test" if f.index in test else "train"
     vars(work).pop("equalised", None)
@@ -85,6 +87,35 @@ def exposure_step(work: Work) -> Step:
     step: Literal["given", "estimated"] = "given" if stored or given is not None else "estimated"
     details = {"source": source, "doubts": notes}
     return Step(provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details)
+
+
+def kept_out(work: Work) -> set[int]:
+    """Indices of the frames that are kept out of training, by the protocol or every so many of each camera."""
+    c, cycle, cameras = work.config, work.manifest.cycle, work.camera_frames()
+    match c.protocol:
+        case "novel-view":
+            return set()
+        case "novel-view-time":
+            return {frames[k] for frames in cameras for k in ingest.between(len(frames), cycle)}
+        case None:
+            return {frames[k] for frames in cameras for k in ingest.held_out(len(frames), held_out_every(work), cycle)}
+
+
+def held_out_every(work: Work) -> int:
+    """Every how many frames are kept out of training; 0 for none, as where a data set brings held-out views of its own."""
+    if work.config.hold_out is not None:
+        return work.config.hold_out
+    return 0 if work.capture is not None and work.capture.withheld else 8
+
+
+def check_protocol(protocol: Protocol, brackets: list[int], test: set[int]) -> None:
+    """InputError where the frames that are not kept out (`test`, indices) show fewer exposures than all, by their `brackets`."""
+    shown, trained = set(brackets), {b for i, b in enumerate(brackets) if i not in test}
+    if len(trained) < len(shown):
+        raise InputError(
+            f"--protocol {protocol}: of {len(brackets)} frames it trains on {len(brackets) - len(test)}, which show only {len(trained)} "
+            f"of {len(shown)} exposures; use a longer clip, or --hold-out"
+        )
 
 
 def given_exposures(work: Work) -> tuple[str, list[float] | None]:
@@ -119,13 +150,6 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         if known and len(known) < len(found):
             say(f"exposure: EXIF of {len(found) - len(known)} frames holds no exposure time; brightness decides instead")
     return "brightness", None
-
-
-def held_out_every(work: Work) -> int:
-    """Every how many frames are kept out of training; 0 for none, as where a data set brings held-out views of its own."""
-    if work.config.hold_out is not None:
-        return work.config.hold_out
-    return 0 if work.capture is not None and work.capture.withheld else 8
 
 
 def check_length(work: Work, cycle: list[float], numbers: list[int]) -> None:

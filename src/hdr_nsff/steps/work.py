@@ -14,7 +14,7 @@ from hdr_nsff import ingest
 from hdr_nsff.datasets.capture import Capture, Picture
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
-from hdr_nsff.scene import FrameEntry, Manifest
+from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
 Part = Literal["poses", "flow", "masks", "depth"]
 StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
@@ -46,6 +46,10 @@ class PrepareConfig:
     """Use every this many frames."""
     hold_out: int | None = None
     """Keep every this many frames out of training, for `evaluate`; 0 keeps all in. Default 8; 0 for a data set with held-out views."""
+    protocol: Protocol | None = None
+    """Split the clip as the published tables do, instead of --hold-out. novel-view: train on all frames, to be evaluated from other cameras
+    at their times; novel-view-time: train on every second frame, to be evaluated at the times between. Either wants held-out views: a truth
+    folder in `evaluate`, or a data set that brings them."""
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
     flow: Path | None = None
