@@ -52,9 +52,12 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         return evaluate_run(Run.open(config.run, config.device), config.truth, config.lpips)
 
 
-def check_truth(folder: Path) -> None:
-    """InputError where `folder` is no truth folder, for those who will need it later."""
-    Truth.open(folder)
+def views_of_clip(folder: Path) -> list[int]:
+    """Which frames of the clip the views of a truth folder are, for those who keep them out of training; none where any view is of another
+    place or time. InputError where `folder` is no truth folder."""
+    views = Truth.open(folder).views
+    own = all(v.c2w is None and v.time == v.anchor for v in views)
+    return sorted({v.anchor for v in views}) if own else []
 
 
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -199,6 +199,9 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
+HOLD_OUT = 8  # every this many frames are kept out of training, where nobody says otherwise
+
+
 def held_out(count: int, every: int, cycle: int) -> list[int]:
     """Which of `count` frames are kept out of training: every `every`-th, never the first or the last; none for 0.
 
@@ -208,6 +211,12 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
     while math.gcd(every, cycle) > 1:
         every += 1
     return list(range(every // 2, count - 1, every))
+
+
+def every_of(frames: Sequence[int]) -> int | None:
+    """The smallest `every` for which `held_out` keeps out just these `frames` of a clip that ends soon after them; None where there is none."""
+    candidates = range(2, 2 * frames[0] + 2)
+    return next((every for every in candidates if held_out(frames[-1] + 2, every, 1) == list(frames)), None)
 
 
 def between(count: int, cycle: int) -> list[int]:

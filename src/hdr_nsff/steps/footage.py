@@ -105,7 +105,7 @@ def held_out_every(work: Work) -> int:
     """Every how many frames are kept out of training; 0 for none, as where a data set brings held-out views of its own."""
     if work.config.hold_out is not None:
         return work.config.hold_out
-    return 0 if work.capture is not None and work.capture.withheld else 8
+    return 0 if work.capture is not None and work.capture.withheld else ingest.HOLD_OUT
 
 
 def check_protocol(protocol: Protocol, brackets: list[int], test: set[int]) -> None:
