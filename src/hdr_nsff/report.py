@@ -245,7 +245,7 @@ def quality(metrics: dict[str, Any] | None) -> str:
         world = f", scene flow by {metrics['world_scale']:.4f}" if metrics["world_scale"] is not None else ""
         parts += [f'<p class="note">{units}{world}.</p>']
     titles = {"stability": "Stability along the training path", "camera": "Learned camera against the true one"}
-    for part, title in {**titles, "poses": "Estimated poses against the true ones"}.items():
+    for part, title in {**titles, "poses": "Poses of the scene against the true ones"}.items():
         found = metrics.get(part) or {}
         rows = [(label, text(found[key])) for key, label in ERRORS[part].items() if key in found]
         parts += [f"<h3>{title}</h3>", table(("", ""), rows)] if rows else []
