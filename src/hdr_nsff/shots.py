@@ -26,7 +26,7 @@ from hdr_nsff.interpolate import Mode, render_at
 from hdr_nsff.paths import View
 from hdr_nsff.progress import say, track
 from hdr_nsff.run import Run
-from hdr_nsff.tensors import to_device
+from hdr_nsff.tensors import hold_threads, to_device
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,7 @@ def device_of(run: Run) -> torch.device:
 
 def take(run: Run, view: View, between: Mode = "auto") -> Still:
     """The picture of one view."""
+    hold_threads(run.config.torch_threads)
     camera = to_device(view.camera, device_of(run))
     with torch.no_grad():
         seen = render_at(run.field, camera, view.time, run.scene.times.tolist(), between)

@@ -32,3 +32,10 @@ def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
 def to_device(value: T, device: torch.device | str) -> T:
     """`value` with every tensor on `device`."""
     return tree_map(lambda t: t.to(device), value)
+
+
+def hold_threads(count: int) -> None:
+    """Let torch use `count` threads (0: as it is). Before every step or frame: numba's kernels set the count of the OpenMP library that
+    both share."""
+    if count:
+        torch.set_num_threads(count)

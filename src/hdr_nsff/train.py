@@ -26,7 +26,7 @@ from hdr_nsff.priors.response import initialise
 from hdr_nsff.progress import bar, say
 from hdr_nsff.run import latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
 from hdr_nsff.scene import Scene
-from hdr_nsff.tensors import to_device
+from hdr_nsff.tensors import hold_threads, to_device
 from hdr_nsff.tonemap import ToneMapper, informative
 
 LOG_EVERY = 25  # steps
@@ -191,8 +191,7 @@ class Trainer:
         """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
         clock, config = self.clock, self.config
         self.field.train()
-        if config.torch_threads:  # every step: numba's kernels set the count of the OpenMP library that both share
-            torch.set_num_threads(config.torch_threads)
+        hold_threads(config.torch_threads)
         if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)
