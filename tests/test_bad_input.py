@@ -338,6 +338,31 @@ def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path
     assert not list(tmp_path.iterdir())
 
 
+FAILING = """
+import gc, pathlib, sys
+import numpy as np
+from hdr_nsff import io
+
+def broken(self, data):
+    view = memoryview(data)
+    raise OSError(28, "No space left on device")
+
+gc.disable()
+pathlib.Path.write_bytes = broken
+try:
+    io.write_npy(sys.argv[1], np.zeros(50))
+except OSError as error:
+    error.itself = error  # a cycle: what the traceback holds is left to the collector
+gc.collect()
+"""
+
+
+def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_later(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(Path(cli.__file__).parents[1]), *sys.path])
+    command = [sys.executable, "-c", FAILING, str(tmp_path / "map.npy")]
+    assert subprocess.run(command, env=os.environ | {"PYTHONPATH": path}).returncode == 0
+
+
 # Ctrl-C
 
 

@@ -110,7 +110,9 @@ def write_npy(path: Path | str, array: np.ndarray) -> None:
     buffer = BytesIO()  # numpy writing to a file itself forgets why it could not
     np.save(buffer, array, allow_pickle=False)
     with atomic(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
+        temporary.write_bytes(
+            buffer.getvalue()
+        )  # not `getbuffer`: where writing fails, Python 3.12.1 crashes when it collects the view
 
 
 def read_npy(path: Path | str) -> np.ndarray:
