@@ -86,7 +86,7 @@ def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(run_folder: Pa
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine/depth/00000.png": b"mine"}
 
 
-@pytest.mark.parametrize("name", ["00001.ply", "7.ply"])
+@pytest.mark.parametrize("name", ["00001.ply", "7.ply", "sequence.json"])
 def test_files_of_the_users_own_are_not_replaced_by_gaussians(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:

@@ -258,7 +258,7 @@ def predict(run: Run, targets: Sequence[Target], folder: Path) -> list[Tensor]:
     """Radiance (H, W, 3) of every target. Kept as EXR, so that a killed evaluation goes on where it was."""
     key = fingerprint(run, [t.view for t in targets])
     note = folder / "predictions.json"
-    if not note.is_file() or note.read_text() != json.dumps(key):
+    if not note.is_file() or note.read_text(encoding="utf-8", errors="replace") != json.dumps(key):
         for old in [*folder.glob("*.exr"), *folder.glob("*.png")]:
             old.unlink()
         io.write_text(note, json.dumps(key))

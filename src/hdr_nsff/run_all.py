@@ -9,7 +9,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from hdr_nsff.config import PRESETS
+from hdr_nsff.config import PRESETS, check
 from hdr_nsff.errors import InputError
 from hdr_nsff.evaluate import check_truth, evaluate_run
 from hdr_nsff.io import writing_to
@@ -62,6 +62,10 @@ def run_all(config: RunConfig) -> None:
     if config.truth is not None:
         check_truth(config.truth)
     check_place(config.out / "report.html")
+    settings = replace(PRESETS[config.preset], out=config.out / "run", seed=config.seed, device=config.device)
+    if config.minutes is not None:
+        settings = replace(settings, minutes=config.minutes, steps=None)
+    check(settings)
     hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
     scene = prepare(
         PrepareConfig(
@@ -69,11 +73,8 @@ def run_all(config: RunConfig) -> None:
             max_size=config.max_size, hold_out=hold_out, poses=config.poses,
         )
     )  # fmt: skip
-    settings = replace(PRESETS[config.preset], scene=scene, out=config.out / "run", seed=config.seed, device=config.device)
-    if config.minutes is not None:
-        settings = replace(settings, minutes=config.minutes, steps=None)
     with writing_to(config.out):
-        run = Run.open(train(settings), config.device)
+        run = Run.open(train(replace(settings, scene=scene)), config.device)
         results = render_all(run, config.out / "render")
         evaluate_run(run, config.truth)
         results["report"] = write_report(run, config.out / "report.html", config.out / "render")

@@ -13,7 +13,8 @@ from pydantic import Field
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_json
-from hdr_nsff.scene import LARGEST_EV, Strict, first_problem, is_intrinsic, is_matrix, is_pose
+from hdr_nsff.notes import first_problem
+from hdr_nsff.scene import LARGEST_EV, Strict, is_intrinsic, is_matrix, is_pose
 
 
 class TruthView(Strict):
