@@ -179,6 +179,7 @@ SETTINGS: dict[str, tuple[Change, str]] = {
     "a field that is a number": (lambda d: d.update(field=7), "config.json"),
     "grids for a field": (lambda d: d.update(kinds=["GridConfig"], field={}), "GridConfig is no field"),
     "a kind of field nobody knows": (lambda d: d.update(kinds=["Cloud"]), "Cloud"),
+    "no kinds": (lambda d: d.update(kinds=[]), "config.json"),
     "kinds that are a number": (lambda d: d.update(kinds=7), "config.json"),
     "a scene that is a number": (lambda d: d.update(scene=7), "config.json"),
 }

@@ -85,7 +85,7 @@ class TrainConfig:
             config = TrainConfig(**{**data, **parts})
             check(config)
             return config
-        except (KeyError, TypeError, ValueError) as error:
+        except (LookupError, TypeError, ValueError) as error:
             raise InputError(
                 f"the run's config.json is from another version or damaged ({error}); train again into a new folder"
             ) from error
