@@ -16,9 +16,10 @@ from torch import Tensor
 from hdr_nsff import alignment, io
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import EvaluateConfig, evaluate, evaluate_run, match_brackets
+from hdr_nsff.evaluate import EvaluateConfig, evaluate, evaluate_run
 from hdr_nsff.fields.base import Render
 from hdr_nsff.run import Run
+from hdr_nsff.scores.targets import match_brackets
 from hdr_nsff.truth import Truth, TruthView
 
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # the truth's world: turned, three times as large, elsewhere

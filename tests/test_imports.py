@@ -9,7 +9,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
 VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report"}
-TRUTH = {"evaluate", "synth", "reexpose"}  # who reads it, and the two that write it
+TRUTH = {
+    "scores.targets",
+    "scores.geometry",
+    "scores.camera",
+    "evaluate",
+    "synth",
+    "reexpose",
+}  # who reads it, and the two that write it
 HEAVY = {"pycolmap", "mitsuba", "rawpy", "flip_evaluator", "gsplat"}
 
 

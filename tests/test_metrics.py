@@ -79,10 +79,36 @@ def test_mu_law_psnr_worked_by_hand():
     assert metrics.mu_law_psnr(truth * 3, truth, peak=8.0) == pytest.approx(100.0)  # beyond the peak nothing is told apart
 
 
-def test_pu21_psnr_is_of_codes_around_256():
-    truth = torch.full((2, 2, 3), 0.1, dtype=torch.float64)  # 100 cd/m^2 where the peak has 1000
-    dark = torch.zeros_like(truth)  # code 0
-    assert metrics.pu21_psnr(dark, truth, peak=1.0, nits=1000.0) == pytest.approx(0.0, abs=0.05)
+def pu21_code(nits):
+    """Mantiuk and Azimi 2021, banding + glare, as printed."""
+    p = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204, 596.3148142)
+    return p[6] * (((p[0] + p[1] * nits ** p[3]) / (1 + p[2] * nits ** p[3])) ** p[4] - p[5])
+
+
+def test_pu21_psnr_worked_by_hand():
+    """White is 1000 cd/m^2: half of it is 500, and the codes of the two are compared with a peak of 256, that of 100 cd/m^2."""
+    truth = torch.full((2, 2, 3), 8.0)
+    assert pu21_code(100) == pytest.approx(256, abs=0.5) and 300 < pu21_code(500) < pu21_code(1000) < 500
+    expected = 20 * math.log10(256 / (pu21_code(1000) - pu21_code(500)))
+    assert metrics.pu21_psnr(truth / 2, truth, white=8.0) == pytest.approx(expected, abs=1e-6)
+    assert metrics.pu21_psnr(truth * 20, truth * 10, white=8.0) == pytest.approx(100)  # 10,000 cd/m^2 is as bright as it tells
+
+
+def test_pu21_psnr_on_a_mask_sees_only_the_mask():
+    truth, mask = torch.full((4, 4, 3), 1.0), torch.zeros(4, 4, dtype=torch.bool)
+    radiance = truth.clone()
+    radiance[1, 2], mask[1, 2] = 0.5, True
+    whole, part = metrics.pu21_psnr(radiance, truth, 1.0), metrics.pu21_psnr(radiance, truth, 1.0, mask)
+    assert whole - part == pytest.approx(10 * math.log10(16))
+
+
+def test_pu21_white_is_not_that_of_a_lamp_of_few_pixels():
+    truth = torch.full((100, 100, 3), 2.0)
+    truth[:5, :8] = 700.0  # 0.4 % of the sequence
+    assert metrics.pu21_white([truth]) == pytest.approx(2.0)
+    truth[:10, :10] = 700.0  # 1 %
+    assert metrics.pu21_white([truth]) == pytest.approx(700.0)
+    assert metrics.pu21_white([truth, torch.full((100, 200, 3), 2.0)]) == pytest.approx(2.0)  # one white for all views
 
 
 def hdr():
@@ -98,23 +124,86 @@ def test_the_flip_range_of_one_picture_is_flips_own():
     _, mean, used = flip.evaluate(truth.float().numpy(), radiance.float().numpy(), "HDR", applyMagma=False)
     start, stop = metrics.flip_exposures([truth])
     assert (start, stop) == pytest.approx((used["startExposure"], used["stopExposure"]), abs=1e-3)
-    assert metrics.hdr_flip(radiance, truth, (start, stop)) == pytest.approx(mean, abs=2e-4)
+    assert float(metrics.hdr_flip_map(radiance, truth, (start, stop)).mean()) == pytest.approx(mean, abs=2e-4)
 
 
-def test_flip_of_equal_pictures_is_zero_also_on_a_mask():
+def test_flip_of_equal_pictures_is_zero_and_differences_stay_where_they_are():
     pytest.importorskip("flip_evaluator")
     radiance, truth = hdr()
     mask = torch.zeros(48, 64, dtype=torch.bool)
     mask[20:30] = True
-    assert metrics.hdr_flip(truth, truth, (-5.0, 2.0)) == pytest.approx(0.0, abs=1e-6)
-    mixed = torch.where(mask[..., None], radiance, truth)
-    assert metrics.hdr_flip(mixed, truth, (-5.0, 2.0), mask) > 2 * metrics.hdr_flip(mixed, truth, (-5.0, 2.0))
+    assert float(metrics.hdr_flip_map(truth, truth, (-5.0, 2.0)).max()) == pytest.approx(0.0, abs=1e-6)
+    seen = metrics.hdr_flip_map(torch.where(mask[..., None], radiance, truth), truth, (-5.0, 2.0))
+    assert seen.shape == mask.shape and seen[mask].mean() > 2 * seen.mean() and float(seen.max()) <= 1
 
 
 def test_flip_is_none_where_it_is_not_installed(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "flip_evaluator", None)
     radiance, truth = hdr()
-    assert metrics.hdr_flip(radiance, truth, (-5.0, 2.0)) is None
+    assert metrics.hdr_flip_map(radiance, truth, (-5.0, 2.0)) is None
+
+
+def ramp(height=6, width=9):
+    """Radiance that rises by 1 per column and 10 per row, from 1."""
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    return (1.0 + x + 10 * y)[..., None].repeat(1, 1, 3)
+
+
+def everywhere(picture):
+    return torch.ones(picture.shape[:2], dtype=torch.bool)
+
+
+def test_hdr_tae_of_two_constants_worked_by_hand():
+    one, rest = torch.ones(4, 5, 3), torch.zeros(4, 5, 2)
+    assert metrics.hdr_tae(one, 3 * one, rest, everywhere(one)) == (pytest.approx(2 / 4), 20)
+    assert metrics.hdr_tae(one, one, rest, everywhere(one)) == (0, 20)
+    assert metrics.hdr_tae(0 * one, 0 * one, rest, everywhere(one)) == (0, 20)  # black stays black
+    assert metrics.hdr_tae(one, 0 * one, rest, everywhere(one)) == (pytest.approx(1), 20)  # the most there is
+    coloured = one * torch.tensor([1.0, 3.0, 9.0])
+    assert metrics.hdr_tae(one, coloured, rest, everywhere(one))[0] == pytest.approx((0 + 2 / 4 + 8 / 10) / 3)
+
+
+def test_hdr_tae_follows_the_flow_between_pixels_and_leaves_out_what_leaves_the_picture():
+    """What is at column x + 1.5, row y + 1 has 1.5 + 10 more; the last two columns and the last row of 6 x 9 flow out."""
+    here, there = ramp() + 11.5, ramp()
+    flow = torch.tensor([1.5, 1.0]).expand(6, 9, 2)
+    assert metrics.hdr_tae(here, there, flow, everywhere(here)) == (pytest.approx(0, abs=1e-12), 5 * 7)
+    wrong, _ = metrics.hdr_tae(here, there, torch.zeros(6, 9, 2), everywhere(here))
+    assert wrong > 0.1
+
+
+def test_hdr_tae_is_over_the_mask_and_no_scale_changes_it():
+    one, rest = torch.ones(4, 5, 3), torch.zeros(4, 5, 2)
+    other, mask = one.clone(), torch.zeros(4, 5, dtype=torch.bool)
+    other[1, 1], mask[1, 1:3] = 3.0, True
+    assert metrics.hdr_tae(one, other, rest, mask) == (pytest.approx(0.25), 2)
+    scale = torch.tensor([0.1, 7.0, 1000.0])
+    assert metrics.hdr_tae(one * scale, other * scale, rest, mask)[0] == pytest.approx(0.25)
+    assert math.isnan(metrics.hdr_tae(one, other, rest, mask & False)[0])
+
+
+def test_depth_errors_worked_by_hand():
+    depth, truth = torch.tensor([[1.0, 3.0, 7.0]]), torch.tensor([[2.0, 4.0, 0.0]])
+    abs_rel, rmse = metrics.depth_errors(depth, truth, truth > 0)
+    assert abs_rel == pytest.approx((1 / 2 + 1 / 4) / 2) and rmse == pytest.approx(1.0)
+    assert metrics.depth_errors(truth, truth, truth > 0) == (0, 0)
+
+
+def test_the_median_ratio_ignores_what_is_unknown_and_what_is_far_off():
+    truth = torch.tensor([2.0, 4.0, 6.0, 8.0, 900.0, 0.0, 5.0])
+    values = torch.tensor([1.0, 2.0, 3.0, 4.0, 1.0, 5.0, 0.0])
+    assert metrics.median_ratio(values, truth) == pytest.approx(2)
+    assert metrics.median_ratio(torch.zeros(3), torch.ones(3)) == 1
+
+
+@pytest.mark.parametrize("step, length", [((3.0, 4.0), 5.0), ((2.0, 3.0, 6.0), 7.0)])
+def test_end_point_error_is_the_mean_distance(step, length):
+    truth = torch.randn(4, 5, len(step), generator=torch.Generator().manual_seed(0))
+    motion, known = truth.clone(), torch.zeros(4, 5, dtype=torch.bool)
+    motion[2, 3] += torch.tensor(step)
+    known[2, 1:4] = True
+    assert metrics.end_point_error(motion, truth, known) == pytest.approx(length / 3, rel=1e-6)
+    assert metrics.end_point_error(truth, truth, known) == 0
 
 
 def alexnet_weights(seed=0):
@@ -195,6 +284,27 @@ def test_nothing_but_arrays_is_unpickled(tmp_path):
     (tmp_path / "evil.ckpt").write_bytes(pickle.dumps({"AlexNet_0": Path("x")}))
     with pytest.raises(pickle.UnpicklingError, match="is no array"):
         lpips_weights().read(tmp_path / "evil.ckpt")
+
+
+def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):
+    """Bilinear by hand: pixel centre (i + 0.5) of n lies at (i + 0.5) m / n - 0.5 of m samples, ends repeated."""
+    net, linear = alexnet_weights()
+    torch.save(net | linear, tmp_path / "w.pth")
+    model, (a, b) = metrics.Lpips(tmp_path / "w.pth"), (p.float() for p in pictures(80, 96))
+    mask = torch.zeros(80, 96, dtype=torch.bool)
+    mask[10:50, 20:33] = True
+
+    def weights(n, m):
+        place = np.clip((np.arange(n) + 0.5) * m / n - 0.5, 0, m - 1)
+        low = np.minimum(place.astype(int), max(m - 2, 0))
+        matrix = np.zeros((n, m))
+        matrix[np.arange(n), low] = 1 - (place - low)
+        matrix[np.arange(n), np.minimum(low + 1, m - 1)] += place - low
+        return matrix
+
+    slow = sum(weights(80, d.shape[0]) @ d.numpy() @ weights(96, d.shape[1]).T for d in model.distances(a, b))
+    assert model.on_mask(a, b, mask) == pytest.approx(slow[mask.numpy()].mean(), rel=1e-4)
+    assert model.on_mask(a, a, mask) == 0 and model.on_mask(a, b, mask) != pytest.approx(model(a, b), rel=1e-3)
 
 
 def test_lpips_without_its_linear_layers_is_refused_in_a_sentence(tmp_path):

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fakes import fake_run
+from test_scores import truth_of, with_flow
 
 from hdr_nsff.evaluate import evaluate_run
 from hdr_nsff.page import figure, table
@@ -86,6 +87,24 @@ def test_what_was_given_and_estimated_is_told_and_names_are_escaped(finished: tu
     text, _ = read(write_report(run, folder / "report.html", folder / "render"))
     assert "EV -4, -2, 0 from --ev" in text and "6 of 6 frames registered" in text and "12.5 s" in text
     assert "made up &lt;clip&gt;" in text and "<clip>" not in text
+
+
+def test_depth_motion_stability_and_exposure_steps_are_shown_where_the_truth_has_them(tmp_path: Path) -> None:
+    run = with_flow(fake_run(tmp_path / "run"))
+    manifest = run.scene.manifest.model_copy(update={"protocol": "novel-view-time"})
+    run = replace(run, scene=replace(run.scene, manifest=manifest))
+    evaluate_run(run, truth_of(tmp_path / "truth", run))
+    text, _ = read(write_report(run, tmp_path / "report.html", tmp_path / "render"))
+    for words in (
+        "depth, AbsRel",
+        "scene flow, end-point error",
+        "PU21 PSNR moving",
+        "HDR-TAE",
+        "largest error of a step between exposures",
+    ):
+        assert words in text, words
+    assert "scene flow by 3.0000" in text and "1000 cd/m²" in text and "protocol novel-view-time" in text
+    assert "<td>pairs of training frames, along the clip&#x27;s own flow</td><td class=n>5</td>" in text
 
 
 def test_missing_parts_are_named_with_the_command_that_makes_them(tmp_path: Path) -> None:

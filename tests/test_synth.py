@@ -15,7 +15,8 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import open_footage, read_exposure_csv
 from hdr_nsff.pathtracer import Surface, Tracer, smooth
 from hdr_nsff.scene import Scene
-from hdr_nsff.synth import SynthConfig, clip_shots, exact_flow, parse_ev, parse_size, synth, truth_shots
+from hdr_nsff.synth import SynthConfig, clip_shots, parse_ev, parse_size, synth, truth_shots
+from hdr_nsff.synth_motion import exact_flow
 from hdr_nsff.synth_oracle import visible
 from hdr_nsff.synth_scene import (
     BACK,

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from hdr_nsff.scene import Frame, Scene
-from hdr_nsff.synth import exact_flow
-from hdr_nsff.synth_oracle import OracleNoise, depth_there, visible, write_oracle
+from hdr_nsff.synth_motion import depth_there, exact_flow
+from hdr_nsff.synth_oracle import OracleNoise, visible, write_oracle
 from hdr_nsff.synth_scene import back_project, body_pose, camera_pose, intrinsics, look_at, project, rig_pose
 
 SIZE, FRAMES = (48, 32), 4

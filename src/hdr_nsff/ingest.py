@@ -209,6 +209,15 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
     return list(range(every // 2, count - 1, every))
 
 
+def between(count: int, cycle: int) -> list[int]:
+    """Which of `count` frames are kept out of training by the protocol novel-view-time: every second one, never the first or the last.
+
+    With an even exposure cycle every second frame would always show the same exposures: there, each cycle begins with the other half,
+    so that of a cycle of 2 the frames 0, 3, 4, 7, 8, ... are trained on."""
+    phase = [k // cycle if cycle % 2 == 0 else 0 for k in range(count)]
+    return [k for k in range(1, count - 1) if (k + phase[k]) % 2]
+
+
 def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None:
     """The EV (log2 exposure) of each frame of one cycle from `--exposures 1/1000,1/250` (seconds) or `--ev -4,-2`, None for neither."""
     if exposures is None or exposures.strip() == "auto":

@@ -21,6 +21,7 @@ import OpenEXR
 
 from hdr_nsff.errors import InputError
 
+SIDES = {1: "forward", -1: "backward"}  # what channels of motion are called: to what is next, to what was before
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # chromaticities of R, G, B and white
 
 

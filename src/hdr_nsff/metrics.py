@@ -1,5 +1,5 @@
-"""How close a picture comes to the truth. Pictures are tensors (H, W, 3), rgb in [0, 1] or linear radiance where it says so; masks
-(H, W) bool say where to look, None everywhere. Every metric gives back plain floats.
+"""How close a picture, a depth map or a motion comes to the truth. Pictures are tensors (H, W, 3), rgb in [0, 1] or linear radiance
+where it says so; masks (H, W) bool say where to look, None everywhere. Every metric gives back plain floats.
 
 Radiance is compared as METHOD.md 7 says: LDR recordings leave its scale free, so `align` fits one scale (or one per channel) for
 the whole sequence on pixels that some exposure records, and one `peak` normalises the whole sequence; neither is ever fitted
@@ -67,15 +67,29 @@ def align(radiance: Tensor, truth: Tensor, recordable: Tensor, per_channel: bool
 
 
 def mu_law_psnr(radiance: Tensor, truth: Tensor, peak: float, mu: float = 5000.0, mask: Tensor | None = None) -> float:
-    """PSNR in dB after the mu-law (eq. 17) of aligned `radiance` and `truth`, both in units of the sequence's `peak` and clipped to it."""
+    """PSNR in dB, at most 100, of `log(1 + mu E) / log(1 + mu)` (eq. 17; Kalantari and Ramamoorthi 2017) of `radiance` and `truth`, both
+    in units of the sequence's `peak` and clipped to it. Aligning comes before, see `align`."""
     return psnr(mu_law((radiance / peak).clip(0, 1), mu), mu_law((truth / peak).clip(0, 1), mu), mask)
 
 
-def pu21_psnr(radiance: Tensor, truth: Tensor, peak: float, nits: float = 1000.0, mask: Tensor | None = None) -> float:
-    """PSNR in dB of PU21-encoded values (Mantiuk and Azimi 2021), aligned radiance shown so that the sequence's `peak` has `nits` cd/m^2.
+PU21_NITS = 1000.0  # cd/m^2 that the sequence's white is taken to have
+PU21_WHITE = 0.995  # quantile of the truth's luminance that is white
 
-    The absolute luminance is an assumption and belongs beside the number. Peak signal 256: the code of 100 cd/m^2."""
-    return psnr(pu21_encode(radiance / peak * nits), pu21_encode(truth / peak * nits), mask, peak=256.0)
+
+def pu21_white(truths: list[Tensor]) -> float:
+    """The luminance that is shown at `PU21_NITS`, one for a whole sequence of true radiance (H, W, 3): the 99.5th percentile, so that a
+    lamp of a few pixels does not decide how dark the rest is. PU21 tells luminances apart up to ten times that."""
+    y = torch.cat([luminance(t).flatten() for t in truths]).double()
+    return max(float(np.quantile(y.numpy(), PU21_WHITE)), 1e-6 * float(y.max()), 1e-12)
+
+
+def pu21_psnr(radiance: Tensor, truth: Tensor, white: float, mask: Tensor | None = None) -> float:
+    """PSNR in dB, at most 100, of PU21-encoded rgb (Mantiuk and Azimi 2021, banding + glare), over pixels of `mask` and channels.
+
+    Aligned `radiance` and `truth` are taken for what a display emits on which luminance `white` has 1000 cd/m^2: an assumption that
+    belongs beside the number. The peak signal is 256, the code of 100 cd/m^2, as in the authors' own PSNR."""
+    scale = PU21_NITS / white
+    return psnr(pu21_encode(radiance.double() * scale), pu21_encode(truth.double() * scale), mask, peak=256.0)
 
 
 def flip_exposures(truths: list[Tensor]) -> tuple[float, float]:
@@ -88,10 +102,11 @@ def flip_exposures(truths: list[Tensor]) -> tuple[float, float]:
     return math.log2(x / max(float(y.max()), 1e-12)), math.log2(x / middle)
 
 
-def hdr_flip(radiance: Tensor, truth: Tensor, exposures: tuple[float, float], mask: Tensor | None = None) -> float | None:
-    """HDR-FLIP in [0, 1], 0 equal (Andersson et al. 2021): the largest visible difference over `exposures` (start, stop; log2), averaged.
+def hdr_flip_map(radiance: Tensor, truth: Tensor, exposures: tuple[float, float]) -> Tensor | None:
+    """The largest visible difference (H, W) in [0, 1] of aligned linear radiance over a range of exposures (Andersson et al. 2021).
 
-    `exposures` are those of the whole sequence, see `flip_exposures`; 67 pixels per degree. None where flip-evaluator is not installed."""
+    `exposures` (start, stop; log2) are those of the whole sequence, see `flip_exposures`; 67 pixels per degree. None where flip-evaluator
+    is not installed."""
     try:
         import flip_evaluator
     except ModuleNotFoundError:
@@ -105,8 +120,43 @@ def hdr_flip(radiance: Tensor, truth: Tensor, exposures: tuple[float, float], ma
     }
     reference, test = (np.ascontiguousarray(x.float().cpu().numpy().clip(0)) for x in (truth, radiance))
     error, _, _ = flip_evaluator.evaluate(reference, test, "HDR", applyMagma=False, computeMeanError=False, parameters=settings)
-    error = np.asarray(error).reshape(truth.shape[0], truth.shape[1], -1)[..., 0]
-    return float(error.mean() if mask is None else error[mask.cpu().numpy()].mean())
+    return torch.from_numpy(np.asarray(error).reshape(truth.shape[0], truth.shape[1], -1)[..., 0].copy())
+
+
+def hdr_tae(radiance: Tensor, other: Tensor, flow: Tensor, mask: Tensor) -> tuple[float, int]:
+    """HDR-TAE in [0, 1], 0 steady, of two pictures in linear radiance (H, W, 3), and over how many pixels: the mean of
+    `|H1 - warp(H2)| / (H1 + warp(H2))` over `mask` (H, W) and channels (Mono4DGS-HDR, arXiv 2510.18489).
+
+    `flow` (H, W, 2), pixels, leads from pixels of `radiance` to `other`, which is read there bilinearly; pixels that leave the picture do
+    not count. Where both are 0 nothing differs. A scale of the radiance, also per channel, cancels. NaN where no pixel is left."""
+    height, width = mask.shape
+    y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    x, y = x + flow[..., 0].double(), y + flow[..., 1].double()
+    inside = mask & (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    grid = torch.stack([2 * x / max(width - 1, 1) - 1, 2 * y / max(height - 1, 1) - 1], -1)
+    warped = functional.grid_sample(other.double().permute(2, 0, 1)[None], grid[None], align_corners=True)[0].permute(1, 2, 0)
+    here, there = radiance.double()[inside], warped[inside]
+    change = (here - there).abs() / (here + there).clamp_min(1e-12)
+    return float(change.mean()), int(inside.sum())
+
+
+def depth_errors(depth: Tensor, truth: Tensor, known: Tensor) -> tuple[float, float]:
+    """AbsRel, `mean |d - d*| / d*`, and RMSE, `sqrt(mean (d - d*)^2)` in units of `truth`, over pixels that are `known` (H, W)
+    (Eigen et al. 2014); both from 0, equal, upwards. `depth` (H, W) is aligned before, by one scale per sequence, see `median_ratio`."""
+    error = (depth.double() - truth.double())[known]
+    return float((error.abs() / truth.double()[known]).mean()), float(error.square().mean().sqrt())
+
+
+def median_ratio(values: Tensor, truth: Tensor) -> float:
+    """The median of `truth / values` over entries where both are above 0: one scale for a whole sequence. 1 where there are none."""
+    use = (values > 0) & (truth > 0)
+    return float((truth[use].double() / values[use].double()).median()) if use.any() else 1.0
+
+
+def end_point_error(motion: Tensor, truth: Tensor, known: Tensor) -> float:
+    """Mean Euclidean distance of two motions (H, W, D) over pixels that are `known` (H, W), in their unit, from 0 upwards: pixels for optical
+    flow (D = 2; Baker et al. 2011), units of the world for scene flow (D = 3; FlowNet3D, Liu et al. 2019)."""
+    return float((motion.double() - truth.double()).norm(dim=-1)[known].mean())
 
 
 class Lpips(nn.Module):
@@ -130,11 +180,19 @@ class Lpips(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor) -> float:
         """The distance of two rgb pictures (H, W, 3) in [0, 1], at least 64 pixels high and wide."""
+        return sum(float(distance.mean()) for distance in self.distances(a, b))
+
+    def on_mask(self, a: Tensor, b: Tensor, mask: Tensor) -> float:
+        """The same where `mask` (H, W) is true: the distances of every layer are brought to the pictures' size (bilinear, as the
+        authors' `spatial` option does) and averaged over the mask."""
+        maps = [functional.interpolate(d[None, None], size=a.shape[:2], mode="bilinear") for d in self.distances(a, b)]
+        return float(torch.cat(maps).sum(0)[0][mask].mean())
+
+    def distances(self, a: Tensor, b: Tensor) -> list[Tensor]:
+        """Weighted square distances (h, w) of each of the five layers."""
         assert a.shape == b.shape and min(a.shape[:2]) >= 64, (a.shape, b.shape)
-        distance = 0.0
-        for x, y, weight in zip(self.features(a), self.features(b), self.importance, strict=True):
-            distance += float(((x - y).square() * weight[:, None, None]).sum(0).mean())
-        return distance
+        layers = zip(self.features(a), self.features(b), self.importance, strict=True)
+        return [((x - y).square() * weight[:, None, None]).sum(0) for x, y, weight in layers]
 
     def features(self, rgb: Tensor) -> list[Tensor]:
         """The five layers' activations (C, h, w), of unit length across channels."""

@@ -112,6 +112,7 @@ class ViewScores(BaseModel):
     __pydantic_extra__: dict[str, float | None]
     name: str = Field(pattern=r"^[^/\x00]+$", max_length=200)
     group: str
+    protocol: str | None = None
     time: float
     bracket: int
     psnr: float
@@ -130,23 +131,40 @@ class TrueResponse(Note):
         return self
 
 
+class Pu21(Note):
+    """The luminance that scores in PU21 assume."""
+
+    white: float
+    nits: float
+
+
+Names = dict[str, tuple[str, Annotated[int, Field(ge=0, le=9)]]]  # of scores: what they are called, and digits to show
+
+
 class Metrics(Note):
     """`metrics.json`: what `evaluate` found."""
 
     kind: str
     notes: list[str]
     headline: Scores
+    protocol: str | None = None
     groups: dict[str, Scores]
+    protocols: dict[str, Scores] = {}
     views: list[ViewScores]
     lpips: str
     seconds: float
-    hdr_scores: dict[str, tuple[str, Annotated[int, Field(ge=0, le=9)]]] | None = None  # what they are called, digits to show
+    hdr_scores: Names | None = None
     peak: float | None = None
     recordable_peak: float | None = None
     scale: float | None = None
     scale_per_channel: list[float] | None = None
-    camera: dict[str, float | list[float] | TrueResponse] | None = None
-    poses: dict[str, float] | None = None
+    pu21: Pu21 | None = None
+    geometry_scores: Names | None = None
+    depth_scale: float | None = None
+    world_scale: float | None = None
+    camera: dict[str, int | float | list[float] | TrueResponse] | None = None
+    poses: dict[str, int | float] | None = None
+    stability: dict[str, int | float] | None = None
 
     @model_validator(mode="after")
     def fits(self) -> Self:
@@ -154,6 +172,8 @@ class Metrics(Note):
             raise ValueError(f"no view is of the group {min(empty)}")
         if self.hdr_scores is not None and None in (self.peak, self.recordable_peak, self.scale, self.scale_per_channel):
             raise ValueError("hdr_scores without their scale")
+        if self.geometry_scores is not None and (self.depth_scale is None or "world_scale" not in self.model_fields_set):
+            raise ValueError("geometry_scores without their scale")
         if not isinstance((self.camera or {}).get("true_response"), TrueResponse | None):
             raise ValueError("true_response is no curve")
         return self

@@ -105,6 +105,8 @@ def check_settings(config: PrepareConfig) -> None:
         raise InputError(f"--max-size {config.max_size}: too small to find anything in; use at least 32")
     if config.hold_out is not None and (config.hold_out < 0 or config.hold_out == 1):
         raise InputError(f"--hold-out {config.hold_out}: leaves nothing to train on; use 0, or 2 and more")
+    if config.protocol is not None and config.hold_out is not None:
+        raise InputError("--protocol and --hold-out both given, and each says what is kept out of training; leave one out")
     ingest.parse_exposures(config.exposures, config.ev)
     for option, path in (("poses", config.poses), ("flow", config.flow), ("masks", config.masks), ("depth", config.depth)):
         if path is not None and not path.exists():
@@ -181,7 +183,10 @@ STEPS: dict[StepName, StepKind] = {
         on_footage.frames_step, settings=("start", "end", "stride", "max_size"), outputs=("images",), complete=all_have("image")
     ),
     "exposure": StepKind(
-        on_footage.exposure_step, needs=("frames",), settings=("exposures", "ev", "hold_out"), complete=all_have("image")
+        on_footage.exposure_step,
+        needs=("frames",),
+        settings=("exposures", "ev", "hold_out", "protocol"),
+        complete=all_have("image"),
     ),
     "flow": StepKind(on_priors.flow_step, needs=("exposure",), settings=("flow",), outputs=("flow",), complete=all_have("flow")),
     "poses": StepKind(

@@ -98,7 +98,8 @@ def headline(metrics: dict[str, Any] | None) -> str:
         tiles += [("LPIPS", number(h["lpips"], 3))]
     cells = "".join(f'<div class="tile"><b>{escape(v)}</b><span>{escape(n)}</span></div>' for n, v in tiles)
     notes = "".join(f'<p class="note">{escape(n)}</p>' for n in metrics["notes"])
-    return f'<p>Mean over {h["views"]} {escape(metrics["kind"])}.</p><div class="tiles">{cells}</div>{notes}'
+    protocol = f", protocol {escape(metrics['protocol'])}" if metrics.get("protocol") else ""
+    return f'<p>Mean over {h["views"]} {escape(metrics["kind"])}{protocol}.</p><div class="tiles">{cells}</div>{notes}'
 
 
 VIDEOS = (
@@ -174,7 +175,7 @@ def comparisons(folder: Path, metrics: dict[str, Any] | None) -> str:
 
 SCORES = (
     ("psnr", "PSNR, dB", 2), ("psnr_moving", "PSNR moving, dB", 2), ("ssim", "SSIM", 3), ("ssim_moving", "SSIM moving", 3),
-    ("lpips", "LPIPS", 3), ("psnr_all_exposures", "PSNR over all exposures, dB", 2),
+    ("lpips", "LPIPS", 3), ("lpips_moving", "LPIPS moving", 3), ("psnr_all_exposures", "PSNR over all exposures, dB", 2),
     ("psnr_moving_all_exposures", "PSNR moving over all exposures, dB", 2),
 )  # fmt: skip
 
@@ -184,9 +185,12 @@ ERRORS = {
         "response_rmse": "response curve, RMS error of the recorded value",
         "power": "learned exposures are the true ones times",
         "response_rmse_after_power": "response curve, RMS error once that is undone",
+        "power_of_response": "the curves agree best if learned exposures are the true ones times",
         "true_ev": "true exposures, EV",
         "learned_ev": "learned exposures, EV",
         "largest_ev_error": "largest error of an exposure, EV",
+        "largest_step_error": "largest error of a step between exposures, EV",
+        "largest_step_error_after_power": "the same once the power of the curves is undone",
     },
     "poses": {
         "ate": "camera centres, RMS error after alignment, true units",
@@ -196,11 +200,18 @@ ERRORS = {
         "true_focal": "true focal length, pixels",
         "focal_error": "focal length, relative error",
     },
+    "stability": {
+        "hdr_tae": "HDR-TAE",
+        "hdr_tae_moving": "HDR-TAE moving",
+        "pairs": "pairs of training frames, along the clip's own flow",
+    },
 }
 
 
 def text(value: Any) -> str:
-    """A number or a list of numbers with four digits after the point."""
+    """A count as it is, a number with four digits after the point, a list of numbers with three."""
+    if isinstance(value, int):
+        return str(value)
     return ", ".join(f"{v:+.3f}" for v in value) if isinstance(value, list) else number(value, 4)
 
 
@@ -208,14 +219,25 @@ def quality(metrics: dict[str, Any] | None) -> str:
     """All metrics in tables."""
     if metrics is None:
         return missing("Not evaluated yet: `hdr-nsff evaluate RUN`.")
-    groups = {**metrics["groups"], "all": metrics["headline"]}
+    groups = {**metrics["groups"], **metrics.get("protocols", {}), "headline": metrics["headline"]}
     parts = ["<h3>Recorded rgb</h3>", score_table(groups, SCORES)]
     if (hdr := metrics.get("hdr_scores")) is not None:
         peaks = f"Normalised by the largest exact radiance, {metrics['peak']:.3g}; recordable pixels by theirs, {metrics['recordable_peak']:.3g}. "
         scale = f"Predicted radiance was multiplied by {metrics['scale']:.4f} for all views (per channel: {', '.join(f'{x:.4f}' for x in metrics['scale_per_channel'])})."
         parts += ["<h3>Linear radiance</h3>", score_table(groups, tuple((k, *v) for k, v in hdr.items()))]
-        parts += [f'<p class="note">{escape(peaks + scale)}</p>']
-    for part, title in (("camera", "Learned camera against the true one"), ("poses", "Estimated poses against the true ones")):
+        shown = (
+            f" PU21 takes luminance {metrics['pu21']['white']:.3g} for {metrics['pu21']['nits']:g} cd/m²."
+            if "pu21" in metrics
+            else ""
+        )
+        parts += [f'<p class="note">{escape(peaks + scale + shown)}</p>']
+    if (geometry := metrics.get("geometry_scores")) is not None:
+        parts += ["<h3>Depth and motion</h3>", score_table(groups, tuple((k, *v) for k, v in geometry.items()))]
+        units = f"Predicted depth was multiplied by {metrics['depth_scale']:.4f} for all views"
+        world = f", scene flow by {metrics['world_scale']:.4f}" if metrics["world_scale"] is not None else ""
+        parts += [f'<p class="note">{units}{world}.</p>']
+    titles = {"stability": "Stability along the training path", "camera": "Learned camera against the true one"}
+    for part, title in {**titles, "poses": "Estimated poses against the true ones"}.items():
         found = metrics.get(part) or {}
         rows = [(label, text(found[key])) for key, label in ERRORS[part].items() if key in found]
         parts += [f"<h3>{title}</h3>", table(("", ""), rows)] if rows else []

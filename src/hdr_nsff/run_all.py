@@ -18,6 +18,7 @@ from hdr_nsff.progress import say
 from hdr_nsff.render import render_all
 from hdr_nsff.report import check_place, write_report
 from hdr_nsff.run import Run, pick_device
+from hdr_nsff.scene import Protocol
 from hdr_nsff.train import train
 
 
@@ -44,6 +45,8 @@ class RunConfig:
     """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the clip are trained on."""
     poses: Path | None = None
     """Given poses (COLMAP model, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    protocol: Protocol | None = None
+    """Split the clip as the published tables do, see `prepare --help`; instead of --hold-out, and with --truth."""
     hold_out: int | None = None
     """Keep every this many frames for `evaluate`; default 8, or 0 with a truth folder."""
     max_size: int = 640
@@ -66,11 +69,11 @@ def run_all(config: RunConfig) -> None:
     if config.minutes is not None:
         settings = replace(settings, minutes=config.minutes, steps=None)
     check(settings)
-    hold_out = config.hold_out if config.hold_out is not None else (0 if config.truth else None)
+    hold_out = 0 if config.hold_out is None and config.truth and config.protocol is None else config.hold_out
     scene = prepare(
         PrepareConfig(
             clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev,
-            max_size=config.max_size, hold_out=hold_out, poses=config.poses,
+            max_size=config.max_size, hold_out=hold_out, protocol=config.protocol, poses=config.poses,
         )
     )  # fmt: skip
     with writing_to(config.out):

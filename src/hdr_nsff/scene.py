@@ -24,6 +24,7 @@ from hdr_nsff.notes import first_problem
 
 Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
+Protocol = Literal["novel-view", "novel-view-time"]
 LARGEST = 1e15  # numbers beyond it, or depths below 1 / it, are no measurement and would overflow in single precision
 LARGEST_EV = 60.0  # stops from the reference
 
@@ -85,6 +86,7 @@ class Manifest(Strict):
     inputs: dict[str, str] = {}  # input file name -> sha256
     width: int = Field(gt=0)
     height: int = Field(gt=0)
+    protocol: Protocol | None = None  # how the clip was split for `evaluate`
     fps: float = Field(default=24.0, gt=0, le=1e6)
     cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
     reference_bracket: int = Field(default=0, ge=0)  # the bracket whose gain is 1: the radiometric gauge

@@ -111,7 +111,7 @@ def display_exposure(run: Run, views: Sequence[View]) -> float:
 def write_still(path: Path, still: Still, view: View, half: bool, header: dict[str, Any]) -> None:
     """One EXR: RGB radiance, `Z`, `motion`, and motion vectors `forward.u`, `.v`, `backward.u`, `.v` in pixels where known."""
     channels = {"RGB": still.radiance, "Z": still.depth, "motion": still.motion}
-    for offset, name in ((1, "forward"), (-1, "backward")):
+    for offset, name in io.SIDES.items():
         if offset in still.flow:
             channels |= {f"{name}.u": still.flow[offset][..., 0], f"{name}.v": still.flow[offset][..., 1]}
     pose = json.dumps([[round(float(x), 6) for x in row] for row in view.camera.c2w])

@@ -3,7 +3,7 @@
 Writes, below the output folder:
     clip.mp4, clip/*.png   what the camera recorded: the same frames as footage and without compression loss
     clip.csv, clip/exposures.csv   of a rig: the exposure of every frame, for `prepare`
-    truth/                 views and times the clip does not show: linear radiance and moving masks (see truth.py)
+    truth/                 views and times the clip does not show: linear radiance, moving masks, depth and motion (see truth.py)
     exact/*.exr            every rendered frame: radiance, z-depth `Z`, `body` (0 room, 1 box, 2 ball), exact optical flow
     oracle/                with `--oracle`: a scene folder made from the truth, for measuring a field without estimated priors
 Every picture is cached in exact/: a run that was killed goes on where it was.
@@ -28,8 +28,9 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.pathtracer import Tracer
 from hdr_nsff.progress import say, track
 from hdr_nsff.recording import Noise, record, response_curve
+from hdr_nsff.synth_motion import exact_flow, view_geometry
 from hdr_nsff.synth_oracle import OracleNoise, write_oracle
-from hdr_nsff.synth_scene import POSES, RIG, build, camera_pose, intrinsics, moved, project
+from hdr_nsff.synth_scene import POSES, RIG, build, camera_pose, intrinsics
 from hdr_nsff.truth import Truth, TruthView
 
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
@@ -200,19 +201,12 @@ def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: Synt
         surface = tracer.surface(shot.time, K, shot.c2w, size)
         channels = {"Z": surface.depth, "body": surface.bodies.astype(np.float32)}
         if shot.name.startswith("clip"):
-            for side, name in ((1, "forward"), (-1, "backward")):
+            for side, name in io.SIDES.items():
                 there = POSES[config.views](shot.time + side)
                 flow = exact_flow(surface.points, surface.bodies, shot.time, shot.time + side, K, there)
                 channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
         channels["RGB"] = tracer.radiance(shot.time, K, shot.c2w, size, shot.spp, shot.seed)
         io.write_exr(config.out / "exact" / f"{shot.name}.exr", channels, half=False)
-
-
-def exact_flow(points: np.ndarray, bodies: np.ndarray, t: float, other: float, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
-    """Optical flow (H, W, 2) px of the surface at pixel centres from frame `t` to time `other`, there seen by a camera `c2w` (3, 4)."""
-    height, width = bodies.shape
-    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-    return project(moved(points, bodies, t, other), K, c2w)[0] - pixels
 
 
 def exact(out: Path, shot: Shot) -> dict[str, np.ndarray]:
@@ -244,13 +238,15 @@ def list_exposures(evs: list[float], config: SynthConfig) -> None:
 def write_truth(
     clip: list[Shot], views: list[Shot], K: np.ndarray, relative: list[float], reference: int, config: SynthConfig
 ) -> None:
-    """truth/: truth.json, radiance as half EXR, moving masks."""
+    """truth/: truth.json, radiance as half EXR, moving masks, depth and motion as float EXR."""
     folder, curve = config.out / "truth", response_curve(config.response)
     entries = []
     for k, shot in enumerate(views):
         channels = exact(config.out, shot)
         io.write_exr(folder / "radiance" / f"{shot.name}.exr", {"RGB": channels["RGB"]})
         io.write_png(folder / "masks" / f"{shot.name}.png", channels["body"] > 0)
+        geometry = view_geometry(channels["Z"], channels["body"].astype(int), shot.time, K, shot.c2w)
+        io.write_exr(folder / "geometry" / f"{shot.name}.exr", geometry, half=False)
         entries.append(
             TruthView(
                 name=shot.name,
@@ -260,6 +256,7 @@ def write_truth(
                 c2w=shot.c2w.tolist() if shot.off_path else None,
                 radiance=f"radiance/{shot.name}.exr",
                 mask=f"masks/{shot.name}.png",
+                geometry=f"geometry/{shot.name}.exr",
             )
         )
     truth = Truth(

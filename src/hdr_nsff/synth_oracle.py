@@ -14,7 +14,8 @@ import numpy as np
 
 from hdr_nsff import io
 from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest, Step
-from hdr_nsff.synth_scene import back_project, moved, project
+from hdr_nsff.synth_motion import depth_there
+from hdr_nsff.synth_scene import back_project
 
 NOTE = "oracle: from truth"
 SAME = 0.02  # relative depth: how far apart two views of one surface may be
@@ -52,7 +53,7 @@ def write_oracle(
         io.write_npy(folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16))
         io.write_npy(folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16))
         for j, files in entry.flow.items():
-            flow = exact_flow(channels, j - i)
+            flow = rendered_flow(channels, j - i)
             io.write_png(folder / files.valid, visible(flow, depth_there(channels, K, c2w, i, j), depths[j]))
             io.write_npy(folder / files.flow, (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16))
     io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
@@ -104,16 +105,9 @@ def depth_error(noise: OracleNoise, size: tuple[int, int], rng: np.random.Genera
     return noise.depth * smooth + noise.grain * np.random.default_rng([noise.seed, frame, 1]).normal(size=size)
 
 
-def exact_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
+def rendered_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
     """The rendered flow (H, W, 2) px to the next (+1) or previous (-1) frame."""
-    name = {1: "forward", -1: "backward"}[side]
-    return np.stack([channels[f"{name}.u"], channels[f"{name}.v"]], -1)
-
-
-def depth_there(channels: dict[str, np.ndarray], K: np.ndarray, c2w: list[np.ndarray], i: int, j: int) -> np.ndarray:
-    """Z-depth (H, W) of what frame `i` shows, where it is at the time of frame `j` and in the camera of frame `j`."""
-    points = moved(back_project(channels["Z"], K, c2w[i]), channels["body"].astype(int), i, j)
-    return project(points, K, c2w[j])[1]
+    return np.stack([channels[f"{io.SIDES[side]}.u"], channels[f"{io.SIDES[side]}.v"]], -1)
 
 
 def visible(flow: np.ndarray, expected: np.ndarray, depth: np.ndarray) -> np.ndarray:

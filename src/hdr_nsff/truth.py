@@ -1,7 +1,8 @@
 """Held-out truth: views and times that no clip shows, read by `evaluate` only (an import test holds this).
 
-A truth folder holds `truth.json` and, per held-out view, linear radiance (EXR) and a moving mask (PNG). Poses are in the
-truth's own world; a view names the clip frame nearest to it in space, so that it can be carried over to estimated poses."""
+A truth folder holds `truth.json` and, per held-out view, linear radiance (EXR), a moving mask (PNG) and, where they are known, depth
+and motion (EXR). Poses are in the truth's own world; a view names the clip frame nearest to it in space, so that it can be carried
+over to estimated poses."""
 
 from __future__ import annotations
 
@@ -12,9 +13,13 @@ from typing import Literal
 from pydantic import Field
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_json
+from hdr_nsff.io import SIDES, read_json
 from hdr_nsff.notes import first_problem
 from hdr_nsff.scene import LARGEST_EV, Strict, is_intrinsic, is_matrix, is_pose
+
+# Channels of a view's geometry, of the ray through each pixel's centre: z-depth in true units (0 where it hits nothing); pixels that the surface
+# moves in this camera, standing still, until one frame later and one frame earlier; the same in the truth's world, in true units.
+GEOMETRY = ("Z", *(f"{side}.{axis}" for side in SIDES.values() for axis in "uvxyz"))
 
 
 class TruthView(Strict):
@@ -27,6 +32,7 @@ class TruthView(Strict):
     c2w: list[list[float]] | None = None  # 3x4 OpenCV, truth units; None: exactly the anchor's pose
     radiance: str  # EXR, linear, relative path
     mask: str | None = None  # PNG, moving = 255
+    geometry: str | None = None  # EXR: depth and motion, see `GEOMETRY`
 
     def problem(self, num_brackets: int) -> str | None:
         """What makes no sense in this view; None where all does."""
@@ -85,6 +91,8 @@ class Truth(Strict):
             return "K is no 3x3 camera matrix"
         if not all(is_matrix(c2w, (3, 4), is_pose) for c2w in self.clip_c2w or []):
             return "clip_c2w are no 3x4 camera poses"
+        if self.clip_c2w is None and any(v.geometry is not None for v in self.views):
+            return "views have depth and motion, but clip_c2w is missing, so that nobody knows which way they point"
         if len({v.name for v in self.views}) < len(self.views):
             return "two views have the same name"
         return next((f"view {v.name[:60]!r} has {p}" for v in self.views if (p := v.problem(num))), None)

@@ -72,9 +72,14 @@ def exposure_step(work: Work) -> Step:
     gauge = values[m.reference_bracket]
     m.bracket_ev = [None if v is None or gauge is None else v - gauge for v in values]
     m.exposure_given = given is not None
-    test = {
-        frames[k] for frames in cameras for k in ingest.held_out(len(frames), 8 if c.hold_out is None else c.hold_out, m.cycle)
-    }
+    m.protocol = c.protocol
+    test = kept_out(work)
+    trained = {b for f, b in zip(m.frames, brackets, strict=True) if f.index not in test}
+    if c.protocol is not None and len(trained) < len(values):
+        raise InputError(
+            f"--protocol {c.protocol}: of {len(m.frames)} frames it trains on {len(m.frames) - len(test)}, which show only {len(trained)} "
+            f"of {len(values)} exposures; use a longer clip, or --hold-out"
+        )
     for f, bracket in zip(m.frames, brackets, strict=True):
         f.bracket, f.ev, f.split = bracket, m.bracket_ev[bracket], "test" if f.index in test else "train"
     vars(work).pop("equalised", None)
@@ -82,6 +87,19 @@ def exposure_step(work: Work) -> Step:
     step: Literal["given", "estimated"] = "given" if given is not None else "estimated"
     details = {"source": source, "doubts": notes}
     return Step(provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details)
+
+
+def kept_out(work: Work) -> set[int]:
+    """Indices of the frames that are kept out of training, by the protocol or every so many of each camera."""
+    c, cycle, cameras = work.config, work.manifest.cycle, work.camera_frames()
+    match c.protocol:
+        case "novel-view":
+            return set()
+        case "novel-view-time":
+            return {frames[k] for frames in cameras for k in ingest.between(len(frames), cycle)}
+        case None:
+            every = 8 if c.hold_out is None else c.hold_out
+            return {frames[k] for frames in cameras for k in ingest.held_out(len(frames), every, cycle)}
 
 
 def given_exposures(work: Work) -> tuple[str, list[float] | None]:

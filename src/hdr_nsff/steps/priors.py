@@ -178,6 +178,8 @@ def depth_step(work: Work) -> Step:
     else:
         disparity, confidence, m.near, m.far = dense_depth(work, index)
         note = f"{(confidence > 0.5).mean():.0%} of the pixels well known, near {m.near:.2f}, far {m.far:.2f} scene units"
+    for f in m.frames:
+        f.disparity = f.disparity_confidence = None  # of a frame that is held out now and was not before
     for f, d, w in zip(train, disparity, confidence, strict=True):
         f.disparity, f.disparity_confidence = f"disparity/{f.index:05d}.npy", f"disparity_confidence/{f.index:05d}.npy"
         write_npy(work.folder / f.disparity, d.astype(np.float16))

@@ -13,7 +13,7 @@ from tyro.conf import Positional
 from hdr_nsff import ingest
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
-from hdr_nsff.scene import Manifest
+from hdr_nsff.scene import Manifest, Protocol
 
 StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
 
@@ -43,6 +43,9 @@ class PrepareConfig:
     """Use every this many frames."""
     hold_out: int | None = None
     """Keep every this many frames out of training, for `evaluate`; 0 keeps all in. Default 8."""
+    protocol: Protocol | None = None
+    """Split the clip as the published tables do. novel-view: train on all frames, to be evaluated from other cameras at their times;
+    novel-view-time: train on every second frame, to be evaluated at the times between. Either wants a truth folder in `evaluate`."""
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
     flow: Path | None = None

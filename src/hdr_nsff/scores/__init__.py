@@ -1,0 +1,1 @@
+"""What `evaluate` measures, one kind of error a file."""

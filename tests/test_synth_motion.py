@@ -1,0 +1,64 @@
+"""The exact motion of the synthetic room, pixel by pixel, and that every held-out view comes with it."""
+
+import numpy as np
+from test_synth import BALL, BOX, ROOM, flat, tracer  # noqa: F401  (fixtures)
+
+from hdr_nsff import io
+from hdr_nsff.pathtracer import Tracer
+from hdr_nsff.synth import SynthConfig, synth
+from hdr_nsff.synth_motion import view_geometry
+from hdr_nsff.synth_scene import CORD, body_pose, camera_pose, intrinsics
+from hdr_nsff.truth import GEOMETRY, Truth
+
+NAMES = {0: "room", 1: "box", 2: "ball"}
+
+
+def test_every_pixel_moves_as_its_body_does() -> None:
+    """One pixel at a time: out along the ray, from world to body, body to world a frame later and earlier, into the picture again."""
+    K, c2w, time = intrinsics(12, 9), camera_pose(3.0), 7.5
+    rng = np.random.default_rng(0)
+    depth, bodies = rng.uniform(1.5, 3, (9, 12)), rng.integers(0, 3, (9, 12))
+    channels = view_geometry(depth, bodies, time, K, c2w)
+    np.testing.assert_array_equal(channels["Z"], depth)
+    for side, name in io.SIDES.items():
+        for y, x in np.ndindex(9, 12):
+            ray = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1]
+            point = c2w[:, :3] @ (depth[y, x] * ray) + c2w[:, 3]
+            body = NAMES[bodies[y, x]]
+            there = (body_pose(body, time + side) @ np.linalg.inv(body_pose(body, time)) @ [*point, 1])[:3]
+            seen = K @ c2w[:, :3].T @ (there - c2w[:, 3])
+            np.testing.assert_allclose([channels[f"{name}.{a}"][y, x] for a in "xyz"], there - point, atol=1e-9)
+            np.testing.assert_allclose(
+                [channels[f"{name}.{a}"][y, x] for a in "uv"], seen[:2] / seen[2] - [x + 0.5, y + 0.5], atol=1e-7
+            )
+
+
+def test_the_room_rests_exactly() -> None:
+    channels = view_geometry(np.full((6, 8), 2.5, np.float32), np.full((6, 8), ROOM), 4.0, intrinsics(8, 6), camera_pose(9))
+    assert all((m == 0).all() for n, m in channels.items() if n != "Z")
+
+
+def test_every_held_out_view_and_half_time_has_depth_and_motion(flat: SynthConfig) -> None:  # noqa: F811
+    synth(flat)
+    truth = Truth.open(flat.out / "truth")
+    assert len(truth.views) == 16 and sum(v.time % 1 == 0.5 for v in truth.views) == 6
+    for view in truth.views:
+        channels = io.read_exr(flat.out / "truth" / str(view.geometry))
+        assert sorted(channels) == sorted(GEOMETRY) and (channels["Z"] == 3).all()
+        assert (np.abs(channels["forward.x"][:, :4]) > 0).all() and (channels["forward.x"][:, 4:] == 0).all()  # a box, a wall
+
+
+def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:  # noqa: F811
+    """What the ray through a pixel hits of the ball is carried to the ball of the next frame, and back to that of the one before."""
+    size, c2w, time = (96, 54), camera_pose(3), 9.5
+    surface = tracer.surface(time, intrinsics(*size), c2w, size)
+    channels = view_geometry(surface.depth, surface.bodies, time, intrinsics(*size), c2w)
+    centre = {s: (body_pose("ball", time + s) @ [0, CORD, 0, 1])[:3] for s in (0, 1, -1)}
+    distance = np.linalg.norm(surface.points - centre[0], axis=-1)
+    ball = (surface.bodies == BALL) & (distance < 0.17)  # and not its cord
+    assert ball.sum() > 20 and (surface.bodies == BOX).any()
+    for side, name in io.SIDES.items():
+        moved = surface.points + np.stack([channels[f"{name}.{a}"] for a in "xyz"], -1)
+        assert np.linalg.norm(centre[side] - centre[0]) > 0.02
+        np.testing.assert_allclose(np.linalg.norm(moved - centre[side], axis=-1)[ball], distance[ball], atol=1e-5)
+        np.testing.assert_allclose(distance[ball], 0.165, atol=1e-3)
