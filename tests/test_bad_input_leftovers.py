@@ -94,6 +94,7 @@ NONSENSE: dict[str, tuple[str, Change]] = {
     "a word for a score": (METRICS, lambda d: d["headline"].update(psnr="good")),
     "scores nobody counts": (METRICS, lambda d: d["headline"].pop("views")),
     "a curve of two channels": (METRICS, lambda d: d.update(camera={"true_response": {"x": [0.0], "y": [[0.0]] * 2}})),
+    "a white that is none": (METRICS, lambda d: d.update(pu21={"white": None, "nits": 1000})),
     "radiance without its scale": (METRICS, lambda d: d.update(hdr_scores={"mu5000": ["mu-law", 2]})),
 }
 

@@ -172,7 +172,7 @@ class Metrics(Note):
             raise ValueError(f"no view is of the group {min(empty)}")
         if self.hdr_scores is not None and None in (self.peak, self.recordable_peak, self.scale, self.scale_per_channel):
             raise ValueError("hdr_scores without their scale")
-        if self.geometry_scores is not None and (self.depth_scale is None or "world_scale" not in self.model_fields_set):
+        if self.geometry_scores is not None and self.depth_scale is None:
             raise ValueError("geometry_scores without their scale")
         if not isinstance((self.camera or {}).get("true_response"), TrueResponse | None):
             raise ValueError("true_response is no curve")
@@ -210,4 +210,4 @@ def first_problem(error: Exception) -> str:
 
 def plain(note: Note) -> dict[str, Any]:
     """What a note holds, without what it leaves open."""
-    return note.model_dump(exclude_unset=True)
+    return note.model_dump(exclude_none=True)

@@ -234,7 +234,7 @@ def quality(metrics: dict[str, Any] | None) -> str:
     if (geometry := metrics.get("geometry_scores")) is not None:
         parts += ["<h3>Depth and motion</h3>", score_table(groups, tuple((k, *v) for k, v in geometry.items()))]
         units = f"Predicted depth was multiplied by {metrics['depth_scale']:.4f} for all views"
-        world = f", scene flow by {metrics['world_scale']:.4f}" if metrics["world_scale"] is not None else ""
+        world = f", scene flow by {metrics['world_scale']:.4f}" if "world_scale" in metrics else ""
         parts += [f'<p class="note">{units}{world}.</p>']
     titles = {"stability": "Stability along the training path", "camera": "Learned camera against the true one"}
     for part, title in {**titles, "poses": "Estimated poses against the true ones"}.items():
