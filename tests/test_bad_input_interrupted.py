@@ -35,6 +35,17 @@ def test_a_full_disk_is_one_sentence(
     assert not snapshot(out) and snapshot(run_folder) == before
 
 
+@pytest.mark.parametrize("layout", ["hdr-gopro", "nerfstudio"])
+def test_a_full_disk_is_one_sentence_for_every_layout_of_a_scene(
+    layout: str, run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = snapshot(run_folder.parent)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        assert "the disk is full" in refused(capsys, "export", run_folder, tmp_path / "out", "--layout", layout)
+    assert not snapshot(tmp_path / "out") and snapshot(run_folder.parent) == before
+
+
 def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path: Path) -> None:
     before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))

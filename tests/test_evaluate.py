@@ -19,8 +19,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.evaluate import EvaluateConfig, evaluate, evaluate_run
 from hdr_nsff.fields.base import Render
 from hdr_nsff.run import Run
-from hdr_nsff.scores.targets import match_brackets
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff.truth import Truth, TruthView, match_brackets
 
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # the truth's world: turned, three times as large, elsewhere
 SHIFT = torch.tensor([5.0, -2.0, 1.0])

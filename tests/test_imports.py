@@ -9,14 +9,15 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
 VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report"}
-TRUTH = {
+TRUTH = {  # who reads it, and the last three, which write it
     "scores.targets",
     "scores.geometry",
     "scores.camera",
     "evaluate",
     "synth",
     "reexpose",
-}  # who reads it, and the two that write it
+    "datasets.held_out",
+}
 HEAVY = {"pycolmap", "mitsuba", "rawpy", "flip_evaluator", "gsplat"}
 
 
@@ -81,6 +82,42 @@ def test_verbs_never_import_each_other(verb: str):
 
 def test_the_truth_is_read_by_evaluate_alone():
     assert {m for m in SOURCES if "truth" in own_imports(m)} == TRUTH
+
+
+def reached(module: str, without: frozenset[str] = frozenset()) -> set[str]:
+    """Every module of this package that a module imports, by itself or through others, but for ways through those `without`."""
+    found: set[str] = set()
+    waiting = [module]
+    while waiting:
+        for name in own_imports(waiting.pop()) - found - without:
+            found.add(name)
+            waiting.append(name)
+    return found
+
+
+def knows_the_truth(modules: set[str]) -> set[str]:
+    """Which of these can open a truth folder, or what data sets keep back."""
+    return {m for m in modules if m in TRUTH | {"truth"} or m.startswith("scores.")}
+
+
+LEARNERS = ["train", "steps.footage", "steps.priors", "datasets", "scene", "batch", "config", "run", "render", "export"]
+
+
+@pytest.mark.parametrize("module", LEARNERS)
+def test_nothing_that_learns_or_prepares_can_reach_held_out_truth(module: str):
+    assert not knows_the_truth(reached(module))
+    assert (
+        knows_the_truth(reached("evaluate")) >= {"truth", "scores.targets"} and len(SOURCES) > 50
+    )  # the search finds what is there
+
+
+def test_prepare_reaches_the_truth_through_its_writer_alone():
+    assert knows_the_truth(reached("prepare")) == {"datasets.held_out", "truth"}
+    assert not knows_the_truth(reached("prepare", without=frozenset({"datasets.held_out"})))
+
+
+def test_only_prepare_writes_what_data_sets_keep_back():
+    assert {m for m in SOURCES if "datasets.held_out" in own_imports(m)} == {"prepare"}
 
 
 @pytest.mark.parametrize("library", sorted(HEAVY))

@@ -11,6 +11,7 @@ from PIL.TiffImagePlugin import IFDRational
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import (
+    every_of,
     held_out,
     log2_seconds,
     number,
@@ -219,3 +220,18 @@ def test_a_broken_raw_photograph_is_named(tmp_path):
     (tmp_path / "a.dng").write_bytes(b"II*\x00 not a photograph")
     with pytest.raises(InputError, match=r"a.dng: not a readable DNG"):
         all_frames(tmp_path)
+
+
+@pytest.mark.parametrize("every", range(2, 12))
+@pytest.mark.parametrize("cycle", [1, 2, 3])
+def test_what_was_kept_out_tells_every_how_many(every: int, cycle: int) -> None:
+    """Whatever the clip's length, the number found keeps out the same frames."""
+    for count in range(every + 2, 40):
+        frames = held_out(count, every, cycle)
+        if frames:
+            found = every_of(frames)
+            assert found is not None and held_out(frames[-1] + 2, found, cycle) == frames
+
+
+def test_frames_that_are_not_every_so_many_have_no_number() -> None:
+    assert every_of([0, 8]) is None and every_of([4, 8]) is None and every_of([1, 2, 4]) is None

@@ -183,7 +183,7 @@ def test_depth_and_motion_that_fit_nothing_are_refused_in_a_sentence(tmp_path: P
     with pytest.raises(InputError, match=r"no channel backward\.v"):
         evaluate_run(run, folder)
     io.write_exr(folder / "geometry/a.exr", {k: v[:5] for k, v in channels.items()}, half=False)
-    with pytest.raises(InputError, match="but the radiance of that view is"):
+    with pytest.raises(InputError, match="but the pictures of that view are"):
         evaluate_run(run, folder)
     lost = Truth.open(folder).model_copy(update={"clip_c2w": None})
     io.write_json(folder / "truth.json", lost.model_dump())

@@ -44,7 +44,9 @@ VERBS = {
         train, PRESETS, "Train a radiance field from a scene folder: `train splat`, `train grid`, `train paper`, `train tiny`."
     ),
     "render": Verb(render, RenderConfig, "Views of a trained run: EXR, PNG, video; any path, time and exposure."),
-    "export": Verb(export, ExportConfig, "The Gaussians of a splat run as PLY, at any time, for viewers and other programs."),
+    "export": Verb(
+        export, ExportConfig, "For other programs: a splat run's Gaussians as PLY, or a scene in a public data layout."
+    ),
     "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
     "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
     "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),

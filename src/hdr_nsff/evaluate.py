@@ -1,5 +1,5 @@
-"""A run against what it has never seen: held-out views with exact radiance (a truth folder), else held-out frames of the clip,
-else, named as such, its own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
+"""A run against what it has never seen: held-out views with exact radiance or as recorded (a truth folder), else held-out frames of
+the clip, else, named as such, its own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
 
 Recorded rgb is compared at the view's own exposure (the headline) and at all exposures of the clip; radiance after one scale
 for all views: LDR recordings alone leave it free. Moving-only numbers average over the moving mask. Every score has its definition,
@@ -28,7 +28,7 @@ from hdr_nsff.scores.predictions import predict, radiance_of, recorded
 from hdr_nsff.scores.radiance import HDR_SCORES, Gauge, find_gauge, score_radiance
 from hdr_nsff.scores.rgb import SMALLEST_LPIPS, score_rgb
 from hdr_nsff.scores.stability import stability
-from hdr_nsff.scores.targets import Target, choose_targets, exact_of, world_scale
+from hdr_nsff.scores.targets import Target, choose_targets, world_scale
 from hdr_nsff.truth import Truth
 
 
@@ -39,7 +39,7 @@ class EvaluateConfig:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     truth: Path | None = None
-    """Truth folder, as `synth` and `reexpose` write it; default: the frames that `prepare` held out."""
+    """Truth folder, as `synth`, `reexpose`, and `prepare` of a public data set write it; default: the frames that `prepare` held out."""
     lpips: str | None = None
     """LPIPS: a file with AlexNet weights, or `hub` to download them."""
     device: str = "auto"
@@ -52,9 +52,12 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
         return evaluate_run(Run.open(config.run, config.device), config.truth, config.lpips)
 
 
-def check_truth(folder: Path) -> None:
-    """InputError where `folder` is no truth folder, for those who will need it later."""
-    Truth.open(folder)
+def views_of_clip(folder: Path) -> list[int]:
+    """Which frames of the clip the views of a truth folder are, for those who keep them out of training; none where any view is of another
+    place or time. InputError where `folder` is no truth folder."""
+    views = Truth.open(folder).views
+    own = all(v.c2w is None and v.time == v.anchor for v in views)
+    return sorted({v.anchor for v in views}) if own else []
 
 
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:
@@ -68,7 +71,7 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
     with_motion = any(t.geometry is not None for t in targets)
     files = predict(run, views, folder, "rendering held-out views", with_motion)
     radiance = [radiance_of(f) for f in files]
-    gauge = find_gauge(targets, radiance) if truth else None
+    gauge = find_gauge(targets, radiance)
     units = find_units(targets, files, world_scale(run, truth)) if truth else None
     scores = []
     for target, predicted, file in zip(targets, track(radiance, "measuring"), files, strict=True):
@@ -77,10 +80,10 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
         scores.append(of_view | (score_geometry(target, file, units) if units else {}))
     write_pictures(run, targets, radiance, gauge, folder)
     result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes} | summary(run, scores, notes)
-    if truth is not None and gauge is not None:
-        result |= told_of_radiance(gauge) | told_of_geometry(units)
+    result |= told_of_radiance(gauge) | told_of_geometry(units)
+    if truth is not None:
         result |= {"camera": camera_errors(run, truth), "poses": trajectory_errors(run, truth, targets)}
-        notes += absences(result["headline"], units)
+        notes += absences(result["headline"], gauge, units)
     result |= {"stability": stability(run, folder / "path"), "lpips": lpips_note(lpips, scores)}
     if not result["stability"]:
         notes.append("HDR-TAE: absent, the scene has no optical flow between training frames")
@@ -121,8 +124,10 @@ def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict
     }
 
 
-def told_of_radiance(gauge: Gauge) -> dict[str, Any]:
+def told_of_radiance(gauge: Gauge | None) -> dict[str, Any]:
     """What belongs beside the scores of radiance."""
+    if gauge is None:
+        return {}
     return {
         "hdr_scores": HDR_SCORES,
         "scale": float(gauge.scale),
@@ -141,10 +146,12 @@ def told_of_geometry(units: Units | None) -> dict[str, Any]:
     return {"geometry_scores": GEOMETRY_SCORES, "depth_scale": units.depth, "world_scale": units.world}
 
 
-def absences(headline: dict[str, Any], units: Units | None) -> list[str]:
-    """Sentences about scores that a truth with radiance could have, and this one or this run has not."""
+def absences(headline: dict[str, Any], gauge: Gauge | None, units: Units | None) -> list[str]:
+    """Sentences about scores that a truth folder could have, and this one or this run has not."""
     notes = []
-    if "hdr_flip" not in headline:
+    if gauge is None:
+        notes.append("radiance: absent, this truth folder holds what a camera recorded alone")
+    elif "hdr_flip" not in headline:
         notes.append("HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)")
     if units is None:
         notes.append("depth and motion: absent, this truth folder holds none (`synth` writes them)")
@@ -183,10 +190,11 @@ def mean_of(views: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def write_pictures(run: Run, targets: Sequence[Target], radiance: Sequence[Tensor], gauge: Gauge | None, folder: Path) -> None:
     """Per view prediction | truth | 4 x error, as recorded and, where the radiance is known, tone-mapped for a display."""
-    exposure = color.auto_exposure(torch.cat([exact_of(t).reshape(-1, 3) for t in targets])) if gauge else 1.0
+    known = [t.radiance.reshape(-1, 3) for t in targets if t.radiance is not None]
+    exposure = color.auto_exposure(torch.cat(known)) if known else 1.0
     for target, predicted in zip(targets, radiance, strict=True):
         pairs = [(recorded(run, target, predicted, target.bracket), target.rgb[target.bracket])]
-        if gauge:
-            pairs.append((color.display(predicted * gauge.scale, exposure), color.display(exact_of(target), exposure)))
+        if gauge is not None and target.radiance is not None:
+            pairs.append((color.display(predicted * gauge.scale, exposure), color.display(target.radiance, exposure)))
         rows = [[p.numpy(), t.numpy(), (4 * (p - t).abs()).clip(0, 1).numpy()] for p, t in pairs]
         io.write_png(folder / f"{target.name}.png", io.contact_sheet(rows))

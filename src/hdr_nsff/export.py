@@ -1,4 +1,5 @@
-"""A run -> files for other programs: the Gaussians of a splat run at any time as a PLY, or one PLY per training time.
+"""Files for other programs: the Gaussians of a splat run at any time as a PLY, or one PLY per training time; or a scene, for other
+methods, in a public data layout (the writers are in `datasets/`).
 
 Coordinates are the scene's: OpenCV axes (+x right, +y down, +z forward of the first cameras), the units of its poses. A PLY knows
 neither background nor tone curve, so every Gaussian gets a colour of its own, developed as `render` develops pixels, or its linear
@@ -10,18 +11,19 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 import tyro
 
 from hdr_nsff import io, notes, ply
+from hdr_nsff.datasets import to_llff, to_nerfstudio
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields.base import GaussianCloud, RadianceField
 from hdr_nsff.paths import training_path
 from hdr_nsff.progress import say, track
-from hdr_nsff.run import Run
+from hdr_nsff.run import Run, read_config
 from hdr_nsff.shots import develop, display_exposure, fingerprint
 
 
@@ -39,12 +41,22 @@ class Look:
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """The Gaussians of a splat run for viewers and other programs."""
+    """The Gaussians of a splat run for viewers, or a scene in a public data layout for other methods.
+
+    Gaussians at a time: hdr-nsff export out/run frame.ply --ply --time 12.5
+
+    Images, poses_bounds.npy, masks, depth, flow and a COLMAP model: hdr-nsff export out/scene out/gopro --layout hdr-gopro
+
+    transforms.json, images and depth: hdr-nsff export out/scene out/ns --layout nerfstudio
+
+    `hdr-nsff prepare` reads both layouts back to the same scene."""
 
     run: tyro.conf.Positional[Path]
-    """Run folder."""
+    """Run folder; for --layout a scene folder, or a run folder, whose scene is meant."""
     out: tyro.conf.Positional[Path]
-    """What to write: a file NAME.ply with --ply, a folder with --ply-sequence."""
+    """What to write: a file NAME.ply with --ply, a folder with --ply-sequence and --layout."""
+    layout: Literal["hdr-gopro", "nerfstudio"] | None = None
+    """The scene's frames, poses, masks, depth and flow as HDR-GoPro / NSFF (LLFF), one picture per time, or as nerfstudio's."""
     ply: bool = False
     """One PLY, at --time."""
     ply_sequence: bool = False
@@ -71,6 +83,8 @@ Colours = Callable[[np.ndarray], np.ndarray]  # radiance (G, 3) to what is writt
 def export(config: ExportConfig) -> Path:
     """The verb: the file or folder that was written."""
     check_settings(config)
+    if config.layout is not None:
+        return export_scene(config.run, config.out, config.layout)
     run = Run.open(config.run, config.device)
     with io.writing_to(config.out):
         if config.ply_sequence:
@@ -83,8 +97,10 @@ def export(config: ExportConfig) -> Path:
 def check_settings(config: ExportConfig) -> None:
     """InputError for settings that make no sense whatever the run is."""
     look = config.look
-    if config.ply == config.ply_sequence:
-        raise InputError("export: say what to write, --ply (one file) or --ply-sequence (a folder)")
+    if config.ply + config.ply_sequence + (config.layout is not None) != 1:
+        raise InputError("export: say what to write, one of --ply (a file), --ply-sequence and --layout NAME (a folder)")
+    if config.layout is not None and (config.time is not None or look != Look()):
+        raise InputError("--layout: writes the recorded frames; --time, --ev, --linear and --camera-id are for Gaussians")
     if config.ply and (config.out.suffix.lower() != ".ply" or config.out.is_dir()):
         raise InputError(f"{config.out}: --ply writes one file; give it a name that ends in .ply")
     if config.ply_sequence and config.out.is_file():
@@ -95,6 +111,24 @@ def check_settings(config: ExportConfig) -> None:
         raise InputError("--linear --ev: linear radiance is not developed; leave one of them out")
     if look.ev is not None and not abs(look.ev) < 60:
         raise InputError(f"--ev {look.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5")
+
+
+def export_scene(folder: Path, out: Path, layout: Literal["hdr-gopro", "nerfstudio"]) -> Path:
+    """Write the scene of a scene or run folder in a public layout; the folder that was written."""
+    if not (folder / "scene.json").is_file():
+        if not (folder / "config.json").is_file():
+            raise InputError(f"{folder}: neither a scene folder nor a run folder; make a scene with `hdr-nsff prepare`")
+        folder = read_config(folder).scene
+    if out.resolve().is_relative_to(folder.resolve()) or folder.resolve().is_relative_to(out.resolve()):
+        raise InputError(f"{out}: overlaps the scene folder {folder}; name a folder outside of it")
+    with io.writing_to(out):
+        match layout:
+            case "hdr-gopro":
+                to_llff.write(folder, out)
+            case "nerfstudio":
+                to_nerfstudio.write(folder, out)
+    say(f"{out}: the scene in the {layout} layout; `hdr-nsff prepare {out} SCENE` reads it back")
+    return out
 
 
 def export_one(run: Run, path: Path, time: float, look: Look) -> Path:

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,6 +36,7 @@ class Footage:
     count: int  # frames per camera; 0 where a video's header does not say
     fps: float
     linear: bool  # EXR or DNG
+    over: float | None = None  # grey that shows through transparent pixels; None: transparency is not looked at
 
     @property
     def files(self) -> dict[str, Path]:
@@ -129,7 +130,7 @@ def decode(footage: Footage, files: list[Path], chosen: range) -> Iterator[tuple
         yield from decode_video(files[0], chosen)
         return
     for number in chosen[: len(files[chosen.start : chosen.stop : chosen.step])]:
-        yield number, files[number].relative_to(footage.path).as_posix(), read_frame(files[number])
+        yield number, files[number].relative_to(footage.path).as_posix(), read_frame(files[number], footage.over)
 
 
 def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
@@ -145,13 +146,13 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
         raise InputError(f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); copy it again")
 
 
-def read_frame(path: Path) -> np.ndarray:
-    """One frame file as float32 (H, W, 3): recorded rgb, or linear radiance for EXR and DNG."""
+def read_frame(path: Path, over: float | None = None) -> np.ndarray:
+    """One frame file as float32 (H, W, 3): recorded rgb (`over` the grey that shows through it), or linear radiance for EXR and DNG."""
     suffix = path.suffix.lower()
     if suffix == ".dng":
         return read_dng(path)
     if suffix != ".exr":
-        return read_image(path)
+        return read_image(path, over)
     channels = read_exr(path)
     if "RGB" not in channels:
         if "Y" not in channels:
@@ -198,6 +199,9 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
+HOLD_OUT = 8  # every this many frames are kept out of training, where nobody says otherwise
+
+
 def held_out(count: int, every: int, cycle: int) -> list[int]:
     """Which of `count` frames are kept out of training: every `every`-th, never the first or the last; none for 0.
 
@@ -207,6 +211,12 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
     while math.gcd(every, cycle) > 1:
         every += 1
     return list(range(every // 2, count - 1, every))
+
+
+def every_of(frames: Sequence[int]) -> int | None:
+    """The smallest `every` for which `held_out` keeps out just these `frames` of a clip that ends soon after them; None where there is none."""
+    candidates = range(2, 2 * frames[0] + 2)
+    return next((every for every in candidates if held_out(frames[-1] + 2, every, 1) == list(frames)), None)
 
 
 def between(count: int, cycle: int) -> list[int]:

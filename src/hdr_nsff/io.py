@@ -135,8 +135,9 @@ def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
     encode(path, np.rint(np.clip(rgb, 0, 1) * top).astype(np.uint8 if bits == 8 else np.uint16))
 
 
-def read_image(path: Path | str) -> np.ndarray:
-    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]."""
+def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
+    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]; `over` is the grey in [0, 1] that shows through
+    transparent pixels (None: transparency is not looked at)."""
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such image; put it back or mend the name")
@@ -146,14 +147,22 @@ def read_image(path: Path | str) -> np.ndarray:
     if path.suffix.lower() in {".jpg", ".jpeg"} and b"\xff\xd9" not in raw[-64:].tobytes():
         raise InputError(f"{path}: the JPEG is cut short; copy it again")
     try:
-        image = cv2.imdecode(raw, cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH) if len(raw) else None
+        flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if over is None else cv2.IMREAD_UNCHANGED
+        image = cv2.imdecode(raw, flags) if len(raw) else None
     except cv2.error:
         image = None
     if image is None:
         raise InputError(f"{path}: not a readable image (PNG, JPEG or TIFF); copy it again")
     if image.dtype not in (np.uint8, np.uint16):
         raise InputError(f"{path}: {image.dtype} pixels; convert to 8 or 16 bits, or to EXR for linear data")
-    return np.ascontiguousarray(image[..., ::-1]).astype(np.float32) / (255 if image.dtype == np.uint8 else 65535)
+    top = 255 if image.dtype == np.uint8 else 65535
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, -1)
+    rgb = np.ascontiguousarray(image[..., 2::-1]).astype(np.float32) / top
+    if image.shape[2] < 4:
+        return rgb
+    alpha = image[..., 3:].astype(np.float32) / top
+    return rgb * alpha + np.float32(over or 0.0) * (1 - alpha)
 
 
 def read_mask(path: Path | str) -> np.ndarray:

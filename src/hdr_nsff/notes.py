@@ -76,6 +76,21 @@ class Exported(Note):
     display_exposure: Brightness
 
 
+class Made(Note):
+    """`made_of.json`: what a truth folder was made of."""
+
+    marks = ("key",)
+    key: str
+
+
+class Layout(Note):
+    """`hdr_nsff_export.json` of a scene exported in a public layout."""
+
+    marks = ("layout",)
+    layout: str = Field(min_length=1)
+    scene: str
+
+
 class Coloured(Note):
     """`views.json`: the ranges of the coloured pictures of the standard set."""
 

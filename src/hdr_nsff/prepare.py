@@ -1,8 +1,11 @@
-"""Footage -> scene folder, step by step: frames, exposure, flow, poses, mask, depth, sheet.
+"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, mask, depth, sheet.
 
 Every step writes its files and then its record into `scene.json`; its key is a hash of its settings and of the steps and inputs it
 builds on. A finished step with the same key is skipped, an unfinished one goes on with the files it has, one with another key
-starts over, and with it whatever builds on it. So killing `prepare` at any moment loses at most the file in the making."""
+starts over, and with it whatever builds on it. So killing `prepare` at any moment loses at most the file in the making.
+
+What a data set gives takes the place of an estimate. What it keeps back for testing no step sees: once the scene is whole, it goes
+into a truth folder outside of it, for `evaluate` alone."""
 
 from __future__ import annotations
 
@@ -11,18 +14,21 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hdr_nsff import ingest
+from hdr_nsff.datasets import recognise
+from hdr_nsff.datasets.capture import Picture
+from hdr_nsff.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import writing_to
 from hdr_nsff.progress import say, track
 from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
 from hdr_nsff.steps import priors as on_priors
-from hdr_nsff.steps.work import PrepareConfig, StepName, Work
+from hdr_nsff.steps.work import Part, PrepareConfig, StepName, Work
 
 __all__ = ["PrepareConfig", "prepare"]
 
@@ -42,16 +48,30 @@ def prepare(config: PrepareConfig) -> Path:
     """Do every step that is not done; the scene folder. InputError where the footage or a setting is at fault."""
     with writing_to(config.out):
         work = begin(config)
+        introduce(work)
         for name in STEPS:
             do(work, name)
+        if work.capture is not None and work.capture.withheld:
+            write_truth(work.capture, work.manifest, work.own_time, truth_place(config), config.max_size)
     say(f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {config.out / 'contact_sheet.png'})")
     return config.out
+
+
+def truth_place(config: PrepareConfig) -> Path:
+    """Where the held-out views of a public data set go."""
+    return config.truth_out or config.out.with_name(f"{config.out.name}_truth")
+
+
+def held_out_truth(config: PrepareConfig) -> Path | None:
+    """The truth folder that `prepare` wrote, None where the footage brings no held-out views."""
+    return truth_folder(truth_place(config))
 
 
 def begin(config: PrepareConfig) -> Work:
     """Look at the footage and at the scene folder; InputError where they do not belong together."""
     check_settings(config)
-    footage = ingest.open_footage(config.clip)
+    capture = recognise(config.clip)
+    footage = capture.footage() if capture else ingest.open_footage(config.clip)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
     if found is not None and found.inputs != inputs and not found.frames:
@@ -62,14 +82,28 @@ def begin(config: PrepareConfig) -> Work:
         leftover.unlink()
     if found is not None:
         found.source, found.inputs = str(config.clip), inputs
-        return Work(config, footage, found)
+        return Work(config, footage, found, capture)
     first = next(ingest.read_frames(footage, config.start, config.start + 1, 1, config.max_size), None)
     if first is None:
         raise InputError(f"{config.clip}: no frame {config.start}; choose a smaller `--start`")
     height, width = first.rgb.shape[:2]
-    work = Work(config, footage, Manifest(source=str(config.clip), inputs=inputs, width=width, height=height))
+    work = Work(config, footage, Manifest(source=str(config.clip), inputs=inputs, width=width, height=height), capture)
     work.save()
     return work
+
+
+def introduce(work: Work) -> None:
+    """Say which data set was recognised, if it is one, and what of it is used."""
+    capture, clip = work.capture, work.config.clip
+    if capture is None:
+        return
+    stored = ["exposures"] if capture.parts()["exposures"] else []
+    parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
+    given = [*stored, *(part for part in parts if work.gives(part))]
+    kept = f", held-out views for {truth_place(work.config)}" if capture.withheld else ""
+    say(f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}")
+    for note in capture.notes:
+        say(f"{clip}: {note}")
 
 
 def found_manifest(config: PrepareConfig) -> Manifest | None:
@@ -108,6 +142,8 @@ def check_settings(config: PrepareConfig) -> None:
     if config.protocol is not None and config.hold_out is not None:
         raise InputError("--protocol and --hold-out both given, and each says what is kept out of training; leave one out")
     ingest.parse_exposures(config.exposures, config.ev)
+    if truth_place(config).resolve().is_relative_to(config.out.resolve()):
+        raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
     for option, path in (("poses", config.poses), ("flow", config.flow), ("masks", config.masks), ("depth", config.depth)):
         if path is not None and not path.exists():
             raise InputError(f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate")
@@ -143,7 +179,34 @@ def step_key(work: Work, name: StepName) -> str:
         settings[s] = given_hash(value) if isinstance(value, Path) else value
     before = [(n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt")) for n in kind.needs]
     inputs = work.manifest.inputs if name == "frames" else {}
-    return hashlib.sha256(json.dumps([settings, before, inputs]).encode()).hexdigest()
+    known = [capture_part(work, name)] if work.capture is not None else []
+    return hashlib.sha256(json.dumps([settings, before, inputs, *known]).encode()).hexdigest()
+
+
+def capture_part(work: Work, name: StepName) -> Any:
+    """What of a data set a step depends on: its values, and the hashes of its files."""
+    capture = work.capture
+    assert capture is not None
+    ps = capture.pictures
+
+    def files(of: Callable[[Picture], Path | None]) -> list[str | None]:
+        return [None if (path := of(p)) is None else ingest.hash_file(path) for p in ps]
+
+    match name:
+        case "frames":
+            return [(p.source, p.time, p.camera_id) for p in ps]
+        case "exposure":
+            return [capture.withheld, asdict(capture.exposures) if capture.exposures else None, [(p.ev, p.bracket) for p in ps]]
+        case "flow" if work.gives("flow"):
+            return [sorted((to, ingest.hash_file(path)) for to, path in p.flow.items()) for p in ps]
+        case "poses" if work.gives("poses") and (given := capture.poses) is not None:
+            points = None if capture.points is None else capture.points.tolist()
+            return [given.K.tolist(), given.c2w.tolist(), given.size.tolist(), given.near, given.far, points]
+        case "mask" if work.gives("masks"):
+            return [capture.still, capture.white_moves, files(lambda p: p.mask)]
+        case "depth" if work.gives("depth"):
+            return [capture.depth_kind, capture.depth_units, files(lambda p: p.depth), files(lambda p: p.confidence)]
+    return None
 
 
 def given_hash(path: Path) -> str:

@@ -1,8 +1,8 @@
 """What a camera does to radiance (METHOD eq. 9-10, forwards): `rgb = g(clip(2^ev * white_balance * radiance + noise))`,
 8 bits. Used to make footage whose truth is known; nothing that trains reads it.
 
-A response curve is 256 points (x, y) per channel, ends fixed at (0, 0) and (1, 1), linear between them; x is the clipped
-sensor exposure in [0, 1]. The points are evenly spaced in x^(1/2.2), so that the darks of a short exposure are resolved."""
+A response curve is a list of points (x, y) per channel, ends fixed at (0, 0) and (1, 1), linear between them; x is the clipped
+sensor exposure in [0, 1]. The 256 points of a named camera are evenly spaced in x^(1/2.2), so that the darks of a short exposure are resolved."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ FILM = ((1.95, 0.42, 0.10), (2.10, 0.36, 0.12), (2.30, 0.28, 0.15))
 class Curve:
     """A sampled response, increasing, from (0, 0) to (1, 1)."""
 
-    x: np.ndarray  # (256,) sensor exposure in [0, 1]
-    y: np.ndarray  # (3, 256) recorded value in [0, 1], per channel
+    x: np.ndarray  # (N,) sensor exposure in [0, 1]
+    y: np.ndarray  # (3, N) recorded value in [0, 1], per channel
 
     def apply(self, exposure: np.ndarray) -> np.ndarray:
         """Recorded value (..., 3) of a sensor exposure (..., 3); what leaves [0, 1] is clipped."""

@@ -5,7 +5,8 @@ alternating exposures, noise and 8 bits. Into `OUT`: `clip/` (the footage), `tru
 `poses_bounds.npy` (where poses are given: those of the footage, for `prepare --poses`), `reexpose.json` (what was done).
 
 With poses, held-out frames are missing from the footage, and their time lies between their neighbours'. Without, nobody
-could say where a missing frame was seen from, so they stay in the footage and `prepare --hold-out` keeps them out of training."""
+could say where a missing frame was seen from, so they stay in the footage and `prepare --hold-out`, or `run --truth`, keeps them out of
+training."""
 
 from __future__ import annotations
 
@@ -41,7 +42,7 @@ class ReexposeConfig:
     """Sensor noise: 1 is a small sensor of 6000 electrons, 0 none."""
     response: str = "film"
     """The camera that records: film (an S-curve, every channel its own), gamma or srgb."""
-    hold_out: int = 8
+    hold_out: int = ingest.HOLD_OUT
     """Every this many frames are the truth."""
     poses: Path | None = None
     """Camera poses of all frames of the clip: COLMAP model folder, transforms.json, poses_bounds.npy, precomputed.json."""

@@ -177,6 +177,8 @@ SCORES = (
     ("psnr", "PSNR, dB", 2), ("psnr_moving", "PSNR moving, dB", 2), ("ssim", "SSIM", 3), ("ssim_moving", "SSIM moving", 3),
     ("lpips", "LPIPS", 3), ("lpips_moving", "LPIPS moving", 3), ("psnr_all_exposures", "PSNR over all exposures, dB", 2),
     ("psnr_moving_all_exposures", "PSNR moving over all exposures, dB", 2),
+    ("psnr_novel_exposures", "PSNR at exposures that the clip has not, dB", 2),
+    ("psnr_moving_novel_exposures", "PSNR moving at those, dB", 2),
 )  # fmt: skip
 
 
@@ -237,7 +239,7 @@ def quality(metrics: dict[str, Any] | None) -> str:
         world = f", scene flow by {metrics['world_scale']:.4f}" if "world_scale" in metrics else ""
         parts += [f'<p class="note">{units}{world}.</p>']
     titles = {"stability": "Stability along the training path", "camera": "Learned camera against the true one"}
-    for part, title in {**titles, "poses": "Estimated poses against the true ones"}.items():
+    for part, title in {**titles, "poses": "Poses of the scene against the true ones"}.items():
         found = metrics.get(part) or {}
         rows = [(label, text(found[key])) for key, label in ERRORS[part].items() if key in found]
         parts += [f"<h3>{title}</h3>", table(("", ""), rows)] if rows else []

@@ -11,9 +11,10 @@ from tyro.conf import Positional
 
 from hdr_nsff.config import PRESETS, check
 from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import check_truth, evaluate_run
+from hdr_nsff.evaluate import evaluate_run, views_of_clip
+from hdr_nsff.ingest import every_of
 from hdr_nsff.io import writing_to
-from hdr_nsff.prepare import PrepareConfig, prepare
+from hdr_nsff.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.progress import say
 from hdr_nsff.render import render_all
 from hdr_nsff.report import check_place, write_report
@@ -30,7 +31,8 @@ class RunConfig:
     views (`render`), held-out quality (`evaluate`), report.html. Killed? The same command goes on where it was."""
 
     clip: Positional[Path]
-    """Footage: a video, a folder of frames, or a folder of such folders (one per synchronized camera)."""
+    """Footage: a video, a folder of frames, or a folder of such folders (one per synchronized camera); or a public data set, see
+    `prepare --help`."""
     out: Positional[Path]
     """Folder for everything: scene/, run/, render/, report.html."""
     exposures: str | None = None
@@ -42,13 +44,15 @@ class RunConfig:
     minutes: float | None = None
     """Training time instead of the preset's."""
     truth: Path | None = None
-    """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the clip are trained on."""
+    """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the clip are trained on but those that are the truth's
+    views. A public data set with held-out views brings its own."""
     poses: Path | None = None
     """Given poses (COLMAP model, transforms.json, poses_bounds.npy) instead of structure from motion."""
     protocol: Protocol | None = None
-    """Split the clip as the published tables do, see `prepare --help`; instead of --hold-out, and with --truth."""
+    """Split the clip as the published tables do, see `prepare --help`; instead of --hold-out, and with held-out views to be evaluated on."""
     hold_out: int | None = None
-    """Keep every this many frames for `evaluate`; default 8, or 0 with a truth folder."""
+    """Keep every this many frames for `evaluate`. Default: 8; with a truth folder, or where a data set brings held-out views, 0, or those
+    frames of the clip that are the truth's views."""
     max_size: int = 640
     """Longest side in pixels; larger frames are shrunk."""
     seed: int = 0
@@ -62,25 +66,40 @@ def run_all(config: RunConfig) -> None:
     pick_device(config.device)
     if config.truth is not None and not config.truth.is_dir():
         raise InputError(f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, or leave the option out")
-    if config.truth is not None:
-        check_truth(config.truth)
     check_place(config.out / "report.html")
     settings = replace(PRESETS[config.preset], out=config.out / "run", seed=config.seed, device=config.device)
     if config.minutes is not None:
         settings = replace(settings, minutes=config.minutes, steps=None)
     check(settings)
-    hold_out = 0 if config.hold_out is None and config.truth and config.protocol is None else config.hold_out
-    scene = prepare(
-        PrepareConfig(
-            clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev,
-            max_size=config.max_size, hold_out=hold_out, protocol=config.protocol, poses=config.poses,
-        )
+    footage = PrepareConfig(
+        clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev, max_size=config.max_size,
+        hold_out=held_out_every(config), protocol=config.protocol, poses=config.poses,
     )  # fmt: skip
+    scene = prepare(footage)
+    truth = config.truth or held_out_truth(footage)
     with writing_to(config.out):
         run = Run.open(train(replace(settings, scene=scene)), config.device)
         results = render_all(run, config.out / "render")
-        evaluate_run(run, config.truth)
+        evaluate_run(run, truth)
         results["report"] = write_report(run, config.out / "report.html", config.out / "render")
     say(f"done in {(time.monotonic() - start) / 60:.1f} minutes; results:")
     for name, path in results.items():
         say(f"  {name:<16} {path}")
+
+
+def held_out_every(config: RunConfig) -> int | None:
+    """`--hold-out` for `prepare`, so that no frame is trained on that the truth is made of: beside a truth of other places or times nothing is
+    kept out, beside one of the clip's own frames these are. None leaves it to `prepare`. InputError where the truth cannot be followed."""
+    frames = views_of_clip(config.truth) if config.truth is not None else []
+    if config.hold_out is not None or config.protocol is not None or config.truth is None:
+        return config.hold_out
+    if not frames:
+        return 0
+    every = every_of(frames)
+    if every is None:
+        named = ", ".join(map(str, frames[:4])) + ", ..." * (len(frames) > 4)
+        raise InputError(
+            f"--truth {config.truth}: its views are frames {named} of the clip, which are not every so many; choose with --hold-out what is kept "
+            "out of training"
+        )
+    return every

@@ -19,6 +19,7 @@ from hdr_nsff.priors.poses import LEAST, Poses, interpolate, project, ranges, tr
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0])  # columns right, up, back -> right, down, forward
 FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # columns down, right, back -> right, down, forward
+ROUNDING = 1e-6  # off which a rotation is made one again
 BENT = 2.0  # pixels of lens distortion at a corner that a pinhole may stand in for
 Parallax = Literal["full", "rotation", "none"]
 NAMES = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "precomputed.json")
@@ -50,8 +51,6 @@ def import_poses(path: Path | str, sources: list[str], size: tuple[int, int]) ->
         given = from_llff(path)
     else:
         given = from_json(path)
-    if not (np.isfinite(given.K).all() and np.isfinite(given.c2w).all()):
-        raise InputError(f"{path}: poses hold NaN or Inf; export them again")
     chosen = arrange(path, given.names, len(given.c2w), sources)
     poses = placed(path, given, chosen, size)
     if model is not None:
@@ -230,6 +229,8 @@ def path_key(parts: int) -> Any:
 
 def placed(path: Path, given: Given, chosen: list[int | None], size: tuple[int, int]) -> Poses:
     """The chosen poses, rescaled to frames of `size` (height, width)."""
+    if not (np.isfinite(given.K).all() and np.isfinite(given.c2w).all()):
+        raise InputError(f"{path}: poses hold NaN or Inf; export them again")
     height, width = size
     K, c2w = np.tile(np.eye(3), (len(chosen), 1, 1)), np.tile(np.eye(4)[:3], (len(chosen), 1, 1))
     for t, k in enumerate(chosen):
@@ -245,12 +246,14 @@ def placed(path: Path, given: Given, chosen: list[int | None], size: tuple[int, 
             K[t, 1, 2] = height / 2
         if k is not None:
             c2w[t] = given.c2w[k]
-    u, _, vt = np.linalg.svd(c2w[:, :, :3])
+    rotation = c2w[:, :, :3]
+    off = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2)) > ROUNDING
+    u, _, vt = np.linalg.svd(rotation)
     if (np.linalg.det(c2w[:, :, :3]) <= 0).any() or (K[:, (0, 1), (0, 1)] <= 0).any():
         raise InputError(
             f"{path}: a pose is no rotation (mirrored or all zero), or a focal length is not positive; export them again"
         )
-    c2w[:, :, :3] = u @ vt
+    c2w[off, :, :3] = (u @ vt)[off]
     registered = np.array([k is not None for k in chosen])
     centres = c2w[registered, :, 3]
     turns = np.abs(c2w[registered, :, :3] - c2w[registered][:1, :, :3]).max()

@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff import alignment
+from hdr_nsff.recording import Curve
 from hdr_nsff.run import Run
-from hdr_nsff.scores.targets import Target, match_brackets, trajectories
-from hdr_nsff.truth import Truth
+from hdr_nsff.scores.targets import Target, trajectories
+from hdr_nsff.truth import Truth, scene_brackets
 
 POWERS = np.geomspace(0.25, 4, 385)  # tried for the response, 0.7 % apart
 
 
 def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
-    """The learned response and exposures against the true ones.
+    """The learned response and exposures against the true ones; empty where the true response is not known.
 
     `response_rmse`: root mean square error of the recorded value in [0, 1], over exposures evenly spaced in x^(1/2.2) and the three channels.
     The scale is fixed, for both curves reach 1 at exposure 1. Where exposures are learned, radiance is known up to a power p only: if E
@@ -25,12 +26,14 @@ def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
     `power`: what the learned exposures are of the true ones, least squares; `response_rmse_after_power`: the error once it is undone;
     `power_of_response`: at which the curves agree best (1 where exposures were given); `largest_step_error_after_power`: that of the exposures once this one is undone.
     EVs are relative to the reference bracket; steps lead from one exposure to the next brighter one."""
-    x, y = (t.cpu().double().numpy() for t in run.tonemapper.curve(0))
-    at = np.linspace(0, 1, 256) ** 2.2
-    true = np.stack([np.interp(at, truth.response_x, c) for c in truth.response_y])
+    if truth.response is None:
+        return {}
+    own = Curve(*(t.cpu().double().numpy() for t in run.tonemapper.curve(0)))
+    at = np.linspace(0, 1, 256)[:, None].repeat(3, 1) ** 2.2  # (256, 3)
+    true = truth.response.apply(at)
 
     def rmse(p: float) -> float:
-        return float(np.sqrt(np.mean((np.stack([np.interp(at**p, x, c) for c in y]) - true) ** 2)))
+        return float(np.sqrt(np.mean((own.apply(at**p) - true) ** 2)))
 
     known, learned = exposure_pairs(run, truth)
     steps, found = (np.diff(ev[np.argsort(known, kind="stable")]) for ev in (known, learned))
@@ -54,27 +57,26 @@ def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
             "largest_step_error_after_power": float(np.abs(found / of_response - steps).max()),
         }
     thin = slice(None, None, 5)
-    return errors | {"true_response": {"x": at[thin].tolist(), "y": true[:, thin].tolist()}}
+    return errors | {"true_response": {"x": at[thin, 0].tolist(), "y": true[thin].T.tolist()}}
 
 
 def exposure_pairs(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
-    """True and learned EV of every bracket of the truth, relative to its reference bracket."""
+    """True and learned EV of every bracket of the truth that the scene has, relative to its reference bracket."""
     ev = run.tonemapper.exposures().cpu().double().numpy()
-    match = match_brackets(truth.bracket_ev, ev.tolist())
+    match = scene_brackets(truth, run.scene.manifest.frames, ev.tolist())
     reference = truth.reference_bracket
-    known = np.array(truth.bracket_ev) - truth.bracket_ev[reference]
-    return known, np.array([ev[match[b]] - ev[match[reference]] for b in range(len(known))])
+    true_ev, brackets = np.array(truth.bracket_ev, np.float64), sorted(match)
+    return true_ev[brackets] - true_ev[reference], ev[[match[b] for b in brackets]] - ev[match[reference]]
 
 
 def trajectory_errors(run: Run, truth: Truth, targets: Sequence[Target]) -> dict[str, float]:
-    """Errors of poses and focal length; empty where the truth has neither."""
+    """Errors of poses and of the focal length of the clip's first frame; empty where the truth has neither."""
     paths = trajectories(run, truth)
     errors = {} if paths is None else alignment.pose_errors(*paths)
-    if truth.K is not None and targets:
-        camera = targets[0].view.camera  # at the size of the truth's pictures, which is the size of its K
-        errors |= {
-            "focal": float(camera.K[0, 0]),
-            "true_focal": truth.K[0][0],
-            "focal_error": float(camera.K[0, 0]) / truth.K[0][0] - 1,
-        }
+    m, first = run.scene.manifest, run.scene.manifest.frames[0]
+    if truth.K is not None and targets and first.K is not None:
+        focal = (
+            first.K[0][0] * targets[0].view.camera.width / m.width
+        )  # at the size of the truth's pictures, which is that of its K
+        errors |= {"focal": focal, "true_focal": truth.K[0][0], "focal_error": focal / truth.K[0][0] - 1}
     return errors

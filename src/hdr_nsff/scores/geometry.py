@@ -45,7 +45,7 @@ def true_geometry(file: GeometryFile) -> Geometry:
     if lost := [n for n in GEOMETRY if n not in channels]:
         raise InputError(f"{file.path}: no channel {lost[0]} in this truth file; make the truth anew")
     if channels["Z"].shape != file.size:
-        raise InputError(f"{file.path}: depth of {channels['Z'].shape}, but the radiance of that view is {file.size}")
+        raise InputError(f"{file.path}: depth of {channels['Z'].shape}, but the pictures of that view are {file.size}")
 
     def stacked(name: str, axes: str) -> Tensor:
         return torch.from_numpy(np.stack([channels[f"{name}.{a}"] for a in axes], -1))

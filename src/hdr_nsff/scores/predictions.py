@@ -95,3 +95,8 @@ def recorded(run: Run, target: Target, radiance: Tensor, bracket: int) -> Tensor
     with torch.no_grad():
         flat = radiance.reshape(-1, 3).to(run.tonemapper.knots.device)
         return run.tonemapper(flat, bracket, target.camera_id, None, leaky=False).cpu().reshape(radiance.shape)
+
+
+def developed(run: Run, target: Target, radiance: Tensor, ev: float) -> Tensor:
+    """The same at any exposure, `ev` relative to the reference bracket."""
+    return run.tonemapper.develop(radiance.to(run.tonemapper.knots.device), ev, target.camera_id).cpu()

@@ -1,4 +1,4 @@
-"""Linear radiance against the exact one, after one scale for all views (METHOD.md 7): LDR recordings alone leave it free."""
+"""Linear radiance against the exact one, where that is known, after one scale for all views: LDR recordings alone leave it free."""
 
 from __future__ import annotations
 
@@ -25,11 +25,14 @@ class Gauge:
     flip: tuple[float, float]  # exposure range of HDR-FLIP, log2
 
 
-def find_gauge(targets: Sequence[Target], radiance: Sequence[Tensor]) -> Gauge:
-    """One gauge for all views: median ratios on recordable pixels."""
-    truths = [exact_of(t) for t in targets]
-    known = torch.cat([recordable(t).flatten() for t in targets])
-    predicted, exact = (torch.cat([x.reshape(-1, 3) for x in maps]) for maps in (radiance, truths))
+def find_gauge(targets: Sequence[Target], radiance: Sequence[Tensor]) -> Gauge | None:
+    """One gauge for all views: median ratios on recordable pixels. None where no view has exact radiance."""
+    pairs = [(t, r) for t, r in zip(targets, radiance, strict=True) if t.radiance is not None]
+    if not pairs:
+        return None
+    truths = [exact_of(t) for t, _ in pairs]
+    known = torch.cat([recordable(t).flatten() for t, _ in pairs])
+    predicted, exact = (torch.cat([x.reshape(-1, 3) for x in maps]) for maps in ([r for _, r in pairs], truths))
     return Gauge(
         scale=metrics.align(predicted, exact, known),
         scales=metrics.align(predicted, exact, known, per_channel=True),
@@ -63,7 +66,9 @@ HDR_SCORES = {  # what they are called, and digits after the point
 
 def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, float]:
     """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`. Normalised by the largest exact radiance of all
-    views; `recordable`: over recordable pixels only, normalised by the largest of them."""
+    views; `recordable`: over recordable pixels only, normalised by the largest of them. Empty where the exact one is not known."""
+    if target.radiance is None:
+        return {}
     exact, known, moving = exact_of(target), recordable(target), moving_of(target)
     regions = {"": None} | ({} if moving is None else {"_moving": moving})
     ways = {"": radiance * gauge.scale, "_per_channel": radiance * gauge.scales, "_unaligned": radiance}

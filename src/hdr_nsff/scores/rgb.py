@@ -7,15 +7,15 @@ from torch import Tensor
 
 from hdr_nsff import metrics
 from hdr_nsff.run import Run
-from hdr_nsff.scores.predictions import recorded
+from hdr_nsff.scores.predictions import developed, recorded
 from hdr_nsff.scores.targets import Target, moving_of
 
 SMALLEST_LPIPS = 64  # pixels
 
 
 def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lpips | None) -> dict[str, float]:
-    """Recorded rgb at the view's own exposure, and PSNR averaged over all exposures; moving-only numbers where there is a mask with
-    something in it."""
+    """Recorded rgb at the view's own exposure, and PSNR averaged over all exposures of the clip at which the view is known, and over those that
+    no frame of the clip has; moving-only numbers where there is a mask with something in it."""
     moving = moving_of(target)
     own, truth = recorded(run, target, radiance, target.bracket), target.rgb[target.bracket]
     scores: dict[str, float] = {"psnr": metrics.psnr(own, truth), "ssim": metrics.ssim(own, truth)}
@@ -26,7 +26,10 @@ def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lp
         if moving is not None:
             scores["lpips_moving"] = perceptual.on_mask(own, truth, moving)
     every = [(recorded(run, target, radiance, b), rgb) for b, rgb in target.rgb.items()]
-    scores["psnr_all_exposures"] = float(np.mean([metrics.psnr(p, t) for p, t in every]))
-    if moving is not None:
-        scores["psnr_moving_all_exposures"] = float(np.mean([metrics.psnr(p, t, moving) for p, t in every]))
+    novel = [(developed(run, target, radiance, ev), rgb) for ev, rgb in target.novel.items()]
+    for name, pairs in (("all_exposures", every), ("novel_exposures", novel)):
+        if pairs:
+            scores[f"psnr_{name}"] = float(np.mean([metrics.psnr(p, t) for p, t in pairs]))
+            if moving is not None:
+                scores[f"psnr_moving_{name}"] = float(np.mean([metrics.psnr(p, t, moving) for p, t in pairs]))
     return scores

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,9 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.paths import View
 from hdr_nsff.progress import say
 from hdr_nsff.run import Run
-from hdr_nsff.scene import Protocol, inside
+from hdr_nsff.scene import FrameEntry, Protocol, inside
 from hdr_nsff.tonemap import informative
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff.truth import Truth, TruthView, scene_brackets, true_pictures
 
 SEEN = "training view"  # the group of views that were trained on
 
@@ -45,6 +45,7 @@ class Target:
     radiance: Tensor | None  # (H, W, 3) exact, where known, in the camera's white balance: the unit of a run's radiance
     moving: Tensor | None  # (H, W) bool
     geometry: GeometryFile | None = None  # where known
+    novel: dict[float, Tensor] = field(default_factory=dict)  # {EV: (H, W, 3)} recorded, at exposures of no frame of the clip
 
     def protocol(self, times: Sequence[float]) -> Protocol | None:
         """Which of the published comparisons the view belongs to, of a run trained at `times`; None where it was trained on."""
@@ -65,7 +66,7 @@ def exact_of(target: Target) -> Tensor:
 
 
 def recordable(target: Target) -> Tensor:
-    """True (H, W) where at least one exposure of the clip records all channels unclipped."""
+    """True (H, W) where at least one exposure of the clip, of those at which the view is known, records all channels unclipped."""
     return (
         torch.stack([informative(rgb.reshape(-1, 3)) for rgb in target.rgb.values()])
         .any(0)
@@ -78,7 +79,9 @@ def choose_targets(run: Run, truth: Truth | None, folder: Path | None) -> tuple[
     if truth is not None and folder is not None:
         targets, notes = truth_targets(run, truth, folder)
         held_out = any(t.group != SEEN for t in targets)
-        return f"{'held-out' if held_out else 'training'} views with exact radiance", targets, notes
+        exact = any(t.radiance is not None for t in targets)
+        what = f"{'held-out' if held_out else 'training'} views {'with exact radiance' if exact else 'as recorded'}"
+        return what, targets, notes
     if run.scene.test:
         return "held-out frames", frame_targets(run, test=True), []
     note = "nothing was held out (`prepare --hold-out 8` does that): these numbers are of frames the field was trained on"
@@ -124,18 +127,16 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
             f"{folder}: no view of this truth can be compared with the run ({notes[0] if notes else 'it lists none'}); "
             "check that it is the truth of this clip"
         )
-    if not any(exact_of(t).any() for t in targets):
+    exact = [t.radiance for t in targets if t.radiance is not None]
+    if exact and not any(e.any() for e in exact):
         raise InputError(f"{folder}: the radiance of every view is 0; make the truth anew")
     return targets, notes
 
 
 def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: float) -> Target:
     """One view of a truth folder; InputError where its files do not fit together."""
-    exact = io.read_exr(inside(folder, view.radiance)).get("RGB")
-    if exact is None:
-        raise InputError(f"{folder / view.radiance}: no R, G and B channels in this truth image")
-    if exact.min() < 0:
-        raise InputError(f"{folder / view.radiance}: negative radiance; clip at zero before writing the truth")
+    exact, true = true_pictures(truth, view, folder)
+    pictures = {b: torch.from_numpy(rgb) for b, rgb in true.items()}
     anchor = next((e for e in run.scene.manifest.frames if e.index == view.anchor), None)
     if anchor is None or anchor.c2w is None or anchor.K is None:
         raise InputError(
@@ -145,17 +146,28 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     if view.c2w is not None:
         assert truth.clip_c2w is not None, "world_scale refuses this"
         pose = alignment.carry(pose, np.array(truth.clip_c2w[view.anchor]), np.array(view.c2w), scale)
-    height, width = exact.shape[:2]
-    m = run.scene.manifest
-    match = match_brackets(truth.bracket_ev, run.tonemapper.exposures().tolist())
-    camera = Camera(torch.tensor(anchor.K), torch.from_numpy(pose).float(), m.width, m.height).resized(width, height)
-    rgb = {match[b]: record(truth, exact, b) for b in range(len(truth.bracket_ev))}
+    height, width = pictures[view.bracket].shape[:2]
+    match = scene_brackets(truth, run.scene.manifest.frames, run.tonemapper.exposures().tolist())
+    if view.bracket not in match:
+        raise InputError(f"{folder}: view {view.name} is of an exposure that the scene does not have; prepare it again")
     return Target(
-        view.name, group_of(run, view), View(camera, view.time), match[view.bracket], anchor.camera_id, rgb,
-        torch.from_numpy(exact * np.array(truth.white_balance, np.float32)),
+        view.name, group_of(run, view), View(camera_of(run, view, anchor, pose, (height, width)), view.time),
+        match[view.bracket], anchor.camera_id,
+        {match[b]: rgb for b, rgb in pictures.items() if b in match},
+        None if exact is None else torch.from_numpy(exact * np.array(truth.white_balance, np.float32)),
         moving_mask(run, view, folder, (height, width)),
         geometry_file(truth, view, folder, (height, width), pose),
+        {ev: rgb for b, rgb in pictures.items() if b not in match and (ev := truth.bracket_ev[b]) is not None},
     )  # fmt: skip
+
+
+def camera_of(run: Run, view: TruthView, anchor: FrameEntry, pose: np.ndarray, size: tuple[int, int]) -> Camera:
+    """The camera of a truth view at `pose` (3, 4) for pictures of `size` (H, W): with a K of its own, else with that of its anchor."""
+    m, (height, width) = run.scene.manifest, size
+    c2w = torch.from_numpy(pose).float()
+    if view.K is not None:
+        return Camera(torch.tensor(view.K), c2w, width, height)
+    return Camera(torch.tensor(anchor.K), c2w, m.width, m.height).resized(width, height)
 
 
 def group_of(run: Run, view: TruthView) -> str:
@@ -181,27 +193,11 @@ def moving_mask(run: Run, view: TruthView, folder: Path, size: tuple[int, int]) 
     if view.mask is not None:
         mask = io.read_mask(inside(folder, view.mask))
         if mask.shape != size:
-            raise InputError(f"{folder / view.mask}: a mask of {mask.shape}, but the radiance of {view.name} is {size}")
+            raise InputError(f"{folder / view.mask}: a mask of {mask.shape}, but the pictures of {view.name} are {size}")
         return torch.from_numpy(mask)
     frames = [f for f in run.scene.train + run.scene.test if f.index == view.anchor and f.time == view.time and view.c2w is None]
     own = frames[0].moving if frames else None
     return own if own is not None and own.shape == size else None
-
-
-def match_brackets(true_ev: Sequence[float], learned_ev: Sequence[float]) -> dict[int, int]:
-    """{bracket of the truth: bracket of the scene}, by rank of exposure; where their numbers differ, by distance from the brightest."""
-    if len(true_ev) == len(learned_ev):
-        order = zip(np.argsort(true_ev, kind="stable"), np.argsort(learned_ev, kind="stable"), strict=True)
-        return {int(b): int(s) for b, s in order}
-    learned = np.array(learned_ev) - max(learned_ev)
-    return {b: int(np.abs(learned - (ev - max(true_ev))).argmin()) for b, ev in enumerate(true_ev)}
-
-
-def record(truth: Truth, radiance: np.ndarray, bracket: int) -> Tensor:
-    """What the true camera records (H, W, 3) of `radiance` (H, W, 3) at a bracket, without noise."""
-    exposure = radiance * 2.0 ** truth.bracket_ev[bracket] * np.array(truth.white_balance)
-    rgb = np.stack([np.interp(exposure[..., c], truth.response_x, truth.response_y[c]) for c in range(3)], -1)
-    return torch.from_numpy(rgb.astype(np.float32))
 
 
 def trajectories(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray] | None:
@@ -218,5 +214,7 @@ def world_scale(run: Run, truth: Truth) -> float | None:
         if any(v.c2w is not None for v in truth.views):
             raise InputError("truth.json: views have poses of their own, but clip_c2w is missing; they cannot be carried over")
         return None
+    if np.allclose(*paths):
+        return 1.0  # given poses: one world
     fit = alignment.umeyama(paths[0][:, :, 3], paths[1][:, :, 3])
     return None if fit is None else fit.scale

@@ -12,7 +12,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.io import write_png
 from hdr_nsff.priors import exposure
 from hdr_nsff.progress import say, track
-from hdr_nsff.scene import FrameEntry, Step
+from hdr_nsff.scene import FrameEntry, Protocol, Step
 from hdr_nsff.steps.work import Work
 
 MIN_FRAMES = 3
@@ -29,7 +29,7 @@ def frames_step(work: Work) -> Step:
             index=len(entries),
             image=f"images/{len(entries):05d}.png",
             source=frame.source,
-            time=(frame.number - c.start) // c.stride,
+            time=work.time_of(frame.source, frame.number),
             camera_id=frame.camera_id,
             bracket=0,
         )
@@ -52,14 +52,18 @@ def frames_step(work: Work) -> Step:
 
 def exposure_step(work: Work) -> Step:
     """Which frames share an exposure, what the exposures are where that is known, and which frames are kept out of training."""
-    m, c = work.manifest, work.config
+    m = work.manifest
     cameras = work.camera_frames()
     source, given = given_exposures(work)
+    stored = work.capture.exposures if work.capture is not None and source == "data set" else None
     notes = []
-    if given is None:
+    values: list[float | None]
+    if stored is not None:
+        brackets, values = [work.picture(f).bracket or 0 for f in m.frames], list(stored.ev)
+    elif given is None:
         cycles = [exposure.detect_cycle(work.video[frames]) for frames in cameras]
         brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
-        values: list[float | None] = [None] * (max(brackets) + 1)
+        values = [None] * (max(brackets) + 1)
         notes += found_cycle(work, cycles)
     else:
         brackets, known = exposure.by_value(given)
@@ -68,23 +72,19 @@ def exposure_step(work: Work) -> Step:
     for note in notes[:3]:
         say(f"exposure: {note}")
     m.cycle = exposure.period([brackets[i] for i in cameras[0]])
-    m.reference_bracket = exposure.reference_bracket(work.video, brackets)
+    m.reference_bracket = stored.reference if stored else exposure.reference_bracket(work.video, brackets)
     gauge = values[m.reference_bracket]
     m.bracket_ev = [None if v is None or gauge is None else v - gauge for v in values]
-    m.exposure_given = given is not None
-    m.protocol = c.protocol
+    m.exposure_given = stored.given if stored else given is not None
+    m.protocol = work.config.protocol
     test = kept_out(work)
-    trained = {b for f, b in zip(m.frames, brackets, strict=True) if f.index not in test}
-    if c.protocol is not None and len(trained) < len(values):
-        raise InputError(
-            f"--protocol {c.protocol}: of {len(m.frames)} frames it trains on {len(m.frames) - len(test)}, which show only {len(trained)} "
-            f"of {len(values)} exposures; use a longer clip, or --hold-out"
-        )
+    if m.protocol is not None:
+        check_protocol(m.protocol, brackets, test)
     for f, bracket in zip(m.frames, brackets, strict=True):
         f.bracket, f.ev, f.split = bracket, m.bracket_ev[bracket], "test" if f.index in test else "train"
     vars(work).pop("equalised", None)
     what = "no alternation" if m.cycle == 1 else f"cycle of {m.cycle}, {len(values)} exposures"
-    step: Literal["given", "estimated"] = "given" if given is not None else "estimated"
+    step: Literal["given", "estimated"] = "given" if stored or given is not None else "estimated"
     details = {"source": source, "doubts": notes}
     return Step(provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details)
 
@@ -98,12 +98,28 @@ def kept_out(work: Work) -> set[int]:
         case "novel-view-time":
             return {frames[k] for frames in cameras for k in ingest.between(len(frames), cycle)}
         case None:
-            every = 8 if c.hold_out is None else c.hold_out
-            return {frames[k] for frames in cameras for k in ingest.held_out(len(frames), every, cycle)}
+            return {frames[k] for frames in cameras for k in ingest.held_out(len(frames), held_out_every(work), cycle)}
+
+
+def held_out_every(work: Work) -> int:
+    """Every how many frames are kept out of training; 0 for none, as where a data set brings held-out views of its own."""
+    if work.config.hold_out is not None:
+        return work.config.hold_out
+    return 0 if work.capture is not None and work.capture.withheld else ingest.HOLD_OUT
+
+
+def check_protocol(protocol: Protocol, brackets: list[int], test: set[int]) -> None:
+    """InputError where the frames that are not kept out (`test`, indices) show fewer exposures than all, by their `brackets`."""
+    shown, trained = set(brackets), {b for i, b in enumerate(brackets) if i not in test}
+    if len(trained) < len(shown):
+        raise InputError(
+            f"--protocol {protocol}: of {len(brackets)} frames it trains on {len(brackets) - len(test)}, which show only {len(trained)} "
+            f"of {len(shown)} exposures; use a longer clip, or --hold-out"
+        )
 
 
 def given_exposures(work: Work) -> tuple[str, list[float] | None]:
-    """Where the EV of every frame comes from, and the EVs; None where brightness has to tell."""
+    """Where the EV of every frame comes from, and the EVs; None where brightness has to tell, or a data set stores brackets."""
     c, footage, frames = work.config, work.footage, work.manifest.frames
     numbers = [c.start + int(f.time) * c.stride for f in frames]
     cycle = ingest.parse_exposures(c.exposures, c.ev)
@@ -112,6 +128,9 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         return "flags", [cycle[n % len(cycle)] for n in numbers]
     if "auto" in (c.exposures, c.ev):
         return "brightness", None
+    if (capture := work.capture) is not None and capture.parts()["exposures"]:
+        evs = [work.picture(f).ev for f in frames]
+        return "data set", None if capture.exposures else [e for e in evs if e is not None]
     if (table := ingest.read_exposure_csv(footage)) is not None:
         path, rows = table
         keys = [

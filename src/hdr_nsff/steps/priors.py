@@ -4,17 +4,19 @@ Pixels of held-out frames are used for their own pose and mask only: nothing abo
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
 from hdr_nsff import ingest
+from hdr_nsff.datasets import maps
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
-from hdr_nsff.priors.depth import geometric_depth, read_depth
+from hdr_nsff.priors.depth import depth_range, geometric_depth, read_depth
 from hdr_nsff.priors.flow import flow, read_flow
-from hdr_nsff.priors.import_poses import import_poses
+from hdr_nsff.priors.import_poses import import_poses, placed
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
 from hdr_nsff.priors.poses import Poses, estimate_poses
 from hdr_nsff.progress import say, track
@@ -45,6 +47,8 @@ def flow_step(work: Work) -> Step:
     pairs = flow_pairs(m.frames)
     names = {(i, j): FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png") for i, j in pairs}
     missing = [p for p in pairs if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))]
+    own = given_flow(work, names)
+    missing = [p for p in missing if p not in own]
     size = FLOW_CHUNK if c.flow is None else max(len(missing), 1)
     for chunk in track([missing[k : k + size] for k in range(0, len(missing), size)], "flow"):
         if c.flow is not None:
@@ -54,17 +58,40 @@ def flow_step(work: Work) -> Step:
             video, clipped = work.equalised
             found, valid = flow(video[some], clipped[some], np.searchsorted(some, chunk), report=None)
         for pair, f, v in zip(chunk, found, valid, strict=True):
-            write_npy(work.folder / names[pair].flow, f.astype(np.float16))
-            write_png(work.folder / names[pair].valid, v)
+            write_flow(work, names[pair], f, v)
     for f in m.frames:
         f.flow = {j: names[i, j] for i, j in pairs if i == f.index}
     share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
     vars(work).pop("flows", None)
+    given = len(pairs) if c.flow is not None else len(own)
+    note = f"{len(pairs)} pairs, {share:.0%} of the pixels pass the forward-backward check"
     return Step(
-        provenance="estimated" if c.flow is None else "given",
-        note=f"{len(pairs)} pairs, {share:.0%} of the pixels pass the forward-backward check",
+        provenance="given" if given == len(pairs) else "estimated",
+        note=note + (f"; {given} given, {len(pairs) - given} estimated" if 0 < given < len(pairs) else ""),
         details={"valid_share": round(float(share), 4)},
     )
+
+
+def given_flow(work: Work, names: dict[tuple[int, int], FlowFiles]) -> set[tuple[int, int]]:
+    """Write the flow that a data set gives; the pairs it was given for."""
+    m = work.manifest
+    found: set[tuple[int, int]] = set()
+    if work.gives("flow") is None:
+        return found
+    for (i, j), files in names.items():
+        path = work.picture(m.frames[i]).flow.get(m.frames[j].source)
+        if path is None:
+            continue
+        found.add((i, j))
+        if not all((work.folder / n).is_file() for n in (files.flow, files.valid)):
+            write_flow(work, files, *maps.flow_map(path, (m.height, m.width)))
+    return found
+
+
+def write_flow(work: Work, names: FlowFiles, flow: np.ndarray, valid: np.ndarray) -> None:
+    """Write flow (H, W, 2) px and where it is believed (H, W)."""
+    write_npy(work.folder / names.flow, flow.astype(np.float16))
+    write_png(work.folder / names.valid, valid)
 
 
 def poses_step(work: Work) -> Step:
@@ -72,9 +99,12 @@ def poses_step(work: Work) -> Step:
 
     The second round is left out where its masks are nearly those of the first. A killed run keeps the first round."""
     c = work.config
-    if c.poses is not None:
+    capture = work.gives("poses")
+    if capture is not None and capture.poses is not None:
+        store(work, given_poses(work))
+    elif c.poses is not None:
         store(work, import_poses(c.poses, [f.source for f in work.manifest.frames], (work.manifest.height, work.manifest.width)))
-    elif c.masks is not None:
+    elif c.masks is not None or work.gives("masks") is not None:
         store(work, estimate(work, given_masks(work)))
     else:
         first = work.folder / "poses" / "first_masks.npy"
@@ -92,9 +122,18 @@ def poses_step(work: Work) -> Step:
                 store(work, estimate(work, moving))
     details = work.manifest.steps["poses"].details
     return Step(
-        provenance="estimated" if c.poses is None else "given",
+        provenance="estimated" if c.poses is None and capture is None else "given",
         note=f"{sum(details['registered'])} of {len(work.manifest.frames)} frames placed, parallax: {work.manifest.parallax}",
     )
+
+
+def given_poses(work: Work) -> Poses:
+    """The poses of a data set, with its static points."""
+    capture, m = work.capture, work.manifest
+    assert capture is not None and capture.poses is not None
+    rows: list[int | None] = [capture.row[f.source] for f in m.frames]
+    poses = placed(capture.root, capture.poses, rows, (m.height, m.width))
+    return poses if capture.points is None else replace(poses, points=capture.points)
 
 
 def estimate(work: Work, moving: np.ndarray) -> Poses:
@@ -117,8 +156,19 @@ def store(work: Work, poses: Poses) -> None:
 
 
 def given_masks(work: Work) -> np.ndarray:
-    """The user's moving masks (T, H, W), one file per frame of the footage in order; InputError where one is missing or of another size."""
-    m, folder = work.manifest, work.config.masks
+    """The moving masks (T, H, W) of a data set, or the user's, one file per frame in order; InputError where one is missing or of
+    another size."""
+    m, folder, capture = work.manifest, work.config.masks, work.gives("masks")
+    if capture is not None:
+        files = [work.picture(f).mask for f in m.frames]
+        return np.stack(
+            [
+                np.zeros((m.height, m.width), bool)
+                if p is None
+                else maps.moving_mask(p, (m.height, m.width), capture.white_moves)
+                for p in files
+            ]
+        )
     assert folder is not None
     masks = []
     for f, path in zip(m.frames, given_files(work, folder, ingest.RECORDED), strict=True):
@@ -144,7 +194,8 @@ def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
 def mask_step(work: Work) -> Step:
     """What moves, per frame. Training frames are judged by flow among training frames alone; held-out ones by all."""
     m, c = work.manifest, work.config
-    if c.masks is not None:
+    given = c.masks is not None or work.gives("masks") is not None
+    if given:
         moving = given_masks(work)
     else:
         found, valid, pairs = work.flows
@@ -157,7 +208,7 @@ def mask_step(work: Work) -> Step:
     for f, mask in zip(m.frames, moving, strict=True):
         f.mask = f"masks/{f.index:05d}.png"
         write_png(work.folder / f.mask, mask)
-    return Step(provenance="estimated" if c.masks is None else "given", note=f"{moving.mean():.1%} of the pixels move")
+    return Step(provenance="given" if given else "estimated", note=f"{moving.mean():.1%} of the pixels move")
 
 
 def depth_step(work: Work) -> Step:
@@ -167,7 +218,14 @@ def depth_step(work: Work) -> Step:
     index = np.array([f.index for f in train])
     size = (m.height, m.width)
     m.depth_kind = "scene"
-    if c.depth is not None:
+    capture = work.gives("depth")
+    if capture is not None:
+        disparity, confidence, how = maps.disparities(capture, [work.picture(f) for f in train], size)
+        m.depth_kind = "relative" if capture.depth_kind == "relative" else "scene"
+        note = "; ".join(n for n in (f"given ({capture.depth_kind})", how) if n)
+        if m.depth_kind == "scene" and capture.poses is not None and capture.poses.near is None:
+            m.near, m.far = depth_range(disparity, confidence)
+    elif c.depth is not None:
         disparity, confidence = read_depth(given_files(work, c.depth, DEPTH_FILES), c.depth_kind, size)
         disparity, confidence = disparity[index], confidence[index]
         m.depth_kind = "relative" if c.depth_kind == "relative" else "scene"
@@ -184,7 +242,7 @@ def depth_step(work: Work) -> Step:
         f.disparity, f.disparity_confidence = f"disparity/{f.index:05d}.npy", f"disparity_confidence/{f.index:05d}.npy"
         write_npy(work.folder / f.disparity, d.astype(np.float16))
         write_npy(work.folder / f.disparity_confidence, w.astype(np.float16))
-    return Step(provenance="estimated" if c.depth is None else "given", note=note)
+    return Step(provenance="estimated" if c.depth is None and capture is None else "given", note=note)
 
 
 def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:

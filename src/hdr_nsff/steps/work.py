@@ -11,10 +11,12 @@ import numpy as np
 from tyro.conf import Positional
 
 from hdr_nsff import ingest
+from hdr_nsff.datasets.capture import Capture, Picture
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
-from hdr_nsff.scene import Manifest, Protocol
+from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
+Part = Literal["poses", "flow", "masks", "depth"]
 StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
 
 
@@ -25,7 +27,8 @@ class PrepareConfig:
     Steps that are done are skipped, so the same command goes on where a killed one was."""
 
     clip: Positional[Path]
-    """Footage: a video, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders, one per synchronized camera."""
+    """Footage: a video, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders, one per synchronized camera.
+    Or a public data set: HDR-GoPro / NSFF (LLFF), D-NeRF, HDR-HexPlane, HDR-4D, HDR-NeRF, nerfstudio; what it gives is used."""
     out: Positional[Path]
     """Scene folder to write."""
     exposures: str | None = None
@@ -42,10 +45,11 @@ class PrepareConfig:
     stride: int = 1
     """Use every this many frames."""
     hold_out: int | None = None
-    """Keep every this many frames out of training, for `evaluate`; 0 keeps all in. Default 8."""
+    """Keep every this many frames out of training, for `evaluate`; 0 keeps all in. Default 8; 0 for a data set with held-out views."""
     protocol: Protocol | None = None
-    """Split the clip as the published tables do. novel-view: train on all frames, to be evaluated from other cameras at their times;
-    novel-view-time: train on every second frame, to be evaluated at the times between. Either wants a truth folder in `evaluate`."""
+    """Split the clip as the published tables do, instead of --hold-out. novel-view: train on all frames, to be evaluated from other cameras
+    at their times; novel-view-time: train on every second frame, to be evaluated at the times between. Either wants held-out views: a truth
+    folder in `evaluate`, or a data set that brings them."""
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
     flow: Path | None = None
@@ -56,6 +60,10 @@ class PrepareConfig:
     """Folder of given depth maps instead of estimating them, one .npy, EXR or PNG per frame in order."""
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
     """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth, or disparity up to scale and shift."""
+    estimate: tuple[Part, ...] = ()
+    """Parts of a public data set to estimate although it gives them. Its depth is left too where its poses are."""
+    truth_out: Path | None = None
+    """Where the held-out views of a public data set go, for `evaluate --truth`. Default: OUT_truth, beside the scene folder."""
     redo: tuple[StepName, ...] = ()
     """Steps to do again although they are done."""
 
@@ -67,6 +75,7 @@ class Work:
     config: PrepareConfig
     footage: ingest.Footage
     manifest: Manifest
+    capture: Capture | None = None  # what a public data set says of its frames
 
     @property
     def folder(self) -> Path:
@@ -76,6 +85,36 @@ class Work:
     def save(self) -> None:
         """Write the manifest."""
         self.manifest.save(self.folder)
+
+    def gives(self, part: Part) -> Capture | None:
+        """The data set, where it gives that part and the settings neither replace it nor ask for an estimate."""
+        c = self.config
+        own_world = c.poses is not None or "poses" in c.estimate
+        if self.capture is None or part in c.estimate or getattr(c, part) is not None or (part == "depth" and own_world):
+            return None
+        return self.capture if self.capture.parts()[part] else None
+
+    def picture(self, frame: FrameEntry) -> Picture:
+        """What the data set says of a frame."""
+        assert self.capture is not None
+        return self.capture.by_source[frame.source]
+
+    def time_of(self, source: str, number: int) -> float:
+        """The time of a frame, in frames as used; `number` is its place in the footage of its camera."""
+        if self.capture is None:
+            return (number - self.config.start) // self.config.stride
+        return self.own_time(self.capture.by_source[source].time)
+
+    def own_time(self, time: float) -> float:
+        """A time of the data set, in frames as used."""
+        assert self.capture is not None
+        first = min(self.capture.by_source[s].time for s in (files[self.config.start] for files in self.sources()))
+        return round((time - first) / self.config.stride, 6)
+
+    def sources(self) -> list[list[str]]:
+        """The names of the footage's files, camera by camera; cameras that are too short for the settings left out."""
+        names = [[f.relative_to(self.footage.path).as_posix() for f in files] for files in self.footage.cameras]
+        return [n for n in names if len(n) > self.config.start]
 
     @cached_property
     def video(self) -> np.ndarray:

@@ -1,0 +1,167 @@
+"""Public layouts: each is recognised for what it is, footage for none of them, and in every convention a known point is where its
+picture shows it, in training pictures and held-out ones."""
+
+from pathlib import Path
+
+import miniatures as mini
+import numpy as np
+import pytest
+
+from hdr_nsff.datasets import held_out, layout_of, recognise
+from hdr_nsff.datasets.capture import Capture, Clock, turns
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_image, write_png, write_video
+from hdr_nsff.priors.import_poses import Given, placed
+
+SETS = {
+    "hdr-gopro": mini.gopro,
+    "d-nerf": lambda root: mini.blender(root, "dnerf"),
+    "nerf": lambda root: mini.blender(root, "nerf"),
+    "hdr-hexplane": mini.blender,
+    "hdr-4d": lambda root: mini.blender(root, "hdr4d"),
+    "hdr-nerf": mini.hdr_nerf,
+    "nerfstudio": mini.nerfstudio,
+}
+NAMES = {
+    "hdr-gopro": "HDR-GoPro / NSFF (LLFF)", "d-nerf": "D-NeRF (Blender)", "nerf": "NeRF synthetic (Blender)",
+    "hdr-hexplane": "HDR-HexPlane (Blender)", "hdr-4d": "HDR-4D (Blender)", "hdr-nerf": "HDR-NeRF (synthetic)", "nerfstudio": "nerfstudio",
+}  # fmt: skip
+
+
+def read(root: Path) -> Capture:
+    """The training part of a data set."""
+    capture = recognise(root)
+    assert capture is not None
+    return capture
+
+
+def misses(root: Path, files: list[Path], given: Given, over: float | None, size: tuple[int, int] = (mini.H, mini.W)) -> float:
+    """How far the dot of a picture is from where its camera should see it, at worst, in pixels."""
+    poses = placed(root, given, list(range(len(files))), size)
+    worst = 0.0
+    for path, K, c2w in zip(files, poses.K, poses.c2w, strict=True):
+        x, y, z = K @ (c2w[:, :3].T @ (mini.DOT - c2w[:, 3]))
+        worst = max(worst, float(np.abs(np.array([x / z, y / z]) - mini.found_dot(read_image(path, over))).max()))
+    return worst
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_a_layout_is_recognised_and_named(name: str, tmp_path: Path) -> None:
+    capture = read(SETS[name](tmp_path))
+    assert capture.layout == NAMES[name]
+    assert capture.withheld and all((tmp_path / p.source).is_file() for p in capture.pictures)
+
+
+def test_footage_is_no_data_set(tmp_path: Path) -> None:
+    for name in ("a/0.png", "a/1.png", "rig/left/0.png", "rig/right/0.png"):
+        write_png(tmp_path / name, np.zeros((4, 4, 3)))
+    write_video(tmp_path / "clip.mp4", [np.zeros((16, 16, 3))] * 3)
+    np.save(tmp_path / "a/poses_bounds.npy", np.zeros((2, 17)))  # poses beside frames, for --poses
+    elsewhere = {"frames": [{"file_path": "elsewhere/0.png", "transform_matrix": []}]}
+    mini.write_json(tmp_path / "rig/transforms.json", elsewhere)  # poses of other pictures, for --poses
+    (tmp_path / "rig/dense").mkdir()
+    (tmp_path / "empty").mkdir()
+    for place in ("a", "rig", "rig/left", "clip.mp4", "empty", "missing"):
+        assert layout_of(tmp_path / place) is None, place
+
+
+def test_the_picture_shows_the_dot_where_it_was_drawn() -> None:
+    c2w = mini.pose(0.6)
+    assert np.abs(mini.found_dot(mini.see(c2w)) - mini.dot_pixel(c2w)).max() < 0.5
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_training_cameras_see_the_dot_where_their_pictures_show_it(name: str, tmp_path: Path) -> None:
+    capture = read(SETS[name](tmp_path))
+    assert capture.poses is not None
+    assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], capture.poses, capture.over) < 0.6
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_held_out_cameras_do_too(name: str, tmp_path: Path) -> None:
+    capture = read(SETS[name](tmp_path))
+    views, given = held_out.read(capture)
+    assert views and misses(tmp_path, [v.recorded[0][0] for v in views], given, capture.over) < 0.6
+
+
+def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
+    capture = read(mini.blender(tmp_path))
+    assert capture.poses is not None
+    flipped = Given(None, capture.poses.K, capture.poses.c2w * [[[1, -1, -1, 1]]], capture.poses.size)
+    assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], flipped, 1.0) > 3
+
+
+def test_times_become_frames_whatever_their_unit() -> None:
+    clock = Clock.of([k / 149 for k in range(150) if k % 5])
+    assert clock.step == pytest.approx(1 / 149)
+    assert [clock(t / 149) for t in (1, 2, 149)] == [0, 1, 148] and clock(5 / 149) == 4
+    assert clock(2.5 / 149) == pytest.approx(1.5)
+    assert Clock.of([7.0])(7.0) == 0
+
+
+def test_pictures_of_one_time_are_of_several_cameras() -> None:
+    assert turns([0, 1, 0, 1, 2, 1]) == [0, 0, 1, 1, 0, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "words"),
+    [
+        ("hdr-gopro", "dense/poses_bounds.npy", "camera poses"),
+        ("hdr-gopro", "dense/images_48x32/00004.png", "8 pictures, but .* camera poses of 9"),
+        ("hdr-gopro", "dense/motion_masks/00004.png", "moving masks"),
+        ("hdr-gopro", "dense/depth-anything/00004.npy", "metric depth"),
+        ("hdr-gopro", "dense/flow_i1/00004_bwd.npz", "optical flow from picture 4 to 3"),
+        ("d-nerf", "train/0003.png", "training picture 3"),
+        ("hdr-nerf", "train/r_1_2.png", "exposure 2 of training view 1"),
+        ("hdr-nerf", "exposure_train.json", "exposure times of the train pictures"),
+        ("nerfstudio", "images/frame_00003.png", "a training picture"),
+        ("nerfstudio", "depth/3.npy", "depth of images/frame_00003.png"),
+    ],
+)
+def test_a_missing_file_is_named_with_what_it_was_for(name: str, lost: str, words: str, tmp_path: Path) -> None:
+    SETS[name](tmp_path)
+    (tmp_path / lost).unlink()
+    with pytest.raises(InputError, match=words) as error:
+        recognise(tmp_path)
+    assert Path(lost).stem in str(error.value) or Path(lost).parent.name in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "words"),
+    [
+        ("hdr-gopro", "dense/mv_images/00004/00001.png", "what camera 1 saw at time 4"),
+        ("hdr-gopro", "dense/mv_masks/00004/00001.png", "moving mask of held-out view"),
+        ("d-nerf", "test/0001.png", "held-out view 1"),
+        ("hdr-4d", "test/0001.exr", "radiance of held-out view 1"),
+        ("hdr-nerf", "exposure_test.json", "exposure times of the test pictures"),
+        ("hdr-nerf", "test/r_1_3.png", "exposure 3 of held-out view 1"),
+        ("nerfstudio", "images/frame_00004.png", "a held-out view"),
+    ],
+)
+def test_a_missing_held_out_file_is_named_and_matters_to_the_truth_alone(
+    name: str, lost: str, words: str, tmp_path: Path
+) -> None:
+    SETS[name](tmp_path)
+    (tmp_path / lost).unlink()
+    capture = read(tmp_path)
+    with pytest.raises(InputError, match=words):
+        held_out.read(capture)
+
+
+@pytest.mark.parametrize("name", ["d-nerf", "hdr-nerf", "nerfstudio"])
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"frames": []}', '{"frames": [{"file_path": "a"}]}'])
+def test_a_transforms_file_cut_short_is_one_sentence(name: str, text: str, tmp_path: Path) -> None:
+    SETS[name](tmp_path)
+    path = tmp_path / ("transforms.json" if name == "nerfstudio" else "transforms_train.json")
+    path.write_text(text)
+    with pytest.raises(InputError, match=path.name):
+        recognise(tmp_path)
+
+
+def test_a_file_name_that_leaves_the_data_set_is_refused(tmp_path: Path) -> None:
+    root = mini.blender(tmp_path / "set")
+    write_png(tmp_path / "secret.png", np.zeros((4, 4, 3)))
+    text = (root / "transforms_train.json").read_text().replace("./train/0000", "../secret")
+    (root / "transforms_train.json").write_text(text)
+    with pytest.raises(InputError, match="outside the data set"):
+        recognise(root)
