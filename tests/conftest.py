@@ -1,5 +1,7 @@
 """What several tests share."""
 
+import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -18,3 +20,23 @@ def toy_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def toy(toy_folder: Path) -> Scene:
     """The closed-form scene in memory."""
     return Scene.open(toy_folder)
+
+
+@pytest.fixture(scope="session")
+def trained(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two steps with its own copy of the scene beside it (read only)."""
+    from bad_input import call, training
+
+    out = tmp_path_factory.mktemp("a run, é 日")
+    shutil.copytree(toy_folder, out / "scene")
+    assert call(*training(out / "scene", out / "run", 2)) == 0
+    return out / "run"
+
+
+@pytest.fixture
+def run_folder(trained: Path, tmp_path: Path) -> Path:
+    """A copy of that run to damage, scene and all."""
+    shutil.copytree(trained.parent, tmp_path / "ü b")
+    config = json.loads((tmp_path / "ü b/run/config.json").read_text())
+    (tmp_path / "ü b/run/config.json").write_text(json.dumps({**config, "scene": str(tmp_path / "ü b/scene")}))
+    return tmp_path / "ü b/run"

@@ -141,12 +141,6 @@ def test_our_own_mistakes_are_not_hidden(error: Exception, act: Any) -> None:
         call("evaluate", "run")
 
 
-@pytest.mark.parametrize("verb", ["render", "evaluate", "report"])
-def test_a_folder_that_is_no_run_is_one_sentence(verb: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert call(verb, str(tmp_path)) == 2
-    assert "not a run folder" in one_sentence(capsys.readouterr().err)
-
-
 def test_training_from_a_folder_that_is_no_scene_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("train", "tiny", "--scene", str(tmp_path), "--out", str(tmp_path / "run")) == 2
     assert "no scene.json here" in one_sentence(capsys.readouterr().err)

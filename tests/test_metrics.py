@@ -1,6 +1,9 @@
 """Metrics against closed forms and slow oracles (scikit-image, flip's own defaults, a plain-numpy AlexNet)."""
 
+import importlib.util
 import math
+import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -252,6 +255,35 @@ def test_lpips_agrees_with_a_network_written_out(tmp_path):
         ((x - y) ** 2 * linear[f"lin{k}.model.1.weight"]).sum(1).mean() for k, (x, y) in enumerate(zip(*seen, strict=True))
     )
     assert metrics.Lpips(tmp_path / "w.pth")(a, b) == pytest.approx(slow.item(), rel=1e-5)
+
+
+def lpips_weights():
+    """benchmarks/lpips_weights.py as a module."""
+    path = Path(__file__).parents[1] / "benchmarks/lpips_weights.py"
+    spec = importlib.util.spec_from_file_location("lpips_weights", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_weights_as_flax_lays_them_out_give_the_same_distance(tmp_path):
+    net, linear = alexnet_weights()
+    torch.save(net | linear, tmp_path / "theirs.pth")
+    params = {"AlexNet_0": {}}
+    for i, at in enumerate(metrics.Lpips.LAYERS):
+        kernel = net[f"features.{at}.weight"].permute(2, 3, 1, 0).numpy()  # out, in, h, w -> h, w, in, out
+        params["AlexNet_0"][f"Conv_{i}"] = {"kernel": kernel, "bias": net[f"features.{at}.bias"].numpy()}
+        params[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": linear[f"lin{i}.model.1.weight"].permute(2, 3, 1, 0).numpy()}}
+    (tmp_path / "flax.ckpt").write_bytes(pickle.dumps(params))
+    lpips_weights().main(str(tmp_path / "flax.ckpt"), str(tmp_path / "ours.pth"))
+    a, b = (p.float() for p in pictures(80, 96))
+    assert metrics.Lpips(tmp_path / "ours.pth")(a, b) == metrics.Lpips(tmp_path / "theirs.pth")(a, b) > 0
+
+
+def test_nothing_but_arrays_is_unpickled(tmp_path):
+    (tmp_path / "evil.ckpt").write_bytes(pickle.dumps({"AlexNet_0": Path("x")}))
+    with pytest.raises(pickle.UnpicklingError, match="is no array"):
+        lpips_weights().read(tmp_path / "evil.ckpt")
 
 
 def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):

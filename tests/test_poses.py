@@ -1,6 +1,7 @@
 """Poses from frames: painted clips with known cameras, and the parts they are made of."""
 
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hdr_nsff import cli, io
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors import poses as module
 from hdr_nsff.priors import sfm
@@ -296,3 +298,43 @@ def test_a_worker_does_not_outlive_its_parent(tmp_path):
         time.sleep(0.1)
     os.kill(worker, signal.SIGKILL)
     pytest.fail("the worker lives on")
+
+
+FULL_DISK = """
+import errno, os, pathlib
+write = pathlib.Path.write_text
+
+def write_text(self, *arguments, **named):
+    if self.name == "pairs.txt":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    return write(self, *arguments, **named)
+
+pathlib.Path.write_text = write_text
+"""
+
+
+def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pycolmap")
+    (tmp_path / "inject").mkdir()
+    (tmp_path / "inject/sitecustomize.py").write_text(FULL_DISK)  # what Python imports first: in the worker only
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "inject"), *sys.path]))
+    for t, frame in enumerate(sliding(PLACES)):
+        io.write_png(tmp_path / f"clip/{t:03d}.png", frame)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["prepare", str(tmp_path / "clip"), str(tmp_path / "scene"), "--ev", "0"])
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("hdr-nsff: ")]
+    assert stop.value.code == 2 and len(said) == 1 and "scene/poses: the disk is full" in said[0]
+    assert not list((tmp_path / "scene/poses").glob(".sfm-*"))
+
+
+def test_a_disk_without_room_is_full_whatever_the_worker_said(tmp_path):
+    sfm.need_room(tmp_path, "all went well")
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (sfm.ROOM // 2, before[1]))
+    try:
+        with pytest.raises(OSError) as full:
+            sfm.need_room(tmp_path, "all went well")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert full.value.errno in io.FULL and not list(tmp_path.iterdir())

@@ -180,20 +180,23 @@ def test_a_checkpoint_of_another_network_does_not_fit(run: Path) -> None:
 
 def test_a_log_line_cut_short_is_left_out_and_the_next_one_is_whole(run: Path, toy: Scene) -> None:
     path = run / "log.jsonl"
-    path.write_text('{"step": 25, "psnr": 10.0}\n{"step": 50, "psn')
-    assert [line["step"] for line in read_log(run)] == [25]
+    whole = '{"step": 25, "seconds": 1.0, "psnr": 10.0, "rays_per_second": 9.0, "losses": {}}'
+    path.write_text(f"{whole}\n{whole[:40]}")
+    assert [line.step for line in read_log(run)] == [25]
     t = trainer(replace(read_config(run), steps=2, out=run), toy)
     t.log({"psnr": 20.0, "depth": 1.0})
     t.clock = replace(t.clock, step=75)
     t.log({"psnr": 30.0})
     lines = read_log(run)
-    assert [line["step"] for line in lines] == [2, 25, 75] and lines[0]["losses"] == {"depth": 1.0}
+    assert [line.step for line in lines] == [2, 25, 75] and lines[0].losses == {"depth": 1.0}
     assert path.read_text().count("\n") == 4
 
 
 def test_a_step_logged_twice_counts_once(run: Path) -> None:
-    (run / "log.jsonl").write_text('{"step": 25, "psnr": 1}\n{"step": 50, "psnr": 2}\n{"step": 25, "psnr": 3}\n')
-    assert [(line["step"], line["psnr"]) for line in read_log(run)] == [(25, 3), (50, 2)]
+    rest = {"seconds": 1.0, "rays_per_second": 9.0, "losses": {}}
+    lines = [{"step": s, "psnr": p, **rest} for s, p in ((25, 1.0), (50, 2.0), (25, 3.0))]
+    (run / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert [(line.step, line.psnr) for line in read_log(run)] == [(25, 3), (50, 2)]
 
 
 def test_without_a_log_there_are_no_lines(tmp_path: Path) -> None:

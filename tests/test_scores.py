@@ -3,6 +3,7 @@ shifted and three times as large as the scene's."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from fakes import DISC, FOCAL, SPEED, DiscBeforeWall, H, W, fake_run
 from test_evaluate import TURN, field_of, write_truth
 from torch import Tensor
 
-from hdr_nsff import io
+from hdr_nsff import io, notes
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
 from hdr_nsff.evaluate import evaluate_run
@@ -94,6 +95,10 @@ def test_the_true_field_has_no_error_of_depth_or_motion(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     result = evaluate_run(run, truth_of(tmp_path / "truth", run))
     assert result["depth_scale"] == pytest.approx(3, rel=1e-4) and result["world_scale"] == pytest.approx(3, rel=1e-4)
+    note = notes.read(run.folder / "metrics.json", notes.Metrics)  # which the report reads
+    assert note is not None and {"geometry_scores", "pu21", "stability", "protocols"} <= note.model_fields_set
+    for key, value in json.loads(note.model_dump_json(exclude_unset=True)).items():
+        assert value == result[key], key
     for name in ("a", "c"):  # b is splatted between two frames
         view = views_of(result)[name]
         for score in ("depth_abs_rel", "depth_rmse", "scene_flow_epe", "flow_epe"):

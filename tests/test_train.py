@@ -142,9 +142,9 @@ def test_training_lowers_the_error(toy_folder: Path, tmp_path: Path) -> None:
     settings = replace(small("grid", toy_folder, tmp_path / "run", 75), rays=192, moving_rays=64)
     run = Run.open(train(settings))
     log = run.log()
-    assert [line["step"] for line in log] == [25, 50, 75] and run.step == 75
-    assert log[-1]["psnr"] > log[0]["psnr"] + 1
-    assert {"photometric", "dynamic", "temporal", "cycle", "response_smoothness"} <= set(log[-1]["losses"])
+    assert [line.step for line in log] == [25, 50, 75] and run.step == 75
+    assert log[-1].psnr > log[0].psnr + 1
+    assert {"photometric", "dynamic", "temporal", "cycle", "response_smoothness"} <= set(log[-1].losses)
     assert list((settings.out / "previews").glob("*.png"))
 
 
@@ -217,4 +217,4 @@ def test_without_steps_the_clock_counts_minutes() -> None:
 def test_every_kind_of_tone_mapper_trains(kind: Literal["none", "fixed", "per_image"], toy_folder: Path, tmp_path: Path) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), tonemap=ToneMapConfig(kind=kind))
     log = read_log(train(replace(settings, steps=25)))
-    assert log[-1]["step"] == 25 and log[-1]["psnr"] > 5
+    assert log[-1].step == 25 and log[-1].psnr > 5

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields.branches import GridConfig, MlpConfig
@@ -82,8 +82,10 @@ class TrainConfig:
                 "scene": Path(data["scene"]),
                 "out": Path(data["out"]),
             }
-            return TrainConfig(**{**data, **parts})
-        except (KeyError, TypeError, ValueError) as error:
+            config = TrainConfig(**{**data, **parts})
+            check(config)
+            return config
+        except (LookupError, TypeError, ValueError) as error:
             raise InputError(
                 f"the run's config.json is from another version or damaged ({error}); train again into a new folder"
             ) from error
@@ -95,8 +97,50 @@ def read_field(kinds: list[str], values: dict[str, Any]) -> NSFFConfig | SplatCo
     if len(kinds) > 1:
         values = {**values, "encoding": known[kinds[1]](**values["encoding"])}
     field = known[kinds[0]](**values)
-    assert isinstance(field, NSFFConfig | SplatConfig)
+    if not isinstance(field, NSFFConfig | SplatConfig):
+        raise TypeError(f"{kinds[0]} is no field")
     return field
+
+
+ABOVE_ZERO = {"minutes", "finest", "motion_cell"}
+FROM_ONE = {"steps", "batches", "bases", "colour_knots", "shade_knots", "presence_knots", "samples", "render_samples", "levels"}
+FROM_ONE |= {"depth_cells", "max_rows", "layers", "width", "static"}
+AT_MOST = {
+    "static": 1e8,
+    "moving": 1e8,
+    "max_rows": 1e9,
+    "steps": 1e12,
+    "seed": 2**63 - 1,
+    "checkpoint_seconds": 1e12,
+}  # else a million
+
+
+def check(settings: Any, prefix: str = "") -> None:
+    """InputError that names the option whose value is of the wrong type or cannot be. Settings are frozen dataclasses of dataclasses,
+    numbers (none may be negative), words, switches and paths."""
+    hints = get_type_hints(type(settings))
+    for f in dataclasses.fields(settings):
+        value, option = getattr(settings, f.name), f"--{prefix}{f.name.replace('_', '-')}"
+        if not fits(value, hints[f.name]):
+            raise InputError(f"{option} {value!r:.40}: no such value; `hdr-nsff train --help` lists what there is")
+        if dataclasses.is_dataclass(value):
+            check(value, f"{prefix}{f.name.replace('_', '-')}.")
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            low, high = 1 if f.name in FROM_ONE else 0, AT_MOST.get(f.name, 1e6)
+            if not low <= value <= high or (f.name in ABOVE_ZERO and value == 0):
+                least = "above 0" if f.name in ABOVE_ZERO else f"from {low}"
+                raise InputError(f"{option} {value!r:.40}: choose a number {least} to {high:g}")
+
+
+def fits(value: Any, kind: Any) -> bool:
+    """Whether a value is of a type as written in a dataclass."""
+    if get_origin(kind) is Literal:
+        return value in get_args(kind)
+    if get_args(kind):
+        return any(fits(value, k) for k in get_args(kind))
+    if kind is float:
+        return type(value) in (int, float) and -1e300 < value < 1e300
+    return type(value) is kind or (kind is Path and isinstance(value, Path))
 
 
 def splat() -> TrainConfig:

@@ -11,13 +11,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 import tyro
 
-from hdr_nsff import io, ply
+from hdr_nsff import io, notes, ply
 from hdr_nsff.datasets import to_llff, to_nerfstudio
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields.base import GaussianCloud, RadianceField
@@ -150,7 +150,7 @@ def export_sequence(run: Run, folder: Path, look: Look) -> Path:
     source = gaussian_field(run, look)
     times = sorted({f.time for f in run.scene.train})
     note = open_folder(run, folder, times, look)
-    colours = colours_of(run, look, note["display_exposure"])
+    colours = colours_of(run, look, note.display_exposure)
     for i, time in enumerate(track(times, "exporting")):
         if not (path := folder / f"{i:05d}.ply").exists():
             write_time(source, path, time, colours, look)
@@ -158,22 +158,22 @@ def export_sequence(run: Run, folder: Path, look: Look) -> Path:
     return folder
 
 
-def open_folder(run: Run, folder: Path, times: list[float], look: Look) -> dict[str, Any]:
+def open_folder(run: Run, folder: Path, times: list[float], look: Look) -> notes.Exported:
     """The sidecar of a sequence. Where the one on disk is of other settings or of another checkpoint, its files are removed."""
     key, sidecar = fingerprint(run, times, look), folder / "sequence.json"
     there = sorted(folder.glob("[0-9]*.ply"))
     foreign = next((p for p in there if not ply.is_ours(p)), None)
     if foreign is not None:
         raise InputError(f"{foreign}: is there already and was not made by export; choose another folder")
-    found = io.read_note(sidecar)
-    if found.get("key") == key:
+    found = notes.read(sidecar, notes.Exported)
+    if found is not None and found.key == key:
         return found
     if there:
         say(f"{folder}: settings or checkpoint changed, exporting again")
     for path in there:
         path.unlink()
-    note = {"key": key, "step": run.step, "times": times, "display_exposure": exposure_of(run, look)}
-    io.write_json(sidecar, note)
+    note = notes.Exported(key=key, step=run.step, times=times, display_exposure=exposure_of(run, look))
+    notes.write(sidecar, note)
     return note
 
 

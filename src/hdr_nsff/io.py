@@ -97,21 +97,14 @@ def read_json(path: Path | str) -> Any:
         raise ValueError("nested too deeply") from error
 
 
-def read_note(path: Path | str) -> dict[str, Any]:
-    """The object in a JSON file of our own making; empty where there is none that can be read, so that it is made again."""
-    try:
-        note = read_json(path)
-    except (OSError, ValueError):
-        return {}
-    return note if isinstance(note, dict) else {}
-
-
 def write_npy(path: Path | str, array: np.ndarray) -> None:
     """Write an array, atomically."""
     buffer = BytesIO()  # numpy writing to a file itself forgets why it could not
     np.save(buffer, array, allow_pickle=False)
     with atomic(path) as temporary:
-        temporary.write_bytes(buffer.getbuffer())
+        temporary.write_bytes(
+            buffer.getvalue()
+        )  # not `getbuffer`: where writing fails, Python 3.12.1 crashes when it collects the view
 
 
 def read_npy(path: Path | str) -> np.ndarray:

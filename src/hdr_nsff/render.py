@@ -7,13 +7,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import torch
 import tyro
 
-from hdr_nsff import io, paths
+from hdr_nsff import io, notes, paths
 from hdr_nsff.errors import InputError
 from hdr_nsff.interpolate import LayeredField
 from hdr_nsff.paths import View
@@ -203,7 +203,7 @@ def standard_shots(run: Run, out: Path, budget: float, refused: list[str]) -> li
     plan = read_plan(run, out, budget, list(wanted.values()), refused)
     shots = []
     for name, shot in wanted.items():
-        scale, chosen = plan[name]["scale"], plan[name]["views"]
+        scale, chosen = plan[name].scale, plan[name].views
         if scale < 1 or len(chosen) < len(shot.views):
             say(
                 f"{name}: {len(chosen)} of {len(shot.views)} views at {scale:.0%} size, to keep to {budget:.0f} s; "
@@ -220,15 +220,14 @@ SCALES = (1.0, 0.75, 0.67, 0.5, 0.35, 0.25)
 NARROWEST = 160  # pixels: videos do not shrink below this width
 
 
-def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused: Sequence[str]) -> dict[str, dict[str, Any]]:
+def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused: Sequence[str]) -> dict[str, notes.Share]:
     """Per shot the scale and the positions of the views to make: what `plan.json` says for this checkpoint, else measured anew."""
     file, key = out / "plan.json", fingerprint(run, budget)
-    if file.is_file():
-        found = io.read_note(file)
-        if found.get("key") == key and set(found.get("shots", {})) == {s.name for s in shots}:
-            return found["shots"]
-        if not found:
-            say(f"{file}: unreadable, measuring the speed again")
+    found, sizes = notes.read(file, notes.Plan), {s.name: len(s.views) for s in shots}
+    if found is not None and found.key == key:
+        if found.shots.keys() == sizes.keys() and all(max(s.views) < sizes[name] for name, s in found.shots.items()):
+            return found.shots
+        say(f"{file}: does not fit these shots, measuring the speed again")
     speed = measure(run)
     times = run.scene.times.tolist()
     plan = {}
@@ -236,9 +235,9 @@ def read_plan(run: Run, out: Path, budget: float, shots: Sequence[Shot], refused
         costs = [speed.at if min(abs(v.time - t) for t in times) < 1e-3 else speed.between for v in shot.views]
         smallest = 1.0 if shot.name == "training" else min(1.0, NARROWEST / shot.views[0].camera.width)
         scale, chosen = cut(costs, SHARE[shot.name] * budget, smallest, thin=shot.name in THINNED)
-        plan[shot.name] = {"scale": scale, "views": chosen}
-    told = {"seconds_at_a_time": speed.at, "seconds_between": speed.between, "refused": list(refused)}
-    io.write_json(file, {"key": key, **told, "shots": plan})
+        plan[shot.name] = notes.Share(scale=scale, views=chosen)
+    seconds = {"seconds_at_a_time": speed.at, "seconds_between": speed.between}
+    notes.write(file, notes.Plan(key=key, **seconds, refused=list(refused), shots=plan))
     return plan
 
 
@@ -286,8 +285,8 @@ def write_views(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
     evs = three_exposures(run.tonemapper.exposures().tolist())
     key = fingerprint(run, shot.views, evs)
     results = {f"LDR at EV {ev:+.1f}": out / "ldr" / f"ev{ev:+.1f}" for ev in evs} | {"depth": out / "depth"}
-    done = io.read_note(note)
-    if done.get("key") != key:
+    done = notes.read(note, notes.Coloured)
+    if done is None or done.key != key:
         near, far, fastest, moves = ranges(sources)
         for i, source in enumerate(track(sources, "LDR, depth and motion pictures")):
             seen = io.read_exr(source)
@@ -298,9 +297,9 @@ def write_views(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
                 flow = np.stack([seen["forward.u"], seen["forward.v"]], -1)
                 io.write_png(out / "scene_flow" / f"{i:05d}.png", io.colorize_flow(flow, fastest))
         write_overview(run, out, shot, evs, moves)
-        done = {"key": key, "depth_range": [near, far], "fastest": fastest, "moves": moves, "exposures": evs}
-        io.write_json(note, done)
-    if done["moves"]:
+        done = notes.Coloured(key=key, depth_range=(near, far), fastest=fastest, moves=moves, exposures=evs)
+        notes.write(note, done)
+    if done.moves:
         results["scene flow"] = out / "scene_flow"
     else:
         say("scene flow: this field tells none, no pictures of it")

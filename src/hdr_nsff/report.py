@@ -17,7 +17,7 @@ import numpy as np
 import torch
 import tyro
 
-from hdr_nsff import __version__, io
+from hdr_nsff import __version__, io, notes
 from hdr_nsff.errors import InputError
 from hdr_nsff.page import COLOURS, GREY, details, document, figure, legend, missing, number, plot, svg, table, video
 from hdr_nsff.progress import say
@@ -52,9 +52,8 @@ def report(config: ReportConfig) -> Path:
 def write_report(run: Run, path: Path, renders: Path) -> Path:
     """Write the report of `run` with the pictures in `renders` to `path`."""
     check_place(path)
-    metrics = read_json(run.folder / "metrics.json")
-    if metrics is not None and not {"headline", "groups", "views", "kind", "notes"} <= metrics.keys():
-        metrics = None  # of another version
+    found = notes.read(run.folder / "metrics.json", notes.Metrics)
+    metrics = None if found is None else notes.plain(found)
     log = run.log()
     sections = [
         ("Results", headline(metrics)),
@@ -83,11 +82,6 @@ def check_place(path: Path) -> None:
         raise InputError(f"{path}: is a folder; name the file to write, such as {path / 'report.html'}")
     if path.is_file() and b"HDR-NSFF report" not in path.read_bytes()[:1000]:
         raise InputError(f"{path}: is there already and is no report; choose another place for the report")
-
-
-def read_json(path: Path) -> dict[str, Any] | None:
-    """A JSON file, or None where there is none or it cannot be read."""
-    return io.read_note(path) or None
 
 
 def headline(metrics: dict[str, Any] | None) -> str:
@@ -133,30 +127,30 @@ def videos(renders: Path, beside: Path) -> str:
 
 def why_absent(renders: Path) -> str:
     """Why videos are missing, as far as the renders tell."""
-    refused = (read_json(renders / "plan.json") or {}).get("refused", [])
-    return " ".join(refused) if refused else "`hdr-nsff render RUN` makes the standard set."
+    plan = notes.read(renders / "plan.json", notes.Plan)
+    return " ".join(plan.refused) if plan is not None and plan.refused else "`hdr-nsff render RUN` makes the standard set."
 
 
 def side_by_side(run: Run, renders: Path) -> str:
     """Rows of recorded frame, tone-mapped HDR, three exposures, depth, scene flow."""
-    views = read_json(renders / "views.json")
-    note = read_json(renders / "training" / "sequence.json")
-    if views is None or note is None:
+    coloured = notes.read(renders / "views.json", notes.Coloured)
+    sequence = notes.read(renders / "training" / "sequence.json", notes.Sequence)
+    if coloured is None or sequence is None:
         return missing("No pictures yet: `hdr-nsff render RUN` makes the standard set.")
-    near, far = views["depth_range"]
+    near, far = coloured.depth_range
     columns = [("training", "HDR, tone-mapped"), ("depth", f"depth, {near:.2g} (red) to {far:.2g} (blue)")]
-    columns += [("scene_flow", f"motion until the next frame, up to {views['fastest']:.2g} px")] if views["moves"] else []
-    columns += [(f"ldr/ev{ev:+.1f}", f"developed at EV {ev:+.1f}") for ev in views["exposures"]]
+    columns += [("scene_flow", f"motion until the next frame, up to {coloured.fastest:.2g} px")] if coloured.moves else []
+    columns += [(f"ldr/ev{ev:+.1f}", f"developed at EV {ev:+.1f}") for ev in coloured.exposures]
     rows = []
-    count = len(note["views"])
+    count = len(sequence.views)
     for i in sorted({round(x) for x in np.linspace(0, count - 1, min(3, count)).tolist()}):
-        time = note["views"][i]["time"]
+        time = sequence.views[i].time
         frame = min(run.scene.train, key=lambda f: abs(f.time - time))
         ev = run.tonemapper.exposures()[frame.bracket].item()
         cells = [figure(frame.image.cpu().numpy(), f"recorded, frame {frame.index}, EV {ev:+.1f}")]
         cells += [figure(io.read_image(renders / folder / f"{i:05d}.png"), caption) for folder, caption in columns]
         rows.append(f'<div class="grid">{"".join(cells)}</div>')
-    absent = "" if views["moves"] else missing("No scene flow: this field tells none.")
+    absent = "" if coloured.moves else missing("No scene flow: this field tells none.")
     return "".join(rows) + absent
 
 
@@ -242,7 +236,7 @@ def quality(metrics: dict[str, Any] | None) -> str:
     if (geometry := metrics.get("geometry_scores")) is not None:
         parts += ["<h3>Depth and motion</h3>", score_table(groups, tuple((k, *v) for k, v in geometry.items()))]
         units = f"Predicted depth was multiplied by {metrics['depth_scale']:.4f} for all views"
-        world = f", scene flow by {metrics['world_scale']:.4f}" if metrics["world_scale"] is not None else ""
+        world = f", scene flow by {metrics['world_scale']:.4f}" if "world_scale" in metrics else ""
         parts += [f'<p class="note">{units}{world}.</p>']
     titles = {"stability": "Stability along the training path", "camera": "Learned camera against the true one"}
     for part, title in {**titles, "poses": "Poses of the scene against the true ones"}.items():
@@ -331,20 +325,20 @@ def radiance(run: Run, renders: Path) -> str:
     return f'<div class="plots">{svg(drawing)}</div><p class="note">{note}</p>'
 
 
-def training(run: Run, log: list[dict[str, Any]]) -> str:
+def training(run: Run, log: list[notes.LogLine]) -> str:
     """PSNR on training pixels, and every loss term on a log axis, against time."""
     if len(log) < 2:
         return missing("No training log (log.jsonl) in the run folder.")
-    minutes = [line["seconds"] / 60 for line in log]
+    minutes = [line.seconds / 60 for line in log]
     drawing, axes = plot(4.6, 3.2)
-    axes.plot(minutes, [line["psnr"] for line in log], color="#3d7fc4", linewidth=0.5, alpha=0.5)
-    axes.plot(minutes, smoothed([line["psnr"] for line in log]), color="#3d7fc4", linewidth=1.6)
+    axes.plot(minutes, [line.psnr for line in log], color="#3d7fc4", linewidth=0.5, alpha=0.5)
+    axes.plot(minutes, smoothed([line.psnr for line in log]), color="#3d7fc4", linewidth=1.6)
     axes.set(xlabel="minutes", ylabel="dB", title="PSNR of training batches")
     plots = [svg(drawing)]
     drawing, axes = plot(6.4, 3.2)
-    names = sorted({n for line in log for n in line["losses"]})
+    names = sorted({n for line in log for n in line.losses})
     for i, name in enumerate(names):
-        points = [(m, line["losses"][name]) for m, line in zip(minutes, log, strict=True) if line["losses"].get(name, 0) > 0]
+        points = [(m, line.losses[name]) for m, line in zip(minutes, log, strict=True) if line.losses.get(name, 0) > 0]
         if points:
             axes.plot(
                 [m for m, _ in points],
@@ -357,7 +351,7 @@ def training(run: Run, log: list[dict[str, Any]]) -> str:
     axes.set(xlabel="minutes", yscale="log", title="loss terms, unweighted")
     legend(axes, loc="center left", bbox_to_anchor=(1, 0.5))
     plots.append(svg(drawing))
-    speed = f"{log[-1]['step']} steps, {log[-1]['rays_per_second']:,.0f} rays per second."
+    speed = f"{log[-1].step} steps, {log[-1].rays_per_second:,.0f} rays per second."
     return f'<div class="plots">{"".join(plots)}</div><p class="note">{speed}</p>'
 
 
@@ -368,14 +362,13 @@ def smoothed(values: Sequence[float]) -> np.ndarray:
     return np.convolve(padded, np.ones(width) / width, mode="valid")
 
 
-def timings(run: Run, log: list[dict[str, Any]], metrics: dict[str, Any] | None, renders: Path) -> str:
+def timings(run: Run, log: list[notes.LogLine], metrics: dict[str, Any] | None, renders: Path) -> str:
     """How long everything took."""
     rows = [(f"prepare: {name}", number(step.seconds, 1, " s")) for name, step in run.scene.manifest.steps.items()]
     rows.append(("train", number(run.seconds, 1, " s")))
     for note in sorted(renders.glob("*/sequence.json")):
-        found = read_json(note) or {}
-        count = len(found.get("views", []))
-        rows.append((f"render: {note.parent.name}, {count} views", number(found.get("seconds"), 1, " s")))
+        if (found := notes.read(note, notes.Sequence)) is not None:
+            rows.append((f"render: {note.parent.name}, {len(found.views)} views", number(found.seconds, 1, " s")))
     rows.append(("evaluate", number((metrics or {}).get("seconds"), 1, " s")))
     return table(("", ""), rows)
 

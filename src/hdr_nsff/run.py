@@ -3,10 +3,8 @@ mapper from it alone. Nothing is unpickled; every write is atomic."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -18,6 +16,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.io import atomic, read_json, write_json
+from hdr_nsff.notes import LogLine
 from hdr_nsff.progress import say
 from hdr_nsff.scene import Scene
 from hdr_nsff.tonemap import ToneMapper
@@ -143,7 +142,7 @@ class Run:
         target = pick_device(device)
         return Run(folder, config, scene, field.to(target).eval(), tonemapper.to(target).eval(), found.step, found.seconds)
 
-    def log(self) -> list[dict[str, Any]]:
+    def log(self) -> list[LogLine]:
         """The lines of log.jsonl; a last line cut short by a kill is left out."""
         return read_log(self.folder)
 
@@ -166,14 +165,14 @@ def write_config(folder: Path, config: TrainConfig) -> None:
     write_json(Path(folder) / "config.json", config.to_json())
 
 
-def read_log(folder: Path) -> list[dict[str, Any]]:
+def read_log(folder: Path) -> list[LogLine]:
     """Complete lines of log.jsonl; where a resumed run wrote a step again, the last line of it counts."""
     path = Path(folder) / "log.jsonl"
-    lines: dict[int, dict[str, Any]] = {}
+    lines: dict[int, LogLine] = {}
     for text in path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []:
         try:
-            line = json.loads(text)
-            lines[int(line["step"])] = line
-        except (ValueError, TypeError, KeyError, RecursionError):
+            line = LogLine.model_validate_json(text)
+        except ValueError:  # cut short by a kill
             continue
+        lines[line.step] = line
     return [lines[step] for step in sorted(lines)]

@@ -9,7 +9,7 @@ from typing import Literal
 
 from tyro.conf import Positional
 
-from hdr_nsff.config import PRESETS
+from hdr_nsff.config import PRESETS, check
 from hdr_nsff.errors import InputError
 from hdr_nsff.evaluate import evaluate_run, views_of_clip
 from hdr_nsff.ingest import every_of
@@ -67,17 +67,18 @@ def run_all(config: RunConfig) -> None:
     if config.truth is not None and not config.truth.is_dir():
         raise InputError(f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, or leave the option out")
     check_place(config.out / "report.html")
+    settings = replace(PRESETS[config.preset], out=config.out / "run", seed=config.seed, device=config.device)
+    if config.minutes is not None:
+        settings = replace(settings, minutes=config.minutes, steps=None)
+    check(settings)
     footage = PrepareConfig(
         clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev, max_size=config.max_size,
         hold_out=held_out_every(config), protocol=config.protocol, poses=config.poses,
     )  # fmt: skip
     scene = prepare(footage)
     truth = config.truth or held_out_truth(footage)
-    settings = replace(PRESETS[config.preset], scene=scene, out=config.out / "run", seed=config.seed, device=config.device)
-    if config.minutes is not None:
-        settings = replace(settings, minutes=config.minutes, steps=None)
     with writing_to(config.out):
-        run = Run.open(train(settings), config.device)
+        run = Run.open(train(replace(settings, scene=scene)), config.device)
         results = render_all(run, config.out / "render")
         evaluate_run(run, truth)
         results["report"] = write_report(run, config.out / "report.html", config.out / "render")

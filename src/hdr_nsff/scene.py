@@ -14,12 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_image, read_json, read_mask, read_npy, write_json
+from hdr_nsff.notes import first_problem
 
 Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
@@ -117,14 +118,6 @@ class Manifest(Strict):
             ) from error
         check_manifest(Path(folder), manifest)
         return manifest
-
-
-def first_problem(error: Exception) -> str:
-    """The first thing pydantic or json complained about, in a few words."""
-    if isinstance(error, ValidationError):
-        e = error.errors()[0]
-        return f"{'.'.join(str(p) for p in e['loc']) or 'top level'}: {e['msg']}"
-    return str(error)
 
 
 @dataclass(frozen=True)

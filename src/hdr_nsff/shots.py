@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from hdr_nsff import color, io
+from hdr_nsff import color, io, notes
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields.base import Render
@@ -143,33 +143,33 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
     wanted = [p.with_suffix(".exr") for p in pictures] * (output.exr != "none") + pictures * output.png + [video] * output.video
-    if note.get("complete") and all(p.exists() for p in wanted):
+    if note.complete and all(p.exists() for p in wanted):
         say(f"{shot.name}: all {len(shot.views)} views are there already ({folder})")
         return result
     start = time.monotonic()
     for picture, view in zip(pictures, track(shot.views, f"rendering {shot.name}"), strict=True):
-        write_view(run, view, picture, output, note)
+        write_view(run, view, picture, output, note.display_exposure)
     if output.video:
-        io.write_video(video, (io.read_image(p) for p in pictures), note["fps"])
+        io.write_video(video, (io.read_image(p) for p in pictures), shot.fps)
     chosen = sorted({round(i) for i in np.linspace(0, len(pictures) - 1, min(12, len(pictures)))})
     cells = [io.read_image(pictures[i]) for i in chosen]
     io.write_png(sheet, io.contact_sheet([cells[i : i + 4] for i in range(0, len(cells), 4)]))
     if not output.png:
         for picture in pictures:
             picture.unlink(missing_ok=True)
-    seconds = note.get("seconds", 0.0) + time.monotonic() - start
-    io.write_json(folder / "sequence.json", {**note, "complete": True, "seconds": round(seconds, 2)})
+    seconds = round(note.seconds + time.monotonic() - start, 2)
+    notes.write(folder / "sequence.json", note.model_copy(update={"complete": True, "seconds": seconds}))
     return result
 
 
-def open_sequence(run: Run, shot: Shot, folder: Path, output: Output, products: Sequence[Path]) -> dict[str, Any]:
+def open_sequence(run: Run, shot: Shot, folder: Path, output: Output, products: Sequence[Path]) -> notes.Sequence:
     """The sidecar of a shot. Where the one on disk is of other settings or of another checkpoint, its files are removed."""
     key = fingerprint(run, shot.views, shot.fps, output)
     sidecar = folder / "sequence.json"
-    if sidecar.is_file():
-        found = io.read_note(sidecar)
-        if found.get("key") == key:
-            return found
+    found = notes.read(sidecar, notes.Sequence)
+    if found is not None and found.key == key:
+        return found
+    if found is not None:
         say(f"{shot.name}: settings or checkpoint changed, rendering again")
     stale = [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}] if folder.is_dir() else []
     if not sidecar.is_file() and (foreign := [p for p in [*stale, *products] if p.exists()]):
@@ -177,23 +177,23 @@ def open_sequence(run: Run, shot: Shot, folder: Path, output: Output, products: 
     for path in [*stale, *products]:
         path.unlink(missing_ok=True)
     exposure = display_exposure(run, shot.views)
-    views = [{"time": v.time, "ev": v.ev if v.ev is not None else output.ev} for v in shot.views]
-    note = {"key": key, "step": run.step, "fps": shot.fps, "display_exposure": exposure, "views": views, "seconds": 0.0}
-    io.write_json(sidecar, note)
+    views = [notes.SequenceView(time=v.time, ev=v.ev if v.ev is not None else output.ev) for v in shot.views]
+    note = notes.Sequence(key=key, step=run.step, fps=shot.fps, display_exposure=exposure, views=views, seconds=0.0)
+    notes.write(sidecar, note)
     return note
 
 
-def write_view(run: Run, view: View, picture: Path, output: Output, note: dict[str, Any]) -> None:
-    """Make `picture` and the EXR beside it where one of them is missing."""
+def write_view(run: Run, view: View, picture: Path, output: Output, exposure: float) -> None:
+    """Make `picture` and the EXR beside it where one of them is missing; `exposure` is that of the display."""
     exr = picture.with_suffix(".exr")
     if picture.exists() and (output.exr == "none" or exr.exists()):
         return
     still = take(run, view, output.between)
     ev = view.ev if view.ev is not None else output.ev
     if output.exr != "none":
-        shown = {"developedEV": float(ev)} if ev is not None else {"displayExposure": float(note["display_exposure"])}
+        shown = {"developedEV": float(ev)} if ev is not None else {"displayExposure": exposure}
         write_still(exr, still, view, output.exr == "half", {**exposure_header(run), **shown})
-    io.write_png(picture, develop(run, still.radiance, ev, output.camera_id, note["display_exposure"]))
+    io.write_png(picture, develop(run, still.radiance, ev, output.camera_id, exposure))
 
 
 def exposure_header(run: Run) -> dict[str, Any]:

@@ -45,27 +45,8 @@ def write_oracle(
     folder, rng = out / "oracle", np.random.default_rng(noise.seed)
     count, height, width = video.shape[:3]
     depths = np.stack([e["Z"] for e in exact])
-    entries = []
-    for i, channels in enumerate(exact):
-        entry = FrameEntry(
-            index=i,
-            image=f"images/{i:05d}.png",
-            source=f"clip/{i:05d}.png",
-            time=float(i),
-            bracket=i % len(ev),
-            ev=ev[i % len(ev)],
-            K=K.tolist(),
-            c2w=c2w[i].tolist(),
-            mask=f"masks/{i:05d}.png",
-            disparity=f"disparity/{i:05d}.npy",
-            disparity_confidence=f"disparity_confidence/{i:05d}.npy",
-            flow={
-                j: FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png")
-                for j in (i - 1, i + 1)
-                if 0 <= j < count
-            },
-        )
-        entries.append(entry)
+    entries = [frame_entry(i, count, K, c2w[i], ev) for i in range(count)]
+    for i, (channels, entry) in enumerate(zip(exact, entries, strict=True)):
         error = depth_error(noise, (height, width), rng, i)
         io.write_png(folder / entry.image, video[i])
         io.write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
@@ -94,6 +75,28 @@ def write_oracle(
         },
     )
     manifest.save(folder)
+
+
+def frame_entry(i: int, count: int, K: np.ndarray, c2w: np.ndarray, ev: list[float]) -> FrameEntry:
+    """Frame `i` of `count` in the manifest: what it is and where its maps are."""
+    return FrameEntry(
+        index=i,
+        image=f"images/{i:05d}.png",
+        source=f"clip/{i:05d}.png",
+        time=float(i),
+        bracket=i % len(ev),
+        ev=ev[i % len(ev)],
+        K=K.tolist(),
+        c2w=c2w.tolist(),
+        mask=f"masks/{i:05d}.png",
+        disparity=f"disparity/{i:05d}.npy",
+        disparity_confidence=f"disparity_confidence/{i:05d}.npy",
+        flow={
+            j: FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png")
+            for j in (i - 1, i + 1)
+            if 0 <= j < count
+        },
+    )
 
 
 def depth_error(noise: OracleNoise, size: tuple[int, int], rng: np.random.Generator, frame: int) -> np.ndarray:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hdr_nsff import distributed
 from hdr_nsff.batch import PixelBatch, draw_pixels, whole_frame
-from hdr_nsff.config import TrainConfig
+from hdr_nsff.config import TrainConfig, check
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field, start_field
 from hdr_nsff.fields.encodings import TouchedAdam
@@ -66,6 +66,7 @@ def train(config: TrainConfig) -> Path:
     """Train (or go on training) until the steps or minutes are spent; the run folder."""
     if config.steps is None and config.minutes is None:
         raise InputError("neither --steps nor --minutes: say how long to train")
+    check(config)
     config = replace(config, scene=config.scene.resolve())  # the run can then be opened from anywhere
     with writing_to(config.out), distributed.group() as ranks:
         if ranks.world > config.batches:

@@ -17,8 +17,9 @@ from pydantic import Field
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import SIDES, read_exr, read_image, read_json
+from hdr_nsff.notes import first_problem
 from hdr_nsff.recording import Curve
-from hdr_nsff.scene import LARGEST_EV, FrameEntry, Strict, first_problem, inside, is_intrinsic, is_matrix, is_pose
+from hdr_nsff.scene import LARGEST_EV, FrameEntry, Strict, inside, is_intrinsic, is_matrix, is_pose
 
 # Channels of a view's geometry, of the ray through each pixel's centre: z-depth in true units (0 where it hits nothing); pixels that the surface
 # moves in this camera, standing still, until one frame later and one frame earlier; the same in the truth's world, in true units.

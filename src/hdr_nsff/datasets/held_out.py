@@ -17,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
+from hdr_nsff import notes
 from hdr_nsff.datasets import blender, hdr_nerf, layout_of, llff, maps, nerfstudio
 from hdr_nsff.datasets.capture import Capture, Clock, named_file, parse_extra, read_document, reorder
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import hash_file, shrink
-from hdr_nsff.io import read_exr, read_image, read_note, write_exr, write_json, write_png
+from hdr_nsff.io import read_exr, read_image, write_exr, write_json, write_png
 from hdr_nsff.priors.import_poses import Given, placed
 from hdr_nsff.priors.poses import Poses
 from hdr_nsff.progress import say, track
@@ -326,14 +327,15 @@ def key_of(chosen: Sequence[tuple[HeldOut, dict[int, Path]]], m: Manifest, max_s
 def claim(out: Path, key: str) -> bool:
     """Whether the truth folder of that make is whole. Otherwise notes what it is made of, and removes files of another make.
     InputError where it holds something else."""
-    if read_note(out / NOTE).get("key") == key:
+    found = notes.read(out / NOTE, notes.Made)
+    if found is not None and found.key == key:
         return (out / "truth.json").is_file() and all((out / n).is_file() for v in Truth.open(out).views for n in v.files)
     if out.exists() and not (out / NOTE).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"{out}: is there already and was not made by prepare; choose another place with --truth-out")
     (out / "truth.json").unlink(missing_ok=True)
     for name in ("recorded", "radiance", "masks"):
         shutil.rmtree(out / name, ignore_errors=True)
-    write_json(out / NOTE, {"key": key})
+    notes.write(out / NOTE, notes.Made(key=key))
     return False
 
 

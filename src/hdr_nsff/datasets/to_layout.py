@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hdr_nsff import notes
 from hdr_nsff.datasets.capture import Extra, ExtraFrame
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import atomic, read_note, read_npy, write_json
+from hdr_nsff.io import atomic, read_npy
 from hdr_nsff.scene import FrameEntry, Manifest, Scene, inside
 
 NOTE = "hdr_nsff_export.json"
@@ -61,14 +62,14 @@ def claim(out: Path, layout: str, scene: Path) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --layout writes a folder, name another one")
     if out.is_dir() and any(out.iterdir()):
-        if not read_note(out / NOTE).get("layout"):
+        if notes.read(out / NOTE, notes.Layout) is None:
             raise InputError(f"{out}: is there already and was not made by export; choose an empty or new folder")
         for path in out.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)
             elif path.name != NOTE:
                 path.unlink()
-    write_json(out / NOTE, {"layout": layout, "scene": str(scene)})
+    notes.write(out / NOTE, notes.Layout(layout=layout, scene=str(scene)))
 
 
 def copy(source: Path, target: Path) -> None:

@@ -6,12 +6,15 @@ leaves COLMAP models behind; the parent shows its progress and kills it when it 
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,6 +24,7 @@ from hdr_nsff.progress import track
 
 Mapping = Literal["incremental", "global"]
 CHUNKS = 24  # progress steps of matching
+ROOM = 2**20  # bytes: a disk with less than this free is full
 
 
 @dataclass(frozen=True)
@@ -40,24 +44,39 @@ class SfmError(RuntimeError):
 
 
 def run(job: Job) -> list[Path]:
-    """Run `job` in a worker process, with progress; the folders of the models it found, largest first. SfmError when it breaks down."""
-    file = Path(job.folder) / "job.json"
-    file.write_text(json.dumps(asdict(job)))
-    log = Path(job.folder) / "worker.log"
-    with open(log, "w") as errors:
-        command = [sys.executable, "-m", "hdr_nsff.priors.sfm", str(file)]
-        worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
-        try:
-            assert worker.stdout is not None
-            follow(worker.stdout)
-            code = worker.wait()
-        finally:
-            worker.kill()
-            worker.wait()
+    """Run `job` in a worker process, with progress; the folders of the models it found, largest first. SfmError when it breaks down,
+    OSError where the disk is full."""
+    folder = Path(job.folder)
+    (folder / "job.json").write_text(json.dumps(asdict(job)))
+    command = [sys.executable, "-m", "hdr_nsff.priors.sfm", str(folder / "job.json")]
+    worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace")
+    assert worker.stdout is not None and worker.stderr is not None
+    said: deque[str] = deque(maxlen=20)  # in memory: on a full disk a log would stay empty
+    listener = threading.Thread(target=said.extend, args=(worker.stderr,), daemon=True)
+    listener.start()
+    try:
+        follow(worker.stdout)
+        code = worker.wait()
+    finally:
+        worker.kill()
+        worker.wait()
+        listener.join()
+    need_room(folder, " ".join(said))
     if code != 0:
-        said = [line for line in log.read_text().splitlines() if line.strip()]
-        raise SfmError(said[-1] if said else f"pycolmap ended with code {code}")
-    return sorted(p for p in (Path(job.folder) / job.mapping).iterdir() if p.is_dir())
+        words = [line.strip() for line in said if line.strip()]
+        raise SfmError(words[-1] if words else f"pycolmap ended with code {code}")
+    return sorted(p for p in (folder / job.mapping).iterdir() if p.is_dir())
+
+
+def need_room(folder: Path, said: str) -> None:
+    """OSError where the disk is full, or was when the worker wrote `said`. On a full disk COLMAP may die without a word, or leave
+    files cut short and not notice, so it is asked whatever the worker's end was."""
+    if any(words in said for words in ("No space left", "disk is full")):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder.parent))
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(bytes(ROOM))
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def follow(lines: IO[str]) -> None:

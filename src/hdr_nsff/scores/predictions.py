@@ -37,7 +37,7 @@ def predict(run: Run, views: Mapping[str, View], folder: Path, description: str,
     is there of the same run is kept, so that a killed evaluation goes on where it was."""
     key = json.dumps(fingerprint(run, motion, list(views.items())))
     note = folder / "predictions.json"
-    if not note.is_file() or note.read_text() != key:
+    if not note.is_file() or note.read_text(encoding="utf-8", errors="replace") != key:
         for old in [*folder.glob("*.exr"), *folder.glob("*.png")]:
             old.unlink()
         io.write_text(note, key)

@@ -67,8 +67,32 @@ def limited(x, z, low, high):
 
 
 @numba.njit(cache=True)
+def dot(a, b):
+    """Of two triples."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@numba.njit(cache=True)
+def gaussian(means, quaternions, scales, g):
+    """Mean (3,), quaternion (4,) and scales (3,) of Gaussian `g` in float64."""
+    return (
+        (float(means[g, 0]), float(means[g, 1]), float(means[g, 2])),
+        (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3])),
+        (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2])),
+    )
+
+
+@numba.njit(cache=True)
+def jacobian(k, held):
+    """The entries 00, 02, 11, 12 of J (2, 3), the projection linearised at the point `held`; the others are 0."""
+    x, y, z, _, _ = held
+    return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
+
+
+@numba.njit(cache=True)
 def footprint(m, q, s, v, k, width, height):
-    """A Gaussian in the picture: camera point t, projection T = J W (2, 3), half-axes M = R S (3, 3), 2D covariance (xx, xy, yy)."""
+    """A Gaussian in the picture: camera point t, the point where the projection is linearised and whether x and y are held there,
+    T = J W (2, 3), the rotation R of `rotation`, V = T R S (2, 3), and the 2D covariance V V^T + blur (xx, xy, yy)."""
     t = (
         v[0, 0] * m[0] + v[0, 1] * m[1] + v[0, 2] * m[2] + v[0, 3],
         v[1, 0] * m[0] + v[1, 1] * m[1] + v[1, 2] * m[2] + v[1, 3],
@@ -79,22 +103,15 @@ def footprint(m, q, s, v, k, width, height):
     edge_x, edge_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
     x, held_x = limited(t[0], z, -cx / fx - edge_x, (width - cx) / fx + edge_x)
     y, held_y = limited(t[1], z, -cy / fy - edge_y, (height - cy) / fy + edge_y)
-    j00, j02, j11, j12 = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)
+    held = (x, y, z, held_x, held_y)
+    j00, j02, j11, j12 = jacobian(k, held)
     t0 = (j00 * v[0, 0] + j02 * v[2, 0], j00 * v[0, 1] + j02 * v[2, 1], j00 * v[0, 2] + j02 * v[2, 2])
     t1 = (j11 * v[1, 0] + j12 * v[2, 0], j11 * v[1, 1] + j12 * v[2, 1], j11 * v[1, 2] + j12 * v[2, 2])
     unit, r, n = rotation(q)
-    a0, a1, a2 = (
-        (t0[0] * r[0][0] + t0[1] * r[1][0] + t0[2] * r[2][0]) * s[0],
-        (t0[0] * r[0][1] + t0[1] * r[1][1] + t0[2] * r[2][1]) * s[1],
-        (t0[0] * r[0][2] + t0[1] * r[1][2] + t0[2] * r[2][2]) * s[2],
-    )
-    b0, b1, b2 = (
-        (t1[0] * r[0][0] + t1[1] * r[1][0] + t1[2] * r[2][0]) * s[0],
-        (t1[0] * r[0][1] + t1[1] * r[1][1] + t1[2] * r[2][1]) * s[1],
-        (t1[0] * r[0][2] + t1[1] * r[1][2] + t1[2] * r[2][2]) * s[2],
-    )
-    covariance = (a0 * a0 + a1 * a1 + a2 * a2 + BLUR, a0 * b0 + a1 * b1 + a2 * b2, b0 * b0 + b1 * b1 + b2 * b2 + BLUR)
-    return t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), ((a0, a1, a2), (b0, b1, b2)), covariance
+    c0, c1, c2 = (r[0][0], r[1][0], r[2][0]), (r[0][1], r[1][1], r[2][1]), (r[0][2], r[1][2], r[2][2])  # columns
+    v0 = (dot(t0, c0) * s[0], dot(t0, c1) * s[1], dot(t0, c2) * s[2])
+    v1 = (dot(t1, c0) * s[0], dot(t1, c1) * s[1], dot(t1, c2) * s[2])
+    return t, held, (t0, t1), (unit, r, n), (v0, v1), (dot(v0, v0) + BLUR, dot(v0, v1), dot(v1, v1) + BLUR)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
@@ -103,9 +120,7 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
     excluded; empty where nothing shows) of world Gaussians seen by `w2c` (3, 4) and `k` = (fx, fy, cx, cy). Lengths in scene units."""
     tiles_x, tiles_y = (width + TILE_X - 1) // TILE_X, (height + TILE_Y - 1) // TILE_Y
     for g in numba.prange(means.shape[0]):
-        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
-        q = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
-        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+        m, q, s = gaussian(means, quaternions, scales, g)
         t, _, _, _, _, (xx, xy, yy) = footprint(m, q, s, w2c, k, width, height)
         depths[g] = t[2]
         boxes[g, 0] = boxes[g, 1] = boxes[g, 2] = boxes[g, 3] = 0
@@ -225,30 +240,47 @@ def forward(starts, members, centres, conics, opacities, features, rows, maps, a
                     maps[d, y0 + y, x0 + x] = total[d, y * TILE_X + x]
 
 
+@numba.njit(inline="always", fastmath=FAST)
+def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, grads, grad_a, behind):
+    """Fill a tile's gradients of its maps `grads` (D, PIXELS) and of alpha (PIXELS,), and the sum of weight * value `behind` (PIXELS,)."""
+    height, width = alpha.shape
+    for y in range(min(TILE_Y, height - y0)):
+        for x in range(min(TILE_X, width - x0)):
+            p = y * TILE_X + x
+            grad_a[p] = grad_alpha[y0 + y, x0 + x]
+            behind[p] = grad_a[p] * alpha[y0 + y, x0 + x]
+            for d in range(len(grads)):
+                grads[d, p] = grad_maps[d, y0 + y, x0 + x]
+                behind[p] += grads[d, p] * maps[d, y0 + y, x0 + x]
+
+
+@numba.njit(inline="always", fastmath=FAST)
+def moments(u, px, py, cx, cy, first, last):
+    """Sums over pixels of u, u dx, u dy, u dx^2, u dx dy, u dy^2."""
+    m0 = m1 = m2 = m3 = m4 = m5 = F0
+    for p in range(first, last):
+        dx, dy = px[p] - cx, py[p] - cy
+        ux, uy = u[p] * dx, u[p] * dy
+        m0 += u[p]
+        m1 += ux
+        m2 += uy
+        m3 += ux * dx
+        m4 += ux * dy
+        m5 += uy * dy
+    return m0, m1, m2, m3, m4, m5
+
+
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
 def backward(starts, members, places, centres, conics, opacities, features, rows, maps, alpha, grad_maps, grad_alpha, out):
     """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its pixels, then its features."""
-    height, width = alpha.shape
     channels = features.shape[1]
-    tiles_x = (width + TILE_X - 1) // TILE_X
+    tiles_x = (alpha.shape[1] + TILE_X - 1) // TILE_X
     for tile in numba.prange(len(starts) - 1):
         x0, y0, px, py = pixel_centres(tile, tiles_x)
-        left, w, u, value = (
-            np.ones(PIXELS, np.float32),
-            np.empty(PIXELS, np.float32),
-            np.empty(PIXELS, np.float32),
-            np.empty(PIXELS, np.float32),
-        )
-        grads, grad_a = np.zeros((channels, PIXELS), np.float32), np.zeros(PIXELS, np.float32)
-        behind = np.zeros(PIXELS, np.float32)  # sum of weight * value from here on
-        for y in range(min(TILE_Y, height - y0)):
-            for x in range(min(TILE_X, width - x0)):
-                p = y * TILE_X + x
-                grad_a[p] = grad_alpha[y0 + y, x0 + x]
-                behind[p] = grad_a[p] * alpha[y0 + y, x0 + x]
-                for d in range(channels):
-                    grads[d, p] = grad_maps[d, y0 + y, x0 + x]
-                    behind[p] += grads[d, p] * maps[d, y0 + y, x0 + x]
+        left, w, u = np.ones(PIXELS, np.float32), np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
+        value, grad_a, behind = np.empty(PIXELS, np.float32), np.zeros(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
+        grads = np.zeros((channels, PIXELS), np.float32)
+        read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, grads, grad_a, behind)
         done = False
         for i in range(starts[tile], starts[tile + 1]):
             g, grad = members[i], out[places[i]]
@@ -278,17 +310,7 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
                 free = q if full <= ALPHA_MAX else F0
                 u[p] = -slope * free
                 left[p] -= v
-            m0 = m1 = m2 = m3 = m4 = m5 = F0
-            for p in range(first, last):
-                dx, dy = px[p] - cx, py[p] - cy
-                ux, uy = u[p] * dx, u[p] * dy
-                m0 += u[p]
-                m1 += ux
-                m2 += uy
-                m3 += ux * dx
-                m4 += ux * dy
-                m5 += uy * dy
-            grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = m0, m1, m2, m3, m4, m5
+            grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = moments(u, px, py, cx, cy, first, last)
             for d in range(channels):
                 sums, total = grads[d], F0
                 for p in range(first, last):
@@ -319,74 +341,108 @@ def project_backward(
             for i in range(first, last):
                 total += pairs[i, MOMENTS + d]
             grad_features[g, d] = total
-        u0 = u1 = u2 = u3 = u4 = u5 = 0.0
-        for i in range(first, last):
-            u0 += pairs[i, 0]
-            u1 += pairs[i, 1]
-            u2 += pairs[i, 2]
-            u3 += pairs[i, 3]
-            u4 += pairs[i, 4]
-            u5 += pairs[i, 5]
-        grad_opacities[g] = -u0 / opacities[g]
-        m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
-        quaternion = (float(quaternions[g, 0]), float(quaternions[g, 1]), float(quaternions[g, 2]), float(quaternions[g, 3]))
-        s = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
-        t, (x, y, z, held_x, held_y), (t0, t1), (unit, r, n), (v0, v1), (xx, xy, yy) = footprint(
-            m, quaternion, s, w2c, k, width, height
-        )
-        det = xx * yy - xy * xy
-        a, b, c = yy / det, -xy / det, xx / det  # in float64: needles thousands of pixels long need it
-        gx, gy = -(a * u1 + b * u2), -(b * u1 + c * u2)  # pixel centre
-        # conic -> 2D covariance: G = -Q (dL / dQ) Q, dL / dQ = half the second moments
-        p0, p1, p2, p3 = a * u3 + b * u4, a * u4 + b * u5, b * u3 + c * u4, b * u4 + c * u5
-        g00, g01, g11 = -0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c)
-        # covariance = V V^T + blur, V = T M: dV = 2 G V, dM = T^T dV, dT = dV M^T
-        d0 = (2 * (g00 * v0[0] + g01 * v1[0]), 2 * (g00 * v0[1] + g01 * v1[1]), 2 * (g00 * v0[2] + g01 * v1[2]))
-        d1 = (2 * (g01 * v0[0] + g11 * v1[0]), 2 * (g01 * v0[1] + g11 * v1[1]), 2 * (g01 * v0[2] + g11 * v1[2]))
-        dt0, dt1, dr = np.zeros(3), np.zeros(3), np.zeros((3, 3))
-        for j in range(3):
-            slope = 0.0
-            for i in range(3):
-                dm = t0[i] * d0[j] + t1[i] * d1[j]
-                slope += dm * r[i][j]
-                dr[i, j] = dm * s[j]
-                dt0[i] += d0[j] * r[i][j] * s[j]
-                dt1[i] += d1[j] * r[i][j] * s[j]
-            grad_scales[g, j] = slope
-        quaternion_gradient(unit, n, dr, grad_quaternions[g])
-        # T = J W
-        dj00 = dt0[0] * w2c[0, 0] + dt0[1] * w2c[0, 1] + dt0[2] * w2c[0, 2]
-        dj02 = dt0[0] * w2c[2, 0] + dt0[1] * w2c[2, 1] + dt0[2] * w2c[2, 2]
-        dj11 = dt1[0] * w2c[1, 0] + dt1[1] * w2c[1, 1] + dt1[2] * w2c[1, 2]
-        dj12 = dt1[0] * w2c[2, 0] + dt1[1] * w2c[2, 1] + dt1[2] * w2c[2, 2]
-        fx, fy = k[0], k[1]
-        dz = (
-            -(fx * dj00 + fy * dj11) / (z * z)
-            - (fx * t[0] * gx + fy * t[1] * gy) / (z * z)
-            + float(grad_features[g, channels - 1])
-        )
-        dx, dy = fx / z * gx, fy / z * gy
-        dz += (fx * x * dj02 / (z * z * z)) * (1.0 if held_x else 2.0) + (fy * y * dj12 / (z * z * z)) * (1.0 if held_y else 2.0)
-        dx -= 0.0 if held_x else fx * dj02 / (z * z)
-        dy -= 0.0 if held_y else fy * dj12 / (z * z)
+        sums = sum_moments(pairs, first, last)
+        grad_opacities[g] = -sums[0] / opacities[g]
+        m, q, s = gaussian(means, quaternions, scales, g)
+        t, held, projection, (unit, r, n), spread, covariance = footprint(m, q, s, w2c, k, width, height)
+        centre, d_covariance = picture_gradient(covariance, sums)
+        d_scales, d_rotation, d_projection = shape_gradient(d_covariance, projection, spread, r, s)
+        grad_scales[g, 0], grad_scales[g, 1], grad_scales[g, 2] = d_scales
+        quaternion_gradient(unit, n, d_rotation, grad_quaternions[g])
+        dx, dy, dz = point_gradient(centre, d_projection, t, held, w2c, k)
+        dz += float(grad_features[g, channels - 1])
         for j in range(3):
             grad_means[g, j] = w2c[0, j] * dx + w2c[1, j] * dy + w2c[2, j] * dz
         if len(grad_pose):
-            j00, j02, j11, j12 = fx / z, -fx * x / (z * z), fy / z, -fy * y / (z * z)
-            for j in range(3):
-                grad_pose[g, j] = dx * m[j] + j00 * dt0[j]
-                grad_pose[g, 4 + j] = dy * m[j] + j11 * dt1[j]
-                grad_pose[g, 8 + j] = dz * m[j] + j02 * dt0[j] + j12 * dt1[j]
-            grad_pose[g, 3], grad_pose[g, 7], grad_pose[g, 11] = dx, dy, dz
+            pose_gradient((dx, dy, dz), d_projection, m, jacobian(k, held), grad_pose[g])
+
+
+@numba.njit(cache=True)
+def sum_moments(pairs, first, last):
+    """The moments of a Gaussian's pairs, added up in float64."""
+    u0 = u1 = u2 = u3 = u4 = u5 = 0.0
+    for i in range(first, last):
+        u0 += pairs[i, 0]
+        u1 += pairs[i, 1]
+        u2 += pairs[i, 2]
+        u3 += pairs[i, 3]
+        u4 += pairs[i, 4]
+        u5 += pairs[i, 5]
+    return u0, u1, u2, u3, u4, u5
+
+
+@numba.njit(cache=True)
+def picture_gradient(covariance, u):
+    """From the moments `u` to dL / d pixel centre (2,) and dL / d 2D covariance (xx, xy, yy), with Q its inverse: -Q (dL / dQ) Q."""
+    xx, xy, yy = covariance
+    det = xx * yy - xy * xy
+    a, b, c = yy / det, -xy / det, xx / det  # in float64: needles thousands of pixels long need it
+    p0, p1, p2, p3 = (
+        a * u[3] + b * u[4],
+        a * u[4] + b * u[5],
+        b * u[3] + c * u[4],
+        b * u[4] + c * u[5],
+    )  # dL / dQ: half the moments
+    inner = (-0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c))
+    return (-(a * u[1] + b * u[2]), -(b * u[1] + c * u[2])), inner
+
+
+@numba.njit(cache=True)
+def shape_gradient(g, projection, spread, r, s):
+    """From G = dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3). The covariance is V V^T + blur with V = T M and
+    M = R S, so dV = 2 G V, dM = T^T dV, dT = dV M^T."""
+    (t0, t1), (v0, v1), (g00, g01, g11) = projection, spread, g
+    d0 = (2 * (g00 * v0[0] + g01 * v1[0]), 2 * (g00 * v0[1] + g01 * v1[1]), 2 * (g00 * v0[2] + g01 * v1[2]))
+    d1 = (2 * (g01 * v0[0] + g11 * v1[0]), 2 * (g01 * v0[1] + g11 * v1[1]), 2 * (g01 * v0[2] + g11 * v1[2]))
+    m0 = (t0[0] * d0[0] + t1[0] * d1[0], t0[0] * d0[1] + t1[0] * d1[1], t0[0] * d0[2] + t1[0] * d1[2])
+    m1 = (t0[1] * d0[0] + t1[1] * d1[0], t0[1] * d0[1] + t1[1] * d1[1], t0[1] * d0[2] + t1[1] * d1[2])
+    m2 = (t0[2] * d0[0] + t1[2] * d1[0], t0[2] * d0[1] + t1[2] * d1[1], t0[2] * d0[2] + t1[2] * d1[2])
+    d_scales = (
+        m0[0] * r[0][0] + m1[0] * r[1][0] + m2[0] * r[2][0],
+        m0[1] * r[0][1] + m1[1] * r[1][1] + m2[1] * r[2][1],
+        m0[2] * r[0][2] + m1[2] * r[1][2] + m2[2] * r[2][2],
+    )
+    d_rotation = (
+        (m0[0] * s[0], m0[1] * s[1], m0[2] * s[2]),
+        (m1[0] * s[0], m1[1] * s[1], m1[2] * s[2]),
+        (m2[0] * s[0], m2[1] * s[1], m2[2] * s[2]),
+    )
+    e0, e1 = (d0[0] * s[0], d0[1] * s[1], d0[2] * s[2]), (d1[0] * s[0], d1[1] * s[1], d1[2] * s[2])
+    d_projection = (dot(e0, r[0]), dot(e0, r[1]), dot(e0, r[2])), (dot(e1, r[0]), dot(e1, r[1]), dot(e1, r[2]))
+    return d_scales, d_rotation, d_projection
+
+
+@numba.njit(cache=True)
+def point_gradient(centre, d_projection, t, held, w2c, k):
+    """dL / d camera point (3,), through the pixel centre and through J in T = J W, which does not see x or y where they are held."""
+    (gx, gy), (dt0, dt1), (x, y, z, held_x, held_y), (fx, fy) = centre, d_projection, held, (k[0], k[1])
+    w0, w1, w2 = (w2c[0, 0], w2c[0, 1], w2c[0, 2]), (w2c[1, 0], w2c[1, 1], w2c[1, 2]), (w2c[2, 0], w2c[2, 1], w2c[2, 2])
+    dj00, dj02, dj11, dj12 = dot(dt0, w0), dot(dt0, w2), dot(dt1, w1), dot(dt1, w2)
+    dz = -(fx * dj00 + fy * dj11) / (z * z) - (fx * t[0] * gx + fy * t[1] * gy) / (z * z)
+    dz += (fx * x * dj02 / (z * z * z)) * (1.0 if held_x else 2.0) + (fy * y * dj12 / (z * z * z)) * (1.0 if held_y else 2.0)
+    dx = fx / z * gx - (0.0 if held_x else fx * dj02 / (z * z))
+    dy = fy / z * gy - (0.0 if held_y else fy * dj12 / (z * z))
+    return dx, dy, dz
+
+
+@numba.njit(cache=True)
+def pose_gradient(point, d_projection, m, j, out):
+    """dL / d world-to-camera `out` (12,), row by row: through the camera point `W m + t`, and through W in T = J W."""
+    (dx, dy, dz), (dt0, dt1), (j00, j02, j11, j12) = point, d_projection, j
+    for i in range(3):
+        out[i] = dx * m[i] + j00 * dt0[i]
+        out[4 + i] = dy * m[i] + j11 * dt1[i]
+        out[8 + i] = dz * m[i] + j02 * dt0[i] + j12 * dt1[i]
+    out[3], out[7], out[11] = dx, dy, dz
 
 
 @numba.njit(cache=True)
 def quaternion_gradient(unit, n, dr, out):
     """From dL / dR (3, 3) to the quaternion before it was made a unit one."""
     w, x, y, z = unit
-    gw = 2 * (x * (dr[2, 1] - dr[1, 2]) + y * (dr[0, 2] - dr[2, 0]) + z * (dr[1, 0] - dr[0, 1]))
-    gx = 2 * (-2 * x * (dr[1, 1] + dr[2, 2]) + y * (dr[0, 1] + dr[1, 0]) + z * (dr[0, 2] + dr[2, 0]) + w * (dr[2, 1] - dr[1, 2]))
-    gy = 2 * (x * (dr[0, 1] + dr[1, 0]) - 2 * y * (dr[0, 0] + dr[2, 2]) + z * (dr[1, 2] + dr[2, 1]) + w * (dr[0, 2] - dr[2, 0]))
-    gz = 2 * (x * (dr[0, 2] + dr[2, 0]) + y * (dr[1, 2] + dr[2, 1]) - 2 * z * (dr[0, 0] + dr[1, 1]) + w * (dr[1, 0] - dr[0, 1]))
+    gw = 2 * (x * (dr[2][1] - dr[1][2]) + y * (dr[0][2] - dr[2][0]) + z * (dr[1][0] - dr[0][1]))
+    gx = 2 * (-2 * x * (dr[1][1] + dr[2][2]) + y * (dr[0][1] + dr[1][0]) + z * (dr[0][2] + dr[2][0]) + w * (dr[2][1] - dr[1][2]))
+    gy = 2 * (x * (dr[0][1] + dr[1][0]) - 2 * y * (dr[0][0] + dr[2][2]) + z * (dr[1][2] + dr[2][1]) + w * (dr[0][2] - dr[2][0]))
+    gz = 2 * (x * (dr[0][2] + dr[2][0]) + y * (dr[1][2] + dr[2][1]) - 2 * z * (dr[0][0] + dr[1][1]) + w * (dr[1][0] - dr[0][1]))
     along = gw * w + gx * x + gy * y + gz * z
     out[0], out[1], out[2], out[3] = (gw - along * w) / n, (gx - along * x) / n, (gy - along * y) / n, (gz - along * z) / n

@@ -1,0 +1,122 @@
+"""A full disk and Ctrl-C: what was complete stays, nothing is half-written, and the same command goes on."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bad_input import Capture, call, clip, commands, poses, recorded, refused, snapshot
+
+from hdr_nsff import cli, io
+
+# A full disk
+
+
+def full(handle: int) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("verb", cli.VERBS)
+def test_a_full_disk_is_one_sentence(
+    verb: str, run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    footage, out = clip(tmp_path / "clip", recorded(3)), tmp_path / "out"
+    before = snapshot(run_folder)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        assert "the disk is full" in refused(capsys, *commands(run_folder, footage, out)[verb])
+    assert not snapshot(out) and snapshot(run_folder) == before
+
+
+@pytest.mark.parametrize("layout", ["hdr-gopro", "nerfstudio"])
+def test_a_full_disk_is_one_sentence_for_every_layout_of_a_scene(
+    layout: str, run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = snapshot(run_folder.parent)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        assert "the disk is full" in refused(capsys, "export", run_folder, tmp_path / "out", "--layout", layout)
+    assert not snapshot(tmp_path / "out") and snapshot(run_folder.parent) == before
+
+
+def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path: Path) -> None:
+    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
+    try:
+        with pytest.raises(io.InputError, match="the disk is full"), io.writing_to(tmp_path):
+            io.write_npy(tmp_path / "map.npy", np.zeros(500))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert not list(tmp_path.iterdir())
+
+
+FAILING = """
+import gc, pathlib, sys
+import numpy as np
+from hdr_nsff import io
+
+def broken(self, data):
+    view = memoryview(data)
+    raise OSError(28, "No space left on device")
+
+gc.disable()
+pathlib.Path.write_bytes = broken
+try:
+    io.write_npy(sys.argv[1], np.zeros(50))
+except OSError as error:
+    error.itself = error  # a cycle: what the traceback holds is left to the collector
+gc.collect()
+"""
+
+
+def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_later(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(Path(cli.__file__).parents[1]), *sys.path])
+    command = [sys.executable, "-c", FAILING, str(tmp_path / "map.npy")]
+    assert subprocess.run(command, env=os.environ | {"PYTHONPATH": path}).returncode == 0
+
+
+# Ctrl-C
+
+
+@pytest.mark.parametrize("verb", ["prepare", "render", "export", "evaluate", "reexpose"])
+def test_ctrl_c_loses_nothing_and_the_same_command_goes_on(
+    verb: str, run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    footage, out, sync = clip(tmp_path / "clip"), tmp_path / "out", os.fsync
+    command = commands(run_folder, footage, out)[verb]
+    if verb == "prepare":
+        command += ["--poses", poses(tmp_path / "poses_bounds.npy")]
+    calls: list[int] = []
+
+    def interrupted(handle: int) -> None:
+        calls.append(handle)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        sync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", interrupted)
+        assert call(*command) == 130
+    error = capsys.readouterr().err
+    assert "Traceback" not in error and "the same command goes on where it was" in error
+    kept = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.suffix in (".png", ".exr", ".npy", ".ply")}
+    assert not list(tmp_path.rglob(".partial-*"))
+    assert call(*command) == 0
+    pictures = [p for p in kept if verb != "evaluate" or p.suffix != ".png"]  # which draws its comparisons anew
+    assert pictures and all(p.stat().st_mtime_ns == kept[p] for p in pictures)
+
+
+def test_ctrl_c_while_the_libraries_load_leaves_no_traceback(tmp_path: Path) -> None:
+    (tmp_path / "tyro.py").write_text("raise KeyboardInterrupt\n")
+    path = os.pathsep.join([str(tmp_path), str(Path(cli.__file__).parents[1])])
+    command = [sys.executable, "-c", "from hdr_nsff.cli import main; main()", "prepare", "a", "b"]
+    result = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
+    assert result.returncode == 130 and result.stderr == ""

@@ -1,0 +1,139 @@
+"""Places that are missing, taken, or cannot be written: every verb names them, and replaces nothing but what it made itself."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from bad_input import FOOTAGE_VERBS, RUN_VERBS, Capture, call, clip, commands, recorded, refused, snapshot, training
+
+from hdr_nsff import cli, io
+
+
+def test_there_is_a_command_of_every_verb_to_try() -> None:
+    assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(cli.VERBS)
+    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
+
+
+# Missing and empty
+
+
+@pytest.mark.parametrize("verb", RUN_VERBS)
+def test_a_missing_and_an_empty_run(verb: str, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "empty").mkdir()
+    for name in ("nowhere", "empty"):
+        assert "not a run folder" in refused(capsys, *commands(tmp_path / name, tmp_path, tmp_path / "out")[verb])
+    assert [p.name for p in tmp_path.rglob("*")] == ["empty"]
+
+
+def test_what_an_option_names_must_be_there(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    footage, nowhere = clip(tmp_path / "clip"), tmp_path / "nowhere"
+    for option in ("--poses", "--flow", "--masks", "--depth"):
+        assert option in refused(capsys, "prepare", footage, tmp_path / "out", option, nowhere)
+    for verb, option in (("run", "--poses"), ("run", "--truth"), ("reexpose", "--poses"), ("reexpose", "--masks")):
+        assert str(nowhere) in refused(capsys, verb, footage, tmp_path / "out", option, nowhere)
+    assert "truth.json" in refused(capsys, "run", footage, tmp_path / "out", "--truth", footage)
+    assert "truth.json" in refused(capsys, "evaluate", run_folder, "--truth", nowhere)
+    assert "--renders" in refused(capsys, "report", run_folder, "--renders", nowhere)
+    assert str(nowhere) in refused(capsys, "render", run_folder, "--path", f"{nowhere}.json")
+    assert not (tmp_path / "out").exists()
+
+
+# Paths
+
+
+def test_a_name_that_is_no_text_is_refused_and_shown(tmp_path: Path, capsys: Capture) -> None:
+    assert "UTF-8" in refused(capsys, "prepare", clip(tmp_path / "clip"), f"{tmp_path}/sc\udcffne")
+    footage = clip(tmp_path / "other")
+    (footage / "004.png").rename(footage / "004\udcff.png")
+    assert "UTF-8" in refused(capsys, "prepare", footage, tmp_path / "scene")
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "y" * 300])
+@pytest.mark.parametrize("verb", [v for v in cli.VERBS if v != "evaluate"])
+def test_a_place_that_cannot_be_written_is_named(
+    verb: str, place: str, run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    footage, out = clip(tmp_path / "clip", recorded(3)), tmp_path / place
+    assert place.partition("/")[0][:40] in refused(capsys, *commands(run_folder, footage, out)[verb])
+    assert (tmp_path / "file").read_text() == "mine"
+
+
+# Output that is there already
+
+
+def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    (tmp_path / "thesis.html").write_text("<p>mine</p>")
+    assert "no report" in refused(capsys, "report", run_folder, "--out", tmp_path / "thesis.html")
+    assert (tmp_path / "thesis.html").read_text() == "<p>mine</p>"
+    assert "is a folder" in refused(capsys, "report", run_folder, "--out", tmp_path)
+    for _ in range(2):
+        assert call("report", run_folder, "--out", tmp_path / "report.html") == 0
+
+
+@pytest.mark.parametrize("name", ["fixed.mp4", "fixed/00001.png", "fixed/7.exr", "fixed_sheet.png"])
+def test_pictures_of_the_users_own_are_not_replaced(name: str, run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    io.write_text(tmp_path / "mine" / name, "mine")
+    assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["render"])
+    assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b"mine"}
+
+
+def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    io.write_text(tmp_path / "mine/depth/00000.png", "mine")
+    assert "depth" in refused(capsys, "render", run_folder, "--out", tmp_path / "mine", "--device", "cpu")
+    assert snapshot(tmp_path / "mine") == {tmp_path / "mine/depth/00000.png": b"mine"}
+
+
+@pytest.mark.parametrize("name", ["00001.ply", "7.ply", "sequence.json"])
+def test_files_of_the_users_own_are_not_replaced_by_gaussians(
+    name: str, run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    io.write_text(tmp_path / "mine" / name, '{"takes": 3}')
+    assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["export"])
+    assert name in refused(capsys, "export", run_folder, tmp_path / "mine" / name, "--ply")
+    assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b'{"takes": 3}'}
+
+
+def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    command = commands(run_folder, tmp_path, tmp_path / "out")["export"]
+    assert call(*command) == 0
+    first = snapshot(tmp_path / "out")
+    assert call(*training(run_folder.parent / "scene", run_folder.parent / "other", 3)) == 0
+    capsys.readouterr()
+    assert call(*commands(run_folder.parent / "other", tmp_path, tmp_path / "out")["export"]) == 0
+    assert "settings or checkpoint changed, exporting again" in capsys.readouterr().err
+    second = snapshot(tmp_path / "out")
+    assert second.keys() == first.keys() and all(second[p] != first[p] for p in first)
+
+
+def test_footage_is_not_prepared_over_another_scene(toy_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+    scene = shutil.copytree(toy_folder, tmp_path / "out/scene")  # it was not made by `prepare`: none of its steps is done
+    before = snapshot(tmp_path / "out")
+    footage = clip(tmp_path / "clip")
+    assert "other footage" in refused(capsys, "prepare", footage, scene)
+    assert "other footage" in refused(capsys, "run", footage, tmp_path / "out")
+    assert snapshot(tmp_path / "out") == before
+
+
+def test_a_run_with_other_settings_stays_as_it_is(run_folder: Path, capsys: Capture) -> None:
+    before = snapshot(run_folder)
+    assert "other settings" in refused(capsys, *training(run_folder.parent / "scene", run_folder, 3))
+    assert snapshot(run_folder) == before
+
+
+def test_checkpoints_without_their_config_are_not_taken_over(run_folder: Path, capsys: Capture, tmp_path: Path) -> None:
+    lone = tmp_path / "run"
+    shutil.copytree(run_folder, lone)
+    (lone / "config.json").unlink()
+    before = snapshot(lone)
+    assert "no config.json" in refused(capsys, *training(run_folder.parent / "scene", lone, 3))
+    assert snapshot(lone) == before
+
+
+def test_a_room_is_not_rendered_into_a_folder_of_something_else(capsys: Capture, tmp_path: Path) -> None:
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
+    assert "holds something else" in refused(capsys, "synth", str(tmp_path), "--size", "16x16", "--frames", "12")
+    assert (tmp_path / "clip" / "00000.png").read_bytes() == b"mine"
