@@ -67,3 +67,9 @@ def test_a_right_motion_mask_costs_next_to_nothing() -> None:
         < 1e-3
         < float(losses.motion_mask(torch.tensor([0.0, 1.0]), moving))
     )
+
+
+def test_untrusted_pixels_of_the_motion_mask_have_no_pull() -> None:
+    motion = torch.tensor([0.3, 0.3], requires_grad=True)
+    losses.motion_mask(motion, torch.tensor([True, True]), torch.tensor([1.0, 0.0])).backward()
+    assert motion.grad is not None and motion.grad[0] < 0 and motion.grad[1] == 0

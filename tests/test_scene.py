@@ -9,7 +9,7 @@ import pytest
 import torch
 from toy_scene import CARD, EV, WALL, ToyScene
 
-from hdr_nsff.scene import FrameEntry, Scene, neighbours
+from hdr_nsff.scene import FrameEntry, Manifest, Scene, Step, neighbours, outline
 
 
 def entry(index: int, time: float, camera: int = 0) -> FrameEntry:
@@ -45,6 +45,24 @@ def test_a_scene_holds_what_was_written(toy: Scene) -> None:
         assert torch.equal(f.moving, torch.from_numpy(moving))
         assert sorted({round(1 / v, 2) for v in f.disparity.unique().tolist()}) == pytest.approx([CARD, WALL], rel=1e-3)
         assert set(f.flow) == set(f.neighbours) == {o for o in (-1, 1) if 0 <= f.index + o < 6}
+
+
+def test_the_outline_of_a_mask_is_two_pixels_on_either_side() -> None:
+    mask = torch.zeros(12, 12, dtype=torch.bool)
+    mask[:, 6:] = True
+    assert outline(mask).any(0).nonzero()[:, 0].tolist() == [4, 5, 6, 7] and torch.equal(outline(mask), outline(~mask))
+    assert not outline(torch.ones(8, 8, dtype=torch.bool)).any()  # the picture's edge is no outline
+
+
+@pytest.mark.parametrize("provenance", ["estimated", "given"])
+def test_only_an_estimated_mask_has_a_doubtful_outline(toy_folder: Path, tmp_path: Path, provenance: str) -> None:
+    folder = shutil.copytree(toy_folder, tmp_path / "scene")
+    manifest = Manifest.load(folder)
+    manifest.steps["mask"] = Step(done=True, provenance=provenance)
+    manifest.save(folder)
+    f = Scene.open(folder).train[0]
+    assert f.moving is not None and (f.outline is None) == (provenance == "given")
+    assert f.outline is None or (f.outline.any() and not f.outline.all())
 
 
 def test_held_out_frames_lend_no_map_to_training(toy_folder: Path, tmp_path: Path) -> None:

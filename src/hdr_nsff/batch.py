@@ -28,6 +28,7 @@ class PixelBatch:
     seed: int = 0  # for the field's own randomness (jitter, noise): the same seed gives the same pass
     chain: int = 0  # direction of the two-step warp: +1, -1, or 0 for none
     moving: Tensor | None = None  # (N,) bool
+    outline: Tensor | None = None  # (N,) bool: near the moving mask's outline
     disparity: Tensor | None = None  # (N,) 1 / scene units (or relative)
     disparity_confidence: Tensor | None = None  # (N,) in [0, 1]
     flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (N, 2)} pixels
@@ -65,6 +66,7 @@ def read_off(
         rgb=at(f.image),
         uniform=torch.ones(len(pixels), dtype=torch.bool, device=f.image.device) if uniform is None else uniform,
         moving=maybe(f.moving),
+        outline=maybe(f.outline),
         disparity=maybe(f.disparity),
         disparity_confidence=maybe(f.disparity_confidence),
         flow={o: at(v) for o, v in f.flow.items()},

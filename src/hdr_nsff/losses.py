@@ -72,7 +72,8 @@ def optical_flow(flow: Tensor, target: Tensor, valid: Tensor, limit: float | Non
     return (error * valid).sum() / valid.sum().clamp_min(1)
 
 
-def motion_mask(motion: Tensor, moving: Tensor) -> Tensor:
-    """Cross-entropy between the rendered share of dynamic content (N,) and the moving mask (N,) bool, in float32."""
+def motion_mask(motion: Tensor, moving: Tensor, trust: Tensor | None = None) -> Tensor:
+    """Cross-entropy between the rendered share of dynamic content (N,) and the moving mask (N,) bool, weighted by `trust` (N,), in float32."""
     inside = motion * (1 - 2e-4) + 1e-4  # not a clamp: a mover that is nowhere yet must feel the mask
-    return -torch.where(moving, inside, 1 - inside).log().mean()
+    entropy = -torch.where(moving, inside, 1 - inside).log()
+    return entropy.mean() if trust is None else (entropy * trust).mean()

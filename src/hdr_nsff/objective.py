@@ -137,7 +137,9 @@ class Objective:
         if flows:
             terms["flow"] = fade * torch.stack(flows).mean()
         if batch.moving is not None:
-            terms["mask"] = losses.motion_mask(render.motion, batch.moving)
+            terms["mask"] = losses.motion_mask(
+                render.motion, batch.moving, None if batch.outline is None else (~batch.outline).float()
+            )
         return terms
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
@@ -26,6 +27,7 @@ Parallax = Literal["full", "rotation", "none"]
 Split = Literal["train", "test"]
 Protocol = Literal["novel-view", "novel-view-time"]
 LARGEST = 1e15  # numbers beyond it, or depths below 1 / it, are no measurement and would overflow in single precision
+OUTLINE = 2  # pixels by which the outline of an estimated mask may be wrong
 LARGEST_EV = 60.0  # stops from the reference
 
 
@@ -133,6 +135,7 @@ class Frame:
     image: Tensor  # (H, W, 3) recorded rgb in [0, 1]
     neighbours: dict[int, int] = field(default_factory=dict)  # {+-1: position in `Scene.train`}, same physical camera
     moving: Tensor | None = None  # (H, W) bool
+    outline: Tensor | None = None  # (H, W) bool: within `OUTLINE` pixels of the mask's outline, on either side
     disparity: Tensor | None = None  # (H, W)
     disparity_confidence: Tensor | None = None  # (H, W) in [0, 1]
     flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W, 2)} pixels
@@ -311,6 +314,8 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
     flows = {o: e.flow[i] for o, i in neighbour_index.items() if i in e.flow}
     flow = {o: checked(f.flow, read_npy, "flow", (2,)) for o, f in flows.items()}
     valid = {o: checked(f.valid, read_mask, "flow mask") for o, f in flows.items()}
+    moving = checked(e.mask, read_mask, "mask")
+    guessed = moving is not None and m.steps.get("mask", Step()).provenance == "estimated"
     return Frame(
         index=e.index,
         time=e.time,
@@ -320,12 +325,20 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
         exposure=e.ev,
         image=image,
         neighbours=links,
-        moving=checked(e.mask, read_mask, "mask"),
+        moving=moving,
+        outline=outline(moving) if moving is not None and guessed else None,
         disparity=disparity,
         disparity_confidence=checked(e.disparity_confidence, read_npy, "disparity confidence"),
         flow={o: v for o, v in flow.items() if v is not None},
         flow_valid={o: v for o, v in valid.items() if v is not None},
     )
+
+
+def outline(mask: Tensor) -> Tensor:
+    """(H, W) bool: the pixels of a mask (H, W) within `OUTLINE` of its outline, on either side."""
+    width, image = 2 * OUTLINE + 1, mask[None, None].float()
+    grown, kept = max_pool2d(image, width, 1, OUTLINE)[0, 0] > 0, -max_pool2d(-image, width, 1, OUTLINE)[0, 0] > 0
+    return grown & ~kept
 
 
 def inside(folder: Path, name: str) -> Path:

@@ -133,14 +133,26 @@ def mover_points(
     scene: Scene, f: Frame, i: int, t: int, tracks: Tracks, groups: list[Group], to_radiance: ToRadiance
 ) -> tuple[Points, Tensor]:
     """The moving pixels of a frame (the `i`-th of training, at time `t`) as points at their canonical places, and the group of each (P,)."""
-    assert f.moving is not None
-    points = lift(f, i, f.moving.reshape(-1), scene.near, scene.far, to_radiance)
+    moving = surely_moving(f)
+    f = replace(f, moving=moving)
+    points = lift(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
     owner = owner_of(f, t, tracks, groups)
     canonical = points.positions.double().numpy().copy()
     for g, group in enumerate(groups):
         canonical[owner == g] = group.canonical(canonical[owner == g], t)
     positions = torch.from_numpy(canonical).float()
     return Points(positions, points.log_radiance, points.trust, points.footprint), torch.from_numpy(owner)
+
+
+def surely_moving(f: Frame) -> Tensor:
+    """(H, W) bool: the moving mask without its doubtful outline; small and thin things stay whole."""
+    assert f.moving is not None
+    if f.outline is None:
+        return f.moving
+    things, count = ndimage.label(f.moving.numpy())
+    sure = f.moving & ~f.outline
+    whole = ~np.isin(np.arange(count + 1), np.unique(things[sure.numpy()]))
+    return sure | (f.moving & torch.from_numpy(whole[things]))
 
 
 def relieved(f: Frame, t: int, tracks: Tracks, shapes: list[Shape]) -> Frame:
