@@ -53,7 +53,7 @@ VERBS = {
     "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
 }
 PRESET_HELP = {
-    "splat": "4D Gaussians, minutes on a CPU, pictures in real time; the default of `run`.",
+    "splat": "4D Gaussians, minutes on a CPU, tens of small frames a second; the default of `run`.",
     "grid": "A scene flow field on additive grids, minutes on a CPU.",
     "paper": "The published network, losses and schedules; hours on a GPU.",
     "tiny": "Seconds on a CPU, to try things out.",
