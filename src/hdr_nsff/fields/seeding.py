@@ -174,7 +174,7 @@ def views_of(field: Splat, scene: Scene) -> tuple[list[View], list[int]]:
         f = scene.train[chosen[k]]
         assert f.disparity is not None
         shape = f.image.shape[:2]
-        moving = np.zeros(shape, bool) if f.moving is None else f.moving.numpy()
+        moving = np.zeros(shape, bool) if f.moving is None else surely_moving(f).numpy()
         rays = f.camera.rays(f.camera.pixel_grid())
         points = rays.origins + rays.directions / f.disparity.reshape(-1, 1).clamp(1 / scene.far, 1 / scene.near)
         trust = np.ones(shape) if f.disparity_confidence is None else f.disparity_confidence.numpy()
