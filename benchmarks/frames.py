@@ -128,6 +128,10 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
             label=f"{width}x{height}, {threads} {'thread' if threads == 1 else 'threads'}",
         )
     axes.set(xlabel="Gaussians", ylabel="milliseconds a frame", xscale="log", yscale="log")
+    counts = sorted({r["gaussians"] for r in rows})
+    axes.set_xticks(counts, [f"{c:,}" for c in counts])
+    axes.set_yticks([5, 10, 20, 50, 100], ["5", "10", "20", "50", "100"])
+    axes.minorticks_off()
     axes.legend()
     figure.tight_layout()
     figure.savefig(path, dpi=150)
