@@ -31,12 +31,15 @@ def main() -> None:
         "--warm-up", type=int, default=150, help="steps before, so that kernels are compiled and culling has settled"
     )
     parser.add_argument("--device", default="auto")
+    parser.add_argument("--rays", type=int, help="uniform rays of a batch, and no others, instead of the preset's")
     parser.add_argument("--bf16", action="store_true")
     args = parser.parse_args()
     device = pick_device(args.device)
     total = args.warm_up + args.steps
     with tempfile.TemporaryDirectory() as folder:
         config = replace(PRESETS[args.preset], scene=args.scene, out=Path(folder), steps=2 * total, minutes=None, bf16=args.bf16)
+        if args.rays is not None:
+            config = replace(config, rays=args.rays, moving_rays=0)
         trainer = Trainer(config, Scene.open(args.scene), device, distributed.Ranks())
 
         def run(steps: int) -> float:
