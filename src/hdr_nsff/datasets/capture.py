@@ -157,15 +157,23 @@ def parse_extra(path: Path, value: Any, names: Sequence[str]) -> Extra:
     return extra
 
 
-def read_document(path: Path, purpose: str) -> dict[str, Any]:
-    """A `transforms*.json` with frames; InputError that says what the file is for."""
+def read_object(path: Path, purpose: str) -> dict[str, Any]:
+    """A JSON object; InputError that says what the file is for."""
     if not path.is_file():
         raise InputError(f"{path}: missing; it holds {purpose}, copy it again")
     try:
-        document = read_json(path)
+        found = read_json(path)
     except ValueError as error:
         raise InputError(f"{path}: not readable JSON ({error}), or cut short; it holds {purpose}, copy it again") from error
-    if not isinstance(document, dict) or not isinstance(document.get("frames"), list) or not document["frames"]:
+    if not isinstance(found, dict):
+        raise InputError(f"{path}: not a JSON object; it holds {purpose}, copy it again")
+    return found
+
+
+def read_document(path: Path, purpose: str) -> dict[str, Any]:
+    """A `transforms*.json` with frames; InputError that says what the file is for."""
+    document = read_object(path, purpose)
+    if not isinstance(document.get("frames"), list) or not document["frames"]:
         raise InputError(f"{path}: no list of `frames` in it; it holds {purpose}, copy it again")
     for k, frame in enumerate(document["frames"]):
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or "transform_matrix" not in frame:

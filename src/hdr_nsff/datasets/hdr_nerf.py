@@ -12,9 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from hdr_nsff.datasets.blender import TEST, TRAIN, poses
-from hdr_nsff.datasets.capture import Capture, Picture, named_file, read_document, source_of
+from hdr_nsff.datasets.capture import Capture, Picture, named_file, read_document, read_object, source_of
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_json
 
 COUNT = 5
 TRAINED = (0, 2, 4)
@@ -48,15 +47,7 @@ def read(folder: Path) -> Capture:
 
 def exposures(folder: Path, split: str) -> dict[str, Any]:
     """`exposure_{split}.json`: picture -> exposure time, names without a leading `./`."""
-    path = folder / f"exposure_{split}.json"
-    if not path.is_file():
-        raise InputError(f"{path}: missing; it holds the exposure times of the {split} pictures, copy it again")
-    try:
-        table = read_json(path)
-    except ValueError as error:
-        raise InputError(f"{path}: not readable JSON ({error}); it holds the exposure times, copy it again") from error
-    if not isinstance(table, dict):
-        raise InputError(f"{path}: expected an object of picture names and exposure times; copy it again")
+    table = read_object(folder / f"exposure_{split}.json", f"the exposure times of the {split} pictures")
     return {plain(name): value for name, value in table.items()}
 
 
