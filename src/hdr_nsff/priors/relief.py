@@ -33,7 +33,7 @@ def relief(
     if len(tracks.trust) < LEAST_TRACKS:
         return disparity, confidence
     cameras = Cameras(shots.K[frames], shots.c2w[frames])
-    groups = [g for g in gather(tracks) if len(g.members) >= LEAST_TRACKS]
+    groups = gather(tracks)
     shapes = [s for g in groups if (s := shape_of(tracks, g, cameras))]
     say(f"depth: the shape of {len(shapes)} of {len(groups)} moving things found from {len(tracks.trust)} tracks")
     disparity, confidence = disparity.copy(), confidence.copy()
