@@ -1,4 +1,5 @@
-"""Frames per second of a field of Gaussians: radiance, depth, motion and scene flow both ways, tone-mapped to what a camera records.
+"""Frames per second of a field of Gaussians: they move to the frame's time and are drawn as radiance, depth and motion share, tone-mapped
+to what a camera records; and the same with the scene flow to either side.
 
     python benchmarks/frames.py [--run RUN] [--sizes 240x136,720x480] [--counts 5000,20000,80000] [--threads 1,2] [--plot PLOT.png]
 
@@ -10,9 +11,9 @@ import argparse
 import json
 import platform
 import statistics
-import time
 from dataclasses import replace
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numba
@@ -47,11 +48,12 @@ def main() -> None:
             tonemapper.to(device)
             for threads in map(int, args.threads.split(",")):
                 numba.set_num_threads(threads)
-                rows.append(
-                    {"gaussians": len(field.static) + len(field.moving), "width": width, "height": height, "threads": threads}
-                    | measure(field, tonemapper, replace(camera, K=camera.K.to(device), c2w=camera.c2w.to(device)), args.frames)
-                )
-                print(json.dumps(rows[-1] | {"device": name_of(device)}), flush=True)
+                where = replace(camera, K=camera.K.to(device), c2w=camera.c2w.to(device))
+                for flow in (False, True):
+                    about = {"gaussians": len(field.static) + len(field.moving), "width": width, "height": height}
+                    about |= {"threads": threads, "scene_flow": flow}
+                    rows.append(about | measure(field, tonemapper, where, args.frames, flow))
+                    print(json.dumps(rows[-1] | {"device": name_of(device)}), flush=True)
     if args.plot:
         plot(rows, args.plot)
 
@@ -89,12 +91,13 @@ def made_up(count: int, camera: Camera) -> Splat:
 
 
 @torch.no_grad()
-def measure(field: Splat, tonemapper: ToneMapper, camera: Camera, frames: int) -> dict[str, float]:
+def measure(field: Splat, tonemapper: ToneMapper, camera: Camera, frames: int, flow: bool) -> dict[str, float]:
     """Median milliseconds of a frame, and how many a second that are."""
 
     def frame(i: int) -> Tensor:
         hold_threads(1)
-        render = field.render(camera, float(field.times[0]) + (i % 97) / 97 * float(field.times[-1] - field.times[0]))
+        time = float(field.times[0]) + (i % 97) / 97 * float(field.times[-1] - field.times[0])
+        render = field.render(camera, time, scene_flow=flow)
         rgb = tonemapper(render.radiance, 0, 0, None, leaky=False)
         if rgb.is_cuda:
             torch.cuda.synchronize()
@@ -104,20 +107,21 @@ def measure(field: Splat, tonemapper: ToneMapper, camera: Camera, frames: int) -
         frame(i)
     spent = []
     for i in range(frames):
-        start = time.perf_counter()
+        start = perf_counter()
         frame(7 * i)
-        spent.append(time.perf_counter() - start)
+        spent.append(perf_counter() - start)
     middle = statistics.median(spent)
     return {"ms": round(1e3 * middle, 2), "frames_per_second": round(1 / middle, 1)}
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Milliseconds against Gaussians, a line for every size and number of threads."""
+    """Milliseconds against Gaussians without scene flow, a line for every size and number of threads."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    rows = [r for r in rows if not r["scene_flow"]]
     figure, axes = plt.subplots(figsize=(6, 4))
     for width, height, threads in sorted({(r["width"], r["height"], r["threads"]) for r in rows}):
         some = [r for r in rows if (r["width"], r["height"], r["threads"]) == (width, height, threads)]

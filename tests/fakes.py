@@ -48,7 +48,7 @@ class DiscBeforeWall:
         motion = torch.tensor([1.0, 0.0]).expand_as(alpha)
         return Layers(positions, alpha, torch.stack([red, gradient], 1), {1: flow, -1: -flow}, motion)
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         self.calls += 1
         layers = self.layers(camera, time, pixels)
         near = layers.alpha[:, 0, None]

@@ -65,7 +65,7 @@ class Scaled(DiscBeforeWall):
 
     factor = torch.ones(3)
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         seen = super().render(camera, time, pixels)
         return replace(seen, radiance=seen.radiance * self.factor)
 

@@ -37,7 +37,7 @@ class Wrong(DiscBeforeWall):
 
     deeper, faster, flicker = 1.0, 1.0, 0.0
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         seen = super().render(camera, time, pixels)
         flow = {o: f * self.faster for o, f in seen.scene_flow.items()}
         return replace(
@@ -50,7 +50,7 @@ class Still(DiscBeforeWall):
 
     layers = None  # type: ignore[assignment]
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         return replace(DiscBeforeWall(speed=self.speed, red=self.red).render(camera, time, pixels), scene_flow={})
 
 
@@ -138,7 +138,7 @@ def test_depth_errors_are_in_true_units_after_the_scale(tmp_path: Path) -> None:
 
 
 class DiscTooFar(DiscBeforeWall):
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         seen = super().render(camera, time, pixels)
         return replace(seen, depth=seen.depth * (1 + 0.12 * seen.motion))
 

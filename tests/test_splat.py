@@ -180,22 +180,22 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(toy: Scene, toy_folder
 def test_invisible_gaussians_are_left_alone_by_the_regularisers() -> None:
     field = scattered()
     field.static.logits.data[:10] = -10.0
-    own = field.regularizers(3.0)
+    own = field.regularizers(field.cloud(3.0), 3.0)
     (own["opacity"] + own["scale"]).backward()
     for g in (field.static.logits.grad, field.static.log_scales.grad):
         assert g is not None and float(g[:10].abs().max()) == 0 and float(g[10:].abs().min()) > 0
     field.static.log_scales.data[:10] += 5.0
-    torch.testing.assert_close(field.regularizers(3.0)["scale"], own["scale"])
+    torch.testing.assert_close(field.regularizers(field.cloud(3.0), 3.0)["scale"], own["scale"])
 
 
 def test_the_regularisers_of_a_plain_field_by_hand() -> None:
     field = card_field()
-    own = {k: float(v.detach()) for k, v in field.regularizers(3.0).items()}
+    own = {k: float(v.detach()) for k, v in field.regularizers(field.cloud(3.0), 3.0).items()}
     assert own["opacity"] == pytest.approx(1 / (1 + math.exp(-6)))
     assert own["scale"] == pytest.approx((825 * (0.2 + 1e-3) + 121 * (0.08 + 1e-3)) / 3 / 946, rel=1e-5)  # near is 1
     assert own["trajectory"] < 1e-12 and own["shade"] == own["colour_change"] == 0  # even steps, constant colours
     field.moving.offsets.data[3] = 2.0  # up and down between 7 times: 2 of 6 differences; 1 of 7 times
-    assert float(field.regularizers(3.0)["colour_change"].detach()) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
+    assert float(field.regularizers(field.cloud(3.0), 3.0)["colour_change"].detach()) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
 
 
 @pytest.mark.parametrize("config", [{"moving": 0}, {"static": 0}, {"colour_knots": 1, "presence_knots": 1, "shade_knots": 1}])
@@ -302,3 +302,20 @@ def test_a_trained_start_knows_the_cards_flow(toy: Scene) -> None:
     step = np.array([*(card_offset(3.0) - offset), 0])
     flow = field.render(f.camera, 2.0, pixel[None]).scene_flow[1][0].numpy()
     assert flow == pytest.approx(step, abs=0.03)
+
+
+def test_a_picture_without_scene_flow_is_the_same_picture() -> None:
+    field = scattered()
+    whole, plain = field.render(CAMERA, 3.3), field.render(CAMERA, 3.3, scene_flow=False)
+    assert set(whole.scene_flow) == {1, -1} and plain.scene_flow == {}
+    for name in ("radiance", "depth", "opacity", "motion"):
+        torch.testing.assert_close(getattr(plain, name), getattr(whole, name))
+
+
+def test_flow_with_a_camera_that_learns_reaches_its_pose() -> None:
+    field, batch = card_field(), batch_of(4, 1)
+    pose = BESIDE.c2w.clone().requires_grad_()
+    moved = field.displacements(replace(batch, neighbours={1: BESIDE.moved(pose)}), field.cloud(4.0).means, 4.0, 1)
+    torch.testing.assert_close(moved, field.displacements(batch, field.cloud(4.0).means, 4.0, 1))
+    moved[:, 0].sum().backward()
+    assert pose.grad is not None and float(pose.grad[0, 3]) < 0  # a camera that goes right sees everything go left

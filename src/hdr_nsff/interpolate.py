@@ -59,14 +59,16 @@ def neighbours(time: float, times: Sequence[float]) -> tuple[float, float, float
 
 
 @torch.no_grad()
-def render_at(field: RadianceField, camera: Camera, time: float, times: Sequence[float], mode: Mode = "auto") -> Render:
+def render_at(
+    field: RadianceField, camera: Camera, time: float, times: Sequence[float], mode: Mode = "auto", scene_flow: bool = True
+) -> Render:
     """The whole picture (S = height * width, row by row) at any `time`; `times` are the training times in order.
 
     `auto` splats where the field has layers and asks directly where it has none; `splat` demands layers. A splatted
-    `Render` carries no scene flow."""
+    `Render` carries no scene flow, nor does one without `scene_flow`."""
     before, after, fraction = neighbours(time, times)
     if fraction == 0 or mode == "direct" or (mode == "auto" and not isinstance(field, LayeredField)):
-        return field.render(camera, time)
+        return field.render(camera, time, scene_flow=scene_flow)
     assert isinstance(field, LayeredField), f"{type(field).__name__} has no layers to splat"
     moved, unmoved = zip(
         splat(field.layers(camera, before), camera, 1, fraction),

@@ -73,12 +73,12 @@ def device_of(run: Run) -> torch.device:
     return run.tonemapper.knots.device
 
 
-def take(run: Run, view: View, between: Mode = "auto") -> Still:
-    """The picture of one view."""
+def take(run: Run, view: View, between: Mode = "auto", motion: bool = True) -> Still:
+    """The picture of one view; without `motion` vectors it is there sooner."""
     hold_threads(run.config.torch_threads)
     camera = to_device(view.camera, device_of(run))
     with torch.no_grad():
-        seen = render_at(run.field, camera, view.time, run.scene.times.tolist(), between)
+        seen = render_at(run.field, camera, view.time, run.scene.times.tolist(), between, motion)
         flow = motion_vectors(seen, camera)
 
     def image(values: torch.Tensor) -> np.ndarray:
@@ -105,7 +105,7 @@ def develop(run: Run, radiance: np.ndarray, ev: float | None, camera_id: int, ex
 def display_exposure(run: Run, views: Sequence[View]) -> float:
     """One display exposure for a whole shot, from three small pictures of it."""
     probes = [views[i] for i in sorted({0, len(views) // 2, len(views) - 1})]
-    seen = [take(run, v.resized(0.25), "direct").radiance.reshape(-1, 3) for v in probes]
+    seen = [take(run, v.resized(0.25), "direct", motion=False).radiance.reshape(-1, 3) for v in probes]
     return color.auto_exposure(np.concatenate(seen))
 
 
@@ -188,7 +188,7 @@ def write_view(run: Run, view: View, picture: Path, output: Output, exposure: fl
     exr = picture.with_suffix(".exr")
     if picture.exists() and (output.exr == "none" or exr.exists()):
         return
-    still = take(run, view, output.between)
+    still = take(run, view, output.between, motion=output.exr != "none")
     ev = view.ev if view.ev is not None else output.ev
     if output.exr != "none":
         shown = {"developedEV": float(ev)} if ev is not None else {"displayExposure": exposure}

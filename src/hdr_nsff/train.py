@@ -279,7 +279,7 @@ class Trainer:
         """The middle frame as recorded and as rendered, side by side."""
         i = len(self.scene.train) // 2
         f = self.scene.train[i]
-        render = self.field.render(f.camera, f.time)
+        render = self.field.render(f.camera, f.time, scene_flow=False)
         rgb = self.tonemapper(render.radiance, f.bracket, f.camera_id, i, leaky=False).view_as(f.image)
         pair = torch.cat([f.image, rgb], 1).cpu().numpy()
         write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)

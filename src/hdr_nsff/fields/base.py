@@ -67,8 +67,9 @@ class GaussianCloud:
 class RadianceField(Protocol):
     """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses by type."""
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
-        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks itself. `time` in frames, may be fractional."""
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
+        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks itself. `time` in frames, may be fractional.
+        Whoever does not need the scene flow has the picture sooner."""
         ...
 
     def __call__(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:

@@ -191,14 +191,14 @@ class NSFF(nn.Module):
     # Rendering
 
     @torch.no_grad()
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         """Every pixel of `camera` (row by row) or `pixels` (S, 2) at `time` in frames, in chunks, without gradients."""
         pixels = camera.pixel_grid() if pixels is None else pixels
         was_training = self.training
         self.eval()
         parts = [self.render_chunk(camera, time, chunk) for chunk in pixels.split(8192)]
         self.train(was_training)
-        flows = {o: torch.cat([p.scene_flow[o] for p in parts]) for o in (FORWARD, BACKWARD)}
+        flows = {o: torch.cat([p.scene_flow[o] for p in parts]) for o in (FORWARD, BACKWARD) if scene_flow}
         radiance, depth, opacity, motion = (
             torch.cat(maps) for maps in zip(*((p.radiance, p.depth, p.opacity, p.motion) for p in parts), strict=True)
         )

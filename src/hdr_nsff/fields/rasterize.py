@@ -34,7 +34,8 @@ def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Ten
     match means.device.type if means.dtype == torch.float32 else None:
         case "cpu":
             maps, alpha = Rasterize.apply(*gaussians, world_to_camera(camera), camera)
-            return Maps(maps[:-1].permute(1, 2, 0), maps[-1], alpha)
+            seen, depth = maps.split([len(maps) - 1, 1])  # whose gradients are joined, where slices' would be added up
+            return Maps(seen.permute(1, 2, 0), depth[0], alpha)
         case "cuda" if rasterize_cuda.available():
             rules = camera.width, camera.height, kernels.NEAREST, kernels.BLUR
             return Maps(*rasterize_cuda.composite(*gaussians, world_to_camera(camera), camera.K, *rules))

@@ -138,34 +138,35 @@ class Splat(nn.Module):
         cloud = self.cloud(self.knot(time))
         return tree_map(lambda t: t[cloud.opacities > FAINTEST], cloud)
 
-    def composed(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,)."""
+    def composed(self, maps: Maps) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,) and what else was drawn (S, ...)."""
         alpha = maps.alpha.reshape(-1)
-        seen = maps.features.flatten(0, 1)
-        radiance = seen[:, :3] + (1 - alpha)[:, None] * self.background.clamp_max(BRIGHTEST).exp()
+        seen, motion, extra = maps.features.flatten(0, 1).split([3, 1, maps.features.shape[-1] - 4], 1)
+        radiance = seen + (1 - alpha)[:, None] * self.background.clamp_max(BRIGHTEST).exp()
         depth = maps.depth.reshape(-1) / alpha.clamp_min(1e-3)
         depth = torch.where(alpha > 1e-3, depth, torch.full_like(depth, self.far))
-        return radiance, depth.clamp_min(1e-3 * self.unit), alpha, seen[:, 3]
+        return radiance, depth.clamp_min(1e-3 * self.unit), alpha, motion[:, 0], extra
 
     @torch.no_grad()
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Render:
+    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
         """Every pixel of `camera` (row by row) or the ones `pixels` (S, 2) lie in, at `time` in frames, without gradients.
         Scene flow is the displacement to one training interval later and earlier; at the clip's ends it goes straight on."""
         knot = self.knot(time)
         cloud = self.cloud(knot)
-        here = cloud.means
-        flow = [torch.zeros_like(here), torch.zeros_like(here)]
-        last = len(self.times) - 1
-        for i, o in enumerate((1, -1)):
-            inside = 0 <= knot + o <= last
-            if inside or 0 <= knot - o <= last:
-                flow[i] = self.positions(knot + o) - here if inside else here - self.positions(knot - o)
-        maps = self.draw(camera, cloud, flow)
-        radiance, depth, opacity, motion = self.composed(maps)
-        depth = depth.clamp(self.near, self.far)
-        seen = maps.features.flatten(0, 1)
-        render = Render(radiance, depth, opacity, motion, {1: seen[:, 4:7], -1: seen[:, 7:10]})
+        maps = self.draw(camera, cloud, self.steps(cloud.means, knot) if scene_flow else [])
+        radiance, depth, opacity, motion, moved = self.composed(maps)
+        flows = {1: moved[:, :3], -1: moved[:, 3:]} if scene_flow else {}
+        render = Render(radiance, depth.clamp(self.near, self.far), opacity, motion, flows)
         return render if pixels is None else picked(render, camera, pixels)
+
+    def steps(self, means: Tensor, knot: float) -> list[Tensor]:
+        """From `means` (G, 3) at a knot to those one training interval later and earlier: two (G, 3)."""
+        steps = [torch.zeros_like(means), torch.zeros_like(means)]
+        for i, o in enumerate((1, -1)):
+            inside = 0 <= knot + o <= len(self.times) - 1
+            if inside or 0 <= knot - o <= len(self.times) - 1:
+                steps[i] = self.positions(knot + o) - means if inside else means - self.positions(knot - o)
+        return steps
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
         """A training render of the whole frame, read off at the batch's pixels; flow to one neighbour as a warp; regularisers."""
@@ -175,31 +176,26 @@ class Splat(nn.Module):
         cloud = self.cloud(knot)
         flows = [self.displacements(batch, cloud.means, knot, o) for o in wanted]
         maps = self.draw(batch.camera, cloud, flows)
-        radiance, depth, opacity, motion = self.composed(maps)
-        seen = maps.features.flatten(0, 1)
-        scale = 1 / opacity.clamp_min(1e-3)[:, None]
-        warps = tuple(
-            Warp(o, seen[:, 4 + 2 * i : 6 + 2 * i] * scale, torch.ones_like(opacity), None) for i, o in enumerate(wanted)
-        )
+        radiance, depth, opacity, motion, moved = self.composed(maps)
+        moved = moved / opacity.clamp_min(1e-3)[:, None]
+        warps = tuple(Warp(o, moved[:, 2 * i : 2 * i + 2], torch.ones_like(opacity), None) for i, o in enumerate(wanted))
         render = Render(radiance, depth, opacity, motion, {}, warps)
         self.trajectories.mark(knot)
-        return picked(render, batch.camera, batch.pixels), self.regularizers(knot)
+        return picked(render, batch.camera, batch.pixels), self.regularizers(cloud, knot)
 
     def displacements(self, batch: PixelBatch, means: Tensor, knot: float, offset: int) -> Tensor:
         """Pixels (G, 2) from where the batch's camera sees each Gaussian's mean (G, 3) to where the neighbour sees it at its time."""
-        here = batch.camera.project(means)[0]
-        there = batch.neighbours[offset].project(self.positions(min(max(knot + offset, 0), len(self.times) - 1)))[0]
-        return (there - here).clamp(-2 * batch.camera.width, 2 * batch.camera.width)
+        there = self.positions(min(max(knot + offset, 0), len(self.times) - 1))
+        camera, neighbour, limit = batch.camera, batch.neighbours[offset], 2.0 * batch.camera.width
+        return (neighbour.project(there)[0] - camera.project(means)[0]).clamp(-limit, limit)
 
-    def regularizers(self, knot: float) -> dict[str, Tensor]:
-        """Terms of the field's own: opacities and scales (Kheradmand et al. 2024), smooth poses, slow colours."""
+    def regularizers(self, cloud: GaussianCloud, knot: float) -> dict[str, Tensor]:
+        """Terms of the field's own: opacities and scales (Kheradmand et al. 2024) of the `cloud` at `knot`, smooth poses, slow colours."""
         still, moving = self.static, self.moving
-        opacities = self.opacities(self.share(knot))
-        scales = torch.cat([still.log_scales, moving.log_scales]).exp()
-        alive = opacities.detach() > FAINTEST
+        alive = cloud.opacities.detach() > FAINTEST
         return {
-            "opacity": (opacities * alive).mean(),
-            "scale": (scales * alive[:, None]).mean() / self.unit,
+            "opacity": (cloud.opacities * alive).mean(),
+            "scale": (cloud.scales * alive[:, None]).mean() / self.unit,
             "trajectory": self.trajectories.roughness(knot, self.unit),
             "shade": mean_square(still.offsets),
             "presence": mean_square(self.presence.diff(dim=0)),

@@ -51,7 +51,7 @@ def look(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
     """The channels of one view. Where a time between frames is splatted, the field itself is asked for its scene flow there."""
     camera, times = to_device(view.camera, device_of(run)), run.scene.times.tolist()
     with torch.no_grad():
-        seen = render_at(run.field, camera, view.time, times)
+        seen = render_at(run.field, camera, view.time, times, scene_flow=motion)
         flows = (seen.scene_flow or run.field.render(camera, view.time).scene_flow) if motion else {}
 
     def image(values: Tensor) -> np.ndarray:
