@@ -56,9 +56,10 @@ def pixel_of(point: Tensor) -> int:
     return y * CAMERA.width + x
 
 
-def scattered(seed: int = 0, static: int = 40, moving: int = 30) -> Splat:
+def scattered(seed: int = 0, static: int = 40, moving: int = 30, view_dependence: bool = False) -> Splat:
     """Anything anywhere in view, with something in every parameter."""
-    field = Splat(SplatConfig(static=static, moving=moving, bases=3), torch.arange(TIMES), 1.0, 6.0, 1200)
+    config = SplatConfig(static=static, moving=moving, bases=3, view_dependence=view_dependence)
+    field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
     generator = torch.Generator().manual_seed(seed)
     for p in field.parameters():
         p.data.add_(0.1 * torch.randn(p.shape, generator=generator))
@@ -153,7 +154,7 @@ def test_shares_stay_between_0_and_1(seed: int) -> None:
 
 
 def test_gradients_reach_every_parameter() -> None:
-    field = scattered()
+    field = scattered(view_dependence=True)
     render, own = field(batch_of(4, 1))
     total = render.radiance.square().sum() + render.depth.sum() + render.motion.sum() + render.warps[0].flow.square().sum()
     (total + sum(own.values())).backward()
@@ -319,3 +320,30 @@ def test_flow_with_a_camera_that_learns_reaches_its_pose() -> None:
     torch.testing.assert_close(moved, field.displacements(batch, field.cloud(4.0).means, 4.0, 1))
     moved[:, 0].sum().backward()
     assert pose.grad is not None and float(pose.grad[0, 3]) < 0  # a camera that goes right sees everything go left
+
+
+def test_neighbours_that_mix_alike_are_rigid_and_others_pay() -> None:
+    field = card_field()  # all mixtures alike; a grid of 11 x 11 Gaussians
+    field.look_around()
+    assert set(field.beside[60].tolist()) == {49, 59, 61, 71}  # the middle one's four
+    assert float(field.rigidity().detach()) == 0
+    field.mixture_logits.data[:, 60] = torch.tensor([1.0, -1.0])  # 0.8808 and 0.1192 instead of halves
+    pairs = int((field.beside == 60).sum()) + 4  # it looks at its four neighbours, and some look at it
+    assert float(field.rigidity().detach()) == pytest.approx(pairs * 2 * 0.3808**2 / (121 * 4 * 2), rel=1e-3)
+    field.rigidity().backward()
+    assert field.mixture_logits.grad is not None and float(field.mixture_logits.grad[0, 60]) > 0
+
+
+def test_colours_depend_on_the_direction_of_view_only_where_wanted() -> None:
+    plain, shiny = (Splat(SplatConfig(1, 0, view_dependence=v), torch.arange(2), 1.0, 6.0, 1200) for v in (False, True))
+    assert plain.static.sheen.numel() == 0
+    with torch.no_grad():
+        for field in (plain, shiny):
+            field.static.means[:] = torch.tensor([0.0, 0.0, 2.0])
+            field.static.log_scales[:], field.static.logits[:] = 0.0, 9.0
+        shiny.static.sheen[0, 1, 0] = 1.0  # green grows to the right
+        beside = CAMERA.moved(torch.tensor([[0.8, 0, 0.6, -1.5], [0, 1, 0, 0], [-0.6, 0, 0.8, 0]]))  # sees it along (0.6, 0, 0.8)
+        middle = torch.tensor([[20.0, 15.0]])
+        for camera, direction in ((CAMERA, 0.0), (beside, 0.6)):
+            ratio = shiny.render(camera, 0.0, middle).radiance / plain.render(camera, 0.0, middle).radiance
+            torch.testing.assert_close(ratio[0], torch.tensor([1.0, math.exp(direction), 1.0]), atol=2e-3, rtol=2e-3)

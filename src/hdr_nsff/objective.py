@@ -52,6 +52,10 @@ class LossWeights:
     """Square of moving Gaussians' changes of opacity logit from one knot to the next."""
     colour_change: float = 0.01
     """Square of moving Gaussians' changes of log radiance from one colour knot to the next."""
+    rigidity: float = 1.0
+    """Square of the differences in how neighbouring moving Gaussians mix the shared motions."""
+    sheen: float = 0.01
+    """Square of Gaussians' changes of log radiance with the direction of view."""
     response_smoothness: float = 1e-3
     gain_residual: float = 1.0
     response_anchor: float = 100.0

@@ -19,6 +19,7 @@ from hdr_nsff.batch import PixelBatch, draw_pixels, whole_frame
 from hdr_nsff.config import TrainConfig, check
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field, start_field
+from hdr_nsff.fields.base import Look
 from hdr_nsff.fields.encodings import TouchedAdam
 from hdr_nsff.io import write_png, writing_to
 from hdr_nsff.objective import Objective
@@ -30,6 +31,7 @@ from hdr_nsff.tensors import hold_threads, to_device
 from hdr_nsff.tonemap import ToneMapper, informative
 
 LOG_EVERY = 25  # steps
+SETTLED = 0.8  # of the run: after that nothing is rearranged any more
 
 
 @dataclass(frozen=True)
@@ -217,10 +219,23 @@ class Trainer:
             if name == "dense":  # the touched one clears what it used
                 optimiser.zero_grad()
         self.ranks.max_buffers(self.field.shared_maxima())
-        self.field.after_step(clock.step + 1)
+        self.field.after_step(clock.step + 1, self.looks if clock.progress < SETTLED else None)
         if "mse" in totals:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
+
+    @torch.no_grad()
+    def looks(self, count: int) -> list[Look]:
+        """How wrong the field is in `count` training frames, evenly spread; others every step."""
+        num = len(self.scene.train)
+        chosen = sorted({int((i + self.clock.step % 97 / 97) * num / count) % num for i in range(min(count, num))})
+        found = []
+        for i in chosen:
+            f = self.scene.train[i]
+            seen = self.field.render(f.camera, f.time, scene_flow=False)
+            rgb = self.tonemapper(seen.radiance, f.bracket, f.camera_id, i, leaky=False).view_as(f.image)
+            found.append(Look(f.camera, f.time, (rgb - f.image).abs().mean(-1)))
+        return found
 
     @torch.no_grad()
     def squared_error(self, radiance: Tensor, batch: PixelBatch) -> float:

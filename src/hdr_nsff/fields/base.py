@@ -6,6 +6,7 @@ field rasterises the frame and reads them off."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -52,6 +53,15 @@ class Layers:
 
 
 @dataclass(frozen=True)
+class Look:
+    """How wrong a field is in one training frame."""
+
+    camera: Camera
+    time: float  # in frames
+    error: Tensor  # (H, W) mean absolute difference of the recorded values over the channels
+
+
+@dataclass(frozen=True)
 class GaussianCloud:
     """G Gaussians at one time."""
 
@@ -80,6 +90,7 @@ class RadianceField(Protocol):
         """Parameter groups with their learning rates, for the optimiser."""
         ...
 
-    def after_step(self, step: int) -> None:
-        """Housekeeping between optimiser steps (culling grids, schedules)."""
+    def after_step(self, step: int, looks: Callable[[int], list[Look]] | None) -> None:
+        """Housekeeping between optimiser steps (culling grids, schedules). `looks(n)` renders n training frames and says how wrong they
+        are; None late in a run, when nothing is to be rearranged any more."""
         ...

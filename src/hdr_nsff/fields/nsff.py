@@ -6,6 +6,7 @@ position on the list of training times. `M` counts the samples that survive cull
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -15,7 +16,7 @@ from torch import Tensor, nn
 from hdr_nsff import volume
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import Layers, Render
+from hdr_nsff.fields.base import Layers, Look, Render
 from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpBranches, MlpConfig
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.motion import Motion
@@ -293,7 +294,7 @@ class NSFF(nn.Module):
         return self.branches.param_groups()
 
     @torch.no_grad()
-    def after_step(self, step: int) -> None:
+    def after_step(self, step: int, looks: Callable[[int], list[Look]] | None) -> None:
         """Refresh the culling grids every 16 steps once they have seen enough."""
         self.step = step
         if self.config.cull and step >= self.config.cull_after and step % 16 == 0:

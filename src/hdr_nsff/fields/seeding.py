@@ -126,6 +126,7 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
     count = place(field.moving, kept)
     hide_unseen(field, tracks, groups, kept_owner[:count])
     share_bases(field, groups, kept.positions[:count], kept_owner[:count])
+    field.look_around()
     return len(groups), count
 
 

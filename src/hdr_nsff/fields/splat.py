@@ -5,21 +5,27 @@ The number of Gaussians is fixed by the settings; ones that fade away draw nothi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import GaussianCloud, Render, Warp
+from hdr_nsff.fields.base import GaussianCloud, Look, Render, Warp
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.rasterize import Maps, rasterize
+from hdr_nsff.fields.renewal import renew
 from hdr_nsff.fields.trajectories import Trajectories
 from hdr_nsff.tensors import tree_map
 
 BRIGHTEST = 16.0  # log radiance beyond this is held: exp stays finite
+BESIDE = 4  # neighbours of a moving Gaussian
+GLOSSIEST = 2.0  # log radiance may change by this much with the direction
+RENEW_LOOKS = 24  # training frames that say what is wrong and what is seen
 FAINTEST = 0.003  # opacity below which a Gaussian draws nothing
 
 
@@ -39,6 +45,10 @@ class SplatConfig:
     """Times at which a static Gaussian has a brightness of its own (1: none)."""
     presence_knots: int = 13
     """Times at which a moving Gaussian has an opacity of its own: things come and go."""
+    view_dependence: bool = False
+    """Colours change with the direction of view (to first order, in log radiance): for shiny things seen from many sides."""
+    renew_every: int = 200
+    """Steps after which Gaussians that nobody sees are put where the picture is wrong (0: never)."""
     lr: float = 1.0
     """Multiplies all learning rates below."""
     place_lr: float = 2e-3
@@ -58,7 +68,7 @@ class SplatConfig:
 class Gaussians(nn.Module):
     """`count` Gaussians at rest, with `knots` log-radiance offsets in time of `channels` (3: colours, 1: brightness)."""
 
-    def __init__(self, count: int, knots: int, channels: int) -> None:
+    def __init__(self, count: int, knots: int, channels: int, shiny: bool = False) -> None:
         super().__init__()
         self.means = nn.Parameter(torch.zeros(count, 3))  # scene units
         self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))  # w x y z
@@ -66,6 +76,7 @@ class Gaussians(nn.Module):
         self.logits = nn.Parameter(torch.full((count,), -10.0))  # of opacity
         self.log_radiance = nn.Parameter(torch.zeros(count, 3))
         self.offsets = nn.Parameter(torch.zeros(knots, count, channels))  # of log radiance, over the clip's time
+        self.sheen = nn.Parameter(torch.zeros(count if shiny else 0, 3, 3))  # change of log radiance by direction of view (xyz)
 
     def __len__(self) -> int:
         return len(self.means)
@@ -81,17 +92,21 @@ class Splat(nn.Module):
 
     times: Tensor
     background: Tensor
+    beside: Tensor
 
     def __init__(self, config: SplatConfig, times: Tensor, near: float, far: float, num_pixels: int) -> None:
         super().__init__()
         self.config, self.unit, self.near, self.far = config, near, near, far
         self.register_buffer("times", times.double())
         static, moving = config.counts(num_pixels)
-        self.static = Gaussians(static, config.shade_knots, 1)
-        self.moving = Gaussians(moving, config.colour_knots, 3)
+        self.static = Gaussians(static, config.shade_knots, 1, config.view_dependence)
+        self.moving = Gaussians(moving, config.colour_knots, 3, config.view_dependence)
         self.presence = nn.Parameter(torch.zeros(config.presence_knots, moving))  # offsets to the moving ones' opacity logits
         self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
         self.trajectories = Trajectories(config.bases, len(times))
+        self.register_buffer(
+            "beside", torch.arange(moving, dtype=torch.int32)[:, None].repeat(1, BESIDE)
+        )  # (M, BESIDE) neighbours
         self.background = nn.Parameter(torch.zeros(3))  # log radiance where no Gaussian is
 
     def knot(self, time: float) -> float:
@@ -119,8 +134,16 @@ class Splat(nn.Module):
 
     def draw(self, camera: Camera, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
         """Rasterise radiance (3), motion (1) and `extra` features (G, ...)."""
-        features = torch.cat([cloud.radiance, cloud.motion[:, None], *extra], 1)
+        radiance = cloud.radiance * self.gloss(camera, cloud.means) if self.config.view_dependence else cloud.radiance
+        features = torch.cat([radiance, cloud.motion[:, None], *extra], 1)
         return rasterize(cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features, camera)
+
+    def gloss(self, camera: Camera, means: Tensor) -> Tensor:
+        """Factors (G, 3) of radiance for the directions in which `camera` sees the `means` (G, 3): those of spherical harmonics of
+        degree 1 in log radiance."""
+        toward = nn.functional.normalize(means - camera.c2w[:, 3], dim=-1)
+        sheen = torch.cat([self.static.sheen, self.moving.sheen])
+        return (sheen @ toward[..., None])[..., 0].clamp(-GLOSSIEST, GLOSSIEST).exp()
 
     def opacities(self, share: float) -> Tensor:
         """(G,) in [0, 1] at a share of the clip."""
@@ -200,14 +223,28 @@ class Splat(nn.Module):
             "shade": mean_square(still.offsets),
             "presence": mean_square(self.presence.diff(dim=0)),
             "colour_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),
+            "rigidity": self.rigidity(),
+            "sheen": mean_square(still.sheen) + mean_square(moving.sheen),
         }
+
+    def rigidity(self) -> Tensor:
+        """Mean square difference of the mixtures of neighbouring moving Gaussians: those that mix alike keep their distances."""
+        mixture = self.mixture_logits.softmax(0)
+        return mean_square(mixture[:, self.beside.long().flatten()] - mixture.repeat_interleave(self.beside.shape[1], 1))
+
+    @torch.no_grad()
+    def look_around(self) -> None:
+        """Find out anew which moving Gaussians lie beside each other."""
+        if len(self.moving) > BESIDE:
+            places = self.moving.means.cpu().numpy()
+            self.beside.copy_(torch.from_numpy(cKDTree(places).query(places, BESIDE + 1)[1][:, 1:]))
 
     def param_groups(self) -> list[dict[str, Any]]:
         """Groups by kind of parameter; only the poses near the drawn frame move."""
         c, both = self.config, (self.static, self.moving)
         rates = {
             "means": c.place_lr * self.unit, "quaternions": c.shape_lr, "log_scales": c.shape_lr, "logits": c.opacity_lr,
-            "log_radiance": c.colour_lr, "offsets": c.colour_lr,
+            "log_radiance": c.colour_lr, "offsets": c.colour_lr, "sheen": c.colour_lr,
         }  # fmt: skip
         groups: list[dict[str, Any]] = [
             {"params": [getattr(g, name) for g in both], "lr": c.lr * rate, "eps": 1e-15} for name, rate in rates.items()
@@ -219,8 +256,15 @@ class Splat(nn.Module):
         groups.append({"params": [t.turns, t.shifts], "lr": c.lr * c.pose_lr, "touched": touched})
         return groups
 
-    def after_step(self, step: int) -> None:
-        """Nothing to do between steps."""
+    def companions(self, gaussians: Gaussians) -> list[Tensor]:
+        """What belongs to each Gaussian (in the last dimension) besides its own parameters."""
+        return [self.presence, self.mixture_logits] if gaussians is self.moving else []
+
+    def after_step(self, step: int, looks: Callable[[int], list[Look]] | None) -> None:
+        """Now and then, Gaussians that nobody sees go where the picture is wrong."""
+        if looks is not None and self.config.renew_every and step % self.config.renew_every == 0:
+            renew(self, looks(RENEW_LOOKS), torch.Generator().manual_seed(step))
+            self.look_around()
 
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""

@@ -1,0 +1,125 @@
+"""Gaussians that nobody sees go where the picture is wrong, and nothing else changes."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from presets import small, trainer
+from test_splat import CAMERA, card_field, scattered
+
+from hdr_nsff.camera import Camera
+from hdr_nsff.fields.base import Look
+from hdr_nsff.fields.rasterize import dense
+from hdr_nsff.fields.renewal import MOST, NARROWER, PARTED, blame, halve, renew
+from hdr_nsff.fields.splat import Splat
+from hdr_nsff.scene import Scene
+
+
+def look(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> Look:
+    return Look(camera, time, torch.ones(camera.height, camera.width) if error is None else error)
+
+
+def corner() -> torch.Tensor:
+    """An error in the picture's upper left quarter alone."""
+    error = torch.zeros(CAMERA.height, CAMERA.width)
+    error[: CAMERA.height // 2, : CAMERA.width // 2] = 1
+    return error
+
+
+def test_blame_is_the_weights_of_the_slow_twin_times_the_error() -> None:
+    field, error = scattered(), torch.rand(CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(1))
+    cloud = field.cloud(field.knot(3.0))
+    parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
+    own = dense(*(p.detach() for p in parts), torch.eye(len(cloud.means)), CAMERA)  # weights
+    told = blame(field, look(error))
+    torch.testing.assert_close(told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(told[:, 1], own.features.sum((0, 1)), atol=1e-3, rtol=1e-3)
+
+
+def in_corner(field: Splat) -> int:
+    """Static Gaussians in and around the picture's upper left quarter."""
+    pixels, _ = CAMERA.project(field.static.means.detach())
+    low = torch.tensor([-2.0, -2.0])
+    high = torch.tensor([CAMERA.width / 2 + 2, CAMERA.height / 2 + 2])
+    return int(((pixels > low) & (pixels < high)).all(1).sum())
+
+
+def test_unseen_gaussians_go_where_the_error_is() -> None:
+    field = card_field()
+    field.static.logits.data[::20] = -10.0  # faded away; others lie outside the picture
+    there = in_corner(field)
+    count = renew(field, [look(corner())], torch.Generator().manual_seed(0))
+    assert count == int(MOST * len(field.static))  # more are unseen
+    assert there + 0.6 * count < in_corner(field) <= there + count  # some were faint ones of that quarter
+
+
+def test_floaters_that_no_view_sees_are_put_to_use() -> None:
+    field = card_field()
+    field.static.means.data[:5] = torch.tensor([0.0, 0.0, -3.0])  # behind every camera
+    renew(field, [look()], torch.Generator().manual_seed(0))
+    assert bool((field.static.means[:5, 2] > 3).all())
+
+
+def test_a_gaussian_seen_in_any_look_stays() -> None:
+    field = card_field()
+    away = CAMERA.moved(torch.tensor([[1.0, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0]]))  # sees nothing
+    before = {n: p.detach().clone() for n, p in field.named_parameters()}
+    renew(field, [look(), look(camera=away)], torch.Generator().manual_seed(0))
+    seen = blame(field, look())[: len(field.static), 1] > 1
+    assert int(seen.sum()) > 200
+    kept = (field.static.means == before["static.means"]).all(1)
+    assert int((~kept & seen).sum()) <= 2 * MOST * len(field.static)  # the halves and what they were cut from
+
+
+def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
+    field = scattered()
+    g, told = field.moving, torch.zeros(30, 2)
+    told[:, 1], told[4, 0], told[7, 1] = 1.0, 3.0, 0.0  # all seen but the eighth; only the fifth is to blame
+    g.quaternions.data[4], g.log_scales.data[4] = torch.tensor([1.0, 0, 0, 0]), torch.tensor([-2.0, -1.0, -3.0])
+    mean, mixture, presence = g.means[4].detach().clone(), field.mixture_logits[:, 4].clone(), field.presence[:, 4].clone()
+    others = g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]].clone()
+    assert halve(g, told, field.companions(g), torch.Generator().manual_seed(0)) == 1
+    along = torch.tensor([0.0, PARTED * math.exp(-1.0), 0.0])
+    torch.testing.assert_close(g.means[4].detach(), mean - along)
+    torch.testing.assert_close(g.means[7].detach(), mean + along)
+    for i in (4, 7):
+        torch.testing.assert_close(g.log_scales[i].detach(), torch.tensor([-2.0, -1.0 + math.log(NARROWER), -3.0]))
+        torch.testing.assert_close(field.mixture_logits[:, i], mixture)
+        torch.testing.assert_close(field.presence[:, i], presence)
+    torch.testing.assert_close(g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]], others)
+
+
+def test_without_error_nothing_moves() -> None:
+    field = scattered()
+    before = [p.detach().clone() for p in field.parameters()]
+    assert renew(field, [look(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
+    assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
+
+
+@pytest.mark.parametrize("shiny", [False, True])
+def test_training_renews_until_late_in_the_run(toy: Scene, toy_folder: Path, tmp_path: Path, shiny: bool) -> None:
+    config = small("splat", toy_folder, tmp_path / "run", steps=10)
+    config = replace(config, field=replace(config.field, renew_every=1, view_dependence=shiny))
+    t = trainer(config, toy)
+    assert isinstance(t.field, Splat)
+    t.field.static.means.data[:40] = torch.tensor([0.0, 0.0, -50.0])  # floaters
+    behind = []
+    for _ in range(10):
+        t.field.static.means.data[40:50] = torch.tensor([0.0, 0.0, -50.0])
+        t.step()
+        behind.append(int((t.field.static.means[:50, 2] < 0).sum()))
+        t.clock = replace(t.clock, step=t.clock.step + 1)
+    assert behind[3] < 40  # at most 20 of 400 find a place at a time
+    assert behind[-1] >= 10 and behind[-2] >= 10  # from 80 % on nothing is rearranged
+
+
+def test_looks_are_the_recorded_differences(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+    t = trainer(small("splat", toy_folder, tmp_path / "run"), toy)
+    found = t.looks(len(toy.train))
+    assert [x.time for x in found] == [f.time for f in toy.train]
+    f = toy.train[2]
+    rgb = t.tonemapper(t.field.render(f.camera, f.time).radiance, f.bracket, f.camera_id, 2, leaky=False)
+    torch.testing.assert_close(found[2].error, (rgb.detach().view_as(f.image) - f.image).abs().mean(-1))
+    assert len({x.time for x in t.looks(3)}) == 3
