@@ -108,9 +108,11 @@ KNOWN: dict[str, Weights] = {
 def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     """Where the weights `name` are: a file, or the folder of a hub model.
 
-    `name`: of `KNOWN`, or OWNER/MODEL of any hub model. `given`: a file, or a folder that holds the file (or the hub model); it is
+    `name`: of `KNOWN`, a path, or OWNER/MODEL of any hub model. `given`: a file, or a folder that holds the file (or the hub model); it is
     taken as it is, and nothing else is looked at. `download`: whether the network may be asked. InputError where they are not to
     be had, or where their hash is wrong."""
+    if given is None and name not in KNOWN and Path(name).exists():
+        return Path(name)
     weights = entry(name)
     if given is not None:
         return given_path(weights, Path(given))
