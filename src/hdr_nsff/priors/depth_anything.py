@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 import torch
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 from torch.nn import functional
 
@@ -23,9 +23,10 @@ from hdr_nsff.progress import say, track
 Kind = Literal["relative", "metric"]
 TRIALS = 200  # pairs of points tried for a first scale and shift
 ROUNDS = 10  # of reweighting
-FEW = 12.0  # points whose say weighs as much as a neighbour in time
+FEW = 30  # points below which a frame listens to its neighbours in time
+QUIET = 0.005  # least noise of disparity, as a share of it: no network is better
 HALF = 0.1  # relative error of disparity at the points that halves the confidence
-FLOOR = 0.25  # of the smallest disparity of the points: nothing is farther
+FLOOR = 0.25  # of the smallest disparity of the points (all but 1 %): nothing is farther
 
 
 def network_disparity(network: Any, video: np.ndarray) -> tuple[np.ndarray, Kind]:
@@ -69,7 +70,7 @@ def anchored_depth(
             "or give depth maps (--depth FOLDER)"
         )
     lines, errors = align(seen, shift=kind == "relative")
-    least = FLOOR * min(float(s[:, 1].min()) for s in seen if len(s))
+    least = FLOOR * float(np.percentile(np.concatenate(seen)[:, 1], 1))
     disparity = np.maximum(lines[:, 0, None, None] * answered + lines[:, 1, None, None], least).astype(np.float32)
     trust = 1 / (1 + (errors / HALF) ** 2)
     confidence = np.stack([doubt_edges(d, np.full(d.shape, c, np.float32)) for d, c in zip(disparity, trust, strict=True)])
@@ -90,25 +91,31 @@ def sample(shots: Shots, t: int, points: np.ndarray, answered: np.ndarray) -> np
     at = pixels[inside]
     x, y = np.clip(at[:, 0].astype(int), 0, width - 1), np.clip(at[:, 1].astype(int), 0, height - 1)
     still = ~shots.moving[t, y, x]
-    there = cv2.remap(answered, (at[:, 0] - 0.5).astype(np.float32), (at[:, 1] - 0.5).astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.stack([there.reshape(-1), 1 / z[inside]], 1)[still].astype(np.float64)
+    there = map_coordinates(answered, (at[:, 1] - 0.5, at[:, 0] - 0.5), order=1, mode="nearest")
+    return np.stack([there, 1 / z[inside]], 1)[still].astype(np.float64)
 
 
 def align(seen: list[np.ndarray], shift: bool) -> tuple[np.ndarray, np.ndarray]:
     """Per frame the scale and shift (T, 2) that take answers to disparities (`seen`: per frame (N, 2) of both; without `shift` it is 0),
     and how far the points are from it, (T,), as a share of their disparity (median; of frames without points that of all).
 
-    Each frame's line starts from the best of many through two of its points (RANSAC) and is refined by reweighting (Huber); then all
-    frames are solved together, tied to their neighbours in time as strongly as `FEW` points would where points are few."""
+    Each frame's line starts from the best of many through two of its points (RANSAC) and is refined by reweighting; then all
+    frames are solved together, those that lack points to `FEW` drawn to their neighbours as strongly as the lacking points would."""
     own = [first_line(s, shift) for s in seen]
     everything = np.concatenate([s for s in seen if len(s)])
     middle = first_line(everything, shift)
     starts = np.array([middle if line is None else line for line in own])
-    spread = max(np.median([float(np.median(np.abs(misses(s, line)))) for s, line in zip(seen, starts, strict=True) if len(s)]) * 1.48, 1e-9)
+    spread = max(
+        np.median([float(np.median(np.abs(misses(s, line)))) for s, line in zip(seen, starts, strict=True) if len(s)]) * 1.48,
+        1e-9,
+    )
     lines = starts
     for _ in range(ROUNDS):
         lines = solve(seen, lines, spread, shift, everything[:, 0])
-    off = [float(np.median(np.abs(misses(s, line)) / s[:, 1])) if len(s) >= FEW else np.nan for s, line in zip(seen, lines, strict=True)]
+    off = [
+        float(np.median(np.abs(misses(s, line)) / s[:, 1])) if len(s) >= FEW else np.nan
+        for s, line in zip(seen, lines, strict=True)
+    ]
     known = np.nanmedian(off) if np.isfinite(off).any() else 1.0
     return lines, np.where(np.isfinite(off), off, known)
 
@@ -134,26 +141,22 @@ def first_line(s: np.ndarray, shift: bool) -> np.ndarray | None:
 
 
 def solve(seen: list[np.ndarray], lines: np.ndarray, spread: float, shift: bool, answers: np.ndarray) -> np.ndarray:
-    """One round: the lines (T, 2) that fit all points, each weighted by how well it fits now (Huber, at 1.345 `spread`), and neighbours' lines
-    where points are few. Two lines differ by what they differ by at the clip's `answers`."""
+    """One round: the lines (T, 2) that fit all points, each weighted by how well it fits now (Geman-McClure: plainly wrong points have no say),
+    and in frames with few points the neighbours' lines. Two lines differ by what they differ by at the clip's `answers`."""
     count, size = len(seen), 2 if shift else 1
-    matrix, vector = np.zeros((count * size, count * size)), np.zeros(count * size)
-    number = np.zeros(count)
+    matrix, vector = np.zeros((count, size, count, size)), np.zeros((count, size))
     for t, s in enumerate(seen):
-        weight = np.minimum(1, 1.345 * spread / np.maximum(np.abs(misses(s, lines[t])), 1e-12))
-        weight = np.where(np.abs(misses(s, lines[t])) > 6 * spread, 0, weight)  # plainly wrong points have no say
+        weight = 1 / (1 + (misses(s, lines[t]) / (2.4 * spread)) ** 2) ** 2
         columns = np.stack([s[:, 0], np.ones(len(s))], 1)[:, :size]
-        own = slice(t * size, (t + 1) * size)
-        matrix[own, own] += columns.T @ (weight[:, None] * columns)
-        vector[own] += columns.T @ (weight * s[:, 1])
-        number[t] = weight.sum()
+        matrix[t, :, t] += columns.T @ (weight[:, None] * columns)
+        vector[t] += columns.T @ (weight * s[:, 1])
     columns = np.stack([answers, np.ones(len(answers))], 1)[:, :size]
     tie = columns.T @ columns / len(answers)
-    for t in range(count - 1):
-        strength = FEW**2 / (FEW + min(number[t], number[t + 1]))
-        if min(number[t], number[t + 1]) > 4 * FEW:
-            continue
-        for a, b, sign in ((t, t, 1), (t + 1, t + 1, 1), (t, t + 1, -1), (t + 1, t, -1)):
-            matrix[a * size : (a + 1) * size, b * size : (b + 1) * size] += sign * strength * tie
-    found = np.linalg.lstsq(matrix, vector, rcond=1e-12)[0].reshape(count, size)
+    for t, s in enumerate(seen):
+        beside = [n for n in (t - 1, t + 1) if 0 <= n < count]
+        lacking = max(FEW - len(s), 0) * tie / max(len(beside), 1)
+        for n in beside:  # into this frame's own equations alone: it pulls nothing
+            matrix[t, :, t] += lacking
+            matrix[t, :, n] -= lacking
+    found = np.linalg.lstsq(matrix.reshape(count * size, -1), vector.reshape(-1), rcond=1e-12)[0].reshape(count, size)
     return found if shift else np.concatenate([found, np.zeros((count, 1))], 1)
