@@ -30,7 +30,7 @@ def test_a_folder_gives_its_maps(tmp_path: Path):
 
 
 def test_a_name_that_is_neither_a_source_nor_a_folder_is_refused():
-    with pytest.raises(InputError, match="--flow farneback: no such folder .* use dis"):
+    with pytest.raises(InputError, match=r"--flow farneback: no such folder .* use dis"):
         check_flow(Path("farneback"), None)
 
 
