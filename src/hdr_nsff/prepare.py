@@ -24,6 +24,7 @@ from hdr_nsff.datasets.capture import Picture
 from hdr_nsff.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import writing_to
+from hdr_nsff.priors.flow_sources import check_flow
 from hdr_nsff.progress import say, track
 from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
@@ -144,7 +145,8 @@ def check_settings(config: PrepareConfig) -> None:
     ingest.parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
-    for option, path in (("poses", config.poses), ("flow", config.flow), ("masks", config.masks), ("depth", config.depth)):
+    check_flow(config.flow, config.flow_weights)
+    for option, path in (("poses", config.poses), ("masks", config.masks), ("depth", config.depth)):
         if path is not None and not path.exists():
             raise InputError(f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate")
 
@@ -251,7 +253,9 @@ STEPS: dict[StepName, StepKind] = {
         settings=("exposures", "ev", "hold_out", "protocol"),
         complete=all_have("image"),
     ),
-    "flow": StepKind(on_priors.flow_step, needs=("exposure",), settings=("flow",), outputs=("flow",), complete=all_have("flow")),
+    "flow": StepKind(
+        on_priors.flow_step, needs=("exposure",), settings=("flow", "flow_weights"), outputs=("flow",), complete=all_have("flow")
+    ),
     "poses": StepKind(
         on_priors.poses_step,
         needs=("flow",),

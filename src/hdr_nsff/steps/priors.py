@@ -15,7 +15,7 @@ from hdr_nsff.datasets import maps
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
 from hdr_nsff.priors.depth import depth_range, geometric_depth, read_depth
-from hdr_nsff.priors.flow import flow, read_flow
+from hdr_nsff.priors.flow_sources import DEFAULT, flow_source
 from hdr_nsff.priors.import_poses import import_poses, placed
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
 from hdr_nsff.priors.poses import Poses, estimate_poses
@@ -49,26 +49,24 @@ def flow_step(work: Work) -> Step:
     missing = [p for p in pairs if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))]
     own = given_flow(work, names)
     missing = [p for p in missing if p not in own]
-    size = FLOW_CHUNK if c.flow is None else max(len(missing), 1)
+    from_folder = isinstance(c.flow, Path)
+    source = flow_source(c.flow, c.flow_weights)
+    size = max(len(missing), 1) if from_folder else FLOW_CHUNK
     for chunk in track([missing[k : k + size] for k in range(0, len(missing), size)], "flow"):
-        if c.flow is not None:
-            found, valid = read_flow(c.flow, chunk, (m.height, m.width))
-        else:
-            some = np.unique(chunk)
-            video, clipped = work.equalised
-            found, valid = flow(video[some], clipped[some], np.searchsorted(some, chunk), report=None)
+        found, valid = source(*work.equalised, np.array(chunk))
         for pair, f, v in zip(chunk, found, valid, strict=True):
             write_flow(work, names[pair], f, v)
     for f in m.frames:
         f.flow = {j: names[i, j] for i, j in pairs if i == f.index}
     share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
     vars(work).pop("flows", None)
-    given = len(pairs) if c.flow is not None else len(own)
-    note = f"{len(pairs)} pairs, {share:.0%} of the pixels pass the forward-backward check"
+    given = len(pairs) if from_folder else len(own)
+    name = "data set" if len(own) == len(pairs) else f"{c.flow or DEFAULT}"
+    note = f"{len(pairs)} pairs ({name}), {share:.0%} of the pixels pass the forward-backward check"
     return Step(
         provenance="given" if given == len(pairs) else "estimated",
         note=note + (f"; {given} given, {len(pairs) - given} estimated" if 0 < given < len(pairs) else ""),
-        details={"valid_share": round(float(share), 4)},
+        details={"valid_share": round(float(share), 4), "source": name},
     )
 
 

@@ -14,6 +14,7 @@ from hdr_nsff import ingest
 from hdr_nsff.datasets.capture import Capture, Picture
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
+from hdr_nsff.priors.flow_sources import FlowName
 from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
 Part = Literal["poses", "flow", "masks", "depth"]
@@ -52,8 +53,11 @@ class PrepareConfig:
     folder in `evaluate`, or a data set that brings them."""
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
-    flow: Path | None = None
-    """Folder of given flow instead of estimating it: 00003_00004.npy (H, W, 2) pixels per pair of frames."""
+    flow: FlowName | Path | None = None
+    """Where optical flow comes from. dis: OpenCV's dense inverse search (default); or a folder of maps made elsewhere: 00003_00004.npy
+    (H, W, 2) pixels per pair of frames."""
+    flow_weights: Path | None = None
+    """Weights of the network that --flow names."""
     masks: Path | None = None
     """Folder of given moving masks instead of estimating them: one PNG per frame in order, moving = white."""
     depth: Path | None = None
