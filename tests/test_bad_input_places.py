@@ -29,8 +29,8 @@ def test_a_missing_and_an_empty_run(verb: str, tmp_path: Path, capsys: Capture) 
 
 def test_what_an_option_names_must_be_there(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
     footage, nowhere = clip(tmp_path / "clip"), tmp_path / "nowhere"
-    for option in ("--poses", "--flow", "--masks", "--depth"):
-        assert option in refused(capsys, "prepare", footage, tmp_path / "out", option, nowhere)
+    for option in ("--poses", "--flow", "--mask", "--masks", "--depth"):
+        assert option.removesuffix("ks") in refused(capsys, "prepare", footage, tmp_path / "out", option, nowhere)
     for verb, option in (("run", "--poses"), ("run", "--truth"), ("reexpose", "--poses"), ("reexpose", "--masks")):
         assert str(nowhere) in refused(capsys, verb, footage, tmp_path / "out", option, nowhere)
     assert "truth.json" in refused(capsys, "run", footage, tmp_path / "out", "--truth", footage)

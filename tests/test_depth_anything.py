@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from tiny_networks import tiny_depth_anything
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors.depth_anything import align, anchored_depth, network_disparity, picture
@@ -126,24 +127,8 @@ def test_without_points_there_is_one_sentence():
 
 @pytest.fixture(scope="module", params=["relative", "metric"])
 def tiny(request, tmp_path_factory):
-    """Depth Anything of a few thousand random weights, saved as a folder."""
-    transformers = pytest.importorskip("transformers")
-    torch.manual_seed(0)
-    backbone = transformers.Dinov2Config(
-        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, mlp_ratio=2, image_size=28, patch_size=14,
-        out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
-    )  # fmt: skip
-    config = transformers.DepthAnythingConfig(
-        backbone_config=backbone, patch_size=14, reassemble_hidden_size=16, neck_hidden_sizes=[4, 8, 12, 16], fusion_hidden_size=8,
-        head_hidden_size=4, depth_estimation_type=request.param, max_depth=20,
-    )  # fmt: skip
-    folder = tmp_path_factory.mktemp("depth")
-    network = transformers.DepthAnythingForDepthEstimation(config)
-    with torch.no_grad():  # as initialised, all answers are nearly the same
-        for weights in (*network.neck.parameters(), *network.head.parameters()):
-            weights.normal_(0, 0.3)
-    network.save_pretrained(folder)
-    return request.param, folder
+    """A tiny Depth Anything, and its kind."""
+    return request.param, tiny_depth_anything(tmp_path_factory.mktemp("depth"), request.param)
 
 
 def test_a_tiny_network_answers_every_frame_at_its_size_and_its_kind_is_read(tiny):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_networks import tiny_sam2
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors import sam2
@@ -164,31 +165,8 @@ def test_what_is_covered_already_is_not_asked_about_again(monkeypatch):
 
 @pytest.fixture(scope="module")
 def tiny(tmp_path_factory):
-    """SAM 2 of a few thousand random weights, saved as a folder."""
-    transformers = pytest.importorskip("transformers")
-    torch.manual_seed(0)
-    backbone = dict(
-        model_type="sam2_hiera_det_model", hidden_size=8, embed_dim_per_stage=[8, 16, 32, 64], blocks_per_stage=[1, 1, 2, 1], 
-        num_attention_heads_per_stage=[1, 1, 2, 2],
-        window_size_per_stage=[4, 4, 4, 2], global_attention_blocks=[3], image_size=[64, 64], window_positional_embedding_background_size=[2, 2],
-    )  # fmt: skip
-    vision = dict(
-        backbone_config=backbone,
-        backbone_channel_list=[64, 32, 16, 8],
-        backbone_feature_sizes=[[16, 16], [8, 8], [4, 4]],
-        fpn_hidden_size=128,
-    )
-    config = transformers.Sam2VideoConfig(
-        vision_config=vision,
-        prompt_encoder_config=dict(hidden_size=128, image_size=64),
-        mask_decoder_config=dict(hidden_size=128, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32),
-        image_size=64, memory_attention_hidden_size=128, memory_attention_num_layers=1, memory_attention_feed_forward_hidden_size=128,
-        memory_attention_rope_feat_sizes=[4, 4], memory_encoder_hidden_size=128, memory_encoder_output_channels=64,
-        mask_downsampler_embed_dim=128, memory_fuser_embed_dim=128, memory_fuser_intermediate_dim=32,
-    )  # fmt: skip
-    folder = tmp_path_factory.mktemp("sam2")
-    transformers.Sam2VideoModel(config).save_pretrained(folder)
-    return folder
+    """A tiny SAM 2."""
+    return tiny_sam2(tmp_path_factory.mktemp("sam2"))
 
 
 def test_a_tiny_network_answers_in_every_frame_both_ways_and_hears_the_prompts(tiny):

@@ -30,7 +30,7 @@ PERHAPS = 0.5  # the same where structure from motion has failed
 STILL = 0.75  # pixels that a camera on a tripod may seem to move
 LOOK = 24  # frames looked at to decide about parallax
 ADVICE = (
-    "film with the camera moving sideways past textured, unmoving things, give masks of the moving objects (--masks FOLDER), "
+    "film with the camera moving sideways past textured, unmoving things, give masks of the moving objects (--mask FOLDER), "
     "or import poses (--poses FOLDER or FILE)"
 )
 

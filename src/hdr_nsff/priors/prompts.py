@@ -38,11 +38,17 @@ class Prompt:
 class Mover:
     """One thing that moves, and what to ask about it."""
 
-    number: int  # from 1
+    number: int
     prompts: tuple[Prompt, ...]
     seen: dict[int, np.ndarray] = field(
         default_factory=dict
     )  # frame -> (H, W) bool, its part of the motion mask; empty for the user's own
+
+    def among(self, frames: Sequence[int], others: Sequence[int]) -> Mover:
+        """The same in a clip of the frames `others`, which hold this one's `frames`."""
+        place = {f: k for k, f in enumerate(others)}
+        prompts = tuple(replace(p, frame=place[frames[p.frame]]) for p in self.prompts)
+        return replace(self, prompts=prompts, seen={place[frames[k]]: mask for k, mask in self.seen.items()})
 
 
 @dataclass(frozen=True)
@@ -55,14 +61,14 @@ class Part:
     centre: np.ndarray  # (2,) pixels
 
 
-def movers(moving: np.ndarray) -> list[Mover]:
-    """The things that move in `moving` (T, H, W) bool, largest (summed over frames) first and numbered from 1, each with one prompt."""
+def movers(moving: np.ndarray, first: int = 1) -> list[Mover]:
+    """The things that move in `moving` (T, H, W) bool, largest (summed over frames) first and numbered from `first`, each with one prompt."""
     frames = [parts(mask, t) for t, mask in enumerate(moving)]
     least = min(SHORTEST, len(moving))
     tracks = [t for t in link(frames) if len(t) >= least]
     tracks.sort(key=lambda track: -sum(p.area for p in track))
     found = []
-    for number, track in enumerate(tracks[:MOST], 1):
+    for number, track in enumerate(tracks[:MOST], first):
         best = clearest(track)
         found.append(Mover(number, (prompt(best, moving[best.frame]),), {p.frame: p.mask for p in track}))
     return found
@@ -142,7 +148,8 @@ def on_it(mask: np.ndarray) -> np.ndarray:
     padded = np.pad(mask.astype(np.uint8), 1)  # the frame's edge counts as outline
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     y, x = np.indices(mask.shape)
-    deepest, points = float(depth.max()), []
+    deepest = float(depth.max())
+    points: list[tuple[float, float]] = []
     while len(points) < INSIDE and depth.max() >= 0.5 * deepest:
         v, u = np.unravel_index(np.argmax(depth), depth.shape)
         points.append((u + 0.5, v + 0.5))
@@ -157,7 +164,7 @@ def beside_it(part: Part, moving: np.ndarray) -> np.ndarray:
     free = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     y, x = np.indices(part.mask.shape) + 0.5
     angle = np.arctan2(y - part.centre[1], x - part.centre[0])
-    points = []
+    points: list[tuple[float, float]] = []
     for direction in np.arange(BESIDE) * 2 * np.pi / BESIDE:
         turn = np.abs(np.angle(np.exp(1j * (angle - direction))))
         cost = np.where(free & (turn < np.pi / BESIDE) & (away < 2 * radius), turn + np.abs(away / radius - 0.5), np.inf)
@@ -167,25 +174,26 @@ def beside_it(part: Part, moving: np.ndarray) -> np.ndarray:
     return np.array(points).reshape(-1, 2)
 
 
-class PointEntry(BaseModel):
-    """One point of a points file."""
+class Entry(BaseModel):
+    """Which object, in which frame."""
 
     model_config = ConfigDict(extra="forbid", strict=True)
 
     frame: int = Field(ge=0)
     object: int = Field(ge=1)
+
+
+class PointEntry(Entry):
+    """One point of a points file, in pixels."""
+
     x: FiniteFloat
     y: FiniteFloat
     label: int = Field(ge=0, le=1)
 
 
-class BoxEntry(BaseModel):
+class BoxEntry(Entry):
     """One box of a points file, in pixels."""
 
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    frame: int = Field(ge=0)
-    object: int = Field(ge=1)
     left: FiniteFloat
     top: FiniteFloat
     right: FiniteFloat
@@ -232,9 +240,8 @@ def corrected(found: Sequence[Mover], given: PointsFile, frames: Sequence[int]) 
     other numbers make objects of their own. `frames` names the clip's frames as the file numbers them; entries of others are left out."""
     place = {f: k for k, f in enumerate(frames)}
     objects = {m.number: m for m in found}
-    for entry in (*given.points, *given.boxes):
-        if entry.frame not in place:
-            continue
+    entries: list[PointEntry | BoxEntry] = [*given.points, *given.boxes]
+    for entry in (e for e in entries if e.frame in place):
         mover = objects.get(entry.object, Mover(entry.object, ()))
         by_frame = {p.frame: p for p in mover.prompts}
         frame = place[entry.frame]
@@ -257,13 +264,10 @@ def as_file(asked: Sequence[Mover], frames: Sequence[int]) -> dict[str, Any]:
         for (x, y), label in zip(p.points, p.labels, strict=True)
     ]
     boxes = [
-        BoxEntry(
-            frame=frames[p.frame],
-            object=m.number,
-            **dict(zip(("left", "top", "right", "bottom"), p.box.round(2).tolist(), strict=True)),
-        )
+        BoxEntry(frame=frames[p.frame], object=m.number, left=left, top=top, right=right, bottom=bottom)
         for m in asked
         for p in m.prompts
         if p.box is not None
+        for left, top, right, bottom in [p.box.round(2).tolist()]
     ]
     return PointsFile(points=points, boxes=boxes).model_dump()

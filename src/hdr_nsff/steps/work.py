@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from hdr_nsff import ingest
 from hdr_nsff.datasets.capture import Capture, Picture
@@ -17,6 +17,8 @@ from hdr_nsff.priors import exposure
 from hdr_nsff.priors.flow_sources import FlowName
 from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
+MaskName = Literal["motion", "sam2"]
+DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
 StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
 
@@ -58,10 +60,18 @@ class PrepareConfig:
     (H, W, 2) pixels per pair of frames."""
     flow_weights: Path | None = None
     """Weights of the network that --flow names."""
-    masks: Path | None = None
-    """Folder of given moving masks instead of estimating them: one PNG per frame in order, moving = white."""
-    depth: Path | None = None
-    """Folder of given depth maps instead of estimating them, one .npy, EXR or PNG per frame in order."""
+    masks: Annotated[MaskName | Path | None, arg(name="mask", aliases=("--masks",))] = None
+    """Where moving masks come from. motion: what the camera's motion does not explain (default); sam2: the same outlined by a network (extra
+    `neural`); or a folder of masks made elsewhere: one PNG per frame in order, moving = white."""
+    mask_weights: str = "sam2"
+    """Weights of sam2: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face hub, or a model's folder."""
+    mask_points: Path | None = None
+    """Points that correct or add to what sam2 is asked: JSON as in `masks/prompts.json` of the scene folder, where its own are written."""
+    depth: DepthName | Path | None = None
+    """Where depth comes from. geometric: parallax, and where movers can be (default); depth-anything: a network (extra `neural`), laid onto
+    static points; or a folder of maps made elsewhere, one .npy, EXR or PNG per frame in order."""
+    depth_weights: str = "depth-anything"
+    """Weights of depth-anything, relative or metric: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face hub, or a model's folder."""
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
     """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth, or disparity up to scale and shift."""
     estimate: tuple[Part, ...] = ()
