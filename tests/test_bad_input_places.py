@@ -6,13 +6,25 @@ import shutil
 from pathlib import Path
 
 import pytest
-from bad_input import FOOTAGE_VERBS, RUN_VERBS, Capture, call, clip, commands, recorded, refused, snapshot, training
+from bad_input import (
+    FOOTAGE_VERBS,
+    RUN_VERBS,
+    WORKING_VERBS,
+    Capture,
+    call,
+    clip,
+    commands,
+    recorded,
+    refused,
+    snapshot,
+    training,
+)
 
-from hdr_nsff import cli, io
+from hdr_nsff import io
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
-    assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(cli.VERBS)
+    assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
     assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
 
 
@@ -51,7 +63,7 @@ def test_a_name_that_is_no_text_is_refused_and_shown(tmp_path: Path, capsys: Cap
 
 
 @pytest.mark.parametrize("place", ["file", "file/below", "y" * 300])
-@pytest.mark.parametrize("verb", [v for v in cli.VERBS if v != "evaluate"])
+@pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v != "evaluate"])
 def test_a_place_that_cannot_be_written_is_named(
     verb: str, place: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:

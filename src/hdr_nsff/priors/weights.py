@@ -224,7 +224,8 @@ def fetch(weights: Weights) -> Path:
 
 def size(weights: Weights) -> str:
     """Size and licence, as in "99 MB, Apache-2.0"."""
-    return f"{weights.megabytes:.3g} MB, {weights.licence}" if weights.megabytes else weights.licence
+    rounded = f"{weights.megabytes:.3g}" if weights.megabytes < 100 else f"{weights.megabytes:.0f}"
+    return f"{rounded} MB, {weights.licence}" if weights.megabytes else weights.licence
 
 
 def missing(weights: Weights) -> str:
