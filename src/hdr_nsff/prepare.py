@@ -185,7 +185,7 @@ def step_key(work: Work, name: StepName) -> str:
     settings: dict[str, Any] = {}
     for s in kind.settings:
         value = getattr(work.config, s)
-        if name == "poses" and isinstance(value, str) and work.capture is None:
+        if (name, s) == ("poses", "masks") and isinstance(value, str) and work.capture is None:
             value = None  # who outlines the masks later is nothing to the poses
         settings[s] = given_hash(value) if isinstance(value, Path) else value
     before = [(n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt")) for n in kind.needs]
@@ -268,7 +268,7 @@ STEPS: dict[StepName, StepKind] = {
     "poses": StepKind(
         on_priors.poses_step,
         needs=("flow",),
-        settings=("poses", "masks"),
+        settings=("poses", "masks", "matcher"),
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),

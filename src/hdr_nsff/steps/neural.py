@@ -10,6 +10,7 @@ import torch
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_mask, read_npy, write_json
 from hdr_nsff.priors.depth_anything import Kind, anchored_depth, network_disparity
+from hdr_nsff.priors.lightglue import check_matcher
 from hdr_nsff.priors.parallax import Shots
 from hdr_nsff.priors.pretrained import architecture, pretrained
 from hdr_nsff.priors.prompts import PointsFile, as_file, corrected, movers, read_points
@@ -24,6 +25,7 @@ PROMPTS = "masks/prompts.json"
 
 def check_networks(config: PrepareConfig) -> None:
     """InputError where a network that was chosen cannot run, before anything else is done; its weights are downloaded where they may be."""
+    check_matcher(config.matcher)
     if config.masks == "sam2":
         architecture(SAM2)
         find(config.mask_weights)

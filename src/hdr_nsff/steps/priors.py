@@ -139,7 +139,9 @@ def given_poses(work: Work) -> Poses:
 def estimate(work: Work, moving: np.ndarray) -> Poses:
     """Poses by structure from motion on equalised frames, leaving out what is `moving` (T, H, W) bool."""
     video, clipped = work.equalised
-    return estimate_poses(video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames])
+    return estimate_poses(
+        video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames], matcher=work.config.matcher
+    )
 
 
 def store(work: Work, poses: Poses) -> None:

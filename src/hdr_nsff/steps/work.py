@@ -15,6 +15,7 @@ from hdr_nsff.datasets.capture import Capture, Picture
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
 from hdr_nsff.priors.flow_sources import FlowName
+from hdr_nsff.priors.lightglue import Matcher
 from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
 MaskName = Literal["motion", "sam2"]
@@ -55,6 +56,9 @@ class PrepareConfig:
     folder in `evaluate`, or a data set that brings them."""
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    matcher: Matcher = "sift"
+    """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk: learned, matched by LightGlue (extra `neural`), seconds
+    per pair of frames on a CPU, for footage in which SIFT finds too little in common."""
     flow: FlowName | Path | None = None
     """Where optical flow comes from. dis: OpenCV's dense inverse search (default); or a folder of maps made elsewhere: 00003_00004.npy
     (H, W, 2) pixels per pair of frames."""
