@@ -89,6 +89,16 @@ def test_a_points_file_is_for_sam2_alone(clip, tmp_path):
     assert not (tmp_path / "scene").exists()
 
 
+def test_points_in_held_out_frames_are_refused(clip, motion, tmp_path):
+    scene = shutil.copytree(motion, tmp_path / "scene")
+    held_out = next(f.index for f in Manifest.load(scene).frames if f.split == "test")
+    point = {"frame": held_out, "object": 1, "x": 30.0, "y": 30.0, "label": 1}
+    (tmp_path / "points.json").write_text(json.dumps({"points": [point]}))
+    weights = str(tiny_sam2(tmp_path / "sam2"))
+    with pytest.raises(InputError, match=f"frame {held_out} is held out"):
+        prepare(replace(clip, out=scene, masks="sam2", mask_weights=weights, mask_points=tmp_path / "points.json"))
+
+
 @pytest.mark.parametrize("kind", ["relative", "metric"])
 def test_depth_anything_is_laid_onto_points_and_its_kind_is_recorded(kind, clip, motion, tmp_path):
     scene = shutil.copytree(motion, tmp_path / "scene")

