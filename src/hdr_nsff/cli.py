@@ -24,6 +24,7 @@ try:
     from hdr_nsff.run_all import RunConfig, run_all
     from hdr_nsff.synth import SynthConfig, synth
     from hdr_nsff.train import train
+    from hdr_nsff.weights import WeightsConfig, weights
 except KeyboardInterrupt:  # while the libraries load, which takes seconds
     raise SystemExit(130) from None
 
@@ -51,6 +52,7 @@ VERBS = {
     "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
     "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),
     "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
+    "weights": Verb(weights, WeightsConfig, "List the networks that can help, whether their weights are here, how to get them."),
 }
 PRESET_HELP = {
     "splat": "4D Gaussians, minutes on a CPU, tens of small frames a second; the default of `run`.",

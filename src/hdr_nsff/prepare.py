@@ -24,10 +24,12 @@ from hdr_nsff.datasets.capture import Picture
 from hdr_nsff.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import writing_to
+from hdr_nsff.priors.flow_sources import check_flow
 from hdr_nsff.progress import say, track
 from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
 from hdr_nsff.steps import priors as on_priors
+from hdr_nsff.steps.neural import check_networks
 from hdr_nsff.steps.work import Part, PrepareConfig, StepName, Work
 
 __all__ = ["PrepareConfig", "prepare"]
@@ -144,9 +146,16 @@ def check_settings(config: PrepareConfig) -> None:
     ingest.parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
-    for option, path in (("poses", config.poses), ("flow", config.flow), ("masks", config.masks), ("depth", config.depth)):
-        if path is not None and not path.exists():
+    check_flow(config.flow, config.flow_weights)
+    for option, path in (
+        ("poses", config.poses),
+        ("mask", config.masks),
+        ("depth", config.depth),
+        ("mask-points", config.mask_points),
+    ):
+        if isinstance(path, Path) and not path.exists():
             raise InputError(f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate")
+    check_networks(config)
 
 
 def do(work: Work, name: StepName) -> None:
@@ -176,6 +185,8 @@ def step_key(work: Work, name: StepName) -> str:
     settings: dict[str, Any] = {}
     for s in kind.settings:
         value = getattr(work.config, s)
+        if (name, s) == ("poses", "masks") and isinstance(value, str) and work.capture is None:
+            value = None  # who outlines the masks later is nothing to the poses
         settings[s] = given_hash(value) if isinstance(value, Path) else value
     before = [(n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt")) for n in kind.needs]
     inputs = work.manifest.inputs if name == "frames" else {}
@@ -251,19 +262,27 @@ STEPS: dict[StepName, StepKind] = {
         settings=("exposures", "ev", "hold_out", "protocol"),
         complete=all_have("image"),
     ),
-    "flow": StepKind(on_priors.flow_step, needs=("exposure",), settings=("flow",), outputs=("flow",), complete=all_have("flow")),
+    "flow": StepKind(
+        on_priors.flow_step, needs=("exposure",), settings=("flow", "flow_weights"), outputs=("flow",), complete=all_have("flow")
+    ),
     "poses": StepKind(
         on_priors.poses_step,
         needs=("flow",),
-        settings=("poses", "masks"),
+        settings=("poses", "masks", "matcher"),
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),
-    "mask": StepKind(on_priors.mask_step, needs=("poses",), settings=("masks",), outputs=("masks",), complete=all_have("mask")),
+    "mask": StepKind(
+        on_priors.mask_step,
+        needs=("poses",),
+        settings=("masks", "mask_weights", "mask_points"),
+        outputs=("masks",),
+        complete=all_have("mask"),
+    ),
     "depth": StepKind(
         on_priors.depth_step,
         needs=("mask",),
-        settings=("depth", "depth_kind"),
+        settings=("depth", "depth_weights", "depth_kind"),
         outputs=("disparity", "disparity_confidence"),
         complete=all_have("disparity", "train"),
     ),

@@ -8,7 +8,7 @@ the other frame, and neither end is clipped."""
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Protocol
@@ -42,28 +42,42 @@ def flow(
 
     `video` (T, H, W, 3) is exposure-equalised rgb in [0, 1], `clipped` (T, H, W) bool marks pixels without information.
     The answer does not depend on the order of the pairs or on the number of cores. `report` None shows no progress."""
-    video, pairs = np.asarray(video, np.float32), np.asarray(pairs, np.int64).reshape(-1, 2)
-    assert video.ndim == 4 and clipped.shape == video.shape[:3], f"video {video.shape}, clipped {clipped.shape}"
-    assert pairs.size == 0 or (pairs.min() >= 0 and pairs.max() < len(video)), f"pairs reach beyond {len(video)} frames"
-    ranges = [recorded_range(frame, clip) for frame, clip in zip(video, clipped, strict=True)]
+    ranges = {int(k): recorded_range(video[k], clipped[k]) for k in np.unique(np.asarray(pairs, np.int64))}
 
-    def one(pair: tuple[int, int]) -> np.ndarray:
-        a, b = common_grey(video, ranges, *pair)
-        return dense_inverse_search(a, b)
+    def both_ways(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+        a, b = common_grey(video, ranges, i, j)
+        return dense_inverse_search(a, b), dense_inverse_search(b, a)
 
-    wanted = sorted({(int(i), int(j)) for i, j in pairs} | {(int(j), int(i)) for i, j in pairs})
-    found = dict(zip(wanted, in_threads(one, wanted, report), strict=True))
+    return checked(both_ways, clipped, pairs, report)
+
+
+def checked(
+    both_ways: Callable[[int, int], tuple[np.ndarray, np.ndarray]],
+    clipped: np.ndarray,
+    pairs: np.ndarray,
+    report: str | None,
+    threads: int = 2,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flow (P, H, W, 2) float32 px and valid (P, H, W) bool of `pairs` (P, 2), each matched once in both directions.
+
+    `both_ways(i, j)` with i < j gives the flow (H, W, 2) from frame i to j and that from j to i; `clipped` (T, H, W) bool."""
+    pairs = np.asarray(pairs, np.int64).reshape(-1, 2)
+    assert pairs.size == 0 or (pairs.min() >= 0 and pairs.max() < len(clipped)), f"pairs reach beyond {len(clipped)} frames"
+    wanted = sorted({(int(min(p)), int(max(p))) for p in pairs})
+    found = {}
+    for (i, j), (there, back) in zip(wanted, in_threads(lambda p: both_ways(*p), wanted, report, threads), strict=True):
+        found[i, j], found[j, i] = there, back
     forward = [found[int(i), int(j)] for i, j in pairs]
     valid = [agreement(found[int(i), int(j)], found[int(j), int(i)], clipped[i], clipped[j]) for i, j in pairs]
-    size = video.shape[1:3]
-    return np.stack(forward) if forward else np.zeros((0, *size, 2), np.float32), np.array(valid, bool).reshape(-1, *size)
+    size = clipped.shape[1:]
+    return np.array(forward, np.float32).reshape(-1, *size, 2), np.array(valid, bool).reshape(-1, *size)
 
 
-def in_threads(work: Callable, items: list, report: str | None) -> list:
-    """`work` of every item, in order, on two threads with OpenCV's own threads off (its results depend on their number)."""
+def in_threads(work: Callable, items: list, report: str | None, threads: int = 2) -> list:
+    """`work` of every item, in order, on a few threads with OpenCV's own threads off (its results depend on their number)."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
-    pool = ThreadPoolExecutor(2)
+    pool = ThreadPoolExecutor(threads)
     try:
         results = pool.map(work, items)
         return list(results if report is None else track(results, report, total=len(items)))
@@ -80,7 +94,7 @@ def recorded_range(frame: np.ndarray, clipped: np.ndarray) -> tuple[np.ndarray, 
     return low, high
 
 
-def common_grey(video: np.ndarray, ranges: list, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+def common_grey(video: np.ndarray, ranges: Mapping | Sequence, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     """Frames `i` and `j` as grey uint8 (H, W), cut to the range both exposures recorded and stretched to it.
 
     What saturates in one frame then looks saturated in the other too, so its rim stays the same curve in the scene."""

@@ -1,0 +1,39 @@
+"""What `--flow` names: a matcher, or a folder; bad names and weights nobody asked for are refused before anything is done."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import write_npy
+from hdr_nsff.priors.flow import flow
+from hdr_nsff.priors.flow_sources import check_flow, flow_source
+
+FRAMES = np.random.default_rng(0).random((3, 24, 32, 3)).astype(np.float32)
+CLIPPED = np.zeros(FRAMES.shape[:3], bool)
+PAIRS = np.array([[1, 2], [2, 1]])
+
+
+def test_the_default_is_dense_inverse_search_over_the_whole_clip():
+    for chosen in (None, "dis"):
+        found = flow_source(chosen)(FRAMES, CLIPPED, PAIRS)
+        assert np.array_equal(found[0], flow(FRAMES, CLIPPED, PAIRS, None)[0])
+    assert np.array_equal(found[0], flow(FRAMES[1:], CLIPPED[1:], PAIRS - 1, None)[0])  # frames of no pair change nothing
+
+
+def test_a_folder_gives_its_maps(tmp_path: Path):
+    for i, j in PAIRS:
+        write_npy(tmp_path / f"{i:05d}_{j:05d}.npy", np.full((24, 32, 2), i - j, np.float32))
+    found, _ = flow_source(tmp_path)(FRAMES, CLIPPED, PAIRS)
+    assert (found[0] == -1).all() and (found[1] == 1).all()
+
+
+def test_a_name_that_is_neither_a_source_nor_a_folder_is_refused():
+    with pytest.raises(InputError, match=r"--flow farneback: no such folder .* use dis"):
+        check_flow(Path("farneback"), None)
+
+
+def test_weights_for_what_takes_none_are_refused(tmp_path: Path):
+    with pytest.raises(InputError, match="takes no weights"):
+        check_flow("dis", tmp_path)
