@@ -54,10 +54,11 @@ class PrepareConfig:
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
     flow: FlowName | Path | None = None
-    """Where optical flow comes from. dis: OpenCV's dense inverse search (default); or a folder of maps made elsewhere: 00003_00004.npy
+    """Where optical flow comes from. dis: OpenCV's dense inverse search, without weights (default); gmflow, raft: networks, see
+    `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a folder of maps made elsewhere: 00003_00004.npy
     (H, W, 2) pixels per pair of frames."""
     flow_weights: Path | None = None
-    """Weights of the network that --flow names."""
+    """Weights of the network that --flow names: a file, or the folder of `finetune-flow`. Default: where weights are kept."""
     masks: Path | None = None
     """Folder of given moving masks instead of estimating them: one PNG per frame in order, moving = white."""
     depth: Path | None = None
