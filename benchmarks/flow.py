@@ -21,7 +21,6 @@ from hdr_nsff.io import read_exr, write_json
 from hdr_nsff.priors.exposure import equalise
 from hdr_nsff.priors.flow import LUMA, agreement, checked, dense_inverse_search, flow
 from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow
-from hdr_nsff.progress import track
 from hdr_nsff.recording import Noise, record, response_curve
 
 FLOWS = ("dis", "gmflow", "raft", "raft-finetuned")

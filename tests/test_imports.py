@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
-VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report"}
+VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report", "finetune_flow"}
 TRUTH = {  # who reads it, and the last three, which write it
     "scores.targets",
     "scores.geometry",
