@@ -112,7 +112,9 @@ def test_a_smaller_stride_gives_more_dinov2_tokens(dino):
     source = feature_source("dinov2-small", dino, layer=2, stride=7)
     found = source.func(*source.args, noise(2, 28, 28, 3), **source.keywords, side=56)
     assert found.maps.shape == (2, 16, 7, 7) and not found.maps.requires_grad
-    assert found.stride == 3.5 and found.origin == 3.5  # twice enlarged: 7 pixels of that from token to token, the first's middle at 7
+    assert (
+        found.stride == 3.5 and found.origin == 3.5
+    )  # twice enlarged: 7 pixels of that from token to token, the first's middle at 7
 
 
 def test_the_layer_is_the_papers_share_of_the_depth(dino):

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 
-from hdr_nsff.priors.correlation import cells, costs, locate, sample, soft_argmax
+from hdr_nsff.priors.correlation import cells, costs, locate, sample
 from hdr_nsff.priors.features import Features
 from hdr_nsff.progress import say, track
 
@@ -70,8 +70,8 @@ class Residual(nn.Module):
 
     def forward(self, maps: Tensor, detail: Tensor) -> Tensor:
         """Corrected features (B, C, h, w) from `maps` (B, C, h, w) and `detail` (B, 3 * DETAIL^2, h, w)."""
-        x = F.gelu(self.inner(torch.cat([maps / self.size, detail - 0.5], 1)))
-        return maps + self.size * self.outer(F.gelu(self.middle(x)))
+        x = functional.gelu(self.inner(torch.cat([maps / self.size, detail - 0.5], 1)))
+        return maps + self.size * self.outer(functional.gelu(self.middle(x)))
 
 
 def colours(video: np.ndarray, features: Features, across: int) -> Tensor:
@@ -83,12 +83,12 @@ def colours(video: np.ndarray, features: Features, across: int) -> Tensor:
     smooth = [cv2.GaussianBlur(frame, (0, 0), max(step / 2, 0.3)) for frame in video]
     x, y = np.broadcast_to(x, (len(y), len(x))), np.broadcast_to(y[:, None], (len(y), len(x)))
     seen = np.stack([cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for frame in smooth])
-    return F.pixel_unshuffle(torch.from_numpy(seen).permute(0, 3, 1, 2), across)
+    return functional.pixel_unshuffle(torch.from_numpy(seen).permute(0, 3, 1, 2), across)
 
 
 def trajectory_term(found: Tensor, end: Tensor) -> Tensor:
     """How far each point was `found` (N, 2) from its `end` (N, 2), cells: (N,), without gradient where it is another place altogether."""
-    error = F.huber_loss(found, end, reduction="none", delta=HUBER).sum(-1)
+    error = functional.huber_loss(found, end, reduction="none", delta=HUBER).sum(-1)
     return error * ((found - end).detach().norm(dim=-1) < DOUBTFUL)
 
 
@@ -114,12 +114,12 @@ def buddies_term(queries: Tensor, target: Tensor, buddy: Tensor, temperature: fl
     place = cells(*target.shape[-2:]).to(target)
     gap = (place - place[buddy][:, None]).abs().amax(-1)  # (N, cells)
     cost = (costs(queries, target) / temperature).masked_fill((gap > 0) & (gap < 2), -torch.inf)
-    return F.cross_entropy(cost, buddy, reduction="none")
+    return functional.cross_entropy(cost, buddy, reduction="none")
 
 
 def near_term(refined: Tensor, original: Tensor) -> Tensor:
     """How far features (B, C, h, w) went from where they were, in angle and in length: (B, h, w)."""
-    angle = 1 - F.cosine_similarity(refined, original, dim=1)
+    angle = 1 - functional.cosine_similarity(refined, original, dim=1)
     return angle + (refined.norm(dim=1) / original.norm(dim=1).clamp_min(1e-6) - 1) ** 2
 
 
@@ -142,7 +142,9 @@ class Lesson:
         refined, original = self.refine(network, [i, j]), self.maps[[i, j]]
         m = self.matching
         h, w = self.maps.shape[-2:]
-        start = torch.from_numpy(rng.random((POINTS, 2)) * [w - 1, h - 1]).float()  # between cells, so that snapping to them costs
+        start = torch.from_numpy(
+            rng.random((POINTS, 2)) * [w - 1, h - 1]
+        ).float()  # between cells, so that snapping to them costs
         there = locate(sample(refined[0], start), start, refined[1], m.reach, m.radius, m.temperature)
         back = locate(sample(refined[1], there), there, refined[0], m.reach, m.radius, m.temperature)
         from_, to = self.buddies[i, j]

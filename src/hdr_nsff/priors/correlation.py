@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.nn import functional as F
+from torch.nn import functional
 
 CHUNK = 512  # queries whose costs are held at a time
 FAR = -9.0  # below every cosine
@@ -23,13 +23,13 @@ def sample(maps: Tensor, positions: Tensor) -> Tensor:
     """`maps` (C, h, w) at `positions` (N, 2), between cells linearly, outside as at the edge: (N, C)."""
     h, w = maps.shape[-2:]
     grid = (2 * positions + 1) / positions.new_tensor([w, h]) - 1
-    found = F.grid_sample(maps[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False)
+    found = functional.grid_sample(maps[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False)
     return found[0, :, 0].T
 
 
 def costs(queries: Tensor, target: Tensor) -> Tensor:
     """Cosine (N, h*w) of each of `queries` (N, C) with each cell of `target` (C, h, w)."""
-    return F.normalize(queries, dim=-1) @ F.normalize(target, dim=0).flatten(1)
+    return functional.normalize(queries, dim=-1) @ functional.normalize(target, dim=0).flatten(1)
 
 
 def soft_argmax(cost: Tensor, place: Tensor, radius: float, temperature: float) -> Tensor:

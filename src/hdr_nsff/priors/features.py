@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn import functional as F
+from torch.nn import functional
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors.pretrained import pretrained
@@ -64,7 +64,7 @@ def feature_source(
         network = pretrained("Dinov2Model", name, weights)
         return partial(dinov2_features, network, layer=layer, stride=stride)
     if layer is not None or stride is not None:
-        raise InputError("--flow-layer and --flow-stride: are for the features of DINOv2; leave them out with `xfeat`")
+        raise InputError("--semantic.layer and --semantic.stride: are for the features of DINOv2; leave them out with `xfeat`")
     return partial(xfeat_features, load_xfeat(find("xfeat", weights)))
 
 
@@ -78,8 +78,8 @@ def magnified(frame: np.ndarray, scale: float, multiple: int) -> Tensor:
     """A frame (H, W, 3) as (1, 3, h, w), `scale` times as large, its right and lower edges repeated to sides that are multiples."""
     image = torch.from_numpy(np.ascontiguousarray(frame, np.float32)).permute(2, 0, 1)[None]
     if scale != 1:
-        image = F.interpolate(image, scale_factor=scale, mode="bicubic", recompute_scale_factor=False).clamp(0, 1)
-    return F.pad(image, (0, -image.shape[-1] % multiple, 0, -image.shape[-2] % multiple), mode="replicate")
+        image = functional.interpolate(image, scale_factor=scale, mode="bicubic", recompute_scale_factor=False).clamp(0, 1)
+    return functional.pad(image, (0, -image.shape[-1] % multiple, 0, -image.shape[-2] % multiple), mode="replicate")
 
 
 class XFeat(nn.Module):
@@ -108,26 +108,24 @@ class XFeat(nn.Module):
     def convolve(self, x: Tensor, name: str, stride: int = 1) -> Tensor:
         """One convolution of what is held, with zeros around."""
         weight, bias = getattr(self, f"{name}_weight"), getattr(self, f"{name}_bias")
-        return F.conv2d(x, weight, bias, stride, padding=weight.shape[-1] // 2)
+        return functional.conv2d(x, weight, bias, stride, padding=weight.shape[-1] // 2)
 
     def block(self, x: Tensor, name: str) -> Tensor:
         """A chain of convolutions and ReLUs."""
         for i, (_, _, _, stride) in enumerate(BLOCKS[name]):
-            x = F.relu(self.convolve(x, f"{name}_{i}", stride))
+            x = functional.relu(self.convolve(x, f"{name}_{i}", stride))
         return x
 
     def forward(self, rgb: Tensor) -> Tensor:
         """Descriptors (T, 64, H/8, W/8) of rgb (T, 3, H, W), any scale and offset of brightness; sides are multiples of 32."""
-        grey = F.instance_norm(rgb.mean(1, keepdim=True), eps=NORM_EPSILON)
-        quarter = self.block(grey, "block1") + self.convolve(F.avg_pool2d(grey, 4), "skip1_1")
+        grey = functional.instance_norm(rgb.mean(1, keepdim=True), eps=NORM_EPSILON)
+        quarter = self.block(grey, "block1") + self.convolve(functional.avg_pool2d(grey, 4), "skip1_1")
         eighth = self.block(self.block(quarter, "block2"), "block3")
         sixteenth = self.block(eighth, "block4")
         coarse = self.block(sixteenth, "block5")
         size = list(eighth.shape[-2:])
-        mixed = eighth + sum(F.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarse))
+        mixed = eighth + sum(functional.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarse))
         return self.convolve(self.block(mixed, "block_fusion"), "block_fusion_2")
-
-
 
 
 def load_xfeat(path: Path) -> XFeat:
@@ -153,9 +151,9 @@ def dinov2_features(
     depth, patch = network.config.num_hidden_layers, network.config.patch_size
     layer, stride = layer or round(DINO_DEPTH * depth), stride or patch // 2
     if not 1 <= layer <= depth:
-        raise InputError(f"--flow-layer {layer}: this network has {depth} layers; choose 1 to {depth}")
+        raise InputError(f"--semantic.layer {layer}: this network has {depth} layers; choose 1 to {depth}")
     if not 1 <= stride <= patch:
-        raise InputError(f"--flow-stride {stride}: the patches are {patch} pixels wide; choose 1 to {patch}")
+        raise InputError(f"--semantic.stride {stride}: the patches are {patch} pixels wide; choose 1 to {patch}")
     scale = side / max(video.shape[1:3])
     maps = per_frame(video, scale, patch, partial(tokens, network, layer, stride))
     return Features(maps, stride / scale, patch / 2 / scale)
@@ -167,11 +165,11 @@ def tokens(network: Any, layer: int, stride: int, rgb: Tensor) -> Tensor:
     embeddings, shape = network.embeddings, (1, 3, 1, 1)
     normalised = (rgb - torch.tensor(IMAGENET_MEAN).view(shape)) / torch.tensor(IMAGENET_STD).view(shape)
     projection = embeddings.patch_embeddings.projection
-    patches = F.conv2d(normalised, projection.weight, projection.bias, stride)  # (1, C, h, w)
+    patches = functional.conv2d(normalised, projection.weight, projection.bias, stride)  # (1, C, h, w)
     position = embeddings.position_embeddings  # (1, 1 + n * n, C), the class token's first
     n = round((position.shape[1] - 1) ** 0.5)
     grid = position[:, 1:].unflatten(1, (n, n)).permute(0, 3, 1, 2)
-    patches = patches + F.interpolate(grid, list(patches.shape[-2:]), mode="bicubic", align_corners=False)
+    patches = patches + functional.interpolate(grid, list(patches.shape[-2:]), mode="bicubic", align_corners=False)
     x = torch.cat([embeddings.cls_token + position[:, :1], patches.flatten(2).mT], 1)
     for block in network.encoder.layer[:layer]:
         x = block(x)

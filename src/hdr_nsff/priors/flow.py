@@ -98,12 +98,25 @@ def common_grey(video: np.ndarray, ranges: Mapping | Sequence, i: int, j: int) -
     """Frames `i` and `j` as grey uint8 (H, W), cut to the range both exposures recorded and stretched to it.
 
     What saturates in one frame then looks saturated in the other too, so its rim stays the same curve in the scene."""
-    low, high = np.maximum(ranges[i][0], ranges[j][0]), np.minimum(ranges[i][1], ranges[j][1])
-    if (high - low < 0.02).any():  # nothing in common: better the frames as they are than stretched noise
-        low, high = np.zeros(3, np.float32), np.ones(3, np.float32)
+    low, high = common_range(ranges[i], ranges[j])
     offset, scale = low @ LUMA, 255.0 / ((high - low) @ LUMA)
     a, b = ((np.clip(video[k], low, high) @ LUMA - offset) * scale for k in (i, j))
     return np.rint(a).astype(np.uint8), np.rint(b).astype(np.uint8)
+
+
+def common_rgb(video: np.ndarray, ranges: Mapping | Sequence, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    """The same in colour: frames `i` and `j` (H, W, 3) in [0, 1], every channel stretched to the range both exposures recorded."""
+    low, high = common_range(ranges[i], ranges[j])
+    a, b = ((np.clip(video[k], low, high) - low) / (high - low) for k in (i, j))
+    return a, b
+
+
+def common_range(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The lowest and highest rgb (3,), (3,) that two frames of these ranges both recorded."""
+    low, high = np.maximum(one[0], other[0]), np.minimum(one[1], other[1])
+    if (high - low < 0.02).any():  # nothing in common: better the frames as they are than stretched noise
+        return np.zeros(3, np.float32), np.ones(3, np.float32)
+    return low, high
 
 
 def dense_inverse_search(a: np.ndarray, b: np.ndarray, initial: np.ndarray | None = None) -> np.ndarray:

@@ -13,8 +13,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.nn import functional
 
 CHANNELS = 128
 MULTIPLE = 32  # images have sides of a multiple of this: 8 windows a side at 1/4
@@ -26,11 +26,14 @@ MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of the images 
 class GMFlow(nn.Module):
     """Two images to the flow between them, both ways."""
 
-    def __init__(self, channels: int = CHANNELS, blocks: int = 6) -> None:
-        """`channels` of the features and `blocks` of the transformer; the defaults are the published network's, smaller ones are for tests."""
+    def __init__(self, channels: int = CHANNELS, blocks: int = 6, bf16: bool = False) -> None:
+        """`channels` of the features and `blocks` of the transformer are the published network's by default, and smaller in tests.
+
+        `bf16`: features in bfloat16, matching in float32 all the same; half the time where the processor knows it."""
         super().__init__()
+        self.bf16 = bf16
         self.backbone = Encoder(channels)
-        self.transformer = nn.ModuleDict({"layers": nn.ModuleList(Block(channels, shifted=k % 2 == 1) for k in range(blocks))})
+        self.transformer = Transformer(channels, blocks)
         self.feature_flow_attn = nn.ModuleDict({f"{name}_proj": nn.Linear(channels, channels) for name in ("q", "k")})
         self.upsampler = nn.Sequential(nn.Conv2d(channels + 2, 256, 3, padding=1), nn.ReLU(), nn.Conv2d(256, 9 * 4 * 4, 1))
 
@@ -43,13 +46,12 @@ class GMFlow(nn.Module):
 
         No gradient runs from one part to those before through flow: each is trained by its own prediction."""
         assert images.shape[0] % 2 == 0 and not any(s % MULTIPLE for s in images.shape[2:]), f"images {tuple(images.shape)}"
-        fine, coarse = self.backbone(
-            (images - images.new_tensor(MEAN).view(3, 1, 1)) / images.new_tensor(DEVIATION).view(3, 1, 1)
-        )
+        with self.arithmetic(images):
+            fine, coarse = (f.to(images.dtype) for f in self.backbone(normalised(images)))
         features = self.acquainted(coarse, WINDOWS[0])
         matched = match_everywhere(features)
         spread = self.spread_everywhere(features, matched.detach())
-        start = 2 * F.interpolate(spread.detach(), scale_factor=2.0, mode="bilinear", align_corners=True)
+        start = 2 * functional.interpolate(spread.detach(), scale_factor=2.0, mode="bilinear", align_corners=True)
         own, there = self.acquainted(torch.cat([fine, warped(swapped(fine), start)]), WINDOWS[1]).chunk(2)
         corrected = start + match_nearby(own, there, REACH)
         final = self.spread_nearby(own, corrected.detach())
@@ -57,10 +59,13 @@ class GMFlow(nn.Module):
 
     def acquainted(self, features: Tensor, windows: int) -> Tensor:
         """A pair batch of features (2B, C, H, W) after the transformer: each has looked at itself and at its partner."""
-        tokens = (features + position(features, windows)).permute(0, 2, 3, 1)
-        for block in self.transformer["layers"]:  # type: ignore[union-attr]
-            tokens = block(tokens, windows)
-        return tokens.permute(0, 3, 1, 2)
+        with self.arithmetic(features):
+            tokens = self.transformer((features + position(features, windows)).permute(0, 2, 3, 1), windows)
+        return tokens.to(features.dtype).permute(0, 3, 1, 2)
+
+    def arithmetic(self, where: Tensor) -> torch.autocast:
+        """The precision that features are computed in."""
+        return torch.autocast(where.device.type, torch.bfloat16, enabled=self.bf16)
 
     def spread_everywhere(self, features: Tensor, flow: Tensor) -> Tensor:
         """Flow (N, 2, H, W) at 1/8, averaged over places whose features (N, C, H, W) are alike."""
@@ -98,9 +103,9 @@ class Encoder(nn.Module):
         self.trident_conv = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        x = F.relu(F.instance_norm(self.conv1(images)))
+        x = functional.relu(functional.instance_norm(self.conv1(images)))
         x = self.conv2(self.layer3(self.layer2(self.layer1(x))))
-        return self.trident_conv(x), F.conv2d(x, self.trident_conv.weight, stride=2, padding=1)
+        return self.trident_conv(x), functional.conv2d(x, self.trident_conv.weight, stride=2, padding=1)
 
 
 class Residual(nn.Module):
@@ -114,8 +119,22 @@ class Residual(nn.Module):
         self.downsample = nn.Sequential() if same else nn.Sequential(nn.Conv2d(channels, out, 1, stride), nn.InstanceNorm2d(out))
 
     def forward(self, x: Tensor) -> Tensor:
-        y = F.relu(F.instance_norm(self.conv1(x)))
-        return F.relu(self.downsample(x) + F.relu(F.instance_norm(self.conv2(y))))
+        y = functional.relu(functional.instance_norm(self.conv1(x)))
+        return functional.relu(self.downsample(x) + functional.relu(functional.instance_norm(self.conv2(y))))
+
+
+class Transformer(nn.Module):
+    """Blocks in a row."""
+
+    def __init__(self, channels: int, blocks: int) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(Block(channels, shifted=k % 2 == 1) for k in range(blocks))
+
+    def forward(self, tokens: Tensor, windows: int) -> Tensor:
+        """A pair batch of tokens (2B, H, W, C) -> the same."""
+        for block in self.layers:
+            tokens = block(tokens, windows)
+        return tokens
 
 
 class Block(nn.Module):
@@ -155,11 +174,16 @@ class Attention(nn.Module):
             for project, x in ((self.q_proj, tokens), (self.k_proj, others), (self.v_proj, others))
         )
         allowed = together(tokens.shape[1:3], move, windows, tokens.device) if shifted else None
-        read = F.scaled_dot_product_attention(q, k, v, attn_mask=allowed)
+        read = functional.scaled_dot_product_attention(q, k, v, attn_mask=allowed)
         message = self.norm1(self.merge(out_of_windows(read, tokens.shape, windows).roll(move, (1, 2))))
         if self.perceptron:
             message = self.norm2(self.mlp(torch.cat([tokens, message], -1)))
         return tokens + message
+
+
+def normalised(images: Tensor) -> Tensor:
+    """Images (N, 3, H, W) in [0, 1] in units of the deviation from the mean that the encoder was trained with."""
+    return (images - images.new_tensor(MEAN).view(3, 1, 1)) / images.new_tensor(DEVIATION).view(3, 1, 1)
 
 
 def swapped(batch: Tensor) -> Tensor:
@@ -230,7 +254,7 @@ def match_nearby(own: Tensor, other: Tensor, reach: int) -> Tensor:
 def shifts(field: Tensor, reach: int) -> Iterator[Tensor]:
     """A field (N, C, H, W) as seen from 1, 2, ... places away, row by row from the top left to the bottom right; 0 outside."""
     h, w = field.shape[-2:]
-    padded = F.pad(field, [reach] * 4)
+    padded = functional.pad(field, [reach] * 4)
     for y in range(2 * reach + 1):
         for x in range(2 * reach + 1):
             yield padded[..., y : y + h, x : x + w]
@@ -240,9 +264,9 @@ def warped(field: Tensor, flow: Tensor) -> Tensor:
     """`field` (N, C, H, W) read bilinearly where `flow` (N, 2, H, W) leads; 0 outside."""
     size = flow.new_tensor([field.shape[-1] - 1, field.shape[-2] - 1])
     where = (places(field) + flow).permute(0, 2, 3, 1) * (2 / size) - 1
-    return F.grid_sample(field, where, padding_mode="zeros", align_corners=True)
+    return functional.grid_sample(field, where, padding_mode="zeros", align_corners=True)
 
 
 def enlarged(flow: Tensor, times: int) -> Tensor:
     """Flow (N, 2, H, W) at `times` its size, bilinearly."""
-    return times * F.interpolate(flow, scale_factor=float(times), mode="bilinear", align_corners=True)
+    return times * functional.interpolate(flow, scale_factor=float(times), mode="bilinear", align_corners=True)

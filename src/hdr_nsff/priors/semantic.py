@@ -8,16 +8,18 @@ is as good elsewhere, so it is asked everywhere and not on moving pixels alone, 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from hdr_nsff.errors import InputError
 from hdr_nsff.priors.adapt import AdaptWeights, Lesson, Matching, Track, adapt, colours
 from hdr_nsff.priors.correlation import motion
-from hdr_nsff.priors.features import Features, Source
+from hdr_nsff.priors.features import FeatureName, Features, Source, feature_source
 from hdr_nsff.priors.flow import checked, common_grey, dense_inverse_search, follow, recorded_range, round_trip
 
-STEPS = 300
 REACH = 1 / 6  # of the longer side: how far things may move from frame to frame
 LOST = 1.5  # cells by which a round trip may miss
 ALIKE = 0.05  # difference of rgb at which a neighbour's motion counts exp(-1/2)
@@ -27,12 +29,36 @@ ENOUGH = 100  # believed pixels, below which a pair of equal exposure teaches no
 Pairs = Sequence[tuple[int, int]]
 
 
+@dataclass(frozen=True)
+class SemanticConfig:
+    """Settings of `--flow semantic`."""
+
+    features: FeatureName = "xfeat"
+    """The network whose features are matched. xfeat: small, for any CPU; dinov2-large: the paper's."""
+    layer: int | None = None
+    """Of DINOv2: after how many layers features are taken. Default 15 of 24, and that share of fewer."""
+    stride: int | None = None
+    """Of DINOv2: pixels from token to token. Default 7, half a patch."""
+    steps: int = 300
+    """Steps of fitting the features to the clip; 0 takes them as they are."""
+    seed: int = 0
+    """Randomness of that fitting."""
+
+
+def semantic_flow(config: SemanticConfig, weights: Path | None, neighbours: Pairs, equal: Pairs) -> SemanticFlow:
+    """The flow prior of these settings; `weights` of the features, None for wherever they are found; pairs as of `SemanticFlow`."""
+    if config.steps < 0:
+        raise InputError(f"--semantic.steps {config.steps}: must be 0 or more")
+    source = feature_source(config.features, weights, config.layer, config.stride)
+    return SemanticFlow(source, neighbours, equal, config.steps, config.seed)
+
+
 class SemanticFlow:
     """`FlowPrior` by features. It looks at the clip once, when the first pairs are asked for: features, and their fitting to it."""
 
-    def __init__(self, source: Source, neighbours: Pairs = (), equal: Pairs = (), steps: int = STEPS, seed: int = 0) -> None:
+    def __init__(self, source: Source, neighbours: Pairs = (), equal: Pairs = (), steps: int = 0, seed: int = 0) -> None:
         """What the features are fitted to: `neighbours`, pairs of frames one after the other, and `equal`, pairs of consecutive frames
-        of equal exposure. `steps` 0, or no neighbours, leaves the features as they are."""
+        of equal exposure. No `steps`, or no neighbours, leaves the features as they are."""
         self.source, self.neighbours, self.equal = source, list(neighbours), list(equal)
         self.steps, self.seed = steps, seed
         self.features: Features | None = None
