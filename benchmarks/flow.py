@@ -21,9 +21,10 @@ from hdr_nsff.io import read_exr, write_json
 from hdr_nsff.priors.exposure import equalise
 from hdr_nsff.priors.flow import LUMA, agreement, checked, dense_inverse_search, flow
 from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow
+from hdr_nsff.priors.semantic import SemanticConfig, SemanticFlow, semantic_flow
 from hdr_nsff.recording import Noise, record, response_curve
 
-FLOWS = ("dis", "gmflow", "raft", "raft-finetuned")
+FLOWS = ("dis", "semantic", "gmflow", "raft", "raft-finetuned")
 
 
 def main() -> None:
@@ -46,7 +47,8 @@ def main() -> None:
         print(f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}")
         for name in args.flows:
             network = None if name == "dis" else named(name, args.weights, args.finetuned)
-            for treated in ("raw", "equalised") if args.only is None else (args.only,):
+            both = ("equalised",) if name == "semantic" else ("raw", "equalised")  # features are of equalised frames
+            for treated in both if args.only is None else (args.only,):
                 for stops in args.ev:
                     rows.append({"scene": scene.name, "flow": name, "frames": treated, "ev": stops})
                     rows[-1] |= measure(frames, pairs, stops, prior(network, treated))
@@ -56,7 +58,9 @@ def main() -> None:
 
 
 def named(name: str, weights: Path | None, finetuned: Path | None) -> object:
-    """A loaded network."""
+    """A loaded network, or the features of `--flow semantic` as they are: fitting them to a clip moved no median by 0.01 px."""
+    if name == "semantic":
+        return semantic_flow(SemanticConfig(steps=0), weights, (), ())
     return load(None, finetuned) if name == "raft-finetuned" else load(name, weights)  # type: ignore[arg-type]
 
 
@@ -72,6 +76,7 @@ def prior(network, treated: str) -> Callable:
     def on_raw(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
             if network is not None:
+                assert not isinstance(network, SemanticFlow)
                 return both_ways(network, video[i], video[j])
             a, b = (np.rint(255 * (video[k] @ LUMA)).astype(np.uint8) for k in (i, j))
             return dense_inverse_search(a, b), dense_inverse_search(b, a)
@@ -80,6 +85,9 @@ def prior(network, treated: str) -> Callable:
 
     def on_equalised(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         frames = equalise(video, groups)
+        if isinstance(network, SemanticFlow):
+            network.features = None  # of another clip
+            return network(*frames, pairs)
         return flow(*frames, pairs, None) if network is None else matched_flow(network, *frames, pairs)
 
     return on_raw if treated == "raw" else on_equalised

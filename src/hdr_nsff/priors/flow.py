@@ -119,9 +119,10 @@ def common_range(one: tuple[np.ndarray, np.ndarray], other: tuple[np.ndarray, np
     return low, high
 
 
-def dense_inverse_search(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def dense_inverse_search(a: np.ndarray, b: np.ndarray, initial: np.ndarray | None = None) -> np.ndarray:
     """Flow (H, W, 2) px between grey uint8 (H, W) images, by OpenCV's DIS with a long variational refinement.
 
+    With `initial` flow (H, W, 2) the search starts from it and at half the size, so it only mends what is nearly right.
     Small frames are doubled first: measured on moving objects, the median error falls by a quarter; larger ones only gain noise."""
     h, w = a.shape
     scale = 2 if h * w < SMALL else 1
@@ -130,11 +131,16 @@ def dense_inverse_search(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         a, b = (cv2.resize(x, (w * 2, h * 2), interpolation=cv2.INTER_CUBIC) for x in (a, b))
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
     search.setFinestScale(0)
-    search.setPatchSize(8 if scale == 1 else 12)
-    search.setPatchStride(3 if scale == 1 else 4)
+    small = scale == 1 or initial is not None
+    search.setPatchSize(8 if small else 12)
+    search.setPatchStride(3 if small else 4)
     search.setVariationalRefinementIterations(10)
     search.setVariationalRefinementAlpha(20.0 * scale)
-    found = np.asarray(search.calc(a, b, np.zeros((*a.shape, 2), np.float32)))
+    start = np.zeros((*a.shape, 2), np.float32)
+    if initial is not None:
+        search.setCoarsestScale(1)
+        start = cv2.resize(initial, a.shape[::-1], interpolation=cv2.INTER_LINEAR) * np.float32(scale)
+    found = np.asarray(search.calc(a, b, start))
     return cv2.resize(found, (w, h), interpolation=cv2.INTER_AREA) / np.float32(scale)
 
 

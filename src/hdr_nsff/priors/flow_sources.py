@@ -12,10 +12,11 @@ import torch
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors.flow import FlowPrior, flow, read_flow
 from hdr_nsff.priors.flow_networks import load, matched_flow
+from hdr_nsff.priors.semantic import Pairs, SemanticConfig, semantic_flow
 
-FlowName = Literal["dis", "gmflow", "raft", "raft-finetuned"]
+FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
 DEFAULT: FlowName = "dis"
-NETWORKS = frozenset({"gmflow", "raft", "raft-finetuned"})  # the names that `--flow-weights` is for
+NETWORKS = frozenset({"semantic", "gmflow", "raft", "raft-finetuned"})  # the names that `--flow-weights` is for
 
 
 def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
@@ -34,13 +35,23 @@ def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
         )
 
 
-def flow_source(chosen: FlowName | Path | None, weights: Path | None = None) -> FlowPrior:
-    """The flow prior that `--flow` chose, None for the default; its `video` and `pairs` are those of the whole clip."""
+def flow_source(
+    chosen: FlowName | Path | None,
+    weights: Path | None = None,
+    semantic: SemanticConfig | None = None,
+    neighbours: Pairs = (),
+    equal: Pairs = (),
+) -> FlowPrior:
+    """The flow prior that `--flow` chose, None for the default; its `video` and `pairs` are those of the whole clip.
+
+    `semantic` (its defaults where None), `neighbours` and `equal` are what `SemanticFlow` fits its features by."""
     match chosen:
         case Path():
             return partial(from_folder, chosen)
         case "dis" | None:
             return partial(flow, report=None)
+        case "semantic":
+            return semantic_flow(semantic or SemanticConfig(), weights, neighbours, equal)
         case "gmflow" | "raft":
             return partial(matched_flow, load(chosen, weights, device()))
         case "raft-finetuned":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -15,6 +15,7 @@ from hdr_nsff.datasets.capture import Capture, Picture
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
 from hdr_nsff.priors.flow_sources import FlowName
+from hdr_nsff.priors.semantic import SemanticConfig
 from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
 Part = Literal["poses", "flow", "masks", "depth"]
@@ -54,11 +55,13 @@ class PrepareConfig:
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
     flow: FlowName | Path | None = None
-    """Where optical flow comes from. dis: OpenCV's dense inverse search, without weights (default); gmflow, raft: networks, see
-    `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a folder of maps made elsewhere: 00003_00004.npy
-    (H, W, 2) pixels per pair of frames."""
+    """Where optical flow comes from. dis: OpenCV's dense inverse search, without weights (default); semantic: by features that change little
+    with the exposure; gmflow, raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a
+    folder of maps made elsewhere: 00003_00004.npy (H, W, 2) pixels per pair of frames."""
     flow_weights: Path | None = None
     """Weights of the network that --flow names: a file, or the folder of `finetune-flow`. Default: where weights are kept."""
+    semantic: SemanticConfig = field(default_factory=SemanticConfig)
+    """Of --flow semantic."""
     masks: Path | None = None
     """Folder of given moving masks instead of estimating them: one PNG per frame in order, moving = white."""
     depth: Path | None = None
