@@ -44,10 +44,11 @@ def verbs_with(setting: str) -> list[str]:
 
 FOOTAGE_VERBS = verbs_with("clip")  # that read footage
 RUN_VERBS = verbs_with("run")  # that read a run
+WORKING_VERBS = [v for v in cli.VERBS if v != "weights"]  # that write something
 
 
 def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
-    """Every verb at work on `run` (with its scene beside it) or `footage`; all but `evaluate` write to `out`."""
+    """Every working verb on `run` (with its scene beside it) or `footage`; all but `evaluate` write to `out`."""
     return {
         "run": ["run", footage, out],
         "prepare": ["prepare", footage, out],

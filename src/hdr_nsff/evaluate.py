@@ -19,6 +19,7 @@ import tyro
 from torch import Tensor
 
 from hdr_nsff import color, io, metrics
+from hdr_nsff.priors.weights import find
 from hdr_nsff.progress import say, track
 from hdr_nsff.run import Run
 from hdr_nsff.scene import Protocol
@@ -41,7 +42,7 @@ class EvaluateConfig:
     truth: Path | None = None
     """Truth folder, as `synth`, `reexpose`, and `prepare` of a public data set write it; default: the frames that `prepare` held out."""
     lpips: str | None = None
-    """LPIPS: a file with AlexNet weights, or `hub` to download them."""
+    """LPIPS: a file with AlexNet weights, or `hub` for those that `hdr-nsff weights` lists, downloaded where they are not here yet."""
     device: str = "auto"
     """auto, cpu or cuda."""
 
@@ -63,7 +64,7 @@ def views_of_clip(folder: Path) -> list[int]:
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:
     """Measure, write `metrics.json` and `evaluation/*.png` into the run folder, and give back what was written."""
     start = time.monotonic()
-    perceptual = metrics.Lpips(lpips) if lpips else None
+    perceptual = metrics.Lpips([find("alexnet"), find("lpips")] if lpips == "hub" else lpips) if lpips else None
     truth = Truth.open(truth_folder) if truth_folder else None
     kind, targets, notes = choose_targets(run, truth, truth_folder)
     say(f"evaluating on {len(targets)} {kind}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,9 +21,6 @@ from torch.nn import functional
 
 from hdr_nsff.color import luminance, mu_law, pu21_encode
 from hdr_nsff.errors import InputError
-
-ALEXNET_URL = "https://download.pytorch.org/models/alexnet-owt-7be5be79.pth"
-LPIPS_URL = "https://github.com/richzhang/PerceptualSimilarity/raw/master/lpips/weights/v0.1/alex.pth"
 
 
 def psnr(a: Tensor, b: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
@@ -163,12 +161,12 @@ class Lpips(nn.Module):
     """LPIPS (Zhang et al. 2018), AlexNet, version 0.1: a distance of deep features, 0 equal, about 0.7 for unlike pictures.
 
     `weights`: a `.pth` file with both the AlexNet features (as torchvision names them) and the linear layers (as the authors' package
-    names them), a folder with such files side by side, or "hub" to download both."""
+    names them), a folder with such files side by side, or those files."""
 
     CHANNELS = (64, 192, 384, 256, 256)
     LAYERS = (0, 3, 6, 8, 10)  # positions of the convolutions in torchvision's AlexNet
 
-    def __init__(self, weights: Path | str) -> None:
+    def __init__(self, weights: Path | str | Sequence[Path]) -> None:
         super().__init__()
         kernels, strides, paddings = (11, 5, 3, 3, 3), (4, 1, 1, 1, 1), (2, 2, 1, 1, 1)
         inputs = (3, *self.CHANNELS[:-1])
@@ -205,19 +203,13 @@ class Lpips(nn.Module):
         return seen
 
 
-def lpips_state(weights: Path | str) -> dict[str, Tensor]:
-    """`Lpips` parameters from a file, a folder of files, or "hub"; InputError where they do not hold all of them."""
+def lpips_state(weights: Path | str | Sequence[Path]) -> dict[str, Tensor]:
+    """`Lpips` parameters from a file, a folder of files, or several files; InputError where they do not hold all of them."""
     found: dict[str, Tensor] = {}
-    if str(weights) == "hub":
-        try:
-            for url in (ALEXNET_URL, LPIPS_URL):
-                name = f"lpips-{url.rsplit('/', 1)[1]}"
-                found |= torch.hub.load_state_dict_from_url(url, map_location="cpu", weights_only=True, file_name=name)
-        except OSError as error:
-            raise InputError(f"LPIPS: its weights could not be downloaded ({error}); give a file by `--lpips FILE`") from error
-    else:
-        for file in sorted(Path(weights).glob("*.pth")) if Path(weights).is_dir() else [Path(weights)]:
-            found |= read_weights(file)
+    if isinstance(weights, Path | str):
+        weights = sorted(Path(weights).glob("*.pth")) if Path(weights).is_dir() else [Path(weights)]
+    for file in weights:
+        found |= read_weights(file)
     state = {}
     for key, value in found.items():
         if match := re.search(r"(?:features|slice\d)\.(\d+)\.(weight|bias)$", key):
@@ -228,7 +220,9 @@ def lpips_state(weights: Path | str) -> dict[str, Tensor]:
     wanted = {f"convolutions.{i}.{p}": None for i, p in itertools.product(range(5), ("weight", "bias"))}
     wanted |= {f"importance.{i}": None for i in range(5)}
     if missing := sorted(set(wanted) - set(state)):
-        raise InputError(f"{weights}: no complete LPIPS weights (AlexNet and linear layers), {missing[0]} is missing")
+        raise InputError(
+            f"{', '.join(map(str, weights))}: no complete LPIPS weights (AlexNet and linear layers), {missing[0]} is missing"
+        )
     return state
 
 

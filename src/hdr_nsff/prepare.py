@@ -29,6 +29,7 @@ from hdr_nsff.progress import say, track
 from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
 from hdr_nsff.steps import priors as on_priors
+from hdr_nsff.steps.neural import check_networks
 from hdr_nsff.steps.work import Part, PrepareConfig, StepName, Work
 
 __all__ = ["PrepareConfig", "prepare"]
@@ -146,9 +147,15 @@ def check_settings(config: PrepareConfig) -> None:
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
     check_flow(config.flow, config.flow_weights)
-    for option, path in (("poses", config.poses), ("masks", config.masks), ("depth", config.depth)):
-        if path is not None and not path.exists():
+    for option, path in (
+        ("poses", config.poses),
+        ("mask", config.masks),
+        ("depth", config.depth),
+        ("mask-points", config.mask_points),
+    ):
+        if isinstance(path, Path) and not path.exists():
             raise InputError(f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate")
+    check_networks(config)
 
 
 def do(work: Work, name: StepName) -> None:
@@ -178,6 +185,8 @@ def step_key(work: Work, name: StepName) -> str:
     settings: dict[str, Any] = {}
     for s in kind.settings:
         value = getattr(work.config, s)
+        if (name, s) == ("poses", "masks") and isinstance(value, str) and work.capture is None:
+            value = None  # who outlines the masks later is nothing to the poses
         settings[s] = given_hash(value) if isinstance(value, Path) else value
         if is_dataclass(value) and not isinstance(value, type):
             settings[s] = asdict(value)
@@ -265,15 +274,21 @@ STEPS: dict[StepName, StepKind] = {
     "poses": StepKind(
         on_priors.poses_step,
         needs=("flow",),
-        settings=("poses", "masks"),
+        settings=("poses", "masks", "matcher"),
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),
-    "mask": StepKind(on_priors.mask_step, needs=("poses",), settings=("masks",), outputs=("masks",), complete=all_have("mask")),
+    "mask": StepKind(
+        on_priors.mask_step,
+        needs=("poses",),
+        settings=("masks", "mask_weights", "mask_points"),
+        outputs=("masks",),
+        complete=all_have("mask"),
+    ),
     "depth": StepKind(
         on_priors.depth_step,
         needs=("mask",),
-        settings=("depth", "depth_kind"),
+        settings=("depth", "depth_weights", "depth_kind"),
         outputs=("disparity", "disparity_confidence"),
         complete=all_have("disparity", "train"),
     ),

@@ -20,7 +20,7 @@ NETWORKS = frozenset({"semantic", "gmflow", "raft", "raft-finetuned"})  # the na
 
 
 def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
-    """InputError where the source that was chosen, or its weights, cannot be used."""
+    """InputError where the source that was chosen, or its weights, cannot be used; a network is loaded, so that this is known early."""
     if isinstance(chosen, Path) and not chosen.is_dir():
         raise InputError(
             f"--flow {chosen}: no such folder of flow maps, and no source of that name; use {', '.join(get_args(FlowName))}, or mend the path"
@@ -33,6 +33,8 @@ def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
         raise InputError(
             "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; name them with --flow-weights"
         )
+    if chosen in NETWORKS:
+        flow_source(chosen, weights)
 
 
 def flow_source(

@@ -19,6 +19,7 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.io import encode
 from hdr_nsff.priors import sfm
 from hdr_nsff.priors.colmap import ColmapModel, read_model
+from hdr_nsff.priors.lightglue import Matcher, enlarged, match_pictures
 from hdr_nsff.priors.matching import camera_groups, keypoints, match_all, picture, spread_pairs, upsampling, usable, view_pairs
 from hdr_nsff.priors.rotation import Panorama, default_focal, panorama, rotation_share
 from hdr_nsff.progress import say
@@ -30,7 +31,7 @@ PERHAPS = 0.5  # the same where structure from motion has failed
 STILL = 0.75  # pixels that a camera on a tripod may seem to move
 LOOK = 24  # frames looked at to decide about parallax
 ADVICE = (
-    "film with the camera moving sideways past textured, unmoving things, give masks of the moving objects (--masks FOLDER), "
+    "film with the camera moving sideways past textured, unmoving things, give masks of the moving objects (--mask FOLDER), "
     "or import poses (--poses FOLDER or FILE)"
 )
 
@@ -71,11 +72,12 @@ def estimate_poses(
     clipped: np.ndarray | None = None,
     camera_ids: list[int] | None = None,
     threads: int = 0,
+    matcher: Matcher = "sift",
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalised rgb in [0, 1].
 
     `masks` (T, H, W) bool moving; `clipped` (T, H, W) bool without information; `camera_ids` (T,) the physical camera of each frame
-    (each has its own focal length), by default one. Temporary files go into `workdir`. InputError where poses cannot be had."""
+    (each has its own focal length), by default one. `matcher` finds and matches keypoints for structure from motion. Temporary files go into `workdir`. InputError where poses cannot be had."""
     count = len(video)
     if count < 3:
         raise InputError(f"{count} frames are too few to estimate poses from; give at least 3, or import poses (--poses)")
@@ -86,7 +88,7 @@ def estimate_poses(
     if found is None:
         views = collapse(video, ignore, groups)
         try:
-            model, scale = best_model(views, Path(workdir), threads)
+            model, scale = best_model(views, Path(workdir), threads, matcher)
             found = assemble(model, views, scale, video.shape[1:3])
         except InputError as error:
             found = standing(video, ignore) if share is not None and share >= PERHAPS else None
@@ -172,7 +174,7 @@ def collapse(video: np.ndarray, ignore: np.ndarray, groups: list[list[int]]) -> 
     return Views(np.stack(pictures), np.stack(hidden), views, of_frame)
 
 
-def best_model(views: Views, workdir: Path, threads: int) -> tuple[ColmapModel, int]:
+def best_model(views: Views, workdir: Path, threads: int, matcher: Matcher) -> tuple[ColmapModel, int]:
     """The best reconstruction of the views, and how much larger than the views its pictures were. InputError where none will do."""
     count = len(views.pictures)
     best: ColmapModel | None = None
@@ -181,9 +183,11 @@ def best_model(views: Views, workdir: Path, threads: int) -> tuple[ColmapModel, 
     for leftover in workdir.glob(".sfm-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     workdir.mkdir(parents=True, exist_ok=True)
-    for level in (True, False):
+    for level in (
+        (True, False) if matcher == "sift" else (False,)
+    ):  # learned keypoints see colour, and one contrast is as good as another
         with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
-            job = write_job(Path(folder), views, scale, level, threads)
+            job = write_job(Path(folder), views, scale, level, threads, matcher)
             for mapping in ("incremental", "global"):
                 try:
                     models = [read_model(p) for p in sfm.run(replace(job, mapping=mapping))]
@@ -200,19 +204,26 @@ def best_model(views: Views, workdir: Path, threads: int) -> tuple[ColmapModel, 
     return best, scale
 
 
-def write_job(folder: Path, views: Views, scale: int, level: bool, threads: int) -> sfm.Job:
-    """The pictures and masks on disk, and what to do with them."""
+def write_job(folder: Path, views: Views, scale: int, level: bool, threads: int, matcher: Matcher) -> sfm.Job:
+    """The pictures and masks on disk, with learned matches if those are wanted, and what to do with them."""
     names = [f"{v:05d}.png" for v in range(len(views.pictures))]
     for v, name in enumerate(names):
         encode(folder / "images" / name, picture(views.pictures[v], scale, level))
         encode(folder / "masks" / f"{name}.png", usable(views.ignore[v], scale))
+    wanted = view_pairs(views.groups)
+    pairs = [(names[a], names[b]) for a, b in wanted]
+    if matcher != "sift":
+        shown = [enlarged(p, scale) for p in views.pictures]
+        found, matches = match_pictures(shown, [usable(i, scale) for i in views.ignore], wanted, matcher)
+        sfm.write_matches(folder, names, found, pairs, matches)
     return sfm.Job(
         folder=str(folder),
         groups=[[names[v] for v in group] for group in views.groups],
-        pairs=[(names[a], names[b]) for a, b in view_pairs(views.groups)],
+        pairs=pairs,
         focal=default_focal(views.pictures.shape[2]) * scale,
         mapping="incremental",
         threads=threads,
+        given=matcher != "sift",
     )
 
 

@@ -18,11 +18,14 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Any, Literal
+
+import numpy as np
 
 from hdr_nsff.progress import track
 
 Mapping = Literal["incremental", "global"]
+GIVEN = "given.npz"
 CHUNKS = 24  # progress steps of matching
 ROOM = 2**20  # bytes: a disk with less than this free is full
 
@@ -37,6 +40,7 @@ class Job:
     focal: float  # first guess, pixels of the images
     mapping: Mapping
     threads: int = 0  # 0 = all cores
+    given: bool = False  # keypoints and matches lie in the folder (`write_matches`): none are looked for
 
 
 class SfmError(RuntimeError):
@@ -66,6 +70,15 @@ def run(job: Job) -> list[Path]:
         words = [line.strip() for line in said if line.strip()]
         raise SfmError(words[-1] if words else f"pycolmap ended with code {code}")
     return sorted(p for p in (folder / job.mapping).iterdir() if p.is_dir())
+
+
+def write_matches(
+    folder: Path, names: list[str], keypoints: list[np.ndarray], pairs: list[tuple[str, str]], matches: list[np.ndarray]
+) -> None:
+    """Put keypoints (N, 2) of each image, pixels with centres at +0.5, and matches (M, 2) of each pair, rows of both, beside a job."""
+    points = {f"points_{name}": xy.astype(np.float32) for name, xy in zip(names, keypoints, strict=True)}
+    rows = {f"matches_{a}|{b}": m.astype(np.uint32) for (a, b), m in zip(pairs, matches, strict=True)}
+    np.savez(folder / GIVEN, allow_pickle=False, **points, **rows)
 
 
 def need_room(folder: Path, said: str) -> None:
@@ -118,6 +131,9 @@ def extract(job: Job, database: Path, threads: int) -> None:
 
     reading = pycolmap.ImageReaderOptions()
     reading.camera_model = "SIMPLE_PINHOLE"
+    if job.given:
+        take_given(job, database, reading)
+        return set_focal(job, database)
     masks = Path(job.folder) / "masks"
     if masks.is_dir():
         reading.mask_path = str(masks)
@@ -141,10 +157,34 @@ def extract(job: Job, database: Path, threads: int) -> None:
             for _ in names:
                 tell("tick")
     tell("end")
+    set_focal(job, database)
+
+
+def set_focal(job: Job, database: Path) -> None:
+    """The first guess of the focal length for every camera."""
+    import pycolmap
+
     with pycolmap.Database.open(database) as db:
         for camera in db.read_all_cameras():
             camera.focal_length = job.focal
             db.update_camera(camera)
+
+
+def take_given(job: Job, database: Path, reading: Any) -> None:
+    """Images, one camera per group, with the keypoints and matches that lie beside the job."""
+    import pycolmap
+
+    pycolmap.Database.open(database).close()  # makes it
+    for group in job.groups:
+        pycolmap.import_images(database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading)
+    with np.load(Path(job.folder) / GIVEN) as given, pycolmap.Database.open(database) as db:
+        ids = {
+            name: image.image_id for group in job.groups for name in group if (image := db.read_image_with_name(name)) is not None
+        }
+        for name, number in ids.items():
+            db.write_keypoints(number, given[f"points_{name}"])
+        for a, b in job.pairs:
+            db.write_matches(ids[a], ids[b], given[f"matches_{a}|{b}"])
 
 
 def match(job: Job, database: Path, threads: int) -> None:
@@ -164,7 +204,10 @@ def match(job: Job, database: Path, threads: int) -> None:
         file = Path(job.folder) / "pairs.txt"
         file.write_text("".join(f"{a} {b}\n" for a, b in job.pairs[k : k + step]))
         pairing.match_list_path = str(file)
-        pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
+        if job.given:
+            pycolmap.verify_matches(database, file, verification)
+        else:
+            pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
         tell("tick")
     tell("end")
 
@@ -200,8 +243,6 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
 def main() -> None:
     """The worker."""
     import zlib  # the system's zlib must be in place before pycolmap brings its own
-
-    import numpy as np
 
     die_with_parent()
     import pycolmap

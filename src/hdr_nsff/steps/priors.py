@@ -7,6 +7,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from hdr_nsff.priors.mask import geometric_mask, rough_mask
 from hdr_nsff.priors.poses import Poses, estimate_poses
 from hdr_nsff.progress import say, track
 from hdr_nsff.scene import FlowFiles, FrameEntry, Step
+from hdr_nsff.steps.neural import network_depth, sam2_masks
 from hdr_nsff.steps.work import Work
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
@@ -113,7 +115,7 @@ def poses_step(work: Work) -> Step:
         store(work, given_poses(work))
     elif c.poses is not None:
         store(work, import_poses(c.poses, [f.source for f in work.manifest.frames], (work.manifest.height, work.manifest.width)))
-    elif c.masks is not None or work.gives("masks") is not None:
+    elif isinstance(c.masks, Path) or work.gives("masks") is not None:
         store(work, estimate(work, given_masks(work)))
     else:
         first = work.folder / "poses" / "first_masks.npy"
@@ -148,7 +150,9 @@ def given_poses(work: Work) -> Poses:
 def estimate(work: Work, moving: np.ndarray) -> Poses:
     """Poses by structure from motion on equalised frames, leaving out what is `moving` (T, H, W) bool."""
     video, clipped = work.equalised
-    return estimate_poses(video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames])
+    return estimate_poses(
+        video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames], matcher=work.config.matcher
+    )
 
 
 def store(work: Work, poses: Poses) -> None:
@@ -178,7 +182,7 @@ def given_masks(work: Work) -> np.ndarray:
                 for p in files
             ]
         )
-    assert folder is not None
+    assert isinstance(folder, Path)
     masks = []
     for f, path in zip(m.frames, given_files(work, folder, ingest.RECORDED), strict=True):
         mask = read_mask(path)
@@ -203,7 +207,7 @@ def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
 def mask_step(work: Work) -> Step:
     """What moves, per frame. Training frames are judged by flow among training frames alone; held-out ones by all."""
     m, c = work.manifest, work.config
-    given = c.masks is not None or work.gives("masks") is not None
+    given = isinstance(c.masks, Path) or work.gives("masks") is not None
     if given:
         moving = given_masks(work)
     else:
@@ -214,10 +218,16 @@ def mask_step(work: Work) -> Step:
         moving = geometric_mask(found[among], valid[among], pairs[among], work.equalised[0], K, c2w)
         if not train.all():
             moving[~train] = geometric_mask(found, valid, pairs, work.equalised[0], K, c2w)[~train]
+        if c.masks == "sam2":
+            moving = sam2_masks(work, moving)
     for f, mask in zip(m.frames, moving, strict=True):
         f.mask = f"masks/{f.index:05d}.png"
         write_png(work.folder / f.mask, mask)
-    return Step(provenance="given" if given else "estimated", note=f"{moving.mean():.1%} of the pixels move")
+    return Step(
+        provenance="given" if given else "estimated",
+        note=f"{moving.mean():.1%} of the pixels move",
+        details={"source": "given" if given else c.masks or "motion"},
+    )
 
 
 def depth_step(work: Work) -> Step:
@@ -228,13 +238,15 @@ def depth_step(work: Work) -> Step:
     size = (m.height, m.width)
     m.depth_kind = "scene"
     capture = work.gives("depth")
+    given = capture is not None or isinstance(c.depth, Path)
+    details: dict[str, Any] = {"source": "given" if given else c.depth or "geometric"}
     if capture is not None:
         disparity, confidence, how = maps.disparities(capture, [work.picture(f) for f in train], size)
         m.depth_kind = "relative" if capture.depth_kind == "relative" else "scene"
         note = "; ".join(n for n in (f"given ({capture.depth_kind})", how) if n)
         if m.depth_kind == "scene" and capture.poses is not None and capture.poses.near is None:
             m.near, m.far = depth_range(disparity, confidence)
-    elif c.depth is not None:
+    elif isinstance(c.depth, Path):
         disparity, confidence = read_depth(given_files(work, c.depth, DEPTH_FILES), c.depth_kind, size)
         disparity, confidence = disparity[index], confidence[index]
         m.depth_kind = "relative" if c.depth_kind == "relative" else "scene"
@@ -242,6 +254,10 @@ def depth_step(work: Work) -> Step:
     elif m.parallax != "full":
         disparity, confidence = np.ones((len(train), *size), np.float32), np.ones((len(train), *size), np.float32)
         note = "everything at distance 1: without parallax there is no depth to find"
+    elif c.depth == "depth-anything":
+        disparity, confidence, m.near, m.far, details["kind"] = network_depth(work, index)
+        details["weights"] = c.depth_weights
+        note = f"{c.depth_weights} ({details['kind']}), near {m.near:.2f}, far {m.far:.2f} scene units"
     else:
         disparity, confidence, m.near, m.far = dense_depth(work, index)
         note = f"{(confidence > 0.5).mean():.0%} of the pixels well known, near {m.near:.2f}, far {m.far:.2f} scene units"
@@ -251,7 +267,7 @@ def depth_step(work: Work) -> Step:
         f.disparity, f.disparity_confidence = f"disparity/{f.index:05d}.npy", f"disparity_confidence/{f.index:05d}.npy"
         write_npy(work.folder / f.disparity, d.astype(np.float16))
         write_npy(work.folder / f.disparity_confidence, w.astype(np.float16))
-    return Step(provenance="estimated" if c.depth is None and capture is None else "given", note=note)
+    return Step(provenance="given" if given else "estimated", note=note, details=details)
 
 
 def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float]:

@@ -5,19 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from hdr_nsff import ingest
 from hdr_nsff.datasets.capture import Capture, Picture
 from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
 from hdr_nsff.priors.flow_sources import FlowName
+from hdr_nsff.priors.lightglue import Matcher
 from hdr_nsff.priors.semantic import SemanticConfig
 from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
+MaskName = Literal["motion", "sam2"]
+DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
 StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
 
@@ -54,6 +57,9 @@ class PrepareConfig:
     folder in `evaluate`, or a data set that brings them."""
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    matcher: Matcher = "sift"
+    """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk: learned, matched by LightGlue (extra `neural`), seconds
+    per pair of frames on a CPU, for footage in which SIFT finds too little in common."""
     flow: FlowName | Path | None = None
     """Where optical flow comes from. dis: OpenCV's dense inverse search, without weights (default); semantic: by features that change little
     with the exposure; gmflow, raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a
@@ -62,10 +68,18 @@ class PrepareConfig:
     """Weights of the network that --flow names: a file, or the folder of `finetune-flow`. Default: where weights are kept."""
     semantic: SemanticConfig = field(default_factory=SemanticConfig)
     """Of --flow semantic."""
-    masks: Path | None = None
-    """Folder of given moving masks instead of estimating them: one PNG per frame in order, moving = white."""
-    depth: Path | None = None
-    """Folder of given depth maps instead of estimating them, one .npy, EXR or PNG per frame in order."""
+    masks: Annotated[MaskName | Path | None, arg(name="mask", aliases=("--masks",))] = None
+    """Where moving masks come from. motion: what the camera's motion does not explain (default); sam2: the same outlined by a network (extra
+    `neural`); or a folder of masks made elsewhere: one PNG per frame in order, moving = white."""
+    mask_weights: str = "sam2"
+    """Weights of sam2: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face hub, or a model's folder."""
+    mask_points: Path | None = None
+    """Points that correct or add to what sam2 is asked: JSON as in `masks/prompts.json` of the scene folder, where its own are written."""
+    depth: DepthName | Path | None = None
+    """Where depth comes from. geometric: parallax, and where movers can be (default); depth-anything: a network (extra `neural`), laid onto
+    static points; or a folder of maps made elsewhere, one .npy, EXR or PNG per frame in order."""
+    depth_weights: str = "depth-anything"
+    """Weights of depth-anything, relative or metric: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face hub, or a model's folder."""
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
     """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth, or disparity up to scale and shift."""
     estimate: tuple[Part, ...] = ()

