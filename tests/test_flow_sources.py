@@ -9,6 +9,8 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.io import write_npy
 from hdr_nsff.priors.flow import flow
 from hdr_nsff.priors.flow_sources import check_flow, flow_source
+from hdr_nsff.scene import FrameEntry
+from hdr_nsff.steps.priors import learning_pairs
 
 FRAMES = np.random.default_rng(0).random((3, 24, 32, 3)).astype(np.float32)
 CLIPPED = np.zeros(FRAMES.shape[:3], bool)
@@ -37,3 +39,28 @@ def test_a_name_that_is_neither_a_source_nor_a_folder_is_refused():
 def test_weights_for_what_takes_none_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="takes no weights"):
         check_flow("dis", tmp_path)
+
+
+def test_semantic_flow_takes_its_features_weights(tmp_path: Path):
+    from hdr_nsff.priors.semantic import SemanticConfig
+
+    broken = tmp_path / "xfeat.pt"
+    broken.write_bytes(b"nothing")
+    check_flow("semantic", broken)
+    with pytest.raises(InputError, match="no weights of XFeat"):
+        flow_source("semantic", broken)
+    with pytest.raises(InputError, match="0 or more"):
+        flow_source("semantic", broken, SemanticConfig(steps=-1))
+
+
+def test_features_learn_from_training_frames_of_one_camera_at_a_time():
+    """Two cameras of 5 and 2 frames, exposures 0, 1, 0, ..., frame 1 held out."""
+    frames = [
+        FrameEntry(
+            index=k, image="", source="", time=float(k), bracket=k % 2, camera_id=int(k > 4), split="test" if k == 1 else "train"
+        )
+        for k in range(7)
+    ]
+    neighbours, equal = learning_pairs(frames)
+    assert neighbours == [(0, 2), (2, 3), (3, 4), (5, 6)]
+    assert equal == [(0, 2), (2, 4)]

@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
-VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report", "weights"}
+VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report", "finetune_flow", "weights"}
 TRUTH = {  # who reads it, and the last three, which write it
     "scores.targets",
     "scores.geometry",
@@ -18,7 +18,7 @@ TRUTH = {  # who reads it, and the last three, which write it
     "reexpose",
     "datasets.held_out",
 }
-HEAVY = {"pycolmap", "mitsuba", "rawpy", "flip_evaluator", "gsplat", "transformers", "huggingface_hub", "kornia"}
+HEAVY = {"torchvision", "pycolmap", "mitsuba", "rawpy", "flip_evaluator", "gsplat", "transformers", "huggingface_hub", "kornia"}
 
 
 def module_of(path: Path) -> str:

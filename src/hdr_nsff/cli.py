@@ -15,6 +15,7 @@ try:
     from hdr_nsff.errors import InputError
     from hdr_nsff.evaluate import EvaluateConfig, evaluate
     from hdr_nsff.export import ExportConfig, export
+    from hdr_nsff.finetune_flow import FinetuneConfig, finetune_flow
     from hdr_nsff.io import writing_to
     from hdr_nsff.prepare import PrepareConfig, prepare
     from hdr_nsff.progress import say
@@ -51,6 +52,9 @@ VERBS = {
     "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
     "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
     "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),
+    "finetune-flow": Verb(
+        finetune_flow, FinetuneConfig, "Adapt a flow network to pairs of different exposure, for `prepare --flow raft-finetuned`."
+    ),
     "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
     "weights": Verb(weights, WeightsConfig, "List the networks that can help, whether their weights are here, how to get them."),
 }
@@ -64,7 +68,7 @@ PRESET_HELP = {
 
 def usage() -> str:
     """What `hdr-nsff --help` prints."""
-    lines = [f"  {name:<10} {verb.summary}" for name, verb in VERBS.items()]
+    lines = [f"  {name:<13} {verb.summary}" for name, verb in VERBS.items()]
     tail = "`hdr-nsff VERB --help` explains a verb; `hdr-nsff VERB --tyro-print-completion bash` prints its shell completion."
     return "\n".join(
         [

@@ -14,7 +14,7 @@ import json
 import shutil
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -188,6 +188,8 @@ def step_key(work: Work, name: StepName) -> str:
         if (name, s) == ("poses", "masks") and isinstance(value, str) and work.capture is None:
             value = None  # who outlines the masks later is nothing to the poses
         settings[s] = given_hash(value) if isinstance(value, Path) else value
+        if is_dataclass(value) and not isinstance(value, type):
+            settings[s] = asdict(value)
     before = [(n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt")) for n in kind.needs]
     inputs = work.manifest.inputs if name == "frames" else {}
     known = [capture_part(work, name)] if work.capture is not None else []
@@ -263,7 +265,11 @@ STEPS: dict[StepName, StepKind] = {
         complete=all_have("image"),
     ),
     "flow": StepKind(
-        on_priors.flow_step, needs=("exposure",), settings=("flow", "flow_weights"), outputs=("flow",), complete=all_have("flow")
+        on_priors.flow_step,
+        needs=("exposure",),
+        settings=("flow", "flow_weights", "semantic"),
+        outputs=("flow",),
+        complete=all_have("flow"),
     ),
     "poses": StepKind(
         on_priors.poses_step,

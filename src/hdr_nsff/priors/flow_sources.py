@@ -1,4 +1,4 @@
-"""What `--flow` can name, each as one function behind `FlowPrior`: the matcher that needs no weights, or a folder of maps."""
+"""What `--flow` can name, each as one function behind `FlowPrior`: a matcher that needs no weights, networks, or a folder of maps."""
 
 from __future__ import annotations
 
@@ -7,36 +7,64 @@ from pathlib import Path
 from typing import Literal, assert_never, get_args
 
 import numpy as np
+import torch
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors.flow import FlowPrior, flow, read_flow
+from hdr_nsff.priors.flow_networks import load, matched_flow
+from hdr_nsff.priors.semantic import Pairs, SemanticConfig, semantic_flow
 
-FlowName = Literal["dis"]
+FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
 DEFAULT: FlowName = "dis"
-NETWORKS: frozenset[str] = frozenset()  # the names that `--flow-weights` is for
+NETWORKS = frozenset({"semantic", "gmflow", "raft", "raft-finetuned"})  # the names that `--flow-weights` is for
 
 
 def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
-    """InputError where the source that was chosen, or its weights, cannot be used."""
+    """InputError where the source that was chosen, or its weights, cannot be used; a network is loaded, so that this is known early."""
     if isinstance(chosen, Path) and not chosen.is_dir():
         raise InputError(
             f"--flow {chosen}: no such folder of flow maps, and no source of that name; use {', '.join(get_args(FlowName))}, or mend the path"
         )
     if weights is not None and chosen not in NETWORKS:
         raise InputError(f"--flow-weights {weights}: `--flow {chosen or DEFAULT}` takes no weights; leave the option out")
-    if weights is not None and not weights.is_file():
+    if weights is not None and not weights.exists():
         raise InputError(f"--flow-weights {weights}: no such file; mend the path")
+    if chosen == "raft-finetuned" and weights is None:
+        raise InputError(
+            "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; name them with --flow-weights"
+        )
+    if chosen in NETWORKS:
+        flow_source(chosen, weights)
 
 
-def flow_source(chosen: FlowName | Path | None, weights: Path | None = None) -> FlowPrior:
-    """The flow prior that `--flow` chose, None for the default; its `video` and `pairs` are those of the whole clip."""
+def flow_source(
+    chosen: FlowName | Path | None,
+    weights: Path | None = None,
+    semantic: SemanticConfig | None = None,
+    neighbours: Pairs = (),
+    equal: Pairs = (),
+) -> FlowPrior:
+    """The flow prior that `--flow` chose, None for the default; its `video` and `pairs` are those of the whole clip.
+
+    `semantic` (its defaults where None), `neighbours` and `equal` are what `SemanticFlow` fits its features by."""
     match chosen:
         case Path():
             return partial(from_folder, chosen)
         case "dis" | None:
             return partial(flow, report=None)
+        case "semantic":
+            return semantic_flow(semantic or SemanticConfig(), weights, neighbours, equal)
+        case "gmflow" | "raft":
+            return partial(matched_flow, load(chosen, weights, device()))
+        case "raft-finetuned":
+            return partial(matched_flow, load(None, weights, device()))
         case _:
             assert_never(chosen)
+
+
+def device() -> torch.device:
+    """Where networks run: on a GPU where there is one."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def from_folder(folder: Path, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -43,6 +43,17 @@ def flow_pairs(frames: list[FrameEntry]) -> list[tuple[int, int]]:
     return [p for i, j in pairs for p in ((i, j), (j, i))]
 
 
+def learning_pairs(frames: list[FrameEntry]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+    """Of the training frames of each camera: neighbours, and consecutive ones of equal exposure."""
+    among: list[dict[tuple[int, ...], list[int]]] = [{}, {}]
+    for f in frames:
+        if f.split == "train":
+            among[0].setdefault((f.camera_id,), []).append(f.index)
+            among[1].setdefault((f.camera_id, f.bracket), []).append(f.index)
+    neighbours, equal = ([pair for line in lines.values() for pair in pairwise(line)] for lines in among)
+    return neighbours, equal
+
+
 def flow_step(work: Work) -> Step:
     """Optical flow between neighbours, from a folder or estimated, a few pairs at a time so that a killed run keeps them."""
     m, c = work.manifest, work.config
@@ -52,7 +63,7 @@ def flow_step(work: Work) -> Step:
     own = given_flow(work, names)
     missing = [p for p in missing if p not in own]
     from_folder = isinstance(c.flow, Path)
-    source = flow_source(c.flow, c.flow_weights)
+    source = flow_source(c.flow, c.flow_weights, c.semantic, *learning_pairs(m.frames))
     size = max(len(missing), 1) if from_folder else FLOW_CHUNK
     for chunk in track([missing[k : k + size] for k in range(0, len(missing), size)], "flow"):
         found, valid = source(*work.equalised, np.array(chunk))

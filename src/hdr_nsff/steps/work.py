@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
@@ -16,6 +16,7 @@ from hdr_nsff.io import read_image, read_mask, read_npy
 from hdr_nsff.priors import exposure
 from hdr_nsff.priors.flow_sources import FlowName
 from hdr_nsff.priors.lightglue import Matcher
+from hdr_nsff.priors.semantic import SemanticConfig
 from hdr_nsff.scene import FrameEntry, Manifest, Protocol
 
 MaskName = Literal["motion", "sam2"]
@@ -60,10 +61,13 @@ class PrepareConfig:
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk: learned, matched by LightGlue (extra `neural`), seconds
     per pair of frames on a CPU, for footage in which SIFT finds too little in common."""
     flow: FlowName | Path | None = None
-    """Where optical flow comes from. dis: OpenCV's dense inverse search (default); or a folder of maps made elsewhere: 00003_00004.npy
-    (H, W, 2) pixels per pair of frames."""
+    """Where optical flow comes from. dis: OpenCV's dense inverse search, without weights (default); semantic: by features that change little
+    with the exposure; gmflow, raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a
+    folder of maps made elsewhere: 00003_00004.npy (H, W, 2) pixels per pair of frames."""
     flow_weights: Path | None = None
-    """Weights of the network that --flow names."""
+    """Weights of the network that --flow names: a file, or the folder of `finetune-flow`. Default: where weights are kept."""
+    semantic: SemanticConfig = field(default_factory=SemanticConfig)
+    """Of --flow semantic."""
     masks: Annotated[MaskName | Path | None, arg(name="mask", aliases=("--masks",))] = None
     """Where moving masks come from. motion: what the camera's motion does not explain (default); sam2: the same outlined by a network (extra
     `neural`); or a folder of masks made elsewhere: one PNG per frame in order, moving = white."""

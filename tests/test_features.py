@@ -1,0 +1,153 @@
+"""Dense features: XFeat with weights made up here, DINOv2 as a tiny network in a folder; the published weights where they are found."""
+
+import numpy as np
+import pytest
+import torch
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.priors.features import (
+    BLOCKS,
+    DINO_DEPTH,
+    IMAGENET_MEAN,
+    IMAGENET_STD,
+    LINEAR,
+    XFeat,
+    dinov2_features,
+    feature_source,
+    load_xfeat,
+    tokens,
+    xfeat_features,
+)
+
+
+def random_state(seed: int = 0) -> dict[str, torch.Tensor]:
+    """Weights of XFeat's shapes and names."""
+    rng = torch.Generator().manual_seed(seed)
+    state = {}
+    for block, layers in BLOCKS.items():
+        for i, (inside, outside, kernel, _) in enumerate(layers):
+            name = f"{block}.{i}.layer"
+            state[f"{name}.0.weight"] = torch.randn(outside, inside, kernel, kernel, generator=rng) / (inside**0.5 * kernel)
+            state[f"{name}.1.running_mean"] = 0.1 * torch.randn(outside, generator=rng)
+            state[f"{name}.1.running_var"] = 0.5 + torch.rand(outside, generator=rng)
+    for name, (inside, outside) in LINEAR.items():
+        state[f"{name}.weight"] = torch.randn(outside, inside, 1, 1, generator=rng) / inside**0.5
+        state[f"{name}.bias"] = 0.1 * torch.randn(outside, generator=rng)
+    return state
+
+
+def noise(*shape: int) -> np.ndarray:
+    """Random rgb."""
+    return np.random.default_rng(0).random(shape).astype(np.float32)
+
+
+@pytest.fixture(scope="module")
+def dino(tmp_path_factory):
+    """A folder with a tiny DINOv2: 4 layers of 16 channels, patches of 14 pixels, 4 x 4 positions."""
+    transformers = pytest.importorskip("transformers")
+    torch.manual_seed(0)
+    config = transformers.Dinov2Config(
+        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, mlp_ratio=2, image_size=56, patch_size=14
+    )
+    folder = tmp_path_factory.mktemp("dino")
+    transformers.Dinov2Model(config).save_pretrained(folder)
+    return folder
+
+
+def test_a_folded_normalisation_is_convolution_then_batch_norm():
+    state = random_state()
+    network, x = XFeat(state), torch.rand(1, 1, 8, 8)
+    plain = torch.nn.functional.conv2d(x, state["block1.0.layer.0.weight"], padding=1)
+    mean, variance = state["block1.0.layer.1.running_mean"], state["block1.0.layer.1.running_var"]
+    expected = torch.nn.functional.batch_norm(plain, mean, variance)
+    assert torch.allclose(network.convolve(x, "block1_0"), expected, atol=1e-5)
+
+
+def test_xfeat_sees_no_gain_and_no_offset():
+    network, rgb = XFeat(random_state()), torch.from_numpy(noise(1, 3, 64, 64))
+    with torch.no_grad():
+        assert torch.allclose(network(rgb), network(0.25 * rgb + 0.1), atol=2e-2)
+        assert not torch.allclose(network(rgb), network(rgb.flip(-1)), atol=2e-2)
+
+
+def test_small_frames_are_doubled_so_cells_are_four_pixels():
+    found = xfeat_features(XFeat(random_state()), noise(2, 48, 70, 3))
+    assert found.stride == 4 and found.origin == 1
+    assert found.maps.shape == (2, 64, 12, 20)  # 96 is 3 times 32, 140 becomes 160
+
+
+def test_features_move_with_the_picture():
+    """A shift by 32 pixels is one by 8 cells of 4 pixels (32 doubled is 64, a whole number of the coarsest cells)."""
+    wide = noise(1, 160, 320, 3)
+    network = XFeat(random_state())
+    a, b = (xfeat_features(network, x).maps[0, :, 16:24] for x in (wide[:, :, 32:288], wide[:, :, :256]))
+    a, b = (torch.nn.functional.normalize(x, dim=0) for x in (a, b))
+    assert (a[:, :, 24:32] - b[:, :, 32:40]).abs().max() < 0.01  # edges and the pictures' different means are all there is
+    assert (a[:, :, 24:32] - b[:, :, 24:32]).abs().max() > 0.05
+
+
+def test_features_carry_no_gradient():
+    assert not xfeat_features(XFeat(random_state()), noise(1, 32, 32, 3)).maps.requires_grad
+    assert not list(XFeat(random_state()).parameters())
+
+
+def test_other_weights_are_refused_in_a_sentence(tmp_path):
+    torch.save({"something": torch.zeros(3)}, tmp_path / "xfeat.pt")
+    with pytest.raises(InputError, match="no weights of XFeat"):
+        load_xfeat(tmp_path / "xfeat.pt")
+
+
+def test_dinov2_tokens_are_those_of_transformers_where_patches_do_not_overlap(dino):
+    transformers = pytest.importorskip("transformers")
+    network = transformers.Dinov2Model.from_pretrained(dino).eval()
+    rgb = torch.from_numpy(noise(1, 3, 56, 56))
+    mean, std = (torch.tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    with torch.no_grad():
+        expected = network((rgb - mean) / std, output_hidden_states=True).hidden_states[3][:, 1:]
+        assert torch.allclose(tokens(network, 3, 14, rgb).flatten(2).mT, expected, atol=1e-5)
+
+
+def test_a_smaller_stride_gives_more_dinov2_tokens(dino):
+    """56 pixels, patches of 14: 4 side by side, (56 - 14) / 7 + 1 = 7 with a stride of 7."""
+    source = feature_source("dinov2-small", dino, layer=2, stride=7)
+    found = source.func(*source.args, noise(2, 28, 28, 3), **source.keywords, side=56)
+    assert found.maps.shape == (2, 16, 7, 7) and not found.maps.requires_grad
+    assert (
+        found.stride == 3.5 and found.origin == 3.5
+    )  # twice enlarged: 7 pixels of that from token to token, the first's middle at 7
+
+
+def test_the_layer_is_the_papers_share_of_the_depth(dino):
+    network = feature_source("dinov2-small", dino).args[0]
+    video = noise(1, 28, 28, 3)
+    named = dinov2_features(network, video, round(DINO_DEPTH * 4), 7, 56).maps  # round(15 / 24 * 4) = 2
+    assert torch.equal(dinov2_features(network, video, side=56).maps, named)
+    assert not torch.equal(dinov2_features(network, video, 3, 7, 56).maps, named)
+
+
+@pytest.mark.parametrize(("layer", "stride", "said"), [(9, None, "has 4 layers"), (None, 15, "14 pixels wide")])
+def test_a_layer_or_stride_that_is_not_there_is_refused(dino, layer, stride, said):
+    source = feature_source("dinov2-small", dino, layer, stride)
+    with pytest.raises(InputError, match=said):
+        source(noise(1, 28, 28, 3))
+
+
+def test_xfeat_has_no_layer_to_choose():
+    with pytest.raises(InputError, match="DINOv2"):
+        feature_source("xfeat", layer=3)
+
+
+def test_published_weights_match_across_four_ev():
+    """The same textured picture, 16 times darker and clipped: most cells are still nearest to themselves."""
+    from hdr_nsff.priors.correlation import costs
+
+    try:
+        source = feature_source("xfeat")
+    except InputError as error:
+        pytest.skip(str(error))
+    cv2 = pytest.importorskip("cv2")
+    picture = cv2.resize(noise(24, 32, 3), (256, 192), interpolation=cv2.INTER_CUBIC).clip(0, 1)
+    bright, dark = (2 * picture).clip(0, 1) ** (1 / 2.2), (picture / 8).clip(0, 1) ** (1 / 2.2)
+    maps = source(np.stack([bright, np.rint(dark * 255) / 255]).astype(np.float32)).maps
+    nearest = costs(maps[0].flatten(1).T, maps[1]).argmax(1)
+    assert (nearest == torch.arange(len(nearest))).float().mean() > 0.7

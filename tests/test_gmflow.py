@@ -1,0 +1,134 @@
+"""GMFlow: its parts against plain loops and closed forms, both directions at once, and the published weights where they are found."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from hdr_nsff.errors import InputError
+from hdr_nsff.priors import gmflow, weights
+from hdr_nsff.priors.flow_networks import both_ways, load
+from hdr_nsff.priors.gmflow import GMFlow
+
+rng = torch.Generator().manual_seed(0)
+
+
+def small() -> GMFlow:
+    """A tiny random network."""
+    torch.manual_seed(0)
+    return GMFlow(channels=16, blocks=2).eval()
+
+
+def images(count: int = 2, height: int = 32, width: int = 64) -> torch.Tensor:
+    """Random images (count, 3, H, W)."""
+    return torch.rand(count, 3, height, width, generator=torch.Generator().manual_seed(1))
+
+
+@torch.no_grad()
+def test_swapping_the_images_swaps_the_flows():
+    pair = images()
+    assert torch.allclose(small()(pair), small()(pair.flip(0)).flip(0), atol=1e-4)
+
+
+@torch.no_grad()
+def test_pairs_of_a_batch_do_not_see_each_other():
+    a, b = images(), 1 - images().flip(-1)
+    together = small()(torch.stack([a[0], b[0], a[1], b[1]]))
+    assert torch.allclose(together[[0, 2]], small()(a), atol=1e-4)
+    assert torch.allclose(together[[1, 3]], small()(b), atol=1e-4)
+
+
+def test_the_match_is_where_the_likeness_is():
+    """Features that occur once each, twenty times over: the softmax picks the place itself."""
+    marks = torch.eye(24).view(1, 24, 4, 6) * 20
+    moved = marks.roll((1, 2), (2, 3))  # row y goes to y + 1, column x to x + 2, around the edge
+    flow = gmflow.match_everywhere(torch.cat([marks, moved]))
+    assert torch.allclose(flow[0, :, 0, 0], torch.tensor([2.0, 1.0]), atol=1e-3)
+    assert torch.allclose(flow[1, :, 1, 2], torch.tensor([-2.0, -1.0]), atol=1e-3)
+
+
+def test_the_near_match_equals_a_loop_over_the_places():
+    own, other = torch.rand(2, 1, 8, 5, 6, generator=rng)
+    found = gmflow.match_nearby(own, other, 1)
+    y, x = 0, 5  # a corner: four places are in the image
+    near = [(v, u) for v in (0, 1) for u in (4, 5)]
+    likeness = torch.stack([(own[0, :, y, x] * other[0, :, v, u]).sum() / 8**0.5 for v, u in near])
+    expected = torch.softmax(likeness, 0) @ torch.tensor([[u - x, v - y] for v, u in near]).float()
+    assert torch.allclose(found[0, :, y, x], expected, atol=1e-6)
+
+
+def test_windows_come_apart_and_together():
+    tokens = torch.rand(2, 4, 8, 3, generator=rng)
+    cut = gmflow.in_windows(tokens, 2)
+    assert torch.equal(cut[1, 1], tokens[1, :2, 4:].reshape(8, 3))  # second window: top right
+    assert torch.equal(gmflow.out_of_windows(cut, tokens.shape, 2), tokens)
+
+
+def test_moved_windows_join_no_opposite_edges():
+    """Four tokens in two windows, moved by one: 1 2 | 3 0, where 3 and 0 are the two ends of the image."""
+    allowed = gmflow.together((2, 4), (0, 1), 2, torch.device("cpu"))  # windows of 1 x 2
+    assert allowed[0].all() and torch.equal(allowed[1], torch.eye(2, dtype=torch.bool))
+
+
+def test_position_repeats_in_every_window():
+    field = gmflow.position(torch.zeros(1, 16, 8, 12), 2)
+    assert torch.equal(field[:, :4, :6], field[:, 4:, 6:])
+    assert field[0, 3, 0].item() == pytest.approx(0, abs=1e-6)  # the last row of a window: sin(2 pi)
+    assert torch.equal(field[:8, :, 0], field[:8, :, 5])  # the first half is of y alone
+
+
+@torch.no_grad()
+def test_a_convex_mixture_of_one_flow_is_that_flow():
+    network = small()
+    flow = torch.full((1, 2, 6, 8), 1.5)
+    large = network.enlarged_convex(flow, torch.rand(1, 16, 6, 8, generator=rng))
+    assert large.shape == (1, 2, 24, 32)
+    assert torch.allclose(large[..., 4:-4, 4:-4], torch.full((1, 2, 16, 24), 6.0), atol=1e-5)  # four times the pixels
+
+
+def test_reading_features_through_a_flow_shifts_them():
+    field = torch.rand(1, 3, 6, 8, generator=rng)
+    flow = torch.tensor([2.0, -1.0]).view(1, 2, 1, 1).expand(1, 2, 6, 8)
+    there = gmflow.warped(field, flow)
+    assert torch.allclose(there[..., 1:, :-2], field[..., :-1, 2:], atol=1e-5)
+    assert there[..., 0, :].abs().max() < 1e-6
+
+
+def test_every_prediction_trains_the_part_that_made_it():
+    """The first prediction moves the encoder but not the enlargement; the last one moves both."""
+    network = small()
+    first, *_, last = network.predictions(images())
+    first.sum().backward(retain_graph=True)
+    assert network.backbone.conv1.weight.grad is not None and network.upsampler[0].weight.grad is None
+    last.square().sum().backward()
+    assert network.upsampler[0].weight.grad is not None
+
+
+def published() -> Path:
+    """The published weights, or a skip that says where they were looked for."""
+    try:
+        return weights.find("gmflow", download=False)
+    except InputError as error:
+        pytest.skip(str(error))
+
+
+def test_published_weights_follow_a_sliding_texture_when_it_darkens():
+    network = load("gmflow", published())
+    noise = cv2.GaussianBlur(np.random.default_rng(0).random((168, 232, 3)).astype(np.float32), (0, 0), 2)
+    texture = (noise - noise.min()) / np.ptp(noise)
+    a, b = texture[20:-20, 20:-20], texture[23:-17, 15:-25]  # what was at (x, y) is at (x + 5, y - 3)
+    there, back = both_ways(network, a, (b / 4) ** 2)  # darker by two stops, and another curve
+    assert np.median(np.abs(there[8:-8, 8:-8] - [5, -3])) < 0.3
+    assert np.median(np.abs(back[8:-8, 8:-8] - [-5, 3])) < 0.3
+
+
+def test_sizes_that_do_not_fall_into_windows_are_our_own_mistake():
+    with pytest.raises(AssertionError, match="images"):
+        small()(torch.zeros(2, 3, 32, 40))
+
+
+def test_normalisation_is_that_of_the_encoder():
+    grey = gmflow.normalised(torch.full((1, 3, 1, 1), 0.485))
+    assert grey[0, 0].item() == pytest.approx(0) and grey[0, 1].item() == pytest.approx((0.485 - 0.456) / 0.224)
