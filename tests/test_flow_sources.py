@@ -64,3 +64,18 @@ def test_features_learn_from_training_frames_of_one_camera_at_a_time():
     neighbours, equal = learning_pairs(frames)
     assert neighbours == [(0, 2), (2, 3), (3, 4), (5, 6)]
     assert equal == [(0, 2), (2, 4)]
+
+
+def test_missing_weights_are_said_before_anything_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    monkeypatch.setattr("hdr_nsff.priors.weights.package_folder", lambda weights: None)
+    with pytest.raises(InputError, match=r"weights gmflow .* is not on this machine"):
+        check_flow("gmflow", None)
+    with pytest.raises(InputError, match=r"--flow-weights .*: no such file"):
+        check_flow("gmflow", tmp_path / "nothing")
+    with pytest.raises(InputError, match="raft-finetuned needs the weights"):
+        check_flow("raft-finetuned", None)
+    (tmp_path / "cut.safetensors").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="no readable weights"):
+        check_flow("raft-finetuned", tmp_path / "cut.safetensors")

@@ -33,7 +33,7 @@ def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
         raise InputError(
             "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; name them with --flow-weights"
         )
-    if chosen in NETWORKS:
+    if chosen in ("gmflow", "raft", "raft-finetuned"):
         flow_source(chosen, weights)
 
 
