@@ -19,6 +19,7 @@ from toy_scene import ToyScene
 
 from hdr_nsff import bench
 from hdr_nsff.run import Run, last_logged, snapshots
+from hdr_nsff.train import Trainer
 
 COMMAND = [sys.executable, "-c", "from hdr_nsff.cli import main; main()"]
 SMALL = "--field.encoding.max-rows 512 --field.samples 6 --field.render-samples 8 --rays 32 --moving-rays 8"
@@ -105,9 +106,7 @@ def test_the_page_opens_offline_and_shows_curves_and_crops(finished: Path) -> No
     page = (finished / "index.html").read_text()
     assert not re.search(r"""(?:src|href)\s*=\s*["'](?!data:|#)|url\((?!#)|@import|<script""", page)
     assert page.count("<svg") >= 4 and "PSNR moving, dB" in page
-    assert (
-        page.count("data:image/jpeg") >= 2 * 2 * 3
-    )  # two scenes; pictures and errors of the truth or the scale, and of two methods
+    assert page.count("data:image/jpeg") >= 2 * 2 * 3  # two scenes; pictures and errors; the truth (or the scale) and two methods
     assert "absolute error" in page and "0 to 0.25" in page
 
 
@@ -137,15 +136,34 @@ def test_lines_of_the_list_do_one_run_each(scenes: Path, tmp_path: Path, capsys:
 
 
 def test_a_run_that_fails_is_shown_and_the_others_go_on(scenes: Path, tmp_path: Path, capsys: Capture) -> None:
-    out, methods = tmp_path / "out", f"nan=tiny {SMALL} --tonemap-lr 1e4 --anchor-at 1,a=tiny {SMALL}"
-    assert call(*words(scenes, out, methods, "--views", 0, "--jobs", 2, steps=6)) == 1
-    found = rows(out)
-    assert [r["status"] for r in found.values()] == ["failed", "done", "failed", "done"]
-    reason = found["toy/nan"]["reason"]
-    assert "FloatingPointError: step" in reason and str(out / "logs/toy/nan.log") in reason
+    out, methods = tmp_path / "out", f"bad=tiny {SMALL},a=tiny {SMALL}"
+    command = ["bench", out, "--scenes", scenes / "three", "--methods", methods, "--steps", 4, "--views", 0, "--device", "cpu"]
+    assert call(*command, "--collect") == 1  # nothing is there yet
+    checkpoint = out / "runs/three/bad/checkpoints/step_00000001.safetensors"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.write_bytes(b"cut short")
+    capsys.readouterr()
+    assert call(*command) == 1
+    assert [r["status"] for r in rows(out).values()] == ["failed", "done"]
+    reason = rows(out)["three/bad"]["reason"]
+    assert "no readable checkpoint" in reason and str(out / "logs/three/bad.log") in reason
     for text in ((out / "results.md").read_text(), (out / "index.html").read_text(), capsys.readouterr().err):
-        assert "not finite" in text and "nan.log" in text
-    assert json.loads((out / "results.json").read_text())["means"][0]["method"] == "a"
+        assert "no readable checkpoint" in text and "bad.log" in text
+    assert [m["method"] for m in json.loads((out / "results.json").read_text())["means"]] == ["a"]
+    checkpoint.unlink()
+    assert call(*command) == 0 and [r["status"] for r in rows(out).values()] == ["done", "done"]  # it is tried again
+
+
+def test_an_error_of_ours_is_kept_with_its_kind(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def nan(self: Trainer) -> None:
+        raise FloatingPointError("step 3: not finite")
+
+    monkeypatch.setattr(Trainer, "step", nan)
+    command = words(scenes, tmp_path / "out", METHODS, "--only", "three/a")
+    with pytest.raises(FloatingPointError):
+        call(*command)
+    told = json.loads((tmp_path / "out/runs/three/a/failure.json").read_text())
+    assert told == {"reason": "FloatingPointError: step 3: not finite", "log": None}
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
@@ -200,7 +218,7 @@ def settings(command: list[str]) -> dict[str, object]:
 def test_other_settings_in_the_same_folder_are_refused(scenes: Path, finished: Path, capsys: Capture) -> None:
     before = snapshot(finished)
     assert "--steps 4, not 5" in refused(capsys, *words(scenes, finished, METHODS, steps=5))
-    assert "other settings" in refused(capsys, *words(scenes, finished, f"a=tiny {SMALL} --loss.cycle 0.5"))
+    assert "other settings" in refused(capsys, *words(scenes, finished, f"a=tiny {SMALL} --loss.cycle 0.123"))
     moved = [
         w.replace(str(scenes / "two/toy"), f"toy={scenes / 'three'}").replace(f",{scenes / 'three'}", "")
         for w in words(scenes, finished, METHODS)

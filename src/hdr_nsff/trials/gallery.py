@@ -99,7 +99,7 @@ def curves(rows: Sequence[Row]) -> list[str]:
     """Quality against training time, a line per method."""
     plots = []
     for key, label in CURVES:
-        drawing, axes = plot(3.9, 3.1)
+        drawing, axes = plot(3.7, 3.0)
         for i, row in enumerate(rows):
             points = [p for p in (row.trial.curve if row.trial else []) if key in p.scores and p.seconds > 0]
             style = "-" if i < 10 else "--"
