@@ -59,6 +59,7 @@ def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
         "report": ["report", run, "--out", out / "report.html"],
         "reexpose": ["reexpose", footage, out],
         "synth": ["synth", out],
+        "bench": ["bench", out, "--scenes", run.parent / "scene", "--methods", "tiny", "--steps", 1, "--device", "cpu"],
     }
 
 

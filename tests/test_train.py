@@ -21,7 +21,7 @@ from hdr_nsff import distributed
 from hdr_nsff.config import PRESETS, TrainConfig
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import write_json
-from hdr_nsff.run import Run, read_log
+from hdr_nsff.run import Run, read_log, snapshots
 from hdr_nsff.scene import Scene
 from hdr_nsff.tonemap import ToneMapConfig
 from hdr_nsff.train import Clock, Trainer, train
@@ -168,6 +168,46 @@ def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), steps=None, minutes=1.5 / 60)
     run = Run.open(train(settings))
     assert run.step > 3 and 1.5 <= run.seconds < 10
+
+
+def test_snapshots_are_kept_on_the_way_and_change_nothing(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+    run = train(config(toy_folder, tmp_path / "run"), keep_at=(0.5, 0.125), previews=False)
+    assert_same(final(unbroken), final(run))
+    assert not (run / "previews").exists() and list(snapshots(run)) == [0.125, 0.5]
+    half = Run.open(run, at=snapshots(run)[0.5])
+    assert half.step == STEPS // 2 and 0 < half.seconds < Run.open(run).seconds
+    table = "branches.static_grid.table"
+    assert not torch.equal(half.field.state_dict()[table], Run.open(run).field.state_dict()[table])
+    assert not any(k.startswith("optimiser.") for k in load_file(snapshots(run)[0.5]))
+
+
+def test_a_resumed_run_keeps_the_snapshots_that_are_still_to_come(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = replace(config(toy_folder, tmp_path / "run"), checkpoint_seconds=0.0)
+    step = Trainer.step
+
+    def stopping(self: Trainer) -> dict[str, float]:
+        if self.clock.step == 8:
+            raise KeyboardInterrupt
+        return step(self)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Trainer, "step", stopping)
+        train(settings, keep_at=(0.25, 0.5))
+    first = snapshots(settings.out)[0.25].stat().st_mtime_ns
+    train(settings, keep_at=(0.25, 0.5))
+    assert list(snapshots(settings.out)) == [0.25, 0.5] and snapshots(settings.out)[0.25].stat().st_mtime_ns == first
+
+
+def test_the_clock_stands_still_while_something_is_written(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Trainer, "keep", lambda self, share: time.sleep(3.0))
+    monkeypatch.setattr(Trainer, "step", lambda self: {"psnr": 0.0})
+    start = time.monotonic()
+    run = Run.open(train(config(toy_folder, tmp_path / "run"), keep_at=(0.5,), previews=False))
+    assert run.seconds < 2 and time.monotonic() - start > 3
 
 
 def test_draws_depend_on_seed_step_and_slot_alone(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ try:
     import tyro
 
     from hdr_nsff import __version__
+    from hdr_nsff.bench import BenchConfig, bench
     from hdr_nsff.config import PRESETS, TrainConfig
     from hdr_nsff.errors import InputError
     from hdr_nsff.evaluate import EvaluateConfig, evaluate
@@ -51,6 +52,7 @@ VERBS = {
     ),
     "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
     "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
+    "bench": Verb(bench, BenchConfig, "Methods x scenes in one table: trained, measured, side by side."),
     "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),
     "finetune-flow": Verb(
         finetune_flow, FinetuneConfig, "Adapt a flow network to pairs of different exposure, for `prepare --flow raft-finetuned`."
@@ -94,7 +96,7 @@ def parse(verb: Verb, name: str, arguments: Sequence[str]) -> Any:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one verb; exits with 0, 2 (bad input) or 130 (Ctrl-C)."""
+    """Run one verb; exits with 0, 1 (a run of `bench` failed), 2 (bad input) or 130 (Ctrl-C)."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments[:1] == ["--version"]:
         print(f"hdr-nsff {__version__}")

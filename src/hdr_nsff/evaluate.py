@@ -107,15 +107,13 @@ def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict
     """Means of the views: `headline`, `groups`, `protocols`. The headline is that of the protocol the scene was prepared for, else of all views
     the run was not trained on, else of all."""
     protocol = run.scene.manifest.protocol
-    wanted = [v for v in views if v["protocol"] is not None and v["protocol"] == (protocol or v["protocol"])]
-    if protocol is not None and not wanted:
+    if protocol is not None and not any(v["protocol"] == protocol for v in views):
         notes.append(
             f"no view to be compared belongs to the protocol {protocol} that the scene was prepared for; the headline is of others"
         )
-    held_out = wanted or [v for v in views if v["protocol"] is not None]
     return {
         "protocol": protocol,
-        "headline": mean_of(held_out or views),
+        "headline": mean_of(headline_views(run, views)),
         "groups": {g: mean_of([v for v in views if v["group"] == g]) for g in dict.fromkeys(v["group"] for v in views)},
         "protocols": {
             p: mean_of([v for v in views if v["protocol"] == p])
@@ -123,6 +121,21 @@ def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict
             if any(v["protocol"] == p for v in views)
         },
     }
+
+
+def headline_views(run: Run, views: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Those of the described views that the headline is of."""
+    protocol = run.scene.manifest.protocol
+    wanted = [v for v in views if v["protocol"] is not None and v["protocol"] == (protocol or v["protocol"])]
+    return wanted or [v for v in views if v["protocol"] is not None] or list(views)
+
+
+def headline_targets(run: Run, truth_folder: Path | None) -> list[Target]:
+    """The views that the headline is of: the same, in the same order, for every run on a scene."""
+    truth = Truth.open(truth_folder) if truth_folder else None
+    targets = choose_targets(run, truth, truth_folder)[1]
+    names = {v["name"] for v in headline_views(run, [describe(run, t) for t in targets])}
+    return [t for t in targets if t.name in names]
 
 
 def told_of_radiance(gauge: Gauge | None) -> dict[str, Any]:

@@ -112,6 +112,64 @@ class LogLine(Note):
     losses: dict[str, float]
 
 
+class Bench(Note):
+    """`bench.json`: what all runs of a benchmark have in common."""
+
+    marks = ("settings", "scenes")
+    settings: dict[str, str | int | float | bool | None]
+    scenes: dict[str, str]  # name -> where it was found
+
+
+class Trained(Note):
+    """What training a run of a benchmark took."""
+
+    steps: Count
+    seconds: float  # of training
+    start_seconds: float  # from reading the scene to the first step, and writing; in the process that finished the training
+    memory: Count  # bytes, the most that process held
+    gpu_memory: Count | None = None
+    device: str
+    threads: Count
+    frame_seconds: float  # to render a frame of the scene
+
+
+class CurvePoint(Note):
+    """Quality on a few held-out views, part of the way through the training."""
+
+    share: float
+    step: Count
+    seconds: float  # of training
+    scores: dict[str, float]
+
+
+class ShownView(Note):
+    """A held-out view of which pictures were kept, and its scores."""
+
+    name: str = Field(pattern=r"^[^/\x00]+$", max_length=200)
+    time: float  # in frames
+    scores: dict[str, float]
+
+
+class Trial(Note):
+    """`trial.json`: a run of a benchmark."""
+
+    marks = ("scene_key", "trained")
+    scene_key: str  # of the scene folder it was trained on
+    trained: Trained | None = None
+    measured: str | None = None  # key of what was measured, and how
+    seconds: float = 0.0  # of measuring
+    curve: list[CurvePoint] = []
+    shown: list[ShownView] = []
+
+
+class Failure(Note):
+    """`failure.json`: why a run of a benchmark has no result."""
+
+    marks = ("reason", "log")
+    reason: str
+    log: str | None
+
+
 class Scores(BaseModel):
     """Means over some views; every further key is a score."""
 

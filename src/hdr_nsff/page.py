@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io as memory
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from html import escape
 from typing import Any
 
@@ -59,15 +59,24 @@ def details(summary: str, content: str) -> str:
     return f"<details><summary>{escape(summary)}</summary>{content}</details>"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]], numeric: bool = True) -> str:
-    """An HTML table of plain texts; all columns but the first are numbers if `numeric`."""
+def table(
+    header: Sequence[str],
+    rows: Sequence[Sequence[str]],
+    numeric: bool = True,
+    words: int = 1,
+    bold: Collection[tuple[int, int]] = (),
+) -> str:
+    """An HTML table of plain texts; all columns but the first `words` are numbers if `numeric`. `bold`: cells as (row, column)."""
 
-    def line(cells: Sequence[str], tag: str) -> str:
-        parts = [f"<{tag}{' class=n' if numeric and i else ''}>{escape(c)}</{tag}>" for i, c in enumerate(cells)]
-        return f"<tr>{''.join(parts)}</tr>"
+    def cell(text: str, tag: str, row: int, column: int) -> str:
+        inner = f"<b>{escape(text)}</b>" if (row, column) in bold else escape(text)
+        return f"<{tag}{' class=n' if numeric and column >= words else ''}>{inner}</{tag}>"
+
+    def line(cells: Sequence[str], tag: str, row: int = -1) -> str:
+        return f"<tr>{''.join(cell(c, tag, row, i) for i, c in enumerate(cells))}</tr>"
 
     top = line(header, "th") if any(header) else ""
-    return f'<div class="wide"><table>{top}{"".join(line(r, "td") for r in rows)}</table></div>'
+    return f'<div class="wide"><table>{top}{"".join(line(r, "td", i) for i, r in enumerate(rows))}</table></div>'
 
 
 def figure(rgb: np.ndarray, caption: str, widest: int = 640) -> str:

@@ -1,5 +1,5 @@
-"""A run folder: config.json, checkpoints/ (safetensors, newest two kept), log.jsonl, previews/. `Run.open` rebuilds field and tone
-mapper from it alone. Nothing is unpickled; every write is atomic."""
+"""A run folder: config.json, checkpoints/ (safetensors, newest two kept), snapshots/ where `bench` asks for them, log.jsonl, previews/.
+`Run.open` rebuilds field and tone mapper from it alone. Nothing is unpickled; every write is atomic."""
 
 from __future__ import annotations
 
@@ -37,12 +37,28 @@ class Checkpoint:
 def save_checkpoint(folder: Path, step: int, seconds: float, tensors: dict[str, Tensor]) -> Path:
     """Write checkpoints/step_XXXXXXXX.safetensors and drop all but the newest two."""
     path = Path(folder) / "checkpoints" / f"step_{step:08d}.safetensors"
-    with atomic(path) as temporary:
-        cpu = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        save_file(cpu, temporary, metadata={"format": FORMAT, "step": str(step), "seconds": repr(seconds)})
+    write_checkpoint(path, step, seconds, tensors)
     for old in sorted(path.parent.glob("step_*.safetensors"))[:-KEEP]:
         old.unlink()
     return path
+
+
+def write_checkpoint(path: Path, step: int, seconds: float, tensors: dict[str, Tensor]) -> None:
+    """One checkpoint file."""
+    with atomic(path) as temporary:
+        cpu = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
+        save_file(cpu, temporary, metadata={"format": FORMAT, "step": str(step), "seconds": repr(seconds)})
+
+
+def keep_snapshot(folder: Path, share: float, step: int, seconds: float, tensors: dict[str, Tensor]) -> None:
+    """Write snapshots/share_X.safetensors: what was learned by that share of the run. A resumed run that gets there again writes it again."""
+    write_checkpoint(Path(folder) / "snapshots" / f"share_{share:.6f}.safetensors", step, seconds, tensors)
+
+
+def snapshots(folder: Path) -> dict[float, Path]:
+    """{share of the run: file}, in order."""
+    files = sorted((Path(folder) / "snapshots").glob("share_*.safetensors"))
+    return {float(f.stem.removeprefix("share_")): f for f in files}
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -129,12 +145,13 @@ class Run:
     seconds: float  # of training
 
     @staticmethod
-    def open(folder: Path | str, device: str = "cpu") -> Run:
-        """Read a run folder; InputError in one sentence where it is none, unfinished or damaged."""
+    def open(folder: Path | str, device: str = "cpu", at: Path | None = None) -> Run:
+        """Read a run folder, as its newest checkpoint has it or as the file `at` does; InputError in one sentence where it is none,
+        unfinished or damaged."""
         folder = Path(folder)
         config = read_config(folder)
         scene = Scene.open(config.scene)
-        found = latest_checkpoint(folder)
+        found = read_checkpoint(at) if at is not None else latest_checkpoint(folder)
         if found is None:
             raise InputError(f"{folder}: no checkpoint yet; run `hdr-nsff train` to the first one")
         field, tonemapper = build_field(config.field, scene), ToneMapper.for_scene(config.tonemap, scene)
@@ -163,6 +180,22 @@ def read_config(folder: Path) -> TrainConfig:
 def write_config(folder: Path, config: TrainConfig) -> None:
     """Save the config of a run."""
     write_json(Path(folder) / "config.json", config.to_json())
+
+
+def last_logged(folder: Path) -> LogLine | None:
+    """The last complete line of log.jsonl, without reading all of it; None where there is none."""
+    path = Path(folder) / "log.jsonl"
+    if not path.is_file():
+        return None
+    with open(path, "rb") as file:
+        file.seek(max(path.stat().st_size - 8192, 0))
+        lines = file.read().decode(errors="replace").splitlines()
+    for text in reversed(lines):
+        try:
+            return LogLine.model_validate_json(text)
+        except ValueError:  # cut short: by a kill, or by where we began to read
+            continue
+    return None
 
 
 def read_log(folder: Path) -> list[LogLine]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -25,7 +26,7 @@ from hdr_nsff.io import write_png, writing_to
 from hdr_nsff.objective import Objective
 from hdr_nsff.priors.response import initialise
 from hdr_nsff.progress import bar, say
-from hdr_nsff.run import latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
+from hdr_nsff.run import keep_snapshot, latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
 from hdr_nsff.scene import Scene
 from hdr_nsff.tensors import hold_threads, to_device
 from hdr_nsff.tonemap import ToneMapper, informative
@@ -64,8 +65,9 @@ class Clock:
         return self.config.lr_final**self.progress if self.config.lr_final else 0.1 ** (self.step / 300_000)
 
 
-def train(config: TrainConfig) -> Path:
-    """Train (or go on training) until the steps or minutes are spent; the run folder."""
+def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = True) -> Path:
+    """Train (or go on training) until the steps or minutes are spent; the run folder. What was learned by the shares `keep_at` of the run, in
+    (0, 1), stays in `snapshots/`; it changes nothing of what is learned. `previews`: a picture with every checkpoint."""
     if config.steps is None and config.minutes is None:
         raise InputError("neither --steps nor --minutes: say how long to train")
     check(config)
@@ -76,8 +78,7 @@ def train(config: TrainConfig) -> Path:
         device, scene = pick_device(config.device), Scene.open(config.scene)
         if ranks.main:
             open_folder(config)
-        trainer = Trainer(config, scene, device, ranks)
-        trainer.loop()
+        Trainer(config, scene, device, ranks).loop(keep_at, previews)
     return config.out
 
 
@@ -161,34 +162,44 @@ class Trainer:
         values = torch.cat(logs)
         return float(values.median()) if len(values) else 0.0
 
-    def loop(self) -> None:
-        """Train until the clock runs out."""
+    def loop(self, keep_at: Sequence[float] = (), previews: bool = True) -> None:
+        """Train until the clock runs out. It stands still while something is written, and starts after this process's first step, in which
+        kernels are compiled."""
         if self.clock.progress >= 1:
             self.report(f"training was finished already, at step {self.clock.step}")
             return
+        due = sorted(share for share in keep_at if share > self.clock.progress)
         started, before = time.monotonic(), self.clock.seconds
-        saved, note = started, ""
+        saved, note, compiled = started, "", False
         if self.clock.step == 0 and self.ranks.main:
             self.save()
         with bar() as progress:
             task = progress.add_task("train", total=1000, note="")
             while self.clock.progress < 1:
                 values = self.step()
+                if not compiled:
+                    started, compiled = time.monotonic(), True
                 elapsed = self.ranks.agree(before + time.monotonic() - started)
                 self.clock = replace(self.clock, step=self.clock.step + 1, seconds=elapsed)
+                paused = time.monotonic()
                 if self.clock.step % LOG_EVERY == 0 and self.ranks.main:
                     self.log(values)
                     note = f"{values['psnr']:.1f} dB"
                     progress.update(task, completed=round(1000 * self.clock.progress), note=note)
+                while due and self.clock.progress >= due[0]:
+                    self.keep(due.pop(0))
                 if time.monotonic() - saved > self.config.checkpoint_seconds and self.ranks.main:
                     self.save()
-                    self.preview()
+                    if previews:
+                        self.preview()
                     if not progress.live.is_started:
                         say(f"train: {self.clock.progress:.0%}, step {self.clock.step}, {note}")
                     saved = time.monotonic()
+                started += time.monotonic() - paused
         if self.ranks.main:
             self.save()
-            self.preview()
+            if previews:
+                self.preview()
 
     def step(self) -> dict[str, float]:
         """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
@@ -288,6 +299,11 @@ class Trainer:
     def save(self) -> None:
         """A checkpoint of everything that counts."""
         save_checkpoint(self.config.out, self.clock.step, self.clock.seconds, pack(self.modules, self.optimisers))
+
+    def keep(self, share: float) -> None:
+        """What was learned by now, to stay."""
+        if self.ranks.main:
+            keep_snapshot(self.config.out, share, self.clock.step, self.clock.seconds, pack(self.modules, {}))
 
     @torch.no_grad()
     def preview(self) -> None:
