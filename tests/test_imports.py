@@ -18,7 +18,7 @@ TRUTH = {  # who reads it, and the last three, which write it
     "reexpose",
     "datasets.held_out",
 }
-HEAVY = {"pycolmap", "mitsuba", "rawpy", "flip_evaluator", "gsplat"}
+HEAVY = {"pycolmap", "mitsuba", "drjit", "rawpy", "flip_evaluator", "gsplat"}
 
 
 def module_of(path: Path) -> str:

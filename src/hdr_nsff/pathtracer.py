@@ -198,6 +198,8 @@ class Tracer:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
         """For rays from one point: distances (S,) in units of each direction's length, normals (S, 3), texture coordinates (S, 2),
         names of the parts hit."""
+        import drjit as dr
+
         mi = self.mi
         if mi.variant().startswith("scalar"):
             hits = [scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(d))) for d in directions]
@@ -205,10 +207,10 @@ class Tracer:
             return np.array([h.t for h in hits]), normals, uv, [h.shape.id() for h in hits]
         columns = [np.ascontiguousarray(c, np.float32) for c in directions.T]
         hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(float, origin)), mi.Vector3f(*columns)))
-        names = np.full(len(directions), "", object)
-        for shape in scene.shapes():
-            names[np.array(hit.shape == mi.ShapePtr(shape)).astype(bool)] = shape.id()
-        return np.array(hit.t, np.float64), np.array(hit.n, np.float64).T, np.array(hit.uv, np.float64).T, list(names)
+        # one number per shape: asking of each shape where it was hit would take longer than a picture
+        number = {int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)))[0]): s.id() for s in scene.shapes()}
+        names = [number.get(int(k), "") for k in np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
+        return np.array(hit.t, np.float64), np.array(hit.n, np.float64).T, np.array(hit.uv, np.float64).T, names
 
 
 def circuit(part: Part) -> str:
