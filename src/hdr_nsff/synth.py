@@ -47,7 +47,7 @@ class SynthConfig:
 
     name: Annotated[Literal["interior", "lamp", "night", "cloth"], tyro.conf.Positional]  # which scene
     out: Annotated[Path, tyro.conf.Positional]  # folder to write
-    views: Literal["mono", "rig"] = "mono"  # one moving camera, or nine synchronized ones that take the frames in turn
+    views: Views = "mono"  # one moving camera, or nine synchronized ones that take the frames in turn
     size: str = "240x136"  # width x height in pixels
     frames: int = 36
     ev: str | None = (
