@@ -1,7 +1,7 @@
 """What holds a result back: a prepared scene with some of its priors replaced by those of an oracle scene of the same clip. ORACLE RUNS: what is
 trained on such a folder says what a better prior would bring, not what the product does.
 
-    hdr-nsff synth CLIP --oracle
+    hdr-nsff synth interior CLIP --oracle
     python benchmarks/replace_priors.py SCENE CLIP/oracle OUT --what masks mover-depth flow
     hdr-nsff train splat --scene OUT --out RUN --steps 1500 && hdr-nsff evaluate RUN --truth CLIP/truth
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.recording import Noise, record, response_curve
+from hdr_nsff.recording import Noise, record, response_curve, vignette
 
 GREY = (1.0, 1.0, 1.0)
-NAMES = ["film", "gamma", "srgb"]
+NAMES = ["film", "log", "gamma", "srgb"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,6 +71,20 @@ def test_a_short_exposure_is_relatively_noisier() -> None:
     assert short.std() / short.mean() > 3 * long.std() / long.mean()  # shot noise alone: sqrt(16) = 4
 
 
+def test_light_falls_off_by_the_fourth_power_of_the_cosine() -> None:
+    """At 45 degrees from the axis cos^4 is 1/4; half the strength takes half as much away. On the axis all light passes."""
+    K = np.array([[2.0, 0, 2.5], [0, 2.0, 0.5], [0, 0, 1]])
+    assert vignette(1, 5, K, 1.0)[0, :, 0] == pytest.approx([0.25, 0.64, 1.0, 0.64, 0.25])  # tangents -1, -1/2, 0, 1/2, 1
+    assert vignette(1, 5, K, 0.5)[0, 0, 0] == pytest.approx(0.625)
+    assert (vignette(4, 4, K, 0.0) == 1).all()
+
+
+def test_a_log_curve_gives_equal_ratios_equal_steps() -> None:
+    """Well above 1/250: doubling adds ln 2 / ln 251."""
+    values = response_curve("log").apply(np.full((3, 3), [[0.25], [0.5], [1.0]]))
+    np.testing.assert_allclose(np.diff(values, axis=0), np.log(2) / np.log(251), rtol=0.02)
+
+
 def test_unknown_response_is_refused_in_a_sentence() -> None:
-    with pytest.raises(InputError, match="use film, gamma or srgb"):
+    with pytest.raises(InputError, match="use film, log, gamma or srgb"):
         response_curve("kodak")

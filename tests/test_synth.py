@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,29 +12,15 @@ from hdr_nsff import synth as verb
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import open_footage, read_exposure_csv
-from hdr_nsff.pathtracer import Surface, Tracer, smooth
+from hdr_nsff.pathtracer import PASS, Surface, Tracer, smooth
 from hdr_nsff.scene import Scene
 from hdr_nsff.synth import SynthConfig, clip_shots, parse_ev, parse_size, synth, truth_shots
 from hdr_nsff.synth_motion import exact_flow
 from hdr_nsff.synth_oracle import visible
-from hdr_nsff.synth_scene import (
-    BACK,
-    CORD,
-    FLOOR,
-    PIVOT,
-    POSES,
-    RIG,
-    RIG_TARGET,
-    body_pose,
-    build,
-    camera_pose,
-    intrinsics,
-    look_at,
-    moved,
-    project,
-    rig_pose,
-)
-from hdr_nsff.truth import Truth
+from hdr_nsff.synth_scenes.base import Views
+from hdr_nsff.synth_scenes.geometry import intrinsics, look_at, project
+from hdr_nsff.synth_scenes.interior import BACK, CORD, FLOOR, INTERIOR, PIVOT, ball_pose, box_pose, camera_pose
+from hdr_nsff.truth import Truth, true_pictures
 
 ROOM, BOX, BALL = 0, 1, 2
 
@@ -70,7 +55,7 @@ def test_projection_agrees_with_the_camera_of_the_package() -> None:
 def test_ball_swings_on_a_circle_about_its_pivot() -> None:
     """At angle a the ball hangs CORD cos(a) below the pivot and CORD sin(a) beside it."""
     for t in (0.0, 3.5, 17.0):
-        centre = (body_pose("ball", t) @ [0, CORD, 0, 1])[:3] - PIVOT
+        centre = (ball_pose(t) @ [0, CORD, 0, 1])[:3] - PIVOT
         angle = np.radians(18) * np.sin(2 * np.pi * (t + 4) / 30)
         assert centre[1] == pytest.approx(CORD * np.cos(angle))
         assert np.hypot(centre[0], centre[2]) == pytest.approx(CORD * abs(np.sin(angle)))
@@ -79,9 +64,9 @@ def test_ball_swings_on_a_circle_about_its_pivot() -> None:
 def test_moved_carries_movers_rigidly_and_leaves_the_room() -> None:
     rng = np.random.default_rng(0)
     local = rng.normal(size=(5, 3))
-    start, end = (local @ body_pose("box", t)[:3, :3].T + body_pose("box", t)[:3, 3] for t in (4.0, 9.5))
+    start, end = (local @ box_pose(t)[:3, :3].T + box_pose(t)[:3, 3] for t in (4.0, 9.5))
     points = np.concatenate([start, local])
-    result = moved(points, np.array([BOX] * 5 + [ROOM] * 5), 4.0, 9.5)
+    result = INTERIOR.moved(points, np.array([BOX] * 5 + [ROOM] * 5), np.zeros((10, 2)), 4.0, 9.5)
     np.testing.assert_allclose(result[:5], end, atol=1e-12)
     np.testing.assert_array_equal(result[5:], local)
 
@@ -89,25 +74,26 @@ def test_moved_carries_movers_rigidly_and_leaves_the_room() -> None:
 def test_flow_of_a_known_point_is_exact() -> None:
     """A pixel that shows the ball's centre flows to where the next camera projects the next position of that centre."""
     K, centre = intrinsics(240, 136), [0, CORD, 0, 1]
-    pixel, _ = project((body_pose("ball", 7) @ centre)[:3], K, camera_pose(7))
-    after, _ = project((body_pose("ball", 8) @ centre)[:3], K, camera_pose(8))
-    points = np.broadcast_to((body_pose("ball", 7) @ centre)[:3], (136, 240, 3))
+    pixel, _ = project((ball_pose(7) @ centre)[:3], K, camera_pose(7))
+    after, _ = project((ball_pose(8) @ centre)[:3], K, camera_pose(8))
+    points = np.broadcast_to((ball_pose(7) @ centre)[:3], (136, 240, 3))
     x, y = np.floor(pixel).astype(int)
-    flow = exact_flow(points, np.full((136, 240), BALL), 7, 8, K, camera_pose(8))[y, x]
+    there = INTERIOR.moved(points, np.full((136, 240), BALL), np.zeros((136, 240, 2)), 7, 8)
+    flow = exact_flow(there, K, camera_pose(8))[y, x]
     np.testing.assert_allclose(flow, after - (np.array([x, y]) + 0.5), atol=1e-9)
 
 
 def test_motion_between_frames_stays_within_ten_pixels() -> None:
     K = intrinsics(240, 136)
     for t in range(36):
-        for body, point in (("box", [0.1, 0.1, 0.1, 1]), ("ball", [0, CORD, 0, 1])):
-            (a, depth), (b, _) = (project((body_pose(body, s) @ point)[:3], K, camera_pose(s)) for s in (t, t + 1))
+        for pose, point in ((box_pose, [0.1, 0.1, 0.1, 1]), (ball_pose, [0, CORD, 0, 1])):
+            (a, depth), (b, _) = (project((pose(s) @ point)[:3], K, camera_pose(s)) for s in (t, t + 1))
             assert np.linalg.norm(b - a) < 10 and depth > 1
             assert (a > 0).all() and (a < [240, 136]).all()  # always in the picture
 
 
 def test_held_out_views_are_never_frames_of_the_clip() -> None:
-    clip, views = clip_shots(36, 1, 0), truth_shots(36, 1, 0)
+    clip, views = clip_shots(INTERIOR, 36, 1, 0), truth_shots(INTERIOR, 36, 1, 0)
     assert [v.name.split("_")[0] for v in views] == ["view"] * 8 + ["time"] * 6 + ["off"] * 2
     for view in views:
         same_time = [c for c in clip if c.time == view.time]
@@ -118,32 +104,34 @@ def test_held_out_views_are_never_frames_of_the_clip() -> None:
 
 
 def test_the_rig_is_two_rows_of_cameras_that_look_at_one_place() -> None:
-    eyes = np.array([rig_pose(k)[:, 3] for k in range(9)])
+    eyes = np.array([INTERIOR.pose("rig", k)[:, 3] for k in range(9)])
     assert np.ptp(eyes, axis=0) == pytest.approx([1.2, 0.28, 0])
     assert sorted(np.unique(eyes[:, 1], return_counts=True)[1]) == [4, 5]
     beside = np.linalg.norm(eyes - np.roll(eyes, 1, axis=0), axis=1)
     assert beside.max() < 0.35  # whoever records next stands beside, also after the last
     for k in range(9):
-        np.testing.assert_allclose(project(np.array(RIG_TARGET), intrinsics(240, 136), rig_pose(k))[0], [120, 68], atol=1e-9)
+        np.testing.assert_allclose(
+            project(np.array(INTERIOR.rig_target), intrinsics(240, 136), INTERIOR.pose("rig", k))[0], [120, 68], atol=1e-9
+        )
 
 
 def test_every_camera_of_the_rig_always_sees_both_movers() -> None:
     K = intrinsics(240, 136)
-    centres = [(body_pose(b, t) @ p)[:3] for t in range(36) for b, p in (("box", [0, 0, 0, 1]), ("ball", [0, CORD, 0, 1]))]
+    centres = [(b(t) @ p)[:3] for t in range(36) for b, p in ((box_pose, [0, 0, 0, 1]), (ball_pose, [0, CORD, 0, 1]))]
     for k in range(9):
-        pixels, depth = project(np.array(centres), K, rig_pose(k))
+        pixels, depth = project(np.array(centres), K, INTERIOR.pose("rig", k))
         assert (pixels > 20).all() and (pixels < [220, 116]).all() and (depth > 1.5).all()
 
 
 def test_frame_i_of_a_rig_is_what_camera_i_modulo_nine_records() -> None:
-    for t, shot in enumerate(clip_shots(20, 1, 0, "rig")):
+    for t, shot in enumerate(clip_shots(INTERIOR, 20, 1, 0, "rig")):
         assert shot.time == t and shot.anchor == t
-        np.testing.assert_allclose(shot.c2w[:, 3], RIG[t % 9])
+        np.testing.assert_allclose(shot.c2w[:, 3], INTERIOR.rig[t % 9])
 
 
 @pytest.mark.parametrize("frames", [12, 36])
 def test_a_rig_holds_out_other_cameras_than_the_one_that_records_then(frames: int) -> None:
-    clip, views = clip_shots(frames, 1, 0, "rig"), truth_shots(frames, 1, 0, "rig")
+    clip, views = clip_shots(INTERIOR, frames, 1, 0, "rig"), truth_shots(INTERIOR, frames, 1, 0, "rig")
     assert len({v.name for v in views}) == 16 and sum(v.time % 1 == 0.5 for v in views) == 6
     for view in views:
         recording = clip[int(view.time)]
@@ -172,15 +160,15 @@ def plane(height: int = 12, width: int = 16, depth: float = 2.0, bodies: int = R
     y, x = np.mgrid[:height, :width] * 0.01
     points = np.stack([x, y, np.full_like(x, depth)], -1)
     normals = np.broadcast_to([0.0, 0, -1], points.shape)
-    return Surface(points, normals, np.full((height, width), depth), np.full((height, width), bodies))
+    return Surface(points, normals, np.full((height, width), depth), np.full((height, width), bodies), points[..., :2])
 
 
 def test_smoothing_keeps_even_light_and_lowers_noise() -> None:
     surface = plane(40, 40)
-    np.testing.assert_allclose(smooth(np.full((40, 40, 3), 0.7), surface), 0.7, rtol=1e-5)
+    np.testing.assert_allclose(smooth(np.full((40, 40, 3), 0.7), surface, 0.05), 0.7, rtol=1e-5)
     noisy = np.random.default_rng(0).normal(1, 0.2, (40, 40, 3))
     # a Gaussian of 5 pixels averages 4 pi 25 = 314 independent values: 0.2 / 17.7 = 0.011; the cut at 9 pixels costs a little
-    assert 0.009 < smooth(noisy, surface)[15:25, 15:25].std() < 0.02
+    assert 0.009 < smooth(noisy, surface, 0.05)[15:25, 15:25].std() < 0.02
 
 
 def test_smoothing_does_not_cross_a_mover_or_a_corner() -> None:
@@ -191,8 +179,8 @@ def test_smoothing_does_not_cross_a_mover_or_a_corner() -> None:
     other_body = replace(surface, bodies=np.where(half, BOX, ROOM) * np.ones((12, 1), int))
     corner = replace(surface, normals=np.where(half[:, None], [1.0, 0, 0], [0, 0, -1.0]) * np.ones((12, 1, 1)))
     for parted in (other_body, corner):
-        np.testing.assert_allclose(smooth(light, parted), light, atol=1e-6)
-    assert 0.2 < smooth(light, surface)[6, 7, 0] < 0.8
+        np.testing.assert_allclose(smooth(light, parted, 0.05), light, atol=1e-6)
+    assert 0.2 < smooth(light, surface, 0.05)[6, 7, 0] < 0.8
 
 
 def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
@@ -218,7 +206,7 @@ class Flat:
         return replace(surface, bodies=np.where(np.arange(size[0]) < 4, BOX, ROOM) * np.ones((size[1], 1), int))
 
     def radiance(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int) -> np.ndarray:
-        Flat.rendered += 1
+        Flat.rendered += spp > PASS  # what is traced for the estimate of time does not count
         return np.full((size[1], size[0], 3), 0.25, np.float32)
 
 
@@ -226,7 +214,7 @@ class Flat:
 def flat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SynthConfig:
     monkeypatch.setattr(verb, "Tracer", Flat)
     Flat.rendered = 0
-    return SynthConfig(tmp_path / "room", size="16x16", frames=12, noise=0, oracle=True)
+    return SynthConfig("interior", tmp_path / "room", size="16x16", frames=12, noise=0, oracle=True)
 
 
 def test_exposures_alternate_about_the_middle_bracket(flat: SynthConfig) -> None:
@@ -251,7 +239,7 @@ def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
 
 
 @pytest.mark.parametrize("views", ["mono", "rig"])
-def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig, views: Literal["mono", "rig"]) -> None:
+def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig, views: Views) -> None:
     synth(replace(flat, views=views))
     scene = Scene.open(flat.out / "oracle")
     assert {s.note for s in scene.manifest.steps.values()} == {"oracle: from truth"}
@@ -261,7 +249,7 @@ def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig, views: Litera
     still = pixels[:, 4:]
     points = plane(16, 16, 3.0).points
     for side in (-1, 1):
-        exact = project(points, intrinsics(16, 16), POSES[views](k + side))[0][:, 4:] - still
+        exact = project(points, intrinsics(16, 16), INTERIOR.pose(views, k + side))[0][:, 4:] - still
         error = frame.flow[side].numpy()[:, 4:] - exact
         assert 0.2 < error.std() < 0.4 and abs(error.mean()) < 0.1  # 0.3 px of noise, no bias
     assert frame.disparity is not None and abs(float(frame.disparity.log().mean() - np.log(1 / 3))) < 0.03
@@ -284,6 +272,47 @@ def test_other_settings_do_not_mix_into_a_folder(flat: SynthConfig) -> None:
     assert Flat.rendered == 12 + 16
 
 
+def test_the_cameras_settings_are_in_the_truth_and_in_the_recording(flat: SynthConfig) -> None:
+    """Without noise, a clip's frame is what the truth makes of the same radiance at the same bracket: gains, fall-off, curve and all."""
+    synth(replace(flat, ev="0,-3", response="log", white_balance="2,1,0.5", vignetting=0.8))
+    truth = Truth.open(flat.out / "truth")
+    assert truth.bracket_ev == [0, -3] and truth.white_balance == [2, 1, 0.5] and truth.vignetting == 0.8
+    assert truth.settings is not None and truth.settings["name"] == "interior" and truth.settings["response"] == "log"
+    _, pictures = true_pictures(truth, truth.views[0], flat.out / "truth")
+    for bracket in (0, 1):
+        recorded = io.read_image(flat.out / "clip" / f"{bracket:05d}.png")
+        np.testing.assert_allclose(recorded, pictures[bracket], atol=0.51 / 255)
+    assert pictures[1][8, 8, 1] > pictures[1][0, 0, 1] + 0.02  # darker in the corner
+
+
+def test_scenes_do_not_mix_in_a_folder_and_are_exposed_as_suits_them(flat: SynthConfig) -> None:
+    synth(flat)
+    with pytest.raises(InputError, match="other settings"):
+        synth(replace(flat, name="night"))
+    synth(replace(flat, name="night", out=flat.out.parent / "night"))
+    assert Truth.open(flat.out.parent / "night" / "truth").bracket_ev == [-3, 0, 3]
+
+
+def test_the_estimate_of_time_is_exact_where_a_path_costs_the_same_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two seconds per picture and a tenth per path: 2 + 25.6 and 2 + 76.8."""
+    now = [0.0]
+
+    class Steady(Flat):
+        def radiance(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int) -> np.ndarray:
+            now[0] += 2 + 0.1 * spp
+            return super().radiance(t, K, c2w, size, spp, seed)
+
+    monkeypatch.setattr(verb.clock, "monotonic", lambda: now[0])
+    shots = [clip_shots(INTERIOR, 12, 256, 0)[0], truth_shots(INTERIOR, 12, 768, 0)[0]]
+    assert verb.estimate(Steady(), shots, intrinsics(16, 16), (16, 16)) == pytest.approx(27.6 + 78.8)
+
+
+@pytest.mark.parametrize("text", ["1,1", "a,b,c", "0,1,1", "nan,1,1", "1,1,1,1"])
+def test_a_bad_white_balance_is_refused_in_a_sentence(text: str) -> None:
+    with pytest.raises(InputError, match="--white-balance"):
+        verb.parse_white_balance(text)
+
+
 def test_a_rig_lists_its_exposures_for_prepare(flat: SynthConfig) -> None:
     synth(replace(flat, views="rig"))
     for footage in ("clip.mp4", "clip"):
@@ -293,7 +322,7 @@ def test_a_rig_lists_its_exposures_for_prepare(flat: SynthConfig) -> None:
 
 def test_the_poses_of_a_rig_are_in_its_truth_and_its_oracle(flat: SynthConfig) -> None:
     synth(replace(flat, views="rig"))
-    poses = np.array([rig_pose(t) for t in range(12)])
+    poses = np.array([INTERIOR.pose("rig", t) for t in range(12)])
     np.testing.assert_allclose(np.array(Truth.open(flat.out / "truth").clip_c2w), poses)
     np.testing.assert_allclose([e.c2w for e in Scene.open(flat.out / "oracle").manifest.frames], poses)
 
@@ -326,6 +355,7 @@ def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
     "change",
     [
         *({"frames": 3}, {"seed": -1}, {"spp": 0}, {"noise": -1.0}, {"noise": float("nan")}, {"response": "kodak"}),
+        *({"vignetting": 1.1}, {"vignetting": float("nan")}, {"white_balance": "1"}),
         *({"depth_noise": 1.0}, {"depth_grain": -0.1}, {"flow_noise": float("nan")}),
     ],
 )
@@ -353,7 +383,7 @@ def test_a_missing_mitsuba_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 @pytest.fixture(scope="module")
 def tracer() -> Tracer:
     pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
-    return Tracer(build(0), "scalar_rgb")
+    return Tracer(INTERIOR, 0, "scalar_rgb")
 
 
 def test_a_tiny_picture_holds_the_range_it_promises(tracer: Tracer) -> None:
@@ -375,7 +405,7 @@ def test_surfaces_lie_on_the_rays_through_pixel_centres(tracer: Tracer) -> None:
     np.testing.assert_allclose(depth, surface.depth, rtol=1e-6)
     assert surface.points[..., 2].max() < BACK + 0.25 and surface.points[..., 1].max() < FLOOR + 1e-3
     assert set(np.unique(surface.bodies)) == {ROOM, BOX, BALL}
-    ball = surface.points[surface.bodies == BALL] - (body_pose("ball", 3.0) @ [0, CORD, 0, 1])[:3]
+    ball = surface.points[surface.bodies == BALL] - (ball_pose(3.0) @ [0, CORD, 0, 1])[:3]
     assert np.abs(np.linalg.norm(ball, axis=1) - 0.165).min() < 0.003  # on the sphere, where it is no cord
 
 
@@ -390,5 +420,9 @@ def test_the_demo_is_whole_and_small_enough_for_git() -> None:
     for view in truth.views:
         assert io.read_exr(demo / "truth" / view.radiance)["RGB"].shape == (136, 240, 3)
         assert 0.02 < io.read_mask(demo / "truth" / str(view.mask)).mean() < 0.15
-    np.testing.assert_allclose(np.array(truth.clip_c2w), [s.c2w for s in clip_shots(36, 1, 0)])  # the code still makes this clip
-    assert [(v.name, v.time, v.anchor) for v in truth.views] == [(s.name, s.time, s.anchor) for s in truth_shots(36, 1, 0)]
+    np.testing.assert_allclose(
+        np.array(truth.clip_c2w), [s.c2w for s in clip_shots(INTERIOR, 36, 1, 0)]
+    )  # the code still makes this clip
+    assert [(v.name, v.time, v.anchor) for v in truth.views] == [
+        (s.name, s.time, s.anchor) for s in truth_shots(INTERIOR, 36, 1, 0)
+    ]

@@ -7,10 +7,11 @@ from hdr_nsff import io
 from hdr_nsff.pathtracer import Tracer
 from hdr_nsff.synth import SynthConfig, synth
 from hdr_nsff.synth_motion import view_geometry
-from hdr_nsff.synth_scene import CORD, body_pose, camera_pose, intrinsics
+from hdr_nsff.synth_scenes.geometry import intrinsics
+from hdr_nsff.synth_scenes.interior import CORD, INTERIOR, ball_pose, box_pose, camera_pose
 from hdr_nsff.truth import GEOMETRY, Truth
 
-NAMES = {0: "room", 1: "box", 2: "ball"}
+POSES = {0: lambda t: np.eye(4), 1: box_pose, 2: ball_pose}
 
 
 def test_every_pixel_moves_as_its_body_does() -> None:
@@ -18,14 +19,14 @@ def test_every_pixel_moves_as_its_body_does() -> None:
     K, c2w, time = intrinsics(12, 9), camera_pose(3.0), 7.5
     rng = np.random.default_rng(0)
     depth, bodies = rng.uniform(1.5, 3, (9, 12)), rng.integers(0, 3, (9, 12))
-    channels = view_geometry(depth, bodies, time, K, c2w)
+    channels = view_geometry(INTERIOR, {"Z": depth, "body": bodies}, time, K, c2w)
     np.testing.assert_array_equal(channels["Z"], depth)
     for side, name in io.SIDES.items():
         for y, x in np.ndindex(9, 12):
             ray = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1]
             point = c2w[:, :3] @ (depth[y, x] * ray) + c2w[:, 3]
-            body = NAMES[bodies[y, x]]
-            there = (body_pose(body, time + side) @ np.linalg.inv(body_pose(body, time)) @ [*point, 1])[:3]
+            pose = POSES[bodies[y, x]]
+            there = (pose(time + side) @ np.linalg.inv(pose(time)) @ [*point, 1])[:3]
             seen = K @ c2w[:, :3].T @ (there - c2w[:, 3])
             np.testing.assert_allclose([channels[f"{name}.{a}"][y, x] for a in "xyz"], there - point, atol=1e-9)
             np.testing.assert_allclose(
@@ -34,7 +35,9 @@ def test_every_pixel_moves_as_its_body_does() -> None:
 
 
 def test_the_room_rests_exactly() -> None:
-    channels = view_geometry(np.full((6, 8), 2.5, np.float32), np.full((6, 8), ROOM), 4.0, intrinsics(8, 6), camera_pose(9))
+    channels = view_geometry(
+        INTERIOR, {"Z": np.full((6, 8), 2.5, np.float32), "body": np.full((6, 8), ROOM)}, 4.0, intrinsics(8, 6), camera_pose(9)
+    )
     assert all((m == 0).all() for n, m in channels.items() if n != "Z")
 
 
@@ -52,8 +55,8 @@ def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:  # noqa: F
     """What the ray through a pixel hits of the ball is carried to the ball of the next frame, and back to that of the one before."""
     size, c2w, time = (96, 54), camera_pose(3), 9.5
     surface = tracer.surface(time, intrinsics(*size), c2w, size)
-    channels = view_geometry(surface.depth, surface.bodies, time, intrinsics(*size), c2w)
-    centre = {s: (body_pose("ball", time + s) @ [0, CORD, 0, 1])[:3] for s in (0, 1, -1)}
+    channels = view_geometry(INTERIOR, {"Z": surface.depth, "body": surface.bodies}, time, intrinsics(*size), c2w)
+    centre = {s: (ball_pose(time + s) @ [0, CORD, 0, 1])[:3] for s in (0, 1, -1)}
     distance = np.linalg.norm(surface.points - centre[0], axis=-1)
     ball = (surface.bodies == BALL) & (distance < 0.17)  # and not its cord
     assert ball.sum() > 20 and (surface.bodies == BOX).any()

@@ -9,11 +9,12 @@ import pytest
 from hdr_nsff.scene import Frame, Scene
 from hdr_nsff.synth_motion import depth_there, exact_flow
 from hdr_nsff.synth_oracle import OracleNoise, visible, write_oracle
-from hdr_nsff.synth_scene import back_project, body_pose, camera_pose, intrinsics, look_at, project, rig_pose
+from hdr_nsff.synth_scenes.geometry import back_project, intrinsics, look_at, project
+from hdr_nsff.synth_scenes.interior import INTERIOR, box_pose, camera_pose
 
 SIZE, FRAMES = (48, 32), 4
 K = intrinsics(*SIZE)
-POSES = [rig_pose(t) for t in range(FRAMES)]
+POSES = [INTERIOR.pose("rig", t) for t in range(FRAMES)]
 EXACT = OracleNoise(depth=0.0, grain=0.0, flow=0.0)
 
 
@@ -25,7 +26,8 @@ def wall(t: int) -> dict[str, np.ndarray]:
     bodies = np.where(np.arange(width) < width // 4, 1, 0) * np.ones((height, 1), int)
     channels = {"Z": depth.astype(np.float32), "body": bodies.astype(np.float32)}
     for side, name in ((1, "forward"), (-1, "backward")):
-        flow = exact_flow(back_project(depth, K, POSES[t]), bodies, t, t + side, K, rig_pose(t + side))
+        there = INTERIOR.moved(back_project(depth, K, POSES[t]), bodies, np.zeros((height, width, 2)), t, t + side)
+        flow = exact_flow(there, K, INTERIOR.pose("rig", t + side))
         channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
     return channels
 
@@ -33,7 +35,7 @@ def wall(t: int) -> dict[str, np.ndarray]:
 def oracle(out: Path, noise: OracleNoise) -> list[Frame]:
     """The frames of an oracle scene of `wall`."""
     video = np.zeros((FRAMES, *SIZE[::-1], 3), np.float32)
-    write_oracle(out, [wall(t) for t in range(FRAMES)], video, K, POSES, [-2.0, 0.0, 2.0], 1, noise)
+    write_oracle(out, INTERIOR, [wall(t) for t in range(FRAMES)], video, K, POSES, [-2.0, 0.0, 2.0], 1, noise)
     return Scene.open(out / "oracle").train
 
 
@@ -79,10 +81,10 @@ def test_the_seed_decides_the_noise(tmp_path: Path) -> None:
 
 def test_a_mover_has_the_depth_of_where_it_goes() -> None:
     """Two cameras that look straight at the box, ten frames apart: the middle of three pixels shows its centre."""
-    eye, (before, after) = np.array([0.4, -0.1, 0.2]), (body_pose("box", t)[:3, 3] for t in (0, 10))
+    eye, (before, after) = np.array([0.4, -0.1, 0.2]), (box_pose(t)[:3, 3] for t in (0, 10))
     channels = {"Z": np.full((3, 3), np.linalg.norm(before - eye)), "body": np.ones((3, 3))}
     poses = [look_at(eye, before)] * 10 + [look_at(eye, after)]
-    assert depth_there(channels, intrinsics(3, 3), poses, 0, 10)[1, 1] == pytest.approx(np.linalg.norm(after - eye))
+    assert depth_there(INTERIOR, channels, intrinsics(3, 3), poses, 0, 10)[1, 1] == pytest.approx(np.linalg.norm(after - eye))
 
 
 def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
@@ -90,7 +92,7 @@ def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
     near = camera_pose(0).copy()
     near[:, 3] += 0.7 * near[:, 2]
     channels = {"Z": np.full(SIZE[::-1], 3.0), "body": np.zeros(SIZE[::-1])}
-    expected = depth_there(channels, K, [camera_pose(0), near], 0, 1)
+    expected = depth_there(INTERIOR, channels, K, [camera_pose(0), near], 0, 1)
     np.testing.assert_allclose(expected, 2.3, rtol=1e-6)
     still = np.zeros((*SIZE[::-1], 2))
     assert visible(still, expected, np.full(SIZE[::-1], 2.3))[:-1, :-1].all()

@@ -2,8 +2,8 @@
 (Mitsuba's own depth and position channels are averaged over the pixel, and its depth runs along the ray).
 
 Radiance is made in two parts, which gives a tenth of the plain path tracer's noise in the same time: light that comes
-straight from a lamp, one lamp at a time, as sharp as it is; and light that bounced, which is what full paths see beyond
-that, divided by albedo, averaged over 5 cm of each surface, and multiplied by albedo again.
+straight from a lamp, one lamp (or circuit of lamps) at a time, as sharp as it is; and light that bounced, which is what full paths see beyond
+that, divided by albedo, averaged over a few centimetres of each surface, and multiplied by albedo again.
 
 The LLVM variant is some four times faster than the scalar one; it needs LLVM 16 or newer (Debian: `libllvm19`)."""
 
@@ -13,17 +13,18 @@ import glob
 import os
 import re
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.progress import say
-from hdr_nsff.synth_scene import BODIES, Part, body_pose
+from hdr_nsff.synth_scenes.base import STILL, Part, SynthScene
 
 PASS = 64  # samples per pixel in one launch: bounds the memory
+SKY = "sky"  # the lamp that is all around
 BLACK = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}}
-BLUR = 0.05  # metres of a surface over which bounced light is averaged
 REACH = 9  # pixels the average reaches at most
 FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV's camera axes to Mitsuba's
 
@@ -35,7 +36,8 @@ class Surface:
     points: np.ndarray  # (H, W, 3) world
     normals: np.ndarray  # (H, W, 3) world
     depth: np.ndarray  # (H, W) z-depth
-    bodies: np.ndarray  # (H, W) index into BODIES
+    bodies: np.ndarray  # (H, W) 0 what stands still, k the scene's k-th body
+    uv: np.ndarray  # (H, W, 2) texture coordinates
 
 
 def start(variant: str) -> Any:
@@ -74,18 +76,31 @@ def newest_llvm() -> str | None:
 
 
 class Tracer:
-    """Renders the room at any time. One Mitsuba scene with every lamp and one per lamp; between pictures only movers move."""
+    """Renders a scene at any time. One Mitsuba scene with every lamp and one per circuit; between pictures only movers move."""
 
-    def __init__(self, parts: list[Part], variant: str = "auto"):
+    def __init__(self, scene: SynthScene, seed: int, variant: str = "auto"):
         self.mi = start(variant)
-        self.parts = {part.name: part for part in parts}
+        self.content = scene
+        self.parts = {part.name: part for part in scene.build(seed)}
         self.scene = self.build(lamp=None)
-        self.lamps = [self.build(part.name) for part in parts if part.emits]
+
+    @cached_property
+    def lamps(self) -> list[Any]:
+        """A scene for every circuit."""
+        circuits = [circuit(part) for part in self.parts.values() if part.emits] + [SKY] * (self.content.sky is not None)
+        return [self.build(name) for name in dict.fromkeys(circuits)]
 
     def build(self, lamp: str | None) -> Any:
-        """Mitsuba's scene at time 0 with every lamp, or only `lamp`, switched on. Scenes share no objects: Mitsuba crashes."""
-        shapes = {p.name: self.shape(p, lit=lamp in (None, p.name)) for p in self.parts.values()}
+        """Mitsuba's scene at time 0 with every lamp, or only the circuit `lamp`, switched on. Scenes share no objects: Mitsuba crashes."""
+        shapes = {p.name: self.shape(p, lit=lamp in (None, circuit(p))) for p in self.parts.values()}
+        if self.content.sky is not None and lamp in (None, SKY):
+            shapes[SKY] = self.surroundings(self.content.sky())
         return self.mi.load_dict({"type": "scene", **shapes})
+
+    def surroundings(self, radiance: np.ndarray) -> dict[str, Any]:
+        """Light from all around as a Mitsuba emitter; its zenith is up, -y of the world."""
+        bitmap = self.mi.Bitmap(np.ascontiguousarray(radiance, np.float32))
+        return {"type": "envmap", "bitmap": bitmap, "to_world": self.mi.ScalarTransform4f().rotate([0, 0, 1], 180)}
 
     def shape(self, part: Part, lit: bool) -> Any:
         """A part as a Mitsuba shape in its body's coordinates; `lit` False switches a lamp off."""
@@ -119,11 +134,13 @@ class Tracer:
         """`scene` with its movers where they are at time `t` in frames."""
         values = self.mi.traverse(scene)
         for part in self.parts.values():
-            if part.body != BODIES[0]:
-                pose = body_pose(part.body, t)
-                values[f"{part.name}.vertex_positions"] = np.ravel(part.vertices @ pose[:3, :3].T + pose[:3, 3]).astype(
-                    np.float32
-                )
+            if part.body == STILL:
+                continue
+            vertices = self.content.vertices(part, t)
+            if part.radius is not None:
+                values[f"{part.name}.to_world"] = self.mi.Transform4f().translate(vertices[0].tolist()).scale(part.radius)
+            else:
+                values[f"{part.name}.vertex_positions"] = np.ravel(vertices).astype(np.float32)
         values.update()
         return scene
 
@@ -151,7 +168,7 @@ class Tracer:
         paths = self.average(scene, sensor, {"type": "path", "max_depth": 8, "rr_depth": 2}, spp, seed)[..., :3]
         guide = {"type": "aov", "aovs": "albedo:albedo"}
         albedo = np.maximum(self.average(scene, sensor, guide, spp, seed)[..., -3:], 0.01)
-        bounced = albedo * smooth((paths - direct) / albedo, self.surface(t, K, c2w, size))
+        bounced = albedo * smooth((paths - direct) / albedo, self.surface(t, K, c2w, size), self.content.blur)
         return (direct + np.maximum(bounced, 0)).astype(np.float32)
 
     def average(self, scene: Any, sensor: Any, integrator: dict[str, Any], spp: int, seed: int) -> np.ndarray:
@@ -168,28 +185,41 @@ class Tracer:
         width, height = size
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1).reshape(-1, 3)
-        depth, normals, names = self.trace(self.at(self.scene, t), c2w[:, 3], local @ c2w[:, :3].T)
+        depth, normals, uv, names = self.trace(self.at(self.scene, t), c2w[:, 3], local @ c2w[:, :3].T)
+        assert np.isfinite(depth).all(), "the geometry of a scene fills every picture of it"
         points = c2w[:, 3] + depth[:, None] * (local @ c2w[:, :3].T)
-        bodies = np.array([BODIES.index(self.parts[name].body) for name in names])
-        shape = (height, width)
-        return Surface(points.reshape(*shape, 3), normals.reshape(*shape, 3), depth.reshape(shape), bodies.reshape(shape))
+        index = {name: self.content.index(part.body) for name, part in self.parts.items()}
+        bodies = np.array([index[name] for name in names]).reshape(height, width)
+        points, normals, depth, uv = (a.reshape(height, width, *a.shape[1:]) for a in (points, normals, depth, uv))
+        return Surface(points, normals, depth, bodies, uv)
 
-    def trace(self, scene: Any, origin: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[str]]:
-        """For rays from one point: distances (S,) in units of each direction's length, normals (S, 3), names of the parts hit."""
+    def trace(
+        self, scene: Any, origin: np.ndarray, directions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
+        """For rays from one point: distances (S,) in units of each direction's length, normals (S, 3), texture coordinates (S, 2),
+        names of the parts hit."""
+        import drjit as dr
+
         mi = self.mi
         if mi.variant().startswith("scalar"):
             hits = [scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(d))) for d in directions]
-            return np.array([h.t for h in hits]), np.array([np.ravel(h.n) for h in hits]), [h.shape.id() for h in hits]
+            normals, uv = (np.array([np.ravel(getattr(h, a)) for h in hits]) for a in ("n", "uv"))
+            return np.array([h.t for h in hits]), normals, uv, [h.shape.id() for h in hits]
         columns = [np.ascontiguousarray(c, np.float32) for c in directions.T]
         hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(float, origin)), mi.Vector3f(*columns)))
-        names = np.full(len(directions), "", object)
-        for shape in scene.shapes():
-            names[np.array(hit.shape == mi.ShapePtr(shape)).astype(bool)] = shape.id()
-        return np.array(hit.t, np.float64), np.array(hit.n, np.float64).T, list(names)
+        # one number per shape: asking of each shape where it was hit would take longer than a picture
+        number = {int(np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)))[0]): s.id() for s in scene.shapes()}
+        names = [number.get(int(k), "") for k in np.array(dr.reinterpret_array(mi.UInt32, hit.shape))]
+        return np.array(hit.t, np.float64), np.array(hit.n, np.float64).T, np.array(hit.uv, np.float64).T, names
 
 
-def smooth(light: np.ndarray, surface: Surface) -> np.ndarray:
-    """Light (H, W, 3) averaged over what is near on the same surface: a Gaussian of BLUR metres, cut where the normal turns."""
+def circuit(part: Part) -> str:
+    """What switches a lamp on: its circuit, or itself."""
+    return part.circuit or part.name
+
+
+def smooth(light: np.ndarray, surface: Surface, blur: float) -> np.ndarray:
+    """Light (H, W, 3) averaged over what is near on the same surface: a Gaussian of `blur` metres, cut where the normal turns."""
     height, width = light.shape[:2]
     light, points, normals = (a.astype(np.float32) for a in (light, surface.points, surface.normals))
     total, weights = np.zeros_like(light), np.zeros((height, width, 1), np.float32)
@@ -199,7 +229,7 @@ def smooth(light: np.ndarray, surface: Surface) -> np.ndarray:
             there = np.s_[max(0, dy) : height + min(0, dy), max(0, dx) : width + min(0, dx)]
             distance = ((points[here] - points[there]) ** 2).sum(-1, keepdims=True)
             facing = np.clip((normals[here] * normals[there]).sum(-1, keepdims=True), 0, 1)
-            weight = np.exp(-distance / (2 * BLUR**2)) * facing**16 * (surface.bodies[here] == surface.bodies[there])[..., None]
+            weight = np.exp(-distance / (2 * blur**2)) * facing**16 * (surface.bodies[here] == surface.bodies[there])[..., None]
             total[here] += weight * light[there]
             weights[here] += weight
     return total / weights

@@ -1,4 +1,4 @@
-"""What a camera does to radiance (METHOD eq. 9-10, forwards): `rgb = g(clip(2^ev * white_balance * radiance + noise))`,
+"""What a camera does to radiance (METHOD eq. 9-10, forwards): `rgb = g(clip(2^ev * white_balance * vignette * radiance + noise))`,
 8 bits. Used to make footage whose truth is known; nothing that trains reads it.
 
 A response curve is a list of points (x, y) per channel, ends fixed at (0, 0) and (1, 1), linear between them; x is the clipped
@@ -13,6 +13,7 @@ import numpy as np
 from hdr_nsff.errors import InputError
 
 POINTS = 256
+LOG_GAIN = 250.0  # of the log curve ln(1 + gain x) / ln(1 + gain)
 # (gamma, contrast of the S-curve, lift of the shoulder), red green blue: every channel its own, as film has it
 FILM = ((1.95, 0.42, 0.10), (2.10, 0.36, 0.12), (2.30, 0.28, 0.15))
 
@@ -42,7 +43,8 @@ class Noise:
 
 
 def response_curve(name: str) -> Curve:
-    """A named camera: "film" (S-curve, other per channel; not a plain gamma), "gamma" (2.2) or "srgb"."""
+    """A named camera: "film" (S-curve, other per channel; not a plain gamma), "log" (as of video cameras: equal steps for
+    equal ratios, but for the darkest), "gamma" (2.2) or "srgb"."""
     t = np.linspace(0, 1, POINTS)
     x = t**2.2
     match name:
@@ -52,8 +54,10 @@ def response_curve(name: str) -> Curve:
             y = np.stack([t] * 3)
         case "srgb":
             y = np.stack([np.where(x <= 0.0031308, 12.92 * x, 1.055 * x ** (1 / 2.4) - 0.055)] * 3)
+        case "log":
+            y = np.stack([np.log1p(LOG_GAIN * x) / np.log1p(LOG_GAIN)] * 3)
         case _:
-            raise InputError(f"response {name!r}: unknown; use film, gamma or srgb")
+            raise InputError(f"response {name!r}: unknown; use film, log, gamma or srgb")
     return Curve(x, y)
 
 
@@ -65,6 +69,13 @@ def film(x: np.ndarray, gamma: float, contrast: float, lift: float) -> np.ndarra
     return u - contrast * np.sin(2 * np.pi * u) / (2 * np.pi) + lift * u * (1 - u)
 
 
+def vignette(height: int, width: int, K: np.ndarray, strength: float) -> np.ndarray:
+    """What a lens passes to each pixel relative to the axis, (H, W, 1): the cos^4 law of the angle to the axis of a camera `K` (3, 3) at
+    `strength` 1, nothing at 0."""
+    x, y = np.meshgrid((np.arange(width) + 0.5 - K[0, 2]) / K[0, 0], (np.arange(height) + 0.5 - K[1, 2]) / K[1, 1])
+    return (1 - strength * (1 - (1 + x**2 + y**2) ** -2.0))[..., None]
+
+
 def record(
     radiance: np.ndarray,
     ev: float,
@@ -72,11 +83,13 @@ def record(
     response: Curve,
     noise: Noise | None,
     rng: np.random.Generator,
+    passed: np.ndarray | float = 1.0,
 ) -> np.ndarray:
     """The frame a camera records of linear `radiance` (H, W, 3): float32 rgb in [0, 1] on multiples of 1/255.
 
-    `ev` is log2 exposure relative to the exposure at which radiance 1 saturates; `noise` None is a perfect sensor."""
-    exposure = np.asarray(radiance, np.float64) * (2.0**ev * np.asarray(white_balance))
+    `ev` is log2 exposure relative to the exposure at which radiance 1 saturates; `noise` None is a perfect sensor; `passed`
+    (H, W, 1) is what the lens lets through, see `vignette`."""
+    exposure = np.asarray(radiance, np.float64) * (2.0**ev * np.asarray(white_balance)) * passed
     if noise is not None:
         exposure = exposure + rng.normal(size=exposure.shape) * np.sqrt(noise.read**2 + noise.shot * np.clip(exposure, 0, 1))
     return (np.rint(response.apply(exposure) * 255) / 255).astype(np.float32)

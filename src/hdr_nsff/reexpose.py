@@ -41,7 +41,7 @@ class ReexposeConfig:
     noise: float = 1.0
     """Sensor noise: 1 is a small sensor of 6000 electrons, 0 none."""
     response: str = "film"
-    """The camera that records: film (an S-curve, every channel its own), gamma or srgb."""
+    """The camera that records: film (an S-curve, every channel its own), log, gamma or srgb."""
     hold_out: int = ingest.HOLD_OUT
     """Every this many frames are the truth."""
     poses: Path | None = None

@@ -1,10 +1,10 @@
-"""`hdr-nsff synth`: a path-traced room as alternating-exposure footage, with held-out truth that only `evaluate` reads.
+"""`hdr-nsff synth`: a path-traced scene as alternating-exposure footage, with held-out truth that only `evaluate` reads.
 
 Writes, below the output folder:
     clip.mp4, clip/*.png   what the camera recorded: the same frames as footage and without compression loss
     clip.csv, clip/exposures.csv   of a rig: the exposure of every frame, for `prepare`
     truth/                 views and times the clip does not show: linear radiance, moving masks, depth and motion (see truth.py)
-    exact/*.exr            every rendered frame: radiance, z-depth `Z`, `body` (0 room, 1 box, 2 ball), exact optical flow
+    exact/*.exr            every rendered frame: radiance, z-depth `Z`, `body` (0 stands still, k the scene's k-th mover), exact optical flow
     oracle/                with `--oracle`: a scene folder made from the truth, for measuring a field without estimated priors
 Every picture is cached in exact/: a run that was killed goes on where it was.
 
@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+import time as clock
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -25,32 +26,39 @@ import tyro
 
 from hdr_nsff import io
 from hdr_nsff.errors import InputError
-from hdr_nsff.pathtracer import Tracer
+from hdr_nsff.pathtracer import PASS, Surface, Tracer
 from hdr_nsff.progress import say, track
-from hdr_nsff.recording import Noise, record, response_curve
-from hdr_nsff.synth_motion import exact_flow, view_geometry
+from hdr_nsff.recording import Noise, record, response_curve, vignette
+from hdr_nsff.synth_motion import UV, exact_flow, view_geometry
 from hdr_nsff.synth_oracle import OracleNoise, write_oracle
-from hdr_nsff.synth_scene import POSES, RIG, build, camera_pose, intrinsics
+from hdr_nsff.synth_scenes import SCENES
+from hdr_nsff.synth_scenes.base import SynthScene, Views
+from hdr_nsff.synth_scenes.geometry import intrinsics
 from hdr_nsff.truth import Truth, TruthView
 
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
-WHITE_BALANCE = (1.12, 1.0, 0.87)
 OFF_PATH = ((0.06, -0.03, 0.03), (-0.05, 0.05, -0.02))  # metres in the camera's axes from the frame's pose
 
 
 @dataclass(frozen=True)
 class SynthConfig:
-    """A path-traced room with a bright window, a lamp, a tumbling box and a swinging ball, filmed by a moving camera or a rig."""
+    """A path-traced scene filmed by a moving camera or a rig. `interior`: a room with a bright window, a tumbling box and a swinging
+    ball. `lamp`: things that rush past a lamp. `night`: an alley at night, lights that move. `cloth`: cloth and a dancing tube in the wind."""
 
+    name: Annotated[Literal["interior", "lamp", "night", "cloth"], tyro.conf.Positional]  # which scene
     out: Annotated[Path, tyro.conf.Positional]  # folder to write
-    views: Literal["mono", "rig"] = "mono"  # one moving camera, or nine synchronized ones that take the frames in turn
+    views: Views = "mono"  # one moving camera, or nine synchronized ones that take the frames in turn
     size: str = "240x136"  # width x height in pixels
     frames: int = 36
-    ev: str = "-4,-2,0"  # the exposures that alternate, in stops, in the order they are taken
-    response: str = "film"  # the camera's response curve: film, gamma or srgb
+    ev: str | None = (
+        None  # stops of the exposures that alternate, in the order they are taken, such as -4,-2,0; by default the scene's
+    )
+    response: str = "film"  # the camera's response curve: film, log, gamma or srgb
+    white_balance: str = "1.12,1,0.87"  # gains of red, green and blue before the response
+    vignetting: float = 0.0  # fall-off of light towards the corners: 1 is the cos^4 law of a simple lens
     noise: float = 1.0  # times the noise of a small sensor; 0 is a perfect one
-    spp: int = 256  # paths per pixel; above 64 rounded to a multiple of it
-    truth_spp: int = 768  # paths per pixel of the held-out views
+    spp: int | None = None  # paths per pixel; above 64 rounded to a multiple of it; by default what suits the scene
+    truth_spp: int | None = None  # paths per pixel of the held-out views
     seed: int = 0  # of textures, paths and noise
     variant: str = "auto"  # Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb
     oracle: bool = False  # also write a scene folder with exact poses and masks, depth and flow with a little noise
@@ -74,38 +82,45 @@ class Shot:
 
 def synth(config: SynthConfig) -> None:
     """Render, record and write everything; InputError where the settings or the output folder make no sense."""
-    size, evs = parse_size(config.size), parse_ev(config.ev)
-    check(config)
-    clip = clip_shots(config.frames, config.spp, config.seed, config.views)
-    views = truth_shots(config.frames, config.truth_spp, config.seed, config.views)
+    scene = SCENES[config.name]
+    ev = scene.ev if config.ev is None else config.ev
+    spp, truth_spp = (d if c is None else c for c, d in ((config.spp, scene.spp), (config.truth_spp, scene.truth_spp)))
+    config = replace(config, ev=ev, spp=spp, truth_spp=truth_spp)
+    size, evs = parse_size(config.size), parse_ev(ev)
+    check(config, min(spp, truth_spp))
+    clip = clip_shots(scene, config.frames, spp, config.seed, config.views)
+    views = truth_shots(scene, config.frames, truth_spp, config.seed, config.views)
     K = intrinsics(*size)
     claim(config)
     render(clip + views, K, size, config)
     reference = int(np.argsort(evs)[len(evs) // 2])
     relative = [float(e - evs[reference]) for e in evs]
-    video = record_clip(clip, relative, config)
+    video = record_clip(clip, relative, K, config)
     if config.views == "rig":
         list_exposures(evs, config)
     write_truth(clip, views, K, relative, reference, config)
     if config.oracle:
         noise = OracleNoise(config.depth_noise, config.depth_grain, config.flow_noise, config.seed)
         frames, poses = [exact(config.out, s) for s in clip], [s.c2w for s in clip]
-        write_oracle(config.out, frames, video, K, poses, relative, reference, noise)
+        write_oracle(config.out, scene, frames, video, K, poses, relative, reference, noise)
     say(
         f"{config.out}/clip.mp4: {len(clip)} frames of {size[0]}x{size[1]}, exposures {config.ev}; {len(views)} held-out views in truth/"
     )
 
 
-def check(config: SynthConfig) -> None:
+def check(config: SynthConfig, fewest_paths: int) -> None:
     """InputError for numbers out of range, before anything is rendered."""
     response_curve(config.response)
+    parse_white_balance(config.white_balance)
+    if not 0 <= config.vignetting <= 1:
+        raise InputError(f"--vignetting {config.vignetting}: must be from 0 (none) to 1 (the cos^4 law)")
     if not 12 <= config.frames <= 400:
         raise InputError(
             f"--frames {config.frames}: 12 to 400 can be made; fewer leave no views far from the frames of their time"
         )
     if not 0 <= config.seed < 1000:
         raise InputError(f"--seed {config.seed}: must be from 0 to 999")
-    if min(config.spp, config.truth_spp) < 1:
+    if fewest_paths < 1:
         raise InputError(f"--spp {config.spp} --truth-spp {config.truth_spp}: at least one path per pixel is needed")
     if not 0 <= config.noise < 1000:
         raise InputError(f"--noise {config.noise}: must be from 0 (a perfect sensor) to 1000")
@@ -134,25 +149,38 @@ def parse_ev(text: str) -> list[float]:
     return evs
 
 
-def clip_shots(frames: int, spp: int, seed: int, views: str = "mono") -> list[Shot]:
+def parse_white_balance(text: str) -> tuple[float, float, float]:
+    """Gains of red, green and blue, of "R,G,B"."""
+    try:
+        red, green, blue = (float(g) for g in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--white-balance {text!r}: write three gains with commas between them, such as 1.12,1,0.87") from error
+    if not all(0.01 <= g <= 100 for g in (red, green, blue)):
+        raise InputError(f"--white-balance {text!r}: the gains must be from 0.01 to 100")
+    return red, green, blue
+
+
+def clip_shots(scene: SynthScene, frames: int, spp: int, seed: int, views: Views = "mono") -> list[Shot]:
     """The frames of the clip."""
-    return [Shot(f"clip_{t:05d}", float(t), POSES[views](t), spp, seed * 1000 + t, t) for t in range(frames)]
+    return [Shot(f"clip_{t:05d}", float(t), scene.pose(views, t), spp, seed * 1000 + t, t) for t in range(frames)]
 
 
-def truth_shots(frames: int, spp: int, seed: int, views: str = "mono") -> list[Shot]:
+def truth_shots(scene: SynthScene, frames: int, spp: int, seed: int, views: Views = "mono") -> list[Shot]:
     """Held-out views: eight at whole times from the pose of another frame (mono: far away in time; rig: of a camera three
     to six further around than the one that records then), six at half times, two off the path."""
     shots: list[Shot] = []
 
     def hold_out(kind: str, time: float, anchor: int, offset: tuple[float, float, float] | None = None) -> None:
-        c2w = POSES[views](anchor)
+        c2w = scene.pose(views, anchor)
         if offset is not None:
             c2w[:, 3] += c2w[:, :3] @ np.asarray(offset)
-        name = f"{kind}_t{time:04.1f}_" + (f"pose{anchor:02d}" if views == "mono" else f"camera{anchor % len(RIG)}")
+        name = f"{kind}_t{time:04.1f}_" + (f"pose{anchor:02d}" if views == "mono" else f"camera{anchor % len(scene.rig)}")
         shots.append(Shot(name, time, c2w, spp, seed * 1000 + 500 + len(shots), anchor, offset is not None))
 
     def other(time: int, rank: float) -> int:
-        return far_anchor(time, frames, rank) if views == "mono" else rig_anchor(time, frames, 3 + len(shots) % 4)
+        if views == "mono":
+            return far_anchor(scene, time, frames, rank)
+        return rig_anchor(time, frames, len(scene.rig), 3 + len(shots) % 4)
 
     for time, rank in zip(np.linspace(1, frames - 2, 8).round().astype(int), np.linspace(0.3, 0.9, 8), strict=True):
         hold_out("view", float(time), other(time, rank))
@@ -163,50 +191,79 @@ def truth_shots(frames: int, spp: int, seed: int, views: str = "mono") -> list[S
     return shots
 
 
-def far_anchor(time: int, frames: int, rank: float) -> int:
+def far_anchor(scene: SynthScene, time: int, frames: int, rank: float) -> int:
     """A frame at least a quarter of the clip away from `time`: of all such, the one at `rank` in [0, 1] by distance."""
     others = [k for k in range(frames) if abs(k - time) >= frames // 4]
-    others.sort(key=lambda k: float(np.linalg.norm(camera_pose(k)[:, 3] - camera_pose(time)[:, 3])))
+    others.sort(key=lambda k: float(np.linalg.norm(scene.camera_pose(k)[:, 3] - scene.camera_pose(time)[:, 3])))
     return others[round(rank * (len(others) - 1))]
 
 
-def rig_anchor(time: int, frames: int, step: int) -> int:
+def rig_anchor(time: int, frames: int, cameras: int, step: int) -> int:
     """The frame nearest to `time` of the rig's camera `step` further around than the one that records then."""
-    recorded = range((time + step) % len(RIG), frames, len(RIG))
+    recorded = range((time + step) % cameras, frames, cameras)
     return min(recorded, key=lambda k: abs(k - time))
 
 
 def claim(config: SynthConfig) -> None:
     """Mark the output folder with what it is rendered from; refuse one that holds something else."""
     key = {k: v for k, v in asdict(config).items() if k in ("size", "frames", "spp", "truth_spp", "seed")}
-    key |= {"views": config.views} if config.views != "mono" else {}
+    key |= {k: v for k, v in (("views", config.views), ("name", config.name)) if v not in ("mono", "interior")}
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     path = config.out / "exact" / "key.json"
     if config.out.exists() and not config.out.is_dir():
         raise InputError(f"{config.out}: is a file; name a folder to write")
     if path.is_file() and digest not in path.read_text(encoding="utf-8", errors="replace"):
-        raise InputError(f"{config.out}: holds a room rendered with other settings; choose another folder or remove it")
+        raise InputError(f"{config.out}: holds a scene rendered with other settings; choose another folder or remove it")
     if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
         raise InputError(f"{config.out}: holds something else; choose a new or an empty folder")
     io.write_json(path, {"digest": digest, **key})
 
 
 def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: SynthConfig) -> None:
-    """Path-trace what is not in exact/ yet."""
+    """Path-trace what is not in exact/ yet; says beforehand how long it will take, and in the end how long a picture took."""
     missing = [s for s in shots if not (config.out / "exact" / f"{s.name}.exr").is_file()]
     if not missing:
         return
-    tracer = Tracer(build(config.seed), config.variant)
+    scene = SCENES[config.name]
+    tracer = Tracer(scene, config.seed, config.variant)
+    seconds = estimate(tracer, missing, K, size)
+    say(f"{config.name}: {len(missing)} pictures of {size[0]}x{size[1]} to trace, about {seconds / 60:.1f} minutes")
+    spent: dict[int, list[float]] = {}
     for shot in track(missing, "path tracing"):
+        began = clock.monotonic()
         surface = tracer.surface(shot.time, K, shot.c2w, size)
-        channels = {"Z": surface.depth, "body": surface.bodies.astype(np.float32)}
-        if shot.name.startswith("clip"):
-            for side, name in io.SIDES.items():
-                there = POSES[config.views](shot.time + side)
-                flow = exact_flow(surface.points, surface.bodies, shot.time, shot.time + side, K, there)
-                channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
+        channels = geometry_channels(scene, surface, shot, K, config.views)
         channels["RGB"] = tracer.radiance(shot.time, K, shot.c2w, size, shot.spp, shot.seed)
         io.write_exr(config.out / "exact" / f"{shot.name}.exr", channels, half=False)
+        spent.setdefault(shot.spp, []).append(clock.monotonic() - began)
+    cost = ", ".join(f"{np.mean(s):.1f} s per picture at {spp} paths per pixel" for spp, s in spent.items())
+    say(f"{config.name}: traced in {sum(map(sum, spent.values())) / 60:.1f} minutes; {cost}")
+
+
+def estimate(tracer: Tracer, shots: list[Shot], K: np.ndarray, size: tuple[int, int]) -> float:
+    """How many seconds the pictures will take, from the first of them with one path per pixel and with as many as are traced at once."""
+    shot = shots[0]
+    few = min(PASS, shot.spp)
+    taken = []
+    for spp in (1, 1, few):  # the first one compiles
+        began = clock.monotonic()
+        tracer.radiance(shot.time, K, shot.c2w, size, spp, shot.seed)
+        taken.append(clock.monotonic() - began)
+    per_path = max(0.0, taken[2] - taken[1]) / max(1, few - 1)
+    return sum(taken[1] + per_path * (s.spp - 1) for s in shots)
+
+
+def geometry_channels(scene: SynthScene, surface: Surface, shot: Shot, K: np.ndarray, views: Views) -> dict[str, np.ndarray]:
+    """What a picture shows: depth, bodies, where something deforms the place on it, and of a clip's frame the flow to the ones beside."""
+    channels = {"Z": surface.depth, "body": surface.bodies.astype(np.float32)}
+    if scene.deforms:
+        channels |= {name: surface.uv[..., k] * (surface.bodies > 0) for k, name in enumerate(UV)}
+    if shot.name.startswith("clip"):
+        for side, name in io.SIDES.items():
+            there = scene.moved(surface.points, surface.bodies, surface.uv, shot.time, shot.time + side)
+            flow = exact_flow(there, K, scene.pose(views, shot.time + side))
+            channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
+    return channels
 
 
 def exact(out: Path, shot: Shot) -> dict[str, np.ndarray]:
@@ -214,15 +271,16 @@ def exact(out: Path, shot: Shot) -> dict[str, np.ndarray]:
     return io.read_exr(out / "exact" / f"{shot.name}.exr")
 
 
-def record_clip(clip: list[Shot], relative: list[float], config: SynthConfig) -> np.ndarray:
+def record_clip(clip: list[Shot], relative: list[float], K: np.ndarray, config: SynthConfig) -> np.ndarray:
     """Record every frame at its bracket's exposure; write clip/ and clip.mp4; the frames (T, H, W, 3)."""
-    curve = response_curve(config.response)
+    curve, gains = response_curve(config.response), parse_white_balance(config.white_balance)
     noise = Noise(1e-3 * config.noise, config.noise**2 / 6000) if config.noise > 0 else None
     video = []
     for t, shot in enumerate(clip):
         rng = np.random.default_rng([config.seed, t])
         radiance = exact(config.out, shot)["RGB"]
-        video.append(record(radiance, relative[t % len(relative)], WHITE_BALANCE, curve, noise, rng))
+        passed = vignette(radiance.shape[0], radiance.shape[1], K, config.vignetting)
+        video.append(record(radiance, relative[t % len(relative)], gains, curve, noise, rng, passed))
         io.write_png(config.out / "clip" / f"{t:05d}.png", video[-1])
     io.write_video(config.out / "clip.mp4", video, crf=VIDEO_CRF, footage=True)
     return np.stack(video)
@@ -245,7 +303,7 @@ def write_truth(
         channels = exact(config.out, shot)
         io.write_exr(folder / "radiance" / f"{shot.name}.exr", {"RGB": channels["RGB"]})
         io.write_png(folder / "masks" / f"{shot.name}.png", channels["body"] > 0)
-        geometry = view_geometry(channels["Z"], channels["body"].astype(int), shot.time, K, shot.c2w)
+        geometry = view_geometry(SCENES[config.name], channels, shot.time, K, shot.c2w)
         io.write_exr(folder / "geometry" / f"{shot.name}.exr", geometry, half=False)
         entries.append(
             TruthView(
@@ -264,7 +322,9 @@ def write_truth(
         reference_bracket=reference,
         response_x=curve.x.tolist(),
         response_y=curve.y.tolist(),
-        white_balance=list(WHITE_BALANCE),
+        white_balance=list(parse_white_balance(config.white_balance)),
+        vignetting=config.vignetting,
+        settings={k: v for k, v in asdict(config).items() if k not in ("out", "variant")},
         K=K.tolist(),
         clip_c2w=[s.c2w.tolist() for s in clip],
         views=entries,

@@ -15,7 +15,8 @@ import numpy as np
 from hdr_nsff import io
 from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest, Step
 from hdr_nsff.synth_motion import depth_there
-from hdr_nsff.synth_scene import back_project
+from hdr_nsff.synth_scenes.base import SynthScene
+from hdr_nsff.synth_scenes.geometry import back_project
 
 NOTE = "oracle: from truth"
 SAME = 0.02  # relative depth: how far apart two views of one surface may be
@@ -33,6 +34,7 @@ class OracleNoise:
 
 def write_oracle(
     out: Path,
+    scene: SynthScene,
     exact: list[dict[str, np.ndarray]],
     video: np.ndarray,
     K: np.ndarray,
@@ -54,7 +56,7 @@ def write_oracle(
         io.write_npy(folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16))
         for j, files in entry.flow.items():
             flow = rendered_flow(channels, j - i)
-            io.write_png(folder / files.valid, visible(flow, depth_there(channels, K, c2w, i, j), depths[j]))
+            io.write_png(folder / files.valid, visible(flow, depth_there(scene, channels, K, c2w, i, j), depths[j]))
             io.write_npy(folder / files.flow, (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16))
     io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
     manifest = Manifest(

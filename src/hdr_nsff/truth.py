@@ -18,7 +18,7 @@ from pydantic import Field
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import SIDES, read_exr, read_image, read_json
 from hdr_nsff.notes import first_problem
-from hdr_nsff.recording import Curve
+from hdr_nsff.recording import Curve, vignette
 from hdr_nsff.scene import LARGEST_EV, FrameEntry, Strict, inside, is_intrinsic, is_matrix, is_pose
 
 # Channels of a view's geometry, of the ray through each pixel's centre: z-depth in true units (0 where it hits nothing); pixels that the surface
@@ -74,7 +74,9 @@ class Truth(Strict):
     response_x: list[float] | None = None  # the camera's response curve sampled: exposure in [0, 1] ...
     response_y: list[list[float]] | None = None  # ... to recorded value, per channel (3 lists); absent where it is unknown
     white_balance: list[float] = Field(default=[1.0, 1.0, 1.0])
+    vignetting: float = Field(default=0.0, ge=0.0, le=1.0)  # strength of the lens's fall-off, see `recording.vignette`
     K: list[list[float]] | None = None  # 3x3 pixels
+    settings: dict[str, str | int | float | bool] | None = None  # of what made it, for the record
     clip_c2w: list[list[list[float]]] | None = (
         None  # true poses of the clip's frames, for pose errors and for carrying views over
     )
@@ -118,6 +120,8 @@ class Truth(Strict):
             return f"white_balance {self.white_balance} is not three gains above 0"
         if self.K is not None and not is_matrix(self.K, (3, 3), is_intrinsic):
             return "K is no 3x3 camera matrix"
+        if self.vignetting > 0 and self.K is None:
+            return "vignetting is known, but K is missing, so that nobody knows how wide the lens sees"
         if not all(is_matrix(c2w, (3, 4), is_pose) for c2w in self.clip_c2w or []):
             return "clip_c2w are no 3x4 camera poses"
         if self.clip_c2w is None and any(v.geometry is not None for v in self.views):
@@ -152,17 +156,19 @@ def true_pictures(truth: Truth, view: TruthView, folder: Path) -> tuple[np.ndarr
             raise InputError(f"{folder / view.radiance}: negative radiance; clip at zero before writing the truth")
     pictures = {b: read_image(inside(folder, name)) for b, name in view.recorded.items()}
     if exact is not None and truth.response is not None:
-        pictures = {b: record(truth, exact, b) for b in range(len(truth.bracket_ev))} | pictures
+        pictures = {b: record(truth, exact, b, view.K or truth.K) for b in range(len(truth.bracket_ev))} | pictures
     sizes = {p.shape[:2] for p in pictures.values()} | ({exact.shape[:2]} if exact is not None else set())
     if len(sizes) > 1:
         raise InputError(f"{folder}: the pictures of view {view.name} have several sizes; make the truth anew")
     return exact, pictures
 
 
-def record(truth: Truth, radiance: np.ndarray, bracket: int) -> np.ndarray:
-    """What the true camera records (H, W, 3) of `radiance` (H, W, 3) at a bracket, without noise."""
+def record(truth: Truth, radiance: np.ndarray, bracket: int, K: list[list[float]] | None) -> np.ndarray:
+    """What the true camera, with `K`, records (H, W, 3) of `radiance` (H, W, 3) at a bracket, without noise."""
     ev, response = truth.bracket_ev[bracket], truth.response
     assert ev is not None and response is not None, "`Truth.problem` refuses this"
+    if truth.vignetting > 0:
+        radiance = radiance * vignette(radiance.shape[0], radiance.shape[1], np.array(K), truth.vignetting)
     return response.apply(radiance * 2.0**ev * np.array(truth.white_balance)).astype(np.float32)
 
 

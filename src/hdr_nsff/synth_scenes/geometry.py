@@ -1,0 +1,41 @@
+"""Pinhole cameras and rotations as plain arrays: OpenCV axes (+x right, +y down, +z forward), metres, pixel centres at +0.5."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def intrinsics(width: int, height: int) -> np.ndarray:
+    """K (3, 3) in pixels of a camera that sees 57 degrees across."""
+    focal = width / 2 / np.tan(np.radians(57 / 2))
+    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+
+
+def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Camera to world (3, 4) at `eye`, +z towards `target`, level (+y of the world is down)."""
+    z = (target - eye) / np.linalg.norm(target - eye)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z, eye], 1)
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation matrix (3, 3) by Rodrigues' formula."""
+    x, y, z = axis / np.linalg.norm(axis)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (..., 2), centres at +0.5, and z-depth (...) of world points (..., 3)."""
+    local = (points - c2w[:, 3]) @ c2w[:, :3]
+    depth = local[..., 2]
+    return local[..., :2] / depth[..., None] * K[[0, 1], [0, 1]] + K[:2, 2], depth
+
+
+def back_project(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
+    """World points (H, W, 3) at z-depth (H, W) on the rays through the pixel centres."""
+    height, width = depth.shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    return c2w[:, 3] + depth[..., None] * (rays @ c2w[:, :3].T)
