@@ -52,7 +52,13 @@ class LossWeights:
     """Square of moving Gaussians' changes of opacity logit from one knot to the next."""
     colour_change: float = 0.01
     """Square of moving Gaussians' changes of log radiance from one colour knot to the next."""
+    transient: float = 0.01
+    """Mean optical thickness of a sample of NeRF-W's transient branch."""
+    total_variation: float = 1e-4
+    """Mean square differences of neighbours in HexPlane's planes."""
     response_smoothness: float = 1e-3
+    unit_exposure: float = 0.5
+    """Distance of a network response from mid grey at the unit exposure."""
     gain_residual: float = 1.0
     response_anchor: float = 100.0
 
@@ -71,7 +77,7 @@ class Objective:
 
     def terms(self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
         """All terms that need only the render, unweighted."""
-        rgb = self.recorded(render.radiance, batch, tonemap)
+        rgb = self.recorded(render.radiance, batch, tonemap) if render.rgb is None else render.rgb
         uniform = None if batch.uniform.all() else batch.uniform[:, None].to(rgb)
         terms = {"photometric": losses.photometric(rgb, batch.rgb, uniform, self.squared)}
         terms |= self.dynamic(render, rgb, batch, tonemap, phase)
