@@ -10,7 +10,12 @@ from torch import Tensor, nn
 WIDTH = 128  # of the hidden layer
 SMALLEST = 1e-6  # exposure below which the logarithm is held
 MIDDLE = 0.5  # the recorded value that is held, where the starting curve reaches it
-FIT_STEPS = 600
+BENDS = (
+    -12.0,
+    -0.4,
+)  # log exposures between which the hidden units bend at the start: beyond, gently on, so that a gradient is left
+FLOOR = 0.004  # recorded values closer to 0 and 1 than this are taken for it: they have no logit
+RIDGE = 1e-6
 
 
 class NetworkResponse(nn.Module):
@@ -22,12 +27,12 @@ class NetworkResponse(nn.Module):
     def __init__(self, knots: Tensor, start: Tensor) -> None:
         """Starts as the curve `start` (K,) or (3, K) at `knots` (K,) in [0, 1]."""
         super().__init__()
-        generator = torch.Generator().manual_seed(0)
         self.register_buffer("knots", knots, persistent=False)
         self.register_buffer("unit", torch.zeros(3))  # log exposure at which `MIDDLE` is recorded
-        self.slope = nn.Parameter(torch.randn(3, WIDTH, generator=generator) * 0.5)
-        self.shift = nn.Parameter(torch.randn(3, WIDTH, generator=generator))
-        self.out = nn.Parameter(torch.randn(3, WIDTH, generator=generator) / WIDTH**0.5)
+        bends = torch.linspace(*BENDS, WIDTH)
+        self.slope = nn.Parameter(torch.ones(3, WIDTH))
+        self.shift = nn.Parameter(-bends.repeat(3, 1))
+        self.out = nn.Parameter(torch.zeros(3, WIDTH))
         self.level = nn.Parameter(torch.zeros(3))
         self.set_values(start)
 
@@ -37,8 +42,11 @@ class NetworkResponse(nn.Module):
 
     def of_log(self, log: Tensor) -> Tensor:
         """Recorded values (N, 3) of log exposures (N, 3)."""
-        hidden = (log[..., None] * self.slope + self.shift).relu()  # (N, 3, WIDTH)
-        return ((hidden * self.out).sum(-1) + self.level).sigmoid()
+        return ((self.hidden(log) * self.out).sum(-1) + self.level).sigmoid()
+
+    def hidden(self, log: Tensor) -> Tensor:
+        """The hidden layer (N, 3, WIDTH) at log exposures (N, 3)."""
+        return (log[..., None] * self.slope + self.shift).relu()
 
     def values(self) -> Tensor:
         """The curve at the knots, (3, K)."""
@@ -48,18 +56,17 @@ class NetworkResponse(nn.Module):
         """Square distance from `MIDDLE` of what is recorded at the unit exposure: HDR-NeRF's unit exposure loss, which fixes the scale."""
         return (self.of_log(self.unit[None]) - MIDDLE).square().sum()
 
+    @torch.no_grad()
     def set_values(self, y: Tensor) -> None:
-        """Take on the curve `y` (K,) or (3, K) at the knots, by least squares in the recorded value."""
-        y = y.detach().to(self.knots).expand(3, -1)
-        x, target = self.knots[1:, None].expand(-1, 3), y[:, 1:].T
-        at = (y >= MIDDLE).float().argmax(-1).clamp_min(1)
-        self.unit.copy_(self.knots[at].log())
-        with torch.enable_grad():
-            optimiser = torch.optim.Adam(self.parameters(), lr=1e-2)
-            for step in range(FIT_STEPS):
-                optimiser.param_groups[0]["lr"] = 1e-2 * 0.02 ** (step / FIT_STEPS)
-                loss = (self(x) - target).square().mean()
-                optimiser.zero_grad()
-                loss.backward()
-                optimiser.step()
-        self.zero_grad(set_to_none=True)
+        """Take on the curve `y` (K,) or (3, K) at the knots: the outer layer by least squares in the recorded value, to first order."""
+        y = y.to(self.knots).expand(3, -1)
+        self.unit.copy_(self.knots[(y >= MIDDLE).float().argmax(-1).clamp_min(1)].log())
+        hidden = self.hidden(self.knots[1:, None].expand(-1, 3).log()).double()
+        target = y[:, 1:].clamp(FLOOR, 1 - FLOOR).double()
+        for c in range(3):
+            slope = (target[c] * (1 - target[c]))[:, None]  # of the recorded value over its logit
+            ones = torch.ones_like(hidden[:, c, :1])
+            a = torch.cat([hidden[:, c], ones], -1) * slope
+            ridge = RIDGE * torch.eye(WIDTH + 1, dtype=a.dtype, device=a.device)
+            found = torch.linalg.solve(a.T @ a + ridge, a.T @ (target[c, :, None].logit() * slope))[:, 0].to(self.out)
+            self.out[c], self.level[c] = found[:-1], found[-1]

@@ -30,7 +30,6 @@ from hdr_nsff.fields.space import Space
 
 FEATURES = 27  # that the colour network sees
 OCTAVES = 2  # of features and of directions, in the colour network
-SHIFT = -10.0  # of raw density: empty at the start
 UNITS = 25.0  # density per cube side
 FAINT = 1e-4  # weight below which a sample has no colour
 GROWTHS = 3  # times that the grid grows
@@ -50,6 +49,8 @@ class HexPlaneConfig:
     """Cells a side at the end."""
     grow_every: int = 3000
     """Steps after which the grid grows, three times in all."""
+    emptiness: float = 10.0
+    """Subtracted from raw density, so that space is empty at the start."""
     width: int = 128
     """Width of the colour network."""
     samples: int = 64
@@ -97,7 +98,7 @@ class HexPlane(nn.Module):
         flat, shape, share = m.coords.reshape(-1, 3), m.depths.shape, self.share(time)
         asked = self.cells.asks(flat, 0.0, self.config.explore if rng is not None else 0.0, rng).nonzero()[:, 0]
         raw = self.to_density(self.density_planes(flat[asked], share))[:, 0]
-        density = flat.new_zeros(len(flat)).index_copy(0, asked, UNITS * nn.functional.softplus(raw + SHIFT))
+        density = flat.new_zeros(len(flat)).index_copy(0, asked, UNITS * nn.functional.softplus(raw - self.config.emptiness))
         w = volume.single(density.view(shape), m.deltas)
         coloured = asked
         if (

@@ -114,7 +114,12 @@ class NerfWT(TwoBranches):
             case MlpConfig() as c:
                 branches = CodedMlp(c, len(times), codes)
         super().__init__(config, space, times, near, far, *size, branches=branches)
-        self.codes = codes
+
+    @property
+    def codes(self) -> Codes:
+        """The codes of the training images."""
+        assert isinstance(self.branches, CodedGrids | CodedMlp)
+        return self.branches.codes
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
         """A render of the batch's pixels in the look of its recording, and the mean optical thickness of the transient branch."""
