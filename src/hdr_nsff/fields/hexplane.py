@@ -30,7 +30,7 @@ from hdr_nsff.fields.space import Space
 
 FEATURES = 27  # that the colour network sees
 OCTAVES = 2  # of features and of directions, in the colour network
-UNITS = 25.0  # density per cube side
+UNITS = 75.0  # density per cube side: 25 per unit of a box of three, as published
 FAINT = 1e-4  # weight below which a sample has no colour
 GROWTHS = 3  # times that the grid grows
 
