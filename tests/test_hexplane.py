@@ -148,13 +148,11 @@ def run_of(request: pytest.FixtureRequest, toy_folder: Path, tmp_path_factory: p
 def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(run_of: Path, tmp_path: Path) -> None:
     render(RenderConfig(run_of, "fixed", tmp_path, output=Output(ev=2.0, video=False, exr="float")))
     run = Run.open(run_of)
-    frame = run.scene.train[3]
     exr = torch.from_numpy(io.read_exr(tmp_path / "fixed/00002.exr")["RGB"]).reshape(-1, 3)
-    camera = next(f for f in run.scene.train if f.time == 3.0).camera
+    camera = run.scene.train[3].camera  # the middle frame's
     torch.testing.assert_close(exr, run.field.render(camera, 2.0).radiance, atol=1e-5, rtol=1e-4)
     png = torch.from_numpy(io.read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
     torch.testing.assert_close(png, recorded(run.field, camera, 2.0, run.tonemapper.look_at(2.0)), atol=0.003, rtol=0)
-    assert frame.time == 3.0
 
 
 def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(run_of: Path, tmp_path: Path) -> None:

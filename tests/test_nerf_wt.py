@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from presets import random_field
+from presets import random_field, small
 from torch import Tensor
 
 from hdr_nsff.batch import Look, draw_pixels
+from hdr_nsff.fields import build_field
 from hdr_nsff.fields.nerf_wt import NerfWT
 from hdr_nsff.scene import Scene
 
@@ -68,10 +69,6 @@ def test_a_recording_teaches_the_code_of_its_image_alone(field: NerfWT, toy: Sce
 
 
 def test_beside_grids_the_colour_network_starts_by_changing_nothing(toy: Scene) -> None:
-    from presets import small
-
-    from hdr_nsff.fields import build_field
-
     field = build_field(small("nerf-wt").field, toy)
     coords = torch.rand(20, 3)
     field.branches.static_grid.table.data.normal_()

@@ -20,11 +20,10 @@ from torch import Tensor, nn
 from hdr_nsff.batch import Look
 from hdr_nsff.errors import InputError
 from hdr_nsff.response_kernel import Respond, bin_table
-from hdr_nsff.response_network import NetworkResponse
+from hdr_nsff.responses import GAMMA, ImageResponse, NetworkResponse, SharedResponse
 from hdr_nsff.scene import Scene, bracket_problem
 
 NUM_POINTS = 256
-GAMMA = 2.2
 LN2 = math.log(2.0)
 
 
@@ -73,56 +72,6 @@ def leaky_ends(x: Tensor, y: Tensor, leak: float) -> Tensor:
     """Eq. 11 as printed: `leak * x` below 0, `-leak / sqrt(x) + leak + 1` above 1, `y` = g(x) between; continuous at both ends."""
     above = 1 + leak - leak * torch.rsqrt(x.clamp_min(1.0))
     return torch.where(x > 1, above, torch.where(x < 0, leak * x, y))
-
-
-class SharedResponse(nn.Module):
-    """One monotone curve per camera and channel: cumulative positive steps that add up to 1, so g(0) = 0 and g(1) = 1."""
-
-    def __init__(self, num_cameras: int, knots: Tensor, min_step: float) -> None:
-        super().__init__()
-        self.min_step = min_step
-        self.register_buffer("knots", knots, persistent=False)
-        self.logits = nn.Parameter(torch.zeros(num_cameras, 3, len(knots) - 1))
-        self.set_values(knots.double() ** (1 / GAMMA))
-
-    knots: Tensor
-
-    def values(self, camera_id: int | slice) -> Tensor:
-        """The curve at the knots: (3, K), or (cameras, 3, K) for a slice."""
-        steps = torch.softmax(self.logits[camera_id], -1)
-        steps = steps * (1 - self.min_step) + self.min_step / steps.shape[-1]
-        inner = torch.cumsum(steps[..., :-1], -1)
-        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
-
-    def set_values(self, y: Tensor, camera_id: int | None = None) -> None:
-        """Take on the values `y` (K,) or (3, K) at the knots; falling or flat pieces become the smallest step."""
-        steps = y.double().diff(dim=-1).clamp_min(0)
-        share = steps / steps.sum(-1, keepdim=True).clamp_min(1e-12)
-        floor = self.min_step / steps.shape[-1]
-        share = ((share - floor) / (1 - self.min_step)).clamp_min(floor * 1e-2)
-        with torch.no_grad():
-            self.logits[slice(None) if camera_id is None else camera_id] = share.log().to(self.logits)
-
-
-class ImageResponse(nn.Module):
-    """The paper's response: free points per image and channel, ends fixed, started at x^(1/2.2); nothing keeps it monotone."""
-
-    def __init__(self, num_images: int, knots: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("knots", knots, persistent=False)
-        self.points = nn.Parameter((knots[1:-1] ** (1 / GAMMA)).expand(num_images, 3, -1).clone())
-
-    knots: Tensor
-
-    def values(self, image: int | slice | Tensor) -> Tensor:
-        """The curve at the knots: (3, K), or (images, 3, K)."""
-        inner = self.points[image]
-        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
-
-    def set_values(self, y: Tensor) -> None:
-        """Take on the values `y` (K,) or (3, K) for every image."""
-        with torch.no_grad():
-            self.points.copy_(y[..., 1:-1].expand_as(self.points))
 
 
 class BracketGain(nn.Module):

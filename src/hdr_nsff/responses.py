@@ -1,25 +1,73 @@
-"""The response as a network (HDR-NeRF, Huang et al. 2022): per channel one hidden layer from log exposure to recorded value.
-
-It is not monotone by construction and its ends are free; HDR-NeRF fixes the scale by holding one point of it, and so does `unit_point`."""
+"""Three ways to hold a learned response curve: ours, the paper's, and HDR-NeRF's."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
 
+GAMMA = 2.2
 WIDTH = 128  # of the hidden layer
 SMALLEST = 1e-6  # exposure below which the logarithm is held
 MIDDLE = 0.5  # the recorded value that is held, where the starting curve reaches it
-BENDS = (
-    -12.0,
-    -0.4,
-)  # log exposures between which the hidden units bend at the start: beyond, gently on, so that a gradient is left
+BENDS = (-12.0, -0.4)  # log exposures where hidden units bend at the start; above, gently on, so that a gradient is left
 FLOOR = 0.004  # recorded values closer to 0 and 1 than this are taken for it: they have no logit
 RIDGE = 1e-6
 
 
+class SharedResponse(nn.Module):
+    """One monotone curve per camera and channel: cumulative positive steps that add up to 1, so g(0) = 0 and g(1) = 1."""
+
+    def __init__(self, num_cameras: int, knots: Tensor, min_step: float) -> None:
+        super().__init__()
+        self.min_step = min_step
+        self.register_buffer("knots", knots, persistent=False)
+        self.logits = nn.Parameter(torch.zeros(num_cameras, 3, len(knots) - 1))
+        self.set_values(knots.double() ** (1 / GAMMA))
+
+    knots: Tensor
+
+    def values(self, camera_id: int | slice) -> Tensor:
+        """The curve at the knots: (3, K), or (cameras, 3, K) for a slice."""
+        steps = torch.softmax(self.logits[camera_id], -1)
+        steps = steps * (1 - self.min_step) + self.min_step / steps.shape[-1]
+        inner = torch.cumsum(steps[..., :-1], -1)
+        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
+
+    def set_values(self, y: Tensor, camera_id: int | None = None) -> None:
+        """Take on the values `y` (K,) or (3, K) at the knots; falling or flat pieces become the smallest step."""
+        steps = y.double().diff(dim=-1).clamp_min(0)
+        share = steps / steps.sum(-1, keepdim=True).clamp_min(1e-12)
+        floor = self.min_step / steps.shape[-1]
+        share = ((share - floor) / (1 - self.min_step)).clamp_min(floor * 1e-2)
+        with torch.no_grad():
+            self.logits[slice(None) if camera_id is None else camera_id] = share.log().to(self.logits)
+
+
+class ImageResponse(nn.Module):
+    """The paper's response: free points per image and channel, ends fixed, started at x^(1/2.2); nothing keeps it monotone."""
+
+    def __init__(self, num_images: int, knots: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("knots", knots, persistent=False)
+        self.points = nn.Parameter((knots[1:-1] ** (1 / GAMMA)).expand(num_images, 3, -1).clone())
+
+    knots: Tensor
+
+    def values(self, image: int | slice | Tensor) -> Tensor:
+        """The curve at the knots: (3, K), or (images, 3, K)."""
+        inner = self.points[image]
+        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
+
+    def set_values(self, y: Tensor) -> None:
+        """Take on the values `y` (K,) or (3, K) for every image."""
+        with torch.no_grad():
+            self.points.copy_(y[..., 1:-1].expand_as(self.points))
+
+
 class NetworkResponse(nn.Module):
-    """`sigmoid(out . relu(w ln x + b))` per channel, one for all cameras."""
+    """The response as a network (HDR-NeRF, Huang et al. 2022): `sigmoid(out . relu(w ln x + b))` per channel, one for all cameras.
+
+    It is not monotone by construction and its ends are free; HDR-NeRF fixes the scale by holding one point of it, as `unit_point` does."""
 
     knots: Tensor
     unit: Tensor
