@@ -7,28 +7,41 @@ import torch
 
 from hdr_nsff import distributed
 from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.fields import build_field, start_field
+from hdr_nsff.fields import AnyField, build_field, start_field
 from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpConfig
-from hdr_nsff.fields.nsff import NSFF
+from hdr_nsff.fields.hexplane import HexPlane, HexPlaneConfig
 from hdr_nsff.fields.splat import Splat, SplatConfig
+from hdr_nsff.fields.two_branches import TwoBranches
 from hdr_nsff.scene import Scene
 from hdr_nsff.train import Trainer, open_folder
 
-NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig] = {
+GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)
+MLP = MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2)
+HEXPLANE = HexPlaneConfig(
+    density_components=3, appearance_components=4, coarsest=8, finest=16, grow_every=3, width=16, samples=12, render_samples=16, cull_after=4
+)  # fmt: skip
+NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
     "splat": SplatConfig(static=400, moving=150, bases=2),
-    "grid": GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12),
-    "paper": MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2),
+    "grid": GRID,
+    "paper": MLP,
     "tiny": GridConfig(finest=6.0, depth_cells=16, levels=2, max_rows=2**12),
+    "nsff": GRID,
+    "nsff-paper": MLP,
+    "nerf-wt": GRID,
+    "nerf-wt-paper": MLP,
+    "hdr-hexplane": HEXPLANE,
+    "hdr-hexplane-paper": HEXPLANE,
+    "grid-sigmoid": GRID,  # the one ablation whose field differs
 }
 
 
 def small(preset: str, scene: Path = Path("scene"), out: Path = Path("run"), steps: int = 2) -> TrainConfig:
     """A preset with a small network, few samples and few rays."""
     config = PRESETS[preset]
-    network = NETWORKS[preset]
+    network = NETWORKS.get(preset) or NETWORKS[preset.partition("-")[0]]
     field = (
         network
-        if isinstance(network, SplatConfig)
+        if isinstance(network, SplatConfig | HexPlaneConfig)
         else replace(config.field, encoding=network, samples=12, render_samples=16, cull_after=4)
     )
     rays = {"rays": 64, "moving_rays": 16} if config.rays else {}
@@ -37,7 +50,7 @@ def small(preset: str, scene: Path = Path("scene"), out: Path = Path("run"), ste
     )
 
 
-def random_field(preset: str, scene: Scene, seed: int = 0) -> NSFF | Splat:
+def random_field(preset: str, scene: Scene, seed: int = 0) -> AnyField:
     """An untrained field with something in every branch."""
     torch.manual_seed(seed)
     field = build_field(small(preset).field, scene)
@@ -50,6 +63,10 @@ def random_field(preset: str, scene: Scene, seed: int = 0) -> NSFF | Splat:
         return field
     for p in field.parameters():
         p.data.add_(0.3 * torch.randn_like(p))
+    if isinstance(field, HexPlane):
+        field.to_density.weight.data.mul_(10)  # something to see, in spite of the shift
+        return field
+    assert isinstance(field, TwoBranches)
     if isinstance(field.branches, GridBranches):
         field.branches.dynamic_grid.table.data[:, 3] += 1.5  # movers that cover something
     return field

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from hdr_nsff import __version__, cli
-from hdr_nsff.config import PRESETS, TrainConfig
+from hdr_nsff.config import ABLATIONS, METHODS, PRESETS, TrainConfig
 from hdr_nsff.errors import InputError
 from hdr_nsff.run import Run
 
@@ -63,7 +63,25 @@ def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str
 def test_every_preset_explains_its_settings(preset: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert call("train", preset, "--help") == 0
     out = capsys.readouterr().out
-    assert "--scene" in out and ("--field.bases" if preset == "splat" else "--field.samples") in out and "--loss.temporal" in out
+    assert (
+        "--scene" in out
+        and ("--field.bases" if preset.startswith("splat") else "--field.samples") in out
+        and "--loss.temporal" in out
+    )
+
+
+def test_train_lists_methods_line_by_line_and_ablations_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert call("train", "--help") == 0
+    out = capsys.readouterr().out
+    assert all(f" {name} " in out for name in METHODS) and not any(f"grid-{name} " in out for name in ABLATIONS)
+    assert all(name in out for name in ABLATIONS) and len(out.splitlines()) < 60
+
+
+def test_an_ablation_reaches_the_verb_by_its_name(act: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[TrainConfig] = []
+    monkeypatch.setitem(cli.VERBS, "train", replace(cli.VERBS["train"], act=seen.append))
+    assert call("train", "splat-response-mlp", "--steps", "7") == 0
+    assert seen == [replace(PRESETS["splat-response-mlp"], steps=7)]
 
 
 def test_help_lists_every_verb(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,18 @@ TRUTH = {  # who reads it, and the last three, which write it
     "reexpose",
     "datasets.held_out",
 }
-HEAVY = {"torchvision", "pycolmap", "mitsuba", "drjit", "rawpy", "flip_evaluator", "gsplat", "transformers", "huggingface_hub", "kornia"}
+HEAVY = {
+    "torchvision",
+    "pycolmap",
+    "mitsuba",
+    "drjit",
+    "rawpy",
+    "flip_evaluator",
+    "gsplat",
+    "transformers",
+    "huggingface_hub",
+    "kornia",
+}
 
 
 def module_of(path: Path) -> str:

@@ -10,15 +10,15 @@ from presets import small, trainer
 from test_splat import CAMERA, card_field, scattered
 
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import Look
+from hdr_nsff.fields.base import Misfit
 from hdr_nsff.fields.rasterize import dense
 from hdr_nsff.fields.renewal import MOST, NARROWER, PARTED, blame, halve, renew
 from hdr_nsff.fields.splat import Splat
 from hdr_nsff.scene import Scene
 
 
-def look(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> Look:
-    return Look(camera, time, torch.ones(camera.height, camera.width) if error is None else error)
+def misfit(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> Misfit:
+    return Misfit(camera, time, torch.ones(camera.height, camera.width) if error is None else error)
 
 
 def corner() -> torch.Tensor:
@@ -33,7 +33,7 @@ def test_blame_is_the_weights_of_the_slow_twin_times_the_error() -> None:
     cloud = field.cloud(field.knot(3.0))
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
     own = dense(*(p.detach() for p in parts), torch.eye(len(cloud.means)), CAMERA)  # weights
-    told = blame(field, look(error))
+    told = blame(field, misfit(error))
     torch.testing.assert_close(told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(told[:, 1], own.features.sum((0, 1)), atol=1e-3, rtol=1e-3)
 
@@ -50,7 +50,7 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
     field = card_field()
     field.static.logits.data[::20] = -10.0  # faded away; others lie outside the picture
     there = in_corner(field)
-    count = renew(field, [look(corner())], torch.Generator().manual_seed(0))
+    count = renew(field, [misfit(corner())], torch.Generator().manual_seed(0))
     assert count == int(MOST * len(field.static))  # more are unseen
     assert there + 0.6 * count < in_corner(field) <= there + count  # some were faint ones of that quarter
 
@@ -58,16 +58,16 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
 def test_floaters_that_no_view_sees_are_put_to_use() -> None:
     field = card_field()
     field.static.means.data[:5] = torch.tensor([0.0, 0.0, -3.0])  # behind every camera
-    renew(field, [look()], torch.Generator().manual_seed(0))
+    renew(field, [misfit()], torch.Generator().manual_seed(0))
     assert bool((field.static.means[:5, 2] > 3).all())
 
 
-def test_a_gaussian_seen_in_any_look_stays() -> None:
+def test_a_gaussian_seen_in_any_frame_stays() -> None:
     field = card_field()
     away = CAMERA.moved(torch.tensor([[1.0, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0]]))  # sees nothing
     before = {n: p.detach().clone() for n, p in field.named_parameters()}
-    renew(field, [look(), look(camera=away)], torch.Generator().manual_seed(0))
-    seen = blame(field, look())[: len(field.static), 1] > 1
+    renew(field, [misfit(), misfit(camera=away)], torch.Generator().manual_seed(0))
+    seen = blame(field, misfit())[: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
     assert int((~kept & seen).sum()) <= 2 * MOST * len(field.static)  # the halves and what they were cut from
@@ -94,7 +94,7 @@ def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
 def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]
-    assert renew(field, [look(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
+    assert renew(field, [misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
     assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
 
 
@@ -115,11 +115,11 @@ def test_training_renews_until_late_in_the_run(toy: Scene, toy_folder: Path, tmp
     assert behind[-1] >= 10 and behind[-2] >= 10  # from 80 % on nothing is rearranged
 
 
-def test_looks_are_the_recorded_differences(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+def test_misfits_are_the_recorded_differences(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
     t = trainer(small("splat", toy_folder, tmp_path / "run"), toy)
-    found = t.looks(len(toy.train))
+    found = t.misfits(len(toy.train))
     assert [x.time for x in found] == [f.time for f in toy.train]
     f = toy.train[2]
     rgb = t.tonemapper(t.field.render(f.camera, f.time).radiance, f.bracket, f.camera_id, 2, leaky=False)
     torch.testing.assert_close(found[2].error, (rgb.detach().view_as(f.image) - f.image).abs().mean(-1))
-    assert len({x.time for x in t.looks(3)}) == 3
+    assert len({x.time for x in t.misfits(3)}) == 3

@@ -120,7 +120,7 @@ def test_refused_bullet_time_is_explained(tmp_path: Path) -> None:
     assert "no bullet time from this clip, its camera stood still" in text
 
 
-@pytest.mark.parametrize("kind", ["none", "fixed", "per_image"])
+@pytest.mark.parametrize("kind", ["none", "fixed", "per_image", "mlp", "sigmoid"])
 def test_every_tone_mapper_can_be_reported(tmp_path: Path, kind) -> None:
     run = replace(
         fake_run(tmp_path), tonemapper=ToneMapper(ToneMapConfig(kind=kind), [0, 1, 2, 0, 1, 2], [0] * 6, [-4.0, None, 0.0], 2)

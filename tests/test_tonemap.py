@@ -198,6 +198,12 @@ def test_develop_is_the_recording_of_a_bracket_at_its_ev():
     assert picture.shape == (4, 5, 3) and picture.min() >= 0 and picture.max() <= 1
 
 
+def test_a_network_response_is_undone_through_its_curve():
+    t = mapper(kind="mlp", residual=False)
+    radiance = torch.rand(50, 3) * 0.6 + 0.1
+    torch.testing.assert_close(t.inverse(t(radiance, bracket=2), bracket=2), radiance, atol=2e-3, rtol=0)
+
+
 def test_the_papers_gain_is_free_but_for_the_reference_image():
     t = disturb(mapper(kind="per_image", knots="even"), scale=0.3)
     assert torch.equal(t.gains()[2], torch.zeros(3))  # frame 2 is the first of the reference bracket
@@ -212,6 +218,72 @@ def test_none_takes_radiance_for_rgb():
     assert torch.equal(t(radiance, bracket=0), radiance)
     assert torch.equal(t(radiance, bracket=0, leaky=False), radiance.clamp(0, 1))
     assert t.regularizers() == {}
+
+
+def test_none_teaches_no_exposure_and_passes_on_the_one_it_was_told():
+    t = mapper([None, None, None], kind="none")
+    assert list(t.parameters()) == []
+    t.set_exposures([-3.0, -1.0, 0.0])  # for matching exposures by rank, not for recording
+    assert t.exposures().tolist() == [-3.0, -1.0, 0.0] and (t.gains() == 0).all()
+    radiance = torch.full((1, 3), 0.3, requires_grad=True)
+    assert torch.equal(t(radiance, bracket=0, leaky=False), radiance)
+    assert mapper([-4.0, None, 0.0], kind="none").exposures().tolist() == [-4.0, 0.0, 0.0]
+
+
+def test_the_sigmoid_records_x_over_one_plus_x_with_one_exposure_per_image():
+    t = mapper(kind="sigmoid")
+    with torch.no_grad():
+        t.image_gain.copy_(torch.log(torch.tensor([[0.25], [1.0], [9.0], [4.0], [2.0], [1.0]])))
+    radiance = torch.full((1, 3), 3.0)
+    for frame, gain in ((0, 0.25), (1, 1.0), (2, 1.0), (3, 4.0)):  # frame 2 is the reference image: gain 1 whatever it says
+        x = 3.0 * gain
+        torch.testing.assert_close(t(radiance, t.frame_brackets[frame], frame=frame), torch.full((1, 3), x / (1 + x)))
+    torch.testing.assert_close(t(radiance, bracket=0), torch.full((1, 3), 0.75))  # borrowed: geometric mean of 1/4 and 4 is 1
+    torch.testing.assert_close(t.inverse(t(radiance, bracket=1, frame=4), bracket=1, frame=4), radiance)
+    torch.testing.assert_close(t.develop(radiance, ev=1.0), torch.full((1, 3), 6 / 7))
+    torch.testing.assert_close(t.curve()[1], (t.knots / (1 + t.knots)).expand(3, -1))
+
+
+def test_the_sigmoids_exposure_learns_from_its_image_alone():
+    t = mapper(kind="sigmoid")
+    t(grid(), bracket=1, frame=4).sum().backward()
+    assert (t.image_gain.grad[:, 0] != 0).tolist() == [False, False, False, False, True, False]
+
+
+def test_a_network_response_starts_at_the_curve_it_is_given_and_is_not_kept_monotone():
+    t = mapper(kind="mlp", residual=False)
+    above = grid()[20:650]
+    assert (t(above, bracket=2) - above ** (1 / GAMMA)).abs().max() < 0.01
+    assert (t(grid(), bracket=2) - grid() ** (1 / GAMMA)).abs().max() < 0.08  # a sigmoid never gets to 1
+    x = torch.linspace(0, 1, 64) ** 2
+    t.set_curve(x, (x**0.3).expand(3, -1))
+    assert (t(above, bracket=2) - above**0.3).abs().max() < 0.02
+    with torch.no_grad():
+        t.response.out.neg_()
+    assert (t(above, bracket=2).diff(dim=0) < 0).any()  # nothing stops it from falling
+
+
+def test_a_network_response_holds_the_point_that_fixes_the_scale():
+    t = mapper(kind="mlp", residual=False)
+    assert float(t.regularizers()["unit_exposure"].detach()) < 1e-3
+    with torch.no_grad():
+        t.response.level.add_(1.0)  # as a common gain would
+    assert float(t.regularizers()["unit_exposure"].detach()) > 0.05
+
+
+def test_a_network_response_teaches_gains_and_radiance_beyond_saturation():
+    t = mapper([None, None, 0.0], kind="mlp", residual=False)
+    radiance = torch.full((1, 3), 4.0, requires_grad=True)
+    t(radiance, bracket=0).sum().backward()
+    assert radiance.grad.min() > 0 and t.bracket_gain.learned_ev.grad[0] > 0
+
+
+def test_a_look_is_the_recording_and_names_the_images_it_resembles():
+    t = disturb(mapper())
+    assert t.look(1, 0).images == (1, 4) and t.look(1, 0, 4).images == (4,)
+    torch.testing.assert_close(t.look(1, 0, 4, leaky=True).rgb(grid()), t(grid(), bracket=1, frame=4))
+    assert t.look_at(-3.9).images == (0, 3)  # the exposures are -4, -2, 0
+    torch.testing.assert_close(t.look_at(-3.9).rgb(grid()), t.develop(grid(), -3.9))
 
 
 def test_black_and_saturated_pixels_tell_nothing():

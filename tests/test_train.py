@@ -62,7 +62,7 @@ def test_another_seed_gives_others(unbroken: Path, toy_folder: Path, tmp_path: P
     assert not torch.equal(final(unbroken)[name], other[name])
 
 
-@pytest.mark.parametrize("preset", ["splat", "grid", "paper"])
+@pytest.mark.parametrize("preset", ["splat", "grid", "paper", "hdr-hexplane", "nerf-wt"])
 def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
     preset: str, unbroken: Path, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -253,8 +253,10 @@ def test_without_steps_the_clock_counts_minutes() -> None:
     assert replace(clock, seconds=1e6).progress == 1.0
 
 
-@pytest.mark.parametrize("kind", ["none", "fixed", "per_image"])
-def test_every_kind_of_tone_mapper_trains(kind: Literal["none", "fixed", "per_image"], toy_folder: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["none", "fixed", "per_image", "mlp", "sigmoid"])
+def test_every_kind_of_tone_mapper_trains(
+    kind: Literal["none", "fixed", "per_image", "mlp", "sigmoid"], toy_folder: Path, tmp_path: Path
+) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), tonemap=ToneMapConfig(kind=kind))
     log = read_log(train(replace(settings, steps=25)))
     assert log[-1].step == 25 and log[-1].psnr > 5

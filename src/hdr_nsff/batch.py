@@ -13,6 +13,16 @@ from hdr_nsff.scene import Frame, Scene
 
 
 @dataclass(frozen=True)
+class Look:
+    """One recording, for the baselines' fields that must know of it before samples are composited; the others never ask."""
+
+    rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to what is recorded of it (M, 3)
+    images: tuple[
+        int, ...
+    ]  # positions in `scene.train` of the images that look like it: the image itself, or those of its exposure
+
+
+@dataclass(frozen=True)
 class PixelBatch:
     """`N` pixels of one training frame."""
 
@@ -26,6 +36,7 @@ class PixelBatch:
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
     seed: int = 0  # for the field's own randomness (jitter, noise): the same seed gives the same pass
+    look: Look | None = None  # the recording, while training
     chain: int = 0  # direction of the two-step warp: +1, -1, or 0 for none
     moving: Tensor | None = None  # (N,) bool
     outline: Tensor | None = None  # (N,) bool: near the moving mask's outline

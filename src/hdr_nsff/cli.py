@@ -12,7 +12,7 @@ try:
 
     from hdr_nsff import __version__
     from hdr_nsff.bench import BenchConfig, bench
-    from hdr_nsff.config import PRESETS, TrainConfig
+    from hdr_nsff.config import ABLATIONS, PRESETS, TrainConfig
     from hdr_nsff.errors import InputError
     from hdr_nsff.evaluate import EvaluateConfig, evaluate
     from hdr_nsff.export import ExportConfig, export
@@ -44,7 +44,9 @@ VERBS = {
     "run": Verb(run_all, RunConfig, "Footage to HDR in one go: prepare, train, render, evaluate, report."),
     "prepare": Verb(prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."),
     "train": Verb(
-        train, PRESETS, "Train a radiance field from a scene folder: `train splat`, `train grid`, `train paper`, `train tiny`."
+        train,
+        PRESETS,
+        "Train a radiance field from a scene folder: `train splat`, `train grid`, ...; `train --help` lists the presets.",
     ),
     "render": Verb(render, RenderConfig, "Views of a trained run: EXR, PNG, video; any path, time and exposure."),
     "export": Verb(
@@ -65,7 +67,17 @@ PRESET_HELP = {
     "grid": "A scene flow field on additive grids, minutes on a CPU.",
     "paper": "The published network, losses and schedules; hours on a GPU.",
     "tiny": "Seconds on a CPU, to try things out.",
+    "nsff": "Baseline: NSFF, which knows one exposure, on the grids of `grid`.",
+    "nsff-paper": "Baseline: NSFF at its published size, for a GPU.",
+    "nerf-wt": "Baseline: NeRF-W with time, a code per image instead of a tone mapper, on the grids of `grid`.",
+    "nerf-wt-paper": "Baseline: the same at its published size, for a GPU.",
+    "hdr-hexplane": "Baseline: HDR-HexPlane, tone-mapped sample by sample, small enough for a CPU.",
+    "hdr-hexplane-paper": "Baseline: the same at its published size, for a GPU.",
 }
+MORE_PRESETS = (
+    f"Ablations of ours: `grid-NAME` and `splat-NAME` with NAME one of {', '.join(ABLATIONS)} (the last two of `grid` alone); "
+    "docs/baselines.md says what each is."
+)
 
 
 def usage() -> str:
@@ -88,8 +100,11 @@ def usage() -> str:
 def parse(verb: Verb, name: str, arguments: Sequence[str]) -> Any:
     """The config of a verb from its arguments; tyro prints help and typos itself and exits."""
     if isinstance(verb.config, dict):
-        presets = {k: (PRESET_HELP[k], v) for k, v in verb.config.items()}
-        config = tyro.extras.overridable_config_cli(presets, prog=f"hdr-nsff {name}", args=arguments)
+        asked = arguments[0] if arguments else ""
+        shown = {asked: f"Ablation: `{asked}`."} if asked in verb.config and asked not in PRESET_HELP else PRESET_HELP
+        presets = {k: (words, verb.config[k]) for k, words in shown.items()}
+        about = f"{TrainConfig.__doc__} {MORE_PRESETS}"
+        config = tyro.extras.overridable_config_cli(presets, prog=f"hdr-nsff {name}", description=about, args=arguments)
         assert isinstance(config, TrainConfig)
         return config
     return tyro.cli(verb.config, prog=f"hdr-nsff {name}", args=arguments, config=(tyro.conf.OmitSubcommandPrefixes,))

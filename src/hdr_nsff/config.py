@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from hdr_nsff.errors import InputError
+from hdr_nsff.fields import FieldConfig
 from hdr_nsff.fields.branches import GridConfig, MlpConfig
+from hdr_nsff.fields.hexplane import HexPlaneConfig
+from hdr_nsff.fields.nerf_wt import NerfWTConfig
 from hdr_nsff.fields.nsff import NSFFConfig
 from hdr_nsff.fields.splat import SplatConfig
+from hdr_nsff.fields.two_branches import BranchesConfig
 from hdr_nsff.objective import LossWeights
 from hdr_nsff.tonemap import ToneMapConfig
 
@@ -23,7 +27,7 @@ class TrainConfig:
     """Scene folder, as `prepare` wrote it."""
     out: Path = Path("run")
     """Run folder: config, checkpoints, log, previews."""
-    field: NSFFConfig | SplatConfig = dataclasses.field(default_factory=NSFFConfig)
+    field: FieldConfig = dataclasses.field(default_factory=NSFFConfig)
     tonemap: ToneMapConfig = dataclasses.field(default_factory=ToneMapConfig)
     loss: LossWeights = dataclasses.field(default_factory=LossWeights)
     steps: int | None = None
@@ -66,7 +70,7 @@ class TrainConfig:
     def to_json(self) -> dict[str, Any]:
         """Plain data that `from_json` turns back."""
         kinds = [type(self.field).__name__]
-        if isinstance(self.field, NSFFConfig):
+        if isinstance(self.field, BranchesConfig):
             kinds.append(type(self.field.encoding).__name__)
         return asdict(self) | {"scene": str(self.scene), "out": str(self.out), "kinds": kinds}
 
@@ -91,20 +95,21 @@ class TrainConfig:
             ) from error
 
 
-def read_field(kinds: list[str], values: dict[str, Any]) -> NSFFConfig | SplatConfig:
+def read_field(kinds: list[str], values: dict[str, Any]) -> FieldConfig:
     """The field's settings from plain data; `kinds` names their types, outermost first."""
-    known: dict[str, Any] = {c.__name__: c for c in (NSFFConfig, SplatConfig, GridConfig, MlpConfig)}
+    known: dict[str, Any] = {c.__name__: c for c in (*get_args(FieldConfig), GridConfig, MlpConfig)}
     if len(kinds) > 1:
         values = {**values, "encoding": known[kinds[1]](**values["encoding"])}
     field = known[kinds[0]](**values)
-    if not isinstance(field, NSFFConfig | SplatConfig):
+    if not isinstance(field, FieldConfig):
         raise TypeError(f"{kinds[0]} is no field")
     return field
 
 
 ABOVE_ZERO = {"minutes", "finest", "motion_cell"}
 FROM_ONE = {"steps", "batches", "bases", "colour_knots", "shade_knots", "presence_knots", "samples", "render_samples", "levels"}
-FROM_ONE |= {"depth_cells", "max_rows", "layers", "width", "static"}
+FROM_ONE |= {"depth_cells", "max_rows", "layers", "width", "static", "code_size", "head_width", "grow_every"}
+FROM_ONE |= {"density_components", "appearance_components", "coarsest", "finest"}
 AT_MOST = {
     "static": 1e8,
     "moving": 1e8,
@@ -166,7 +171,7 @@ def paper() -> TrainConfig:
         cull=False,
     )
     return TrainConfig(
-        field=network, tonemap=ToneMapConfig(kind="per_image", knots="even"), loss=weights, steps=250_000, minutes=None, rays=1024,
+        field=network, tonemap=ToneMapConfig(kind="per_image", knots="even", from_recordings=False), loss=weights, steps=250_000, minutes=None, rays=1024,
         moving_rays=512, batches=1, paint=False, period=0.0, prior_fade=0.1, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, torch_threads=0, checkpoint_seconds=600,
     )  # fmt: skip
 
@@ -179,4 +184,101 @@ def tiny() -> TrainConfig:
     return TrainConfig(field=network, steps=60, minutes=None, rays=192, moving_rays=64, batches=1)
 
 
-PRESETS: dict[str, TrainConfig] = {"splat": splat(), "grid": TrainConfig(), "paper": paper(), "tiny": tiny()}
+# Baselines (METHOD.md 6); docs/baselines.md says of each what is the same, what had to differ and why
+
+
+NOTHING = LossWeights(**{f.name: 0.0 for f in dataclasses.fields(LossWeights)} | {"photometric": 1.0})
+LDR = ToneMapConfig(kind="none")
+
+
+def nsff_paper() -> TrainConfig:
+    """NSFF at its published size: `paper` without a tone mapper, with squared errors that trust every recorded value."""
+    return replace(paper(), tonemap=LDR, squared=True, saturation=False)
+
+
+def nsff() -> TrainConfig:
+    """The same on the grids of `grid`, its schedules as the same shares of the run."""
+    published = nsff_paper()
+    field = NSFFConfig(compositing="blend", radiance="sigmoid")
+    weights = replace(published.loss, depth=0.5, flow=0.01)
+    return replace(
+        published, field=field, loss=weights, steps=None, minutes=5.0, rays=1536, paint=True, period=0.12, moving_until=0.12,
+        prior_fade=0.5, lr_final=0.05, torch_threads=1, checkpoint_seconds=60,
+    )  # fmt: skip
+
+
+def nerf_wt_paper() -> TrainConfig:
+    """NeRF-W with time at the size of its public implementation."""
+    field = NerfWTConfig(MlpConfig(), samples=128, render_samples=128, density="relu", density_noise=1.0, cull=False)
+    return replace(nsff_paper(), field=field, loss=replace(NOTHING, transient=0.01), moving_rays=0)
+
+
+def nerf_wt() -> TrainConfig:
+    """The same on the grids of `grid`, with the geometry that grids need."""
+    weights = replace(NOTHING, transient=0.01, depth=0.5)
+    return TrainConfig(field=NerfWTConfig(), tonemap=LDR, loss=weights, squared=True, saturation=False, moving_rays=0)
+
+
+def hexplane_paper() -> TrainConfig:
+    """HDR-HexPlane at its published size."""
+    return TrainConfig(
+        field=HexPlaneConfig(), tonemap=ToneMapConfig(kind="sigmoid"), loss=replace(NOTHING, total_variation=1e-4), steps=25_000,
+        minutes=None, rays=4096, moving_rays=0, lr_final=0.1, tonemap_lr=1e-3, anchor_at=1.0, paint=False, squared=True,
+        saturation=False, torch_threads=0, checkpoint_seconds=600,
+    )  # fmt: skip
+
+
+def hexplane() -> TrainConfig:
+    """The same for minutes on a CPU: smaller grids and batches."""
+    field = HexPlaneConfig(coarsest=48, finest=128, grow_every=200, emptiness=5.0, samples=32, render_samples=48, cull_after=50)
+    return replace(hexplane_paper(), field=field, steps=None, minutes=5.0, rays=512, torch_threads=1, checkpoint_seconds=120)
+
+
+# Ablations of ours
+
+
+RESPONSES: dict[str, Literal["none", "fixed", "mlp", "per_image"]] = {
+    "response-none": "none",
+    "response-fixed": "fixed",
+    "response-mlp": "mlp",
+    "response-per-image": "per_image",
+}
+ABLATIONS = (*RESPONSES, "no-flow", "no-depth", "no-saturation", "sigmoid")
+
+
+def ablated(config: TrainConfig, name: str) -> TrainConfig:
+    """A preset with one thing changed; `name` is one of `ABLATIONS`."""
+    match name:
+        case "no-flow":  # nor is the flow looked at before training
+            return replace(config, loss=replace(config.loss, flow=0.0))
+        case "no-depth":
+            return replace(config, loss=replace(config.loss, depth=0.0), paint=False)
+        case "no-saturation":
+            return replace(config, saturation=False)
+        case "sigmoid":
+            assert isinstance(config.field, BranchesConfig), "Gaussians keep a logarithm of radiance"
+            return replace(config, field=replace(config.field, radiance="sigmoid"))
+        case _:
+            return replace(config, tonemap=replace(config.tonemap, kind=RESPONSES[name]))
+
+
+def ablations() -> dict[str, TrainConfig]:
+    """By name, `grid-no-flow` and the like. Gaussians have no term that saturation weighs, and no sigmoid."""
+    presets = {"splat": splat(), "grid": TrainConfig()}
+    without = {"splat": {"no-saturation", "sigmoid"}, "grid": set()}
+    return {f"{p}-{a}": ablated(config, a) for p, config in presets.items() for a in ABLATIONS if a not in without[p]}
+
+
+METHODS: dict[str, TrainConfig] = {
+    "splat": splat(),
+    "grid": TrainConfig(),
+    "paper": paper(),
+    "tiny": tiny(),
+    "nsff": nsff(),
+    "nsff-paper": nsff_paper(),
+    "nerf-wt": nerf_wt(),
+    "nerf-wt-paper": nerf_wt_paper(),
+    "hdr-hexplane": hexplane(),
+    "hdr-hexplane-paper": hexplane_paper(),
+}
+PRESETS: dict[str, TrainConfig] = METHODS | ablations()

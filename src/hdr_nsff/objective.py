@@ -56,7 +56,13 @@ class LossWeights:
     """Square of the differences in how neighbouring moving Gaussians mix the shared motions."""
     sheen: float = 0.01
     """Square of Gaussians' changes of log radiance with the direction of view."""
+    transient: float = 0.01
+    """Mean optical thickness of a sample of NeRF-W's transient branch."""
+    total_variation: float = 1e-4
+    """Mean square differences of neighbours in HexPlane's planes."""
     response_smoothness: float = 1e-3
+    unit_exposure: float = 0.5
+    """Distance of a network response from mid grey at the unit exposure."""
     gain_residual: float = 1.0
     response_anchor: float = 100.0
 
@@ -75,7 +81,7 @@ class Objective:
 
     def terms(self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
         """All terms that need only the render, unweighted."""
-        rgb = self.recorded(render.radiance, batch, tonemap)
+        rgb = self.recorded(render.radiance, batch, tonemap) if render.rgb is None else render.rgb
         uniform = None if batch.uniform.all() else batch.uniform[:, None].to(rgb)
         terms = {"photometric": losses.photometric(rgb, batch.rgb, uniform, self.squared)}
         terms |= self.dynamic(render, rgb, batch, tonemap, phase)

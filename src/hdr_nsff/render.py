@@ -20,7 +20,7 @@ from hdr_nsff.paths import View
 from hdr_nsff.progress import say, track
 from hdr_nsff.run import Run
 from hdr_nsff.scene import Frame
-from hdr_nsff.shots import Output, Shot, develop, device_of, fingerprint, render_shot, take
+from hdr_nsff.shots import Output, Shot, device_of, fingerprint, picture_of, render_shot, take
 from hdr_nsff.tensors import to_device
 
 SHOTS = ("training", "fixed", "bullet", "slowmo")
@@ -291,7 +291,8 @@ def write_views(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
         for i, source in enumerate(track(sources, "LDR, depth and motion pictures")):
             seen = io.read_exr(source)
             for ev in evs:
-                io.write_png(out / "ldr" / f"ev{ev:+.1f}" / f"{i:05d}.png", develop(run, seen["RGB"], ev, 0, 1.0))
+                picture = picture_of(run, shot.views[i], seen["RGB"], ev, 0, 1.0)
+                io.write_png(out / "ldr" / f"ev{ev:+.1f}" / f"{i:05d}.png", picture)
             io.write_png(out / "depth" / f"{i:05d}.png", io.colorize(1 / seen["Z"].clip(1e-6), 1 / far, 1 / near))
             if moves:
                 flow = np.stack([seen["forward.u"], seen["forward.v"]], -1)

@@ -384,7 +384,7 @@ def provenance(run: Run) -> str:
     rows.append(
         (
             "response curve",
-            "estimated" if run.config.tonemap.kind in ("shared", "per_image") else "given",
+            "estimated" if run.config.tonemap.kind in ("shared", "per_image", "mlp") else "given",
             f"tone map: {run.config.tonemap.kind}",
         )
     )

@@ -21,7 +21,7 @@ import torch
 from hdr_nsff import color, io, notes
 from hdr_nsff.camera import Camera
 from hdr_nsff.errors import InputError
-from hdr_nsff.fields.base import Render
+from hdr_nsff.fields.base import Render, recorded
 from hdr_nsff.interpolate import Mode, render_at
 from hdr_nsff.paths import View
 from hdr_nsff.progress import say, track
@@ -96,10 +96,21 @@ def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
 
 
 def develop(run: Run, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float) -> np.ndarray:
-    """An rgb picture (H, W, 3) in [0, 1]: recorded by a learned camera at `ev`, or (None) tone-mapped for a display."""
+    """An rgb picture (..., 3) in [0, 1] of `radiance`: recorded by a learned camera at `ev`, or (None) tone-mapped for a display."""
     if ev is None:
         return color.display(radiance * run.tonemapper.neutral(camera_id).cpu().numpy(), exposure)
     return run.tonemapper.develop(torch.from_numpy(radiance).to(device_of(run)), ev, camera_id).cpu().numpy()
+
+
+def picture_of(run: Run, view: View, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float) -> np.ndarray:
+    """The same of a view of which the run rendered `radiance` (H, W, 3); fields that record before they composite are asked again."""
+    if ev is None:
+        return develop(run, radiance, ev, camera_id, exposure)
+    flat = torch.from_numpy(radiance.reshape(-1, 3)).to(device_of(run))
+    camera = to_device(view.camera, device_of(run))
+    return (
+        recorded(run.field, camera, view.time, run.tonemapper.look_at(ev, camera_id), flat).cpu().numpy().reshape(radiance.shape)
+    )
 
 
 def display_exposure(run: Run, views: Sequence[View]) -> float:
@@ -193,7 +204,7 @@ def write_view(run: Run, view: View, picture: Path, output: Output, exposure: fl
     if output.exr != "none":
         shown = {"developedEV": float(ev)} if ev is not None else {"displayExposure": exposure}
         write_still(exr, still, view, output.exr == "half", {**exposure_header(run), **shown})
-    io.write_png(picture, develop(run, still.radiance, ev, output.camera_id, exposure))
+    io.write_png(picture, picture_of(run, view, still.radiance, ev, output.camera_id, exposure))
 
 
 def exposure_header(run: Run) -> dict[str, Any]:

@@ -17,12 +17,13 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.batch import Look
 from hdr_nsff.errors import InputError
 from hdr_nsff.response_kernel import Respond, bin_table
+from hdr_nsff.responses import GAMMA, ImageResponse, NetworkResponse, SharedResponse
 from hdr_nsff.scene import Scene, bracket_problem
 
 NUM_POINTS = 256
-GAMMA = 2.2
 LN2 = math.log(2.0)
 
 
@@ -30,15 +31,18 @@ LN2 = math.log(2.0)
 class ToneMapConfig:
     """How radiance becomes recorded rgb."""
 
-    kind: Literal["shared", "per_image", "fixed", "none"] = "shared"
+    kind: Literal["shared", "per_image", "mlp", "fixed", "sigmoid", "none"] = "shared"
     """shared: one monotone curve per camera and one exposure per bracket; per_image: the paper's free gain and curve per
-    image; fixed: gamma 2.2 with one exposure per bracket; none: radiance is taken for rgb (plain NSFF)."""
+    image; mlp: HDR-NeRF's network for the curve; fixed: gamma 2.2; both with one exposure per bracket; sigmoid: HDR-HexPlane's fixed
+    x / (1 + x) with one exposure per image; none: radiance is taken for rgb (plain NSFF)."""
     knots: Literal["gamma", "even"] = "gamma"
     """Where the curve's 256 points lie on [0, 1]: evenly in x^(1/2.2), which resolves the darks, or evenly in x (paper)."""
     leak: float = 0.01
     """Slope parameter of eq. 11 beyond [0, 1]."""
     residual: bool = True
     """shared: let every training frame deviate a little from its bracket's gain (flicker, drifting white balance)."""
+    from_recordings: bool = True
+    """per_image: start gains and curves where the others start; else at 1 and gamma 2.2, as published."""
     min_step: float = 1e-3
     """shared: smallest step of the curve between two points as a share of the mean step; keeps it invertible."""
 
@@ -68,56 +72,6 @@ def leaky_ends(x: Tensor, y: Tensor, leak: float) -> Tensor:
     """Eq. 11 as printed: `leak * x` below 0, `-leak / sqrt(x) + leak + 1` above 1, `y` = g(x) between; continuous at both ends."""
     above = 1 + leak - leak * torch.rsqrt(x.clamp_min(1.0))
     return torch.where(x > 1, above, torch.where(x < 0, leak * x, y))
-
-
-class SharedResponse(nn.Module):
-    """One monotone curve per camera and channel: cumulative positive steps that add up to 1, so g(0) = 0 and g(1) = 1."""
-
-    def __init__(self, num_cameras: int, knots: Tensor, min_step: float) -> None:
-        super().__init__()
-        self.min_step = min_step
-        self.register_buffer("knots", knots, persistent=False)
-        self.logits = nn.Parameter(torch.zeros(num_cameras, 3, len(knots) - 1))
-        self.set_values(knots.double() ** (1 / GAMMA))
-
-    knots: Tensor
-
-    def values(self, camera_id: int | slice) -> Tensor:
-        """The curve at the knots: (3, K), or (cameras, 3, K) for a slice."""
-        steps = torch.softmax(self.logits[camera_id], -1)
-        steps = steps * (1 - self.min_step) + self.min_step / steps.shape[-1]
-        inner = torch.cumsum(steps[..., :-1], -1)
-        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
-
-    def set_values(self, y: Tensor, camera_id: int | None = None) -> None:
-        """Take on the values `y` (K,) or (3, K) at the knots; falling or flat pieces become the smallest step."""
-        steps = y.double().diff(dim=-1).clamp_min(0)
-        share = steps / steps.sum(-1, keepdim=True).clamp_min(1e-12)
-        floor = self.min_step / steps.shape[-1]
-        share = ((share - floor) / (1 - self.min_step)).clamp_min(floor * 1e-2)
-        with torch.no_grad():
-            self.logits[slice(None) if camera_id is None else camera_id] = share.log().to(self.logits)
-
-
-class ImageResponse(nn.Module):
-    """The paper's response: free points per image and channel, ends fixed, started at x^(1/2.2); nothing keeps it monotone."""
-
-    def __init__(self, num_images: int, knots: Tensor) -> None:
-        super().__init__()
-        self.register_buffer("knots", knots, persistent=False)
-        self.points = nn.Parameter((knots[1:-1] ** (1 / GAMMA)).expand(num_images, 3, -1).clone())
-
-    knots: Tensor
-
-    def values(self, image: int | slice | Tensor) -> Tensor:
-        """The curve at the knots: (3, K), or (images, 3, K)."""
-        inner = self.points[image]
-        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
-
-    def set_values(self, y: Tensor) -> None:
-        """Take on the values `y` (K,) or (3, K) for every image."""
-        with torch.no_grad():
-            self.points.copy_(y[..., 1:-1].expand_as(self.points))
 
 
 class BracketGain(nn.Module):
@@ -181,29 +135,37 @@ class ToneMapper(nn.Module):
         self.register_buffer("fixed_curve", (knots ** (1 / GAMMA)).expand(3, -1).contiguous(), persistent=False)
         self.register_buffer("anchored", torch.zeros((), dtype=torch.bool))
         residuals = len(frame_brackets) if config.kind == "shared" and config.residual else 0
+        free = torch.ones(len(frame_brackets), 1)
+        free[self.reference_frame] = 0
         match config.kind:
             case "shared":
-                self.response: SharedResponse | ImageResponse | None = SharedResponse(self.num_cameras, knots, config.min_step)
+                self.response: SharedResponse | ImageResponse | NetworkResponse | None = SharedResponse(
+                    self.num_cameras, knots, config.min_step
+                )
                 self.bracket_gain = BracketGain(bracket_ev, reference_bracket, self.num_cameras, residuals)
                 self.register_buffer("anchor_curve", torch.zeros(self.num_cameras, 3, NUM_POINTS))
                 self.register_buffer("anchor_ev", torch.zeros(len(bracket_ev)))
                 self.register_buffer("anchor_white_balance", torch.zeros(self.num_cameras - 1, 3))
-            case "fixed":
-                self.response = None
+            case "fixed" | "mlp":
+                self.response = NetworkResponse(knots, self.fixed_curve) if config.kind == "mlp" else None
                 self.bracket_gain = BracketGain(bracket_ev, reference_bracket, self.num_cameras, residuals)
             case "per_image":
                 self.response = ImageResponse(len(frame_brackets), knots)
                 self.image_gain = nn.Parameter(torch.zeros(len(frame_brackets), 3))  # natural log
-                free = torch.ones(len(frame_brackets), 1)
-                free[self.reference_frame] = 0
+                self.register_buffer("free", free, persistent=False)
+            case "sigmoid":
+                self.response = None
+                self.image_gain = nn.Parameter(torch.zeros(len(frame_brackets), 1))  # natural log
                 self.register_buffer("free", free, persistent=False)
             case "none":
                 self.response = None
+                self.register_buffer("told_ev", torch.tensor([ev or 0.0 for ev in bracket_ev], dtype=torch.float32))
 
     knots: Tensor
     bins: Tensor
     fixed_curve: Tensor
     free: Tensor
+    told_ev: Tensor
     anchored: Tensor
     anchor_curve: Tensor
     anchor_ev: Tensor
@@ -228,7 +190,30 @@ class ToneMapper(nn.Module):
         if self.config.kind == "none":
             return radiance if leaky else radiance.clamp(0, 1)
         gain = self.log_gain(bracket, camera_id, frame).exp()
-        return self.respond(radiance, gain, self.curve_values(bracket, camera_id, frame), leaky)
+        return (
+            self.record(radiance * gain)
+            if self.has_formula
+            else self.respond(radiance, gain, self.curve_values(bracket, camera_id, frame), leaky)
+        )
+
+    def look(self, bracket: int, camera_id: int, frame: int | None = None, leaky: bool = False) -> Look:
+        """One recording, for fields that record before they composite."""
+        images = self.images_of(bracket).tolist() if frame is None else [frame]
+        return Look(lambda radiance: self(radiance, bracket, camera_id, frame, leaky), tuple(images))
+
+    def look_at(self, ev: float, camera_id: int = 0) -> Look:
+        """A picture developed at `ev`, the same; it looks like the training images of the nearest exposure."""
+        nearest = int((self.exposures() - ev).abs().argmin())
+        return Look(lambda radiance: self.develop(radiance, ev, camera_id), tuple(self.images_of(nearest).tolist()))
+
+    @property
+    def has_formula(self) -> bool:
+        """Whether the response is a formula of the exposure, never clipped, instead of a curve of points on [0, 1]."""
+        return self.config.kind in ("sigmoid", "mlp")
+
+    def record(self, exposure: Tensor) -> Tensor:
+        """What such a response records of exposures (N, 3) = gain * radiance: sigmoid(log x) = x / (1 + x), or the network."""
+        return self.response(exposure) if isinstance(self.response, NetworkResponse) else exposure / (1 + exposure)
 
     def develop(self, radiance: Tensor, ev: float, camera_id: int = 0) -> Tensor:
         """The picture (..., 3) in [0, 1] that camera `camera_id` would record of `radiance` (..., 3) at `ev` relative to the reference bracket.
@@ -240,6 +225,12 @@ class ToneMapper(nn.Module):
             match self.config.kind:
                 case "none":
                     return radiance.clamp(0, 1).reshape(shape)
+                case "sigmoid":
+                    return self.record(radiance * 2.0**ev).reshape(shape)
+                case "mlp":
+                    return self.record(radiance * (self.bracket_gain.log_white_balance(camera_id) + ev * LN2).exp()).reshape(
+                        shape
+                    )
                 case "per_image":
                     values = self.curve_values(0, camera_id, self.reference_frame)
                     return self.respond(radiance, values.new_full((3,), 2.0**ev), values, leaky=False).reshape(shape)
@@ -260,6 +251,9 @@ class ToneMapper(nn.Module):
         with torch.no_grad():
             if self.config.kind == "none":
                 return rgb.clone()
+            if self.config.kind == "sigmoid":
+                y = rgb.clamp(0, 1 - 1 / 512)  # white could be anything
+                return y / (1 - y) * (-self.log_gain(bracket, camera_id, frame)).exp()
             values = self.curve_values(bracket, camera_id, frame).cummax(-1).values.contiguous()
             y = rgb.clamp(0, 1).T.contiguous()  # (3, N)
             right = torch.searchsorted(values, y).clamp(1, NUM_POINTS - 1)
@@ -277,9 +271,9 @@ class ToneMapper(nn.Module):
         return grey.log().mean().exp() / grey
 
     def log_gain(self, bracket: int, camera_id: int, frame: int | None) -> Tensor:
-        """Natural log gain (3,), eq. 10. per_image without a frame borrows the mean of the bracket's training images."""
-        if self.config.kind == "per_image":
-            gains = self.image_gain * self.free
+        """Natural log gain (3,), eq. 10. per_image and sigmoid without a frame borrow the mean of the bracket's training images."""
+        if self.config.kind in ("per_image", "sigmoid"):
+            gains = (self.image_gain * self.free).expand(-1, 3)
             return gains[self.images_of(bracket)].mean(0) if frame is None else gains[frame]
         return self.bracket_gain(bracket, camera_id, frame)
 
@@ -290,8 +284,10 @@ class ToneMapper(nn.Module):
                 return self.response.values(camera_id)
             case ImageResponse():
                 return self.response.values(self.images_of(bracket)).mean(0) if frame is None else self.response.values(frame)
+            case NetworkResponse():
+                return self.response.values()
             case _:
-                return self.fixed_curve
+                return self.knots / (1 + self.knots).expand(3, -1) if self.config.kind == "sigmoid" else self.fixed_curve
 
     def images_of(self, bracket: int) -> Tensor:
         """Positions of the training images of a bracket; all of them where the bracket was never trained."""
@@ -307,9 +303,12 @@ class ToneMapper(nn.Module):
             return torch.stack([self.log_gain(b, c, i) / LN2 for i, (b, c) in enumerate(frames)])
 
     def exposures(self) -> Tensor:
-        """EV of every bracket (B,) relative to the reference; per_image: mean over the bracket's images and channels."""
+        """EV of every bracket (B,) relative to the reference; per_image, sigmoid: mean over the bracket's images and channels; none: what the
+        scene or its brightness says, which nothing here uses."""
         with torch.no_grad():
-            if self.config.kind in ("shared", "fixed"):
+            if self.config.kind == "none":
+                return self.told_ev.clone()
+            if self.config.kind in ("shared", "fixed", "mlp"):
                 return self.bracket_gain.ev().clone()
             num_brackets = max(self.frame_brackets, default=0) + 1
             gains = self.gains().mean(-1)
@@ -332,17 +331,20 @@ class ToneMapper(nn.Module):
         match self.response:
             case SharedResponse():
                 self.response.set_values(values, camera_id)
-            case ImageResponse():
+            case ImageResponse() | NetworkResponse():
                 self.response.set_values(values)
             case _:
                 raise AssertionError(f"a {self.config.kind} tone mapper has no curve to set")
 
     def set_exposures(self, ev: Sequence[float]) -> None:
-        """Start the unknown exposures from `ev` (B,), relative to the reference bracket; known ones stay. per_image: the images' gains."""
+        """Start the unknown exposures from `ev` (B,), relative to the reference bracket; known ones stay. per_image, sigmoid: the images' gains."""
+        told = [e if known is None else known for e, known in zip(ev, self.given_ev, strict=True)]
         with torch.no_grad():
-            if self.config.kind == "per_image":
-                self.image_gain.copy_(torch.tensor([[ev[b] * LN2] * 3 for b in self.frame_brackets]))
-            elif self.config.kind != "none":
+            if self.config.kind in ("per_image", "sigmoid"):
+                self.image_gain.copy_(torch.tensor([[told[b] * LN2] for b in self.frame_brackets]).expand_as(self.image_gain))
+            elif self.config.kind == "none":
+                self.told_ev.copy_(torch.tensor(told))
+            else:
                 self.bracket_gain.learned_ev.copy_(torch.tensor([ev[int(i)] for i in self.bracket_gain.unknown]))
 
     def smoothness(self) -> Tensor:
@@ -350,8 +352,11 @@ class ToneMapper(nn.Module):
 
         On even knots this is the paper's term. On gamma knots it is curvature over x^(1/2.2): zero for gamma 2.2, and the
         darks are held as firmly as the lights (evenly in x, the first of 255 cells would hide 20 knots from it)."""
-        if self.response is None:
-            return self.knots.new_zeros(())
+        match self.response:
+            case None:
+                return self.knots.new_zeros(())
+            case NetworkResponse():
+                return self.response.values().diff(n=2, dim=-1).square().sum(-1).mean()
         return self.response.values(slice(None)).diff(n=2, dim=-1).square().sum(-1).mean()
 
     def regularizers(self) -> dict[str, Tensor]:
@@ -360,6 +365,8 @@ class ToneMapper(nn.Module):
         `gain_residual` is the mean square of the frames' residuals and of the log white balances: of a camera that only ever
         saw one bracket, the recordings do not tell exposure from white balance."""
         terms = {} if self.response is None else {"response_smoothness": self.smoothness()}
+        if isinstance(self.response, NetworkResponse):
+            terms["unit_exposure"] = self.response.unit_point()
         if self.config.kind == "shared":
             gain = self.bracket_gain
             small = [t.square().mean() for t in (gain.residual, gain.white_balance) if t is not None and t.numel()]

@@ -20,10 +20,10 @@ from hdr_nsff.batch import PixelBatch, draw_pixels, whole_frame
 from hdr_nsff.config import TrainConfig, check
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field, start_field
-from hdr_nsff.fields.base import Look
+from hdr_nsff.fields.base import Misfit, Render, recorded
 from hdr_nsff.fields.encodings import TouchedAdam
 from hdr_nsff.io import write_png, writing_to
-from hdr_nsff.objective import Objective
+from hdr_nsff.objective import LossWeights, Objective
 from hdr_nsff.priors.response import initialise
 from hdr_nsff.progress import bar, say
 from hdr_nsff.run import keep_snapshot, latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
@@ -94,6 +94,11 @@ def open_folder(config: TrainConfig) -> None:
     write_config(config.out, config)
 
 
+def heeded(scene: Scene, weights: LossWeights) -> Scene:
+    """What of the scene the start may look at: not the flow of an objective that gives it no weight."""
+    return scene if weights.flow else replace(scene, train=[replace(f, flow={}, flow_valid={}) for f in scene.train])
+
+
 class Trainer:
     """Field, tone mapper, optimisers and clock of one run."""
 
@@ -137,7 +142,13 @@ class Trainer:
             self.report(f"going on at step {found.step}, {found.seconds:.0f} s into the training")
             return
         self.report(f"response curve: {initialise(self.tonemapper, self.scene)}")
-        told = start_field(self.field, self.scene, self.recorded_radiance, self.typical_log_radiance(), self.config.paint)
+        told = start_field(
+            self.field,
+            heeded(self.scene, self.config.loss),
+            self.recorded_radiance,
+            self.typical_log_radiance(),
+            self.config.paint,
+        )
         if told:
             self.report(told)
 
@@ -220,7 +231,7 @@ class Trainer:
             for name, value in terms.items():
                 totals[name] = totals.get(name, 0.0) + float(value.detach()) / len(slots)
             if (clock.step + 1) % LOG_EVERY == 0:
-                totals["mse"] = totals.get("mse", 0.0) + self.squared_error(render.radiance.detach(), batch) / len(slots)
+                totals["mse"] = totals.get("mse", 0.0) + self.squared_error(render, batch) / len(slots)
         self.ranks.sum_gradients(p for o in self.optimisers.values() for g in o.param_groups for p in g["params"])
         self.ranks.max_buffers(self.marks)
         for name, optimiser in self.optimisers.items():
@@ -230,28 +241,30 @@ class Trainer:
             if name == "dense":  # the touched one clears what it used
                 optimiser.zero_grad()
         self.ranks.max_buffers(self.field.shared_maxima())
-        self.field.after_step(clock.step + 1, self.looks if clock.progress < SETTLED else None)
+        self.field.after_step(clock.step + 1, self.misfits if clock.progress < SETTLED else None)
         if "mse" in totals:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
 
     @torch.no_grad()
-    def looks(self, count: int) -> list[Look]:
+    def misfits(self, count: int) -> list[Misfit]:
         """How wrong the field is in `count` training frames, evenly spread; others every step."""
         num = len(self.scene.train)
         chosen = sorted({int((i + self.clock.step % 97 / 97) * num / count) % num for i in range(min(count, num))})
         found = []
         for i in chosen:
             f = self.scene.train[i]
-            seen = self.field.render(f.camera, f.time, scene_flow=False)
-            rgb = self.tonemapper(seen.radiance, f.bracket, f.camera_id, i, leaky=False).view_as(f.image)
-            found.append(Look(f.camera, f.time, (rgb - f.image).abs().mean(-1)))
+            rgb = recorded(self.field, f.camera, f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
+            found.append(Misfit(f.camera, f.time, (rgb - f.image).abs().mean(-1)))
         return found
 
     @torch.no_grad()
-    def squared_error(self, radiance: Tensor, batch: PixelBatch) -> float:
+    def squared_error(self, render: Render, batch: PixelBatch) -> float:
         """Mean square difference of the recorded and the rendered rgb at the uniformly drawn pixels."""
-        rgb = self.tonemapper(radiance, batch.bracket, batch.camera_id, batch.frame, leaky=False)
+        if render.rgb is not None:
+            rgb = render.rgb.clamp(0, 1)
+        else:
+            rgb = self.tonemapper(render.radiance, batch.bracket, batch.camera_id, batch.frame, leaky=False)
         return float((rgb - batch.rgb)[batch.uniform].square().mean())
 
     def draw(self, slot: int) -> PixelBatch:
@@ -263,7 +276,8 @@ class Trainer:
         moving = config.moving_rays if when < config.moving_until else 0
         batch = draw_pixels(self.scene, frame, config.rays, moving, generator) if config.rays else whole_frame(self.scene, frame)
         chain = (1 if clock.step % 2 else -1) if clock.phase >= 2 and config.loss.chain else 0
-        return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), chain=chain)
+        look = self.tonemapper.look(batch.bracket, batch.camera_id, frame, leaky=True)
+        return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), look=look, chain=chain)
 
     def check(self, terms: dict[str, Tensor], batch: PixelBatch, radiance: Tensor) -> None:
         """NaN and Inf are errors with the step, the term and the ray."""
@@ -310,7 +324,6 @@ class Trainer:
         """The middle frame as recorded and as rendered, side by side."""
         i = len(self.scene.train) // 2
         f = self.scene.train[i]
-        render = self.field.render(f.camera, f.time, scene_flow=False)
-        rgb = self.tonemapper(render.radiance, f.bracket, f.camera_id, i, leaky=False).view_as(f.image)
+        rgb = recorded(self.field, f.camera, f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
         pair = torch.cat([f.image, rgb], 1).cpu().numpy()
         write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import assert_never
 
+from hdr_nsff.fields.hexplane import HexPlane, HexPlaneConfig
+from hdr_nsff.fields.nerf_wt import NerfWT, NerfWTConfig
 from hdr_nsff.fields.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.painting import paint
 from hdr_nsff.fields.seeding import seed
@@ -12,32 +14,43 @@ from hdr_nsff.fields.splat import Splat, SplatConfig
 from hdr_nsff.fields.surface import ToRadiance
 from hdr_nsff.scene import Scene
 
-FieldConfig = NSFFConfig | SplatConfig
+FieldConfig = NSFFConfig | NerfWTConfig | HexPlaneConfig | SplatConfig
+AnyField = NSFF | NerfWT | HexPlane | Splat
 
 
-def build_field(config: FieldConfig, scene: Scene) -> NSFF | Splat:
+def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     """An untrained field for a scene."""
+    m, near, far = scene.manifest, scene.near, scene.far
+    if isinstance(config, SplatConfig):
+        return Splat(config, scene.times, near, far, m.width * m.height)
+    space = build_space([f.camera for f in scene.train], near, far)
     match config:
         case NSFFConfig():
-            m = scene.manifest
-            space = build_space([f.camera for f in scene.train], scene.near, scene.far)
-            field = NSFF(config, space, scene.times, scene.near, scene.far, m.width, m.height)
-            field.allow_motion(scene.train)
-            return field
-        case SplatConfig():
-            return Splat(config, scene.times, scene.near, scene.far, scene.manifest.width * scene.manifest.height)
+            field: NSFF | NerfWT = NSFF(config, space, scene.times, near, far, m.width, m.height)
+        case NerfWTConfig():
+            reference = tuple(i for i, f in enumerate(scene.train) if f.bracket == m.reference_bracket)
+            everyone = tuple(range(len(scene.train)))
+            size = (m.width, m.height)
+            field = NerfWT(config, space, scene.times, near, far, size, len(everyone), reference or everyone)
+        case HexPlaneConfig():
+            return HexPlane(config, space, scene.times, near, far)
         case _:
             assert_never(config)
+    field.allow_motion(scene.train)
+    return field
 
 
-def start_field(field: NSFF | Splat, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool) -> str | None:
+def start_field(field: AnyField, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool) -> str | None:
     """Give an untrained field what the scene tells before training: `typical` log radiance and, if `from_priors`, the surfaces of
     the depth prior in the colours that `to_radiance(rgb (P, 3), i)` recovers from training frame i. A sentence about it, if any."""
     match field:
-        case NSFF():
+        case NSFF() | NerfWT():
             field.bias.fill_(typical)
             painted = from_priors and paint(field, scene.train, to_radiance)
             return "field: painted from the depth prior" if painted else None
+        case HexPlane():
+            field.bias.fill_(typical)
+            return None
         case Splat():
             return "field: " + seed(field, scene, to_radiance, typical, from_priors)
         case _:

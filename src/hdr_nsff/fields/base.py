@@ -2,7 +2,8 @@
 
 Fields know nothing of exposure, white balance or response curves: tone mapping happens outside. `S` is the number of
 pixels asked for. Camera, time and pixels are the currency, not rays: an NSFF casts rays through the pixels, a splat
-field rasterises the frame and reads them off."""
+field rasterises the frame and reads them off. Two published baselines cannot be told without what was recorded (`RecordingField`):
+they are handed a `Look` from outside."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from hdr_nsff.batch import PixelBatch
+from hdr_nsff.batch import Look, PixelBatch
 from hdr_nsff.camera import Camera
 
 
@@ -38,6 +39,9 @@ class Render:
     warps: tuple[Warp, ...] = ()  # while training
     dynamic_radiance: Tensor | None = None  # (S, 3) the dynamic branch alone, while training
     dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch alone, while training
+    rgb: Tensor | None = (
+        None  # (S, 3) recorded, of a field that composites recordings; None: tone mapping makes it from `radiance`
+    )
 
 
 @dataclass(frozen=True)
@@ -53,7 +57,7 @@ class Layers:
 
 
 @dataclass(frozen=True)
-class Look:
+class Misfit:
     """How wrong a field is in one training frame."""
 
     camera: Camera
@@ -90,7 +94,24 @@ class RadianceField(Protocol):
         """Parameter groups with their learning rates, for the optimiser."""
         ...
 
-    def after_step(self, step: int, looks: Callable[[int], list[Look]] | None) -> None:
-        """Housekeeping between optimiser steps (culling grids, schedules). `looks(n)` renders n training frames and says how wrong they
+    def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
+        """Housekeeping between optimiser steps (culling grids, schedules). `misfits(n)` renders n training frames and says how wrong they
         are; None late in a run, when nothing is to be rearranged any more."""
         ...
+
+
+@runtime_checkable
+class RecordingField(RadianceField, Protocol):
+    """A field whose recordings do not follow from its composited radiance, because the camera acts on samples (HDR-HexPlane) or inside
+    the network (NeRF-W)."""
+
+    def record(self, camera: Camera, time: float, look: Look) -> Tensor:
+        """What is recorded (S, 3) in [0, 1] of every pixel, row by row, without gradients; chunks itself."""
+        ...
+
+
+def recorded(field: RadianceField, camera: Camera, time: float, look: Look, radiance: Tensor | None = None) -> Tensor:
+    """What is recorded (S, 3) in [0, 1] of every pixel, row by row; `radiance` (S, 3) is what the field rendered, if it was."""
+    if isinstance(field, RecordingField):
+        return field.record(camera, time, look)
+    return look.rgb(field.render(camera, time, scene_flow=False).radiance if radiance is None else radiance)

@@ -99,9 +99,10 @@ class GridBranches(nn.Module):
 
 
 class Trunk(nn.Module):
-    """`layers` x `width` ReLU layers with one skip, a density head and a view-dependent radiance head."""
+    """`layers` x `width` ReLU layers with one skip, a density head and a view-dependent radiance head, which may know a code of
+    `code_size` numbers besides: they come behind the directions."""
 
-    def __init__(self, config: MlpConfig, dims: int, extra: int) -> None:
+    def __init__(self, config: MlpConfig, dims: int, extra: int, code_size: int = 0) -> None:
         super().__init__()
         self.config = config
         inputs = dims * (1 + 2 * config.octaves)
@@ -109,7 +110,7 @@ class Trunk(nn.Module):
         self.hidden = nn.ModuleList(nn.Linear(n, config.width) for n in sizes)
         self.extra = nn.Linear(config.width, 1 + extra)  # density, then whatever else depends on position alone
         self.feature = nn.Linear(config.width, config.width)
-        self.view = nn.Linear(config.width + 3 * (1 + 2 * config.direction_octaves), config.width // 2)
+        self.view = nn.Linear(config.width + 3 * (1 + 2 * config.direction_octaves) + code_size, config.width // 2)
         self.radiance = nn.Linear(config.width // 2, 3)
 
     def forward(self, position: Tensor, directions: Tensor) -> Tensor:
@@ -119,7 +120,8 @@ class Trunk(nn.Module):
         for i, layer in enumerate(self.hidden):
             h = torch.cat([encoded, h], -1) if i == self.config.skip_after else h
             h = layer(h).relu()
-        viewed = torch.cat([self.feature(h), frequencies(directions, self.config.direction_octaves)], -1)
+        views = frequencies(directions[:, :3], self.config.direction_octaves)
+        viewed = torch.cat([self.feature(h), views, directions[:, 3:]], -1)
         return torch.cat([self.radiance(self.view(viewed).relu()), self.extra(h)], -1)
 
 

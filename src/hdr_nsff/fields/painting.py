@@ -13,8 +13,8 @@ from torch import Tensor
 
 from hdr_nsff.fields.branches import GridBranches
 from hdr_nsff.fields.encodings import AdditiveGrid
-from hdr_nsff.fields.nsff import NSFF
 from hdr_nsff.fields.surface import ToRadiance, exposure_trust
+from hdr_nsff.fields.two_branches import TwoBranches
 from hdr_nsff.progress import track
 from hdr_nsff.scene import Frame
 
@@ -28,7 +28,7 @@ class Splash:
     """What one frame paints."""
 
     coords: Tensor  # (P, 3) surface points, cube
-    log_radiance: Tensor  # (P, 3)
+    raw_radiance: Tensor  # (P, 3) as the grids store it
     trust: Tensor  # (P,)
     moving: Tensor  # (P,) bool
     crossed: Tensor  # (P, CROSSINGS, 3) cube points in front of the surface
@@ -36,7 +36,7 @@ class Splash:
     knot: float
 
 
-def paint(field: NSFF, frames: list[Frame], to_radiance: ToRadiance) -> bool:
+def paint(field: TwoBranches, frames: list[Frame], to_radiance: ToRadiance) -> bool:
     """Paint `field` from the frames' depth priors; False where it has no grids or the frames no depth in scene units.
 
     `to_radiance(rgb (P, 3), i)` inverts the recording of frame `i`."""
@@ -61,7 +61,7 @@ def static_density_level(grid: AdditiveGrid) -> int:
     return dense[-1] if dense else 0
 
 
-def splash(field: NSFF, f: Frame, position: int, to_radiance: ToRadiance) -> Splash:
+def splash(field: TwoBranches, f: Frame, position: int, to_radiance: ToRadiance) -> Splash:
     """Points, colours and crossed space of the frame at `position` of the training frames."""
     assert f.disparity is not None
     rays = f.camera.rays(f.camera.pixel_grid())
@@ -74,7 +74,7 @@ def splash(field: NSFF, f: Frame, position: int, to_radiance: ToRadiance) -> Spl
     confidence = torch.ones_like(disparity) if f.disparity_confidence is None else f.disparity_confidence.reshape(-1)
     return Splash(
         coords=coords,
-        log_radiance=to_radiance(rgb, position).clamp_min(1e-5).log() - field.bias,
+        raw_radiance=field.from_radiance(to_radiance(rgb, position)),
         trust=(confidence + 0.02) * exposure_trust(rgb),
         moving=torch.zeros_like(disparity, dtype=torch.bool) if f.moving is None else f.moving.reshape(-1),
         crossed=crossed,
@@ -92,7 +92,7 @@ def paint_radiance(grid: AdditiveGrid, splashes: list[Splash], moving: bool) -> 
             chosen = s.moving == moving
             coords, trust = s.coords[chosen], s.trust[chosen, None]
             with torch.no_grad():
-                left = s.log_radiance[chosen] - grid(coords, s.knot)[:, :3]
+                left = s.raw_radiance[chosen] - grid(coords, s.knot)[:, :3]
             total += grid.spread_to(level, coords, torch.cat([left * trust, trust], -1), s.knot)
         weight = total[:, 3:]
         grid.rows_of(level)[:, :3] += total[:, :3] / (weight + 0.05 * weight[weight > 0].mean().nan_to_num(1.0) + 1e-9)

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import GaussianCloud, Look, Render, Warp
+from hdr_nsff.fields.base import GaussianCloud, Misfit, Render, Warp
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.rasterize import Maps, rasterize
 from hdr_nsff.fields.renewal import renew
@@ -25,7 +25,7 @@ from hdr_nsff.tensors import tree_map
 BRIGHTEST = 16.0  # log radiance beyond this is held: exp stays finite
 BESIDE = 4  # neighbours of a moving Gaussian
 GLOSSIEST = 2.0  # log radiance may change by this much with the direction
-RENEW_LOOKS = 24  # training frames that say what is wrong and what is seen
+RENEW_FRAMES = 24  # training frames that say what is wrong and what is seen
 FAINTEST = 0.003  # opacity below which a Gaussian draws nothing
 
 
@@ -260,10 +260,10 @@ class Splat(nn.Module):
         """What belongs to each Gaussian (in the last dimension) besides its own parameters."""
         return [self.presence, self.mixture_logits] if gaussians is self.moving else []
 
-    def after_step(self, step: int, looks: Callable[[int], list[Look]] | None) -> None:
+    def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
         """Now and then, Gaussians that nobody sees go where the picture is wrong."""
-        if looks is not None and self.config.renew_every and step % self.config.renew_every == 0:
-            renew(self, looks(RENEW_LOOKS), torch.Generator().manual_seed(step))
+        if misfits is not None and self.config.renew_every and step % self.config.renew_every == 0:
+            renew(self, misfits(RENEW_FRAMES), torch.Generator().manual_seed(step))
             self.look_around()
 
     def shared_maxima(self) -> list[Tensor]:

@@ -251,14 +251,12 @@ def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int 
 
     From static points where there are enough of them; otherwise gamma 2.2, and exposures from the frames' brightness."""
     kind, ev, reference = tonemapper.config.kind, tonemapper.given_ev, scene.manifest.reference_bracket
-    if kind == "none":
-        return "none: radiance is taken for rgb"
-    if kind == "per_image":
+    if kind == "per_image" and not tonemapper.config.from_recordings:
         return "gamma 2.2 and gains of 1, as published"
     if len({f.bracket for f in scene.train}) == 1:
         return "gamma 2.2: a single exposure tells nothing of the response"
     problem = "as configured"
-    if kind == "shared":
+    if kind in ("shared", "per_image", "mlp"):
         views = [view_of(f) for f in scene.train if f.disparity is not None and scene.manifest.depth_kind == "scene"]
         samples = static_samples(views, len(ev), num, np.random.default_rng(seed))
         brackets = {f.bracket for f in scene.train}
@@ -266,7 +264,7 @@ def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int 
         if fit is not None and fit.misfit < MAX_MISFIT:
             tonemapper.set_curve(torch.from_numpy(fit.x), torch.from_numpy(fit.y))
             tonemapper.set_exposures(fit.ev.tolist())
-            own = camera_curves(tonemapper, scene, fit, num, seed)
+            own = camera_curves(tonemapper, scene, fit, num, seed) if kind == "shared" else ""
             how = "sure but for a common factor near 1: give `--ev` if you know them" if fit.guessed else "estimated with it"
             return f"from {len(samples.rgb)} static points (misfit {fit.misfit:.3f} stops){own}; {exposure_note(tonemapper, how)}"
         problem = (
@@ -276,7 +274,8 @@ def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int 
         )
     images = [f.image.cpu().numpy() for f in scene.train]
     tonemapper.set_exposures(brightness_ev(images, [f.bracket for f in scene.train], reference, len(ev)))
-    return f"gamma 2.2 ({problem}); {exposure_note(tonemapper, 'from the brightness of the frames')}"
+    curve = {"none": "none", "sigmoid": "x / (1 + x)"}.get(kind, "gamma 2.2")
+    return f"{curve} ({problem}); {exposure_note(tonemapper, 'from the brightness of the frames')}"
 
 
 def camera_curves(tonemapper: ToneMapper, scene: Scene, fit: ResponseFit, num: int, seed: int) -> str:

@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 
 from hdr_nsff import io
+from hdr_nsff.batch import Look
+from hdr_nsff.fields import base
 from hdr_nsff.interpolate import render_at
 from hdr_nsff.paths import View
 from hdr_nsff.progress import track
@@ -91,12 +93,18 @@ def geometry_of(path: Path, view: View) -> Geometry:
 
 
 def recorded(run: Run, target: Target, radiance: Tensor, bracket: int) -> Tensor:
-    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3) at a bracket of the scene."""
-    with torch.no_grad():
-        flat = radiance.reshape(-1, 3).to(run.tonemapper.knots.device)
-        return run.tonemapper(flat, bracket, target.camera_id, None, leaky=False).cpu().reshape(radiance.shape)
+    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run rendered of the target, at a bracket of the scene."""
+    return seen_by(run, target, radiance, run.tonemapper.look(bracket, target.camera_id))
 
 
 def developed(run: Run, target: Target, radiance: Tensor, ev: float) -> Tensor:
     """The same at any exposure, `ev` relative to the reference bracket."""
-    return run.tonemapper.develop(radiance.to(run.tonemapper.knots.device), ev, target.camera_id).cpu()
+    return seen_by(run, target, radiance, run.tonemapper.look_at(ev, target.camera_id))
+
+
+def seen_by(run: Run, target: Target, radiance: Tensor, look: Look) -> Tensor:
+    """The same as a given recording looks."""
+    device = device_of(run)
+    with torch.no_grad():
+        camera, flat = to_device(target.view.camera, device), radiance.reshape(-1, 3).to(device)
+        return base.recorded(run.field, camera, target.view.time, look, flat).cpu().reshape(radiance.shape)

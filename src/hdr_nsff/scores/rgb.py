@@ -17,7 +17,8 @@ def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lp
     """Recorded rgb at the view's own exposure, and PSNR averaged over all exposures of the clip at which the view is known, and over those that
     no frame of the clip has; moving-only numbers where there is a mask with something in it."""
     moving = moving_of(target)
-    own, truth = recorded(run, target, radiance, target.bracket), target.rgb[target.bracket]
+    at = {b: recorded(run, target, radiance, b) for b in target.rgb}
+    own, truth = at[target.bracket], target.rgb[target.bracket]
     scores: dict[str, float] = {"psnr": metrics.psnr(own, truth), "ssim": metrics.ssim(own, truth)}
     if moving is not None:
         scores |= {"psnr_moving": metrics.psnr(own, truth, moving), "ssim_moving": metrics.ssim(own, truth, moving)}
@@ -25,7 +26,7 @@ def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lp
         scores["lpips"] = perceptual(own, truth)
         if moving is not None:
             scores["lpips_moving"] = perceptual.on_mask(own, truth, moving)
-    every = [(recorded(run, target, radiance, b), rgb) for b, rgb in target.rgb.items()]
+    every = [(at[b], rgb) for b, rgb in target.rgb.items()]
     novel = [(developed(run, target, radiance, ev), rgb) for ev, rgb in target.novel.items()]
     for name, pairs in (("all_exposures", every), ("novel_exposures", novel)):
         if pairs:
