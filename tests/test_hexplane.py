@@ -65,7 +65,7 @@ def test_the_grid_grows_three_times_to_its_finest(toy: Scene) -> None:
     assert isinstance(field, HexPlane)
     sizes = []
     for step in range(1, 5 * HEXPLANE.grow_every):
-        field.after_step(step)
+        field.after_step(step, None)
         sizes.append(int(field.density_planes.cells))
     assert sorted(set(sizes)) == [8, 10, 13, 16] and len(set(sizes)) == GROWTHS + 1  # 8 * 2^(k/3)
 
