@@ -69,7 +69,7 @@ class DiscBeforeWall:
     def param_groups(self) -> list[dict[str, Any]]:
         return []
 
-    def after_step(self, step: int) -> None:
+    def after_step(self, step: int, misfits: object = None) -> None:
         del step
 
 

@@ -4,6 +4,7 @@ import sys
 from pathlib import Path
 from types import ModuleType
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -11,7 +12,7 @@ from safetensors.torch import save_file
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors import flow_networks
-from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow, read_weights, resized_flow, working_size
+from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow, mended, read_weights, resized_flow, working_size
 from hdr_nsff.priors.gmflow import GMFlow
 from hdr_nsff.priors.raft import Raft
 
@@ -54,11 +55,21 @@ def test_a_constant_flow_survives_any_size():
 
 
 def test_a_network_is_a_flow_prior_that_checks_itself():
-    video, clipped = np.random.default_rng(0).random((3, 60, 90, 3)).astype(np.float32), np.zeros((3, 60, 90), bool)
+    video, clipped = np.full((3, 60, 90, 3), 0.5, np.float32), np.zeros((3, 60, 90), bool)  # flat: nothing to mend
     clipped[2, 30, 40] = True
     found, valid = matched_flow(Constant(), video, clipped, np.array([[0, 2], [2, 0]]))
     assert np.allclose(found[0], -found[1]) and np.abs(found[0] - [1.40625, -0.625]).max() < 1e-4
     assert not valid[1, 30, 40] and valid[1, 30, 45] and not valid[0, :, -1].any()  # clipped; believed; leaves the frame
+
+
+def test_the_search_mends_what_is_nearly_right_and_leaves_the_rest():
+    """Noise that slides by (3, 0): from (3.4, 0) it is found; from (9, 6), whatever the search says is no more than half a pixel away."""
+    noise = cv2.GaussianBlur(np.random.default_rng(0).random((64, 110)).astype(np.float32), (0, 0), 2)
+    grey = np.rint(255 * (noise - noise.min()) / np.ptp(noise)).astype(np.uint8)
+    a, b = grey[:, 5:-9].copy(), grey[:, 2:-12].copy()
+    near, far = (np.broadcast_to(np.float32(f), (*a.shape, 2)).copy() for f in ((3.4, 0), (9, 6)))
+    assert np.median(np.abs(mended(a, b, near) - [3, 0])) < 0.1
+    assert np.linalg.norm(mended(a, b, far) - far, axis=-1).max() <= 0.5
 
 
 def test_weights_say_which_network_they_are_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

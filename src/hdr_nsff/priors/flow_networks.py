@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.priors.flow import checked, common_rgb, recorded_range
+from hdr_nsff.priors.flow import checked, common_grey, common_rgb, dense_inverse_search, recorded_range
 from hdr_nsff.priors.gmflow import GMFlow
 from hdr_nsff.priors.raft import Raft
 from hdr_nsff.priors.weights import find
@@ -25,6 +25,7 @@ Network = Literal["gmflow", "raft"]
 FINETUNED = "weights.safetensors"  # what `finetune-flow` leaves in its folder
 SIDE = 640  # pixels of the longer side at which frames are matched, ...
 ENLARGED = 3  # ... unless that would enlarge them more than this many times
+MEND = 0.5  # pixels by which dense inverse search may correct a network
 MULTIPLE, LEAST = 32, 128  # sides are multiples of the one and no less than the other
 
 
@@ -34,9 +35,24 @@ FlowNetwork = GMFlow | Raft  # and whatever else answers `predictions`
 def matched_flow(
     network: FlowNetwork, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray, report: str | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (P, H, W, 2) px and valid (P, H, W) by a loaded network; `video`, `clipped` and `pairs` as in `FlowPrior`."""
+    """Flow (P, H, W, 2) px and valid (P, H, W) by a loaded network, then `mended`; `video`, `clipped` and `pairs` as in `FlowPrior`."""
     ranges = {int(k): recorded_range(video[k], clipped[k]) for k in np.unique(np.asarray(pairs, np.int64))}
-    return checked(lambda i, j: both_ways(network, *common_rgb(video, ranges, i, j)), clipped, pairs, report, threads=1)
+
+    def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+        there, back = both_ways(network, *common_rgb(video, ranges, i, j))
+        a, b = common_grey(video, ranges, i, j)
+        return mended(a, b, there), mended(b, a, back)
+
+    return checked(match, clipped, pairs, report, threads=1)
+
+
+def mended(a: np.ndarray, b: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """Flow (H, W, 2) px between grey uint8 (H, W) images, searched on from a network's `flow`, which stays where the search leaves it.
+
+    Networks find large motion, the search is exact to a tenth of a pixel on what they found; where it goes farther than `MEND`, it is lost."""
+    found = dense_inverse_search(a, b, flow)
+    lost = np.linalg.norm(found - flow, axis=-1) > MEND
+    return np.where(lost[..., None], flow, found)
 
 
 @torch.no_grad()
