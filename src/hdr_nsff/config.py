@@ -229,8 +229,10 @@ def hexplane_paper() -> TrainConfig:
 
 
 def hexplane() -> TrainConfig:
-    """The same for minutes on a CPU: smaller grids and batches."""
-    field = HexPlaneConfig(coarsest=48, finest=128, grow_every=200, emptiness=5.0, samples=32, render_samples=48, cull_after=50)
+    """The same for minutes on a CPU: smaller grids and batches, and rates for a twentieth of the steps."""
+    field = HexPlaneConfig(
+        coarsest=48, finest=128, grow_every=200, emptiness=5.0, samples=32, render_samples=48, cull_after=50, plane_lr=0.05, network_lr=5e-3
+    )  # fmt: skip
     return replace(hexplane_paper(), field=field, steps=None, minutes=5.0, rays=512, torch_threads=1, checkpoint_seconds=120)
 
 
