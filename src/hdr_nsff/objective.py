@@ -52,6 +52,8 @@ class LossWeights:
     """Square of moving Gaussians' changes of opacity logit from one knot to the next."""
     colour_change: float = 0.01
     """Square of moving Gaussians' changes of log radiance from one colour knot to the next."""
+    pose: float = 1e-4
+    """Square of the drawn camera's corrections: degrees, percents of depth and of focal length (`refine_poses`)."""
     response_smoothness: float = 1e-3
     gain_residual: float = 1.0
     response_anchor: float = 100.0

@@ -22,6 +22,7 @@ from hdr_nsff.fields import build_field, start_field
 from hdr_nsff.fields.encodings import TouchedAdam
 from hdr_nsff.io import write_png, writing_to
 from hdr_nsff.objective import Objective
+from hdr_nsff.pose_corrections import PoseCorrections
 from hdr_nsff.priors.response import initialise
 from hdr_nsff.progress import bar, say
 from hdr_nsff.run import latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
@@ -104,6 +105,8 @@ class Trainer:
         )
         groups = self.field.param_groups()
         dense = [g for g in groups if not g.get("touched")] + self.tonemapper.param_groups(config.tonemap_lr)
+        self.poses = PoseCorrections(scene) if config.refine_poses else None
+        dense += self.poses.param_groups(config.pose_lr) if self.poses else []
         touched = [g for g in groups if g.get("touched")]
         self.optimisers: dict[str, torch.optim.Optimizer] = {}
         if dense:  # grids without a tone mapper have nothing dense
@@ -117,13 +120,16 @@ class Trainer:
         self.scene = to_device(scene, device)
         self.field.to(device)
         self.tonemapper.to(device)
+        if self.poses:
+            self.poses.to(device)
         for optimiser in self.optimisers.values():
             optimiser.load_state_dict(optimiser.state_dict())  # moments follow their parameters
 
     @property
     def modules(self) -> dict[str, torch.nn.Module]:
         """What a checkpoint holds besides the optimisers."""
-        return {"field": self.field, "tonemapper": self.tonemapper}
+        learned = {"field": self.field, "tonemapper": self.tonemapper}
+        return {**learned, "poses": self.poses} if self.poses else learned
 
     def resume_or_initialise(self) -> None:
         """Continue from the newest checkpoint, or start response and brightness from the recordings."""
@@ -199,9 +205,11 @@ class Trainer:
         totals: dict[str, float] = {}
         for slot in slots:
             batch = self.draw(slot)
+            batch = self.poses(batch) if self.poses else batch
             with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
                 render, own = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase) | own | self.tonemapper.regularizers()
+            terms |= self.poses.regularizers(batch.frame) if self.poses else {}
             self.check(terms, batch, render.radiance)
             (self.objective.total(terms) / config.batches).backward()
             for name, value in terms.items():
@@ -212,10 +220,12 @@ class Trainer:
         self.ranks.max_buffers(self.marks)
         for name, optimiser in self.optimisers.items():
             for group, lr in zip(optimiser.param_groups, self.base_lr[name], strict=True):
-                group["lr"] = lr * clock.lr_share
+                group["lr"] = lr * clock.lr_share * (clock.progress >= group.get("start", 0.0))
             optimiser.step()
             if name == "dense":  # the touched one clears what it used
                 optimiser.zero_grad()
+        if self.poses:
+            self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
         self.field.after_step(clock.step + 1)
         if "mse" in totals:
@@ -279,7 +289,8 @@ class Trainer:
         """The middle frame as recorded and as rendered, side by side."""
         i = len(self.scene.train) // 2
         f = self.scene.train[i]
-        render = self.field.render(f.camera, f.time)
+        camera = self.poses.camera(f.camera, *self.poses.frames[i]) if self.poses else f.camera
+        render = self.field.render(camera, f.time)
         rgb = self.tonemapper(render.radiance, f.bracket, f.camera_id, i, leaky=False).view_as(f.image)
         pair = torch.cat([f.image, rgb], 1).cpu().numpy()
         write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)
