@@ -5,6 +5,8 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from presets import random_field, small, trainer
@@ -20,7 +22,7 @@ from hdr_nsff.fields import splat
 from hdr_nsff.fields.nsff import NSFF
 from hdr_nsff.fields.rasterize import dense
 from hdr_nsff.fields.splat import Splat, SplatConfig
-from hdr_nsff.pose_corrections import PoseCorrections, moved
+from hdr_nsff.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
 from hdr_nsff.run import Run
 from hdr_nsff.scene import Manifest, Scene
 from hdr_nsff.tensors import tree_map
@@ -45,14 +47,29 @@ def perturbation(count: int, degrees: float, share: float) -> Tensor:
     return (axes * torch.tensor([degrees * torch.pi / 180, share])[:, None]).flatten(1)
 
 
+def set_twists(corrections: PoseCorrections, twists: Tensor) -> None:
+    with torch.no_grad():
+        corrections.moves.copy_(torch.einsum("cij,cj->ci", corrections.judge, twists))
+
+
+def perturbed(scene: Scene) -> Tensor:
+    """Twists of two degrees and 2 % of the depth, but for what a common similarity explains: nothing could find that."""
+    corrections = PoseCorrections(scene)
+    set_twists(corrections, perturbation(6, 2.0, 0.02))
+    corrections.fix_gauge()
+    return corrections.twists().detach()
+
+
 @pytest.fixture(scope="module")
 def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The toy scene with cameras turned by half a degree and shifted by half a percent of the depth."""
-    folder = ToyScene().write(tmp_path_factory.mktemp("wrong") / "scene")
+    """The toy scene with wrong cameras, with features larger than cameras are off, that no exposure clips."""
+    exact, rng = ToyScene(), np.random.default_rng(0)
+    coarse = [np.kron(rng.random((10, 15, 3)), np.ones((16, 16, 1))) for _ in range(2)]
+    exact.textures = [0.45 * cv2.GaussianBlur(t, (0, 0), 4).astype(np.float32) for t in coarse]
+    folder = exact.write(tmp_path_factory.mktemp("wrong") / "scene")
     scene = Scene.open(folder)
-    twists = perturbation(6, 0.5, 0.005)
-    cameras = [moved(f.camera, t, 4.0) for f, t in zip(scene.train, twists, strict=True)]
-    return edited(folder, c2w={i: c.c2w.tolist() for i, c in enumerate(cameras)})
+    cameras = [moved(f.camera, t, typical_depth(scene)) for f, t in zip(scene.train, perturbed(scene), strict=True)]
+    return edited(folder, exact, c2w={i: c.c2w.tolist() for i, c in enumerate(cameras)})
 
 
 def seen(field: NSFF | Splat, batch: PixelBatch, weights: dict[str, Tensor]) -> Tensor:
@@ -113,11 +130,6 @@ def test_the_neighbours_camera_has_the_gradient_of_the_flow_into_it(toy: Scene) 
     assert float(rows[2]) > 0 and float(rows[[1, 3]].max()) > 0 and float(rows[[0, 4, 5]].max()) == 0
 
 
-def set_twists(corrections: PoseCorrections, twists: Tensor) -> None:
-    with torch.no_grad():
-        corrections.moves.copy_(torch.einsum("cij,cj->ci", corrections.judge, twists))
-
-
 def test_a_common_similarity_is_taken_out_of_the_corrections(toy: Scene) -> None:
     corrections = PoseCorrections(toy)
     own = perturbation(6, 0.5, 0.01)
@@ -130,7 +142,7 @@ def test_a_common_similarity_is_taken_out_of_the_corrections(toy: Scene) -> None
     centres = torch.stack([f.camera.c2w[:, 3] for f in toy.train]) / corrections.unit
     common = torch.cat([turn.expand(6, 3), shift + (scale - 1) * centres + torch.linalg.cross(turn.expand(6, 3), centres)], 1)
     set_twists(corrections, kept + common)
-    assert float((corrections.twists() - kept).abs().max()) > 0.01
+    assert float((corrections.twists().detach() - kept).abs().max()) > 0.01
     corrections.fix_gauge()
     torch.testing.assert_close(corrections.twists(), kept, atol=1e-6, rtol=1e-4)
 
@@ -224,28 +236,25 @@ def test_a_camera_that_stands_still_is_refused_and_one_that_turns_only_turns(toy
     with torch.no_grad():
         corrections.moves.normal_(generator=torch.Generator().manual_seed(0))
     corrections.fix_gauge()
-    twists = corrections.twists()
+    twists = corrections.twists().detach()
     assert float(twists[:, 3:].abs().max()) == 0 and float(twists[:, :3].abs().max()) > 0.1
     assert float(twists[:, :3].mean(0).abs().max()) < 1e-5
 
 
-def pixels_off(exact: Scene, scene: Scene) -> float:
-    """Root mean square pixels between where cameras see their points and where they should, a common shift left in."""
-    off = []
-    for f, g in zip(exact.train, scene.train, strict=True):
-        assert f.disparity is not None
-        rays = f.camera.rays(f.camera.pixel_grid())
-        points = rays.origins + rays.directions / f.disparity.reshape(-1, 1)
-        off.append((g.camera.project(points)[0] - f.camera.pixel_grid()).square().sum(-1).mean())
-    return float(torch.stack(off).mean().sqrt())
-
-
 def test_a_known_perturbation_is_found_back(wrong: Path, toy: Scene, tmp_path: Path) -> None:
-    settings = replace(refining(wrong, tmp_path / "run", "splat", 240), field=SplatConfig(static=1200, moving=300, bases=2))
-    run = Run.open(train(settings))
-    # the share that is a common similarity cannot be found: it is taken out of the perturbation first
-    corrections = PoseCorrections(toy)
-    set_twists(corrections, perturbation(6, 0.5, 0.005) * torch.tensor([1.0] * 3 + [4.0 / corrections.unit] * 3))
-    corrections.fix_gauge()
-    before, after = pixels_off(toy, corrections.applied(toy)), pixels_off(toy, run.scene)
-    assert before > 0.5 and after < 0.4 * before, (before, after)
+    field = SplatConfig(static=1200, moving=300, bases=2)
+    settings = replace(refining(wrong, tmp_path / "run", "splat", 240), field=field, pose_lr=1e-3)
+    state = load_file(max((train(settings) / "checkpoints").glob("*")))
+    learned, judge = PoseCorrections(Scene.open(wrong)), PoseCorrections(toy)
+    learned.load_state_dict({k.removeprefix("poses."): v for k, v in state.items() if k.startswith("poses.")})
+
+    def pixels(twists: Tensor) -> float:
+        """Root mean square motion of the pictures by twists (6, 6), but for what a common similarity explains."""
+        set_twists(judge, twists)
+        judge.fix_gauge()
+        left = judge.twists().detach().double()
+        return 60 * float(torch.einsum("ti,tij,tj->t", left, metric, left).mean().sqrt())
+
+    metric = torch.stack([visible_motion(f, toy, judge.unit) for f in toy.train])
+    before, after = pixels(perturbed(toy)), pixels(perturbed(toy) + learned.twists().detach())
+    assert before > 1.0 and after < 0.4 * before, (before, after)

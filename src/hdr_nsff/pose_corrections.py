@@ -4,7 +4,7 @@ A camera turns by an axis-angle in world axes and its centre shifts by a share o
 by a factor. Frames of one physical camera that have the same pose share its correction, frames that have the same K share the factor.
 
 *Steps.* Turning and shifting a camera move its picture in almost the same way, so what is learned is preconditioned (after CamP, Park et
-al. 2023): a parameter of 1 moves the camera's visible points by one width of the picture, root mean square, whichever it is.
+al. 2023): a parameter moves the camera's visible points by about as many widths of the picture, root mean square, whichever it is.
 
 *Gauge.* A similarity of all cameras changes no picture, for the field follows it. It is taken out of the corrections after every step: to
 first order they hold no common turn, shift or scale, and the world stays that of the prepared scene."""
@@ -27,12 +27,9 @@ DAMPING = 0.5  # of the mean eigenvalue: how much slower what hardly moves the p
 ZOOM = 3.0  # log focal length per parameter: pixels lie about a third of the width from the middle
 BETAS = (0.9, 0.9999)  # a long memory of how large gradients were: steps shrink as the pictures come to fit
 START = 0.05  # share of the run after which cameras move: the first surfaces are rough
-ZOOM_RATE = 0.1
-DEGREE, SHIFT, LENGTHENING = (
-    torch.pi / 180,
-    0.01,
-    0.002,
-)  # of turns, typical depths and focal lengths: what counts as 1 in the regulariser
+ZOOM_RATE = 0.1  # a factor is of many frames and moves at every step: slowly
+DEGREE, SHIFT, LENGTHENING = torch.pi / 180, 0.01, 0.002  # turn, typical depths, share of the focal length: 1 in the regulariser
+FOCAL = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]])  # entries of K that are focal lengths
 
 
 class PoseCorrections(nn.Module):
@@ -41,7 +38,6 @@ class PoseCorrections(nn.Module):
     precondition: Tensor
     judge: Tensor
     gauge: Tensor
-    zooms_free: Tensor
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
@@ -92,7 +88,7 @@ class PoseCorrections(nn.Module):
         return {"pose": (twist[:3] / DEGREE).square().sum() + (twist[3:] / SHIFT).square().sum() + zoom.square()}
 
     def param_groups(self, lr: float) -> list[dict[str, Any]]:
-        """Poses and focal lengths; `lr` in shares of the picture's width. A factor is of many frames and moves at every step: slowly."""
+        """Poses and focal lengths; `lr` in shares of the picture's width."""
         common = {"betas": BETAS, "eps": 1e-15, "start": START}
         return [{"params": [self.moves], "lr": lr, **common}, {"params": [self.zooms], "lr": ZOOM_RATE * lr, **common}]
 
@@ -104,9 +100,16 @@ class PoseCorrections(nn.Module):
         self.moves.copy_(torch.einsum("cij,cj->ci", self.judge, twists))
 
     @torch.no_grad()
+    def told(self) -> str:
+        """How far the cameras have come, in words."""
+        turn, shift = (t.square().sum(-1).mean().sqrt() for t in self.twists().split(3, -1))
+        zoom = (ZOOM * self.zooms).expm1().square().mean().sqrt()
+        return f"cameras: turned by {turn / DEGREE:.2f} degrees, shifted by {shift:.2%} of the depth, focal length by {zoom:.2%} (rms)"
+
+    @torch.no_grad()
     def applied(self, scene: Scene) -> Scene:
-        """The scene with corrected cameras, its manifest's included. A held-out frame keeps its pose, which no picture of training has seen, unless it was
-        filmed by the very camera of a training frame; it shares the factor of its K."""
+        """The scene with corrected cameras, its manifest's included. A held-out frame keeps its pose, of which no training picture tells,
+        unless it was filmed by the very camera of a training frame; it shares the factor of its K."""
 
         def corrected(f: Frame) -> Frame:
             if (lens := self.lenses.get(lens_key(f))) is None:
@@ -117,9 +120,6 @@ class PoseCorrections(nn.Module):
         known = {f.index: {"K": f.camera.K.tolist(), "c2w": f.camera.c2w.tolist()} for f in train + test}
         entries = [e.model_copy(update=known.get(e.index, {})) for e in scene.manifest.frames]
         return replace(scene, train=train, test=test, manifest=scene.manifest.model_copy(update={"frames": entries}))
-
-
-FOCAL = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]])  # entries of K that are focal lengths
 
 
 def pose_key(f: Frame) -> tuple[Any, ...]:

@@ -128,7 +128,7 @@ class Trainer:
     @property
     def modules(self) -> dict[str, torch.nn.Module]:
         """What a checkpoint holds besides the optimisers."""
-        learned = {"field": self.field, "tonemapper": self.tonemapper}
+        learned: dict[str, torch.nn.Module] = {"field": self.field, "tonemapper": self.tonemapper}
         return {**learned, "poses": self.poses} if self.poses else learned
 
     def resume_or_initialise(self) -> None:
@@ -193,6 +193,8 @@ class Trainer:
         if self.ranks.main:
             self.save()
             self.preview()
+        if self.poses:
+            self.report(self.poses.told())
 
     def step(self) -> dict[str, float]:
         """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
