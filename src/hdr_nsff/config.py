@@ -53,6 +53,10 @@ class TrainConfig:
     """Share of the run after which response and exposures are held where they are (1: never)."""
     paint: bool = True
     """Start the field from the depth prior and the recorded colours (no effect on the published network)."""
+    refine_poses: bool = False
+    """Correct the training cameras (poses and focal length) a little, by the picture."""
+    pose_lr: float = 6e-4
+    """Of these corrections, as a motion of the picture in shares of its width."""
     squared: bool = False
     """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
     saturation: bool = True

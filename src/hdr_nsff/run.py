@@ -17,6 +17,7 @@ from hdr_nsff.fields import build_field
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.io import atomic, read_json, write_json
 from hdr_nsff.notes import LogLine
+from hdr_nsff.pose_corrections import PoseCorrections
 from hdr_nsff.progress import say
 from hdr_nsff.scene import Scene
 from hdr_nsff.tonemap import ToneMapper
@@ -138,7 +139,7 @@ class Run:
 
     folder: Path
     config: TrainConfig
-    scene: Scene
+    scene: Scene  # with the cameras that the run has found, where it refines poses
     field: RadianceField
     tonemapper: ToneMapper
     step: int
@@ -155,7 +156,10 @@ class Run:
         if found is None:
             raise InputError(f"{folder}: no checkpoint yet; run `hdr-nsff train` to the first one")
         field, tonemapper = build_field(config.field, scene), ToneMapper.for_scene(config.tonemap, scene)
-        unpack(found.tensors, {"field": field, "tonemapper": tonemapper}, {})
+        modules: dict[str, torch.nn.Module] = {"field": field, "tonemapper": tonemapper}
+        poses = PoseCorrections(scene) if config.refine_poses else None
+        unpack(found.tensors, modules if poses is None else {**modules, "poses": poses}, {})
+        scene = scene if poses is None else poses.applied(scene)
         target = pick_device(device)
         return Run(folder, config, scene, field.to(target).eval(), tonemapper.to(target).eval(), found.step, found.seconds)
 

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hdr_nsff import distributed
 from hdr_nsff.batch import PixelBatch, draw_pixels, whole_frame
+from hdr_nsff.camera import Camera
 from hdr_nsff.config import TrainConfig, check
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields import build_field, start_field
@@ -24,6 +25,7 @@ from hdr_nsff.fields.base import Misfit, Render, recorded
 from hdr_nsff.fields.encodings import TouchedAdam
 from hdr_nsff.io import write_png, writing_to
 from hdr_nsff.objective import LossWeights, Objective
+from hdr_nsff.pose_corrections import PoseCorrections
 from hdr_nsff.priors.response import initialise
 from hdr_nsff.progress import bar, say
 from hdr_nsff.run import keep_snapshot, latest_checkpoint, pack, pick_device, read_config, save_checkpoint, unpack, write_config
@@ -112,6 +114,8 @@ class Trainer:
         )
         groups = self.field.param_groups()
         dense = [g for g in groups if not g.get("touched")] + self.tonemapper.param_groups(config.tonemap_lr)
+        self.poses = PoseCorrections(scene) if config.refine_poses else None
+        dense += self.poses.param_groups(config.pose_lr) if self.poses else []
         touched = [g for g in groups if g.get("touched")]
         self.optimisers: dict[str, torch.optim.Optimizer] = {}
         if dense:  # grids without a tone mapper have nothing dense
@@ -125,13 +129,16 @@ class Trainer:
         self.scene = to_device(scene, device)
         self.field.to(device)
         self.tonemapper.to(device)
+        if self.poses:
+            self.poses.to(device)
         for optimiser in self.optimisers.values():
             optimiser.load_state_dict(optimiser.state_dict())  # moments follow their parameters
 
     @property
     def modules(self) -> dict[str, torch.nn.Module]:
         """What a checkpoint holds besides the optimisers."""
-        return {"field": self.field, "tonemapper": self.tonemapper}
+        learned: dict[str, torch.nn.Module] = {"field": self.field, "tonemapper": self.tonemapper}
+        return {**learned, "poses": self.poses} if self.poses else learned
 
     def resume_or_initialise(self) -> None:
         """Continue from the newest checkpoint, or start response and brightness from the recordings."""
@@ -156,6 +163,11 @@ class Trainer:
         """A line for the person at the terminal, once however many processes there are."""
         if self.ranks.main:
             say(message)
+
+    def camera(self, frame: int) -> Camera:
+        """The camera of training frame `frame`, as far as it has been refined."""
+        camera = self.scene.train[frame].camera
+        return self.poses.camera(camera, *self.poses.frames[frame]) if self.poses else camera
 
     def recorded_radiance(self, rgb: Tensor, frame: int) -> Tensor:
         """Radiance (N, 3) that training frame `frame` recorded as `rgb` (N, 3)."""
@@ -211,6 +223,8 @@ class Trainer:
             self.save()
             if previews:
                 self.preview()
+        if self.poses:
+            self.report(self.poses.told())
 
     def step(self) -> dict[str, float]:
         """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
@@ -223,9 +237,11 @@ class Trainer:
         totals: dict[str, float] = {}
         for slot in slots:
             batch = self.draw(slot)
+            batch = self.poses(batch) if self.poses else batch
             with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
                 render, own = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase) | own | self.tonemapper.regularizers()
+            terms |= self.poses.regularizers(batch.frame) if self.poses else {}
             self.check(terms, batch, render.radiance)
             (self.objective.total(terms) / config.batches).backward()
             for name, value in terms.items():
@@ -236,10 +252,12 @@ class Trainer:
         self.ranks.max_buffers(self.marks)
         for name, optimiser in self.optimisers.items():
             for group, lr in zip(optimiser.param_groups, self.base_lr[name], strict=True):
-                group["lr"] = lr * clock.lr_share
+                group["lr"] = lr * clock.lr_share * (clock.progress >= group.get("start", 0.0))
             optimiser.step()
             if name == "dense":  # the touched one clears what it used
                 optimiser.zero_grad()
+        if self.poses:
+            self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
         self.field.after_step(clock.step + 1, self.misfits if clock.progress < SETTLED else None)
         if "mse" in totals:
@@ -254,8 +272,9 @@ class Trainer:
         found = []
         for i in chosen:
             f = self.scene.train[i]
-            rgb = recorded(self.field, f.camera, f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
-            found.append(Misfit(f.camera, f.time, (rgb - f.image).abs().mean(-1)))
+            camera = self.camera(i)
+            rgb = recorded(self.field, camera, f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
+            found.append(Misfit(camera, f.time, (rgb - f.image).abs().mean(-1)))
         return found
 
     @torch.no_grad()
@@ -324,6 +343,6 @@ class Trainer:
         """The middle frame as recorded and as rendered, side by side."""
         i = len(self.scene.train) // 2
         f = self.scene.train[i]
-        rgb = recorded(self.field, f.camera, f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
+        rgb = recorded(self.field, self.camera(i), f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
         pair = torch.cat([f.image, rgb], 1).cpu().numpy()
         write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)

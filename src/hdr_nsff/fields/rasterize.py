@@ -1,4 +1,4 @@
-"""3D Gaussians to feature maps, differentiable in everything, the camera's pose included (EWA splatting; Zwicker et al. 2001, Kerbl
+"""3D Gaussians to feature maps, differentiable in everything, the camera's pose and focal lengths included (EWA splatting; Zwicker et al. 2001, Kerbl
 et al. 2023). One call, twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`, the plain-torch one, slow and
 obviously right."""
 
@@ -33,12 +33,12 @@ def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Ten
     gaussians = means, quaternions, scales, opacities, features
     match means.device.type if means.dtype == torch.float32 else None:
         case "cpu":
-            maps, alpha = Rasterize.apply(*gaussians, world_to_camera(camera), camera)
+            maps, alpha = Rasterize.apply(*gaussians, stretched(camera), camera)
             seen, depth = maps.split([len(maps) - 1, 1])  # whose gradients are joined, where slices' would be added up
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
         case "cuda" if rasterize_cuda.available():
             rules = camera.width, camera.height, kernels.NEAREST, kernels.BLUR
-            return Maps(*rasterize_cuda.composite(*gaussians, world_to_camera(camera), camera.K, *rules))
+            return Maps(*rasterize_cuda.composite(*gaussians, stretched(camera), camera.K.detach(), *rules))
         case "cuda":  # `dense` would hold every Gaussian at every pixel: too much for a real picture
             seen = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
             return Maps(*(m.to(means.device) for m in seen))
@@ -50,6 +50,15 @@ def world_to_camera(camera: Camera) -> Tensor:
     """(3, 4), differentiable in the pose."""
     rotation = camera.c2w[:, :3].T
     return torch.cat([rotation, -rotation @ camera.c2w[:, 3:]], 1)
+
+
+def stretched(camera: Camera) -> Tensor:
+    """`world_to_camera` that carries the gradient of the focal lengths as well, for kernels to which K is numbers: a longer focal length
+    is a camera whose x and y are stretched."""
+    w2c, focal = world_to_camera(camera), camera.K[[0, 1], [0, 1]]
+    if not focal.requires_grad:
+        return w2c
+    return torch.cat([focal / focal.detach(), focal.new_ones(1)])[:, None] * w2c
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
