@@ -12,7 +12,7 @@ from test_splat import CAMERA, card_field, scattered
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import Misfit
 from hdr_nsff.fields.rasterize import dense
-from hdr_nsff.fields.renewal import MOST, NARROWER, PARTED, blame, halve, renew
+from hdr_nsff.fields.renewal import MOST, NARROWER, PARTED, blame, halve
 from hdr_nsff.fields.splat import Splat
 from hdr_nsff.scene import Scene
 
@@ -33,7 +33,7 @@ def test_blame_is_the_weights_of_the_slow_twin_times_the_error() -> None:
     cloud = field.cloud(field.knot(3.0))
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
     own = dense(*(p.detach() for p in parts), torch.eye(len(cloud.means)), CAMERA)  # weights
-    told = blame(field, misfit(error))
+    told = blame(cloud, misfit(error))
     torch.testing.assert_close(told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(told[:, 1], own.features.sum((0, 1)), atol=1e-3, rtol=1e-3)
 
@@ -50,7 +50,7 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
     field = card_field()
     field.static.logits.data[::20] = -10.0  # faded away; others lie outside the picture
     there = in_corner(field)
-    count = renew(field, [misfit(corner())], torch.Generator().manual_seed(0))
+    count = field.renew([misfit(corner())], torch.Generator().manual_seed(0))
     assert count == int(MOST * len(field.static))  # more are unseen
     assert there + 0.6 * count < in_corner(field) <= there + count  # some were faint ones of that quarter
 
@@ -58,7 +58,7 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
 def test_floaters_that_no_view_sees_are_put_to_use() -> None:
     field = card_field()
     field.static.means.data[:5] = torch.tensor([0.0, 0.0, -3.0])  # behind every camera
-    renew(field, [misfit()], torch.Generator().manual_seed(0))
+    field.renew([misfit()], torch.Generator().manual_seed(0))
     assert bool((field.static.means[:5, 2] > 3).all())
 
 
@@ -66,8 +66,8 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
     field = card_field()
     away = CAMERA.moved(torch.tensor([[1.0, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0]]))  # sees nothing
     before = {n: p.detach().clone() for n, p in field.named_parameters()}
-    renew(field, [misfit(), misfit(camera=away)], torch.Generator().manual_seed(0))
-    seen = blame(field, misfit())[: len(field.static), 1] > 1
+    field.renew([misfit(), misfit(camera=away)], torch.Generator().manual_seed(0))
+    seen = blame(field.cloud(3.0), misfit())[: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
     assert int((~kept & seen).sum()) <= 2 * MOST * len(field.static)  # the halves and what they were cut from
@@ -80,7 +80,7 @@ def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
     g.quaternions.data[4], g.log_scales.data[4] = torch.tensor([1.0, 0, 0, 0]), torch.tensor([-2.0, -1.0, -3.0])
     mean, mixture, presence = g.means[4].detach().clone(), field.mixture_logits[:, 4].clone(), field.presence[:, 4].clone()
     others = g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]].clone()
-    assert halve(g, told, field.companions(g), torch.Generator().manual_seed(0)) == 1
+    assert halve(g, told, [field.presence, field.mixture_logits], torch.Generator().manual_seed(0)) == 1
     along = torch.tensor([0.0, PARTED * math.exp(-1.0), 0.0])
     torch.testing.assert_close(g.means[4].detach(), mean - along)
     torch.testing.assert_close(g.means[7].detach(), mean + along)
@@ -94,7 +94,7 @@ def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
 def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]
-    assert renew(field, [misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
+    assert field.renew([misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
     assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
 
 

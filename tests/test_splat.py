@@ -15,7 +15,8 @@ from hdr_nsff.batch import PixelBatch, whole_frame
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields import start_field
 from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.fields.splat import BRIGHTEST, Splat, SplatConfig, picked
+from hdr_nsff.fields.gaussians import BRIGHTEST
+from hdr_nsff.fields.splat import Splat, SplatConfig, picked
 from hdr_nsff.fields.trajectories import WINDOW
 from hdr_nsff.scene import Scene
 

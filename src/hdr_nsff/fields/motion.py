@@ -3,8 +3,8 @@ METHOD.md 3 that live on samples. One object per pass, so that the pieces can na
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -13,16 +13,15 @@ from hdr_nsff import losses, volume
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.fields.samples import Content, March
-
-if TYPE_CHECKING:
-    from hdr_nsff.fields.nsff import NSFF
+from hdr_nsff.fields.two_branches import TwoBranches
 
 
 @dataclass
 class Motion:
     """Everything known about one training pass after both branches were asked at the batch's own time."""
 
-    field: NSFF
+    field: TwoBranches
+    to_flow: Callable[[Tensor], Tensor]  # raw motion (M, 8) to scene flow in cube units, forward and backward (M, 2, 3)
     batch: PixelBatch
     m: March
     knot: float
@@ -35,7 +34,7 @@ class Motion:
 
     def __post_init__(self) -> None:
         field, knots = self.field, len(self.field.times)
-        self.flow = field.to_flow(self.raw)  # (M, 2, 3) cube
+        self.flow = self.to_flow(self.raw)  # (M, 2, 3) cube
         self.disocclusion = self.raw[:, 3::4].sigmoid()  # (M, 2)
         self.offsets = [o for o in (1, -1) if 0 <= self.knot + o <= knots - 1]
         s = self.m.depths.shape[1]
@@ -122,7 +121,7 @@ class Motion:
         there = self.there[direction]
         assert there is not None
         side = self.side(direction)
-        coords = self.moved[direction] + self.field.to_flow(there)[:, side]
+        coords = self.moved[direction] + self.to_flow(there)[:, side]
         content, _ = self.field.dynamic_content(
             coords, self.slot, self.contents[direction].density.shape, knot, self.views, motion=False
         )
@@ -140,7 +139,7 @@ class Motion:
         for o in self.offsets:
             there = self.there[o]
             assert there is not None
-            flow_there = self.field.to_flow(there)
+            flow_there = self.to_flow(there)
             confident = 1 - self.disocclusion[:, self.side(o)]
             back = flow_there[:, self.side(-o)]
             terms["cycle"].append(losses.cycle(self.flow[:, self.side(o)], back, confident))

@@ -45,7 +45,7 @@ class NSFF(TwoBranches):
         """A render of the batch's pixels with its warps, and the per-sample regularisers."""
         p = self.ask(batch, motion=True)
         assert p.raw_motion is not None
-        motion = Motion(self, batch, p.m, p.knot, p.index, p.coords, p.raw_motion, p.static, p.dynamic, p.w)
+        motion = Motion(self, self.to_flow, batch, p.m, p.knot, p.index, p.coords, p.raw_motion, p.static, p.dynamic, p.w)
         return motion.render(), motion.regularizers()
 
     # Rendering

@@ -5,16 +5,12 @@ who choose by opacity)."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.base import Misfit
+from hdr_nsff.fields.base import GaussianCloud, Misfit
+from hdr_nsff.fields.gaussians import Gaussians
 from hdr_nsff.fields.rasterize import rasterize, rotation_matrices
-
-if TYPE_CHECKING:
-    from hdr_nsff.fields.splat import Gaussians, Splat
 
 UNSEEN = 0.05  # pixels: a Gaussian whose weights add up to less in the mean frame is as good as not there
 MOST = 0.05  # of the Gaussians are put elsewhere at a time
@@ -22,26 +18,14 @@ PARTED = 0.5  # standard deviations that two halves lie off the middle of the wh
 NARROWER = 0.7  # times as long as the whole is a half, along the axis it was cut across
 
 
-def renew(field: Splat, misfits: list[Misfit], generator: torch.Generator) -> int:
-    """Put unseen Gaussians beside those with most error in their pixels, and how many. Nothing but places, shapes, colours and opacities
-    of the unseen ones and of the halves they came from changes."""
-    told = sum(blame(field, m) for m in misfits) / len(misfits)
-    assert isinstance(told, Tensor)
-    count = len(field.static)
-    return sum(
-        halve(gaussians, some, field.companions(gaussians), generator)
-        for gaussians, some in ((field.static, told[:count]), (field.moving, told[count:]))
-    )
-
-
-def blame(field: Splat, misfit: Misfit) -> Tensor:
-    """(G, 2): every Gaussian's weights summed over the pixels of a frame, times their error and alone: the gradients of two features."""
-    with torch.no_grad():
-        cloud = field.cloud(field.knot(misfit.time))
+def blame(cloud: GaussianCloud, misfit: Misfit) -> Tensor:
+    """(G, 2): the weights of every Gaussian of the `cloud` of that time summed over the pixels of a frame, times their error and alone: the
+    gradients of two features."""
     told = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
-    maps = rasterize(cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, told, misfit.camera)
-    weights = torch.stack([misfit.error, torch.ones_like(misfit.error)], -1)
-    return torch.autograd.grad((maps.features * weights).sum(), told)[0]
+    with torch.enable_grad():
+        maps = rasterize(cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, told, misfit.camera)
+        weights = torch.stack([misfit.error, torch.ones_like(misfit.error)], -1)
+        return torch.autograd.grad((maps.features * weights).sum(), told)[0]
 
 
 @torch.no_grad()

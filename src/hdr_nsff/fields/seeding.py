@@ -13,9 +13,10 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from hdr_nsff.fields.gaussians import Gaussians
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.space import FrustumSpace, build_space
-from hdr_nsff.fields.splat import Gaussians, Splat
+from hdr_nsff.fields.splat import Splat
 from hdr_nsff.fields.surface import CELLS, Points, ToRadiance, cells_for, joined, lift, thinned, thinned_to
 from hdr_nsff.priors.bundle import Cameras, Shape
 from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather

@@ -16,13 +16,13 @@ from torch import Tensor, nn
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import GaussianCloud, Misfit, Render, Warp
+from hdr_nsff.fields.gaussians import BRIGHTEST, Gaussians
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.rasterize import Maps, rasterize
-from hdr_nsff.fields.renewal import renew
+from hdr_nsff.fields.renewal import blame, halve
 from hdr_nsff.fields.trajectories import Trajectories
 from hdr_nsff.tensors import tree_map
 
-BRIGHTEST = 16.0  # log radiance beyond this is held: exp stays finite
 BESIDE = 4  # neighbours of a moving Gaussian
 GLOSSIEST = 2.0  # log radiance may change by this much with the direction
 RENEW_FRAMES = 24  # training frames that say what is wrong and what is seen
@@ -63,28 +63,6 @@ class SplatConfig:
         static = min(round(0.55 * num_pixels), 80_000) if self.static is None else self.static
         moving = min(round(0.15 * num_pixels), 20_000) if self.moving is None else self.moving
         return static, moving
-
-
-class Gaussians(nn.Module):
-    """`count` Gaussians at rest, with `knots` log-radiance offsets in time of `channels` (3: colours, 1: brightness)."""
-
-    def __init__(self, count: int, knots: int, channels: int, shiny: bool = False) -> None:
-        super().__init__()
-        self.means = nn.Parameter(torch.zeros(count, 3))  # scene units
-        self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))  # w x y z
-        self.log_scales = nn.Parameter(torch.full((count, 3), -5.0))  # log of standard deviations in scene units
-        self.logits = nn.Parameter(torch.full((count,), -10.0))  # of opacity
-        self.log_radiance = nn.Parameter(torch.zeros(count, 3))
-        self.offsets = nn.Parameter(torch.zeros(knots, count, channels))  # of log radiance, over the clip's time
-        self.sheen = nn.Parameter(torch.zeros(count if shiny else 0, 3, 3))  # change of log radiance by direction of view (xyz)
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    def radiance(self, share: float) -> Tensor:
-        """Radiance (G, 3) at a share in [0, 1] of the clip's time."""
-        log = self.log_radiance + linear(self.offsets, share * (len(self.offsets) - 1))
-        return log.clamp_max(BRIGHTEST).exp()
 
 
 class Splat(nn.Module):
@@ -256,14 +234,19 @@ class Splat(nn.Module):
         groups.append({"params": [t.turns, t.shifts], "lr": c.lr * c.pose_lr, "touched": touched})
         return groups
 
-    def companions(self, gaussians: Gaussians) -> list[Tensor]:
-        """What belongs to each Gaussian (in the last dimension) besides its own parameters."""
-        return [self.presence, self.mixture_logits] if gaussians is self.moving else []
+    @torch.no_grad()
+    def renew(self, misfits: list[Misfit], generator: torch.Generator) -> int:
+        """Put unseen Gaussians beside those with most error in their pixels, static and moving ones apart; how many."""
+        told = torch.stack([blame(self.cloud(self.knot(m.time)), m) for m in misfits]).mean(0)
+        still, moving = told.split([len(self.static), len(self.moving)])
+        return halve(self.static, still, [], generator) + halve(
+            self.moving, moving, [self.presence, self.mixture_logits], generator
+        )
 
     def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
         """Now and then, Gaussians that nobody sees go where the picture is wrong."""
         if misfits is not None and self.config.renew_every and step % self.config.renew_every == 0:
-            renew(self, misfits(RENEW_FRAMES), torch.Generator().manual_seed(step))
+            self.renew(misfits(RENEW_FRAMES), torch.Generator().manual_seed(step))
             self.look_around()
 
     def shared_maxima(self) -> list[Tensor]:
