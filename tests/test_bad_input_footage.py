@@ -145,7 +145,7 @@ def test_exposures_that_cannot_be(verb: str, tmp_path: Path, capsys: Capture) ->
 @pytest.mark.parametrize("value", ["1/0", "nan", "dark", ""])
 def test_exposures_that_cannot_be_made(value: str, tmp_path: Path, capsys: Capture) -> None:
     assert "--ev" in refused(capsys, "reexpose", clip(tmp_path / "clip"), tmp_path / "out", f"--ev={value},0")
-    assert "--ev" in refused(capsys, "synth", tmp_path / "out", f"--ev={value},0")
+    assert "--ev" in refused(capsys, "synth", "interior", tmp_path / "out", f"--ev={value},0")
     assert not (tmp_path / "out").exists()
 
 

@@ -147,5 +147,5 @@ def test_checkpoints_without_their_config_are_not_taken_over(run_folder: Path, c
 def test_a_room_is_not_rendered_into_a_folder_of_something_else(capsys: Capture, tmp_path: Path) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
-    assert "holds something else" in refused(capsys, "synth", str(tmp_path), "--size", "16x16", "--frames", "12")
+    assert "holds something else" in refused(capsys, "synth", "interior", str(tmp_path), "--size", "16x16", "--frames", "12")
     assert (tmp_path / "clip" / "00000.png").read_bytes() == b"mine"

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from inspect import signature
 
 import numpy as np
 from scipy import ndimage
@@ -22,6 +23,7 @@ SHORTEST = 3  # frames a track must last
 LINK = 6.0  # pixels: neighbours in a picture
 PARTING = 1.0  # pixels a frame: neighbours that part faster hardly belong together
 PARTS = 10  # the graph is cut into, before joining
+RESTARTS = {"rng": 0} if "rng" in signature(eigsh).parameters else {}  # newer SciPy draws restarts from chance otherwise
 CUTTING = 1000  # iterations; a graph that holds together takes ten
 WORSE = 1.3  # times the residual that two groups have alone is still one motion
 RELIEF = 0.1  # of a thing's size: what wrong depth may add to a residual
@@ -191,7 +193,7 @@ def parts(tracks: Tracks) -> np.ndarray:
     scale = diags(1 / np.sqrt(np.asarray(graph.sum(1)).ravel()))
     start = np.random.default_rng(0).standard_normal(n)
     try:
-        _, vectors = eigsh(scale @ graph @ scale, PARTS, which="LA", v0=start, maxiter=CUTTING)
+        _, vectors = eigsh(scale @ graph @ scale, PARTS, which="LA", v0=start, maxiter=CUTTING, **RESTARTS)
     except ArpackNoConvergence:  # the graph lies in pieces, which are parts already
         piece = connected_components(graph)[1]
         rank = np.argsort(np.argsort(-np.bincount(piece), kind="stable"))
