@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from safetensors.torch import load_file
 from test_flow_sets import synth
 
 from hdr_nsff import finetune_flow as verb
 from hdr_nsff.errors import InputError
-from hdr_nsff.finetune_flow import FinetuneConfig, finetune_flow, rate, sequence_loss, split
+from hdr_nsff.finetune_flow import FinetuneConfig, finetune_flow, mean, rate, sequence_loss, split
 from hdr_nsff.flow_sets import FlowPair, flow_pairs
 from hdr_nsff.priors import flow_networks
 from hdr_nsff.priors.gmflow import GMFlow
@@ -89,6 +90,15 @@ def test_a_few_steps_lower_the_loss(config: FinetuneConfig):
         adam.step()
         losses.append(loss.item())
     assert losses[-1] < 0.8 * losses[0]
+
+
+def test_the_result_is_half_way_from_where_it_started(config: FinetuneConfig):
+    start = torch.load(str(config.weights), weights_only=True)
+    half = load_file(finetune_flow(config))
+    trained = load_file(config.out / "checkpoints/step_00000004.safetensors")
+    name = "backbone.conv1.weight"
+    assert torch.allclose(half[name], (start[name] + trained[f"network.{name}"]) / 2)
+    assert (mean({"a": torch.tensor([0.0])}, {"a": torch.tensor([1.0])}, 0.25)["a"] == 0.75).all()
 
 
 def pair(scene: str, k: int) -> FlowPair:

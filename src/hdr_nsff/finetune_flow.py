@@ -56,6 +56,9 @@ class FinetuneConfig:
     stops: float = 5.0
     """The farthest that the exposures of a pair are apart, in EV."""
     lr: float = 5e-5
+    keep: float = 0.5
+    """Share of the network as it was in the result, which is the mean of the weights before and after (Wortsman et al. 2022): it keeps what
+    the data do not show. 0 takes the trained network alone."""
     held_out: float = 0.1
     """Share of the scenes (of a single scene: of its last pairs) kept for measuring."""
     measure: int = 6
@@ -75,11 +78,13 @@ def finetune_flow(config: FinetuneConfig) -> Path:
     training, held_out = split(pairs, config.held_out)
     held_out = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, config.measure).astype(int))]
     network = load(config.network, config.weights, device)
+    start = {k: v.clone() for k, v in network.state_dict().items()}
     with writing_to(config.out):
         claim(config)
         say(f"finetune-flow: {len(training)} pairs to train on, {len(held_out)} others to measure on")
         before = measured(network, held_out, config.out / "before.json")
         seconds = train(network, training, size, config)
+        network.load_state_dict(mean(start, network.state_dict(), config.keep))
         after = measured(network, held_out, None)
         weights = write_weights(
             network,
@@ -106,8 +111,8 @@ def check(config: FinetuneConfig) -> tuple[int, int]:
         raise InputError(f"--size {config.size!r}: write it as WIDTHxHEIGHT, both multiples of {MULTIPLE} and at least 128")
     if min(config.steps, config.batch, config.measure, config.checkpoint_steps) < 1:
         raise InputError("--steps, --batch, --measure and --checkpoint-steps must be at least 1")
-    if not (0 < config.held_out < 1 and 0 <= config.stops <= 12 and 0 < config.lr < 1):
-        raise InputError("--held-out must be between 0 and 1, --stops from 0 to 12, --lr between 0 and 1")
+    if not (0 < config.held_out < 1 and 0 <= config.keep < 1 and 0 <= config.stops <= 12 and 0 < config.lr < 1):
+        raise InputError("--held-out, --keep and --lr must be between 0 and 1, --stops from 0 to 12")
     return int(height), int(width)
 
 
@@ -169,6 +174,11 @@ def train(network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], co
             )
     network.requires_grad_(False)
     return before + time.monotonic() - started
+
+
+def mean(one: dict[str, Tensor], other: dict[str, Tensor], share: float) -> dict[str, Tensor]:
+    """Weights that are `share` of `one` and the rest of the `other`; numbers that are no weights are the other's."""
+    return {k: torch.lerp(v, one[k], share) if v.is_floating_point() else v for k, v in other.items()}
 
 
 def rate(progress: float) -> float:
