@@ -75,9 +75,12 @@ def test_unknown_exposures_of_a_typical_camera_come_back():
     assert rmse(fit.x, fit.y, SRGB) < 0.03
 
 
-def test_unknown_exposures_of_a_gamma_camera_are_within_a_third_of_a_stop():
-    fit = debevec(points(GAMMA22, EV), [None, None, None], reference=2)
-    np.testing.assert_allclose(fit.ev, EV, atol=0.33)
+@pytest.mark.parametrize("curve", [GAMMA22, SRGB, S_CURVE], ids=["gamma", "srgb", "s-curve"])
+@pytest.mark.parametrize("ev", [EV, [-3.0, 0.0], [0.0, 1.0, 2.0]], ids=["2 stops", "3 stops", "1 stop"])
+def test_unknown_exposures_in_whole_stops_come_back_whatever_the_curve(curve, ev):
+    fit = debevec(points(curve, ev), [None] * len(ev), reference=len(ev) - 1)
+    np.testing.assert_allclose(fit.ev, np.array(ev) - ev[-1], atol=0.08)
+    assert rmse(fit.x, fit.y, curve) < 0.03
 
 
 def test_the_proportions_of_unknown_exposures_are_measured_whatever_the_curve():

@@ -7,9 +7,9 @@ its own G, the exposures are common. One linear least squares, reweighted a few 
 hidden or fell into shadow.
 
 With no exposure known the recordings tell G and the log exposures only up to one common factor (E^p explains them as well
-as E). That factor is then chosen so that the curves are, on average, as steep over the mid-tones as sRGB. So log exposures
-of which none is known carry one common error (real video: 4 %, gamma 2.2: 7 %, a contrasty S-curve: 20 % and more); their
-proportions are measured."""
+as E). That factor is then first chosen so that the curves are, on average, as steep over the mid-tones as sRGB, which is off by a few
+per cent (real video: 4 %, gamma 2.2: 7 %, a contrasty S-curve: 20 % and more), and then so that the steps are usual ones, whole stops
+above all (bracketing.py). Their proportions are measured."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 import torch
+
+from hdr_nsff.priors.bracketing import likely_factor
 
 if TYPE_CHECKING:
     from hdr_nsff.scene import Frame, Scene
@@ -67,7 +69,7 @@ class ResponseFit:
     y: np.ndarray  # (3, 256) recorded value, rising from 0 to 1
     ev: np.ndarray  # (B,) log2 exposure, 0 at the reference bracket
     misfit: float  # median absolute misfit of a point's exposure, in stops
-    guessed: bool  # no exposure was known: all of `ev` carry one common, guessed factor
+    guessed: bool  # no exposure was known: the common factor of all of `ev` is the likeliest one
 
 
 @dataclass
@@ -113,6 +115,7 @@ def debevec(samples: Samples, ev: Sequence[float | None], reference: int, iterat
         curves, log_exposure[free] = solve(equations, noise, len(free))
         noise = reweight(equations, curves, log_exposure[free])
     factor = typical_factor(curves) if guessed else 1.0
+    factor *= likely_factor(log_exposure * factor / LN2) if guessed else 1.0
     misfit = np.concatenate([np.abs(r[r != 0]) for r in all_residuals(equations, curves, log_exposure[free])])
     tops = np.array([saturation(samples, c, curves[c], log_exposure) for c in range(3)])
     x, y = response_of(curves * factor, tops * factor)
@@ -265,7 +268,7 @@ def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int 
             tonemapper.set_curve(torch.from_numpy(fit.x), torch.from_numpy(fit.y))
             tonemapper.set_exposures(fit.ev.tolist())
             own = camera_curves(tonemapper, scene, fit, num, seed) if kind == "shared" else ""
-            how = "sure but for a common factor near 1: give `--ev` if you know them" if fit.guessed else "estimated with it"
+            how = "taken to be the likeliest steps, for recordings leave a common factor open: give `--ev` if you know them" if fit.guessed else "estimated with it"
             return f"from {len(samples.rgb)} static points (misfit {fit.misfit:.3f} stops){own}; {exposure_note(tonemapper, how)}"
         problem = (
             "too few static points seen in several exposures"
