@@ -268,7 +268,11 @@ def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int 
             tonemapper.set_curve(torch.from_numpy(fit.x), torch.from_numpy(fit.y))
             tonemapper.set_exposures(fit.ev.tolist())
             own = camera_curves(tonemapper, scene, fit, num, seed) if kind == "shared" else ""
-            how = "taken to be the likeliest steps, for recordings leave a common factor open: give `--ev` if you know them" if fit.guessed else "estimated with it"
+            how = (
+                "taken to be the likeliest steps, for recordings leave a common factor open: give `--ev` if you know them"
+                if fit.guessed
+                else "estimated with it"
+            )
             return f"from {len(samples.rgb)} static points (misfit {fit.misfit:.3f} stops){own}; {exposure_note(tonemapper, how)}"
         problem = (
             "too few static points seen in several exposures"
