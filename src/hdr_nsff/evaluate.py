@@ -25,7 +25,7 @@ from hdr_nsff.run import Run
 from hdr_nsff.scene import Protocol
 from hdr_nsff.scores.camera import camera_errors, trajectory_errors
 from hdr_nsff.scores.geometry import GEOMETRY_SCORES, Units, find_units, score_geometry
-from hdr_nsff.scores.predictions import predict, radiance_of, recorded
+from hdr_nsff.scores.predictions import predict, radiance_of, recordings
 from hdr_nsff.scores.radiance import HDR_SCORES, Gauge, find_gauge, score_radiance
 from hdr_nsff.scores.rgb import SMALLEST_LPIPS, score_rgb
 from hdr_nsff.scores.stability import stability
@@ -74,12 +74,14 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
     radiance = [radiance_of(f) for f in files]
     gauge = find_gauge(targets, radiance)
     units = find_units(targets, files, world_scale(run, truth)) if truth else None
-    scores = []
+    known = [t.radiance.reshape(-1, 3) for t in targets if t.radiance is not None]
+    scores, exposure = [], color.auto_exposure(torch.cat(known)) if known else 1.0
     for target, predicted, file in zip(targets, track(radiance, "measuring"), files, strict=True):
-        of_view = describe(run, target) | score_rgb(run, target, predicted, perceptual)
+        at = recordings(run, target, predicted)
+        of_view = describe(run, target) | score_rgb(run, target, predicted, at, perceptual)
         of_view |= score_radiance(target, predicted, gauge) if gauge else {}
         scores.append(of_view | (score_geometry(target, file, units) if units else {}))
-    write_pictures(run, targets, radiance, gauge, folder)
+        write_picture(target, predicted, at[target.bracket], gauge, exposure, folder)
     result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes} | summary(run, scores, notes)
     result |= told_of_radiance(gauge) | told_of_geometry(units)
     if truth is not None:
@@ -202,13 +204,10 @@ def mean_of(views: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {"views": len(views)} | {k: float(np.mean(x)) for k, x in means.items() if x}
 
 
-def write_pictures(run: Run, targets: Sequence[Target], radiance: Sequence[Tensor], gauge: Gauge | None, folder: Path) -> None:
-    """Per view prediction | truth | 4 x error, as recorded and, where the radiance is known, tone-mapped for a display."""
-    known = [t.radiance.reshape(-1, 3) for t in targets if t.radiance is not None]
-    exposure = color.auto_exposure(torch.cat(known)) if known else 1.0
-    for target, predicted in zip(targets, radiance, strict=True):
-        pairs = [(recorded(run, target, predicted, target.bracket), target.rgb[target.bracket])]
-        if gauge is not None and target.radiance is not None:
-            pairs.append((color.display(predicted * gauge.scale, exposure), color.display(target.radiance, exposure)))
-        rows = [[p.numpy(), t.numpy(), (4 * (p - t).abs()).clip(0, 1).numpy()] for p, t in pairs]
-        io.write_png(folder / f"{target.name}.png", io.contact_sheet(rows))
+def write_picture(target: Target, predicted: Tensor, own: Tensor, gauge: Gauge | None, exposure: float, folder: Path) -> None:
+    """Prediction | truth | 4 x error, as recorded (`own`) and, where the radiance is known, tone-mapped for a display at `exposure`."""
+    pairs = [(own, target.rgb[target.bracket])]
+    if gauge is not None and target.radiance is not None:
+        pairs.append((color.display(predicted * gauge.scale, exposure), color.display(target.radiance, exposure)))
+    rows = [[p.numpy(), t.numpy(), (4 * (p - t).abs()).clip(0, 1).numpy()] for p, t in pairs]
+    io.write_png(folder / f"{target.name}.png", io.contact_sheet(rows))

@@ -273,7 +273,7 @@ class Trainer:
         for i in chosen:
             f = self.scene.train[i]
             camera = self.camera(i)
-            rgb = recorded(self.field, camera, f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
+            rgb = recorded(self.field, camera, f.time, [self.tonemapper.look(f.bracket, f.camera_id, i)])[0].view_as(f.image)
             found.append(Misfit(camera, f.time, (rgb - f.image).abs().mean(-1)))
         return found
 
@@ -343,6 +343,6 @@ class Trainer:
         """The middle frame as recorded and as rendered, side by side."""
         i = len(self.scene.train) // 2
         f = self.scene.train[i]
-        rgb = recorded(self.field, self.camera(i), f.time, self.tonemapper.look(f.bracket, f.camera_id, i)).view_as(f.image)
+        rgb = recorded(self.field, self.camera(i), f.time, [self.tonemapper.look(f.bracket, f.camera_id, i)])[0].view_as(f.image)
         pair = torch.cat([f.image, rgb], 1).cpu().numpy()
         write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)

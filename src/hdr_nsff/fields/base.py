@@ -7,7 +7,7 @@ they are handed a `Look` from outside."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
@@ -105,13 +105,16 @@ class RecordingField(RadianceField, Protocol):
     """A field whose recordings do not follow from its composited radiance, because the camera acts on samples (HDR-HexPlane) or inside
     the network (NeRF-W)."""
 
-    def record(self, camera: Camera, time: float, look: Look) -> Tensor:
-        """What is recorded (S, 3) in [0, 1] of every pixel, row by row, without gradients; chunks itself."""
+    def record(self, camera: Camera, time: float, looks: Sequence[Look]) -> list[Tensor]:
+        """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row, without gradients; chunks itself."""
         ...
 
 
-def recorded(field: RadianceField, camera: Camera, time: float, look: Look, radiance: Tensor | None = None) -> Tensor:
-    """What is recorded (S, 3) in [0, 1] of every pixel, row by row; `radiance` (S, 3) is what the field rendered, if it was."""
+def recorded(
+    field: RadianceField, camera: Camera, time: float, looks: Sequence[Look], radiance: Tensor | None = None
+) -> list[Tensor]:
+    """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row; `radiance` (S, 3) is what the field rendered, if it was."""
     if isinstance(field, RecordingField):
-        return field.record(camera, time, look)
-    return look.rgb(field.render(camera, time, scene_flow=False).radiance if radiance is None else radiance)
+        return field.record(camera, time, looks)
+    seen = field.render(camera, time, scene_flow=False).radiance if radiance is None else radiance
+    return [look.rgb(seen) for look in looks]

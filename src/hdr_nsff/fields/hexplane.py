@@ -11,7 +11,7 @@ appearance features, softplus density, a view-dependent network of three layers,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -94,8 +94,9 @@ class HexPlane(nn.Module):
         """A time (in frames) as a share of the training times."""
         return knot_of(self.times, time) / max(len(self.times) - 1, 1)
 
-    def see(self, m: March, time: float, look: Look | None, rng: torch.Generator | None) -> tuple[Render, Tensor]:
-        """Rays (N rays, S samples) at a time, recorded before compositing if there is a `look`; and the weights (N, S)."""
+    def see(self, m: March, time: float, looks: Sequence[Look], rng: torch.Generator | None) -> tuple[Render, Tensor]:
+        """Rays (N rays, S samples) at a time, with what each of the `looks` records before compositing side by side in `rgb`; and the
+        weights (N, S)."""
         flat, shape, share = m.coords.reshape(-1, 3), m.depths.shape, self.share(time)
         asked = self.cells.asks(flat, 0.0, self.config.explore if rng is not None else 0.0, rng).nonzero()[:, 0]
         raw = self.to_density(self.density_planes(flat[asked], share))[:, 0]
@@ -111,9 +112,9 @@ class HexPlane(nn.Module):
         packed = w.reshape(-1)[coloured, None]
 
         def composite(values: Tensor) -> Tensor:
-            return values.new_zeros(shape[0], 3).index_add(0, ray, packed * values)
+            return values.new_zeros(shape[0], values.shape[1]).index_add(0, ray, packed * values)
 
-        rgb = None if look is None else composite(look.rgb(radiance))
+        rgb = composite(torch.cat([look.rgb(radiance) for look in looks], 1)) if looks else None
         depth = volume.expected_depth(w, m.depths, self.far)
         return Render(composite(radiance), depth, w.sum(-1), torch.zeros_like(depth), rgb=rgb), w
 
@@ -128,27 +129,27 @@ class HexPlane(nn.Module):
         assert batch.look is not None
         rng = torch.Generator().manual_seed(batch.seed)
         m = march(self.space, batch.camera, batch.pixels, self.config.samples, self.near, self.far, rng)
-        render, w = self.see(m, batch.time, batch.look, rng)
+        render, w = self.see(m, batch.time, [batch.look], rng)
         self.cells.observe(m.coords.reshape(-1, 3), w.reshape(-1))
         return render, {"total_variation": self.density_planes.total_variation() + self.appearance_planes.total_variation()}
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True, look: Look | None = None
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True, looks: Sequence[Look] = ()
     ) -> Render:
         """Every pixel of `camera` (row by row) or `pixels` (S, 2) at `time` in frames. It tells no scene flow and no share of motion."""
 
         def part(chunk: Tensor) -> Render:
             m = march(self.space, camera, chunk, self.config.render_samples, self.near, self.far, None)
-            return self.see(m, time, look, None)[0]
+            return self.see(m, time, looks, None)[0]
 
         return in_chunks(self, camera, pixels, part)
 
-    def record(self, camera: Camera, time: float, look: Look) -> Tensor:
-        """What is recorded (S, 3) in [0, 1] of every pixel, row by row."""
-        rgb = self.render(camera, time, look=look).rgb
+    def record(self, camera: Camera, time: float, looks: Sequence[Look]) -> list[Tensor]:
+        """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row; one render tells them all."""
+        rgb = self.render(camera, time, looks=looks).rgb
         assert rgb is not None
-        return rgb.clamp(0, 1)
+        return list(rgb.clamp(0, 1).split(3, 1))
 
     def param_groups(self) -> list[dict[str, Any]]:
         """Planes and networks, at the published rates."""

@@ -8,6 +8,7 @@ the exposure of the frames that show it."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -143,9 +144,9 @@ class NerfWT(TwoBranches):
         self.codes.images = self.codes.reference if look is None else look.images
         return in_chunks(self, camera, pixels, lambda chunk: self.render_chunk(camera, time, chunk))
 
-    def record(self, camera: Camera, time: float, look: Look) -> Tensor:
-        """What is recorded (S, 3) in [0, 1] of every pixel, row by row."""
-        return look.rgb(self.render(camera, time, look=look).radiance)
+    def record(self, camera: Camera, time: float, looks: Sequence[Look]) -> list[Tensor]:
+        """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row."""
+        return [look.rgb(self.render(camera, time, look=look).radiance) for look in looks]
 
     def render_chunk(self, camera: Camera, time: float, pixels: Tensor) -> Render:
         """A few thousand pixels at once."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from hdr_nsff import io
 from hdr_nsff.batch import Look
 from hdr_nsff.fields import base
-from hdr_nsff.interpolate import render_at
+from hdr_nsff.interpolate import LayeredField, render_at
 from hdr_nsff.paths import View
 from hdr_nsff.progress import track
 from hdr_nsff.run import Run
@@ -54,7 +54,8 @@ def look(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
     camera, times = to_device(view.camera, device_of(run)), run.scene.times.tolist()
     with torch.no_grad():
         seen = render_at(run.field, camera, view.time, times, scene_flow=motion)
-        flows = (seen.scene_flow or run.field.render(camera, view.time).scene_flow) if motion else {}
+        again = motion and not seen.scene_flow and isinstance(run.field, LayeredField)
+        flows = run.field.render(camera, view.time).scene_flow if again else seen.scene_flow
 
     def image(values: Tensor) -> np.ndarray:
         return values.reshape(camera.height, camera.width, *values.shape[1:]).float().cpu().numpy()
@@ -92,19 +93,23 @@ def geometry_of(path: Path, view: View) -> Geometry:
     return Geometry(depth, flow, scene_flow)
 
 
-def recorded(run: Run, target: Target, radiance: Tensor, bracket: int) -> Tensor:
-    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run rendered of the target, at a bracket of the scene."""
-    return seen_by(run, target, radiance, run.tonemapper.look(bracket, target.camera_id))
+def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
+    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run rendered of the target, at every bracket at which
+    the target is known."""
+    brackets = list(target.rgb)
+    looks = [run.tonemapper.look(b, target.camera_id) for b in brackets]
+    return dict(zip(brackets, seen_by(run, target, radiance, looks), strict=True))
 
 
-def developed(run: Run, target: Target, radiance: Tensor, ev: float) -> Tensor:
-    """The same at any exposure, `ev` relative to the reference bracket."""
-    return seen_by(run, target, radiance, run.tonemapper.look_at(ev, target.camera_id))
+def developed(run: Run, target: Target, radiance: Tensor, evs: Sequence[float]) -> list[Tensor]:
+    """The same at any exposures, `evs` relative to the reference bracket."""
+    return seen_by(run, target, radiance, [run.tonemapper.look_at(ev, target.camera_id) for ev in evs]) if evs else []
 
 
-def seen_by(run: Run, target: Target, radiance: Tensor, look: Look) -> Tensor:
-    """The same as a given recording looks."""
+def seen_by(run: Run, target: Target, radiance: Tensor, looks: Sequence[Look]) -> list[Tensor]:
+    """The same as given recordings look."""
     device = device_of(run)
     with torch.no_grad():
         camera, flat = to_device(target.view.camera, device), radiance.reshape(-1, 3).to(device)
-        return base.recorded(run.field, camera, target.view.time, look, flat).cpu().reshape(radiance.shape)
+        pictures = base.recorded(run.field, camera, target.view.time, looks, flat)
+    return [p.cpu().reshape(radiance.shape) for p in pictures]

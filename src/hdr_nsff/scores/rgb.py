@@ -7,17 +7,18 @@ from torch import Tensor
 
 from hdr_nsff import metrics
 from hdr_nsff.run import Run
-from hdr_nsff.scores.predictions import developed, recorded
+from hdr_nsff.scores.predictions import developed
 from hdr_nsff.scores.targets import Target, moving_of
 
 SMALLEST_LPIPS = 64  # pixels
 
 
-def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lpips | None) -> dict[str, float]:
-    """Recorded rgb at the view's own exposure, and PSNR averaged over all exposures of the clip at which the view is known, and over those that
-    no frame of the clip has; moving-only numbers where there is a mask with something in it."""
+def score_rgb(
+    run: Run, target: Target, radiance: Tensor, at: dict[int, Tensor], perceptual: metrics.Lpips | None
+) -> dict[str, float]:
+    """What is recorded `at` each bracket, {bracket: (H, W, 3)}: at the view's own exposure, and PSNR averaged over all exposures of the clip at
+    which the view is known, and over those that no frame of the clip has; moving-only numbers where there is a mask with something in it."""
     moving = moving_of(target)
-    at = {b: recorded(run, target, radiance, b) for b in target.rgb}
     own, truth = at[target.bracket], target.rgb[target.bracket]
     scores: dict[str, float] = {"psnr": metrics.psnr(own, truth), "ssim": metrics.ssim(own, truth)}
     if moving is not None:
@@ -27,7 +28,7 @@ def score_rgb(run: Run, target: Target, radiance: Tensor, perceptual: metrics.Lp
         if moving is not None:
             scores["lpips_moving"] = perceptual.on_mask(own, truth, moving)
     every = [(at[b], rgb) for b, rgb in target.rgb.items()]
-    novel = [(developed(run, target, radiance, ev), rgb) for ev, rgb in target.novel.items()]
+    novel = list(zip(developed(run, target, radiance, list(target.novel)), target.novel.values(), strict=True))
     for name, pairs in (("all_exposures", every), ("novel_exposures", novel)):
         if pairs:
             scores[f"psnr_{name}"] = float(np.mean([metrics.psnr(p, t) for p, t in pairs]))

@@ -5,6 +5,7 @@ The views are spread evenly over those that the headline is of, so every method 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from hdr_nsff import io
 from hdr_nsff.evaluate import headline_targets, mean_of
 from hdr_nsff.notes import CurvePoint, ShownView
 from hdr_nsff.run import Run, snapshots
-from hdr_nsff.scores.predictions import predict, radiance_of, recorded
+from hdr_nsff.scores.predictions import predict, radiance_of, recordings
 from hdr_nsff.scores.radiance import find_gauge, score_radiance
 from hdr_nsff.scores.rgb import score_rgb
 from hdr_nsff.scores.targets import Target, moving_of
@@ -50,8 +51,16 @@ def scores(run: Run, targets: Sequence[Target], files: Sequence[Path]) -> list[d
     """The scores of predictions, view by view; radiance after one scale for these views."""
     radiance = [radiance_of(f) for f in files]
     gauge = find_gauge(targets, radiance)
-    pairs = list(zip(targets, radiance, strict=True))
-    return [score_rgb(run, t, r, None) | (score_radiance(t, r, gauge) if gauge else {}) for t, r in pairs]
+    found = []
+    for target, predicted in zip(map(of_its_exposure, targets), radiance, strict=True):
+        of_view = score_rgb(run, target, predicted, recordings(run, target, predicted), None)
+        found.append(of_view | (score_radiance(target, predicted, gauge) if gauge else {}))
+    return found
+
+
+def of_its_exposure(target: Target) -> Target:
+    """The target at its own exposure alone, which is all that is shown."""
+    return replace(target, rgb={target.bracket: target.rgb[target.bracket]}, novel={})
 
 
 def kept(of_view: dict[str, Any]) -> dict[str, float]:
@@ -68,7 +77,7 @@ def show(run: Run, target: Target) -> None:
     """Write RUN/shown/NAME_run.png, NAME_truth.png and, where something moves, NAME_moving.png, as recorded at the view's own exposure."""
     folder, moving = run.folder / "shown", moving_of(target)
     predicted = radiance_of(run.folder / "evaluation" / f"{target.name}.exr")
-    io.write_png(folder / f"{target.name}_run.png", recorded(run, target, predicted, target.bracket).numpy())
+    io.write_png(folder / f"{target.name}_run.png", recordings(run, of_its_exposure(target), predicted)[target.bracket].numpy())
     io.write_png(folder / f"{target.name}_truth.png", target.rgb[target.bracket].numpy())
     if moving is not None:
         io.write_png(folder / f"{target.name}_moving.png", moving.numpy())
