@@ -19,7 +19,7 @@ import numpy as np
 
 from hdr_nsff import notes
 from hdr_nsff.datasets import blender, hdr_nerf, layout_of, llff, maps, nerfstudio
-from hdr_nsff.datasets.capture import Capture, Clock, named_file, parse_extra, read_document, reorder
+from hdr_nsff.datasets.capture import Capture, Clock, Extra, named_file, parse_extra, read_document, reorder
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import hash_file, shrink
 from hdr_nsff.io import read_exr, read_image, write_exr, write_json, write_png
@@ -110,7 +110,8 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
     views = []
     for k in kept:
         file = named_file(root, names[k], f"a held-out view of {nerfstudio.NAME}")
-        name = re.sub(r"[^A-Za-z0-9._-]", "_", Path(names[k]).with_suffix("").as_posix())
+        plain = Path(names[k].removeprefix(nerfstudio.VIEWS)).with_suffix("").as_posix()
+        name = re.sub(r"[^A-Za-z0-9._-]", "_", plain)
         if extra is None:
             views.append(HeldOut(name, clock(times[k]), [(file, None)]))
             continue
@@ -122,7 +123,11 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
 
 def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
     """`mv_images/<time>/<camera>.png` of the cameras that no training picture of that time is from, `mv_images_time/` half a frame
-    later, their masks in `mv_masks/` and `mv_masks_time/`."""
+    later, their masks in `mv_masks/` and `mv_masks_time/`. Of a set that `export` wrote, the ones that it noted."""
+    dense = llff.dense_folder(capture.root)
+    extra = llff.noted(dense, [Path(p.source).name for p in capture.pictures])
+    if extra is not None and extra.held_out:
+        return noted_views(capture, dense, extra)
     count = len(capture.pictures)
     views, rows = [], []
     for name, later in zip(llff.MULTI_VIEW, (0.0, 0.5), strict=True):
@@ -139,6 +144,18 @@ def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
                 views.append(view)
                 rows.append(k)
     return views, reorder(capture_poses(capture), rows)
+
+
+def noted_views(capture: Capture, dense: Path, extra: Extra) -> tuple[list[HeldOut], Given]:
+    """The views that `export --truth` wrote below `dense`: some times, some cameras."""
+    views = []
+    source = {Path(p.source).name: p.source for p in capture.pictures}
+    for name, own in extra.held_out.items():
+        like: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
+        picture = named_file(dense, name, f"held-out view {own.name}")
+        mask = None if own.mask is None else named_file(dense, own.mask, f"the moving mask of held-out view {own.name}")
+        views.append(HeldOut(own.name, own.time, [(picture, like)], mask=mask, anchor=source[own.anchor]))
+    return views, reorder(capture_poses(capture), [capture.row[str(v.anchor)] for v in views])
 
 
 def cameras_of(folder: Path, steps: range) -> int:
