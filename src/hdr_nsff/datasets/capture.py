@@ -160,12 +160,12 @@ def parse_extra(path: Path, value: Any, names: Sequence[str]) -> Extra:
         raise InputError(f"{path}: what `export` noted there is damaged ({first_problem(error)}); export again") from error
     if lost := [n for n in names if n not in extra.frames]:
         raise InputError(f"{path}: no entry for picture {lost[0]}, which holds its time and exposure; export again")
-    brackets = [f.bracket for f in (*extra.frames.values(), *extra.held_out.values())]
+    brackets = [f.bracket for f in extra.frames.values()] + [v.bracket for v in extra.held_out.values()]
     problem = bracket_problem(brackets, extra.bracket_ev, extra.reference_bracket)
     if any(f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic) for f in extra.frames.values()):
         problem = "a K is no 3x3 camera matrix"
-    if lost := {v.anchor for v in extra.held_out.values()} - set(names):
-        problem = f"held-out views have the pose of {min(lost)}, which is no training picture"
+    if strange := {v.anchor for v in extra.held_out.values()} - set(names):
+        problem = f"held-out views have the pose of {min(strange)}, which is no training picture"
     if problem is not None:
         raise InputError(f"{path}: {problem}; export again")
     return extra
