@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff import notes
-from hdr_nsff.datasets import blender, hdr_nerf, layout_of, llff, maps, nerfstudio
+from hdr_nsff.datasets import blender, hdr_nerf, hdr_nerf_real, layout_of, llff, maps, nerfstudio
 from hdr_nsff.datasets.capture import Capture, Clock, Extra, named_file, parse_extra, read_document, reorder
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import hash_file, shrink
@@ -53,7 +53,13 @@ def truth_folder(place: Path) -> Path | None:
 
 def read(capture: Capture) -> tuple[list[HeldOut], Given]:
     """The views that a set keeps back, and their poses, row by row. InputError where something is missing or short."""
-    readers = {"nerfstudio": from_nerfstudio, "hdr-nerf": from_hdr_nerf, "blender": from_blender, "hdr-gopro": from_llff}
+    readers = {
+        "nerfstudio": from_nerfstudio,
+        "hdr-nerf": from_hdr_nerf,
+        "hdr-nerf-real": from_hdr_nerf_real,
+        "blender": from_blender,
+        "hdr-gopro": from_llff,
+    }
     name = layout_of(capture.root)
     assert name is not None, capture.root
     return readers[name](capture)
@@ -94,6 +100,15 @@ def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
         exr = root / "test_hdr" / f"hdr_{k:03d}.exr"
         views.append(HeldOut(f"{k:04d}", None, pictures, exr if exr.is_file() else None))
     return views, blender.poses(path, document)
+
+
+def from_hdr_nerf_real(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """All five exposures of every second pose."""
+    given, ev = hdr_nerf_real.rows(capture.root)
+    files = hdr_nerf_real.pictures(capture.root, len(ev))
+    poses = hdr_nerf_real.held_out_rows(len(ev))
+    views = [HeldOut(f"{k:04d}", None, [(files[row], ev[row]) for row in rows]) for k, rows in enumerate(poses)]
+    return views, reorder(given, [rows[0] for rows in poses])
 
 
 def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
