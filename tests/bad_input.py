@@ -44,13 +44,13 @@ def verbs_with(setting: str) -> list[str]:
 
 FOOTAGE_VERBS = verbs_with("clip")  # that read footage
 RUN_VERBS = verbs_with("run")  # that read a run
-WORKING_VERBS = [
-    v for v in cli.VERBS if v not in ("weights", "finetune-flow")
-]  # that write something; the latter needs a network: its own tests
+WORKING_VERBS = [v for v in cli.VERBS if v != "weights"]  # that write something
 
 
 def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
-    """Every working verb on `run` (with its scene beside it) or `footage`; all but `evaluate` write to `out`."""
+    """Every working verb on `run` (with its scene beside it) or `footage`; all but `evaluate` write to `out`. `finetune-flow` wants the
+    fixture `flow_data` beside the run."""
+    flow = ["--data", run.parent / "pairs", "--weights", run.parent / "flow.pkl", "--size", "128x128", "--steps", 3, "--batch", 1]
     return {
         "run": ["run", footage, out],
         "prepare": ["prepare", footage, out],
@@ -61,6 +61,7 @@ def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
         "report": ["report", run, "--out", out / "report.html"],
         "reexpose": ["reexpose", footage, out],
         "synth": ["synth", "interior", out],
+        "finetune-flow": ["finetune-flow", out, *flow, "--measure", 1, "--checkpoint-steps", 1, "--device", "cpu"],
         "bench": ["bench", out, "--scenes", run.parent / "scene", "--methods", "tiny", "--steps", 1, "--device", "cpu"],
     }
 

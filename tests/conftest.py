@@ -5,8 +5,11 @@ import shutil
 from pathlib import Path
 
 import pytest
+import torch
 from toy_scene import ToyScene
 
+from hdr_nsff.priors import flow_networks
+from hdr_nsff.priors.gmflow import GMFlow
 from hdr_nsff.scene import Scene
 
 
@@ -40,3 +43,13 @@ def run_folder(trained: Path, tmp_path: Path) -> Path:
     config = json.loads((tmp_path / "ü b/run/config.json").read_text())
     (tmp_path / "ü b/run/config.json").write_text(json.dumps({**config, "scene": str(tmp_path / "ü b/scene")}))
     return tmp_path / "ü b/run"
+
+
+@pytest.fixture
+def flow_data(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beside the run, what `finetune-flow` wants: five pairs whose flow is known, and a tiny network."""
+    from test_flow_sets import synth
+
+    monkeypatch.setattr(flow_networks, "GMFlow", lambda bf16: GMFlow(8, 1))
+    torch.save(GMFlow(8, 1).state_dict(), run_folder.parent / "flow.pkl")
+    synth(run_folder.parent / "pairs", frames=6, size=(48, 64))

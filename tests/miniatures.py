@@ -198,6 +198,21 @@ def hdr_nerf(root: Path) -> Path:
     return root
 
 
+def hdr_nerf_real(root: Path) -> Path:
+    """Twelve poses, five exposures each, two stops apart."""
+    rows = []
+    for n in range(12):
+        c2w = pose(0.1 * n)
+        right, down, forward, centre = c2w.T
+        matrix = np.stack([down, right, -forward, centre, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
+        for e in range(5):
+            ev = 2.0 * (e - 2)
+            rows.append([*matrix.ravel(), 3.0, 5.0, 2.0**ev])
+            write_png(root / f"input_images/{n:03d}_{e}.png", see(c2w, ev))
+    write_npy(root / "poses_bounds_exps.npy", np.array(rows))
+    return root
+
+
 # nerfstudio
 
 

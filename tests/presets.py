@@ -31,7 +31,8 @@ NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
     "nerf-wt-paper": MLP,
     "hdr-hexplane": HEXPLANE,
     "hdr-hexplane-paper": HEXPLANE,
-    "grid-sigmoid": GRID,  # the one ablation whose field differs
+    "grid-sigmoid": GRID,  # the ablation whose field differs
+    "splat-sigmoid": SplatConfig(static=400, moving=150, bases=2, radiance="sigmoid"),
 }
 
 

@@ -23,6 +23,7 @@ def full(handle: int) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.usefixtures("flow_data")
 @pytest.mark.parametrize("verb", WORKING_VERBS)
 def test_a_full_disk_is_one_sentence(
     verb: str, run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
@@ -33,6 +34,22 @@ def test_a_full_disk_is_one_sentence(
         patch.setattr(os, "fsync", full)
         assert "the disk is full" in refused(capsys, *commands(run_folder, footage, out)[verb])
     assert not snapshot(out) and snapshot(run_folder) == before
+
+
+@pytest.mark.usefixtures("flow_data")
+def test_a_disk_that_fills_up_while_a_flow_network_learns_loses_no_checkpoint(
+    run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command, out, sync = commands(run_folder, tmp_path, tmp_path / "out")["finetune-flow"], tmp_path / "out", os.fsync
+
+    def filled(handle: int) -> None:
+        full(handle) if list(out.glob("checkpoints/step_*")) else sync(handle)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", filled)
+        assert "the disk is full" in refused(capsys, *command)
+    assert [p.name for p in (out / "checkpoints").iterdir()] == ["step_00000001.safetensors"]
+    assert call(*command) == 0 and (out / "weights.safetensors").is_file()
 
 
 @pytest.mark.parametrize("layout", ["hdr-gopro", "nerfstudio"])

@@ -62,6 +62,7 @@ def test_a_name_that_is_no_text_is_refused_and_shown(tmp_path: Path, capsys: Cap
     assert "UTF-8" in refused(capsys, "prepare", footage, tmp_path / "scene")
 
 
+@pytest.mark.usefixtures("flow_data")
 @pytest.mark.parametrize("place", ["file", "file/below", "y" * 300])
 @pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v != "evaluate"])
 def test_a_place_that_cannot_be_written_is_named(

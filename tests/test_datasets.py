@@ -1,6 +1,7 @@
 """Public layouts: each is recognised for what it is, footage for none of them, and in every convention a known point is where its
 picture shows it, in training pictures and held-out ones."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import miniatures as mini
@@ -20,11 +21,13 @@ SETS = {
     "hdr-hexplane": mini.blender,
     "hdr-4d": lambda root: mini.blender(root, "hdr4d"),
     "hdr-nerf": mini.hdr_nerf,
+    "hdr-nerf-real": mini.hdr_nerf_real,
     "nerfstudio": mini.nerfstudio,
 }
 NAMES = {
     "hdr-gopro": "HDR-GoPro / NSFF (LLFF)", "d-nerf": "D-NeRF (Blender)", "nerf": "NeRF synthetic (Blender)",
-    "hdr-hexplane": "HDR-HexPlane (Blender)", "hdr-4d": "HDR-4D (Blender)", "hdr-nerf": "HDR-NeRF (synthetic)", "nerfstudio": "nerfstudio",
+    "hdr-hexplane": "HDR-HexPlane (Blender)", "hdr-4d": "HDR-4D (Blender)", "hdr-nerf": "HDR-NeRF (synthetic)",
+    "hdr-nerf-real": "HDR-NeRF (real)", "nerfstudio": "nerfstudio",
 }  # fmt: skip
 
 
@@ -114,6 +117,7 @@ def test_pictures_of_one_time_are_of_several_cameras() -> None:
         ("d-nerf", "train/0003.png", "training picture 3"),
         ("hdr-nerf", "train/r_1_2.png", "exposure 2 of training view 1"),
         ("hdr-nerf", "exposure_train.json", "exposure times of the train pictures"),
+        ("hdr-nerf-real", "input_images/003_2.png", "59 pictures, but .* cameras and exposures of 60"),
         ("nerfstudio", "images/frame_00003.png", "a training picture"),
         ("nerfstudio", "depth/3.npy", "depth of images/frame_00003.png"),
     ],
@@ -155,6 +159,24 @@ def test_a_transforms_file_cut_short_is_one_sentence(name: str, text: str, tmp_p
     path = tmp_path / ("transforms.json" if name == "nerfstudio" else "transforms_train.json")
     path.write_text(text)
     with pytest.raises(InputError, match=path.name):
+        recognise(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda t: t[:, :17], r"expected an array \(frames, 18\)"),
+        (lambda t: t[:58], "58 rows, but every pose has 5"),
+        (lambda t: t * np.where(np.arange(18) == 17, -1, 1), "exposure time in its last column"),
+        (lambda t: t[:55], "60 pictures, but .* of 55"),
+    ],
+)
+def test_cameras_of_real_hdr_nerf_scenes_that_make_no_sense_are_one_sentence(
+    change: Callable[[np.ndarray], np.ndarray], words: str, tmp_path: Path
+) -> None:
+    path = mini.hdr_nerf_real(tmp_path) / "poses_bounds_exps.npy"
+    np.save(path, change(np.load(path)))
+    with pytest.raises(InputError, match=words):
         recognise(tmp_path)
 
 

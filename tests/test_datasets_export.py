@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, Literal
 
 import miniatures as mini
 import numpy as np
@@ -14,11 +16,12 @@ from toy_scene import ToyScene
 from hdr_nsff.datasets import recognise, to_colmap
 from hdr_nsff.errors import InputError
 from hdr_nsff.export import ExportConfig, Look, export
-from hdr_nsff.io import read_mask, read_npy, write_npy, write_png
+from hdr_nsff.io import read_image, read_mask, read_npy, write_exr, write_json, write_npy, write_png
 from hdr_nsff.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.colmap import read_model
+from hdr_nsff.recording import response_curve
 from hdr_nsff.scene import FrameEntry, Manifest, Scene
-from hdr_nsff.truth import Truth, true_pictures
+from hdr_nsff.truth import Truth, TruthView, true_pictures
 
 LAYOUTS = ("hdr-gopro", "nerfstudio")
 
@@ -209,3 +212,143 @@ def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(scene: Path,
             export(wrong)
     with pytest.raises(InputError, match="neither a scene folder nor a run folder"):
         export(replace(config, run=tmp_path))
+
+
+# Held-out views
+
+
+EXPOSURES = [2.0, 0.0, -1.0]  # of the toy scene's brackets 0 to 2
+
+
+def write_truth(scene: Path, folder: Path, **changes: Any) -> Truth:
+    """Five views with masks: of another frame's pose at a whole and a half time, as recorded in 16 bits; off the path; at another time.
+    The world of the truth is the scene's, turned, shifted and five times as large."""
+    m, rng = Manifest.load(scene), np.random.default_rng(5)
+    turn, shift = mini.pose(4.0)[:, :3], np.array([1.0, -2.0, 0.5])
+
+    def true(c2w: Any) -> np.ndarray:
+        c2w = np.array(c2w)
+        return np.concatenate([turn @ c2w[:, :3], (5 * turn @ c2w[:, 3] + shift)[:, None]], 1)
+
+    views = []
+    for name, time, anchor, bracket in (("a", 1, 4, 0), ("b", 2.5, 5, 1), ("c", 3, 0, 2), ("off", 2, 2, 1), ("odd", 2.25, 0, 0)):
+        own = {"c2w": true(mini.pose(0.4)).tolist()} if name == "off" else {}
+        views.append(TruthView(name=name, time=time, anchor=anchor, bracket=bracket, mask=f"masks/{name}.png", **own))
+        write_png(folder / f"masks/{name}.png", rng.random((m.height, m.width)) > 0.5)
+        if name == "c":
+            views[-1].recorded = {2: "recorded/c.png"}
+            write_png(folder / "recorded/c.png", rng.random((m.height, m.width, 3)), bits=16)
+        else:
+            views[-1].radiance = f"radiance/{name}.exr"
+            write_exr(folder / f"radiance/{name}.exr", {"RGB": rng.random((m.height, m.width, 3), np.float32)})
+    curve = response_curve("film")
+    truth = Truth(
+        bracket_ev=EXPOSURES, reference_bracket=1, response_x=curve.x.tolist(), response_y=curve.y.tolist(), white_balance=[1.2, 1, 0.9],
+        clip_c2w=[true(f.c2w).tolist() for f in m.frames], views=views, **changes,
+    )  # fmt: skip
+    write_json(folder / "truth.json", truth.model_dump())
+    return truth
+
+
+@pytest.fixture
+def kept(scene: Path) -> tuple[Path, Path, Truth]:
+    """A scene whose brackets' brightness is in the order of the truth's exposures, and its truth."""
+    m = Manifest.load(scene)
+    for f in m.frames:
+        write_png(scene / f.image, read_image(scene / f.image) * (1.0, 0.5, 0.25)[f.bracket])
+    return scene, scene.with_name("truth"), write_truth(scene, scene.with_name("truth"))
+
+
+def carried(scene: Path, name: str) -> np.ndarray:
+    """Where in the scene's world a view stands (3, 4)."""
+    anchors = {"a": 4, "b": 5, "c": 0, "odd": 0}
+    return mini.pose(0.4) if name == "off" else np.array(Manifest.load(scene).frames[anchors[name]].c2w)
+
+
+@pytest.mark.parametrize(("layout", "names"), [("hdr-gopro", "abc"), ("nerfstudio", ["a", "b", "c", "off", "odd"])])
+def test_a_truth_comes_back_with_the_same_views(
+    layout: Literal["hdr-gopro", "nerfstudio"], names: Sequence[str], kept: tuple[Path, Path, Truth]
+) -> None:
+    scene, folder, truth = kept
+    out = export(ExportConfig(scene, scene.with_name("out"), layout=layout, truth=folder))
+    again = prepare(PrepareConfig(out, scene.with_name("again")))
+    place = again.with_name("again_truth")
+    back, before = Truth.open(place), {v.name: v for v in truth.views}
+    assert [v.name for v in back.views] == list(names) and len(Manifest.load(again).frames) == len(Manifest.load(scene).frames)
+    assert back.clip_c2w is not None
+    for view in back.views:
+        old = before[view.name]
+        c2w = np.array(view.c2w or back.clip_c2w[view.anchor])
+        assert np.allclose(c2w, carried(scene, view.name), atol=1e-6 if view.name == "off" else 0, rtol=0)
+        assert (view.time, view.bracket) == (old.time, old.bracket) and view.radiance is None
+        recorded = true_pictures(truth, old, folder)[1][old.bracket]
+        exact = recorded if old.recorded else np.float32(np.rint(recorded * 255) / 255)
+        assert (true_pictures(back, view, place)[1][view.bracket] == exact).all() and exact.std() > 0.05
+        assert view.mask and old.mask and (read_mask(place / view.mask) == read_mask(folder / old.mask)).all()
+
+
+def test_a_view_that_the_gopro_layout_cannot_tell_is_named(
+    kept: tuple[Path, Path, Truth], capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene, folder, _ = kept
+    out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
+    assert "left out 2 of 5 held-out views (off, odd)" in " ".join(capsys.readouterr().err.split())
+    found = sorted(p.relative_to(out / "dense").as_posix() for p in (out / "dense").glob("mv_*/*/*"))
+    assert found == [
+        "mv_images/00001/00005.png", "mv_images/00003/00001.png", "mv_images_time/00002/00006.png",
+        "mv_masks/00001/00005.png", "mv_masks/00003/00001.png", "mv_masks_time/00002/00006.png",
+    ]  # fmt: skip
+
+
+def test_cameras_of_a_rig_keep_their_numbers(kept: tuple[Path, Path, Truth]) -> None:
+    """Frames 0 and 3 are of camera 1, and so on: a view from the pose of frame 4 is of camera 2."""
+    scene, folder, _ = kept
+    m = Manifest.load(scene)
+    for f in m.frames:
+        f.c2w = m.frames[f.index % 3].c2w
+    m.save(scene)
+    write_truth(scene, folder)
+    out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
+    assert (out / "dense/mv_images/00001/00002.png").is_file() and (out / "dense/mv_images_time/00002/00003.png").is_file()
+
+
+def test_a_truth_that_does_not_fit_is_one_sentence(kept: tuple[Path, Path, Truth], tmp_path: Path) -> None:
+    scene, folder, truth = kept
+    config = ExportConfig(scene, tmp_path / "out", layout="nerfstudio", truth=folder)
+    with pytest.raises(InputError, match=r"no truth\.json here"):
+        export(replace(config, truth=tmp_path / "nothing"))
+    with pytest.raises(InputError, match="overlaps the truth folder"):
+        export(replace(config, out=folder / "inside"))
+    with pytest.raises(InputError, match="use it with --layout"):
+        export(replace(config, layout=None, ply=True, out=tmp_path / "a.ply"))
+    assert truth.clip_c2w is not None
+    write_json(folder / "truth.json", truth.model_copy(update={"clip_c2w": truth.clip_c2w[:5]}).model_dump())
+    with pytest.raises(InputError, match="a clip of 5 frames, the scene has 6"):
+        export(config)
+    write_json(folder / "truth.json", truth.model_dump())
+    write_exr(folder / "radiance/b.exr", {"RGB": np.ones((8, 9, 3), np.float32)})
+    with pytest.raises(InputError, match="view b has 9x8 pixels"):
+        export(config)
+
+
+def test_what_export_noted_of_held_out_views_is_checked(kept: tuple[Path, Path, Truth]) -> None:
+    scene, folder, _ = kept
+    out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
+    note = out / "dense/hdr_nsff.json"
+    told = json.loads(note.read_text())
+    (first, entry), *_ = told["held_out"].items()
+    for wrong, words in (
+        ({first: entry | {"anchor": "00099.png"}}, "pose of 00099.png"),
+        ({first: entry | {"bracket": 7}}, "bracket 7"),
+        ({first: entry | {"name": "../up"}}, "name"),
+    ):
+        note.write_text(json.dumps(told | {"held_out": wrong}))
+        with pytest.raises(InputError, match=words):
+            recognise(out)
+    note.write_text(json.dumps(told | {"held_out": {"../../scene/images/00000.png": entry}}))
+    with pytest.raises(InputError, match="points outside the data set"):
+        prepare(PrepareConfig(out, scene.with_name("again")))
+    note.write_text(json.dumps(told))
+    (out / "dense" / first).unlink()
+    with pytest.raises(InputError, match="it is held-out view a"):
+        prepare(PrepareConfig(out, scene.with_name("again")))

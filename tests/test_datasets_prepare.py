@@ -310,6 +310,26 @@ def test_all_five_exposures_of_a_held_out_view_are_kept(tmp_path: Path) -> None:
         assert (read_image(tmp_path / "scene_truth" / name) == np.float32(expected)).all()
 
 
+def test_every_second_pose_of_a_real_hdr_nerf_scene_is_held_out(tmp_path: Path) -> None:
+    config = replace(still(tmp_path, 6, mini.hdr_nerf_real(tmp_path / "set")), masks=None)
+    m = Manifest.load(prepare(config))
+    assert [f.source for f in m.frames] == [f"input_images/{2 * k:03d}_{(0, 2, 4)[k % 3]}.png" for k in range(6)]
+    gauge = m.frames[0].ev
+    assert gauge is not None and [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
+    assert m.steps["mask"].provenance == "given" and m.exposure_given
+    assert all(np.allclose(f.c2w, mini.pose(0.2 * k)) for k, f in enumerate(m.frames) if f.c2w is not None)
+    folder = tmp_path / "scene_truth"
+    truth = Truth.open(folder)
+    assert len(truth.views) == 6 and sum(f is None for f in truth.bracket_frame or []) == 2
+    for k, view in enumerate(truth.views):
+        assert len(view.recorded) == 5 and np.allclose(view.c2w, mini.pose(0.1 * (2 * k + 1)))
+        for bracket, name in view.recorded.items():
+            ev = truth.bracket_ev[bracket]
+            assert ev is not None
+            expected = mini.see(mini.pose(0.1 * (2 * k + 1)), ev - gauge - 4)
+            assert (read_image(folder / name) == np.float32(expected)).all()
+
+
 def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimetres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = PrepareConfig(mini.nerfstudio(tmp_path / "set"), tmp_path / "scene", max_size=W)
     m = Manifest.load(prepare(config))

@@ -33,7 +33,7 @@ def nsff(request: pytest.FixtureRequest, toy: Scene) -> NSFF:
 
 
 def test_every_preset_is_tested() -> None:
-    assert set(NETWORKS) == set(METHODS) | {"grid-sigmoid"} <= set(PRESETS)
+    assert set(NETWORKS) == set(METHODS) | {"grid-sigmoid", "splat-sigmoid"} <= set(PRESETS)
 
 
 def test_a_render_has_the_promised_shapes_and_ranges(field: AnyField, toy: Scene) -> None:

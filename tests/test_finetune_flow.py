@@ -137,6 +137,28 @@ def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneCon
         finetune_flow(config)
 
 
+@pytest.mark.parametrize("text", ["{", "[]", "{}", '{"by_stops": {}}', '{"by_stops": {"0": 3}}'])
+def test_damaged_measurements_are_made_again(text: str, config: FinetuneConfig, capsys: pytest.CaptureFixture[str]):
+    network, pairs, kept = (
+        flow_networks.load("gmflow", config.weights),
+        flow_pairs(config.data[0])[:1],
+        config.out / "before.json",
+    )
+    before = verb.measured(network, pairs, kept)
+    assert verb.measured(network, pairs, kept) == before and "taken for missing" not in capsys.readouterr().err
+    kept.write_text(text)
+    assert verb.measured(network, pairs, kept) == before and "taken for missing" in capsys.readouterr().err
+    assert verb.measured(network, [], kept) == before  # from the file
+
+
+def test_damaged_settings_are_one_sentence(config: FinetuneConfig):
+    verb.claim(config)
+    for text in (b"{", b"\xff"):
+        (config.out / "config.json").write_bytes(text)
+        with pytest.raises(InputError, match="not readable JSON"):
+            finetune_flow(config)
+
+
 def test_another_run_in_the_folder_is_refused(config: FinetuneConfig):
     verb.claim(config)
     verb.claim(config)

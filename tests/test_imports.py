@@ -9,11 +9,12 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
 VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report", "finetune_flow", "weights"}
-TRUTH = {  # who reads it, and the last three, which write it
+TRUTH = {  # who reads it, for `evaluate` and for `export --truth`, and the last three, which write it
     "scores.targets",
     "scores.geometry",
     "scores.camera",
     "evaluate",
+    "datasets.to_held_out",
     "synth",
     "reexpose",
     "datasets.held_out",
@@ -91,7 +92,7 @@ def test_verbs_never_import_each_other(verb: str):
     assert not own_imports(verb) & VERBS
 
 
-def test_the_truth_is_read_by_evaluate_alone():
+def test_the_truth_is_read_for_evaluate_and_export_alone():
     assert {m for m in SOURCES if "truth" in own_imports(m)} == TRUTH
 
 
@@ -111,7 +112,7 @@ def knows_the_truth(modules: set[str]) -> set[str]:
     return {m for m in modules if m in TRUTH | {"truth"} or m.startswith("scores.")}
 
 
-LEARNERS = ["train", "steps.footage", "steps.priors", "datasets", "scene", "batch", "config", "run", "render", "export"]
+LEARNERS = ["train", "steps.footage", "steps.priors", "datasets", "scene", "batch", "config", "run", "render"]
 
 
 @pytest.mark.parametrize("module", LEARNERS)
@@ -125,6 +126,12 @@ def test_nothing_that_learns_or_prepares_can_reach_held_out_truth(module: str):
 def test_prepare_reaches_the_truth_through_its_writer_alone():
     assert knows_the_truth(reached("prepare")) == {"datasets.held_out", "truth"}
     assert not knows_the_truth(reached("prepare", without=frozenset({"datasets.held_out"})))
+
+
+def test_export_reaches_the_truth_through_what_it_writes_it_with():
+    door = "datasets.to_held_out"
+    assert knows_the_truth(reached("export")) == {door, "truth"} and {m for m in SOURCES if door in own_imports(m)} == {"export"}
+    assert not knows_the_truth(reached("export", without=frozenset({door})))
 
 
 def test_only_prepare_writes_what_data_sets_keep_back():

@@ -10,9 +10,12 @@ import pytest
 from tiny_networks import tiny_depth_anything, tiny_sam2
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_mask, read_npy, write_npy, write_png
+from hdr_nsff.io import read_mask, read_npy, write_npy, write_png, write_text
 from hdr_nsff.prepare import PrepareConfig, prepare
+from hdr_nsff.priors.semantic import SemanticConfig
+from hdr_nsff.priors.weights import KNOWN
 from hdr_nsff.scene import Manifest
+from hdr_nsff.steps.neural import weights_of
 
 COUNT, H, W, FOCAL, SIDE = 9, 64, 96, 80.0, 20
 
@@ -120,3 +123,60 @@ def test_weights_that_are_not_there_stop_it_at_the_door(clip, tmp_path, monkeypa
         with pytest.raises(InputError, match=words):
             prepare(replace(clip, out=tmp_path / "scene", **chosen))
     assert not (tmp_path / "scene").exists()
+
+
+def changed(weights: Path) -> None:
+    """Other numbers under the same name."""
+    from safetensors.torch import load_file, save_file
+
+    tensors = load_file(weights)
+    name = sorted(k for k, v in tensors.items() if v.is_floating_point())[0]
+    save_file(tensors | {name: tensors[name] + 1}, weights, metadata={"format": "pt"})
+
+
+def test_a_step_is_done_again_where_its_weights_changed_under_their_name(clip, motion, tmp_path, monkeypatch):
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
+    network = tiny_depth_anything(tmp_path / "cache/depth-anything", "relative")
+    config = replace(clip, out=shutil.copytree(motion, tmp_path / "scene"), depth="depth-anything")
+
+    def attempts() -> dict[str, int]:
+        return {n: s.details["attempt"] for n, s in Manifest.load(prepare(config)).steps.items()}
+
+    before = attempts()
+    assert attempts() == before
+    changed(network / "model.safetensors")
+    assert attempts() == before | {n: before[n] + 1 for n in ("depth", "sheet")}
+
+
+def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
+    for name in ("gmflow", "raft", "xfeat", "aliked", "aliked-lightglue"):
+        monkeypatch.setitem(KNOWN, name, replace(KNOWN[name], sha256=None, inside=""))
+        write_text(tmp_path / "cache" / name / str(KNOWN[name].file), name)
+    write_text(tmp_path / "tuned/weights.safetensors", "tuned")
+    for name in ("sam2", "depth-anything", "dinov2-small"):
+        for file in ("config.json", "model.safetensors"):
+            write_text(tmp_path / "cache" / name / file, name)
+    tuned = {"flow": "raft-finetuned", "flow_weights": tmp_path / "tuned"}
+    read = {
+        "gmflow": ("flow", {"flow": "gmflow"}), "raft": ("flow", {"flow": "raft"}), "xfeat": ("flow", {"flow": "semantic"}),
+        "dinov2-small": ("flow", {"flow": "semantic", "semantic": SemanticConfig(features="dinov2-small")}), "tuned": ("flow", tuned),
+        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("mask", {"masks": "sam2"}),
+        "depth-anything": ("depth", {"depth": "depth-anything"}),
+    }  # fmt: skip
+    for name, (step, chosen) in read.items():
+        config = replace(clip, **chosen)
+        found = weights_of(config, step)
+        folder = tmp_path / "cache" / name if name != "tuned" else tmp_path / "tuned"
+        file = next(p for p in folder.iterdir() if p.suffix != ".json")
+        write_text(file, "something else")
+        assert found and weights_of(config, step) != found, name
+        assert not any(weights_of(config, other) for other in ("frames", "exposure", "sheet"))
+    assert not any(weights_of(replace(clip, flow=None, depth=None, poses=None), s) for s in ("flow", "poses", "mask", "depth"))
+
+
+def test_a_known_file_that_changed_is_refused(clip, tmp_path, monkeypatch):
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
+    write_text(tmp_path / "cache/xfeat/xfeat.pt", "something else")
+    with pytest.raises(InputError, match="has SHA-256"):
+        weights_of(replace(clip, flow="semantic"), "flow")

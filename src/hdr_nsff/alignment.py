@@ -63,6 +63,14 @@ def pose_errors(true: np.ndarray, estimated: np.ndarray) -> dict[str, float]:
     return errors
 
 
+def scale_between(true: np.ndarray, estimated: np.ndarray) -> float | None:
+    """Units of the `estimated` poses (N, 3, 4) per unit of the `true` ones; 1 where both are the same, None where the cameras do not spread."""
+    if np.allclose(true, estimated):
+        return 1.0  # given poses: one world
+    fit = umeyama(true[:, :, 3], estimated[:, :, 3])
+    return None if fit is None else fit.scale
+
+
 def carry(anchor: np.ndarray, true_anchor: np.ndarray, true_view: np.ndarray, scale: float) -> np.ndarray:
     """The pose (3, 4) that stands to the estimated `anchor` as `true_view` stands to `true_anchor`; lengths times `scale`."""
     turn = true_anchor[:, :3].T @ true_view[:, :3]

@@ -75,7 +75,7 @@ PRESET_HELP = {
     "hdr-hexplane-paper": "Baseline: the same at its published size, for a GPU.",
 }
 MORE_PRESETS = (
-    f"Ablations of ours: `grid-NAME` and `splat-NAME` with NAME one of {', '.join(ABLATIONS)} (the last two of `grid` alone); "
+    f"Ablations of ours: `grid-NAME` and `splat-NAME` with NAME one of {', '.join(ABLATIONS)} (no-saturation of `grid` alone); "
     "docs/baselines.md says what each is."
 )
 

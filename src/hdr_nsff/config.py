@@ -262,17 +262,18 @@ def ablated(config: TrainConfig, name: str) -> TrainConfig:
         case "no-saturation":
             return replace(config, saturation=False)
         case "sigmoid":
-            assert isinstance(config.field, BranchesConfig), "Gaussians keep a logarithm of radiance"
+            assert not isinstance(config.field, HexPlaneConfig), "its sigmoid is the camera's"
             return replace(config, field=replace(config.field, radiance="sigmoid"))
         case _:
             return replace(config, tonemap=replace(config.tonemap, kind=RESPONSES[name]))
 
 
 def ablations() -> dict[str, TrainConfig]:
-    """By name, `grid-no-flow` and the like. Gaussians have no term that saturation weighs, and no sigmoid."""
+    """By name, `grid-no-flow` and the like. Gaussians have no term that saturation weighs."""
     presets = {"splat": splat(), "grid": TrainConfig()}
-    without = {"splat": {"no-saturation", "sigmoid"}, "grid": set()}
-    return {f"{p}-{a}": ablated(config, a) for p, config in presets.items() for a in ABLATIONS if a not in without[p]}
+    return {
+        f"{p}-{a}": ablated(config, a) for p, config in presets.items() for a in ABLATIONS if (p, a) != ("splat", "no-saturation")
+    }
 
 
 METHODS: dict[str, TrainConfig] = {

@@ -18,7 +18,8 @@ import torch
 import tyro
 
 from hdr_nsff import io, notes, ply
-from hdr_nsff.datasets import to_llff, to_nerfstudio
+from hdr_nsff.datasets import to_held_out, to_llff, to_nerfstudio
+from hdr_nsff.datasets.to_layout import Source
 from hdr_nsff.errors import InputError
 from hdr_nsff.fields.base import GaussianCloud, RadianceField
 from hdr_nsff.paths import training_path
@@ -49,6 +50,8 @@ class ExportConfig:
 
     transforms.json, images and depth: hdr-nsff export out/scene out/ns --layout nerfstudio
 
+    With held-out views, as recorded: hdr-nsff export out/scene out/ns --layout nerfstudio --truth truth
+
     `hdr-nsff prepare` reads both layouts back to the same scene."""
 
     run: tyro.conf.Positional[Path]
@@ -57,6 +60,8 @@ class ExportConfig:
     """What to write: a file NAME.ply with --ply, a folder with --ply-sequence and --layout."""
     layout: Literal["hdr-gopro", "nerfstudio"] | None = None
     """The scene's frames, poses, masks, depth and flow as HDR-GoPro / NSFF (LLFF), one picture per time, or as nerfstudio's."""
+    truth: Path | None = None
+    """With --layout: a truth folder, as `synth`, `reexpose` and `prepare` write them; its views become held-out pictures of the layout."""
     ply: bool = False
     """One PLY, at --time."""
     ply_sequence: bool = False
@@ -84,7 +89,7 @@ def export(config: ExportConfig) -> Path:
     """The verb: the file or folder that was written."""
     check_settings(config)
     if config.layout is not None:
-        return export_scene(config.run, config.out, config.layout)
+        return export_scene(config.run, config.out, config.layout, config.truth)
     run = Run.open(config.run, config.device)
     with io.writing_to(config.out):
         if config.ply_sequence:
@@ -101,6 +106,8 @@ def check_settings(config: ExportConfig) -> None:
         raise InputError("export: say what to write, one of --ply (a file), --ply-sequence and --layout NAME (a folder)")
     if config.layout is not None and (config.time is not None or look != Look()):
         raise InputError("--layout: writes the recorded frames; --time, --ev, --linear and --camera-id are for Gaussians")
+    if config.layout is None and config.truth is not None:
+        raise InputError("--truth: held-out views are pictures, and Gaussians have none; use it with --layout NAME")
     if config.ply and (config.out.suffix.lower() != ".ply" or config.out.is_dir()):
         raise InputError(f"{config.out}: --ply writes one file; give it a name that ends in .ply")
     if config.ply_sequence and config.out.is_file():
@@ -113,20 +120,23 @@ def check_settings(config: ExportConfig) -> None:
         raise InputError(f"--ev {look.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5")
 
 
-def export_scene(folder: Path, out: Path, layout: Literal["hdr-gopro", "nerfstudio"]) -> Path:
-    """Write the scene of a scene or run folder in a public layout; the folder that was written."""
+def export_scene(folder: Path, out: Path, layout: Literal["hdr-gopro", "nerfstudio"], truth: Path | None = None) -> Path:
+    """Write the scene of a scene or run folder in a public layout, with the views of a `truth` folder; the folder that was written."""
     if not (folder / "scene.json").is_file():
         if not (folder / "config.json").is_file():
             raise InputError(f"{folder}: neither a scene folder nor a run folder; make a scene with `hdr-nsff prepare`")
         folder = read_config(folder).scene
-    if out.resolve().is_relative_to(folder.resolve()) or folder.resolve().is_relative_to(out.resolve()):
-        raise InputError(f"{out}: overlaps the scene folder {folder}; name a folder outside of it")
+    for what, kept in (("scene", folder), ("truth", truth)):
+        if kept is not None and (out.resolve().is_relative_to(kept.resolve()) or kept.resolve().is_relative_to(out.resolve())):
+            raise InputError(f"{out}: overlaps the {what} folder {kept}; name a folder outside of it")
+    source = Source.open(folder)
+    views = to_held_out.views_of(source, truth) if truth is not None else []
     with io.writing_to(out):
         match layout:
             case "hdr-gopro":
-                to_llff.write(folder, out)
+                to_llff.write(source, out, views)
             case "nerfstudio":
-                to_nerfstudio.write(folder, out)
+                to_nerfstudio.write(source, out, views)
     say(f"{out}: the scene in the {layout} layout; `hdr-nsff prepare {out} SCENE` reads it back")
     return out
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 from tyro.conf import Positional
 
+from hdr_nsff import notes
 from hdr_nsff.errors import InputError
 from hdr_nsff.flow_exposures import Example, example, recorded_pair
 from hdr_nsff.flow_sets import FlowPair, flow_pairs, read_sample
@@ -137,11 +138,19 @@ def claim(config: FinetuneConfig) -> None:
         for k, v in asdict(config).items()
         if k not in ("out", "device")
     }
-    if path.is_file() and read_json(path) != settings:
+    if path.is_file() and settings_in(path) != settings:
         raise InputError(f"{config.out}: holds a run with other settings; choose a new folder, or repeat its command")
     if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
         raise InputError(f"{config.out}: holds other files; choose an empty or new folder")
     write_json(path, settings)
+
+
+def settings_in(path: Path) -> Any:
+    """What a run's config.json holds; InputError where it is damaged."""
+    try:
+        return read_json(path)
+    except ValueError as error:
+        raise InputError(f"{path}: not readable JSON ({error}); restore it, or choose a new folder") from error
 
 
 def train(network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig) -> float:
@@ -210,19 +219,19 @@ def measured(network: FlowNetwork, pairs: list[FlowPair], kept: Path | None) -> 
     """End-point error of `pairs` per EV difference, mean and median in pixels of the frames, as `prepare` matches them.
 
     `kept`: a file with the answer, if it is there; where it is not, it is written."""
-    if kept is not None and kept.is_file():
-        return dict(read_json(kept))
+    if kept is not None and (found := notes.read(kept, notes.FlowErrors)) is not None:
+        return {k: e.model_dump() for k, e in found.by_stops.items()}
     errors: dict[str, list[np.ndarray]] = {f"{stops:g}": [] for stops in MEASURED}
     for pair in track(pairs, "measure"):
         sample = read_sample(pair)
         for stops in MEASURED:
-            found = both_ways(network, *recorded_pair(sample.radiance, stops, equal=True))
-            errors[f"{stops:g}"].append(np.linalg.norm(np.stack(found) - sample.flow, axis=-1)[sample.known])
+            flow = np.stack(both_ways(network, *recorded_pair(sample.radiance, stops, equal=True)))
+            errors[f"{stops:g}"].append(np.linalg.norm(flow - sample.flow, axis=-1)[sample.known])
     result = {
         k: {"mean": float(np.concatenate(e).mean()), "median": float(np.median(np.concatenate(e)))} for k, e in errors.items()
     }
     if kept is not None:
-        write_json(kept, result)
+        notes.write(kept, notes.FlowErrors.model_validate({"by_stops": result}))
     return result
 
 

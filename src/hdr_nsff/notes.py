@@ -102,6 +102,19 @@ class Coloured(Note):
     exposures: list[float]  # EV
 
 
+class FlowError(Note):
+    """End-point error, in pixels."""
+
+    mean: float = Field(ge=0)
+    median: float = Field(ge=0)
+
+
+class FlowErrors(Note):
+    """`before.json` of `finetune-flow`: what the network it starts from does to the pairs kept out of training."""
+
+    by_stops: dict[str, FlowError] = Field(min_length=1)  # EV between the two pictures -> error
+
+
 class LogLine(Note):
     """One line of a run's `log.jsonl`."""
 

@@ -1,7 +1,7 @@
 """Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, mask, depth, sheet.
 
-Every step writes its files and then its record into `scene.json`; its key is a hash of its settings and of the steps and inputs it
-builds on. A finished step with the same key is skipped, an unfinished one goes on with the files it has, one with another key
+Every step writes its files and then its record into `scene.json`; its key is a hash of its settings, of the weights of the networks that it
+asks, and of the steps and inputs it builds on. A finished step with the same key is skipped, an unfinished one goes on with the files it has, one with another key
 starts over, and with it whatever builds on it. So killing `prepare` at any moment loses at most the file in the making.
 
 What a data set gives takes the place of an estimate. What it keeps back for testing no step sees: once the scene is whole, it goes
@@ -29,7 +29,7 @@ from hdr_nsff.progress import say, track
 from hdr_nsff.scene import Manifest, Split, Step
 from hdr_nsff.steps import footage as on_footage
 from hdr_nsff.steps import priors as on_priors
-from hdr_nsff.steps.neural import check_networks
+from hdr_nsff.steps.neural import check_networks, weights_of
 from hdr_nsff.steps.work import Part, PrepareConfig, StepName, Work
 
 __all__ = ["PrepareConfig", "prepare"]
@@ -180,7 +180,8 @@ def do(work: Work, name: StepName) -> None:
 
 
 def step_key(work: Work, name: StepName) -> str:
-    """The hash of everything a step depends on: its settings, the files they name, the steps before it and how often those were redone."""
+    """The hash of everything a step depends on: its settings, the files they name, the weights of its networks, the steps before it and how
+    often those were redone."""
     kind = STEPS[name]
     settings: dict[str, Any] = {}
     for s in kind.settings:
@@ -193,7 +194,7 @@ def step_key(work: Work, name: StepName) -> str:
     before = [(n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt")) for n in kind.needs]
     inputs = work.manifest.inputs if name == "frames" else {}
     known = [capture_part(work, name)] if work.capture is not None else []
-    return hashlib.sha256(json.dumps([settings, before, inputs, *known]).encode()).hexdigest()
+    return hashlib.sha256(json.dumps([settings, before, inputs, *known, *weights_of(work.config, name)]).encode()).hexdigest()
 
 
 def capture_part(work: Work, name: StepName) -> Any:

@@ -4,10 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hdr_nsff.datasets import blender, hdr_nerf, llff, nerfstudio
+from hdr_nsff.datasets import blender, hdr_nerf, hdr_nerf_real, llff, nerfstudio
 from hdr_nsff.datasets.capture import Capture
 
-LAYOUTS = {"nerfstudio": nerfstudio, "hdr-nerf": hdr_nerf, "blender": blender, "hdr-gopro": llff}  # the first that fits counts
+LAYOUTS = {  # the first that fits counts
+    "nerfstudio": nerfstudio,
+    "hdr-nerf": hdr_nerf,
+    "hdr-nerf-real": hdr_nerf_real,
+    "blender": blender,
+    "hdr-gopro": llff,
+}
 
 
 def layout_of(folder: Path) -> str | None:

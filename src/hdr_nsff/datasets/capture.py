@@ -122,6 +122,16 @@ class ExtraFrame(Strict):
     moving: str | None = None
 
 
+class ExtraView(Strict):
+    """What the HDR-GoPro layout cannot say of a held-out view."""
+
+    name: str = Field(pattern=r"^[^/\\\x00]{1,100}$")
+    time: float
+    bracket: int = Field(ge=0)
+    anchor: str  # the training picture whose pose it has
+    mask: str | None = None
+
+
 class Extra(Strict):
     """What `export` writes beside a public layout, so that reading it again gives the same scene."""
 
@@ -135,6 +145,7 @@ class Extra(Strict):
     depth_kind: Literal["scene", "relative"]
     points: str | None = None  # .npy (P, 3) static, scene units
     frames: dict[str, ExtraFrame]  # by name of the picture
+    held_out: dict[str, ExtraView] = Field(default_factory=dict)  # by name of the picture, where the layout names none
 
     def exposures(self) -> Exposures:
         """The exposures of the brackets."""
@@ -149,9 +160,12 @@ def parse_extra(path: Path, value: Any, names: Sequence[str]) -> Extra:
         raise InputError(f"{path}: what `export` noted there is damaged ({first_problem(error)}); export again") from error
     if lost := [n for n in names if n not in extra.frames]:
         raise InputError(f"{path}: no entry for picture {lost[0]}, which holds its time and exposure; export again")
-    problem = bracket_problem([f.bracket for f in extra.frames.values()], extra.bracket_ev, extra.reference_bracket)
+    brackets = [f.bracket for f in extra.frames.values()] + [v.bracket for v in extra.held_out.values()]
+    problem = bracket_problem(brackets, extra.bracket_ev, extra.reference_bracket)
     if any(f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic) for f in extra.frames.values()):
         problem = "a K is no 3x3 camera matrix"
+    if strange := {v.anchor for v in extra.held_out.values()} - set(names):
+        problem = f"held-out views have the pose of {min(strange)}, which is no training picture"
     if problem is not None:
         raise InputError(f"{path}: {problem}; export again")
     return extra

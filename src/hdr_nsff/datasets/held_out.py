@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff import notes
-from hdr_nsff.datasets import blender, hdr_nerf, layout_of, llff, maps, nerfstudio
-from hdr_nsff.datasets.capture import Capture, Clock, named_file, parse_extra, read_document, reorder
+from hdr_nsff.datasets import blender, hdr_nerf, hdr_nerf_real, layout_of, llff, maps, nerfstudio
+from hdr_nsff.datasets.capture import Capture, Clock, Extra, named_file, parse_extra, read_document, reorder
 from hdr_nsff.errors import InputError
 from hdr_nsff.ingest import hash_file, shrink
 from hdr_nsff.io import read_exr, read_image, write_exr, write_json, write_png
@@ -53,7 +53,13 @@ def truth_folder(place: Path) -> Path | None:
 
 def read(capture: Capture) -> tuple[list[HeldOut], Given]:
     """The views that a set keeps back, and their poses, row by row. InputError where something is missing or short."""
-    readers = {"nerfstudio": from_nerfstudio, "hdr-nerf": from_hdr_nerf, "blender": from_blender, "hdr-gopro": from_llff}
+    readers = {
+        "nerfstudio": from_nerfstudio,
+        "hdr-nerf": from_hdr_nerf,
+        "hdr-nerf-real": from_hdr_nerf_real,
+        "blender": from_blender,
+        "hdr-gopro": from_llff,
+    }
     name = layout_of(capture.root)
     assert name is not None, capture.root
     return readers[name](capture)
@@ -96,6 +102,15 @@ def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
     return views, blender.poses(path, document)
 
 
+def from_hdr_nerf_real(capture: Capture) -> tuple[list[HeldOut], Given]:
+    """All five exposures of every second pose."""
+    given, ev = hdr_nerf_real.rows(capture.root)
+    files = hdr_nerf_real.pictures(capture.root, len(ev))
+    poses = hdr_nerf_real.held_out_rows(len(ev))
+    views = [HeldOut(f"{k:04d}", None, [(files[row], ev[row]) for row in rows]) for k, rows in enumerate(poses)]
+    return views, reorder(given, [rows[0] for rows in poses])
+
+
 def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
     """The frames that `val_filenames` and `test_filenames` name."""
     root, path = capture.root, capture.root / nerfstudio.NAME
@@ -110,7 +125,8 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
     views = []
     for k in kept:
         file = named_file(root, names[k], f"a held-out view of {nerfstudio.NAME}")
-        name = re.sub(r"[^A-Za-z0-9._-]", "_", Path(names[k]).with_suffix("").as_posix())
+        plain = Path(names[k].removeprefix(nerfstudio.VIEWS)).with_suffix("").as_posix()
+        name = re.sub(r"[^A-Za-z0-9._-]", "_", plain)
         if extra is None:
             views.append(HeldOut(name, clock(times[k]), [(file, None)]))
             continue
@@ -122,7 +138,11 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
 
 def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
     """`mv_images/<time>/<camera>.png` of the cameras that no training picture of that time is from, `mv_images_time/` half a frame
-    later, their masks in `mv_masks/` and `mv_masks_time/`."""
+    later, their masks in `mv_masks/` and `mv_masks_time/`. Of a set that `export` wrote, the ones that it noted."""
+    dense = llff.dense_folder(capture.root)
+    extra = llff.noted(dense, [Path(p.source).name for p in capture.pictures])
+    if extra is not None and extra.held_out:
+        return noted_views(capture, dense, extra)
     count = len(capture.pictures)
     views, rows = [], []
     for name, later in zip(llff.MULTI_VIEW, (0.0, 0.5), strict=True):
@@ -139,6 +159,18 @@ def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
                 views.append(view)
                 rows.append(k)
     return views, reorder(capture_poses(capture), rows)
+
+
+def noted_views(capture: Capture, dense: Path, extra: Extra) -> tuple[list[HeldOut], Given]:
+    """The views that `export --truth` wrote below `dense`: some times, some cameras."""
+    views = []
+    source = {Path(p.source).name: p.source for p in capture.pictures}
+    for name, own in extra.held_out.items():
+        like: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
+        picture = named_file(dense, name, f"held-out view {own.name}")
+        mask = None if own.mask is None else named_file(dense, own.mask, f"the moving mask of held-out view {own.name}")
+        views.append(HeldOut(own.name, own.time, [(picture, like)], mask=mask, anchor=source[own.anchor]))
+    return views, reorder(capture_poses(capture), [capture.row[str(v.anchor)] for v in views])
 
 
 def cameras_of(folder: Path, steps: range) -> int:

@@ -1,6 +1,7 @@
 """HDR-GoPro / NSFF layout (LLFF poses): under `<scene>/dense/` the pictures, `poses_bounds.npy` (c2w columns down, right, back), and
 where they are there moving masks, depth and optical flow. Cameras take turns: training picture i is of camera i mod C, and stands at
-time i. Held out (opened by `held_out.py` alone): `mv_images/<time>/<camera>.png`, `mv_images_time/`, `mv_masks/`.
+time i. Held out (opened by `held_out.py` alone): `mv_images/<time>/<camera>.png`, `mv_images_time/`, `mv_masks/`; of sets that `export`
+wrote only the ones that `hdr_nsff.json` lists.
 
 The pictures are those of `images_<W>x<H>/` (the largest), else of `images/`. Maps of another size are resampled. Flow is that of
 `semantic_flow_i1/` before `flow_i1/`; depth that of `depth-anything/` (metric) before `disp/` (disparity up to scale and shift), brought
@@ -76,7 +77,7 @@ def read(folder: Path) -> Capture:
         root=root,
         pictures=entries,
         poses=replace(given, names=names),
-        withheld=any(multi_view(folder, n) is not None for n in MULTI_VIEW),
+        withheld=bool(extra and extra.held_out) or any(multi_view(folder, n) is not None for n in MULTI_VIEW),
         white_moves=white_moves,
         depth_kind="disparity" if kind == "disparity" else "metric",
         depth_units="own",
@@ -105,6 +106,7 @@ def with_note(capture: Capture, extra: Extra, names: list[str]) -> Capture:
         layout="HDR-GoPro / NSFF (LLFF), written by hdr-nsff",
         pictures=entries,
         poses=replace(capture.poses, K=K, near=extra.near, far=extra.far),
+        white_moves=True,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
         depth_units="scene",
         exposures=extra.exposures(),

@@ -33,6 +33,7 @@ from hdr_nsff.priors.import_poses import Given
 NAME = "transforms.json"
 HELD_OUT = ("val_filenames", "test_filenames")
 EXTRA = "hdr_nsff"
+VIEWS = "held_out/"  # where `export` puts the views of a truth folder
 MILLIMETRES = 1000.0  # a unit of the poses in what depth files hold
 
 

@@ -4,6 +4,7 @@ are, are copied byte by byte."""
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -55,6 +56,20 @@ class Source:
             depth_kind=m.depth_kind,
             frames=frames,
         )
+
+
+@dataclass(frozen=True)
+class HeldOutPicture:
+    """A view that is kept back, in the world of the scene."""
+
+    name: str
+    time: float  # in frames, may be fractional
+    camera_id: int
+    bracket: int
+    K: np.ndarray  # (3, 3) pixels
+    c2w: np.ndarray  # (3, 4)
+    mask: Path | None  # PNG, moving = 255
+    write: Callable[[Path], None]  # its picture, to a PNG
 
 
 def claim(out: Path, layout: str, scene: Path) -> None:

@@ -1,30 +1,34 @@
-"""A scene folder -> the HDR-GoPro / NSFF layout (LLFF), as `llff.py` describes it: training frames alone, in time.
+"""A scene folder -> the HDR-GoPro / NSFF layout (LLFF), as `llff.py` describes it: training frames in time, and
+what a truth folder keeps back.
 
 The layout has one focal length and a principal point at the centre, one picture per time, and no place for exposures and trust in the
-depth: `dense/hdr_nsff.json` and `dense/disp_confidence/` hold those, and other readers pass over them."""
+depth: `dense/hdr_nsff.json` and `dense/disp_confidence/` hold those, and other readers pass over them. Held-out views it knows from the
+poses of training pictures (camera k stands where training picture k - 1 does), at their times and half-way to the next."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 
 from hdr_nsff.datasets import to_colmap
-from hdr_nsff.datasets.capture import ExtraFrame
-from hdr_nsff.datasets.llff import NOTE
-from hdr_nsff.datasets.to_layout import Source, claim, copy, z_depth
+from hdr_nsff.datasets.capture import ExtraFrame, ExtraView
+from hdr_nsff.datasets.llff import MULTI_VIEW, NOTE
+from hdr_nsff.datasets.to_layout import HeldOutPicture, Source, claim, copy, z_depth
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import atomic, read_mask, read_npy, write_json, write_npy, write_png
 from hdr_nsff.priors.import_poses import FROM_LLFF
 from hdr_nsff.progress import say, track
 from hdr_nsff.scene import FrameEntry
 
+SAME_TIME = 1e-6  # frames
 
-def write(scene: Path, out: Path) -> Path:
+
+def write(source: Source, out: Path, held_out: Sequence[HeldOutPicture] = ()) -> Path:
     """Write the layout into `out`/dense and `out`/masks. InputError for a scene that it cannot hold."""
-    source = Source.open(scene)
-    m = source.manifest
+    scene, m = source.folder, source.manifest
     frames = sorted((f for f in m.frames if f.split == "train"), key=lambda f: f.time)
     if len({f.time for f in frames}) < len(frames):
         raise InputError(
@@ -36,6 +40,7 @@ def write(scene: Path, out: Path) -> Path:
             f"{out}: the layout has no place for the {len(m.frames) - len(frames)} frames that the scene holds out of training: left out"
         )
     dense = out / "dense"
+    views = write_held_out(frames, held_out, dense)
     for i, f in enumerate(track(frames, "exporting")):
         write_frame(source, f, i, out)
         for j, side in ((i + 1, "fwd"), (i - 1, "bwd")):
@@ -43,8 +48,49 @@ def write(scene: Path, out: Path) -> Path:
                 write_flow(source, f, frames[j], dense / f"flow_i1/{i:05d}_{side}.npz")
     write_poses(source, frames, dense)
     own = {f"{i:05d}.png": ExtraFrame(time=f.time, camera_id=f.camera_id, bracket=f.bracket, K=f.K) for i, f in enumerate(frames)}
-    write_json(dense / NOTE, source.extra(own).model_dump())
+    write_json(dense / NOTE, (source.extra(own).model_copy(update={"held_out": views})).model_dump())
     return out
+
+
+def write_held_out(frames: Sequence[FrameEntry], views: Sequence[HeldOutPicture], dense: Path) -> dict[str, ExtraView]:
+    """Write the held-out views that the layout has a place for, and their masks; what it cannot say of them, by their pictures' names.
+    Says which have none. `frames` are the training pictures in order."""
+    noted: dict[str, ExtraView] = {}
+    lost = []
+    for view in track(views, "held-out views"):
+        camera, place = camera_of(frames, view), step_of(frames, view.time)
+        name = None if camera is None or place is None else f"{place}/{camera + 1:05d}.png"
+        if camera is None or name is None or name in noted:
+            lost.append(view.name)
+            continue
+        view.write(dense / name)
+        mask = None if view.mask is None else name.replace("images", "masks")
+        if view.mask is not None and mask is not None:
+            copy(view.mask, dense / mask)
+        noted[name] = ExtraView(name=view.name, time=view.time, bracket=view.bracket, anchor=f"{camera:05d}.png", mask=mask)
+    if lost:
+        say(
+            f"{dense}: left out {len(lost)} of {len(views)} held-out views ({', '.join(lost)}): the layout has a place for one view from the pose of "
+            "a training picture at the time of one or half-way to the next; --layout nerfstudio takes all"
+        )
+    return noted
+
+
+def camera_of(frames: Sequence[FrameEntry], view: HeldOutPicture) -> int | None:
+    """The first of the training pictures that has exactly the pose and intrinsics of a view; of a rig that is its camera, from 0."""
+    same = (
+        i for i, f in enumerate(frames) if np.array_equal(np.array(f.c2w), view.c2w) and np.array_equal(np.array(f.K), view.K)
+    )
+    return next(same, None)
+
+
+def step_of(frames: Sequence[FrameEntry], time: float) -> str | None:
+    """The folder of views at a `time`: that of a training picture, or half-way to the next."""
+    times = np.array([f.time for f in frames])
+    for name, steps in zip(MULTI_VIEW, (times, (times[1:] + times[:-1]) / 2), strict=True):
+        if len(found := np.flatnonzero(np.abs(steps - time) < SAME_TIME)):
+            return f"{name}/{found[0]:05d}"
+    return None
 
 
 def write_frame(source: Source, f: FrameEntry, i: int, out: Path) -> None:

@@ -16,6 +16,8 @@ from torch import Tensor
 from hdr_nsff.batch import Look, PixelBatch
 from hdr_nsff.camera import Camera
 
+HIGHEST = 0.999  # radiance below 1 that a sigmoid is asked to start from at most
+
 
 @dataclass(frozen=True)
 class Warp:

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hdr_nsff.fields.gaussians import Gaussians
+from hdr_nsff.fields.gaussians import Gaussians, from_log_radiance
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat import Splat
@@ -36,7 +36,7 @@ def seed(field: Splat, scene: Scene, to_radiance: ToRadiance, typical: float, fr
     """Place all Gaussians; one sentence about what was found. `typical` is the median log radiance."""
     frames = scene.train
     with torch.no_grad():
-        field.background.fill_(typical)
+        field.background[:] = from_log_radiance(torch.tensor(typical), field.bounded)
         if not from_priors or any(f.disparity is None for f in frames):
             scatter(field, scene, typical)
             return "static Gaussians start at random places and moving ones not at all, without a depth prior in scene units"
@@ -74,7 +74,7 @@ def place(gaussians: Gaussians, points: Points) -> int:
     gaussians.means[:n] = points.positions[:n]
     gaussians.log_scales[:n] = (OVERLAP * spacing).log()[:, None]
     gaussians.logits[:n] = math.log(OPACITY / (1 - OPACITY))
-    gaussians.log_radiance[:n] = points.log_radiance[:n]
+    gaussians.log_radiance[:n] = from_log_radiance(points.log_radiance[:n], gaussians.bounded)
     return n
 
 

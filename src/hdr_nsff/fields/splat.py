@@ -1,5 +1,5 @@
 """Dynamic radiance as 4D Gaussians in linear HDR: static ones, and moving ones on shared trajectories. Colour is the exponential of
-a log radiance, unbounded; movers' changes in time, and static ones' brightens or darkens slowly (shadows of movers).
+a log radiance, unbounded (a sigmoid bounds it for the ablation); movers' changes in time, and static ones' brightens or darkens slowly (shadows of movers).
 
 The number of Gaussians is fixed by the settings; ones that fade away draw nothing and cost next to nothing."""
 
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from scipy.spatial import cKDTree
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import GaussianCloud, Misfit, Render, Warp
-from hdr_nsff.fields.gaussians import BRIGHTEST, Gaussians
+from hdr_nsff.fields.gaussians import Gaussians, brightened, to_radiance
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.rasterize import Maps, rasterize
 from hdr_nsff.fields.renewal import blame, halve
@@ -47,6 +47,8 @@ class SplatConfig:
     """Times at which a moving Gaussian has an opacity of its own: things come and go."""
     view_dependence: bool = False
     """Colours change with the direction of view (to first order, in log radiance): for shiny things seen from many sides."""
+    radiance: Literal["exp", "sigmoid"] = "exp"
+    """Unbounded radiance, or one below 1."""
     renew_every: int = 200
     """Steps after which Gaussians that nobody sees are put where the picture is wrong (0: never)."""
     lr: float = 1.0
@@ -77,15 +79,16 @@ class Splat(nn.Module):
         self.config, self.unit, self.near, self.far = config, near, near, far
         self.register_buffer("times", times.double())
         static, moving = config.counts(num_pixels)
-        self.static = Gaussians(static, config.shade_knots, 1, config.view_dependence)
-        self.moving = Gaussians(moving, config.colour_knots, 3, config.view_dependence)
+        self.bounded = config.radiance == "sigmoid"
+        self.static = Gaussians(static, config.shade_knots, 1, config.view_dependence, self.bounded)
+        self.moving = Gaussians(moving, config.colour_knots, 3, config.view_dependence, self.bounded)
         self.presence = nn.Parameter(torch.zeros(config.presence_knots, moving))  # offsets to the moving ones' opacity logits
         self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
         self.trajectories = Trajectories(config.bases, len(times))
         self.register_buffer(
             "beside", torch.arange(moving, dtype=torch.int32)[:, None].repeat(1, BESIDE)
         )  # (M, BESIDE) neighbours
-        self.background = nn.Parameter(torch.zeros(3))  # log radiance where no Gaussian is
+        self.background = nn.Parameter(torch.zeros(3))  # log radiance (or log odds) where no Gaussian is
 
     def knot(self, time: float) -> float:
         """Position of a time (in frames) on the list of training times."""
@@ -112,16 +115,17 @@ class Splat(nn.Module):
 
     def draw(self, camera: Camera, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
         """Rasterise radiance (3), motion (1) and `extra` features (G, ...)."""
-        radiance = cloud.radiance * self.gloss(camera, cloud.means) if self.config.view_dependence else cloud.radiance
+        radiance = cloud.radiance
+        if self.config.view_dependence:
+            radiance = brightened(radiance, self.gloss(camera, cloud.means), self.bounded)
         features = torch.cat([radiance, cloud.motion[:, None], *extra], 1)
         return rasterize(cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features, camera)
 
     def gloss(self, camera: Camera, means: Tensor) -> Tensor:
-        """Factors (G, 3) of radiance for the directions in which `camera` sees the `means` (G, 3): those of spherical harmonics of
-        degree 1 in log radiance."""
+        """What the directions in which `camera` sees the `means` (G, 3) add to log radiance, (G, 3): spherical harmonics of degree 1."""
         toward = nn.functional.normalize(means - camera.c2w[:, 3], dim=-1)
         sheen = torch.cat([self.static.sheen, self.moving.sheen])
-        return (sheen @ toward[..., None])[..., 0].clamp(-GLOSSIEST, GLOSSIEST).exp()
+        return (sheen @ toward[..., None])[..., 0].clamp(-GLOSSIEST, GLOSSIEST)
 
     def opacities(self, share: float) -> Tensor:
         """(G,) in [0, 1] at a share of the clip."""
@@ -143,7 +147,7 @@ class Splat(nn.Module):
         """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,) and what else was drawn (S, ...)."""
         alpha = maps.alpha.reshape(-1)
         seen, motion, extra = maps.features.flatten(0, 1).split([3, 1, maps.features.shape[-1] - 4], 1)
-        behind = (1 - alpha)[:, None] * self.background.clamp_max(BRIGHTEST).exp()
+        behind = (1 - alpha)[:, None] * to_radiance(self.background, self.bounded)
         radiance = behind.add_(
             seen
         )  # in place, pixel by pixel in memory, where `seen` is channel by channel: tone mapping wants it so

@@ -16,14 +16,12 @@ from torch import Tensor, nn
 from hdr_nsff import volume
 from hdr_nsff.batch import PixelBatch
 from hdr_nsff.camera import Camera
-from hdr_nsff.fields.base import Misfit
+from hdr_nsff.fields.base import HIGHEST, Misfit
 from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpBranches, MlpConfig
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.occupancy import Occupancy
 from hdr_nsff.fields.samples import Content, March, march
 from hdr_nsff.fields.space import Space
-
-HIGHEST = 0.999  # radiance below 1 that a sigmoid is asked to start from at most
 
 
 @dataclass(frozen=True)

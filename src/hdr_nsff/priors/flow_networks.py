@@ -86,7 +86,7 @@ def load(name: Network | None, given: Path | None, device: torch.device | str = 
     """The network `name` with its weights, in evaluation mode; where `name` is None, the network that `given` says it is of.
 
     `given`: a file, a folder of `finetune-flow`, or None to look where weights are kept. InputError where they are missing or do not fit."""
-    path = (tuned_file(given) if given is not None else None) or find(name or "gmflow", given)
+    path = weights_file(name, given)
     state, of = read_weights(path)
     if name is None and of is None:
         raise InputError(f"{path}: does not say which network it is of; name a file that `hdr-nsff finetune-flow` wrote")
@@ -99,6 +99,11 @@ def load(name: Network | None, given: Path | None, device: torch.device | str = 
         reason = " ".join(str(error).split())[:150]
         raise InputError(f"{path}: these weights do not fit {name or of} ({reason}); name a file that does") from error
     return network.to(device).eval().requires_grad_(False)
+
+
+def weights_file(name: Network | None, given: Path | None) -> Path:
+    """The file that `load` reads."""
+    return (tuned_file(given) if given is not None else None) or find(name or "gmflow", given)
 
 
 def build(name: str | None, device: torch.device) -> FlowNetwork:

@@ -11,8 +11,9 @@ import torch
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.priors.flow import FlowPrior, flow, read_flow
-from hdr_nsff.priors.flow_networks import load, matched_flow
+from hdr_nsff.priors.flow_networks import load, matched_flow, weights_file
 from hdr_nsff.priors.semantic import Pairs, SemanticConfig, semantic_flow
+from hdr_nsff.priors.weights import find
 
 FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
 DEFAULT: FlowName = "dis"
@@ -58,6 +59,21 @@ def flow_source(
             return partial(matched_flow, load(chosen, weights, device()))
         case "raft-finetuned":
             return partial(matched_flow, load(None, weights, device()))
+        case _:
+            assert_never(chosen)
+
+
+def flow_weights(chosen: FlowName | Path | None, weights: Path | None, semantic: SemanticConfig) -> list[Path]:
+    """The weights that the flow prior of these settings reads; none where it reads none. InputError where they are not to be had."""
+    match chosen:
+        case Path() | "dis" | None:
+            return []
+        case "semantic":
+            return [find(semantic.features, weights)]
+        case "gmflow" | "raft":
+            return [weights_file(chosen, weights)]
+        case "raft-finetuned":
+            return [weights_file(None, weights)]
         case _:
             assert_never(chosen)
 

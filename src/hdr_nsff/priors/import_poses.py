@@ -123,12 +123,22 @@ def check_lens(path: Path, K: np.ndarray, width: float, height: float, distortio
 
 def from_llff(path: Path) -> Given:
     """`poses_bounds.npy` (N, 17): 3x5 row by row (columns down, right, back, centre, (height, width, focal)), then near, far."""
+    return llff_rows(llff_table(path, 17))
+
+
+def llff_table(path: Path, columns: int) -> np.ndarray:
+    """The numbers (N, columns) of a `.npy` in the way of LLFF."""
     try:
         table = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
         raise InputError(f"{path}: not a readable .npy array ({error}); export the poses again") from error
-    if table.ndim != 2 or table.shape[1] != 17 or not len(table):
-        raise InputError(f"{path}: expected an array (frames, 17) as LLFF writes it, found {table.shape}")
+    if table.ndim != 2 or table.shape[1] != columns or not len(table):
+        raise InputError(f"{path}: expected an array (frames, {columns}) as LLFF writes it, found {table.shape}")
+    return np.asarray(table)
+
+
+def llff_rows(table: np.ndarray) -> Given:
+    """The poses of rows (N, 17) of `poses_bounds.npy`."""
     return llff(table[:, :15].reshape(-1, 3, 5).astype(np.float64), table[:, 15:].astype(np.float64), FROM_LLFF)
 
 

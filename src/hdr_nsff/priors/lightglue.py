@@ -6,6 +6,7 @@ Keypoints are pixels of the pictures, centres at +0.5."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, Literal
 
 import cv2
@@ -26,8 +27,12 @@ def check_matcher(matcher: Matcher) -> None:
     """InputError where kornia or the weights of `matcher` are missing."""
     if matcher != "sift":
         features()
-        find(matcher)
-        find(f"{matcher}-lightglue")
+        matcher_weights(matcher)
+
+
+def matcher_weights(matcher: Matcher) -> list[Path]:
+    """The weights that `matcher` reads; InputError where they are not to be had."""
+    return [] if matcher == "sift" else [find(matcher), find(f"{matcher}-lightglue")]
 
 
 def features() -> Any:

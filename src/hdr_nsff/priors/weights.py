@@ -247,6 +247,13 @@ def advice(weights: Weights) -> str:
     return f"{', or '.join(ways)}, or put {copied} from another machine into {place}"
 
 
+def content(path: Path) -> str:
+    """The hash of weights: of a file, or of all that a folder's model is loaded from."""
+    files = [path] if path.is_file() else sorted(p for e in ("*.json", "*.safetensors") for p in path.glob(e))
+    hashes = [sha256(f, f.stat().st_mtime_ns) for f in files]
+    return hashes[0] if path.is_file() else hashlib.sha256("".join(hashes).encode()).hexdigest()
+
+
 @functools.lru_cache(maxsize=64)
 def sha256(path: Path, changed: int) -> str:
     """The hash of a file that was last `changed` then, in hexadecimal digits."""

@@ -214,7 +214,4 @@ def world_scale(run: Run, truth: Truth) -> float | None:
         if any(v.c2w is not None for v in truth.views):
             raise InputError("truth.json: views have poses of their own, but clip_c2w is missing; they cannot be carried over")
         return None
-    if np.allclose(*paths):
-        return 1.0  # given poses: one world
-    fit = alignment.umeyama(paths[0][:, :, 3], paths[1][:, :, 3])
-    return None if fit is None else fit.scale
+    return alignment.scale_between(*paths)

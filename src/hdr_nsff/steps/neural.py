@@ -1,4 +1,5 @@
-"""Masks and depth by networks: what `prepare --mask sam2` and `--depth depth-anything` do with a clip of one or more cameras."""
+"""Masks and depth by networks: what `prepare --mask sam2` and `--depth depth-anything` do with a clip of one or more cameras; and which
+weights the steps read."""
 
 from __future__ import annotations
 
@@ -10,14 +11,15 @@ import torch
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_mask, read_npy, write_json
 from hdr_nsff.priors.depth_anything import Kind, anchored_depth, network_disparity
-from hdr_nsff.priors.lightglue import check_matcher
+from hdr_nsff.priors.flow_sources import flow_weights
+from hdr_nsff.priors.lightglue import check_matcher, matcher_weights
 from hdr_nsff.priors.parallax import Shots
 from hdr_nsff.priors.pretrained import architecture, pretrained
 from hdr_nsff.priors.prompts import PointsFile, as_file, corrected, movers, read_points
 from hdr_nsff.priors.sam2 import sam2_mask
-from hdr_nsff.priors.weights import find
+from hdr_nsff.priors.weights import content, find
 from hdr_nsff.progress import say
-from hdr_nsff.steps.work import PrepareConfig, Work
+from hdr_nsff.steps.work import PrepareConfig, StepName, Work
 
 SAM2, DEPTH_ANYTHING = "Sam2VideoModel", "DepthAnythingForDepthEstimation"
 PROMPTS = "masks/prompts.json"
@@ -36,6 +38,22 @@ def check_networks(config: PrepareConfig) -> None:
     if config.depth == "depth-anything":
         architecture(DEPTH_ANYTHING)
         find(config.depth_weights)
+
+
+def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
+    """The hashes of the weights that a step reads. InputError where they are not to be had."""
+    match step:
+        case "flow":
+            paths = flow_weights(config.flow, config.flow_weights, config.semantic)
+        case "poses" if config.poses is None:
+            paths = matcher_weights(config.matcher)
+        case "mask" if config.masks == "sam2":
+            paths = [find(config.mask_weights)]
+        case "depth" if config.depth == "depth-anything":
+            paths = [find(config.depth_weights)]
+        case _:
+            paths = []
+    return [content(path) for path in paths]
 
 
 def ready(network: str, weights: str) -> Any:
