@@ -67,7 +67,10 @@ def test_rendering_in_chunks_changes_nothing(field: AnyField, toy: Scene) -> Non
 
 def test_what_is_recorded_of_a_field_has_the_shape_and_range_of_a_picture(field: AnyField, toy: Scene) -> None:
     camera = toy.train[2].camera
-    rgb = recorded(field, camera, 2.0, LOOK)
+    darker = Look(lambda radiance: LOOK.rgb(radiance / 4), LOOK.images)
+    rgb, dark = recorded(field, camera, 2.0, [LOOK, darker])
+    torch.testing.assert_close(dark, recorded(field, camera, 2.0, [darker])[0])  # as alone
+    assert dark.shape == rgb.shape and dark.mean() < rgb.mean()
     assert rgb.shape == (camera.width * camera.height, 3) and 0 <= float(rgb.min()) <= float(rgb.max()) <= 1
     assert isinstance(field, RecordingField) != isinstance(field, NSFF | Splat)
     if isinstance(field, NSFF | Splat):  # the camera stands behind the field

@@ -152,7 +152,7 @@ def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(run_of:
     camera = run.scene.train[3].camera  # the middle frame's
     torch.testing.assert_close(exr, run.field.render(camera, 2.0).radiance, atol=1e-5, rtol=1e-4)
     png = torch.from_numpy(io.read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
-    torch.testing.assert_close(png, recorded(run.field, camera, 2.0, run.tonemapper.look_at(2.0)), atol=0.003, rtol=0)
+    torch.testing.assert_close(png, recorded(run.field, camera, 2.0, [run.tonemapper.look_at(2.0)])[0], atol=0.003, rtol=0)
 
 
 def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(run_of: Path, tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(run
     assert all(math.isfinite(result["headline"][name]) for name in ("psnr", "psnr_moving", "psnr_all_exposures"))
     run = Run.open(run_of)
     f = run.scene.train[1]
-    rgb = recorded(run.field, f.camera, f.time, run.tonemapper.look(f.bracket, f.camera_id)).view_as(f.image)
+    rgb = recorded(run.field, f.camera, f.time, [run.tonemapper.look(f.bracket, f.camera_id)])[0].view_as(f.image)
     psnr = next(v["psnr"] for v in result["views"] if v["time"] == f.time)
     assert psnr == pytest.approx(-10 * math.log10(float((rgb - f.image).square().mean())), abs=0.05)
     with pytest.raises(InputError, match="Gaussian"):
