@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
 from hdr_nsff.priors.bundle import Cameras, Problem, Shape, State, adjust
-from hdr_nsff.priors.groups import GAP, SHORTEST, SMALLEST, Group, Tracks, apart, affinity, fit, gather, neighbours
+from hdr_nsff.priors.groups import GAP, SHORTEST, SMALLEST, Group, Tracks, affinity, apart, fit, gather, neighbours
 
 LEAST_TRACKS = 60  # of a group that can be adjusted
 GOOD = 1.5  # standard deviations: reprojection error of a shape, or of a track by one, that is believed
@@ -35,17 +35,22 @@ def things(tracks: Tracks, cameras: Cameras) -> list[Found]:
 def groups_by_motion(tracks: Tracks, members: list[np.ndarray], cameras: Cameras) -> list[Found]:
     """The same from groups that may be mixed or in pieces: tracks shared out anew, pieces joined, rest left out."""
     found = shaped(tracks, members, [], cameras)
+    if any(shape for _, shape in found):
+        found = settled(tracks, found, cameras)
+    return [f for i, f in enumerate(found) if i == 0 or len(f[0].members) >= SMALLEST * len(tracks.trust)]
+
+
+def settled(tracks: Tracks, found: list[Found], cameras: Cameras) -> list[Found]:
+    """Groups joined, and tracks shared out between them, until hardly any changes."""
     near = nearness(tracks)
     for _ in range(ROUNDS):
-        if not any(shape for _, shape in found):
-            break
         found = joined(tracks, found, cameras)
         before = [g.members for g, _ in found]
         owner = share_out(before, misfits(tracks, [s for _, s in found], cameras, near))
         if all(same(m, np.nonzero(owner == k)[0]) for k, m in enumerate(before)):
             break
         found = shaped(tracks, members_of(owner), found, cameras)
-    return [f for i, f in enumerate(found) if i == 0 or len(f[0].members) >= SMALLEST * len(tracks.trust)]
+    return found
 
 
 def shaped(tracks: Tracks, groups: list[np.ndarray], known: list[Found], cameras: Cameras) -> list[Found]:
