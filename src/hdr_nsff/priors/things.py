@@ -20,7 +20,7 @@ WHOLE = 0.7  # of a track's life a motion must be known for
 TURNS = 6  # iterations that place a track's point by given poses
 PIECE = 0.5  # of the least group: a thing that was hidden may come back for so little
 STRAY = 0.1  # of a group's tracks: where fewer are seen they are strays
-FAR = 6.0  # of a thing's radius in the picture: no further off does it come back
+FAR = 4.0  # of a thing's radius in the picture: no further off does it come back
 SETTLED = 0.01  # of a group's tracks: fewer changes change nothing
 
 
@@ -87,10 +87,14 @@ def may_be_one(tracks: Tracks, a: Group, b: Group) -> bool:
     if (seen_a & seen_b).sum() >= SHORTEST:
         return not apart(tracks, a, b)
     i, j = min(product(np.nonzero(seen_a)[0], np.nonzero(seen_b)[0]), key=lambda ij: abs(int(ij[0]) - int(ij[1])))
-    here, there = tracks.pixels[a.members, i], tracks.pixels[b.members, j]
-    middles = [np.nanmedian(p, 0) for p in (here, there)]
-    radius = max(np.nanmedian(np.linalg.norm(p - m, axis=-1)) for p, m in zip((here, there), middles, strict=True))
-    return bool(abs(int(i) - int(j)) <= GAP and np.linalg.norm(middles[0] - middles[1]) < FAR * radius)
+    here, there = (np.nanmedian(tracks.pixels[g.members, t], 0) for g, t in ((a, i), (b, j)))
+    radius = max(radius_of(tracks.pixels[g.members][:, seen]) for g, seen in ((a, seen_a), (b, seen_b)))
+    return bool(abs(int(i) - int(j)) <= GAP and np.linalg.norm(here - there) < FAR * radius)
+
+
+def radius_of(pixels: np.ndarray) -> float:
+    """How far tracks (N, T, 2), some seen at every time, are from their middle in the pictures: the median."""
+    return float(np.nanmedian(np.linalg.norm(pixels - np.nanmedian(pixels, 0), axis=-1)))
 
 
 def ids(found: list[Found], pair: tuple[int, ...]) -> tuple[int, ...]:
