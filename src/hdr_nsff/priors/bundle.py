@@ -21,7 +21,7 @@ BETTER = 0.98  # of the cost: what a reversal must gain
 MOST = 200  # tracks that poses are found from
 FEWEST = 3  # tracks that have a shape
 NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbours share their errors
-FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation in all
+FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation of all times that tracks join
 FAR_SIGMA_ALONE = 0.02  # the same of every time of a path too short to tell
 PATH_SIGMA = 0.001  # of the path's third differences, as a share of z-depth, where it is smoothest
 ROUGH = 0.01  # the same before anything is known
@@ -135,9 +135,14 @@ class Problem:
         self.unit = np.median(self.mean_depth[self.told]) if self.told.any() else 1.0
         self.nearing = self.told[:, None] * self.w2c[:, 2] / max(int(self.told.sum()), 1)  # (T, 3) of the distance by the shifts
         self.path_sigma = ROUGH
-        self.rows = (np.abs(self.third) > 0) @ ~self.told == 0  # (T - 3,) third differences of times that were all seen
-        known = FAR_SIGMA * np.sqrt(self.told.sum()) if self.rows.sum() >= LEAST_ROWS else FAR_SIGMA_ALONE
-        self.far_sigma = known * self.unit
+        linked = (seen[:, 1:] & seen[:, :-1]).sum(0) >= FEWEST
+        piece = np.concatenate([[0], np.cumsum(~linked)])  # (T,) times that tracks join: within, depth is known but for a factor
+        self.rows = ((np.abs(self.third) > 0) @ ~self.told == 0) & (piece[3:] == piece[:-3])
+        each = np.bincount(piece, self.told)[piece]
+        tells = self.rows.sum() >= LEAST_ROWS
+        self.far_sigma = self.unit * (
+            FAR_SIGMA * np.sqrt(np.maximum(each, 1)) if tells else np.full(len(self.K), FAR_SIGMA_ALONE)
+        )
 
     def solve(self, state: State, iterations: int) -> tuple[State, float]:
         """The best state nearby and its cost."""
@@ -271,7 +276,7 @@ class Problem:
         gx = np.einsum("ntij,nti->nj", wx, error)
         V, gx = V + np.eye(3) / self.spread(s) ** 2, gx + shape / self.spread(s)
         W[:, :, 3:] -= (self.nearing / self.distance(s))[None, :, :, None] * (shape / self.spread(s))[:, None, None]
-        row = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1) / self.far_sigma * self.told[:, None]
+        row = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1) / self.far_sigma[:, None] * self.told[:, None]
         U, gp = U + row[:, :, None] * row[:, None], gp + row * far[:, None]
         full = np.zeros((num, 6, num, 6))
         full[np.arange(num), :, np.arange(num)] = U
