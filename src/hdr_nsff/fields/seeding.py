@@ -19,8 +19,9 @@ from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat import Splat
 from hdr_nsff.fields.surface import CELLS, Points, ToRadiance, cells_for, joined, lift, thinned, thinned_to
 from hdr_nsff.priors.bundle import Cameras, Shape
-from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather
-from hdr_nsff.priors.relief import apply, shape_of
+from hdr_nsff.priors.groups import Group, Tracks, View, follow
+from hdr_nsff.priors.relief import apply
+from hdr_nsff.priors.things import things
 from hdr_nsff.scene import Frame, Scene
 
 DEPTH_CELLS = 12.0  # a cell is this many times longer along the view than across, as shares of the frustum
@@ -111,12 +112,11 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
     if not any(v.moving.any() for v in views):
         return 0, 0
     tracks = follow(views)
-    found = gather(tracks)[: field.config.bases] if len(tracks.trust) else []
     cameras = [f.camera for f in frames]
     known = Cameras(*(torch.stack(m).double().numpy() for m in ([c.K for c in cameras], [c.c2w for c in cameras])))
-    shapes = [shape_of(tracks, g, known) for g in found]
-    groups = [s.group if s else g for g, s in zip(found, shapes, strict=True)] or [drift(views)]
-    frames = [relieved(f, t, tracks, [s for s in shapes if s]) for t, f in enumerate(frames)]
+    found = things(tracks, known)[: field.config.bases] if len(tracks.trust) else []
+    groups = [shape.group if shape else group for group, shape in found] or [drift(views)]
+    frames = [relieved(f, t, tracks, [shape for _, shape in found if shape]) for t, f in enumerate(frames)]
     seen = [t for t, v in enumerate(views) if v.moving.any()]
     key = sorted({seen[round(i)] for i in np.linspace(0, len(seen) - 1, min(KEY_FRAMES, len(seen))).tolist()})
     parts = [mover_points(scene, frames[t], frame_of[t], t, tracks, groups, to_radiance) for t in key]

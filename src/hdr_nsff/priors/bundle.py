@@ -18,13 +18,17 @@ REVERSALS = 4  # rounds of looking for reversed depth
 SPLIT = 3  # frames between the times tried
 QUICK = 8  # iterations that tell whether a try is better
 BETTER = 0.98  # of the cost: what a reversal must gain
-MOST = 400  # tracks that poses are found from
+MOST = 200  # tracks that poses are found from
 FEWEST = 3  # tracks that have a shape
 NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbours share their errors
-FAR_SIGMA = 0.02  # how well the mean z-depth of a time is known, as a share of it
-PATH_SIGMA = 0.002  # of the path's third differences, as a share of z-depth
+FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation of all times that tracks join
+FAR_SIGMA_ALONE = 0.02  # the same of every time of a path too short to tell
+PATH_SIGMA = 0.001  # of the path's third differences, as a share of z-depth, where it is smoothest
+ROUGH = 0.01  # the same before anything is known
+LEAST_ROWS = 6  # third differences that tell how smooth a path is, and so how far away
+SMOOTHINGS = 2  # rounds of telling how smooth the path is
 TURN_SIGMA = np.radians(2.0)  # of the second differences of its turning
-SHAPE_SIGMA = 2.0  # of a point's canonical place, as a share of the thing's size
+SHAPE_SIGMA = 2.0  # of a point's distance from the thing's middle, as a share of the thing's size
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,7 @@ class Shape:
 def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
     """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better."""
     points = np.full((len(group.members), 3), np.nan)
-    longest = np.argsort(-(tracks.trust[group.members] > 0).sum(1), kind="stable")[:MOST]
-    some, solved = group.members[np.sort(longest)], []
+    some, solved = group.members[telling(tracks.trust[group.members] > 0, MOST)], []
     for start in (group, without_turning(tracks, group)):
         problem = Problem(tracks, replace(start, members=some), cameras)
         if problem.use.sum() >= FEWEST:
@@ -62,11 +65,22 @@ def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
         return Shape(group, points, np.inf)
     state, cost, problem, start = min(solved, key=lambda s: s[1])
     state = problem.unreversed(state, cost)
+    for _ in range(SMOOTHINGS):
+        problem.roughened(state)
+        state, _ = problem.solve(state, ITERATIONS)
     every = Problem(tracks, start, cameras)
     state = every.points_for(state)
     points[every.use] = state.points + group.centre
     error = (np.linalg.norm(every.residuals(state)[0], axis=-1) / every.noise)[every.seen]
     return Shape(replace(start, rotations=state.rotations, shifts=state.shifts), points, float(np.median(error)))
+
+
+def telling(seen: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of the tracks `seen` (N, T) at some times, in order: at every time the longest."""
+    length = seen.sum(1)
+    order = np.argsort(-length, kind="stable")
+    rank = np.where(seen[order], np.cumsum(seen[order], 0), len(seen) + 1).min(1, initial=len(seen) + 1)
+    return np.sort(order[np.argsort(rank, kind="stable")[:most]])
 
 
 def without_turning(tracks: Tracks, group: Group) -> Group:
@@ -110,7 +124,8 @@ class Problem:
         self.noise = NOISE * np.sqrt(1.0 + tracks.age[group.members][use])  # (N, T) pixels
         self.w2c = np.swapaxes(cameras.c2w[:, :, :3], 1, 2)  # (T, 3, 3)
         self.eye = cameras.c2w[:, :, 3] - group.centre
-        self.size = np.median(np.linalg.norm(start - np.median(start, 0), axis=-1)) + 1e-9 if len(start) else 1.0
+        self.middle = np.median(start, 0) if len(start) else np.zeros(3)
+        self.size = np.median(np.linalg.norm(start - self.middle, axis=-1)) + 1e-9 if len(start) else 1.0
         prior = np.einsum("tj,ntj->nt", self.w2c[:, 2], tracks.points[group.members][use] - group.centre - self.eye)
         count = np.maximum(seen.sum(0), 1)
         self.mean_depth = np.where(seen, np.nan_to_num(prior), 0).sum(0) / count  # (T,)
@@ -118,6 +133,16 @@ class Problem:
         self.second = np.diff(np.eye(len(self.K)), n=2, axis=0) if len(self.K) > 2 else np.zeros((0, len(self.K)))
         self.third = np.diff(np.eye(len(self.K)), n=3, axis=0) if len(self.K) > 3 else np.zeros((0, len(self.K)))
         self.unit = np.median(self.mean_depth[self.told]) if self.told.any() else 1.0
+        self.nearing = self.told[:, None] * self.w2c[:, 2] / max(int(self.told.sum()), 1)  # (T, 3) of the distance by the shifts
+        self.path_sigma = ROUGH
+        linked = (seen[:, 1:] & seen[:, :-1]).sum(0) >= FEWEST
+        piece = np.concatenate([[0], np.cumsum(~linked)])  # (T,) times that tracks join: within, depth is known but for a factor
+        self.rows = ((np.abs(self.third) > 0) @ ~self.told == 0) & (piece[3:] == piece[:-3])
+        each = np.bincount(piece, self.told)[piece]
+        tells = self.rows.sum() >= LEAST_ROWS
+        self.far_sigma = self.unit * (
+            FAR_SIGMA * np.sqrt(np.maximum(each, 1)) if tells else np.full(len(self.K), FAR_SIGMA_ALONE)
+        )
 
     def solve(self, state: State, iterations: int) -> tuple[State, float]:
         """The best state nearby and its cost."""
@@ -130,17 +155,25 @@ class Problem:
                 break
         return state, cost
 
-    def points_for(self, state: State) -> State:
+    def points_for(self, state: State, iterations: int = ITERATIONS) -> State:
         """The same poses with all of this problem's points placed as they say."""
-        state = replace(state, points=self.start)
-        for _ in range(ITERATIONS):
-            error, turned, local = self.residuals(state)
+        points, spread = self.on_rays(state), self.spread(state)
+        middle = np.median(points, 0)
+        for _ in range(iterations):
+            error, turned, local = self.residuals(replace(state, points=points))
             _, point, weight = self.slopes(error, turned, local, state)
-            V = np.einsum("ntij,ntik->njk", point * weight[..., None], point) + np.eye(3) / (SHAPE_SIGMA * self.size) ** 2
-            slope = np.einsum("ntij,nti->nj", point * weight[..., None], error)
-            slope += (state.points - self.start) / (SHAPE_SIGMA * self.size) ** 2
-            state = replace(state, points=state.points - np.linalg.solve(V, slope[..., None])[..., 0])
-        return state
+            V = np.einsum("ntij,ntik->njk", point * weight[..., None], point) + np.eye(3) / spread**2
+            slope = np.einsum("ntij,nti->nj", point * weight[..., None], error) + (points - middle) / spread**2
+            points = points - np.linalg.solve(V, slope[..., None])[..., 0]
+        return replace(state, points=points)
+
+    def on_rays(self, s: State) -> np.ndarray:
+        """Canonical places (N, 3) of points as far away as the thing's centre: the median over time."""
+        depth = np.einsum("tj,tj->t", self.w2c[:, 2], s.shifts - self.eye)
+        rays = (self.pixels - self.K[:, :2, 2]) / self.K[:, [0, 1], [0, 1]]
+        local = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) * depth[:, None]
+        back = np.einsum("tji,ntj->nti", s.rotations, np.einsum("tji,ntj->nti", self.w2c, local) + self.eye - s.shifts)
+        return np.nanmedian(np.where(self.seen[..., None], back, np.nan), 1)
 
     def unreversed(self, state: State, cost: float) -> State:
         """The state with depth no longer reversed: seen from afar, a thing turning one way and its mirror image turning the other look
@@ -183,9 +216,29 @@ class Problem:
         turns = Rotation.from_matrix(s.rotations[1:] @ np.swapaxes(s.rotations[:-1], 1, 2)).as_rotvec()
         turning = np.diff(turns, axis=0) / TURN_SIGMA
         mean = np.where(self.seen, local[..., 2], 0).sum(0) / np.maximum(self.seen.sum(0), 1)
-        far = np.where(self.told, (mean - self.mean_depth) / (FAR_SIGMA * self.unit), 0)
-        path = self.third @ s.shifts / (PATH_SIGMA * self.unit)
-        return far, path, turning, (s.points - self.start) / (SHAPE_SIGMA * self.size)
+        far = np.where(self.told, (mean - self.mean_depth) / self.far_sigma, 0)
+        path = self.third @ s.shifts / (self.path_sigma * self.distance(s))
+        return far, path, turning, (s.points - self.middle) / self.spread(s)
+
+    def distance(self, s: State) -> float:
+        """How far away the thing is on the whole: its mean z-depth."""
+        return max(float((self.nearing * (s.shifts - self.eye)).sum()), 0.05 * self.unit)
+
+    def spread(self, s: State) -> float:
+        """Standard deviation of a point's distance from the middle, which grows with the thing's distance as pixels leave it open."""
+        return SHAPE_SIGMA * self.size * self.distance(s) / self.unit
+
+    def path_slopes(self, s: State, path: np.ndarray) -> np.ndarray:
+        """Derivatives (T - 3, 3, T, 3) of the path's residuals by the shifts. They are shares of the distance: else all would do well
+        to come nearer, as whatever is near moves little."""
+        out = self.third[:, None, :, None] * np.eye(3)[None, :, None] / self.path_sigma - path[..., None, None] * self.nearing
+        return out / self.distance(s)
+
+    def roughened(self, s: State) -> None:
+        """Believe in smooth paths as far as this state's is, where it was seen for long enough to tell."""
+        if self.rows.sum() >= LEAST_ROWS:
+            path = np.abs(self.third @ s.shifts)[self.rows] / self.distance(s)
+            self.path_sigma = max(PATH_SIGMA, 1.5 * float(np.median(path)))
 
     def cost(self, s: State) -> float:
         """Huber cost of everything."""
@@ -221,18 +274,20 @@ class Problem:
         W = np.einsum("ntij,ntik->ntjk", wp, point)  # (N, T, 6, 3)
         gp = np.einsum("ntij,nti->tj", wp, error)
         gx = np.einsum("ntij,nti->nj", wx, error)
-        V = V + np.eye(3) / (SHAPE_SIGMA * self.size) ** 2
-        gx = gx + shape / (SHAPE_SIGMA * self.size)
-        row = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1) / (FAR_SIGMA * self.unit) * self.told[:, None]
+        V, gx = V + np.eye(3) / self.spread(s) ** 2, gx + shape / self.spread(s)
+        W[:, :, 3:] -= (self.nearing / self.distance(s))[None, :, :, None] * (shape / self.spread(s))[:, None, None]
+        row = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1) / self.far_sigma[:, None] * self.told[:, None]
         U, gp = U + row[:, :, None] * row[:, None], gp + row * far[:, None]
         full = np.zeros((num, 6, num, 6))
         full[np.arange(num), :, np.arange(num)] = U
-        smooth = self.third.T @ self.third / (PATH_SIGMA * self.unit) ** 2
+        smooth = self.path_slopes(s, path).reshape(path.size, 3 * num)
+        full[:, 3:, :, 3:] += (smooth.T @ smooth).reshape(num, 3, num, 3)
+        gp[:, 3:] += (smooth.T @ path.reshape(-1)).reshape(num, 3) - (shape**2).sum() * self.nearing / self.distance(s)
+        nearing = np.sqrt((shape**2).sum()) * self.nearing.reshape(-1) / self.distance(s)
+        full[:, 3:, :, 3:] += np.outer(nearing, nearing).reshape(num, 3, num, 3)
         for axis in range(3):
-            full[:, 3 + axis, :, 3 + axis] += smooth
             full[:, axis, :, axis] += self.second.T @ self.second / TURN_SIGMA**2
         gp[:, :3] += self.second.T @ turning / TURN_SIGMA
-        gp[:, 3:] += self.third.T @ path / (PATH_SIGMA * self.unit)
         full, gp = full.reshape(6 * num, 6 * num), gp.reshape(-1)
         full[np.diag_indices(6 * num)] *= 1 + damping
         full[np.diag_indices(6 * num)] += 1e-9 * np.trace(full) / len(full) + 1e-12

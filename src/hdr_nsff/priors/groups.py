@@ -132,8 +132,9 @@ def advance(view: View, following: View, step: int, at: np.ndarray) -> np.ndarra
     return np.where((inside & landed)[:, None], out, np.nan)
 
 
-def gather(tracks: Tracks) -> list[Group]:
-    """Things that move as one, largest first: parts of the graph of neighbouring tracks, joined again where one rigid motion explains both."""
+def gather(tracks: Tracks, smallest: float = SMALLEST) -> list[Group]:
+    """Things that move as one, of a share `smallest` of the tracks at least, largest first: parts of the graph of
+    neighbouring tracks, joined again where one rigid motion explains both."""
     label = parts(tracks)
     few = np.unique(np.linspace(0, len(label) - 1, MOST).astype(int))  # enough to tell motions apart
     members = [np.nonzero(label == k)[0] for k in range(label.max() + 1)]
@@ -144,7 +145,7 @@ def gather(tracks: Tracks) -> list[Group]:
         a, b = (groups.pop(k) for k in pair)
         groups[max(*groups, *pair) + 1] = fit(tracks, np.concatenate([a.members, b.members]))
     everyone = [np.nonzero(np.isin(label, label[g.members]))[0] for g in groups.values()]
-    large = [m for m in everyone if len(m) >= SMALLEST * len(label)] or everyone[:1]
+    large = [m for m in everyone if len(m) >= smallest * len(label)] or everyone[:1]
     return [fit(tracks, m) for m in sorted(large, key=len, reverse=True)]
 
 
@@ -181,12 +182,7 @@ def parts(tracks: Tracks) -> np.ndarray:
     n, num = tracks.trust.shape
     if num < 2 or n < 3 * PARTS:
         return np.zeros(n, int)
-    found = [np.zeros((0, 2), int)]
-    for t in range(num):
-        seen = np.nonzero(tracks.trust[:, t])[0]
-        if len(seen):
-            found.append(seen[cKDTree(tracks.pixels[seen, t]).query_pairs(LINK, output_type="ndarray")])
-    pairs = np.unique(np.concatenate(found), axis=0)
+    pairs = neighbours(tracks)
     strength = affinity(tracks, pairs)
     graph = coo_matrix((strength, pairs.T), (n, n)).tocsr()
     graph = graph + graph.T + diags(np.full(n, 1e-6))
@@ -200,6 +196,16 @@ def parts(tracks: Tracks) -> np.ndarray:
         return np.minimum(rank[piece], PARTS - 1)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
     return kmeans2(vectors, PARTS, minit="++", rng=np.random.default_rng(0))[1]
+
+
+def neighbours(tracks: Tracks) -> np.ndarray:
+    """Pairs (P, 2) of tracks that come near each other in a picture."""
+    found = [np.zeros((0, 2), int)]
+    for t in range(tracks.trust.shape[1]):
+        seen = np.nonzero(tracks.trust[:, t])[0]
+        if len(seen):
+            found.append(seen[cKDTree(tracks.pixels[seen, t]).query_pairs(LINK, output_type="ndarray")])
+    return np.unique(np.concatenate(found), axis=0)
 
 
 def affinity(tracks: Tracks, pairs: np.ndarray) -> np.ndarray:

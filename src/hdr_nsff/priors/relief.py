@@ -6,18 +6,17 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from hdr_nsff.priors.bundle import Cameras, Shape, adjust
-from hdr_nsff.priors.groups import Group, Tracks, View, follow, gather
+from hdr_nsff.priors.bundle import Cameras, Shape
+from hdr_nsff.priors.groups import Tracks, View, follow
 from hdr_nsff.priors.movers import steps_in_time
 from hdr_nsff.priors.parallax import Shots
+from hdr_nsff.priors.things import LEAST_TRACKS, things
 from hdr_nsff.progress import say
 
-LEAST_TRACKS = 60  # of a group that can be adjusted
-GOOD = 1.5  # standard deviations: median reprojection error of a shape that is believed
 NEIGHBOURS = 4  # tracks that a pixel's depth is taken from
 REACH = 8.0  # pixels to the nearest of them
 SURE = 0.5  # confidence right at a track: its distance as a whole is the prior's
-CHANGE = 1.5  # a pixel's depth may change by this factor
+CHANGE = 2.0  # a pixel's depth may change by this factor
 
 
 def relief(
@@ -33,21 +32,13 @@ def relief(
     if len(tracks.trust) < LEAST_TRACKS:
         return disparity, confidence
     cameras = Cameras(shots.K[frames], shots.c2w[frames])
-    groups = gather(tracks)
-    shapes = [s for g in groups if (s := shape_of(tracks, g, cameras))]
-    say(f"depth: the shape of {len(shapes)} of {len(groups)} moving things found from {len(tracks.trust)} tracks")
+    found = things(tracks, cameras)
+    shapes = [shape for _, shape in found if shape]
+    say(f"depth: the shape of {len(shapes)} of {len(found)} moving things found from {len(tracks.trust)} tracks")
     disparity, confidence = disparity.copy(), confidence.copy()
     for t, f in enumerate(frames):
         apply(shots.moving[f], shots.c2w[f], t, tracks, shapes, disparity[f], confidence[f])
     return disparity, confidence
-
-
-def shape_of(tracks: Tracks, group: Group, cameras: Cameras) -> Shape | None:
-    """The group's shape and motion where its tracks tell them."""
-    if len(group.members) < LEAST_TRACKS or len(cameras.K) < 4:
-        return None
-    shape = adjust(tracks, group, cameras)
-    return shape if shape.error < GOOD else None
 
 
 def views_in_time(
