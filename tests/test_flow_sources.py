@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from hdr_nsff.errors import InputError
-from hdr_nsff.io import write_npy
+from hdr_nsff.io import write_npy, write_text
+from hdr_nsff.priors import weights
 from hdr_nsff.priors.flow import flow
-from hdr_nsff.priors.flow_sources import check_flow, flow_source
+from hdr_nsff.priors.flow_sources import check_flow, fallback_note, flow_source, flow_weights, resolved
+from hdr_nsff.priors.semantic import SemanticConfig
+from hdr_nsff.priors.weights import find
 from hdr_nsff.scene import FrameEntry
 from hdr_nsff.steps.priors import learning_pairs
 
@@ -17,11 +20,34 @@ CLIPPED = np.zeros(FRAMES.shape[:3], bool)
 PAIRS = np.array([[1, 2], [2, 1]])
 
 
-def test_the_default_is_dense_inverse_search_over_the_whole_clip():
+@pytest.fixture
+def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A machine on which no weights are; the folder where they would be kept."""
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "weights"))
+    monkeypatch.setattr(weights, "package_folder", lambda entry: None)
+    return tmp_path / "weights"
+
+
+def test_without_weights_the_default_is_dense_inverse_search_over_the_whole_clip_and_says_so(bare: Path):
+    assert resolved(None, "xfeat") == "dis" and "hdr-nsff weights xfeat" in fallback_note(None, "xfeat")
+    assert fallback_note("dis", "xfeat") == "" and flow_weights(None, None, SemanticConfig()) == []
     for chosen in (None, "dis"):
         found = flow_source(chosen)(FRAMES, CLIPPED, PAIRS)
         assert np.array_equal(found[0], flow(FRAMES, CLIPPED, PAIRS, None)[0])
     assert np.array_equal(found[0], flow(FRAMES[1:], CLIPPED[1:], PAIRS - 1, None)[0])  # frames of no pair change nothing
+
+
+def test_with_the_weights_of_its_features_the_default_is_semantic(bare: Path):
+    write_text(bare / "xfeat" / "xfeat.pt", "something else")
+    assert resolved(None, "xfeat") == "semantic" and fallback_note(None, "xfeat") == ""
+    assert resolved("dis", "xfeat") == "dis" and resolved(None, "dinov2-small") == "dis"
+    with pytest.raises(InputError, match=r"xfeat.pt"):  # broken weights are no reason to fall back silently
+        flow_weights(None, None, SemanticConfig())
+
+
+def test_the_weights_that_the_prepare_extra_brings_are_found():
+    assert find("xfeat", download=False).name == "xfeat.pt"
+    assert resolved(None, "xfeat") == "semantic"
 
 
 def test_a_folder_gives_its_maps(tmp_path: Path):
@@ -39,11 +65,11 @@ def test_a_name_that_is_neither_a_source_nor_a_folder_is_refused():
 def test_weights_for_what_takes_none_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="takes no weights"):
         check_flow("dis", tmp_path)
+    with pytest.raises(InputError, match="name the network"):
+        check_flow(None, tmp_path)
 
 
 def test_semantic_flow_takes_its_features_weights(tmp_path: Path):
-    from hdr_nsff.priors.semantic import SemanticConfig
-
     broken = tmp_path / "xfeat.pt"
     broken.write_bytes(b"nothing")
     check_flow("semantic", broken)

@@ -13,11 +13,23 @@ from hdr_nsff.errors import InputError
 from hdr_nsff.priors.flow import FlowPrior, flow, read_flow
 from hdr_nsff.priors.flow_networks import load, matched_flow, weights_file
 from hdr_nsff.priors.semantic import Pairs, SemanticConfig, semantic_flow
-from hdr_nsff.priors.weights import find
+from hdr_nsff.priors.weights import entry, find, look
 
 FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
-DEFAULT: FlowName = "dis"
 NETWORKS = frozenset({"semantic", "gmflow", "raft", "raft-finetuned"})  # the names that `--flow-weights` is for
+
+
+def resolved(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
+    """What was chosen; None stands for `semantic` where the weights of its `features` are on this machine, else for `dis`, which needs none."""
+    if chosen is not None:
+        return chosen
+    return "dis" if look(entry(features)) is None else "semantic"
+
+
+def fallback_note(chosen: FlowName | Path | None, features: str) -> str:
+    """Half a sentence where None stands for `dis` for want of weights."""
+    lacking = chosen is None and resolved(chosen, features) == "dis"
+    return f", for the weights of {features} are not on this machine: see `hdr-nsff weights {features}`" if lacking else ""
 
 
 def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
@@ -27,7 +39,12 @@ def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
             f"--flow {chosen}: no such folder of flow maps, and no source of that name; use {', '.join(get_args(FlowName))}, or mend the path"
         )
     if weights is not None and chosen not in NETWORKS:
-        raise InputError(f"--flow-weights {weights}: `--flow {chosen or DEFAULT}` takes no weights; leave the option out")
+        mend = (
+            "name the network they are of with --flow"
+            if chosen is None
+            else f"`--flow {chosen}` takes no weights; leave the option out"
+        )
+        raise InputError(f"--flow-weights {weights}: {mend}")
     if weights is not None and not weights.exists():
         raise InputError(f"--flow-weights {weights}: no such file; mend the path")
     if chosen == "raft-finetuned" and weights is None:
@@ -45,37 +62,38 @@ def flow_source(
     neighbours: Pairs = (),
     equal: Pairs = (),
 ) -> FlowPrior:
-    """The flow prior that `--flow` chose, None for the default; its `video` and `pairs` are those of the whole clip.
+    """The flow prior that `--flow` chose, None for what it stands for; its `video` and `pairs` are those of the whole clip.
 
     `semantic` (its defaults where None), `neighbours` and `equal` are what `SemanticFlow` fits its features by."""
-    match chosen:
+    semantic = semantic or SemanticConfig()
+    match source := resolved(chosen, semantic.features):
         case Path():
-            return partial(from_folder, chosen)
-        case "dis" | None:
+            return partial(from_folder, source)
+        case "dis":
             return partial(flow, report=None)
         case "semantic":
-            return semantic_flow(semantic or SemanticConfig(), weights, neighbours, equal)
+            return semantic_flow(semantic, weights, neighbours, equal)
         case "gmflow" | "raft":
-            return partial(matched_flow, load(chosen, weights, device()))
+            return partial(matched_flow, load(source, weights, device()))
         case "raft-finetuned":
             return partial(matched_flow, load(None, weights, device()))
         case _:
-            assert_never(chosen)
+            assert_never(source)
 
 
 def flow_weights(chosen: FlowName | Path | None, weights: Path | None, semantic: SemanticConfig) -> list[Path]:
     """The weights that the flow prior of these settings reads; none where it reads none. InputError where they are not to be had."""
-    match chosen:
-        case Path() | "dis" | None:
+    match source := resolved(chosen, semantic.features):
+        case Path() | "dis":
             return []
         case "semantic":
             return [find(semantic.features, weights)]
         case "gmflow" | "raft":
-            return [weights_file(chosen, weights)]
+            return [weights_file(source, weights)]
         case "raft-finetuned":
             return [weights_file(None, weights)]
         case _:
-            assert_never(chosen)
+            assert_never(source)
 
 
 def device() -> torch.device:

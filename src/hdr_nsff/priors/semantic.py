@@ -39,18 +39,19 @@ class SemanticConfig:
     """Of DINOv2: after how many layers features are taken. Default 15 of 24, and that share of fewer."""
     stride: int | None = None
     """Of DINOv2: pixels from token to token. Default 7, half a patch."""
-    steps: int = 300
-    """Steps of fitting the features to the clip; 0 takes them as they are."""
+    steps: int | None = None
+    """Steps of fitting the features to the clip; 0 takes them as they are. Default: 0 for XFeat, which fitting made no better, 300 for DINOv2."""
     seed: int = 0
     """Randomness of that fitting."""
 
 
 def semantic_flow(config: SemanticConfig, weights: Path | None, neighbours: Pairs, equal: Pairs) -> SemanticFlow:
     """The flow prior of these settings; `weights` of the features, None for wherever they are found; pairs as of `SemanticFlow`."""
-    if config.steps < 0:
-        raise InputError(f"--semantic.steps {config.steps}: must be 0 or more")
+    steps = (0 if config.features == "xfeat" else 300) if config.steps is None else config.steps
+    if steps < 0:
+        raise InputError(f"--semantic.steps {steps}: must be 0 or more")
     source = feature_source(config.features, weights, config.layer, config.stride)
-    return SemanticFlow(source, neighbours, equal, config.steps, config.seed)
+    return SemanticFlow(source, neighbours, equal, steps, config.seed)
 
 
 class SemanticFlow:

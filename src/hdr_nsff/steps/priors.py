@@ -16,7 +16,7 @@ from hdr_nsff.datasets import maps
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
 from hdr_nsff.priors.depth import depth_range, geometric_depth, read_depth
-from hdr_nsff.priors.flow_sources import DEFAULT, flow_source
+from hdr_nsff.priors.flow_sources import fallback_note, flow_source, resolved
 from hdr_nsff.priors.import_poses import import_poses, placed
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
 from hdr_nsff.priors.poses import Poses, estimate_poses
@@ -74,8 +74,9 @@ def flow_step(work: Work) -> Step:
     share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
     vars(work).pop("flows", None)
     given = len(pairs) if from_folder else len(own)
-    name = "data set" if len(own) == len(pairs) else f"{c.flow or DEFAULT}"
-    note = f"{len(pairs)} pairs ({name}), {share:.0%} of the pixels pass the forward-backward check"
+    name = "data set" if len(own) == len(pairs) else f"{resolved(c.flow, c.semantic.features)}"
+    why = "" if len(own) == len(pairs) else fallback_note(c.flow, c.semantic.features)
+    note = f"{len(pairs)} pairs ({name}{why}), {share:.0%} of the pixels pass the forward-backward check"
     return Step(
         provenance="given" if given == len(pairs) else "estimated",
         note=note + (f"; {given} given, {len(pairs) - given} estimated" if 0 < given < len(pairs) else ""),

@@ -61,13 +61,13 @@ class PrepareConfig:
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk: learned, matched by LightGlue (extra `neural`), seconds
     per pair of frames on a CPU, for footage in which SIFT finds too little in common."""
     flow: FlowName | Path | None = None
-    """Where optical flow comes from. dis: OpenCV's dense inverse search, without weights (default); semantic: by features that change little
-    with the exposure; gmflow, raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a
+    """Where optical flow comes from. Default: semantic where the weights of its features are on this machine, else dis. semantic: by features
+    that change little with the exposure; dis: OpenCV's dense inverse search, without weights; gmflow, raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a
     folder of maps made elsewhere: 00003_00004.npy (H, W, 2) pixels per pair of frames."""
     flow_weights: Path | None = None
     """Weights of the network that --flow names: a file, or the folder of `finetune-flow`. Default: where weights are kept."""
     semantic: SemanticConfig = field(default_factory=SemanticConfig)
-    """Of --flow semantic."""
+    """Of --flow semantic, which is the default where its weights are there."""
     masks: Annotated[MaskName | Path | None, arg(name="mask", aliases=("--masks",))] = None
     """Where moving masks come from. motion: what the camera's motion does not explain (default); sam2: the same outlined by a network (extra
     `neural`); or a folder of masks made elsewhere: one PNG per frame in order, moving = white."""
