@@ -172,7 +172,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         write_text(file, "something else")
         assert found and weights_of(config, step) != found, name
         assert not any(weights_of(config, other) for other in ("frames", "exposure", "sheet"))
-    assert not any(weights_of(replace(clip, flow=None, depth=None, poses=None), s) for s in ("flow", "poses", "mask", "depth"))
+    assert not any(weights_of(replace(clip, flow="dis", depth=None, poses=None), s) for s in ("flow", "poses", "mask", "depth"))
 
 
 def test_a_known_file_that_changed_is_refused(clip, tmp_path, monkeypatch):

