@@ -3,6 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
 import torch
 
 from hdr_nsff import distributed
@@ -13,7 +14,7 @@ from hdr_nsff.fields.hexplane import HexPlane, HexPlaneConfig
 from hdr_nsff.fields.splat import Splat, SplatConfig
 from hdr_nsff.fields.two_branches import TwoBranches
 from hdr_nsff.scene import Scene
-from hdr_nsff.train import Trainer, open_folder
+from hdr_nsff.train import Trainer, open_folder, train
 
 GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)
 MLP = MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2)
@@ -77,3 +78,17 @@ def trainer(config: TrainConfig, scene: Scene) -> Trainer:
     """Ready for its first step, alone."""
     open_folder(config)
     return Trainer(config, scene, torch.device("cpu"), distributed.Ranks())
+
+
+def interrupted_at(stop: int, settings: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Train up to step `stop`, where somebody presses Ctrl-C."""
+    step = Trainer.step
+
+    def stopping(self: Trainer) -> dict[str, float]:
+        if self.clock.step == stop:
+            raise KeyboardInterrupt
+        return step(self)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Trainer, "step", stopping)
+        train(settings)

@@ -284,14 +284,20 @@ def test_several_pictures_of_one_time_become_cameras(tmp_path: Path) -> None:
 # HDR-NeRF and nerfstudio
 
 
+def reference_of_rounds(m: Manifest) -> float:
+    """The EV of the first picture of a still scene whose first, third and fifth exposures, all given, come in turn."""
+    gauge = m.frames[0].ev
+    assert gauge is not None and [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
+    assert m.steps["mask"].provenance == "given" and m.exposure_given
+    return gauge
+
+
 def test_a_still_scene_trains_on_one_of_five_exposures_per_view(tmp_path: Path) -> None:
     config = replace(still(tmp_path, 6, mini.hdr_nerf(tmp_path / "set")), masks=None)
     m = Manifest.load(prepare(config))
     assert [f.source for f in m.frames] == [f"train/r_{n}_{(0, 2, 4)[n % 3]}.png" for n in range(6)]
-    gauge = m.frames[0].ev
-    assert gauge is not None and [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
+    reference_of_rounds(m)
     assert not any(f.moving.any() for f in Scene.open(config.out).train if f.moving is not None)
-    assert m.steps["mask"].provenance == "given" and m.exposure_given
 
 
 def test_all_five_exposures_of_a_held_out_view_are_kept(tmp_path: Path) -> None:
@@ -314,9 +320,7 @@ def test_every_second_pose_of_a_real_hdr_nerf_scene_is_held_out(tmp_path: Path) 
     config = replace(still(tmp_path, 6, mini.hdr_nerf_real(tmp_path / "set")), masks=None)
     m = Manifest.load(prepare(config))
     assert [f.source for f in m.frames] == [f"input_images/{2 * k:03d}_{(0, 2, 4)[k % 3]}.png" for k in range(6)]
-    gauge = m.frames[0].ev
-    assert gauge is not None and [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
-    assert m.steps["mask"].provenance == "given" and m.exposure_given
+    gauge = reference_of_rounds(m)
     assert all(np.allclose(f.c2w, mini.pose(0.2 * k)) for k, f in enumerate(m.frames) if f.c2w is not None)
     folder = tmp_path / "scene_truth"
     truth = Truth.open(folder)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from presets import random_field, small, trainer
+from presets import interrupted_at, random_field, small, trainer
 from safetensors.torch import load_file
 from torch import Tensor
 from toy_scene import ToyScene
@@ -195,18 +195,8 @@ def test_a_stopped_run_resumes_to_the_unbroken_ones_corrections(
     monkeypatch.setattr(Trainer, "preview", lambda self: None)
     straight = train(refining(toy_folder, tmp_path / "straight", preset))
     settings = replace(refining(toy_folder, tmp_path / "run", preset), checkpoint_seconds=0.0)
-    step = Trainer.step
     for stop in (1, 13):  # before and after cameras start to move
-
-        def stopping(self: Trainer, stop: int = stop) -> dict[str, float]:
-            if self.clock.step == stop:
-                raise KeyboardInterrupt
-            return step(self)
-
-        monkeypatch.setattr(Trainer, "step", stopping)
-        with pytest.raises(KeyboardInterrupt):
-            train(settings)
-    monkeypatch.setattr(Trainer, "step", step)
+        interrupted_at(stop, settings, monkeypatch)
     a, b = (load_file(max((run / "checkpoints").glob("*"))) for run in (straight, train(settings)))
     assert a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
     assert float(a["poses.moves"].abs().max()) > 1e-4 and float(a["poses.zooms"].abs().max()) > 0

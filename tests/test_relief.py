@@ -104,6 +104,10 @@ def test_the_clip_is_what_it_says(clip: Clip) -> None:
 def test_relief_is_found_where_depth_knew_one_distance(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
     before, after = clip.wrong(clip.flat), clip.wrong(found[0])
     assert before.min() > 0.009 and (after < 0.7 * before).all() and after.mean() < 0.55 * before.mean()
+    distance = np.median((found[0] / clip.true)[clip.moving])  # found from the camera's shake, not given by depth
+    assert distance == pytest.approx(1, abs=0.02)
+    relief_alone = clip.wrong(found[0] / distance)
+    assert (relief_alone < 0.3 * before).all() and relief_alone.mean() < 0.2 * before.mean()
 
 
 def test_nothing_changes_outside_the_masks(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:

@@ -13,7 +13,7 @@ from typing import Literal
 
 import pytest
 import torch
-from presets import small, trainer
+from presets import interrupted_at, small, trainer
 from safetensors.torch import load_file
 from torch import Tensor
 
@@ -71,19 +71,9 @@ def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
         unbroken if preset == "grid" else train(replace(settings, out=tmp_path / "straight", checkpoint_seconds=1e9))
     )
     monkeypatch.setattr(Trainer, "preview", lambda self: None)
-    step = Trainer.step
     for stop in (3, 17):  # before and after culling starts and the tone mapper is anchored
-
-        def stopping(self: Trainer, stop: int = stop) -> dict[str, float]:
-            if self.clock.step == stop:
-                raise KeyboardInterrupt
-            return step(self)
-
-        monkeypatch.setattr(Trainer, "step", stopping)
-        with pytest.raises(KeyboardInterrupt):
-            train(settings)
+        interrupted_at(stop, settings, monkeypatch)
         assert max(p.name for p in (settings.out / "checkpoints").iterdir()) == f"step_{stop:08d}.safetensors"
-    monkeypatch.setattr(Trainer, "step", step)
     assert_same(final(train(settings)), straight)
 
 
