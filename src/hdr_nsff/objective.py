@@ -159,4 +159,5 @@ class Objective:
         known = {f.name: getattr(self.weights, f.name) for f in fields(self.weights)}
         unknown = set(terms) - set(known)
         assert not unknown, f"terms without a weight in LossWeights: {sorted(unknown)}"
-        return torch.stack([known[name] * value for name, value in terms.items() if known[name]]).sum()
+        counting = torch.stack([value for name, value in terms.items() if known[name]])
+        return (counting * torch.tensor([known[name] for name in terms if known[name]]).to(counting)).sum()

@@ -39,36 +39,36 @@ def bin_of(x, knots, table):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
-    """Fill `out` (N, 3) with what is recorded of `radiance` (N, 3) through `gain` (3,) and a curve `values` (3, K) at `knots` (K,).
+    """Fill `out` (3, N) with what is recorded of `radiance` (3, N) through `gain` (3,) and a curve `values` (3, K) at `knots` (K,).
 
     `inverse` (K - 1,) is 1 / width of the bins, `table` that of `bin_table`; not `leaky`: clamped instead of eq. 11."""
-    n, top = len(radiance), F1 + leak
+    n, top = radiance.shape[1], F1 + leak
     for k in numba.prange(CHUNKS):
         for c in range(3):
-            curve, factor = values[c], gain[c]
+            curve, factor, seen, told = values[c], gain[c], radiance[c], out[c]
             for i in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
-                x = radiance[i, c] * factor
+                x = seen[i] * factor
                 if F0 <= x <= F1:
                     b = bin_of(x, knots, table)
-                    out[i, c] = curve[b] + (curve[b + NEXT] - curve[b]) * ((x - knots[b]) * inverse[b])
+                    told[i] = curve[b] + (curve[b + NEXT] - curve[b]) * ((x - knots[b]) * inverse[b])
                 elif x > F1:
-                    out[i, c] = top - leak / np.sqrt(x) if leaky else curve[-1]
+                    told[i] = top - leak / np.sqrt(x) if leaky else curve[-1]
                 elif x < F0:
-                    out[i, c] = leak * x if leaky else curve[0]
+                    told[i] = leak * x if leaky else curve[0]
                 else:
-                    out[i, c] = x  # NaN
+                    told[i] = x  # NaN
 
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def backward(radiance, gain, values, knots, inverse, table, leaky, leak, grad_out, grad_radiance, grad_gain, grad_values):
-    """Fill `grad_radiance` (N, 3) and `grad_gain` (CHUNKS, 3) and add to `grad_values` (CHUNKS, 3, K): sums over the chunks are to be taken."""
-    n, half = len(radiance), leak / np.float32(2)
+    """Fill `grad_radiance` (3, N) and `grad_gain` (CHUNKS, 3) and add to `grad_values` (CHUNKS, 3, K): sums over the chunks are to be taken."""
+    n, half = radiance.shape[1], leak / np.float32(2)
     for k in numba.prange(CHUNKS):
         for c in range(3):
             curve, factor, said = values[c], gain[c], grad_values[k, c]
             total = 0.0
             for i in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
-                x, g, slope = radiance[i, c] * factor, grad_out[i, c], F0
+                x, g, slope = radiance[c, i] * factor, grad_out[c, i], F0
                 if F0 <= x <= F1:
                     b = bin_of(x, knots, table)
                     right = g * ((x - knots[b]) * inverse[b])
@@ -84,26 +84,27 @@ def backward(radiance, gain, values, knots, inverse, table, leaky, leak, grad_ou
                 if x != x:  # NaN has no bin and no slope, but the curve shall not hide it
                     said[0] += x
                     slope = F0
-                grad_radiance[i, c] = g * slope * factor
-                total += g * slope * radiance[i, c]
+                grad_radiance[c, i] = g * slope * factor
+                total += g * slope * radiance[c, i]
             grad_gain[k, c] = total
 
 
 class Respond(torch.autograd.Function):
     """Recorded rgb (N, 3) of `radiance` (N, 3) through `gain` (3,) and a curve (3, K) at `knots` (K,), all float32 on the CPU.
 
-    Ends as in eq. 11 with `leak`, clamped where that is None. `table` is `bin_table(knots)`."""
+    Ends as in eq. 11 with `leak`, clamped where that is None. `table` is `bin_table(knots)`. The kernels work channel by channel, so
+    radiance that lies in memory like that is not copied, and the recording lies like that, too."""
 
     @staticmethod
     def forward(
         ctx: Any, radiance: Tensor, gain: Tensor, values: Tensor, knots: Tensor, table: Tensor, leak: float | None
     ) -> Tensor:
-        saved = radiance.contiguous(), gain.contiguous(), values.contiguous(), knots, 1 / knots.diff(), table
+        saved = radiance.T.contiguous(), gain.contiguous(), values.contiguous(), knots, 1 / knots.diff(), table
         ctx.save_for_backward(*saved)
         ctx.ends = leak is not None, np.float32(leak or 0)
         out = torch.empty_like(saved[0])
         forward(*(t.detach().numpy() for t in saved), *ctx.ends, out.numpy())
-        return out
+        return out.T
 
     @staticmethod
     @once_differentiable
@@ -113,5 +114,5 @@ class Respond(torch.autograd.Function):
         grad_gain = torch.empty(CHUNKS, 3, dtype=torch.float64)
         grad_values = torch.zeros(CHUNKS, *saved[2].shape, dtype=torch.float64)
         grads = grad_radiance, grad_gain, grad_values
-        backward(*(t.detach().numpy() for t in saved), *ctx.ends, grad_out.contiguous().numpy(), *(t.numpy() for t in grads))
-        return grad_radiance, grad_gain.sum(0).float(), grad_values.sum(0).float(), None, None, None
+        backward(*(t.detach().numpy() for t in saved), *ctx.ends, grad_out.T.contiguous().numpy(), *(t.numpy() for t in grads))
+        return grad_radiance.T, grad_gain.sum(0).float(), grad_values.sum(0).float(), None, None, None

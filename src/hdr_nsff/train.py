@@ -242,10 +242,11 @@ class Trainer:
                 render, own = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase) | own | self.tonemapper.regularizers()
             terms |= self.poses.regularizers(batch.frame) if self.poses else {}
-            self.check(terms, batch, render.radiance)
+            values = dict(zip(terms, torch.stack(list(terms.values())).tolist(), strict=True))
+            self.check(values, batch, render.radiance)
             (self.objective.total(terms) / config.batches).backward()
-            for name, value in terms.items():
-                totals[name] = totals.get(name, 0.0) + float(value.detach()) / len(slots)
+            for name, value in values.items():
+                totals[name] = totals.get(name, 0.0) + value / len(slots)
             if (clock.step + 1) % LOG_EVERY == 0:
                 totals["mse"] = totals.get("mse", 0.0) + self.squared_error(render, batch) / len(slots)
         self.ranks.sum_gradients(p for o in self.optimisers.values() for g in o.param_groups for p in g["params"])
@@ -298,9 +299,9 @@ class Trainer:
         look = self.tonemapper.look(batch.bracket, batch.camera_id, frame, leaky=True)
         return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), look=look, chain=chain)
 
-    def check(self, terms: dict[str, Tensor], batch: PixelBatch, radiance: Tensor) -> None:
+    def check(self, values: dict[str, float], batch: PixelBatch, radiance: Tensor) -> None:
         """NaN and Inf are errors with the step, the term and the ray."""
-        bad = [name for name, value in terms.items() if not torch.isfinite(value)]
+        bad = [name for name, value in values.items() if not math.isfinite(value)]
         if not bad:
             return
         rays = (~torch.isfinite(radiance).all(-1)).nonzero()[:, 0]

@@ -61,15 +61,27 @@ def stretched(camera: Camera) -> Tensor:
     return torch.cat([focal / focal.detach(), focal.new_ones(1)])[:, None] * w2c
 
 
+def products(*wanted: str) -> Tensor:
+    """(16, n) that makes the `wanted` sums of products, such as "ww -zz", of the outer product (16) of a quaternion w x y z with itself."""
+    table = torch.zeros(16, len(wanted))
+    for column, terms in enumerate(wanted):
+        for term in terms.split():
+            first, second = ("wxyz".index(axis) for axis in term[-2:])
+            table[4 * first + second, column] += -1 if term[0] == "-" else 1
+    return table
+
+
+ROTATION = products(
+    "ww xx -yy -zz", "xy xy -wz -wz", "xz xz wy wy",
+    "xy xy wz wz", "ww -xx yy -zz", "yz yz -wx -wx",
+    "xz xz -wy -wy", "yz yz wx wx", "ww -xx -yy zz",
+)  # fmt: skip
+
+
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """(G, 3, 3) from (G, 4) w x y z of any length."""
-    w, x, y, z = (quaternions / (quaternions.norm(dim=-1, keepdim=True) + 1e-12)).unbind(-1)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    unit = quaternions / (quaternions.norm(dim=-1, keepdim=True) + 1e-12)
+    return ((unit[..., None] * unit[..., None, :]).flatten(-2) @ ROTATION.to(unit)).unflatten(-1, (3, 3))
 
 
 def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
@@ -119,6 +131,14 @@ def front_to_back(depths: np.ndarray) -> np.ndarray:
     return low[np.argsort((bits >> 16).astype(np.uint16)[low], kind="stable")]
 
 
+def blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Features (G, D) and z-depths (G,) side by side, then zeros up to a whole number of the kernels' blocks."""
+    count, d = features.shape
+    values = np.zeros((count, -(-(d + 1) // kernels.BLOCK) * kernels.BLOCK), np.float32)
+    values[:, :d], values[:, d] = features, depths
+    return values
+
+
 class Rasterize(torch.autograd.Function):
     """The numba twin. Returns maps (D + 1, H, W), the last one z-depth, and alpha (H, W)."""
 
@@ -143,8 +163,8 @@ class Rasterize(torch.autograd.Function):
         order = front_to_back(depths)
         tiles = -(-size[0] // kernels.TILE_X), -(-size[1] // kernels.TILE_Y)
         starts, members, places, owned = kernels.bin_tiles(boxes, order, *tiles)
-        values = np.concatenate([features.detach().numpy(), depths[:, None]], 1)
-        maps = torch.empty(values.shape[1], size[1], size[0])
+        values, channels = blocks(features.detach().numpy(), depths), features.shape[1] + 1
+        maps = torch.empty(channels, size[1], size[0])
         alpha = torch.empty(size[1], size[0])
         drawn = (starts, members, centres, conics, arrays[3], values, rows)
         kernels.forward(*drawn, maps.numpy(), alpha.numpy())
@@ -160,7 +180,7 @@ class Rasterize(torch.autograd.Function):
         pairs = np.empty((len(members), kernels.MOMENTS + values.shape[1]), np.float32)
         seen = maps.numpy(), alpha.numpy()
         kernels.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
-        out = [torch.empty(a.shape) for a in (*arrays, values)]
+        out = [torch.empty(a.shape) for a in (*arrays, values[:, : len(maps)])]
         poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
         kernels.project_backward(*arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy())
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None

@@ -147,10 +147,7 @@ class Splat(nn.Module):
         """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,) and what else was drawn (S, ...)."""
         alpha = maps.alpha.reshape(-1)
         seen, motion, extra = maps.features.flatten(0, 1).split([3, 1, maps.features.shape[-1] - 4], 1)
-        behind = (1 - alpha)[:, None] * to_radiance(self.background, self.bounded)
-        radiance = behind.add_(
-            seen
-        )  # in place, pixel by pixel in memory, where `seen` is channel by channel: tone mapping wants it so
+        radiance = torch.addcmul(seen, (1 - alpha)[:, None], to_radiance(self.background, self.bounded))  # lies in memory like `seen`
         depth = maps.depth.reshape(-1) / alpha.clamp_min(1e-3)
         depth = torch.where(alpha > 1e-3, depth, torch.full_like(depth, self.far))
         return radiance, depth.clamp_min(1e-3 * self.unit), alpha, motion[:, 0], extra

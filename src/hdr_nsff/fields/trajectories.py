@@ -42,8 +42,8 @@ class Trajectories(nn.Module):
         q, s = self.pose(knot)
         r = rotation_matrices(q)  # (B, 3, 3)
         offset = self.centres + s - (r @ self.centres[..., None])[..., 0]
-        moved = torch.matmul(points, r.mT) + offset[:, None]  # (B, G, 3)
-        return (mixture[..., None] * moved).sum(0)
+        motions = (mixture.T @ torch.cat([r, offset[..., None]], 2).flatten(1)).unflatten(1, (3, 4))  # each point's own
+        return torch.baddbmm(motions[..., 3:], motions[..., :3], points[..., None])[..., 0]
 
     def turn(self, quaternions: Tensor, mixture: Tensor, knot: float) -> Tensor:
         """Orientations (G, 4) at a knot of Gaussians with canonical `quaternions` (G, 4): the mixture's mean turn, then their own."""

@@ -7,8 +7,8 @@ et al. 2023). The backward pass goes front to back too, with one scalar per pixe
 pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and the same result whatever the
 number of threads. The plain-torch twin is `rasterize.dense`.
 
-Loops over the pixels of a tile are written so that LLVM vectorises them: flat arrays, unsigned ranges, no library call, no maximum
-carried along. `FAST` lets it reorder sums; NaN and Inf stay what they are."""
+Loops over the pixels of a tile are written so that LLVM vectorises them: one flat array, unsigned ranges, no library call, no maximum
+carried along, no error for a division by zero. `FAST` lets it reorder sums; NaN and Inf stay what they are."""
 
 from __future__ import annotations
 
@@ -17,8 +17,14 @@ import math
 import numba
 import numpy as np
 
-TILE_X, TILE_Y = 16, 8  # pixels
+TILE_X, TILE_Y = 8, 32  # pixels
 PIXELS = TILE_X * TILE_Y
+BLOCK = 8  # channels that one pass over a Gaussian's pixels takes; features come in multiples of it
+X, Y, LEFT, WEIGHT, VALUE, GRAD_ALPHA, BEHIND, SUMS = (np.uint64(i * PIXELS) for i in range(8))  # a tile's planes of pixels
+N1, N2, N3, N4, N5, N6, N7 = (np.uint64(i * PIXELS) for i in range(1, BLOCK))
+TWO_ROWS = np.uint64(2 * TILE_X)  # as wide as a vector
+OWN = 7  # planes before SUMS
+LINE = 16  # float32 in a cache line
 MOMENTS = 6  # gradients of a pair before its features: sums of u, u dx, u dy, u dx^2, u dx dy, u dy^2
 F0, F1, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 ALPHA_MIN, ALPHA_MAX = np.float32(1 / 255), np.float32(0.999)
@@ -177,110 +183,127 @@ def bin_tiles(boxes, order, tiles_x, tiles_y):
 
 
 @numba.njit(cache=True)
-def pixel_centres(tile, tiles_x):
-    """First column and row of a tile, and its pixel centres x and y (PIXELS,), row by row."""
+def planes(count, tile, tiles_x):
+    """A tile's first column and row, and `count` planes of PIXELS numbers in one flat array at the start of a cache line: X, Y and LEFT
+    are filled, the others 0. One array with constant distances, for then LLVM need not ask before every loop whether two planes overlap."""
+    room = np.zeros(count * PIXELS + LINE, np.float32)
+    first = (LINE - room.ctypes.data // 4 % LINE) % LINE
+    z = room[first : first + count * PIXELS]
     x0, y0 = (tile % tiles_x) * TILE_X, (tile // tiles_x) * TILE_Y
-    px, py = np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-    for p in range(PIXELS):
-        px[p], py[p] = np.float32(x0 + p % TILE_X) + HALF, np.float32(y0 + p // TILE_X) + HALF
-    return x0, y0, px, py
+    for i in range(PIXELS):
+        p = np.uint64(i)
+        z[X + p], z[Y + p], z[LEFT + p] = np.float32(x0 + i % TILE_X) + HALF, np.float32(y0 + i // TILE_X) + HALF, F1
+    return x0, y0, z
 
 
 @numba.njit(cache=True)
 def span(rows, g, y0):
-    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows; unsigned, or LLVM would not vectorise over them."""
-    first = max((rows[g, 0] - y0) // 2 * (2 * TILE_X), 0)
-    last = min((rows[g, 1] - y0 + 1) // 2 * (2 * TILE_X), PIXELS)
-    return np.uint64(first), np.uint64(max(first, last))
+    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows: unsigned, or LLVM would not vectorise over them, and in a
+    way that it sees whole vectors, or it would look for what is left over."""
+    first, last = max(rows[g, 0] - y0, 0) // 2, (min(rows[g, 1] - y0, TILE_Y) + 1) // 2
+    start = np.uint64(first) * TWO_ROWS
+    return start, start + np.uint64(max(last - first, 0)) * TWO_ROWS
 
 
 @numba.njit(inline="always", fastmath=FAST)
-def spent(left):
+def spent(z):
     """Whether nothing behind can be seen any more."""
     most = F0
     for p in range(PIXELS):
-        most = max(most, left[p])
+        most = max(most, z[LEFT + np.uint64(p)])
     return most < SPENT
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+@numba.njit(cache=True)
+def block(features, g, d):
+    """The plane where the sums of the channels from d on begin, and BLOCK of these of Gaussian `g`."""
+    first = features[g, d], features[g, d + 1], features[g, d + 2], features[g, d + 3]
+    return SUMS + np.uint64(d * PIXELS), (*first, features[g, d + 4], features[g, d + 5], features[g, d + 6], features[g, d + 7])
+
+
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def forward(starts, members, centres, conics, opacities, features, rows, maps, alpha):
-    """Composite features (G, D) into `maps` (D, H, W) and `alpha` (H, W)."""
+    """Composite features (G, D) into `maps` (D, H, W) and `alpha` (H, W); D is a multiple of BLOCK."""
     height, width = alpha.shape
     channels = features.shape[1]
     tiles_x = (width + TILE_X - 1) // TILE_X
     for tile in numba.prange(len(starts) - 1):
-        x0, y0, px, py = pixel_centres(tile, tiles_x)
-        left, w = np.ones(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-        total = np.zeros((channels, PIXELS), np.float32)
+        x0, y0, z = planes(OWN + channels, tile, tiles_x)
         for i in range(starts[tile], starts[tile + 1]):
             g = members[i]
             cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
+            _, (f0, f1, f2, f3, f4, f5, f6, f7) = block(features, g, 0)
             for p in range(first, last):
-                dx, dy = px[p] - cx, py[p] - cy
+                dx, dy = z[X + p] - cx, z[Y + p] - cy
                 e0, e1 = a * dx, b * dx + c * dy
                 s = min(e0 * e0 + e1 * e1, DEEPEST)
                 q = min(o * exp_minus(s), ALPHA_MAX)
                 q = q if q >= ALPHA_MIN else F0
-                v = q * left[p]
-                w[p] = v
-                left[p] -= v
-            for d in range(channels):
-                f, sums = features[g, d], total[d]
+                v = q * z[LEFT + p]
+                z[WEIGHT + p] = v
+                z[LEFT + p] -= v
+                z[SUMS + p] += f0 * v
+                z[SUMS + N1 + p] += f1 * v
+                z[SUMS + N2 + p] += f2 * v
+                z[SUMS + N3 + p] += f3 * v
+                z[SUMS + N4 + p] += f4 * v
+                z[SUMS + N5 + p] += f5 * v
+                z[SUMS + N6 + p] += f6 * v
+                z[SUMS + N7 + p] += f7 * v
+            for d in range(BLOCK, channels, BLOCK):
+                at, (f0, f1, f2, f3, f4, f5, f6, f7) = block(features, g, d)
                 for p in range(first, last):
-                    sums[p] += f * w[p]
-            if i % 16 == 0 and spent(left):
+                    v = z[WEIGHT + p]
+                    z[at + p] += f0 * v
+                    z[at + N1 + p] += f1 * v
+                    z[at + N2 + p] += f2 * v
+                    z[at + N3 + p] += f3 * v
+                    z[at + N4 + p] += f4 * v
+                    z[at + N5 + p] += f5 * v
+                    z[at + N6 + p] += f6 * v
+                    z[at + N7 + p] += f7 * v
+            if i % 16 == 0 and spent(z):
                 break
         for y in range(min(TILE_Y, height - y0)):
             for x in range(min(TILE_X, width - x0)):
-                alpha[y0 + y, x0 + x] = F1 - left[y * TILE_X + x]
-                for d in range(channels):
-                    maps[d, y0 + y, x0 + x] = total[d, y * TILE_X + x]
+                p = np.uint64(y * TILE_X + x)
+                alpha[y0 + y, x0 + x] = F1 - z[LEFT + p]
+                for d in range(len(maps)):
+                    maps[d, y0 + y, x0 + x] = z[SUMS + np.uint64(d * PIXELS) + p]
 
 
 @numba.njit(inline="always", fastmath=FAST)
-def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, grads, grad_a, behind):
-    """Fill a tile's gradients of its maps `grads` (D, PIXELS) and of alpha (PIXELS,), and the sum of weight * value `behind` (PIXELS,)."""
+def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
+    """Fill a tile's planes: gradients of its maps (SUMS), of alpha (GRAD_ALPHA), and the sum of weight * value (BEHIND)."""
     height, width = alpha.shape
     for y in range(min(TILE_Y, height - y0)):
         for x in range(min(TILE_X, width - x0)):
-            p = y * TILE_X + x
-            grad_a[p] = grad_alpha[y0 + y, x0 + x]
-            behind[p] = grad_a[p] * alpha[y0 + y, x0 + x]
-            for d in range(len(grads)):
-                grads[d, p] = grad_maps[d, y0 + y, x0 + x]
-                behind[p] += grads[d, p] * maps[d, y0 + y, x0 + x]
+            p = np.uint64(y * TILE_X + x)
+            z[GRAD_ALPHA + p] = grad_alpha[y0 + y, x0 + x]
+            z[BEHIND + p] = z[GRAD_ALPHA + p] * alpha[y0 + y, x0 + x]
+            for d in range(len(maps)):
+                grad = grad_maps[d, y0 + y, x0 + x]
+                z[SUMS + np.uint64(d * PIXELS) + p] = grad
+                z[BEHIND + p] += grad * maps[d, y0 + y, x0 + x]
 
 
-@numba.njit(inline="always", fastmath=FAST)
-def moments(u, px, py, cx, cy, first, last):
-    """Sums over pixels of u, u dx, u dy, u dx^2, u dx dy, u dy^2."""
-    m0 = m1 = m2 = m3 = m4 = m5 = F0
-    for p in range(first, last):
-        dx, dy = px[p] - cx, py[p] - cy
-        ux, uy = u[p] * dx, u[p] * dy
-        m0 += u[p]
-        m1 += ux
-        m2 += uy
-        m3 += ux * dx
-        m4 += ux * dy
-        m5 += uy * dy
-    return m0, m1, m2, m3, m4, m5
+@numba.njit(cache=True)
+def tell(grad, d, t):
+    """Gradients `t` of the BLOCK channels from `d` on."""
+    d += MOMENTS
+    grad[d], grad[d + 1], grad[d + 2], grad[d + 3], grad[d + 4], grad[d + 5], grad[d + 6], grad[d + 7] = t
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def backward(starts, members, places, centres, conics, opacities, features, rows, maps, alpha, grad_maps, grad_alpha, out):
     """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its pixels, then its features."""
     channels = features.shape[1]
     tiles_x = (alpha.shape[1] + TILE_X - 1) // TILE_X
     for tile in numba.prange(len(starts) - 1):
-        x0, y0, px, py = pixel_centres(tile, tiles_x)
-        left, w, u = np.ones(PIXELS, np.float32), np.empty(PIXELS, np.float32), np.empty(PIXELS, np.float32)
-        value, grad_a, behind = np.empty(PIXELS, np.float32), np.zeros(PIXELS, np.float32), np.zeros(PIXELS, np.float32)
-        grads = np.zeros((channels, PIXELS), np.float32)
-        read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, grads, grad_a, behind)
+        x0, y0, z = planes(OWN + channels, tile, tiles_x)
+        read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z)
         done = False
         for i in range(starts[tile], starts[tile + 1]):
             g, grad = members[i], out[places[i]]
@@ -290,34 +313,65 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
             cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
-            for p in range(first, last):
-                value[p] = grad_a[p]
-            for d in range(channels):
-                f, sums = features[g, d], grads[d]
+            if channels > BLOCK:
                 for p in range(first, last):
-                    value[p] += f * sums[p]
+                    z[VALUE + p] = F0
+            for d in range(BLOCK, channels, BLOCK):
+                at, (f0, f1, f2, f3, f4, f5, f6, f7) = block(features, g, d)
+                for p in range(first, last):
+                    z[VALUE + p] += f0 * z[at + p] + f1 * z[at + N1 + p] + f2 * z[at + N2 + p] + f3 * z[at + N3 + p]
+                    z[VALUE + p] += f4 * z[at + N4 + p] + f5 * z[at + N5 + p] + f6 * z[at + N6 + p] + f7 * z[at + N7 + p]
+            _, (f0, f1, f2, f3, f4, f5, f6, f7) = block(features, g, 0)
+            m0 = m1 = m2 = m3 = m4 = m5 = t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = F0
             for p in range(first, last):
-                dx, dy = px[p] - cx, py[p] - cy
+                g0, g1, g2, g3 = z[SUMS + p], z[SUMS + N1 + p], z[SUMS + N2 + p], z[SUMS + N3 + p]
+                g4, g5, g6, g7 = z[SUMS + N4 + p], z[SUMS + N5 + p], z[SUMS + N6 + p], z[SUMS + N7 + p]
+                value = z[GRAD_ALPHA + p] + z[VALUE + p] + f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3 + f4 * g4 + f5 * g5 + f6 * g6 + f7 * g7
+                dx, dy = z[X + p] - cx, z[Y + p] - cy
                 e0, e1 = a * dx, b * dx + c * dy
                 s = min(e0 * e0 + e1 * e1, DEEPEST)
                 full = o * exp_minus(s)
                 q = min(full, ALPHA_MAX)
                 q = q if q >= ALPHA_MIN else F0
-                v = q * left[p]
-                w[p] = v
-                behind[p] -= v * value[p]
-                slope = left[p] * value[p] - behind[p] / (F1 - q)  # dL / d alpha
-                free = q if full <= ALPHA_MAX else F0
-                u[p] = -slope * free
-                left[p] -= v
-            grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = moments(u, px, py, cx, cy, first, last)
-            for d in range(channels):
-                sums, total = grads[d], F0
+                left = z[LEFT + p]
+                v = q * left
+                behind = z[BEHIND + p] - v * value
+                slope = left * value - behind / (F1 - q)  # dL / d alpha
+                u = -slope * (q if full <= ALPHA_MAX else F0)
+                z[WEIGHT + p], z[BEHIND + p], z[LEFT + p] = v, behind, left - v
+                ux, uy = u * dx, u * dy
+                m0 += u
+                m1 += ux
+                m2 += uy
+                m3 += ux * dx
+                m4 += ux * dy
+                m5 += uy * dy
+                t0 += g0 * v
+                t1 += g1 * v
+                t2 += g2 * v
+                t3 += g3 * v
+                t4 += g4 * v
+                t5 += g5 * v
+                t6 += g6 * v
+                t7 += g7 * v
+            grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = m0, m1, m2, m3, m4, m5
+            tell(grad, 0, (t0, t1, t2, t3, t4, t5, t6, t7))
+            for d in range(BLOCK, channels, BLOCK):
+                at = SUMS + np.uint64(d * PIXELS)
+                t0 = t1 = t2 = t3 = t4 = t5 = t6 = t7 = F0
                 for p in range(first, last):
-                    total += sums[p] * w[p]
-                grad[MOMENTS + d] = total
+                    v = z[WEIGHT + p]
+                    t0 += z[at + p] * v
+                    t1 += z[at + N1 + p] * v
+                    t2 += z[at + N2 + p] * v
+                    t3 += z[at + N3 + p] * v
+                    t4 += z[at + N4 + p] * v
+                    t5 += z[at + N5 + p] * v
+                    t6 += z[at + N6 + p] * v
+                    t7 += z[at + N7 + p] * v
+                tell(grad, d, (t0, t1, t2, t3, t4, t5, t6, t7))
             if i % 16 == 0:
-                done = spent(left)
+                done = spent(z)
 
 
 @numba.njit(parallel=True, cache=True, nogil=True)
@@ -327,7 +381,7 @@ def project_backward(
 ):  # fmt: skip
     """Add up the pairs' gradients and carry them to the world: everything `(G, ...)`; `grad_pose` (G, 12) per Gaussian, or (0, 12) if
     not wanted. The last feature is the z-depth."""
-    channels = pairs.shape[1] - MOMENTS
+    channels = grad_features.shape[1]
     for g in numba.prange(means.shape[0]):
         first, last = owned[g], owned[g + 1]
         if first == last:
