@@ -119,10 +119,12 @@ def test_flow_through_a_faint_card_is_the_same() -> None:
     torch.testing.assert_close(faint[0][at], full[0][at], atol=0.1, rtol=0)
 
 
-def test_one_side_a_step_is_drawn_and_the_seed_tells_which() -> None:
+def test_flow_to_one_side_and_rigidity_take_turns_as_the_seed_says() -> None:
     batch = batch_of(4, 1)
     both = replace(batch, neighbours={1: BESIDE, -1: BESIDE}, flow={o: batch.flow[1] for o in (1, -1)})
-    assert [card_field()(replace(both, seed=s))[0].warps[0].offset for s in (0, 1, 2)] == [1, -1, 1]
+    seen = [card_field()(replace(both, seed=s)) for s in range(5)]
+    assert [[w.offset for w in render.warps] for render, _ in seen] == [[1], [], [-1], [], [1]]
+    assert ["rigidity" in own for _, own in seen] == [False, True, False, True, False]
     assert card_field()(replace(both, flow={}))[0].warps == ()
 
 

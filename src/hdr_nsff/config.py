@@ -153,8 +153,10 @@ def fits(value: Any, kind: Any) -> bool:
 
 
 def splat() -> TrainConfig:
-    """4D Gaussians: minutes to train on a CPU, tens of small frames a second."""
-    weights = LossWeights(dynamic=0.0, temporal=0.0, chain=0.0, cycle=0.0, flow_magnitude=0.0, depth=0.2, flow=0.01, mask=0.1)
+    """4D Gaussians: minutes to train on a CPU, tens of small frames a second. Flow and rigidity are looked at every second step each."""
+    weights = LossWeights(
+        dynamic=0.0, temporal=0.0, chain=0.0, cycle=0.0, flow_magnitude=0.0, depth=0.2, flow=0.02, mask=0.1, rigidity=2.0
+    )
     return TrainConfig(field=SplatConfig(), loss=weights, rays=0, moving_rays=0, lr_final=0.03)
 
 

@@ -147,9 +147,11 @@ class Splat(nn.Module):
         """Radiance (S, 3) over the background, z-depth (S,), opacity (S,), motion (S,) and what else was drawn (S, ...)."""
         alpha = maps.alpha.reshape(-1)
         seen, motion, extra = maps.features.flatten(0, 1).split([3, 1, maps.features.shape[-1] - 4], 1)
-        radiance = torch.addcmul(seen, (1 - alpha)[:, None], to_radiance(self.background, self.bounded))  # lies in memory like `seen`
+        radiance = torch.addcmul(
+            seen, (1 - alpha)[:, None], to_radiance(self.background, self.bounded)
+        )  # lies in memory like `seen`
         depth = maps.depth.reshape(-1) / alpha.clamp_min(1e-3)
-        depth = torch.where(alpha > 1e-3, depth, torch.full_like(depth, self.far))
+        depth = torch.where(alpha > 1e-3, depth, self.far)
         return radiance, depth.clamp_min(1e-3 * self.unit), alpha, motion[:, 0], extra
 
     @torch.no_grad()
@@ -174,10 +176,12 @@ class Splat(nn.Module):
         return steps
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A training render of the whole frame, read off at the batch's pixels; flow to one neighbour as a warp; regularisers."""
+        """A training render of the whole frame, read off at the batch's pixels; regularisers. Two dear things take turns, at random: flow
+        to one of the neighbours, as a warp, and rigidity."""
         knot = self.knot(batch.time)
         sides = [o for o in batch.neighbours if o in batch.flow]
-        wanted = [sides[batch.seed % len(sides)]] if sides else []  # one side a step is half the work
+        side, flow_turn = batch.seed // 2 % max(len(sides), 1), batch.seed % 2 == 0
+        wanted = sides[side : side + 1] if flow_turn else []
         cloud = self.cloud(knot)
         flows = [self.displacements(batch, cloud.means, knot, o) for o in wanted]
         maps = self.draw(batch.camera, cloud, flows)
@@ -186,7 +190,8 @@ class Splat(nn.Module):
         warps = tuple(Warp(o, moved[:, 2 * i : 2 * i + 2], torch.ones_like(opacity), None) for i, o in enumerate(wanted))
         render = Render(radiance, depth, opacity, motion, {}, warps)
         self.trajectories.mark(knot)
-        return picked(render, batch.camera, batch.pixels), self.regularizers(cloud, knot)
+        own = self.regularizers(cloud, knot) | ({} if flow_turn else {"rigidity": self.rigidity()})
+        return picked(render, batch.camera, batch.pixels), own
 
     def displacements(self, batch: PixelBatch, means: Tensor, knot: float, offset: int) -> Tensor:
         """Pixels (G, 2) from where the batch's camera sees each Gaussian's mean (G, 3) to where the neighbour sees it at its time."""
@@ -205,7 +210,6 @@ class Splat(nn.Module):
             "shade": mean_square(still.offsets),
             "presence": mean_square(self.presence.diff(dim=0)),
             "colour_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),
-            "rigidity": self.rigidity(),
             "sheen": mean_square(still.sheen) + mean_square(moving.sheen),
         }
 

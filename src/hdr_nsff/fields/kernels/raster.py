@@ -326,7 +326,18 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
             for p in range(first, last):
                 g0, g1, g2, g3 = z[SUMS + p], z[SUMS + N1 + p], z[SUMS + N2 + p], z[SUMS + N3 + p]
                 g4, g5, g6, g7 = z[SUMS + N4 + p], z[SUMS + N5 + p], z[SUMS + N6 + p], z[SUMS + N7 + p]
-                value = z[GRAD_ALPHA + p] + z[VALUE + p] + f0 * g0 + f1 * g1 + f2 * g2 + f3 * g3 + f4 * g4 + f5 * g5 + f6 * g6 + f7 * g7
+                value = (
+                    z[GRAD_ALPHA + p]
+                    + z[VALUE + p]
+                    + f0 * g0
+                    + f1 * g1
+                    + f2 * g2
+                    + f3 * g3
+                    + f4 * g4
+                    + f5 * g5
+                    + f6 * g6
+                    + f7 * g7
+                )
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
                 e0, e1 = a * dx, b * dx + c * dy
                 s = min(e0 * e0 + e1 * e1, DEEPEST)
