@@ -14,7 +14,7 @@ from presets import random_field, small
 from hdr_nsff import cli, color, export, ply
 from hdr_nsff.errors import InputError
 from hdr_nsff.export import ExportConfig, GaussianField, Look, export_one, export_sequence
-from hdr_nsff.fields.kernels.raster import ALPHA_MIN
+from hdr_nsff.fields.kernels.projection import ALPHA_MIN
 from hdr_nsff.fields.rasterize import rasterize
 from hdr_nsff.fields.splat import Splat
 from hdr_nsff.run import Run, pack, save_checkpoint, write_config

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields import rasterize_cuda
-from hdr_nsff.fields.kernels import raster as kernels
+from hdr_nsff.fields.kernels import compositing, projection
 from hdr_nsff.fields.rasterize import Maps, dense, front_to_back, project, rasterize, rotation_matrices
 
 FOCAL = 40.0
@@ -79,8 +79,10 @@ def sure(gaussians: list[Tensor], view: Camera) -> Tensor:
     centres, covariance, z = project(*gaussians[:3], view)
     d = view.pixel_grid()[:, None] - centres
     alpha = gaussians[3] * torch.exp(-0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0])
-    unsure = ((alpha / float(kernels.ALPHA_MIN)).log().abs() < 0.01) | ((alpha / float(kernels.ALPHA_MAX)).log().abs() < 3e-4)
-    return ~(unsure & (z > kernels.NEAREST)).any(1).unflatten(0, (view.height, view.width))
+    unsure = ((alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01) | (
+        (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
+    )
+    return ~(unsure & (z > projection.NEAREST)).any(1).unflatten(0, (view.height, view.width))
 
 
 def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> Tensor:
@@ -124,7 +126,7 @@ def test_nothing_behind_the_camera_is_seen_or_has_a_gradient() -> None:
 @pytest.mark.parametrize("size", [0.01, 1.0])
 def test_kernels_equal_plain_torch_across_the_near_plane(size: float) -> None:
     view = camera()
-    gaussians = placed(view, (0.0, 3 * kernels.NEAREST), 1.0, size)
+    gaussians = placed(view, (0.0, 3 * projection.NEAREST), 1.0, size)
     assert float(compare(gaussians, view, gradients=5e-3)[..., -1].max()) > 0.5
 
 
@@ -239,9 +241,9 @@ def test_the_depth_order_is_a_stable_sort_of_all_that_is_drawn() -> None:
     depths = g.permutation(depths).astype(np.float32)
     order = front_to_back(depths)
     assert sorted(order.tolist()) == list(range(len(depths)))
-    drawn = order[depths[order] > kernels.NEAREST]
+    drawn = order[depths[order] > projection.NEAREST]
     expected = np.argsort(depths, kind="stable")
-    assert drawn.tolist() == expected[depths[expected] > kernels.NEAREST].tolist()
+    assert drawn.tolist() == expected[depths[expected] > projection.NEAREST].tolist()
 
 
 def test_opacity_never_exceeds_1_however_many_there_are() -> None:

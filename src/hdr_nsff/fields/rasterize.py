@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hdr_nsff.camera import Camera
 from hdr_nsff.fields import rasterize_cuda
-from hdr_nsff.fields.kernels import raster as kernels
+from hdr_nsff.fields.kernels import compositing, projection
 from hdr_nsff.tensors import to_device
 
 
@@ -37,7 +37,7 @@ def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Ten
             seen, depth = maps.split([len(maps) - 1, 1])  # whose gradients are joined, where slices' would be added up
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
         case "cuda" if rasterize_cuda.available():
-            rules = camera.width, camera.height, kernels.NEAREST, kernels.BLUR
+            rules = camera.width, camera.height, projection.NEAREST, projection.BLUR
             return Maps(*rasterize_cuda.composite(*gaussians, stretched(camera), camera.K.detach(), *rules))
         case "cuda":  # `dense` would hold every Gaussian at every pixel: too much for a real picture
             seen = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
@@ -88,10 +88,10 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     """Pixel centres (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,)."""
     w2c, K = world_to_camera(camera), camera.K
     t = means @ w2c[:, :3].T + w2c[:, 3]
-    z = t[:, 2].clamp_min(kernels.NEAREST)
+    z = t[:, 2].clamp_min(projection.NEAREST)
     size = torch.tensor([camera.width, camera.height]).to(means)
     focal, centre = K[[0, 1], [0, 1]], K[:2, 2]
-    edge = kernels.MARGIN * 0.5 * size / focal
+    edge = projection.MARGIN * 0.5 * size / focal
     xy = z[:, None] * torch.minimum(torch.maximum(t[:, :2] / z[:, None], -centre / focal - edge), (size - centre) / focal + edge)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
@@ -99,7 +99,7 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     ).unflatten(-1, (2, 3))
     half_axes = rotation_matrices(quaternions) * scales[:, None]
     spread = jacobian @ w2c[:, :3] @ half_axes
-    covariance = spread @ spread.mT + kernels.BLUR * torch.eye(2).to(means)
+    covariance = spread @ spread.mT + projection.BLUR * torch.eye(2).to(means)
     return t[:, :2] / z[:, None] * focal + centre, covariance, t[:, 2]
 
 
@@ -111,12 +111,12 @@ def dense(
     means, quaternions, scales, opacities, features = (t[known] for t in (means, quaternions, scales, opacities, features))
     centres, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
-    order = order[z.detach()[order] > kernels.NEAREST]
+    order = order[z.detach()[order] > projection.NEAREST]
     d = camera.pixel_grid().to(means)[:, None] - centres[order]  # (S, G, 2)
     s = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance[order]) @ d[..., None])[..., 0, 0]
-    alpha = (opacities[order] * torch.exp(-s)).clamp_max(float(kernels.ALPHA_MAX))
+    alpha = (opacities[order] * torch.exp(-s)).clamp_max(float(compositing.ALPHA_MAX))
     if cut:
-        alpha = torch.where(alpha >= float(kernels.ALPHA_MIN), alpha, torch.zeros_like(alpha))
+        alpha = torch.where(alpha >= float(projection.ALPHA_MIN), alpha, torch.zeros_like(alpha))
     left = torch.cumprod(1 - alpha, 1)
     weights = alpha * torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
     shape = (camera.height, camera.width)
@@ -134,7 +134,7 @@ def front_to_back(depths: np.ndarray) -> np.ndarray:
 def blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Features (G, D) and z-depths (G,) side by side, then zeros up to a whole number of the kernels' blocks."""
     count, d = features.shape
-    values = np.zeros((count, -(-(d + 1) // kernels.BLOCK) * kernels.BLOCK), np.float32)
+    values = np.zeros((count, -(-(d + 1) // compositing.BLOCK) * compositing.BLOCK), np.float32)
     values[:, :d], values[:, d] = features, depths
     return values
 
@@ -159,15 +159,15 @@ class Rasterize(torch.autograd.Function):
         count, size = len(means), (camera.width, camera.height)
         centres, depths, conics = (np.empty(s, np.float32) for s in ((count, 2), count, (count, 3)))
         rows, boxes = np.empty((count, 2), np.int64), np.empty((count, 4), np.int64)
-        kernels.project(*arrays, pose, k, *size, centres, depths, conics, rows, boxes)
+        projection.project(*arrays, pose, k, *size, centres, depths, conics, rows, boxes)
         order = front_to_back(depths)
-        tiles = -(-size[0] // kernels.TILE_X), -(-size[1] // kernels.TILE_Y)
-        starts, members, places, owned = kernels.bin_tiles(boxes, order, *tiles)
+        tiles = -(-size[0] // projection.TILE_X), -(-size[1] // projection.TILE_Y)
+        starts, members, places, owned = compositing.bin_tiles(boxes, order, *tiles)
         values, channels = blocks(features.detach().numpy(), depths), features.shape[1] + 1
         maps = torch.empty(channels, size[1], size[0])
         alpha = torch.empty(size[1], size[0])
         drawn = (starts, members, centres, conics, arrays[3], values, rows)
-        kernels.forward(*drawn, maps.numpy(), alpha.numpy())
+        compositing.forward(*drawn, maps.numpy(), alpha.numpy())
         ctx.kept = (arrays, pose, k, size, drawn, places, owned)
         ctx.save_for_backward(maps, alpha)
         return maps, alpha
@@ -177,11 +177,11 @@ class Rasterize(torch.autograd.Function):
         maps, alpha = ctx.saved_tensors
         arrays, pose, k, size, (starts, members, *drawn), places, owned = ctx.kept
         values = drawn[3]
-        pairs = np.empty((len(members), kernels.MOMENTS + values.shape[1]), np.float32)
+        pairs = np.empty((len(members), projection.MOMENTS + values.shape[1]), np.float32)
         seen = maps.numpy(), alpha.numpy()
-        kernels.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
+        compositing.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
         out = [torch.empty(a.shape) for a in (*arrays, values[:, : len(maps)])]
         poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
-        kernels.project_backward(*arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy())
+        projection.project_backward(*arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy())
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
         return *out[:4], out[4][:, :-1], grad_pose, None
