@@ -34,27 +34,27 @@ def test_nothing_moves_before_training() -> None:
     t.centres[:] = random(3, 3, seed=1)
     mixture = random(3, 20, seed=2).softmax(0)
     for knot in (0.0, 3.7, 9.0):
-        torch.testing.assert_close(t.move(points, mixture, knot), points)
-        torch.testing.assert_close(t.turn(quaternions, mixture, knot), quaternions)
+        torch.testing.assert_close(t.move(points, mixture, t.pose(knot)), points)
+        torch.testing.assert_close(t.turn(quaternions, mixture, t.pose(knot)), quaternions)
 
 
 def test_a_pure_rotation_turns_about_its_centre() -> None:
     t, points = turning(0.3), random(20, 3)
     for knot in (0, 2, 9):
         expected = (points - t.centres) @ about_z(0.3 * knot).T + t.centres
-        torch.testing.assert_close(t.move(points, torch.ones(1, 20), float(knot)), expected)
+        torch.testing.assert_close(t.move(points, torch.ones(1, 20), t.pose(float(knot))), expected)
 
 
 def test_between_knots_a_rotation_stays_rigid_and_nearly_even() -> None:
     t, points = turning(0.3), random(20, 3)
-    moved = t.move(points, torch.ones(1, 20), 4.5)
+    moved = t.move(points, torch.ones(1, 20), t.pose(4.5))
     torch.testing.assert_close(torch.cdist(moved, moved), torch.cdist(points, points), atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(moved, (points - t.centres) @ about_z(0.3 * 4.5).T + t.centres, atol=1e-4, rtol=1e-3)
 
 
 def test_a_gaussian_turns_as_its_place_does() -> None:
     t, quaternions = turning(0.3), random(20, 4)
-    turned = rotation_matrices(t.turn(quaternions, torch.ones(1, 20), 3.0))
+    turned = rotation_matrices(t.turn(quaternions, torch.ones(1, 20), t.pose(3.0)))
     torch.testing.assert_close(turned, about_z(0.9) @ rotation_matrices(quaternions))
 
 
@@ -65,7 +65,7 @@ def test_a_mixture_of_two_shifts_is_their_weighted_mean() -> None:
     shifts[:, 1, 1] = 2.0 * torch.arange(KNOTS)  # twice as far along y
     mixture = torch.tensor([[1.0, 0.0, 0.25], [0.0, 1.0, 0.75]])
     expected = torch.tensor([[3.5, 0, 0], [0, 7, 0], [0.25 * 3.5, 0.75 * 7, 0]])
-    torch.testing.assert_close(t.move(points, mixture, 3.5) - points, expected)
+    torch.testing.assert_close(t.move(points, mixture, t.pose(3.5)) - points, expected)
 
 
 def test_quaternions_multiply_as_rotation_matrices_do() -> None:
@@ -98,8 +98,8 @@ def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
     knot = 9.3
     t.mark(knot)
     (
-        t.move(random(5, 3), mixture, knot).square().sum()
-        + t.turn(random(5, 4), mixture, knot)[:, 1].sum()
+        t.move(random(5, 3), mixture, t.pose(knot)).square().sum()
+        + t.turn(random(5, 4), mixture, t.pose(knot))[:, 1].sum()
         + t.roughness(knot, 1.0)
     ).backward()
     for values, touched in ((t.turns, t.turns_touched), (t.shifts, t.shifts_touched)):

@@ -19,7 +19,8 @@ def linear(values: Tensor, position: float) -> Tensor:
     if len(values) == 1:
         return values[0]
     low = min(int(position), len(values) - 2)
-    return torch.lerp(values[low], values[low + 1], position - low)
+    u = position - low
+    return weighted(values[low : low + 2], [1 - u, u])
 
 
 def catmull_rom(values: Tensor, position: float) -> Tensor:
@@ -29,9 +30,20 @@ def catmull_rom(values: Tensor, position: float) -> Tensor:
         return values[0]
     low = min(max(int(position), 0), last - 1)
     u = position - low
-    b, c = values[low], values[low + 1]
-    if u == 0:
-        return b
-    a = values[low - 1] if low > 0 else 2 * b - c
-    d = values[low + 2] if low + 2 <= last else 2 * c - b
-    return b + 0.5 * u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * (b - c) + d - a)))
+    a, b, c, d = (
+        0.5 * u * (u * (2 - u) - 1),
+        1 + 0.5 * u * u * (3 * u - 5),
+        0.5 * u * (u * (4 - 3 * u) + 1),
+        0.5 * u * u * (u - 1),
+    )
+    if low == 0:
+        a, b, c = 0.0, b + 2 * a, c - a
+    if low + 2 > last:
+        b, c, d = b - d, c + 2 * d, 0.0
+    first, end = max(low - 1, 0), min(low + 3, last + 1)
+    return weighted(values[first:end], [a, b, c, d][first - low + 1 : end - low + 1])
+
+
+def weighted(values: Tensor, weights: list[float]) -> Tensor:
+    """The sum of `values` (K, ...) times `weights` (K): one product, where gradients of single rows would each fill the whole of them."""
+    return (values.new_tensor(weights) @ values.flatten(1)).view(values.shape[1:])

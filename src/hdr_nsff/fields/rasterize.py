@@ -62,7 +62,7 @@ def stretched(camera: Camera) -> Tensor:
 
 
 def products(*wanted: str) -> Tensor:
-    """(16, n) that makes the `wanted` sums of products, such as "ww -zz", of the outer product (16) of a quaternion w x y z with itself."""
+    """(16, n) that makes the `wanted` sums of products, such as "wx -zy", of the outer product (16) of two quaternions w x y z."""
     table = torch.zeros(16, len(wanted))
     for column, terms in enumerate(wanted):
         for term in terms.split():

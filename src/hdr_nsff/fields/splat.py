@@ -102,8 +102,9 @@ class Splat(nn.Module):
         """All Gaussians at a knot, static ones first, differentiable in everything."""
         mixture, share = self.mixture_logits.softmax(0), self.share(knot)
         still, moving = self.static, self.moving
-        moved = self.trajectories.move(moving.means, mixture, knot)
-        turned = self.trajectories.turn(moving.quaternions, mixture, knot)
+        pose = self.trajectories.pose(knot)
+        moved = self.trajectories.move(moving.means, mixture, pose)
+        turned = self.trajectories.turn(moving.quaternions, mixture, pose)
         return GaussianCloud(
             torch.cat([still.means, moved]),
             torch.cat([still.quaternions, turned]),
@@ -135,7 +136,8 @@ class Splat(nn.Module):
     def positions(self, knot: float) -> Tensor:
         """Means (G, 3) of all Gaussians at a knot."""
         mixture = self.mixture_logits.softmax(0)
-        return torch.cat([self.static.means, self.trajectories.move(self.moving.means, mixture, knot)])
+        moved = self.trajectories.move(self.moving.means, mixture, self.trajectories.pose(knot))
+        return torch.cat([self.static.means, moved])
 
     @torch.no_grad()
     def gaussians(self, time: float) -> GaussianCloud:
@@ -203,15 +205,15 @@ class Splat(nn.Module):
         """Terms of the field's own: opacities and scales (Kheradmand et al. 2024) of the `cloud` at `knot`, smooth poses, slow colours."""
         still, moving = self.static, self.moving
         alive = cloud.opacities.detach() > FAINTEST
-        return {
+        terms = {
             "opacity": (cloud.opacities * alive).mean(),
             "scale": (cloud.scales * alive[:, None]).mean() / self.unit,
             "trajectory": self.trajectories.roughness(knot, self.unit),
             "shade": mean_square(still.offsets),
             "presence": mean_square(self.presence.diff(dim=0)),
             "colour_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),
-            "sheen": mean_square(still.sheen) + mean_square(moving.sheen),
         }
+        return terms | ({"sheen": mean_square(still.sheen) + mean_square(moving.sheen)} if self.config.view_dependence else {})
 
     def rigidity(self) -> Tensor:
         """Mean square difference of the mixtures of neighbouring moving Gaussians: those that mix alike keep their distances."""
@@ -226,17 +228,18 @@ class Splat(nn.Module):
             self.beside.copy_(torch.from_numpy(cKDTree(places).query(places, BESIDE + 1)[1][:, 1:]))
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Groups by kind of parameter; only the poses near the drawn frame move."""
+        """One group for every learning rate, as an optimiser works group by group; only the poses near the drawn frame move."""
         c, both = self.config, (self.static, self.moving)
         rates = {
             "means": c.place_lr * self.unit, "quaternions": c.shape_lr, "log_scales": c.shape_lr, "logits": c.opacity_lr,
             "log_radiance": c.colour_lr, "offsets": c.colour_lr, "sheen": c.colour_lr,
         }  # fmt: skip
-        groups: list[dict[str, Any]] = [
-            {"params": [getattr(g, name) for g in both], "lr": c.lr * rate, "eps": 1e-15} for name, rate in rates.items()
-        ]
-        groups.append({"params": [self.presence], "lr": c.lr * c.opacity_lr, "eps": 1e-15})
-        groups.append({"params": [self.mixture_logits, self.background], "lr": c.lr * c.colour_lr, "eps": 1e-15})
+        at_rate: dict[float, list[Tensor]] = {}
+        for name, rate in rates.items():
+            at_rate.setdefault(rate, []).extend(p for p in (getattr(g, name) for g in both) if p.numel())
+        at_rate[c.opacity_lr].append(self.presence)
+        at_rate[c.colour_lr] += [self.mixture_logits, self.background]
+        groups: list[dict[str, Any]] = [{"params": p, "lr": c.lr * rate, "eps": 1e-15} for rate, p in at_rate.items()]
         t = self.trajectories
         touched = [t.turns_touched, t.shifts_touched]
         groups.append({"params": [t.turns, t.shifts], "lr": c.lr * c.pose_lr, "touched": touched})

@@ -9,9 +9,11 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.fields.knots import catmull_rom
-from hdr_nsff.fields.rasterize import rotation_matrices
+from hdr_nsff.fields.rasterize import products, rotation_matrices
 
 WINDOW = 3  # knots on either side whose smoothness a step may change
+THIRD_DIFFERENCE = torch.tensor([-1.0, 3.0, -3.0, 1.0])
+HAMILTON = products("ww -xx -yy -zz", "wx xw yz -zy", "wy -xz yw zx", "wz xy -yx zw")
 
 
 class Trajectories(nn.Module):
@@ -37,18 +39,17 @@ class Trajectories(nn.Module):
         s = catmull_rom(self.shifts.view(self.num_knots, self.num_bases, 4), knot)
         return nn.functional.normalize(q, dim=-1), s[:, :3]
 
-    def move(self, points: Tensor, mixture: Tensor, knot: float) -> Tensor:
-        """Where canonical `points` (G, 3) are at a knot, given each one's `mixture` (B, G) of the bases."""
-        q, s = self.pose(knot)
+    def move(self, points: Tensor, mixture: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
+        """Where canonical `points` (G, 3) are in the bases' `pose`, given each one's `mixture` (B, G) of them."""
+        q, s = pose
         r = rotation_matrices(q)  # (B, 3, 3)
         offset = self.centres + s - (r @ self.centres[..., None])[..., 0]
         motions = (mixture.T @ torch.cat([r, offset[..., None]], 2).flatten(1)).unflatten(1, (3, 4))  # each point's own
         return torch.baddbmm(motions[..., 3:], motions[..., :3], points[..., None])[..., 0]
 
-    def turn(self, quaternions: Tensor, mixture: Tensor, knot: float) -> Tensor:
-        """Orientations (G, 4) at a knot of Gaussians with canonical `quaternions` (G, 4): the mixture's mean turn, then their own."""
-        q, _ = self.pose(knot)
-        return quaternion_product(mixture.T @ q, quaternions)
+    def turn(self, quaternions: Tensor, mixture: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
+        """Orientations (G, 4) of Gaussians with canonical `quaternions` (G, 4): the mixture's mean turn in that `pose`, then their own."""
+        return quaternion_product(mixture.T @ pose[0], quaternions)
 
     def mark(self, knot: float, reach: int = WINDOW) -> None:
         """Say that a step touches the poses near `knot` only."""
@@ -59,16 +60,15 @@ class Trajectories(nn.Module):
     def roughness(self, knot: float, unit: float) -> Tensor:
         """Mean square third difference of the poses near a knot (quaternions; shifts in `unit`): 0 for constant acceleration."""
         low, high = max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
-        turns = nn.functional.normalize(self.turns.view(self.num_knots, self.num_bases, 4)[low:high], dim=-1)
+        turns = nn.functional.normalize(self.turns.view(self.num_knots, -1, 4)[low:high], dim=-1)
         if high - low < 4:
             return turns.sum() * 0
-        shifts = self.shifts.view(self.num_knots, self.num_bases, 4)[low:high]
-        return turns.diff(n=3, dim=0).square().sum(-1).mean() + (shifts / unit).diff(n=3, dim=0).square().sum(-1).mean()
+        shifts = self.shifts.view(self.num_knots, -1, 4)[low:high] / unit
+        poses = torch.cat([turns, shifts], -1)
+        bent = poses.unfold(0, 4, 1) @ THIRD_DIFFERENCE.to(poses)
+        return 8 * bent.square().mean()  # the sum over the 4 + 4 numbers of a pose
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product a b of (..., 4) w x y z: first b turns, then a."""
-    w, u = a[..., :1], a[..., 1:]
-    v, x = b[..., :1], b[..., 1:]
-    real = w * v - (u * x).sum(-1, keepdim=True)
-    return torch.cat([real, w * x + v * u + torch.linalg.cross(u, x)], -1)
+    return (a[..., None] * b[..., None, :]).flatten(-2) @ HAMILTON.to(a)

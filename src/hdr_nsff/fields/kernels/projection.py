@@ -18,10 +18,11 @@ F0 = np.float32(0)
 ALPHA_MIN = np.float32(1 / 255)  # alpha below this counts as nothing
 NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn
 BLUR = 0.3  # pixels^2 added to 2D variances, so that no Gaussian falls between pixels
+FAST = {"contract", "reassoc", "nsz", "arcp"}  # sums may be reordered, division be multiplication; NaN and Inf stay what they are
 MARGIN = 0.3  # of half the picture: how far outside it the projection is still linearised where the Gaussian is
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def rotation(q):
     """Unit quaternion (w, x, y, z), its rotation matrix row by row, and the length it had."""
     n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) + 1e-12
@@ -34,7 +35,7 @@ def rotation(q):
     return (w, x, y, z), r, n
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def limited(x, z, low, high):
     """x moved so that x / z lies within [low, high], and whether it had to be."""
     ratio = x / z
@@ -45,13 +46,13 @@ def limited(x, z, low, high):
     return x, False
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def dot(a, b):
     """Of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def gaussian(means, quaternions, scales, g):
     """Mean (3,), quaternion (4,) and scales (3,) of Gaussian `g` in float64."""
     return (
@@ -61,14 +62,14 @@ def gaussian(means, quaternions, scales, g):
     )
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def jacobian(k, held):
     """The entries 00, 02, 11, 12 of J (2, 3), the projection linearised at the point `held`; the others are 0."""
     x, y, z, _, _ = held
     return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def footprint(m, q, s, v, k, width, height):
     """A Gaussian in the picture: camera point t, the point where the projection is linearised and whether x and y are held there,
     T = J W (2, 3), the rotation R of `rotation`, V = T R S (2, 3), and the 2D covariance V V^T + blur (xx, xy, yy)."""
@@ -93,7 +94,7 @@ def footprint(m, q, s, v, k, width, height):
     return t, held, (t0, t1), (unit, r, n), (v0, v1), (dot(v0, v0) + BLUR, dot(v0, v1), dot(v1, v1) + BLUR)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def project(means, quaternions, scales, opacities, w2c, k, width, height, centres, depths, conics, rows, boxes):
     """Fill pixel `centres` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G, 2) and tile `boxes` (G, 4: x0, y0, x1, y1, ends
     excluded; empty where nothing shows) of world Gaussians seen by `w2c` (3, 4) and `k` = (fx, fy, cx, cy). Lengths in scene units."""
@@ -126,7 +127,7 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         boxes[g, 3] = min(int(bottom) // TILE_Y + 1, tiles_y)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True)
+@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def project_backward(
     means, quaternions, scales, opacities, w2c, k, width, height, owned, pairs,
     grad_means, grad_quaternions, grad_scales, grad_opacities, grad_features, grad_pose,
@@ -163,7 +164,7 @@ def project_backward(
             pose_gradient((dx, dy, dz), d_projection, m, jacobian(k, held), grad_pose[g])
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def sum_moments(pairs, first, last):
     """The moments of a Gaussian's pairs, added up in float64."""
     u0 = u1 = u2 = u3 = u4 = u5 = 0.0
@@ -177,7 +178,7 @@ def sum_moments(pairs, first, last):
     return u0, u1, u2, u3, u4, u5
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def picture_gradient(covariance, u):
     """From the moments `u` to dL / d pixel centre (2,) and dL / d 2D covariance (xx, xy, yy), with Q its inverse: -Q (dL / dQ) Q."""
     xx, xy, yy = covariance
@@ -193,7 +194,7 @@ def picture_gradient(covariance, u):
     return (-(a * u[1] + b * u[2]), -(b * u[1] + c * u[2])), inner
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def shape_gradient(g, projection, spread, r, s):
     """From G = dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3). The covariance is V V^T + blur with V = T M and
     M = R S, so dV = 2 G V, dM = T^T dV, dT = dV M^T."""
@@ -218,7 +219,7 @@ def shape_gradient(g, projection, spread, r, s):
     return d_scales, d_rotation, d_projection
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def point_gradient(centre, d_projection, t, held, w2c, k):
     """dL / d camera point (3,), through the pixel centre and through J in T = J W, which does not see x or y where they are held."""
     (gx, gy), (dt0, dt1), (x, y, z, held_x, held_y), (fx, fy) = centre, d_projection, held, (k[0], k[1])
@@ -231,7 +232,7 @@ def point_gradient(centre, d_projection, t, held, w2c, k):
     return dx, dy, dz
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def pose_gradient(point, d_projection, m, j, out):
     """dL / d world-to-camera `out` (12,), row by row: through the camera point `W m + t`, and through W in T = J W."""
     (dx, dy, dz), (dt0, dt1), (j00, j02, j11, j12) = point, d_projection, j
@@ -242,7 +243,7 @@ def pose_gradient(point, d_projection, m, j, out):
     out[3], out[7], out[11] = dx, dy, dz
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def quaternion_gradient(unit, n, dr, out):
     """From dL / dR (3, 3) to the quaternion before it was made a unit one."""
     w, x, y, z = unit
