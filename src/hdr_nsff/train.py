@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -265,18 +266,17 @@ class Trainer:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
 
-    @torch.no_grad()
     def misfits(self, count: int) -> list[Misfit]:
-        """How wrong the field is in `count` training frames, evenly spread; others every step."""
+        """How wrong pictures of `count` training frames are, evenly spread; others every step."""
         num = len(self.scene.train)
         chosen = sorted({int((i + self.clock.step % 97 / 97) * num / count) % num for i in range(min(count, num))})
-        found = []
-        for i in chosen:
-            f = self.scene.train[i]
-            camera = self.camera(i)
-            rgb = recorded(self.field, camera, f.time, [self.tonemapper.look(f.bracket, f.camera_id, i)])[0].view_as(f.image)
-            found.append(Misfit(camera, f.time, (rgb - f.image).abs().mean(-1)))
-        return found
+        return [Misfit(self.camera(i), self.scene.train[i].time, partial(self.misfit, i)) for i in chosen]
+
+    @torch.no_grad()
+    def misfit(self, frame: int, radiance: Tensor) -> Tensor:
+        """Mean absolute difference (S,) of what training frame `frame` recorded and would record of `radiance` (S, 3)."""
+        f = self.scene.train[frame]
+        return (self.tonemapper(radiance, f.bracket, f.camera_id, frame, leaky=False) - f.image.flatten(0, 1)).abs().mean(-1)
 
     @torch.no_grad()
     def squared_error(self, render: Render, batch: PixelBatch) -> float:

@@ -60,11 +60,13 @@ class Layers:
 
 @dataclass(frozen=True)
 class Misfit:
-    """How wrong a field is in one training frame."""
+    """How wrong a picture of one training frame is."""
 
     camera: Camera
     time: float  # in frames
-    error: Tensor  # (H, W) mean absolute difference of the recorded values over the channels
+    error: Callable[
+        [Tensor], Tensor
+    ]  # of its radiance (S, 3): (S,) mean absolute difference of the recorded values over the channels
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class RadianceField(Protocol):
         ...
 
     def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
-        """Housekeeping between optimiser steps (culling grids, schedules). `misfits(n)` renders n training frames and says how wrong they
+        """Housekeeping between optimiser steps (culling grids, schedules). `misfits(n)` says of n training frames how wrong their pictures
         are; None late in a run, when nothing is to be rearranged any more."""
         ...
 

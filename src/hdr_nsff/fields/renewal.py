@@ -8,9 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.base import GaussianCloud, Misfit
 from hdr_nsff.fields.gaussians import Gaussians
-from hdr_nsff.fields.rasterize import rasterize, rotation_matrices
+from hdr_nsff.fields.rasterize import rotation_matrices
 
 UNSEEN = 0.05  # pixels: a Gaussian whose weights add up to less in the mean frame is as good as not there
 MOST = 0.05  # of the Gaussians are put elsewhere at a time
@@ -18,21 +17,11 @@ PARTED = 0.5  # standard deviations that two halves lie off the middle of the wh
 NARROWER = 0.7  # times as long as the whole is a half, along the axis it was cut across
 
 
-def blame(cloud: GaussianCloud, misfit: Misfit) -> Tensor:
-    """(G, 2): the weights of every Gaussian of the `cloud` of that time summed over the pixels of a frame, times their error and alone: the
-    gradients of two features."""
-    told = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
-    with torch.enable_grad():
-        maps = rasterize(cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, told, misfit.camera)
-        weights = torch.stack([misfit.error, torch.ones_like(misfit.error)], -1)
-        return torch.autograd.grad((maps.features * weights).sum(), told)[0]
-
-
 @torch.no_grad()
 def halve(gaussians: Gaussians, told: Tensor, companions: list[Tensor], generator: torch.Generator) -> int:
     """Cut the Gaussians most to blame in two across their longest axis; the unseen ones become the other halves. How many.
 
-    `told` (G, 2) as `blame` has it; `companions` are what else belongs to each, in their last dimension."""
+    `told` (G, 2) are each one's weights summed over the pixels, times their error and alone; `companions` are what else belongs to each, in their last dimension."""
     unseen = (told[:, 1] < UNSEEN).nonzero()[:, 0]
     weight = torch.where(told[:, 1] < UNSEEN, torch.zeros_like(told[:, 0]), told[:, 0]).nan_to_num(0)
     count = min(len(unseen), int(MOST * len(gaussians)), int((weight > 0).sum()))

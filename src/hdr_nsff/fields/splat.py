@@ -19,7 +19,7 @@ from hdr_nsff.fields.base import GaussianCloud, Misfit, Render, Warp
 from hdr_nsff.fields.gaussians import Gaussians, brightened, to_radiance
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.rasterize import Maps, rasterize
-from hdr_nsff.fields.renewal import blame, halve
+from hdr_nsff.fields.renewal import halve
 from hdr_nsff.fields.trajectories import Trajectories
 from hdr_nsff.tensors import tree_map
 
@@ -248,11 +248,21 @@ class Splat(nn.Module):
     @torch.no_grad()
     def renew(self, misfits: list[Misfit], generator: torch.Generator) -> int:
         """Put unseen Gaussians beside those with most error in their pixels, static and moving ones apart; how many."""
-        told = torch.stack([blame(self.cloud(self.knot(m.time)), m) for m in misfits]).mean(0)
+        told = torch.stack([self.blame(m) for m in misfits]).mean(0)
         still, moving = told.split([len(self.static), len(self.moving)])
         return halve(self.static, still, [], generator) + halve(
             self.moving, moving, [self.presence, self.mixture_logits], generator
         )
+
+    @torch.no_grad()
+    def blame(self, misfit: Misfit) -> Tensor:
+        """(G, 2): the weights of every Gaussian summed over the pixels of a frame, times their error and alone: the gradients of two features."""
+        cloud = self.cloud(self.knot(misfit.time))
+        told = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
+        with torch.enable_grad():
+            radiance, _, _, _, drawn = self.composed(self.draw(misfit.camera, cloud, [told]))
+            error = misfit.error(radiance.detach())
+            return torch.autograd.grad((drawn * torch.stack([error, torch.ones_like(error)], 1)).sum(), told)[0]
 
     def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
         """Now and then, Gaussians that nobody sees go where the picture is wrong."""
