@@ -15,7 +15,8 @@ from hdr_nsff.priors.groups import Group, Tracks, canonical_points
 
 ITERATIONS = 25
 REVERSALS = 4  # rounds of looking for reversed depth
-SPLIT = 3  # frames between the times tried
+SPLIT = 3  # frames between the times tried, at least
+SPLITS = 12  # times tried, about
 QUICK = 8  # iterations that tell whether a try is better
 BETTER = 0.98  # of the cost: what a reversal must gain
 MOST = 200  # tracks that poses are found from
@@ -53,18 +54,27 @@ class Shape:
         return (self.points - g.centre) @ g.rotations[t].T + g.centre + g.shifts[t]
 
 
-def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
-    """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better."""
+def adjust(tracks: Tracks, group: Group, cameras: Cameras, again: bool = False) -> Shape:
+    """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better;
+    `again`: from the group's motion, which a shape of almost the same tracks had."""
+    times = np.nonzero((tracks.trust[group.members] > 0).any(0))[0]
+    a, b = times.min(initial=0), times.max(initial=len(cameras.K) - 1) + 1  # what is not seen costs as much time
+    shape = adjusted(tracks.between(a, b), group.between(a, b), Cameras(cameras.K[a:b], cameras.c2w[a:b]), again)
+    return replace(shape, group=shape.group.extended(a, group.known))
+
+
+def adjusted(tracks: Tracks, group: Group, cameras: Cameras, again: bool) -> Shape:
+    """The same of a group that is seen at the first and the last time."""
     points = np.full((len(group.members), 3), np.nan)
     some, solved = group.members[telling(tracks.trust[group.members] > 0, MOST)], []
-    for start in (group, without_turning(tracks, group)):
+    for start in (group,) if again else (group, without_turning(tracks, group)):
         problem = Problem(tracks, replace(start, members=some), cameras)
         if problem.use.sum() >= FEWEST:
             solved.append((*problem.solve(State(problem.start, start.rotations, start.shifts), ITERATIONS), problem, start))
     if not solved:
         return Shape(group, points, np.inf)
     state, cost, problem, start = min(solved, key=lambda s: s[1])
-    state = problem.unreversed(state, cost)
+    state = state if again else problem.unreversed(state, cost)
     for _ in range(SMOOTHINGS):
         problem.roughened(state)
         state, _ = problem.solve(state, ITERATIONS)
@@ -180,7 +190,8 @@ class Problem:
         alike (Necker 1832), and a start without relief may take either, a different one at different times. Perspective tells."""
         num = len(self.K)
         for _ in range(REVERSALS):
-            splits = [*range(SPLIT, num - SPLIT // 2, SPLIT), num]
+            apart = max(SPLIT, num // SPLITS)
+            splits = [*range(apart, num - apart // 2, apart), num]
             tries = [self.solve(self.reversed(state, k), QUICK) for k in splits]
             best, lowest = min(tries, key=lambda t: t[1])
             if lowest > BETTER * cost:

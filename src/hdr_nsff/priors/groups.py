@@ -54,6 +54,10 @@ class Tracks:
     patch: np.ndarray  # (N, T) which connected patch of moving pixels it lies in, 0 where unseen
     age: np.ndarray  # (N, T) steps of flow since its start: errors add up
 
+    def between(self, a: int, b: int) -> Tracks:
+        """What is known of the times from `a` to before `b`."""
+        return Tracks(*(v[:, a:b] for v in (self.pixels, self.points, self.trust, self.patch, self.age)))
+
 
 @dataclass(frozen=True)
 class Group:
@@ -64,6 +68,18 @@ class Group:
     centre: np.ndarray  # (3,) canonical
     members: np.ndarray  # indices of its tracks
     known: np.ndarray  # (T,) bool: times at which enough of it was seen; poses between are interpolated, outer ones held
+
+    def between(self, a: int, b: int) -> Group:
+        """The motion at the times from `a` to before `b`."""
+        return Group(self.rotations[a:b], self.shifts[a:b], self.centre, self.members, self.known[a:b])
+
+    def extended(self, start: int, known: np.ndarray) -> Group:
+        """The motion over all times, `known` (T,) at some of them, of one that begins at `start`: before and after it goes straight on."""
+        num, at = len(self.shifts), np.arange(len(known)) - start
+        inside = at.clip(0, num - 1)
+        speed = np.stack([self.shifts[min(1, num - 1)] - self.shifts[0], self.shifts[-1] - self.shifts[max(num - 2, 0)]])
+        beyond = (at - inside)[:, None] * speed[(at > 0).astype(int)]
+        return Group(self.rotations[inside], self.shifts[inside] + beyond, self.centre, self.members, known)
 
     def canonical(self, points: np.ndarray, t: int) -> np.ndarray:
         """Where `points` (P, 3) of time t are canonically."""

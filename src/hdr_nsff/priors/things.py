@@ -11,6 +11,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from hdr_nsff.priors.bundle import Cameras, Problem, Shape, State, adjust
 from hdr_nsff.priors.groups import GAP, SHORTEST, SMALLEST, Group, Tracks, affinity, apart, fit, gather, neighbours
+from hdr_nsff.progress import track
 
 LEAST_TRACKS = 60  # of a group that can be adjusted
 GOOD = 1.5  # standard deviations: reprojection error of a shape, or of a track by one, that is believed
@@ -22,6 +23,7 @@ PIECE = 0.5  # of the least group: a thing that was hidden may come back for so 
 STRAY = 0.1  # of a group's tracks: where fewer are seen they are strays
 FAR = 4.0  # of a thing's radius in the picture: no further off does it come back
 SETTLED = 0.01  # of a group's tracks: fewer changes change nothing
+LITTLE = 0.25  # of a group's tracks: after fewer changes its shape and motion are found from those before
 
 
 Found = tuple[Group, Shape | None]
@@ -54,12 +56,23 @@ def settled(tracks: Tracks, found: list[Found], cameras: Cameras) -> list[Found]
 
 
 def shaped(tracks: Tracks, groups: list[np.ndarray], known: list[Found], cameras: Cameras) -> list[Found]:
-    """Groups of given members, and their shapes; of those that hardly changed what is `known`."""
-    return [next((k for k in known if same(k[0].members, m)), None) or with_shape(tracks, m, cameras) for m in groups]
+    """Groups of given members, and their shapes; of those that hardly changed what is `known`, and from there if they changed little."""
+    return [anew(tracks, members, known, cameras) for members in track(groups, "things that move")]
+
+
+def anew(tracks: Tracks, members: np.ndarray, known: list[Found], cameras: Cameras) -> Found:
+    """A group of given members, and its shape."""
+    before = min(known, key=lambda k: change(k[0].members, members), default=None)
+    if before is None or before[1] is None or change(before[0].members, members) > LITTLE:
+        return with_shape(tracks, members, cameras)
+    if same(before[0].members, members):
+        return before
+    group = replace(before[1].group, members=members)
+    return group, shape_of(tracks, group, cameras, again=True)
 
 
 def with_shape(tracks: Tracks, members: np.ndarray, cameras: Cameras) -> Found:
-    """A group of given members, and its shape."""
+    """A group of given members, and its shape, by what its tracks alone tell."""
     group = fit(tracks, members)
     return group, shape_of(tracks, group, cameras)
 
@@ -109,11 +122,11 @@ def about_as_good(tracks: Tracks, alone: Found, both: Shape, cameras: Cameras) -
     return bool(np.median(misfit(tracks, both, cameras)[group.members]) < own + AS_GOOD)
 
 
-def shape_of(tracks: Tracks, group: Group, cameras: Cameras) -> Shape | None:
-    """The group's shape and motion where its tracks tell them."""
+def shape_of(tracks: Tracks, group: Group, cameras: Cameras, again: bool = False) -> Shape | None:
+    """The group's shape and motion where its tracks tell them; `again`: from the motion that it has."""
     if len(group.members) < LEAST_TRACKS or len(cameras.K) < 4:
         return None
-    shape = adjust(tracks, group, cameras)
+    shape = adjust(tracks, group, cameras, again)
     return shape if shape.error < GOOD else None
 
 
@@ -125,7 +138,12 @@ def members_of(owner: np.ndarray) -> list[np.ndarray]:
 
 def same(before: np.ndarray, after: np.ndarray) -> bool:
     """Whether two groups have the same members but for a few."""
-    return len(np.setxor1d(before, after)) <= SETTLED * len(before)
+    return change(before, after) <= SETTLED
+
+
+def change(before: np.ndarray, after: np.ndarray) -> float:
+    """How many tracks came or went, as a share of those before."""
+    return len(np.setxor1d(before, after)) / len(before)
 
 
 def nearness(tracks: Tracks) -> csr_matrix:
