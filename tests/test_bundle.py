@@ -254,3 +254,30 @@ def test_a_solution_is_the_lowest_place_around() -> None:
         assert problem.cost(replace(best, rotations=turn @ best.rotations)) > cost
         assert problem.cost(replace(best, shifts=best.shifts + size * away[0])) > cost
         assert problem.cost(replace(best, points=best.points + size * away[1])) > cost
+
+
+def test_times_at_which_nothing_is_seen_change_nothing() -> None:
+    tracks, shape = adjusted()
+    wider = [np.pad(v, ((0, 0), (3, 4), *(((0, 0),) * (v.ndim - 2))), mode="edge") for v in (tracks.pixels, tracks.points)]
+    never = [np.pad(v, ((0, 0), (3, 4))) for v in (tracks.trust, tracks.patch, tracks.age)]
+    hidden = np.pad(np.zeros(TIMES, bool), (3, 4), constant_values=True)
+    for v in wider:
+        v[:, hidden] = np.nan
+    cameras = Cameras(*(np.pad(v, ((3, 4), (0, 0), (0, 0)), mode="edge") for v in (CAMERAS.K, CAMERAS.c2w)))
+    longer = Tracks(*wider, *never)
+    found = adjust(longer, fit(longer, np.arange(COUNT)), cameras)
+    inside = found.group.between(3, 3 + TIMES)
+    np.testing.assert_allclose(of_shape(replace(found, group=inside)), of_shape(shape), atol=1e-3)
+    steps = np.diff(found.group.shifts, axis=0)
+    np.testing.assert_allclose(steps[:3], steps[[3] * 3], atol=1e-9)  # straight on
+    np.testing.assert_allclose(steps[-4:], steps[[-5] * 4], atol=1e-9)
+    assert found.group.rotations.shape == (TIMES + 7, 3, 3) and not found.group.known[hidden].any()
+
+
+def test_a_shape_is_found_from_what_it_was_with_other_tracks() -> None:
+    tracks, shape = adjusted()
+    before = replace(shape.group, members=np.arange(COUNT // 8, COUNT))
+    found = adjust(tracks, before, CAMERAS, again=True)
+    everyone = np.full((COUNT, TIMES, 3), np.nan)
+    everyone[before.members] = of_shape(found)
+    assert likeness(everyone, before.members).min() > 0.99 and wrong_steps(found.group.rotations).max() < 0.5

@@ -58,7 +58,7 @@ def adjust(tracks: Tracks, group: Group, cameras: Cameras, again: bool = False) 
     """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better;
     `again`: from the group's motion, which a shape of almost the same tracks had."""
     times = np.nonzero((tracks.trust[group.members] > 0).any(0))[0]
-    a, b = times.min(initial=0), times.max(initial=len(cameras.K) - 1) + 1  # what is not seen costs as much time
+    a, b = (int(times[0]), int(times[-1]) + 1) if len(times) else (0, len(cameras.K))  # what is not seen costs as much time
     shape = adjusted(tracks.between(a, b), group.between(a, b), Cameras(cameras.K[a:b], cameras.c2w[a:b]), again)
     return replace(shape, group=shape.group.extended(a, group.known))
 
