@@ -63,10 +63,10 @@ def shaped(tracks: Tracks, groups: list[np.ndarray], known: list[Found], cameras
 def anew(tracks: Tracks, members: np.ndarray, known: list[Found], cameras: Cameras) -> Found:
     """A group of given members, and its shape."""
     before = min(known, key=lambda k: change(k[0].members, members), default=None)
+    if before and same(before[0].members, members):
+        return before
     if before is None or before[1] is None or change(before[0].members, members) > LITTLE:
         return with_shape(tracks, members, cameras)
-    if same(before[0].members, members):
-        return before
     group = replace(before[1].group, members=members)
     return group, shape_of(tracks, group, cameras, again=True)
 
