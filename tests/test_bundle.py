@@ -272,12 +272,3 @@ def test_times_at_which_nothing_is_seen_change_nothing() -> None:
     np.testing.assert_allclose(steps[:3], steps[[3] * 3], atol=1e-9)  # straight on
     np.testing.assert_allclose(steps[-4:], steps[[-5] * 4], atol=1e-9)
     assert found.group.rotations.shape == (TIMES + 7, 3, 3) and not found.group.known[hidden].any()
-
-
-def test_a_shape_is_found_from_what_it_was_with_other_tracks() -> None:
-    tracks, shape = adjusted()
-    before = replace(shape.group, members=np.arange(COUNT // 8, COUNT))
-    found = adjust(tracks, before, CAMERAS, again=True)
-    everyone = np.full((COUNT, TIMES, 3), np.nan)
-    everyone[before.members] = of_shape(found)
-    assert likeness(everyone, before.members).min() > 0.99 and wrong_steps(found.group.rotations).max() < 0.5

@@ -54,27 +54,26 @@ class Shape:
         return (self.points - g.centre) @ g.rotations[t].T + g.centre + g.shifts[t]
 
 
-def adjust(tracks: Tracks, group: Group, cameras: Cameras, again: bool = False) -> Shape:
-    """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better;
-    `again`: from the group's motion, which a shape of almost the same tracks had."""
+def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
+    """The shape and motion that explain the tracks' pixels best, from the motion that depth gave, or from none where that is better."""
     times = np.nonzero((tracks.trust[group.members] > 0).any(0))[0]
     a, b = (int(times[0]), int(times[-1]) + 1) if len(times) else (0, len(cameras.K))  # what is not seen costs as much time
-    shape = adjusted(tracks.between(a, b), group.between(a, b), Cameras(cameras.K[a:b], cameras.c2w[a:b]), again)
+    shape = adjusted(tracks.between(a, b), group.between(a, b), Cameras(cameras.K[a:b], cameras.c2w[a:b]))
     return replace(shape, group=shape.group.extended(a, group.known))
 
 
-def adjusted(tracks: Tracks, group: Group, cameras: Cameras, again: bool) -> Shape:
+def adjusted(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
     """The same of a group that is seen at the first and the last time."""
     points = np.full((len(group.members), 3), np.nan)
     some, solved = group.members[telling(tracks.trust[group.members] > 0, MOST)], []
-    for start in (group,) if again else (group, without_turning(tracks, group)):
+    for start in (group, without_turning(tracks, group)):
         problem = Problem(tracks, replace(start, members=some), cameras)
         if problem.use.sum() >= FEWEST:
             solved.append((*problem.solve(State(problem.start, start.rotations, start.shifts), ITERATIONS), problem, start))
     if not solved:
         return Shape(group, points, np.inf)
     state, cost, problem, start = min(solved, key=lambda s: s[1])
-    state = state if again else problem.unreversed(state, cost)
+    state = problem.unreversed(state, cost)
     for _ in range(SMOOTHINGS):
         problem.roughened(state)
         state, _ = problem.solve(state, ITERATIONS)

@@ -23,7 +23,6 @@ PIECE = 0.5  # of the least group: a thing that was hidden may come back for so 
 STRAY = 0.1  # of a group's tracks: where fewer are seen they are strays
 FAR = 4.0  # of a thing's radius in the picture: no further off does it come back
 SETTLED = 0.01  # of a group's tracks: fewer changes change nothing
-LITTLE = 0.25  # of a group's tracks: after fewer changes its shape and motion are found from those before
 
 
 Found = tuple[Group, Shape | None]
@@ -56,23 +55,15 @@ def settled(tracks: Tracks, found: list[Found], cameras: Cameras) -> list[Found]
 
 
 def shaped(tracks: Tracks, groups: list[np.ndarray], known: list[Found], cameras: Cameras) -> list[Found]:
-    """Groups of given members, and their shapes; of those that hardly changed what is `known`, and from there if they changed little."""
-    return [anew(tracks, members, known, cameras) for members in track(groups, "things that move")]
-
-
-def anew(tracks: Tracks, members: np.ndarray, known: list[Found], cameras: Cameras) -> Found:
-    """A group of given members, and its shape."""
-    before = min(known, key=lambda k: change(k[0].members, members), default=None)
-    if before and same(before[0].members, members):
-        return before
-    if before is None or before[1] is None or change(before[0].members, members) > LITTLE:
-        return with_shape(tracks, members, cameras)
-    group = replace(before[1].group, members=members)
-    return group, shape_of(tracks, group, cameras, again=True)
+    """Groups of given members, and their shapes; of those that hardly changed what is `known`."""
+    return [
+        next((k for k in known if same(k[0].members, m)), None) or with_shape(tracks, m, cameras)
+        for m in track(groups, "things that move")
+    ]
 
 
 def with_shape(tracks: Tracks, members: np.ndarray, cameras: Cameras) -> Found:
-    """A group of given members, and its shape, by what its tracks alone tell."""
+    """A group of given members, and its shape."""
     group = fit(tracks, members)
     return group, shape_of(tracks, group, cameras)
 
@@ -122,11 +113,11 @@ def about_as_good(tracks: Tracks, alone: Found, both: Shape, cameras: Cameras) -
     return bool(np.median(misfit(tracks, both, cameras)[group.members]) < own + AS_GOOD)
 
 
-def shape_of(tracks: Tracks, group: Group, cameras: Cameras, again: bool = False) -> Shape | None:
-    """The group's shape and motion where its tracks tell them; `again`: from the motion that it has."""
+def shape_of(tracks: Tracks, group: Group, cameras: Cameras) -> Shape | None:
+    """The group's shape and motion where its tracks tell them."""
     if len(group.members) < LEAST_TRACKS or len(cameras.K) < 4:
         return None
-    shape = adjust(tracks, group, cameras, again)
+    shape = adjust(tracks, group, cameras)
     return shape if shape.error < GOOD else None
 
 
@@ -138,12 +129,7 @@ def members_of(owner: np.ndarray) -> list[np.ndarray]:
 
 def same(before: np.ndarray, after: np.ndarray) -> bool:
     """Whether two groups have the same members but for a few."""
-    return change(before, after) <= SETTLED
-
-
-def change(before: np.ndarray, after: np.ndarray) -> float:
-    """How many tracks came or went, as a share of those before."""
-    return len(np.setxor1d(before, after)) / len(before)
+    return len(np.setxor1d(before, after)) <= SETTLED * len(before)
 
 
 def nearness(tracks: Tracks) -> csr_matrix:
