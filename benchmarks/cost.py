@@ -64,7 +64,6 @@ def main() -> None:
 
 def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any]:
     """Median milliseconds of a step and of a picture, and peak memory."""
-    numba.set_num_threads(setting["cores"])
     scene = Scene.open(folder)
     camera = scene.train[0].camera
     width, height = setting["width"], round(setting["width"] * camera.height / camera.width)
@@ -105,21 +104,15 @@ def timed(do: Any, times: int) -> float:
 
 def at_length(frames: list[Frame], count: int) -> list[Frame]:
     """The first `count` frames; where there are too few, the clip goes on backwards and forwards again, without flow."""
-    order = [i for turn in range(count) for i in (range(len(frames)) if turn % 2 == 0 else reversed(range(len(frames))))][:count]
-    longer = [
-        replace(frames[i], time=float(t), neighbours={o: t + o for o in (1, -1) if 0 <= t + o < count})
-        for t, i in enumerate(order)
-    ]
-    return [
-        replace(
-            f,
-            flow={o: f.flow[o] for o in f.neighbours if o in f.flow},
-            flow_valid={o: f.flow_valid[o] for o in f.neighbours if o in f.flow_valid},
-        )
-        if t < len(frames)
-        else replace(f, flow={}, flow_valid={})
-        for t, f in enumerate(longer)
-    ]
+    there_and_back = [*frames, *reversed(frames)]
+    longer = []
+    for t in range(count):
+        f = there_and_back[t % len(there_and_back)]
+        near = {o: t + o for o in (1, -1) if 0 <= t + o < count}
+        told = {o for o in near if o in f.flow} if t < len(frames) else set()
+        flow, valid = {o: f.flow[o] for o in told}, {o: f.flow_valid[o] for o in told}
+        longer.append(replace(f, time=float(t), neighbours=near, flow=flow, flow_valid=valid))
+    return longer
 
 
 def resized(frame: Frame, width: int, height: int) -> Frame:

@@ -64,9 +64,7 @@ class Misfit:
 
     camera: Camera
     time: float  # in frames
-    error: Callable[
-        [Tensor], Tensor
-    ]  # of its radiance (S, 3): (S,) mean absolute difference of the recorded values over the channels
+    error: Callable[[Tensor], Tensor]  # of its radiance (S, 3): (S,) mean absolute difference of recorded values
 
 
 @dataclass(frozen=True)
