@@ -114,6 +114,18 @@ def test_saturation_is_where_recordings_begin_to_saturate():
     assert saturation(samples, 0, curve, np.log([1.0, 4.0])) == pytest.approx(0.0, abs=0.01)  # ln 1
 
 
+def test_shadows_do_not_move_saturation():
+    """As above, but nothing is recorded between 0.9 and 1.6 of saturation, save points that fell into shadow before the brighter frame."""
+    dark = np.concatenate([np.linspace(0.05, 0.225, 300), np.linspace(0.23, 0.4, 30), np.linspace(0.4, 0.6, 200)])[:, None]
+    light = np.minimum(4 * dark, 1)
+    light[300:330] = 0.3
+    rgb = np.stack([dark, light], 1).repeat(3, -1)
+    samples = Samples(rgb, rgb < 0.99, rgb >= 1)
+    curve = np.zeros(42)
+    curve[40] = 1.0
+    assert saturation(samples, 0, curve, np.log([1.0, 4.0])) == pytest.approx(0.0, abs=0.01)
+
+
 def test_the_response_rises_even_where_the_fit_falls():
     curves = np.zeros((3, 42))
     curves[:, 20:30] = -3.0  # a deep dent in G

@@ -201,21 +201,25 @@ def saturation(samples: Samples, channel: int, curve: np.ndarray, log_exposure: 
     points whose exposure another, darker bracket tells. Extrapolated where fewer than 30 of either kind are known."""
     valid, saturated = samples.valid[..., channel], samples.saturated[..., channel]
     extrapolated = float(basis(np.array(1.0)) @ curve)
-    known = np.where(valid, basis(samples.rgb[..., channel]) @ curve - log_exposure, np.nan)  # (P, B) the point's ln E
-    above, below = [], []
+    told = np.where(valid, basis(samples.rgb[..., channel]) @ curve, np.nan)  # (P, B) log exposure of what was recorded
+    above, below, off = [], [], []
     for dark, light in itertools.permutations(range(valid.shape[1]), 2):
         if log_exposure[dark] < log_exposure[light]:
-            level = known[:, dark] + log_exposure[light]
+            level = told[:, dark] - log_exposure[dark] + log_exposure[light]
+            both = valid[:, dark] & valid[:, light]
             above.append(level[valid[:, dark] & saturated[:, light]])
-            below.append(level[valid[:, dark] & valid[:, light]])
-    high, low = np.sort(np.concatenate(above)), np.sort(np.concatenate(below))
+            below.append(level[both])
+            off.append(np.abs(level - told[:, light])[both])
+    misfit = np.concatenate(off)
+    same = misfit <= 3 * np.median(misfit) if misfit.size else misfit > 0  # the others fell into shadow between the two
+    high, low = np.sort(np.concatenate(above)), np.sort(np.concatenate(below)[same])
     floor = float(basis(np.array(HIGH)) @ curve)
     if min(len(high), len(low)) < 30:
         return max(extrapolated, floor)
     candidates = np.linspace(floor - 0.5, max(extrapolated, floor) + 1.0, 301)
     wrong = np.searchsorted(high, candidates) + len(low) - np.searchsorted(low, candidates)
-    best = candidates[wrong == wrong.min()]
-    return max(float(best.mean()), floor + 1e-3)
+    best = candidates[wrong == wrong.min()]  # a gap between the kinds leaves many: the one that the curve itself leads to
+    return max(float(np.clip(extrapolated, best.min(), best.max())), floor + 1e-3)
 
 
 def response_of(curves: np.ndarray, tops: np.ndarray, num: int = 256) -> tuple[np.ndarray, np.ndarray]:

@@ -22,6 +22,7 @@ from typing import IO, Any, Literal
 
 import numpy as np
 
+from hdr_nsff.priors.trimming import trim
 from hdr_nsff.progress import track
 
 Mapping = Literal["incremental", "global"]
@@ -213,7 +214,7 @@ def match(job: Job, database: Path, threads: int) -> None:
 
 
 def reconstruct(job: Job, database: Path, threads: int) -> None:
-    """Map the matches; models are left in `<folder>/<mapping>/<n>`, with a last robust adjustment of everything."""
+    """Map the matches; models are left in `<folder>/<mapping>/<n>`, adjusted to the points that stand still."""
     import pycolmap
 
     out = Path(job.folder) / job.mapping
@@ -235,7 +236,10 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
         pycolmap.calibrate_view_graph(database)
         models = pycolmap.global_mapping(database, images, out, whole)
     tell("end")
+    adjustment = pycolmap.BundleAdjustmentOptions()
+    adjustment.print_summary = False
     for key, model in models.items():
+        trim(model, lambda m: pycolmap.bundle_adjustment(m, adjustment))
         (out / str(key)).mkdir(exist_ok=True)
         model.write_binary(out / str(key))
 
