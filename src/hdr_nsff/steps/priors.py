@@ -26,6 +26,7 @@ from hdr_nsff.steps.neural import network_depth, sam2_masks
 from hdr_nsff.steps.work import Work
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
+ROUNDS = 2  # of structure from motion after the first
 SAME_MASKS = 0.75  # intersection over union from which masks count as the same
 FLOW_CHUNK = 8  # pairs between two savings
 SPHERE_NEAR, SPHERE_FAR = 0.5, 2.0  # around distance 1, where everything lies when there is no parallax
@@ -107,9 +108,9 @@ def write_flow(work: Work, names: FlowFiles, flow: np.ndarray, valid: np.ndarray
 
 
 def poses_step(work: Work) -> Step:
-    """Cameras of all frames: given, or by structure from motion in two rounds, since poses need masks and good masks need poses.
+    """Cameras of all frames: given, or by structure from motion in up to three rounds, since poses need masks and good masks need poses.
 
-    The second round is left out where its masks are nearly those of the first. A killed run keeps the first round."""
+    The last is the one whose masks are nearly those before. A killed run keeps the first round."""
     c = work.config
     capture = work.gives("poses")
     if capture is not None and capture.poses is not None:
@@ -125,13 +126,16 @@ def poses_step(work: Work) -> Step:
             store(work, estimate(work, moving))
             work.save()
             write_npy(first, moving)
-        if work.manifest.parallax == "full":
-            before, moving = read_npy(first), geometric_mask(*work.flows, work.equalised[0], *work.cameras())
+        before = read_npy(first)
+        for _ in range(ROUNDS if work.manifest.parallax == "full" else 0):
+            moving = geometric_mask(*work.flows, work.equalised[0], *work.cameras())
             agreement = (before & moving).sum() / max((before | moving).sum(), 1)
             again = agreement < SAME_MASKS
-            say(f"poses: masks from these poses agree to {agreement:.0%} with the first ones{': once more' if again else ''}")
-            if again:
-                store(work, estimate(work, moving))
+            say(f"poses: masks from these poses agree to {agreement:.0%} with those before{': once more' if again else ''}")
+            if not again:
+                break
+            store(work, estimate(work, moving))
+            before = moving
     details = work.manifest.steps["poses"].details
     return Step(
         provenance="estimated" if c.poses is None and capture is None else "given",
