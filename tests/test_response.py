@@ -115,8 +115,8 @@ def test_saturation_is_where_recordings_begin_to_saturate():
 
 
 def test_shadows_do_not_move_saturation():
-    """As above, but nothing is recorded between 0.9 and 1.6 of saturation, save points that fell into shadow before the brighter frame."""
-    dark = np.concatenate([np.linspace(0.05, 0.225, 300), np.linspace(0.23, 0.4, 30), np.linspace(0.4, 0.6, 200)])[:, None]
+    """As above, but points that fell into shadow before the brighter frame outnumber those that are just bright enough to saturate."""
+    dark = np.concatenate([np.linspace(0.05, 0.225, 300), np.linspace(0.23, 0.4, 30), np.linspace(0.278, 0.6, 40)])[:, None]
     light = np.minimum(4 * dark, 1)
     light[300:330] = 0.3
     rgb = np.stack([dark, light], 1).repeat(3, -1)

@@ -218,8 +218,8 @@ def saturation(samples: Samples, channel: int, curve: np.ndarray, log_exposure: 
         return max(extrapolated, floor)
     candidates = np.linspace(floor - 0.5, max(extrapolated, floor) + 1.0, 301)
     wrong = np.searchsorted(high, candidates) + len(low) - np.searchsorted(low, candidates)
-    best = candidates[wrong == wrong.min()]  # a gap between the kinds leaves many: the one that the curve itself leads to
-    return max(float(np.clip(extrapolated, best.min(), best.max())), floor + 1e-3)
+    best = candidates[wrong == wrong.min()]
+    return max(float(best.mean()), floor + 1e-3)
 
 
 def response_of(curves: np.ndarray, tops: np.ndarray, num: int = 256) -> tuple[np.ndarray, np.ndarray]:
