@@ -218,6 +218,7 @@ def test_initialise_finds_the_curve_through_noisy_depth():
     x, y = tonemapper.curve()
     assert rmse(x.numpy(), y.numpy(), S_CURVE) < 0.01
     assert "static points" in note and "as given" in note
+    assert tonemapper.anchored  # what was measured is held from the first step on
 
 
 def test_initialise_falls_back_on_brightness_and_says_so():
@@ -229,6 +230,7 @@ def test_initialise_falls_back_on_brightness_and_says_so():
     tonemapper = ToneMapper.for_scene(ToneMapConfig(), scene)
     note = initialise(tonemapper, scene)
     assert "too few static points" in note and "brightness" in note
+    assert not tonemapper.anchored
     assert tonemapper.exposures().tolist() == pytest.approx(EV, abs=0.4)
     x, y = tonemapper.curve()
     torch.testing.assert_close(y, (x ** (1 / 2.2)).expand(3, -1), atol=1e-5, rtol=0)

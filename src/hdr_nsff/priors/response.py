@@ -272,6 +272,8 @@ def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int 
             tonemapper.set_curve(torch.from_numpy(fit.x), torch.from_numpy(fit.y))
             tonemapper.set_exposures(fit.ev.tolist())
             own = camera_curves(tonemapper, scene, fit, num, seed) if kind == "shared" else ""
+            if tonemapper.num_cameras == 1:  # the white balance of others is found with the field
+                tonemapper.anchor()  # measured, not guessed: a field that is still coarse would only bend it
             how = (
                 "taken to be the likeliest steps, for recordings leave a common factor open: give `--ev` if you know them"
                 if fit.guessed
