@@ -28,6 +28,7 @@ from hdr_nsff.progress import track
 Mapping = Literal["incremental", "global"]
 GIVEN = "given.npz"
 CHUNKS = 24  # progress steps of matching
+TOLD = 0.9998  # of the error with focal lengths held: what others must reach, for thousands of observations tell less than that by chance
 ROOM = 2**20  # bytes: a disk with less than this free is full
 
 
@@ -236,12 +237,33 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
         pycolmap.calibrate_view_graph(database)
         models = pycolmap.global_mapping(database, images, out, whole)
     tell("end")
-    adjustment = pycolmap.BundleAdjustmentOptions()
-    adjustment.print_summary = False
     for key, model in models.items():
-        trim(model, lambda m: pycolmap.bundle_adjustment(m, adjustment))
+        trim(model, adjust)
         (out / str(key)).mkdir(exist_ok=True)
         model.write_binary(out / str(key))
+
+
+def adjust(model: Any) -> None:
+    """Fit cameras and points to each other, and focal lengths where that lowers the error: a camera that slides without turning tells none."""
+    import pycolmap
+
+    held = pycolmap.BundleAdjustmentOptions()
+    held.print_summary = held.refine_focal_length = False
+    free = pycolmap.BundleAdjustmentOptions()
+    free.print_summary = False
+    pycolmap.bundle_adjustment(model, held)
+    before, error = {key: c.focal_length for key, c in model.cameras.items()}, mean_error(model)
+    pycolmap.bundle_adjustment(model, free)
+    if mean_error(model) > TOLD * error:
+        for key, focal in before.items():
+            model.cameras[key].focal_length = focal
+        pycolmap.bundle_adjustment(model, held)
+
+
+def mean_error(model: Any) -> float:
+    """Of all observations, in pixels."""
+    model.update_point_3d_errors()
+    return float(model.compute_mean_reprojection_error())
 
 
 def main() -> None:
