@@ -50,7 +50,7 @@ class TrainConfig:
     """Learning rates fall exponentially to this share of their start over the run; 0: the published 0.1 per 300k steps."""
     tonemap_lr: float = 2e-3
     anchor_at: float = 0.05
-    """Share of the run after which response and exposures are held where they are (1: never); at once where static points told them."""
+    """Share of the run after which response and exposures are held where they are (1: never), unless static points told them: then at once."""
     paint: bool = True
     """Start the field from the depth prior and the recorded colours (no effect on the published network)."""
     refine_poses: bool = False

@@ -22,7 +22,7 @@ from typing import IO, Any, Literal
 
 import numpy as np
 
-from hdr_nsff.priors.trimming import trim
+from hdr_nsff.priors.trimming import ROUNDS, trim
 from hdr_nsff.progress import track
 
 Mapping = Literal["incremental", "global"]
@@ -237,10 +237,12 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
         pycolmap.calibrate_view_graph(database)
         models = pycolmap.global_mapping(database, images, out, whole)
     tell("end")
+    tell("stage adjustment", (ROUNDS + 1) * len(models))
     for key, model in models.items():
         trim(model, adjust)
         (out / str(key)).mkdir(exist_ok=True)
         model.write_binary(out / str(key))
+    tell("end")
 
 
 def adjust(model: Any) -> None:
@@ -258,6 +260,7 @@ def adjust(model: Any) -> None:
         for key, focal in before.items():
             model.cameras[key].focal_length = focal
         pycolmap.bundle_adjustment(model, held)
+    tell("tick")
 
 
 def mean_error(model: Any) -> float:
