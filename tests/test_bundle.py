@@ -28,14 +28,14 @@ def pixels_of(points: np.ndarray) -> np.ndarray:
     return local[..., :2] / local[..., 2:] * FOCAL + [160, 100]
 
 
-def tracked(pixels: np.ndarray, far: float = 1.0, lasting: int = 10) -> Tracks:
-    """Tracks of `lasting` times each, put at one depth per time: `far` times that of the body's middle."""
+def tracked(pixels: np.ndarray, far: float = 1.0, lasting: int = 10, trust: float = 0.5) -> Tracks:
+    """Tracks of `lasting` times each, put at one depth per time: `far` times that of the body's middle, which is trusted so much."""
     first = np.random.default_rng(1).integers(0, TIMES - lasting + 1, len(pixels))[:, None]
     seen = (np.arange(TIMES) >= first) & (np.arange(TIMES) < first + lasting)
     depth = far * (PLACES - EYES)[:, 2:]
     points = np.concatenate([(pixels - [160, 100]) / FOCAL * depth, np.broadcast_to(depth, (*pixels.shape[:2], 1))], -1) + EYES
     hide = np.where(seen, 1.0, np.nan)[..., None]
-    return Tracks(pixels * hide, points * hide, seen.astype(float), seen.astype(int), np.zeros(seen.shape, int))
+    return Tracks(pixels * hide, points * hide, trust * seen, seen.astype(int), np.zeros(seen.shape, int))
 
 
 @cache
@@ -97,6 +97,13 @@ def test_a_camera_that_shakes_tells_how_far_away_it_is_whatever_the_prior_says(f
     assert likeness(points).min() > 0.99 and wrong_steps(shape.group.rotations).max() < 0.3
     assert np.allclose(points[..., 2].std(0) / TRUE[..., 2].std(0), 1, atol=0.03)
     assert np.allclose((points - EYES)[..., 2].mean(0) / (TRUE - EYES)[..., 2].mean(0), 1, atol=0.03)
+
+
+@pytest.mark.parametrize("far", [0.8, 1.15])
+def test_depth_that_is_sure_of_itself_is_believed_against_the_path(far: float) -> None:
+    tracks = tracked(pixels_of(TRUE), far, trust=1.0)
+    points = of_shape(adjust(tracks, fit(tracks, np.arange(COUNT)), CAMERAS))
+    assert np.median((points - EYES)[..., 2].mean(0) / (TRUE - EYES)[..., 2].mean(0)) == pytest.approx(far, abs=0.03)
 
 
 def test_a_camera_that_moves_evenly_leaves_how_far_away_it_is_to_the_prior(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -22,7 +22,8 @@ BETTER = 0.98  # of the cost: what a reversal must gain
 MOST = 200  # tracks that poses are found from
 FEWEST = 3  # tracks that have a shape
 NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbours share their errors
-FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation of all times that tracks join
+FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation of all times that tracks join ...
+UNSURE, FAR_SIGMA_SURE = 0.52, 0.01  # ... where its confidence is at most the one, and where it is 1
 FAR_SIGMA_ALONE = 0.02  # the same of every time of a path too short to tell
 PATH_SIGMA = 0.001  # of the path's third differences, as a share of z-depth, where it is smoothest
 ROUGH = 0.01  # the same before anything is known
@@ -149,8 +150,11 @@ class Problem:
         self.rows = ((np.abs(self.third) > 0) @ ~self.told == 0) & (piece[3:] == piece[:-3])
         each = np.bincount(piece, self.told)[piece]
         tells = self.rows.sum() >= LEAST_ROWS
+        trust = tracks.trust[group.members][use][seen]
+        sure = np.clip((np.median(trust) - UNSURE) / (1 - UNSURE), 0, 1) if len(trust) else 0.0
+        far = FAR_SIGMA + (FAR_SIGMA_SURE - FAR_SIGMA) * sure
         self.far_sigma = self.unit * (
-            FAR_SIGMA * np.sqrt(np.maximum(each, 1)) if tells else np.full(len(self.K), FAR_SIGMA_ALONE)
+            far * np.sqrt(np.maximum(each, 1)) if tells else np.full(len(self.K), min(far, FAR_SIGMA_ALONE))
         )
 
     def solve(self, state: State, iterations: int) -> tuple[State, float]:
