@@ -27,7 +27,7 @@ from hdr_nsff.steps.work import Work
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
 ROUNDS = 2  # of structure from motion after the first
-SAME_MASKS = 0.75  # intersection over union from which masks count as the same
+SAME_MASKS = 0.85  # intersection over union from which masks count as the same
 FLOW_CHUNK = 8  # pairs between two savings
 SPHERE_NEAR, SPHERE_FAR = 0.5, 2.0  # around distance 1, where everything lies when there is no parallax
 
