@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.bundle import Cameras, Problem, Shape, State, adjust, without_turning
+from hdr_nsff.priors.bundle import PATH_SIGMA, Cameras, Problem, Shape, State, adjust, without_turning
 from hdr_nsff.priors.groups import Group, Tracks, fit
 
 TIMES, COUNT, FOCAL = 16, 90, 300.0
@@ -99,6 +99,43 @@ def test_a_camera_that_shakes_tells_how_far_away_it_is_whatever_the_prior_says(f
     assert np.allclose((points - EYES)[..., 2].mean(0) / (TRUE - EYES)[..., 2].mean(0), 1, atol=0.03)
 
 
+@pytest.mark.parametrize("far", [0.75, 1.0, 1.4])  # with one smoothness for all directions: 0.86, 1.13, 1.57
+def test_what_goes_to_and_fro_along_a_line_is_found_by_the_shake_across_it(far: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    jerk = np.outer(0.15 * np.sin(2.1 * np.arange(TIMES)), [1, 0, 0])  # more than the camera shakes
+    true = TRUE + jerk
+    monkeypatch.setattr(sys.modules[__name__], "PLACES", PLACES + jerk)
+    tracks = tracked(pixels_of(true), far)
+    points = of_shape(adjust(tracks, fit(tracks, np.arange(COUNT)), CAMERAS))
+    assert np.median((points - EYES)[..., 2].mean(0) / (true - EYES)[..., 2].mean(0)) == pytest.approx(1, abs=0.11)
+
+
+def test_every_direction_of_a_path_has_a_smoothness_of_its_own() -> None:
+    problem = flat_problem()
+    s = true_state(problem)
+    jerky = replace(s, shifts=s.shifts + np.outer(0.2 * (-1.0) ** np.arange(TIMES), [0.6, 0.8, 0.0]))
+    problem.roughened(jerky)
+    path = problem.priors(jerky, problem.residuals(jerky)[2])[1]
+    assert path.shape == (TIMES - 3, 3)
+    assert (path**2).mean(0).sum() == pytest.approx(1, abs=0.01)  # along the line as much as it shows, across it nothing
+    across = np.array([0.8, -0.6, 0.0]), np.array([0.0, 0.0, 1.0])
+    assert all(np.linalg.norm(problem.path_scale @ a) == pytest.approx(1 / PATH_SIGMA) for a in across)
+
+
+def test_slopes_of_the_path_are_its_derivatives() -> None:
+    problem, h = flat_problem(), 1e-6
+    s = true_state(problem)
+    s = replace(s, shifts=s.shifts + np.random.default_rng(0).normal(0, 0.05, s.shifts.shape))
+    problem.roughened(s)
+    path = problem.priors(s, problem.residuals(s)[2])[1]
+    slopes = problem.path_slopes(s, path)
+    for t, axis in ((0, 0), (5, 1), (TIMES - 1, 2)):
+        moved = s.shifts.copy()
+        moved[t, axis] += h
+        there = replace(s, shifts=moved)
+        measured = (problem.priors(there, problem.residuals(there)[2])[1] - path) / h
+        assert measured == pytest.approx(slopes[:, :, t, axis], abs=1e-3 * np.abs(slopes).max())
+
+
 @pytest.mark.parametrize("far", [0.8, 1.15])
 def test_depth_that_is_sure_of_itself_is_believed_against_the_path(far: float) -> None:
     tracks = tracked(pixels_of(TRUE), far, trust=1.0)
@@ -125,7 +162,7 @@ def test_no_prior_but_the_one_on_distance_changes_with_scale() -> None:
         assert np.allclose(problem.residuals(scaled)[0], problem.residuals(state)[0])
         # the path, straight in the world, shows the camera's shake at any other scale, as a share of the distance
         paths = [problem.priors(s, problem.residuals(s)[2])[1] for s in (state, scaled)]
-        shake = (1 / factor - 1) * (problem.third @ problem.eye) / (problem.path_sigma * problem.distance(state))
+        shake = (1 / factor - 1) * (problem.third @ problem.eye) @ problem.path_scale / problem.distance(state)
         assert np.allclose(paths[0], 0) and np.allclose(paths[1], shake)
 
 

@@ -50,7 +50,8 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
     told = capsys.readouterr().err
     assert "HDR-GoPro / NSFF (LLFF), 9 pictures, with its own poses, flow, masks, depth" in " ".join(told.split())
     assert provenance(gopro.out) == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "depth": "given", "sheet": "estimated",
+        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "absent",
+        "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 3 and not scene.test
     assert [f.time for f in scene.train] == list(range(9)) and {f.camera_id for f in scene.train} == {0}
@@ -175,7 +176,7 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
     prepare(gopro)
     steps = Manifest.load(gopro.out).steps
     assert {n: s.details["attempt"] for n, s in steps.items()} == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "mask": 2, "depth": 2, "sheet": 2,
+        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "mask": 2, "rims": 2, "depth": 2, "sheet": 2,
     }  # fmt: skip
 
 

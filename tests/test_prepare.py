@@ -74,7 +74,8 @@ def test_footage_becomes_a_scene_that_opens(config):
 def test_the_manifest_says_where_everything_came_from(config):
     m = Manifest.load(prepare(config))
     assert {name: step.provenance for name, step in m.steps.items()} == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "depth": "given", "sheet": "estimated",
+        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "absent",
+        "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert m.inputs.keys() == {f"{t:03d}.png" for t in range(COUNT)} and all(len(h) == 64 for h in m.inputs.values())
     assert (m.cycle, m.exposure_given, m.bracket_ev) == (3, False, [None] * 3)
@@ -99,14 +100,38 @@ def test_a_second_run_does_nothing(config):
 def test_redo_does_a_step_and_what_builds_on_it(config):
     prepare(config)
     prepare(replace(config, redo=("poses",)))
-    assert attempts(config.out) == {"frames": 1, "exposure": 1, "flow": 1, "poses": 2, "mask": 2, "depth": 2, "sheet": 2}
+    assert attempts(config.out) == {
+        "frames": 1, "exposure": 1, "flow": 1, "poses": 2, "mask": 2, "rims": 2, "depth": 2, "sheet": 2,
+    }  # fmt: skip
+
+
+def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(config):
+    estimated = replace(config, flow="dis")
+    m = Manifest.load(prepare(estimated))
+    f = m.frames[4]
+    assert (f.flow[5].flow, f.flow[5].valid) == ("rims/00004_00005.npy", "rims/00004_00005_valid.png")
+    assert (f.matched[5].flow, f.matched[5].valid) == ("flow/00004_00005.npy", "flow/00004_00005_valid.png")
+    assert m.steps["rims"].provenance == "estimated"
+    before, after = (np.load(config.out / files[5].flow) for files in (f.matched, f.flow))
+    assert np.array_equal(before[:, 4:], after[:, 4:]) and not np.array_equal(before[:, :4], after[:, :4])  # 4 columns move
+
+    (config.out / "rims/00004_00005.npy").unlink()
+    prepare(estimated)
+    assert np.array_equal(np.load(config.out / "rims/00004_00005.npy"), after)
+    write_png(config.masks / "004.png", np.ones((H, W), bool))
+    prepare(estimated)
+    assert attempts(config.out)["flow"] == 1 and attempts(config.out)["rims"] == 2
+    assert np.array_equal(np.load(config.out / f.matched[5].flow), before)
+    assert not np.array_equal(np.load(config.out / f.flow[5].flow), after)
 
 
 def test_a_changed_setting_redoes_what_depends_on_it(config):
     prepare(config)
     write_npy(config.depth / "003.npy", np.full((H, W), 3.0, np.float32))  # the contents of a given folder count
     prepare(config)
-    assert attempts(config.out) == {"frames": 1, "exposure": 1, "flow": 1, "poses": 1, "mask": 1, "depth": 2, "sheet": 2}
+    assert attempts(config.out) == {
+        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "mask": 1, "rims": 1, "depth": 2, "sheet": 2,
+    }  # fmt: skip
     prepare(replace(config, ev="-2,0,2"))
     assert attempts(config.out)["frames"] == 1 and attempts(config.out)["exposure"] == 2 and attempts(config.out)["flow"] == 2
 

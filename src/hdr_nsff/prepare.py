@@ -1,4 +1,4 @@
-"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, mask, depth, sheet.
+"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, mask, rims, depth, sheet.
 
 Every step writes its files and then its record into `scene.json`; its key is a hash of its settings, of the weights of the networks that it
 asks, and of the steps and inputs it builds on. A finished step with the same key is skipped, an unfinished one goes on with the files it has, one with another key
@@ -270,7 +270,7 @@ STEPS: dict[StepName, StepKind] = {
         needs=("exposure",),
         settings=("flow", "flow_weights", "semantic"),
         outputs=("flow",),
-        complete=all_have("flow"),
+        complete=all_have("matched"),
     ),
     "poses": StepKind(
         on_priors.poses_step,
@@ -286,9 +286,10 @@ STEPS: dict[StepName, StepKind] = {
         outputs=("masks",),
         complete=all_have("mask"),
     ),
+    "rims": StepKind(on_priors.rims_step, needs=("mask",), outputs=("rims",), complete=all_have("flow")),
     "depth": StepKind(
         on_priors.depth_step,
-        needs=("mask",),
+        needs=("rims",),
         settings=("depth", "depth_weights", "depth_kind"),
         outputs=("disparity", "disparity_confidence"),
         complete=all_have("disparity", "train"),

@@ -61,11 +61,12 @@ class FrameEntry(Strict):
     disparity: str | None = None  # .npy (H, W) half, 1 / z-depth
     disparity_confidence: str | None = None  # .npy (H, W) half, in [0, 1]
     flow: dict[int, FlowFiles] = {}  # other frame's index -> flow towards it
+    matched: dict[int, FlowFiles] = {}  # the same as it was before masks were known, which poses and masks come from
 
     @property
     def files(self) -> list[str]:
         """The names of all files of this frame."""
-        flow = [n for f in self.flow.values() for n in (f.flow, f.valid)]
+        flow = [n for kind in (self.flow, self.matched) for f in kind.values() for n in (f.flow, f.valid)]
         return [n for n in (self.image, self.mask, self.disparity, self.disparity_confidence, *flow) if n is not None]
 
 

@@ -2,7 +2,8 @@
 
 A thing that turns, or that a moving camera goes round, shows its relief as a static scene does; only how far away it is as a whole
 stays a matter of the prior. Levenberg-Marquardt with the points eliminated (Triggs et al., "Bundle adjustment: a modern synthesis",
-1999), Huber weights, weak priors on the mean z-depth of every time, on the path's third differences and on the shape."""
+1999), Huber weights, weak priors on the mean z-depth of every time, on the path's third differences, whose covariance is estimated with it, and
+on the shape."""
 
 from __future__ import annotations
 
@@ -25,10 +26,10 @@ NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbours sha
 FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation of all times that tracks join ...
 UNSURE, FAR_SIGMA_SURE = 0.52, 0.01  # ... where it is trusted no more than the one (geometry claims 0.5), and fully
 FAR_SIGMA_ALONE = 0.02  # the same of every time of a path too short to tell
-PATH_SIGMA = 0.001  # of the path's third differences, as a share of z-depth, where it is smoothest
+PATH_SIGMA = 0.001  # of the path's third differences, as a share of z-depth, in the direction in which it is smoothest
 ROUGH = 0.01  # the same before anything is known
 LEAST_ROWS = 6  # third differences that tell how smooth a path is, and so how far away
-SMOOTHINGS = 2  # rounds of telling how smooth the path is
+SMOOTHINGS = 4  # rounds of telling how smooth the path is in which direction
 TURN_SIGMA = np.radians(2.0)  # of the second differences of its turning
 SHAPE_SIGMA = 2.0  # of a point's distance from the thing's middle, as a share of the thing's size
 
@@ -144,7 +145,7 @@ class Problem:
         self.third = np.diff(np.eye(len(self.K)), n=3, axis=0) if len(self.K) > 3 else np.zeros((0, len(self.K)))
         self.unit = np.median(self.mean_depth[self.told]) if self.told.any() else 1.0
         self.nearing = self.told[:, None] * self.w2c[:, 2] / max(int(self.told.sum()), 1)  # (T, 3) of the distance by the shifts
-        self.path_sigma = ROUGH
+        self.path_scale = np.eye(3) / ROUGH  # (3, 3): makes third differences, as shares of z-depth, standard deviations
         linked = (seen[:, 1:] & seen[:, :-1]).sum(0) >= FEWEST
         piece = np.concatenate([[0], np.cumsum(~linked)])  # (T,) times that tracks join: within, depth is known but for a factor
         self.rows = ((np.abs(self.third) > 0) @ ~self.told == 0) & (piece[3:] == piece[:-3])
@@ -231,7 +232,7 @@ class Problem:
         turning = np.diff(turns, axis=0) / TURN_SIGMA
         mean = np.where(self.seen, local[..., 2], 0).sum(0) / np.maximum(self.seen.sum(0), 1)
         far = np.where(self.told, (mean - self.mean_depth) / self.far_sigma, 0)
-        path = self.third @ s.shifts / (self.path_sigma * self.distance(s))
+        path = self.third @ s.shifts / self.distance(s) @ self.path_scale
         return far, path, turning, (s.points - self.middle) / self.spread(s)
 
     def distance(self, s: State) -> float:
@@ -245,14 +246,16 @@ class Problem:
     def path_slopes(self, s: State, path: np.ndarray) -> np.ndarray:
         """Derivatives (T - 3, 3, T, 3) of the path's residuals by the shifts. They are shares of the distance: else all would do well
         to come nearer, as whatever is near moves little."""
-        out = self.third[:, None, :, None] * np.eye(3)[None, :, None] / self.path_sigma - path[..., None, None] * self.nearing
+        out = self.third[:, None, :, None] * self.path_scale[:, None] - path[..., None, None] * self.nearing
         return out / self.distance(s)
 
     def roughened(self, s: State) -> None:
-        """Believe in smooth paths as far as this state's is, where it was seen for long enough to tell."""
+        """Believe in smooth paths as far as this state's is, in every direction by itself, where it was seen for long enough to tell. What
+        goes to and fro does so along a line or in a plane: across it nothing but the camera's own shake is left, which tells the distance."""
         if self.rows.sum() >= LEAST_ROWS:
-            path = np.abs(self.third @ s.shifts)[self.rows] / self.distance(s)
-            self.path_sigma = max(PATH_SIGMA, 1.5 * float(np.median(path)))
+            path = (self.third @ s.shifts)[self.rows] / self.distance(s)
+            variance, axes = np.linalg.eigh(path.T @ path / len(path) + PATH_SIGMA**2 * np.eye(3))
+            self.path_scale = axes / np.sqrt(variance) @ axes.T
 
     def cost(self, s: State) -> float:
         """Huber cost of everything."""

@@ -16,10 +16,12 @@ from hdr_nsff.datasets import maps
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
 from hdr_nsff.priors.depth import depth_range, geometric_depth, read_depth
+from hdr_nsff.priors.flow import agreement, common_rgb, in_threads, recorded_range
 from hdr_nsff.priors.flow_sources import fallback_note, flow_source, resolved
 from hdr_nsff.priors.import_poses import import_poses, placed
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
 from hdr_nsff.priors.poses import Poses, estimate_poses
+from hdr_nsff.priors.rims import mended
 from hdr_nsff.progress import say, track
 from hdr_nsff.scene import FlowFiles, FrameEntry, Step
 from hdr_nsff.steps.neural import network_depth, sam2_masks
@@ -71,7 +73,7 @@ def flow_step(work: Work) -> Step:
         for pair, f, v in zip(chunk, found, valid, strict=True):
             write_flow(work, names[pair], f, v)
     for f in m.frames:
-        f.flow = {j: names[i, j] for i, j in pairs if i == f.index}
+        f.flow = f.matched = {j: names[i, j] for i, j in pairs if i == f.index}
     share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
     vars(work).pop("flows", None)
     given = len(pairs) if from_folder else len(own)
@@ -235,6 +237,45 @@ def mask_step(work: Work) -> Step:
     )
 
 
+def rims_step(work: Work) -> Step:
+    """Estimated flow once more where things move, from what moves alone; flow that is given stays as it is."""
+    m = work.manifest
+    own = [(f.index, j) for f in m.frames for j in f.matched if not flow_is_given(work, f.index, j)]
+    video, clipped = work.equalised
+    moving = [read_mask(work.folder / f.mask) for f in m.frames if f.mask]
+    ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
+    names = {(i, j): FlowFiles(flow=f"rims/{i:05d}_{j:05d}.npy", valid=f"rims/{i:05d}_{j:05d}_valid.png") for i, j in own}
+
+    def mend(i: int, j: int) -> None:
+        if all((work.folder / n).is_file() for p in ((i, j), (j, i)) for n in (names[p].flow, names[p].valid)):
+            return  # by a run that was killed
+        seen = common_rgb(video, ranges, i, j), common_rgb(video, ranges, j, i)
+        there, back = (
+            mended(*pictures, read_npy(work.folder / m.frames[a].matched[b].flow).astype(np.float32), moving[a])
+            for pictures, (a, b) in zip(seen, ((i, j), (j, i)), strict=True)
+        )
+        write_flow(work, names[i, j], there, agreement(there, back, clipped[i], clipped[j]))
+        write_flow(work, names[j, i], back, agreement(back, there, clipped[j], clipped[i]))
+
+    in_threads(lambda pair: mend(*pair), [(i, j) for i, j in own if i < j], "flow of movers")
+    for f in m.frames:
+        f.flow = {j: names.get((f.index, j), files) for j, files in f.matched.items()}
+    for name in ("flows", "mended_flows"):
+        vars(work).pop(name, None)
+    return Step(
+        provenance="estimated" if own else "absent",
+        note=f"flow of what moves told by what moves alone in {len(own)} pairs" if own else "flow that is given stays as it is",
+    )
+
+
+def flow_is_given(work: Work, i: int, j: int) -> bool:
+    """Whether the flow between the frames `i` and `j` is the user's or the data set's, one way or both."""
+    if isinstance(work.config.flow, Path) or work.gives("flow") is None:
+        return isinstance(work.config.flow, Path)
+    a, b = (work.manifest.frames[k] for k in (i, j))
+    return b.source in work.picture(a).flow or a.source in work.picture(b).flow
+
+
 def depth_step(work: Work) -> Step:
     """Disparity of the training frames and how far it can be believed."""
     m, c = work.manifest, work.config
@@ -279,7 +320,7 @@ def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     """Depth of the frames `index` (increasing) from those frames alone."""
     m = work.manifest
     frames = [m.frames[i] for i in index]
-    found, valid, pairs = work.flows
+    found, valid, pairs = work.mended_flows
     among = np.isin(pairs, index).all(1)
     video, clipped = work.equalised
     K, c2w = work.cameras()

@@ -17,12 +17,15 @@ from hdr_nsff.priors import exposure
 from hdr_nsff.priors.flow_sources import FlowName
 from hdr_nsff.priors.lightglue import Matcher
 from hdr_nsff.priors.semantic import SemanticConfig
-from hdr_nsff.scene import FrameEntry, Manifest, Protocol
+from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest, Protocol
 
 MaskName = Literal["motion", "sam2"]
 DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
-StepName = Literal["frames", "exposure", "flow", "poses", "mask", "depth", "sheet"]
+Flows = tuple[
+    np.ndarray, np.ndarray, np.ndarray
+]  # (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)
+StepName = Literal["frames", "exposure", "flow", "poses", "mask", "rims", "depth", "sheet"]
 
 
 @dataclass(frozen=True)
@@ -151,9 +154,18 @@ class Work:
         return exposure.equalise(self.video, groups, np.array([f.split == "train" for f in frames]))
 
     @cached_property
-    def flows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All flow: (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)."""
-        files = [(f.index, to, names) for f in self.manifest.frames for to, names in f.flow.items()]
+    def flows(self) -> Flows:
+        """All flow as it was matched, which poses and masks come from."""
+        return self.read_flows([(f.index, f.matched) for f in self.manifest.frames])
+
+    @cached_property
+    def mended_flows(self) -> Flows:
+        """All flow as training sees it: that of what moves told by what moves alone."""
+        return self.read_flows([(f.index, f.flow) for f in self.manifest.frames])
+
+    def read_flows(self, named: list[tuple[int, dict[int, FlowFiles]]]) -> Flows:
+        """Flow from files."""
+        files = [(i, j, names) for i, to in named for j, names in to.items()]
         found = np.stack([read_npy(self.folder / names.flow).astype(np.float32) for _, _, names in files])
         valid = np.stack([read_mask(self.folder / names.valid) for _, _, names in files])
         return found, valid, np.array([(i, j) for i, j, _ in files])
