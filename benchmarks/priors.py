@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff import alignment, io
-from hdr_nsff.scene import FrameEntry, Manifest
+from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest
 
 
 def main() -> None:
@@ -76,8 +76,10 @@ def depths(scene: Path, frames: list[FrameEntry], exact: dict[int, dict[str, np.
 
 
 def flows(scene: Path, frames: list[FrameEntry], exact: dict[int, dict[str, np.ndarray]]) -> dict[str, float]:
-    """End-point errors of the flow to the frames beside, where it is believed."""
+    """End-point errors of the flow to the frames beside, where it is believed; and by how much movers are too slow before what is
+    at rest, flow as it was matched and as training sees it."""
     error, moving, believed = [], [], []
+    slow = {"matched": np.zeros(2), "flow": np.zeros(2)}
     for f in frames:
         for side, name in io.SIDES.items():
             if f.index + side not in f.flow:
@@ -87,10 +89,21 @@ def flows(scene: Path, frames: list[FrameEntry], exact: dict[int, dict[str, np.n
             error.append(np.linalg.norm(io.read_npy(scene / files.flow).astype(np.float32) - true, axis=-1))
             moving.append(there["body"] > 0)
             believed.append(io.read_mask(scene / files.valid))
-    e, m, b = np.stack(error), np.stack(moving), np.stack(believed)
+            for kind in slow:
+                slow[kind] += missed(scene, getattr(f, kind).get(f.index + side, files), true, moving[-1])
+    e, m, b = (np.stack(v) for v in (error, moving, believed))
     parts = {"moving": e[b & m], "still": e[b & ~m]}
     told = {f"flow_{n}_{w}_px": float(f(p)) for n, p in parts.items() for w, f in (("median", np.median), ("mean", np.mean))}
+    told |= {f"{kind}_too_slow_percent": float(100 * part / max(whole, 1e-9)) for kind, (part, whole) in slow.items()}
     return told | {"flow_moving_believed": float(b[m].mean()), "flow_still_believed": float(b[~m].mean())}
+
+
+def missed(scene: Path, files: FlowFiles, true: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Sums (2,) over the movers' believed pixels: of what the flow misses along their motion before what is at rest, and of that motion, squared."""
+    found, believed = io.read_npy(scene / files.flow).astype(np.float32), io.read_mask(scene / files.valid)
+    motion = true - np.median(true[~moving], axis=0)
+    some = moving & believed
+    return np.array([((true - found) * motion)[some].sum(), (motion[some] ** 2).sum()])
 
 
 if __name__ == "__main__":
