@@ -50,7 +50,7 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
     told = capsys.readouterr().err
     assert "HDR-GoPro / NSFF (LLFF), 9 pictures, with its own poses, flow, masks, depth" in " ".join(told.split())
     assert provenance(gopro.out) == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "absent",
+        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "given",
         "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 3 and not scene.test

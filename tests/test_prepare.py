@@ -74,7 +74,7 @@ def test_footage_becomes_a_scene_that_opens(config):
 def test_the_manifest_says_where_everything_came_from(config):
     m = Manifest.load(prepare(config))
     assert {name: step.provenance for name, step in m.steps.items()} == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "absent",
+        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "given",
         "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert m.inputs.keys() == {f"{t:03d}.png" for t in range(COUNT)} and all(len(h) == 64 for h in m.inputs.values())

@@ -263,7 +263,7 @@ def rims_step(work: Work) -> Step:
     for name in ("flows", "mended_flows"):
         vars(work).pop(name, None)
     return Step(
-        provenance="estimated" if own else "absent",
+        provenance="estimated" if own else "given",
         note=f"flow of what moves told by what moves alone in {len(own)} pairs" if own else "flow that is given stays as it is",
     )
 
