@@ -22,9 +22,8 @@ from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest, Protocol
 MaskName = Literal["motion", "sam2"]
 DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
-Flows = tuple[
-    np.ndarray, np.ndarray, np.ndarray
-]  # (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)
+# flow (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)
+Flows = tuple[np.ndarray, np.ndarray, np.ndarray]
 StepName = Literal["frames", "exposure", "flow", "poses", "mask", "rims", "depth", "sheet"]
 
 
