@@ -144,13 +144,13 @@ def dense_inverse_search(a: np.ndarray, b: np.ndarray, initial: np.ndarray | Non
     return cv2.resize(found, (w, h), interpolation=cv2.INTER_AREA) / np.float32(scale)
 
 
-def follow(field: np.ndarray, flow: np.ndarray, fill: float | None = None) -> np.ndarray:
+def follow(field: np.ndarray, flow: np.ndarray, fill: float | None = None, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
     """`field` (H, W) or (H, W, C) of the other frame, read where `flow` (H, W, 2) px leads; outside is `fill`, or the edge."""
     h, w = flow.shape[:2]
     x = np.arange(w, dtype=np.float32) + flow[..., 0]
     y = np.arange(h, dtype=np.float32)[:, None] + flow[..., 1]
     mode = cv2.BORDER_REPLICATE if fill is None else cv2.BORDER_CONSTANT
-    return cv2.remap(field, x, y, cv2.INTER_LINEAR, borderMode=mode, borderValue=0.0 if fill is None else fill)
+    return cv2.remap(field, x, y, interpolation, borderMode=mode, borderValue=0.0 if fill is None else fill)
 
 
 def round_trip(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:

@@ -39,9 +39,10 @@ def mended(here: np.ndarray, there: np.ndarray, flow: np.ndarray, moving: np.nda
 def towards(here: np.ndarray, there: np.ndarray, flow: np.ndarray, own: np.ndarray) -> np.ndarray:
     """The step (H, W, 2) px of the flow that makes windows of `own` pixels (H, W, 1) look alike, whatever their brightness."""
     x, y = (follow(cv2.Sobel(there, cv2.CV_32F, *order, ksize=3, scale=1 / 8), flow) for order in ((1, 0), (0, 1)))
-    error = cv2.remap(there, *landing(flow), cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE) - here
+    error = follow(there, flow, interpolation=cv2.INTER_CUBIC) - here
     error -= averaged(error * own, own, WINDOW)
-    weight = own * inside(flow)[..., None] / (1 + (error / OUTLIER) ** 2)
+    inside = follow(np.ones(flow.shape[:2], np.float32), flow, fill=0.0) > 0.99
+    weight = own * inside[..., None] / (1 + (error / OUTLIER) ** 2)
     products = np.stack([(weight * p).sum(-1) for p in (x * x, x * y, y * y, x * error, y * error)], -1)
     xx, xy, yy, xe, ye = np.moveaxis(averaged(products, own, WINDOW), -1, 0)
     xx, yy = xx + FLAT, yy + FLAT
@@ -53,16 +54,3 @@ def averaged(values: np.ndarray, own: np.ndarray, sigma: float) -> np.ndarray:
     weight = np.maximum(cv2.GaussianBlur(own, (0, 0), sigma), 1e-6)
     channels = [cv2.GaussianBlur(np.ascontiguousarray(v), (0, 0), sigma) for v in np.moveaxis(values, -1, 0)]
     return np.stack(channels, -1) / weight[..., None]
-
-
-def landing(flow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Columns and rows (H, W) of the other picture that `flow` (H, W, 2) leads to."""
-    h, w = flow.shape[:2]
-    return np.arange(w, dtype=np.float32) + flow[..., 0], np.arange(h, dtype=np.float32)[:, None] + flow[..., 1]
-
-
-def inside(flow: np.ndarray) -> np.ndarray:
-    """Where (H, W) it leads into the other picture."""
-    h, w = flow.shape[:2]
-    x, y = landing(flow)
-    return (x >= 0) & (y >= 0) & (x <= w - 1) & (y <= h - 1)
