@@ -93,6 +93,27 @@ def smooth_weights(batch: PixelBatch) -> dict[str, Tensor]:
     }
 
 
+def pull(corrections: PoseCorrections, degrees: float) -> tuple[float, Tensor]:
+    """What camera 1 costs when it is turned by so many degrees, and the gradient by its corrections."""
+    twists = torch.zeros(6, 6)
+    twists[1, 0] = degrees * torch.pi / 180
+    set_twists(corrections, twists)
+    corrections.zero_grad()
+    cost = corrections.regularizers(1)["pose"]
+    cost.backward()
+    assert corrections.moves.grad is not None
+    return float(cost.detach()), corrections.moves.grad[1]
+
+
+def test_small_corrections_are_held_and_large_ones_let_go(toy: Scene) -> None:
+    corrections = PoseCorrections(toy)
+    for degrees in (0.01, 0.1, 1.0):
+        assert pull(corrections, degrees)[0] == pytest.approx(np.log1p((degrees / 0.1) ** 2), rel=1e-3)
+    slopes = [float(pull(corrections, degrees)[1].norm()) for degrees in (0.01, 0.1, 1.0)]
+    assert slopes[1] > 4 * slopes[0] and slopes[1] > 4 * slopes[2]  # 2 c / (0.01 + c^2): 1.98, 10 and 1.98
+    assert float(corrections.regularizers(2)["pose"].detach()) == 0.0
+
+
 @pytest.mark.parametrize("what", ["radiance", "depth", "flow"])
 @pytest.mark.parametrize("preset", ["splat", "grid", "paper"])
 def test_a_camera_has_the_gradient_of_its_picture(preset: str, what: str, toy: Scene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,7 +61,7 @@ class LossWeights:
     total_variation: float = 1e-4
     """Mean square differences of neighbours in HexPlane's planes."""
     pose: float = 1e-4
-    """Square of the drawn camera's corrections: degrees, percents of depth and of focal length (`refine_poses`)."""
+    """What the drawn camera's corrections cost: of its pose by a Cauchy prior, of its focal length squared (`refine_poses`)."""
     response_smoothness: float = 1e-3
     unit_exposure: float = 0.5
     """Distance of a network response from mid grey at the unit exposure."""

@@ -29,6 +29,7 @@ BETAS = (0.9, 0.9999)  # a long memory of how large gradients were: steps shrink
 START = 0.05  # share of the run after which cameras move: the first surfaces are rough
 ZOOM_RATE = 0.1  # a factor is of many frames and moves at every step: slowly
 DEGREE, SHIFT, LENGTHENING = torch.pi / 180, 0.01, 0.002  # turn, typical depths, share of the focal length: 1 in the regulariser
+DOUBT = 0.1  # of those: a correction this small is held, a larger one is let go (Cauchy)
 FOCAL = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]])  # entries of K that are focal lengths
 
 
@@ -80,12 +81,14 @@ class PoseCorrections(nn.Module):
         return replace(batch, camera=self.camera(batch.camera, *self.frames[batch.frame]), neighbours=neighbours)
 
     def regularizers(self, frame: int) -> dict[str, Tensor]:
-        """Square of the correction of a training frame's camera: of degrees, of percents of the typical depth, and of the focal length in fifths of
-        a percent (structure from motion knows it from all frames together, and a field follows a wrong one with wrong depths)."""
+        """What a correction of a training frame's camera costs. Turn (degrees) and shift (percents of the typical depth) together: log(1 + (c / 0.1)^2), the
+        prior of errors most of which are small and some large, so good poses are held and wrong ones are not. Focal length: the square, in fifths
+        of a percent (structure from motion knows it from all frames together, and a field follows a wrong one with wrong depths)."""
         correction, lens = self.frames[frame]
         twist = self.twists()[correction]
         zoom = ZOOM * self.zooms[lens] / LENGTHENING
-        return {"pose": (twist[:3] / DEGREE).square().sum() + (twist[3:] / SHIFT).square().sum() + zoom.square()}
+        moved = (twist[:3] / DEGREE).square().sum() + (twist[3:] / SHIFT).square().sum()
+        return {"pose": (moved / DOUBT**2).log1p() + zoom.square()}
 
     def param_groups(self, lr: float) -> list[dict[str, Any]]:
         """Poses and focal lengths; `lr` in shares of the picture's width."""
