@@ -89,6 +89,12 @@ def test_structure_from_motion_finds_the_path(mapped):
     assert np.abs(scale * found @ turn.T - true).max() < 0.03  # of a path 1 long
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_structure_from_motion_is_the_same_with_any_number_of_threads(mapped, tmp_path, threads):
+    again = estimate_poses(sliding(PLACES), None, tmp_path, threads=threads)
+    assert np.array_equal(again.c2w, mapped.c2w) and np.array_equal(again.K, mapped.K) and np.array_equal(again.points, mapped.points)
+
+
 def test_points_project_where_they_were_seen_and_near_is_one(mapped):
     frames, rows = mapped.tracks[:, 0].astype(int), mapped.tracks[:, 1].astype(int)
     pixels, depth = project(mapped, frames, mapped.points[rows])

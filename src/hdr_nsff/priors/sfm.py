@@ -131,11 +131,10 @@ def extract(job: Job, database: Path, threads: int) -> None:
     """Keypoints of all images into the database, one camera per group."""
     import pycolmap
 
-    reading = pycolmap.ImageReaderOptions()
-    reading.camera_model = "SIMPLE_PINHOLE"
+    enter(job, database)
     if job.given:
-        take_given(job, database, reading)
-        return set_focal(job, database)
+        return take_given(job, database)
+    reading = pycolmap.ImageReaderOptions()
     masks = Path(job.folder) / "masks"
     if masks.is_dir():
         reading.mask_path = str(masks)
@@ -146,39 +145,34 @@ def extract(job: Job, database: Path, threads: int) -> None:
     for group in job.groups:
         for k in range(0, len(group), 6):
             names = group[k : k + 6]
-            if k:
-                with pycolmap.Database.open(database) as db:
-                    first = db.read_image_with_name(group[0])
-                    assert first is not None, group[0]
-                    reading.existing_camera_id = first.camera_id
-            else:
-                reading.existing_camera_id = -1
             pycolmap.extract_features(
-                database, Path(job.folder) / "images", names, pycolmap.CameraMode.SINGLE, reading, extraction, pycolmap.Device.cpu
+                database, Path(job.folder) / "images", names, pycolmap.CameraMode.AUTO, reading, extraction, pycolmap.Device.cpu
             )
             for _ in names:
                 tell("tick")
     tell("end")
-    set_focal(job, database)
 
 
-def set_focal(job: Job, database: Path) -> None:
-    """The first guess of the focal length for every camera."""
+def enter(job: Job, database: Path) -> None:
+    """Images into the database, one camera per group with the first guess of its focal length. In the order of the job, for threads that extract would
+    number them as they come, and structure from motion of another order is another."""
     import pycolmap
 
+    reading = pycolmap.ImageReaderOptions()
+    reading.camera_model = "SIMPLE_PINHOLE"
+    pycolmap.Database.open(database).close()  # makes it
+    for group in job.groups:
+        pycolmap.import_images(database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading)
     with pycolmap.Database.open(database) as db:
         for camera in db.read_all_cameras():
             camera.focal_length = job.focal
             db.update_camera(camera)
 
 
-def take_given(job: Job, database: Path, reading: Any) -> None:
-    """Images, one camera per group, with the keypoints and matches that lie beside the job."""
+def take_given(job: Job, database: Path) -> None:
+    """The keypoints and matches that lie beside the job."""
     import pycolmap
 
-    pycolmap.Database.open(database).close()  # makes it
-    for group in job.groups:
-        pycolmap.import_images(database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading)
     with np.load(Path(job.folder) / GIVEN) as given, pycolmap.Database.open(database) as db:
         ids = {
             name: image.image_id for group in job.groups for name in group if (image := db.read_image_with_name(name)) is not None
