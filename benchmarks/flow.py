@@ -19,7 +19,7 @@ import torch
 
 from hdr_nsff.io import read_exr, write_json
 from hdr_nsff.priors.exposure import equalise
-from hdr_nsff.priors.flow import LUMA, agreement, checked, dense_inverse_search, flow
+from hdr_nsff.priors.flow import LUMA, agreement, checked, common_grey, dense_inverse_search, flow, recorded_range, told
 from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow
 from hdr_nsff.priors.semantic import SemanticConfig, SemanticFlow, semantic_flow
 from hdr_nsff.recording import Noise, record, response_curve
@@ -87,10 +87,21 @@ def prior(network, treated: str) -> Callable:
         frames = equalise(video, groups)
         if isinstance(network, SemanticFlow):
             network.features = None  # of another clip
-            return network(*frames, pairs)
-        return flow(*frames, pairs, None) if network is None else matched_flow(network, *frames, pairs)
+            found, valid = network(*frames, pairs)
+        else:
+            found, valid = flow(*frames, pairs, None) if network is None else matched_flow(network, *frames, pairs)
+        return completed(found, *frames, pairs), valid
 
     return on_raw if treated == "raw" else on_equalised
+
+
+def completed(found: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """The flow (P, H, W, 2) px of pairs and their reverses, where it is not sure told by what is around, as the step `rims` of `prepare` ends with."""
+    ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
+    one_way = {(int(i), int(j)): one for (i, j), one in zip(pairs, found, strict=True)}
+    return np.stack(
+        [told(one, one_way[j, i], *common_grey(video, ranges, i, j), clipped[i], clipped[j]) for (i, j), one in one_way.items()]
+    )
 
 
 def measure(frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float, match: Callable) -> dict:

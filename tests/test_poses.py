@@ -92,7 +92,11 @@ def test_structure_from_motion_finds_the_path(mapped):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_structure_from_motion_is_the_same_with_any_number_of_threads(mapped, tmp_path, threads):
     again = estimate_poses(sliding(PLACES), None, tmp_path, threads=threads)
-    assert np.array_equal(again.c2w, mapped.c2w) and np.array_equal(again.K, mapped.K) and np.array_equal(again.points, mapped.points)
+    assert (
+        np.array_equal(again.c2w, mapped.c2w)
+        and np.array_equal(again.K, mapped.K)
+        and np.array_equal(again.points, mapped.points)
+    )
 
 
 def test_points_project_where_they_were_seen_and_near_is_one(mapped):

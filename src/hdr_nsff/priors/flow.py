@@ -18,12 +18,17 @@ import numpy as np
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import read_mask, read_npy
+from hdr_nsff.priors.local_motion import filled
 from hdr_nsff.progress import say, track
 
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 TOLERANCE = 0.5  # pixels forward and backward flow may disagree by ...
 RELATIVE_TOLERANCE = 0.01  # ... plus this share of the flow's length (METHOD.md 5: the reference allows 50 %)
 SMALL = 100_000  # frames of fewer pixels are matched at twice their size
+SURE = 0.25  # pixels: where a round trip misses by less, and nothing is clipped, flow stays as it was matched
+MISSED = 0.1  # pixels: a round trip that misses by so much is trusted exp(-1/2)
+PLAIN = 64.0  # squared greys per pixel: the smaller eigenvalue of the structure tensor at which a pixel is trusted by half
+BLIND = 0.1  # trust in a clipped pixel, relative to others: patches around it may show something
 
 
 class FlowPrior(Protocol):
@@ -163,6 +168,29 @@ def agreement(forward: np.ndarray, backward: np.ndarray, clipped_from: np.ndarra
     tolerance = TOLERANCE + RELATIVE_TOLERANCE * np.linalg.norm(forward, axis=-1)
     blocked = follow(clipped_to.astype(np.float32), forward, fill=1.0)  # also 1 outside the frame
     return (round_trip(forward, backward) < tolerance) & (blocked < 0.01) & ~clipped_from
+
+
+def told(
+    flow: np.ndarray,
+    reverse: np.ndarray,
+    here: np.ndarray,
+    there: np.ndarray,
+    clipped_here: np.ndarray,
+    clipped_there: np.ndarray,
+) -> np.ndarray:
+    """`flow` (H, W, 2) px between grey uint8 pictures (H, W), where it is not sure told by the trusted pixels around that move alike.
+
+    Trusted is what agrees with its `reverse`, shows something in both pictures, and is clipped at neither end."""
+    blind = clipped_here | (follow(clipped_there.astype(np.float32), flow, fill=1.0) > 0.01)
+    missed = round_trip(flow, reverse)
+    shown = np.minimum(detail(here), follow(detail(there), flow))
+    trust = np.exp(-0.5 * (missed / MISSED) ** 2) * np.where(blind, BLIND, 1) * shown / (shown + PLAIN)
+    return filled(flow, trust, blind | (missed > SURE))
+
+
+def detail(grey: np.ndarray) -> np.ndarray:
+    """The smaller eigenvalue (H, W) of the structure tensor over 5x5 pixels, in squared greys per pixel (Shi & Tomasi 1994)."""
+    return cv2.cornerMinEigenVal(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.6), 5) / 4
 
 
 def read_flow(folder: Path | str, pairs: Iterable[tuple[int, int]], size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:

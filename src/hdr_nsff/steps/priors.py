@@ -16,7 +16,7 @@ from hdr_nsff.datasets import maps
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
 from hdr_nsff.priors.depth import depth_range, geometric_depth, read_depth
-from hdr_nsff.priors.flow import agreement, common_rgb, in_threads, recorded_range
+from hdr_nsff.priors.flow import agreement, common_grey, common_rgb, in_threads, recorded_range, told
 from hdr_nsff.priors.flow_sources import fallback_note, flow_source, resolved
 from hdr_nsff.priors.import_poses import import_poses, placed
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
@@ -238,7 +238,7 @@ def mask_step(work: Work) -> Step:
 
 
 def rims_step(work: Work) -> Step:
-    """Estimated flow once more where things move, from what moves alone; flow that is given stays as it is."""
+    """Estimated flow once more where things move, from what moves alone, and where it is not sure, from what is around; given flow stays as it is."""
     m = work.manifest
     own = [(f.index, j) for f in m.frames for j in f.matched if not flow_is_given(work, f.index, j)]
     video, clipped = work.equalised
@@ -254,8 +254,10 @@ def rims_step(work: Work) -> Step:
             mended(*pictures, read_npy(work.folder / m.frames[a].matched[b].flow).astype(np.float32), moving[a])
             for pictures, (a, b) in zip(seen, ((i, j), (j, i)), strict=True)
         )
-        write_flow(work, names[i, j], there, agreement(there, back, clipped[i], clipped[j]))
-        write_flow(work, names[j, i], back, agreement(back, there, clipped[j], clipped[i]))
+        a, b = common_grey(video, ranges, i, j)
+        sure = agreement(there, back, clipped[i], clipped[j]), agreement(back, there, clipped[j], clipped[i])
+        write_flow(work, names[i, j], told(there, back, a, b, clipped[i], clipped[j]), sure[0])
+        write_flow(work, names[j, i], told(back, there, b, a, clipped[j], clipped[i]), sure[1])
 
     in_threads(lambda pair: mend(*pair), [(i, j) for i, j in own if i < j], "flow of movers")
     for f in m.frames:
