@@ -87,8 +87,8 @@ class PoseCorrections(nn.Module):
         correction, lens = self.frames[frame]
         twist = self.twists()[correction]
         zoom = ZOOM * self.zooms[lens] / LENGTHENING
-        moved = (twist[:3] / DEGREE).square().sum() + (twist[3:] / SHIFT).square().sum()
-        return {"pose": (moved / DOUBT**2).log1p() + zoom.square()}
+        size = (twist[:3] / DEGREE).square().sum() + (twist[3:] / SHIFT).square().sum()
+        return {"pose": (size / DOUBT**2).log1p() + zoom.square()}
 
     def param_groups(self, lr: float) -> list[dict[str, Any]]:
         """Poses and focal lengths; `lr` in shares of the picture's width."""
