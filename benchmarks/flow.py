@@ -1,10 +1,11 @@
 """How well flow holds when the exposure changes: end-point error on rendered scenes, whose flow is exact, for EV differences of one's choice.
 
     hdr-nsff synth SCENE
-    python benchmarks/flow.py SCENE [SCENE ...] --flows dis gmflow raft-finetuned --finetuned TUNED
+    python benchmarks/flow.py SCENE [SCENE ...] --flows prepared dis gmflow raft-finetuned --finetuned TUNED
 
 The frames' exact radiance (SCENE/exact/clip_*.exr) is recorded again, as a clip whose two exposures alternate: the same pairs of neighbours,
 with nothing changed between rows but how many stops apart they are. `raw` matches what was recorded; `equalised` what `prepare` makes of it.
+`prepared` is the flow of a scene that `prepare` made of those frames, nothing else given: the default, with the masks that it found itself.
 Errors are those of pixels that both frames show, in both directions, clipped or not; seconds are CPU seconds per pair, both directions."""
 
 from __future__ import annotations
@@ -13,18 +14,21 @@ import argparse
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
 
-from hdr_nsff.io import read_exr, write_json
+from hdr_nsff.io import read_exr, read_mask, read_npy, write_json, write_png
+from hdr_nsff.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.exposure import equalise
-from hdr_nsff.priors.flow import LUMA, agreement, checked, common_grey, dense_inverse_search, flow, recorded_range, told
+from hdr_nsff.priors.flow import LUMA, agreement, checked, common_grey, dense_inverse_search, flow, halfway, recorded_range, told
 from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow
 from hdr_nsff.priors.semantic import SemanticConfig, SemanticFlow, semantic_flow
 from hdr_nsff.recording import Noise, record, response_curve
+from hdr_nsff.scene import Manifest
 
-FLOWS = ("dis", "semantic", "gmflow", "raft", "raft-finetuned")
+FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
 
 
 def main() -> None:
@@ -46,12 +50,14 @@ def main() -> None:
         pairs = neighbours(len(frames), args.pairs)
         print(f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}")
         for name in args.flows:
-            network = None if name == "dis" else named(name, args.weights, args.finetuned)
-            both = ("equalised",) if name == "semantic" else ("raw", "equalised")  # features are of equalised frames
+            network = None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
+            both = (
+                ("equalised",) if name in ("semantic", "prepared") else ("raw", "equalised")
+            )  # features are of equalised frames
             for treated in both if args.only is None else (args.only,):
                 for stops in args.ev:
                     rows.append({"scene": scene.name, "flow": name, "frames": treated, "ev": stops})
-                    rows[-1] |= measure(frames, pairs, stops, prior(network, treated))
+                    rows[-1] |= measure(frames, pairs, stops, as_prepared if name == "prepared" else prior(network, treated))
                     print(line(rows[-1]), flush=True)
     if args.json:
         write_json(args.json, rows)
@@ -95,13 +101,31 @@ def prior(network, treated: str) -> Callable:
     return on_raw if treated == "raw" else on_equalised
 
 
+def as_prepared(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The flow that training sees of a clip, by all steps of `prepare` with their defaults, and where it is believed."""
+    with TemporaryDirectory() as folder:
+        clip, scene = Path(folder) / "clip", Path(folder) / "scene"
+        clip.mkdir()
+        for k, frame in enumerate(video):
+            write_png(clip / f"{k:05d}.png", frame)
+        prepare(PrepareConfig(clip, scene, hold_out=0))
+        frames = Manifest.load(scene).frames
+        files = [frames[i].flow[int(j)] for i, j in pairs]
+        found = [read_npy(scene / one.flow).astype(np.float32) for one in files]
+        return np.stack(found), np.stack([read_mask(scene / one.valid) for one in files])
+
+
 def completed(found: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """The flow (P, H, W, 2) px of pairs and their reverses, where it is not sure told by what is around, as the step `rims` of `prepare` ends with."""
+    """The flow (P, H, W, 2) px of pairs and their reverses, ended as the step `rims` of `prepare` does, without its masks: where it is not sure
+    told by what is around, and both ways met halfway."""
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
     one_way = {(int(i), int(j)): one for (i, j), one in zip(pairs, found, strict=True)}
-    return np.stack(
-        [told(one, one_way[j, i], *common_grey(video, ranges, i, j), clipped[i], clipped[j]) for (i, j), one in one_way.items()]
-    )
+    still = np.zeros(clipped.shape[1:], bool)
+    ended = {
+        (i, j): told(one, one_way[j, i], *common_grey(video, ranges, i, j), clipped[i], clipped[j], still)
+        for (i, j), one in one_way.items()
+    }
+    return np.stack([halfway(one, ended[j, i]) for (i, j), one in ended.items()])
 
 
 def measure(frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float, match: Callable) -> dict:

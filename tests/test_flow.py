@@ -6,7 +6,7 @@ import pytest
 
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import write_npy, write_png
-from hdr_nsff.priors.flow import agreement, common_grey, flow, follow, read_flow, recorded_range
+from hdr_nsff.priors.flow import agreement, common_grey, flow, follow, halfway, read_flow, recorded_range
 
 H, W = 64, 96
 NOTHING = np.zeros((H, W), bool)
@@ -73,6 +73,17 @@ def test_round_trips_beyond_half_a_pixel_are_rejected():
     """Tolerance is 0.5 px + 1 % of the length: 0.53 px for a motion of 3 px."""
     assert agreement(constant(3, 0), constant(-3.5, 0), NOTHING, NOTHING)[:, :-4].all()
     assert not agreement(constant(3, 0), constant(-3.6, 0), NOTHING, NOTHING).any()
+
+
+def test_both_ways_meet_halfway_where_they_agree_and_nowhere_else():
+    shape = (20, 30, 2)
+    there, back = np.full(shape, 2.0, np.float32), np.full(shape, -1.8, np.float32)
+    assert np.allclose(halfway(there, back), 1.9) and np.allclose(halfway(back, there), -1.9)
+    assert np.array_equal(halfway(there, -there), there)
+    assert np.array_equal(halfway(there, -there + 1), there)  # one of them is wrong, nobody knows which
+    rng = np.random.default_rng(0)
+    noisy = [flow + rng.normal(0, 0.05, shape).astype(np.float32) for flow in (there, -there)]
+    assert np.std(halfway(*noisy) - there) < 0.85 * np.std(noisy[0] - there)
 
 
 def test_what_an_occluder_hides_fails_the_check():

@@ -25,8 +25,7 @@ LUMA = np.array([0.299, 0.587, 0.114], np.float32)
 TOLERANCE = 0.5  # pixels forward and backward flow may disagree by ...
 RELATIVE_TOLERANCE = 0.01  # ... plus this share of the flow's length (METHOD.md 5: the reference allows 50 %)
 SMALL = 100_000  # frames of fewer pixels are matched at twice their size
-SURE = 0.25  # pixels: where a round trip misses by less, and nothing is clipped, flow stays as it was matched
-MISSED = 0.1  # pixels: a round trip that misses by so much is trusted exp(-1/2)
+MISSED = 0.1  # pixels: a round trip that misses by so much is trusted exp(-1/2); one that misses by more, or is clipped, is told by what is around
 PLAIN = 64.0  # squared greys per pixel: the smaller eigenvalue of the structure tensor at which a pixel is trusted by half
 BLIND = 0.1  # trust in a clipped pixel, relative to others: patches around it may show something
 
@@ -165,9 +164,13 @@ def round_trip(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
 
 def agreement(forward: np.ndarray, backward: np.ndarray, clipped_from: np.ndarray, clipped_to: np.ndarray) -> np.ndarray:
     """Where flow can be believed (H, W) bool: round trip within tolerance, target inside the frame, neither end clipped."""
-    tolerance = TOLERANCE + RELATIVE_TOLERANCE * np.linalg.norm(forward, axis=-1)
     blocked = follow(clipped_to.astype(np.float32), forward, fill=1.0)  # also 1 outside the frame
-    return (round_trip(forward, backward) < tolerance) & (blocked < 0.01) & ~clipped_from
+    return (round_trip(forward, backward) < allowed(forward)) & (blocked < 0.01) & ~clipped_from
+
+
+def allowed(flow: np.ndarray) -> np.ndarray:
+    """By how many pixels (H, W) a round trip that begins with `flow` (H, W, 2) px may miss."""
+    return TOLERANCE + RELATIVE_TOLERANCE * np.linalg.norm(flow, axis=-1)
 
 
 def told(
@@ -177,15 +180,25 @@ def told(
     there: np.ndarray,
     clipped_here: np.ndarray,
     clipped_there: np.ndarray,
+    moving: np.ndarray,
 ) -> np.ndarray:
     """`flow` (H, W, 2) px between grey uint8 pictures (H, W), where it is not sure told by the trusted pixels around that move alike.
 
-    Trusted is what agrees with its `reverse`, shows something in both pictures, and is clipped at neither end."""
+    What stands still tells nothing of what is `moving` (H, W) bool. Masks miss some of that, so the rest is told by all; of what is clipped
+    they know nothing. Trusted is what agrees with its `reverse`, shows something in both pictures, and is clipped at neither end."""
     blind = clipped_here | (follow(clipped_there.astype(np.float32), flow, fill=1.0) > 0.01)
     missed = round_trip(flow, reverse)
     shown = np.minimum(detail(here), follow(detail(there), flow))
     trust = np.exp(-0.5 * (missed / MISSED) ** 2) * np.where(blind, BLIND, 1) * shown / (shown + PLAIN)
-    return filled(flow, trust, blind | (missed > SURE))
+    side = np.where(blind, 0, np.where(moving, 1, -1))
+    return filled(flow, trust, blind | (missed > MISSED), side)
+
+
+def halfway(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
+    """`forward` (H, W, 2) px, and where it agrees with `backward` the mean of both: each is off by errors of its own."""
+    missed = forward + follow(backward, forward)
+    near = np.linalg.norm(missed, axis=-1) < allowed(forward)
+    return forward - 0.5 * missed * near[..., None]
 
 
 def detail(grey: np.ndarray) -> np.ndarray:

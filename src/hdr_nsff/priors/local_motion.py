@@ -19,19 +19,21 @@ LEAST = 0.01  # weight in the window below which the flow stays as it was
 jit = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 
 
-def filled(flow: np.ndarray, trust: np.ndarray, unsure: np.ndarray) -> np.ndarray:
-    """`flow` (H, W, 2) float32 px, where `unsure` (H, W) bool the local motion of trusted pixels; `trust` (H, W) in [0, 1]."""
+def filled(flow: np.ndarray, trust: np.ndarray, unsure: np.ndarray, side: np.ndarray) -> np.ndarray:
+    """`flow` (H, W, 2) float32 px, where `unsure` (H, W) bool the local motion of trusted pixels; `trust` (H, W) in [0, 1].
+
+    `side` (H, W): pixels of 1 are not told by those of -1, nor the other way round; 0 tells all and is told by all."""
     result = flow.copy()
     offsets = np.arange(-SAMPLES, SAMPLES + 1)
     window = np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / WIDTH**2)
-    fit(flow, trust.astype(np.float32), unsure, window, -(-max(trust.shape) // LONGER), result)
+    fit(flow, trust.astype(np.float32), unsure, side.astype(np.int8), window, -(-max(trust.shape) // LONGER), result)
     return result
 
 
 @jit
-def fit(flow, trust, unsure, window, step, result):
-    """Fill `result` (H, W, 2) where `unsure` (H, W) from `flow` (H, W, 2) and `trust` (H, W) with a `window` (2n + 1, 2n + 1) of samples `step`
-    pixels apart."""
+def fit(flow, trust, unsure, side, window, step, result):
+    """Fill `result` (H, W, 2) where `unsure` (H, W) from `flow` (H, W, 2), `trust` (H, W) and `side` (H, W) with a `window` (2n + 1, 2n + 1) of
+    samples `step` pixels apart."""
     height, width = trust.shape
     n = len(window) // 2
     system = np.zeros((6, 8))  # upper half of the normal equations and their two right sides
@@ -46,7 +48,7 @@ def fit(flow, trust, unsure, window, step, result):
                 for column in range(max(-n, -(x // step)), min(n, (width - 1 - x) // step) + 1):
                     there_y, there_x = y + row * step, x + column * step
                     weight = trust[there_y, there_x] * window[row + n, column + n]
-                    if weight < 1e-4:
+                    if weight < 1e-4 or (side[y, x] > 0 and side[there_y, there_x] < 0):
                         continue
                     dx, dy = column / WIDTH, row / WIDTH
                     term[1], term[2], term[3], term[4], term[5] = dx, dy, dx * dx, dx * dy, dy * dy

@@ -389,19 +389,25 @@ class Neighbourhoods:
     mean: np.ndarray  # (H, W, 3) recorded
     unclipped: np.ndarray  # (H, W, 3) bool: all nine away from black and saturation (a mean over clipped ones is no recording)
     saturated: np.ndarray  # (H, W, 3) bool: all nine saturated
-    good: np.ndarray  # (H, W) bool: smooth, static, disparity known
+    good: np.ndarray  # (H, W) bool: smooth, and known to be found again
 
 
 def usable(view: View) -> Neighbourhoods:
     """Where a frame's points can be trusted to be found again in other frames."""
-    kernel = np.ones((3, 3), np.uint8)
-    image = np.ascontiguousarray(view.image, np.float32)
-    low, high = np.asarray(cv2.erode(image, kernel)), np.asarray(cv2.dilate(image, kernel))
-    good = ((high - low) < 0.03 + 0.12 * high).all(-1) & (view.disparity > 0)
+    known = view.disparity > 0
     if view.moving is not None:
-        good = good & (cv2.dilate(view.moving.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0)
+        known = known & (cv2.dilate(view.moving.astype(np.uint8), np.ones((7, 7), np.uint8)) == 0)
     if view.confidence is not None:
-        good = good & (view.confidence > 0.1)
+        known = known & (view.confidence > 0.1)
+    return smooth(view.image, known)
+
+
+def smooth(image: np.ndarray, known: np.ndarray) -> Neighbourhoods:
+    """The neighbourhoods of a recorded `image` (H, W, 3), good where they are smooth and `known` (H, W) bool."""
+    kernel = np.ones((3, 3), np.uint8)
+    image = np.ascontiguousarray(image, np.float32)
+    low, high = np.asarray(cv2.erode(image, kernel)), np.asarray(cv2.dilate(image, kernel))
+    good = ((high - low) < 0.03 + 0.12 * high).all(-1) & known
     return Neighbourhoods(np.asarray(cv2.blur(image, (3, 3))), (low >= LOW) & (high <= HIGH), low >= SATURATED, good)
 
 

@@ -16,10 +16,11 @@ from hdr_nsff.datasets import maps
 from hdr_nsff.errors import InputError
 from hdr_nsff.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
 from hdr_nsff.priors.depth import depth_range, geometric_depth, read_depth
-from hdr_nsff.priors.flow import agreement, common_grey, common_rgb, in_threads, recorded_range, told
+from hdr_nsff.priors.flow import agreement, common_grey, common_rgb, halfway, in_threads, recorded_range, told
 from hdr_nsff.priors.flow_sources import fallback_note, flow_source, resolved
 from hdr_nsff.priors.import_poses import import_poses, placed
 from hdr_nsff.priors.mask import geometric_mask, rough_mask
+from hdr_nsff.priors.one_exposure import at_one_exposure, response_from_flow
 from hdr_nsff.priors.poses import Poses, estimate_poses
 from hdr_nsff.priors.rims import mended
 from hdr_nsff.progress import say, track
@@ -241,8 +242,9 @@ def rims_step(work: Work) -> Step:
     """Estimated flow once more where things move, from what moves alone, and where it is not sure, from what is around; given flow stays as it is."""
     m = work.manifest
     own = [(f.index, j) for f in m.frames for j in f.matched if not flow_is_given(work, f.index, j)]
-    video, clipped = work.equalised
-    moving = [read_mask(work.folder / f.mask) for f in m.frames if f.mask]
+    clipped = work.equalised[1]
+    moving = np.stack([read_mask(work.folder / str(f.mask)) for f in m.frames])
+    video, how = through_response(work, moving) if own else (work.equalised[0], "")
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
     names = {(i, j): FlowFiles(flow=f"rims/{i:05d}_{j:05d}.npy", valid=f"rims/{i:05d}_{j:05d}_valid.png") for i, j in own}
 
@@ -251,13 +253,17 @@ def rims_step(work: Work) -> Step:
             return  # by a run that was killed
         seen = common_rgb(video, ranges, i, j), common_rgb(video, ranges, j, i)
         there, back = (
-            mended(*pictures, read_npy(work.folder / m.frames[a].matched[b].flow).astype(np.float32), moving[a])
+            mended(*pictures, read_npy(work.folder / m.frames[a].matched[b].flow).astype(np.float32), moving[a] & ~clipped[a])
             for pictures, (a, b) in zip(seen, ((i, j), (j, i)), strict=True)
         )
         a, b = common_grey(video, ranges, i, j)
         sure = agreement(there, back, clipped[i], clipped[j]), agreement(back, there, clipped[j], clipped[i])
-        write_flow(work, names[i, j], told(there, back, a, b, clipped[i], clipped[j]), sure[0])
-        write_flow(work, names[j, i], told(back, there, b, a, clipped[j], clipped[i]), sure[1])
+        there, back = (
+            told(there, back, a, b, clipped[i], clipped[j], moving[i]),
+            told(back, there, b, a, clipped[j], clipped[i], moving[j]),
+        )
+        write_flow(work, names[i, j], halfway(there, back), sure[0])
+        write_flow(work, names[j, i], halfway(back, there), sure[1])
 
     in_threads(lambda pair: mend(*pair), [(i, j) for i, j in own if i < j], "flow of movers")
     for f in m.frames:
@@ -266,8 +272,34 @@ def rims_step(work: Work) -> Step:
         vars(work).pop(name, None)
     return Step(
         provenance="estimated" if own else "given",
-        note=f"flow of what moves told by what moves alone in {len(own)} pairs" if own else "flow that is given stays as it is",
+        note=f"flow of what moves told by what moves alone in {len(own)} pairs{how}"
+        if own
+        else "flow that is given stays as it is",
     )
+
+
+def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
+    """All frames at one brightness (T, H, W, 3): through the response of their camera where matched flow tells it, else by the brackets'
+    brightness; and how, in words. `moving` (T, H, W) bool."""
+    frames, ev = work.manifest.frames, work.manifest.bracket_ev
+    bracket, train = np.array([f.bracket for f in frames]), np.array([f.split == "train" for f in frames])
+    known, reference = ev or [None] * int(bracket.max() + 1), work.manifest.reference_bracket
+    video, (flow, valid, pairs) = work.equalised[0].copy(), work.flows
+    cameras = [np.array(own) for own in work.camera_frames()]
+    told = []
+    for own in cameras:
+        learn = own[train[own]]
+        among = np.isin(pairs, learn).all(1)
+        flows = flow[among], valid[among], np.searchsorted(learn, pairs[among])
+        fit = response_from_flow(work.video[learn], bracket[learn], known, reference, flows, moving[learn])
+        if fit is not None:
+            like = own[np.isin(bracket[own], bracket[learn])]
+            video[like] = at_one_exposure(work.video[like], bracket[like], fit)
+            told.append(fit.misfit)
+    if told:
+        every = "" if len(told) == len(cameras) else f" of {len(told)} of {len(cameras)} cameras, else by brightness"
+        return video, f", at one exposure through the response that flow tells (misfit {max(told):.3f} stops){every}"
+    return video, ", frames equalised by brightness: too few pixels at rest in several exposures" if len(set(bracket)) > 1 else ""
 
 
 def flow_is_given(work: Work, i: int, j: int) -> bool:
