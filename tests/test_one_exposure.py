@@ -85,7 +85,7 @@ def test_what_moves_is_not_asked() -> None:
     samples = matched_samples(video, BRACKETS, 3, flows(), moving)
     video[:, :39] = np.random.default_rng(2).random((T, 39, W, 3))  # the pixels around a pixel count with it
     again = matched_samples(video, BRACKETS, 3, flows(), moving)
-    assert len(samples.rgb) > 500 and samples.valid.sum(1).min() >= 0
+    assert len(samples.rgb) > 500
     assert np.array_equal(samples.rgb, again.rgb) and np.array_equal(samples.valid, again.valid)
 
 
@@ -101,14 +101,16 @@ def test_nothing_is_told_where_no_flow_is_believed_all_moves_or_there_is_one_exp
     assert response_from_flow(video, BRACKETS, [None] * 3, 0, flows(STILL), STILL) is None
     assert response_from_flow(video, BRACKETS, [None] * 3, 0, flows(), ~STILL) is None
     assert response_from_flow(video, 0 * BRACKETS, [None], 0, flows(), STILL) is None
+    nothing = tuple(part[:0] for part in flows())
+    assert response_from_flow(video[:0], BRACKETS[:0], [None] * 3, 0, nothing, STILL[:0]) is None  # a camera that is all held out
 
 
 def test_points_that_do_not_agree_tell_nothing() -> None:
     video = np.random.default_rng(3).random((T, 1, 1, 3)).astype(np.float32).repeat(H, 1).repeat(W, 2)  # flickers at will
     video[:, :, ::2] = np.random.default_rng(4).random((T, 1, 1, 3)).astype(np.float32)
-    fit = response_from_flow(cv2_blurred(video), BRACKETS, list(EV), 0, flows(), STILL)
+    fit = response_from_flow(blurred(video), BRACKETS, list(EV), 0, flows(), STILL)
     assert fit is None
 
 
-def cv2_blurred(video: np.ndarray) -> np.ndarray:
+def blurred(video: np.ndarray) -> np.ndarray:
     return np.stack([cv2.GaussianBlur(frame, (0, 0), 9) for frame in video])

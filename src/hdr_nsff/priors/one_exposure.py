@@ -29,8 +29,10 @@ def response_from_flow(
     `video` (T, H, W, 3) as recorded in [0, 1]; `brackets` (T,) int; `ev` per bracket the log2 exposures that are known; `flows`: flow
     (P, H, W, 2) px, where it is believed (P, H, W) bool, and pairs (P, 2) of frames of the video; `moving` (T, H, W) bool."""
     occurring = {int(b) for b in brackets}
+    if len(occurring) < 2:
+        return None
     samples = matched_samples(video, brackets, len(ev), flows, moving)
-    if len(occurring) < 2 or not linked(samples, occurring):
+    if not linked(samples, occurring):
         return None
     fit = debevec(samples, ev, reference if reference in occurring else min(occurring))
     return fit if fit.misfit < MAX_MISFIT else None
