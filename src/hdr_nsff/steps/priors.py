@@ -297,8 +297,8 @@ def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
             video[like] = at_one_exposure(work.video[like], bracket[like], fit)
             told.append(fit.misfit)
     if told:
-        every = "" if len(told) == len(cameras) else f" of {len(told)} of {len(cameras)} cameras, else by brightness"
-        return video, f", at one exposure through the response that flow tells (misfit {max(told):.3f} stops){every}"
+        where = "" if len(told) == len(cameras) else f" in {len(told)} of {len(cameras)} cameras, else by brightness"
+        return video, f", at one exposure through the response that flow tells{where} (misfit {max(told):.3f} stops)"
     return video, ", frames equalised by brightness: too few pixels at rest in several exposures" if len(set(bracket)) > 1 else ""
 
 
