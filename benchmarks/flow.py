@@ -52,8 +52,8 @@ def main() -> None:
         for name in args.flows:
             network = None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
             both = (
-                ("equalised",) if name in ("semantic", "prepared") else ("raw", "equalised")
-            )  # features are of equalised frames
+                ("equalised",) if name in ("prepared", "semantic") else ("raw", "equalised")
+            )  # these two equalise by themselves
             for treated in both if args.only is None else (args.only,):
                 for stops in args.ev:
                     rows.append({"scene": scene.name, "flow": name, "frames": treated, "ev": stops})

@@ -60,9 +60,7 @@ def test_a_patch_that_shows_nothing_moves_as_what_is_around_it() -> None:
 
 def test_what_stands_still_tells_nothing_of_what_moves_and_what_is_unknown_is_told_by_both() -> None:
     side = np.where(X < W / 2, 1, -1)
-    alike = np.where(X[..., None] < W / 2, np.float32([0.2, 0]), np.float32([-0.2, 0])).astype(
-        np.float32
-    )  # within what counts as alike
+    alike = 0.05 * halves()  # nearer to each other than what counts as unlike
     assert error(smoothed(alike, ALL), alike).max() > 0.05
     told_apart = error(filled(alike, ALL, ALL > 0, side), alike)
     assert told_apart[side == 1].max() < 1e-4 and told_apart[side == -1].max() > 0.05

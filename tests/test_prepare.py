@@ -125,6 +125,16 @@ def test_frames_are_matched_again_through_the_response_that_flow_tells(config):
     assert both.sum() > 100
     assert np.abs(dark - bright)[both].mean() < 0.02 < 0.1 < np.abs(recorded[0] - recorded[1])[both].mean()
 
+    first, moving = COUNT - 3, np.zeros((COUNT, H, W), bool)
+    moving[first:] = True  # nothing at rest to ask
+    for f in work.manifest.frames[first:]:
+        f.camera_id = 1
+    level, how = through_response(work, moving)
+    assert "in 1 of 2 cameras, else by brightness" in how
+    assert np.array_equal(level[first:], work.equalised[0][first:]) and not np.array_equal(
+        level[:first], work.equalised[0][:first]
+    )
+
 
 def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(config):
     estimated = replace(config, flow="dis")

@@ -22,7 +22,7 @@ jit = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def filled(flow: np.ndarray, trust: np.ndarray, unsure: np.ndarray, side: np.ndarray) -> np.ndarray:
     """`flow` (H, W, 2) float32 px, where `unsure` (H, W) bool the local motion of trusted pixels; `trust` (H, W) in [0, 1].
 
-    `side` (H, W): pixels of 1 are not told by those of -1, nor the other way round; 0 tells all and is told by all."""
+    `side` (H, W): pixels of 1 are told by none of -1; those of -1 and of 0 are told by all."""
     result = flow.copy()
     offsets = np.arange(-SAMPLES, SAMPLES + 1)
     window = np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / WIDTH**2)
