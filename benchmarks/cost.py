@@ -23,12 +23,12 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from hdr_nsff import distributed
-from hdr_nsff.config import PRESETS
-from hdr_nsff.fields.splat import SplatConfig
-from hdr_nsff.scene import Frame, Scene
-from hdr_nsff.tensors import hold_threads
-from hdr_nsff.train import Trainer
+from hdr_nsff.core import distributed
+from hdr_nsff.core.tensors import hold_threads
+from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.train import Trainer
 
 MOVING = 0.2  # of all Gaussians
 WARM_UP = 20  # steps

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.ingest import open_footage, read_frames
-from hdr_nsff.priors.exposure import detect_cycle
+from hdr_nsff.footage.ingest import open_footage, read_frames
+from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 
 
 def main(clips: list[str]) -> None:

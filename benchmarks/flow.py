@@ -19,14 +19,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from hdr_nsff.io import read_exr, read_mask, read_npy, write_json, write_png
-from hdr_nsff.prepare import PrepareConfig, prepare
-from hdr_nsff.priors.exposure import equalise
-from hdr_nsff.priors.flow import LUMA, agreement, checked, common_grey, dense_inverse_search, flow, halfway, recorded_range, told
-from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow
-from hdr_nsff.priors.semantic import SemanticConfig, SemanticFlow, semantic_flow
-from hdr_nsff.recording import Noise, record, response_curve
-from hdr_nsff.scene import Manifest
+from hdr_nsff.core.io import read_exr, read_mask, read_npy, write_json, write_png
+from hdr_nsff.geometry.round_trip import agreement
+from hdr_nsff.prepare.prepare import PrepareConfig, prepare
+from hdr_nsff.priors.flow.dense import checked, dense_inverse_search, flow, halfway, told
+from hdr_nsff.priors.flow.networks import both_ways, load, matched_flow
+from hdr_nsff.priors.flow.semantic import SemanticConfig, SemanticFlow, semantic_flow
+from hdr_nsff.radiometry.common_range import LUMA, common_grey, recorded_range
+from hdr_nsff.radiometry.exposure_cycle import equalise
+from hdr_nsff.radiometry.recording import Noise, record, response_curve
+from hdr_nsff.scene.scene import Manifest
 
 FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
 

@@ -20,11 +20,11 @@ import numba
 import torch
 from torch import Tensor
 
-from hdr_nsff.camera import Camera
-from hdr_nsff.fields.splat import Splat, SplatConfig
-from hdr_nsff.run import Run, pick_device
-from hdr_nsff.tensors import hold_threads
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.core.tensors import hold_threads, pick_device
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.training.run_folder import Run
 
 MOVING = 0.2  # of all Gaussians
 TIMES = 36  # training times of the made-up field

@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff import io
-from hdr_nsff.evaluate import evaluate_run
-from hdr_nsff.run import Run
-from hdr_nsff.synth import SynthConfig, claim, clip_shots, parse_ev, parse_size, render, truth_shots, write_truth
-from hdr_nsff.synth_scenes import SCENES
-from hdr_nsff.synth_scenes.geometry import intrinsics
+from hdr_nsff.core import io
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.synth.scenes import SCENES
+from hdr_nsff.synth.scenes.geometry import intrinsics
+from hdr_nsff.synth.synth import SynthConfig, claim, clip_shots, parse_ev, parse_size, render, truth_shots, write_truth
+from hdr_nsff.training.run_folder import Run
 
 SHOWN = ("psnr", "psnr_moving", "ssim", "mu5000", "mu5000_moving")
 

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numba
 
-from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.evaluate import evaluate_run
-from hdr_nsff.io import read_json
-from hdr_nsff.run import Run
-from hdr_nsff.train import train
+from hdr_nsff.core.io import read_json
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.run_folder import Run
+from hdr_nsff.training.train import train
 
 TERMS = {"psnr": "full", "psnr_moving": "moving", "mu5000": "hdr"}
 

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff import io
-from hdr_nsff.metrics import Lpips
+from hdr_nsff.core import io
+from hdr_nsff.maths.metrics import Lpips
 
 ARRAYS = {("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype")}
 

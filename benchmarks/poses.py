@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff import alignment
-from hdr_nsff.priors.import_poses import import_poses
-from hdr_nsff.scene import Manifest
+from hdr_nsff.footage.pose_files import import_poses
+from hdr_nsff.geometry import alignment
+from hdr_nsff.scene.scene import Manifest
 
 
 def main() -> None:

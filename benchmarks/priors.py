@@ -14,8 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff import alignment, io
-from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.core import io
+from hdr_nsff.geometry import alignment
+from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest
 
 
 def main() -> None:

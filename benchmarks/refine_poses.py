@@ -19,14 +19,14 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff import alignment
-from hdr_nsff.camera import Camera
-from hdr_nsff.config import PRESETS
-from hdr_nsff.evaluate import evaluate_run
-from hdr_nsff.pose_corrections import moved, similarities, typical_depth, visible_motion
-from hdr_nsff.run import Run
-from hdr_nsff.scene import Frame, Manifest, Scene
-from hdr_nsff.train import train
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.geometry import alignment
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.scene import Frame, Manifest, Scene
+from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.pose_corrections import moved, similarities, typical_depth, visible_motion
+from hdr_nsff.training.run_folder import Run
+from hdr_nsff.training.train import train
 
 DEGREES, SHARE = 1.0, 0.01  # of the perturbation
 NAMES = ("rotation_degrees", "ate", "pixels")

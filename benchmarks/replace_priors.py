@@ -13,8 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff import alignment, io
-from hdr_nsff.scene import FrameEntry, Manifest
+from hdr_nsff.core import io
+from hdr_nsff.geometry import alignment
+from hdr_nsff.scene.scene import FrameEntry, Manifest
 
 PRIORS = ("masks", "mover-depth", "depth", "flow")
 

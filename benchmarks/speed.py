@@ -15,11 +15,11 @@ from pathlib import Path
 
 import torch
 
-from hdr_nsff import distributed
-from hdr_nsff.config import PRESETS
-from hdr_nsff.run import pick_device
-from hdr_nsff.scene import Scene
-from hdr_nsff.train import Trainer
+from hdr_nsff.core import distributed
+from hdr_nsff.core.tensors import pick_device
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.train import Trainer
 
 
 def main() -> None:

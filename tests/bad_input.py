@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from toy_scene import ToyScene, camera_centre
 
-from hdr_nsff import cli, io
+from hdr_nsff import cli
+from hdr_nsff.core import io
 
 Capture = pytest.CaptureFixture[str]
 FRAMES = 9

@@ -8,9 +8,9 @@ import pytest
 import torch
 from toy_scene import ToyScene
 
-from hdr_nsff.priors import flow_networks
-from hdr_nsff.priors.gmflow import GMFlow
-from hdr_nsff.scene import Scene
+from hdr_nsff.priors.flow import networks as flow_networks
+from hdr_nsff.priors.flow.gmflow import GMFlow
+from hdr_nsff.scene.scene import Scene
 
 
 @pytest.fixture(scope="session")

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hdr_nsff.camera import Camera
-from hdr_nsff.config import TrainConfig
 from hdr_nsff.fields.base import Layers, Render
-from hdr_nsff.run import Run
-from hdr_nsff.scene import Frame, FrameEntry, Manifest, Scene, Step
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.scene import Frame, FrameEntry, Manifest, Scene, Step
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.run_folder import Run
 
 W, H, FOCAL = 48, 32, 40.0
 WALL, DISC = 4.0, 2.0  # z of the two planes

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.io import write_exr, write_npy, write_png
+from hdr_nsff.core.io import write_exr, write_npy, write_png
 
 W, H, FOCAL = 48, 32, 40.0
 WALL = 4.0

@@ -6,15 +6,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from hdr_nsff import distributed
-from hdr_nsff.config import PRESETS, TrainConfig
+from hdr_nsff.core import distributed
 from hdr_nsff.fields import AnyField, build_field, start_field
-from hdr_nsff.fields.branches import GridBranches, GridConfig, MlpConfig
-from hdr_nsff.fields.hexplane import HexPlane, HexPlaneConfig
-from hdr_nsff.fields.splat import Splat, SplatConfig
-from hdr_nsff.fields.two_branches import TwoBranches
-from hdr_nsff.scene import Scene
-from hdr_nsff.train import Trainer, open_folder, train
+from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
+from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpConfig
+from hdr_nsff.fields.nsff.two_branches import TwoBranches
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.train import Trainer, open_folder, train
 
 GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)
 MLP = MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2)

@@ -7,13 +7,13 @@ import pytest
 import torch
 from presets import random_field, small, trainer
 
-from hdr_nsff.batch import whole_frame
-from hdr_nsff.config import ABLATIONS, METHODS, PRESETS, ablated
 from hdr_nsff.fields import build_field, start_field
 from hdr_nsff.fields.base import HIGHEST
-from hdr_nsff.fields.splat import Splat, SplatConfig
-from hdr_nsff.scene import Scene
-from hdr_nsff.train import heeded
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.scene.batch import whole_frame
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.config import ABLATIONS, METHODS, PRESETS, ablated
+from hdr_nsff.training.train import heeded
 
 NAMES = [name for name in PRESETS if name not in METHODS]
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.priors.adapt import (
+from hdr_nsff.priors.flow.adapt import (
     DETAIL,
     AdaptWeights,
     Lesson,
@@ -20,8 +20,8 @@ from hdr_nsff.priors.adapt import (
     near_term,
     trajectory_term,
 )
-from hdr_nsff.priors.correlation import cells
-from hdr_nsff.priors.features import Features
+from hdr_nsff.priors.flow.correlation import cells
+from hdr_nsff.priors.flow.features import Features
 
 
 def sliding(frames: int = 3, step: int = 4, size: tuple[int, int] = (48, 64)) -> np.ndarray:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.background import correct_masks, laid_over, parts
+from hdr_nsff.priors.masks.background import correct_masks, laid_over, parts
 
 T, H, W, FOCAL = 12, 48, 64, 60.0
 K = np.tile(np.array([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1.0]]), (T, 1, 1))

@@ -12,7 +12,7 @@ import OpenEXR
 import pytest
 from bad_input import FOOTAGE_VERBS, FRAMES, Capture, call, clip, cut, recorded, refused, snapshot
 
-from hdr_nsff import io
+from hdr_nsff.core import io
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 from bad_input import WORKING_VERBS, Capture, call, clip, commands, poses, recorded, refused, snapshot
 
-from hdr_nsff import cli, io
+from hdr_nsff import cli
+from hdr_nsff.core import io
 
 # A full disk
 
@@ -78,7 +79,7 @@ def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path
 FAILING = """
 import gc, pathlib, sys
 import numpy as np
-from hdr_nsff import io
+from hdr_nsff.core import io
 
 def broken(self, data):
     view = memoryview(data)

@@ -11,8 +11,9 @@ import pytest
 from bad_input import Capture, call, clip, commands, cut, edit, reading, refused, snapshot, training, truth
 from safetensors.torch import save_file
 
-from hdr_nsff import io, notes
-from hdr_nsff.run import Run, latest_checkpoint
+from hdr_nsff.core import io, notes
+from hdr_nsff.core.checkpoints import latest_checkpoint
+from hdr_nsff.training.run_folder import Run
 
 # Checkpoints
 

@@ -20,7 +20,7 @@ from bad_input import (
     training,
 )
 
-from hdr_nsff import io
+from hdr_nsff.core import io
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from bad_input import Capture, call, clip, edit, reading, refused, snapshot, training
 
-from hdr_nsff import io
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import write_npy, write_png
-from hdr_nsff.scene import Manifest, Scene
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_npy, write_png
+from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 
 Change = Callable[[dict[str, Any]], object]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from bad_input import Capture, call, cut, edit, refused, snapshot, truth
 
-from hdr_nsff import io
+from hdr_nsff.core import io
 
 
 def view(key: str, value: object) -> Callable[[dict], object]:

@@ -17,9 +17,9 @@ import pytest
 from bad_input import Capture, call, edit, refused, snapshot, truth
 from toy_scene import ToyScene
 
-from hdr_nsff import bench
-from hdr_nsff.run import Run, last_logged, snapshots
-from hdr_nsff.train import Trainer
+from hdr_nsff.bench import bench
+from hdr_nsff.training.run_folder import Run, last_logged, snapshots
+from hdr_nsff.training.train import Trainer
 
 COMMAND = [sys.executable, "-c", "from hdr_nsff.cli import main; main()"]
 SMALL = "--field.encoding.max-rows 512 --field.samples 6 --field.render-samples 8 --rays 32 --moving-rays 8"
@@ -249,7 +249,7 @@ def test_a_scene_that_changed_under_its_runs_is_refused(tmp_path: Path, capsys: 
 
 
 def test_environment_of_a_process_is_its_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    from hdr_nsff.trials.pool import THREADS, slots
+    from hdr_nsff.bench.pool import THREADS, slots
 
     for name in THREADS:
         monkeypatch.delenv(name, raising=False)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hdr_nsff.priors.bracketing import likely_factor, usual_steps
+from hdr_nsff.radiometry.bracketing import likely_factor, usual_steps
 
 
 @pytest.mark.parametrize("measured, meant", [

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.bundle import PATH_SIGMA, Cameras, Problem, Shape, State, adjust, without_turning
-from hdr_nsff.priors.groups import Group, Tracks, fit
+from hdr_nsff.priors.movers.bundle import PATH_SIGMA, Cameras, Problem, Shape, State, adjust, without_turning
+from hdr_nsff.priors.movers.rigid_groups import Group, Tracks, fit
 
 TIMES, COUNT, FOCAL = 16, 90, 300.0
 K = np.tile([[FOCAL, 0, 160], [0, FOCAL, 100], [0, 0, 1.0]], (TIMES, 1, 1))

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from hdr_nsff import __version__, cli
-from hdr_nsff.config import ABLATIONS, METHODS, PRESETS, TrainConfig
-from hdr_nsff.errors import InputError
-from hdr_nsff.run import Run
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.training.config import ABLATIONS, METHODS, PRESETS, TrainConfig
+from hdr_nsff.training.run_folder import Run
 
 COMMAND = [
     sys.executable,

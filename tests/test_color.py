@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff import color
+from hdr_nsff.maths import color
 
 LINEAR = np.linspace(0, 1, 101)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.priors.correlation import cells, locate, motion, sample, soft_argmax
+from hdr_nsff.priors.flow.correlation import cells, locate, motion, sample, soft_argmax
 
 
 def shifted(dx: float, dy: float, size: tuple[int, int] = (20, 28), channels: int = 48) -> torch.Tensor:
@@ -51,5 +51,5 @@ def test_positions_carry_a_gradient_to_the_features():
 def test_chunks_do_not_change_the_answer(monkeypatch):
     a, b = shifted(0, 0), shifted(1.5, 0.5)
     whole = motion(a, b, 4, 2, 0.05)
-    monkeypatch.setattr("hdr_nsff.priors.correlation.CHUNK", 37)
+    monkeypatch.setattr("hdr_nsff.priors.flow.correlation.CHUNK", 37)
     assert torch.allclose(motion(a, b, 4, 2, 0.05), whole, atol=1e-5)

@@ -8,11 +8,11 @@ import miniatures as mini
 import numpy as np
 import pytest
 
-from hdr_nsff.datasets import held_out, layout_of, recognise
-from hdr_nsff.datasets.capture import Capture, Clock, turns
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_image, write_png, write_video
-from hdr_nsff.priors.import_poses import Given, placed
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_image, write_png, write_video
+from hdr_nsff.footage.datasets import held_out, layout_of, recognise
+from hdr_nsff.footage.datasets.capture import Capture, Clock, turns
+from hdr_nsff.footage.pose_files import Given, placed
 
 SETS = {
     "hdr-gopro": mini.gopro,

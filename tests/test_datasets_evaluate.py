@@ -11,13 +11,14 @@ import pytest
 import torch
 from fakes import EV, DiscBeforeWall, H, W, camera, fake_run
 
-from hdr_nsff import io, run_all
-from hdr_nsff.camera import Camera
-from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import evaluate_run
-from hdr_nsff.prepare import PrepareConfig
-from hdr_nsff.run import Run
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff import pipeline as run_all
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.prepare.prepare import PrepareConfig
+from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.training.run_folder import Run
 
 BRIGHTER = 1.5  # EV that no frame of the clip has
 

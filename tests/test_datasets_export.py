@@ -13,15 +13,16 @@ import numpy as np
 import pytest
 from toy_scene import ToyScene
 
-from hdr_nsff.datasets import recognise, to_colmap
-from hdr_nsff.errors import InputError
-from hdr_nsff.export import ExportConfig, Look, export
-from hdr_nsff.io import read_image, read_mask, read_npy, write_exr, write_json, write_npy, write_png
-from hdr_nsff.prepare import PrepareConfig, prepare
-from hdr_nsff.priors.colmap import read_model
-from hdr_nsff.recording import response_curve
-from hdr_nsff.scene import FrameEntry, Manifest, Scene
-from hdr_nsff.truth import Truth, TruthView, true_pictures
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_image, read_mask, read_npy, write_exr, write_json, write_npy, write_png
+from hdr_nsff.footage.colmap import read_model
+from hdr_nsff.footage.datasets import recognise
+from hdr_nsff.footage.layouts import colmap as to_colmap
+from hdr_nsff.prepare.prepare import PrepareConfig, prepare
+from hdr_nsff.radiometry.recording import response_curve
+from hdr_nsff.rendering.export import ExportConfig, Look, export
+from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene
+from hdr_nsff.scene.truth import Truth, TruthView, true_pictures
 
 LAYOUTS = ("hdr-gopro", "nerfstudio")
 

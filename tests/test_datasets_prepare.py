@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from miniatures import EV, H, W
 
-from hdr_nsff.datasets import maps
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_exr, read_image, read_mask, write_npy, write_png
-from hdr_nsff.prepare import PrepareConfig, held_out_truth, prepare
-from hdr_nsff.scene import Manifest, Scene
-from hdr_nsff.truth import Truth, true_pictures
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_exr, read_image, read_mask, write_npy, write_png
+from hdr_nsff.footage.datasets import maps
+from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
+from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.truth import Truth, true_pictures
 
 
 def provenance(folder: Path) -> dict[str, str]:

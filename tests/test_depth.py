@@ -4,14 +4,17 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import write_exr, write_npy
-from hdr_nsff.priors import depth as depth_module
-from hdr_nsff.priors.depth import geometric_depth, read_depth
-from hdr_nsff.priors.fuse import carry_over, clean, fill, vote
-from hdr_nsff.priors.movers import differences, link, mover_depth, regions, smoothest_path, split, steps_in_time
-from hdr_nsff.priors.parallax import Shots, choose_views, triangulate
-from hdr_nsff.priors.sweep import aggregate, best_share, box
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_exr, write_npy
+from hdr_nsff.footage.depth_files import read_depth
+from hdr_nsff.geometry.fill import fill
+from hdr_nsff.priors.depth import geometric as depth_module
+from hdr_nsff.priors.depth.fuse import carry_over, clean, vote
+from hdr_nsff.priors.depth.geometric import geometric_depth
+from hdr_nsff.priors.depth.parallax import choose_views, triangulate
+from hdr_nsff.priors.depth.plane_sweep import aggregate, best_share, box
+from hdr_nsff.priors.movers.distance import differences, link, mover_depth, regions, smoothest_path, split, steps_in_time
+from hdr_nsff.scene.posed_video import Shots
 
 H, W, F = 48, 64, 60.0
 K = np.array([[F, 0, W / 2], [0, F, H / 2], [0, 0, 1.0]])

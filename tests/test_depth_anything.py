@@ -5,10 +5,10 @@ import pytest
 import torch
 from tiny_networks import tiny_depth_anything
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors.depth_anything import align, anchored_depth, network_disparity, picture
-from hdr_nsff.priors.parallax import Shots
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.depth.depth_anything import align, anchored_depth, network_disparity, picture
 from hdr_nsff.priors.pretrained import pretrained
+from hdr_nsff.scene.posed_video import Shots
 
 H, W, F = 48, 64, 60.0
 K = np.array([[F, 0, W / 2], [0, F, H / 2], [0, 0, 1.0]])

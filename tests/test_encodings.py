@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from hdr_nsff.fields.encodings import AdditiveGrid, TouchedAdam, frequencies
+from hdr_nsff.fields.nsff.encodings import AdditiveGrid, TouchedAdam, frequencies
 
 SHAPES = [(4, 5, 6, 1), (9, 7, 8, 3), (20, 20, 20, 3)]
 

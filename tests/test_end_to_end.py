@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from toy_scene import WALL, ToyScene, camera_centre
 
-from hdr_nsff import cli, io
-from hdr_nsff.run import Run
-from hdr_nsff.scene import Manifest
+from hdr_nsff import cli
+from hdr_nsff.core import io
+from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.training.run_folder import Run
 
 FRAMES, WIDTH, HEIGHT = 14, 112, 64
 EXPOSURES = (0.0, -1.5, -3.0)  # EV; the brightest clips a little

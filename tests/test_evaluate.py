@@ -13,13 +13,14 @@ import torch
 from fakes import EV, SPEED, DiscBeforeWall, H, W, camera, fake_run
 from torch import Tensor
 
-from hdr_nsff import alignment, io
-from hdr_nsff.camera import Camera
-from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import EvaluateConfig, evaluate, evaluate_run
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate, evaluate_run
 from hdr_nsff.fields.base import Render
-from hdr_nsff.run import Run
-from hdr_nsff.truth import Truth, TruthView, match_brackets
+from hdr_nsff.geometry import alignment
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.truth import Truth, TruthView, match_brackets
+from hdr_nsff.training.run_folder import Run
 
 TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])  # the truth's world: turned, three times as large, elsewhere
 SHIFT = torch.tensor([5.0, -2.0, 1.0])

@@ -11,16 +11,19 @@ import torch
 from fakes import fake_run
 from presets import random_field, small
 
-from hdr_nsff import cli, color, export, ply
-from hdr_nsff.errors import InputError
-from hdr_nsff.export import ExportConfig, GaussianField, Look, export_one, export_sequence
+from hdr_nsff import cli
+from hdr_nsff.core.checkpoints import pack, save_checkpoint
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.fields.kernels.projection import ALPHA_MIN
-from hdr_nsff.fields.rasterize import rasterize
-from hdr_nsff.fields.splat import Splat
-from hdr_nsff.run import Run, pack, save_checkpoint, write_config
-from hdr_nsff.scene import Scene
-from hdr_nsff.shots import develop
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.fields.splat.rasterize import rasterize
+from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.maths import color
+from hdr_nsff.rendering import export, ply
+from hdr_nsff.rendering.export import ExportConfig, GaussianField, Look, export_one, export_sequence
+from hdr_nsff.rendering.shots import develop
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.training.run_folder import Run, write_config
 
 LINEAR = Look(linear=True)
 

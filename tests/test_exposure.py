@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hdr_nsff.priors.exposure import (
+from hdr_nsff.radiometry.exposure_cycle import (
     by_value,
     common_brackets,
     detect_cycle,

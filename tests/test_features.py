@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors.features import (
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.flow.features import (
     BLOCKS,
     DINO_DEPTH,
     IMAGENET_MEAN,
@@ -139,7 +139,7 @@ def test_xfeat_has_no_layer_to_choose():
 
 def test_published_weights_match_across_four_ev():
     """The same textured picture, 16 times darker and clipped: most cells are still nearest to themselves."""
-    from hdr_nsff.priors.correlation import costs
+    from hdr_nsff.priors.flow.correlation import costs
 
     try:
         source = feature_source("xfeat")

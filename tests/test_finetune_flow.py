@@ -10,12 +10,12 @@ import torch
 from safetensors.torch import load_file
 from test_flow_sets import synth
 
-from hdr_nsff import finetune_flow as verb
-from hdr_nsff.errors import InputError
-from hdr_nsff.finetune_flow import FinetuneConfig, finetune_flow, mean, rate, sequence_loss, split
-from hdr_nsff.flow_sets import FlowPair, flow_pairs
-from hdr_nsff.priors import flow_networks
-from hdr_nsff.priors.gmflow import GMFlow
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.flow_training import finetune_flow as verb
+from hdr_nsff.flow_training.finetune_flow import FinetuneConfig, finetune_flow, mean, rate, sequence_loss, split
+from hdr_nsff.flow_training.flow_sets import FlowPair, flow_pairs
+from hdr_nsff.priors.flow import networks as flow_networks
+from hdr_nsff.priors.flow.gmflow import GMFlow
 
 
 @pytest.fixture

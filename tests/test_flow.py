@@ -4,9 +4,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import write_npy, write_png
-from hdr_nsff.priors.flow import agreement, common_grey, flow, follow, halfway, read_flow, recorded_range
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_npy, write_png
+from hdr_nsff.footage.flow_files import read_flow
+from hdr_nsff.geometry.round_trip import agreement, follow
+from hdr_nsff.priors.flow.dense import flow, halfway
+from hdr_nsff.radiometry.common_range import common_grey, recorded_range
 
 H, W = 64, 96
 NOTHING = np.zeros((H, W), bool)

@@ -10,11 +10,11 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors import flow_networks
-from hdr_nsff.priors.flow_networks import both_ways, load, matched_flow, mended, read_weights, resized_flow, working_size
-from hdr_nsff.priors.gmflow import GMFlow
-from hdr_nsff.priors.raft import Raft
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.flow import networks as flow_networks
+from hdr_nsff.priors.flow.gmflow import GMFlow
+from hdr_nsff.priors.flow.networks import both_ways, load, matched_flow, mended, read_weights, resized_flow, working_size
+from hdr_nsff.priors.flow.raft import Raft
 
 
 class Constant(torch.nn.Module):

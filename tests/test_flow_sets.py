@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.flow_exposures import cropped, example, random_curve, recorded_pair
-from hdr_nsff.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
-from hdr_nsff.io import write_exr, write_png
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_exr, write_png
+from hdr_nsff.flow_training.flow_exposures import cropped, example, random_curve, recorded_pair
+from hdr_nsff.flow_training.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
 
 H, W = 12, 16
 FLOW = np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1).astype(np.float32)  # (x, y) at (x, y): no two pixels alike

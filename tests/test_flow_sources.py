@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import write_npy, write_text
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_npy, write_text
+from hdr_nsff.prepare.steps.priors import learning_pairs
 from hdr_nsff.priors import weights
-from hdr_nsff.priors.flow import flow
-from hdr_nsff.priors.flow_sources import check_flow, fallback_note, flow_source, flow_weights, resolved
-from hdr_nsff.priors.semantic import SemanticConfig
+from hdr_nsff.priors.flow.dense import flow
+from hdr_nsff.priors.flow.semantic import SemanticConfig
+from hdr_nsff.priors.flow.sources import check_flow, fallback_note, flow_source, flow_weights, resolved
 from hdr_nsff.priors.weights import find
-from hdr_nsff.scene import FrameEntry
-from hdr_nsff.steps.priors import learning_pairs
+from hdr_nsff.scene.scene import FrameEntry
 
 FRAMES = np.random.default_rng(0).random((3, 24, 32, 3)).astype(np.float32)
 CLIPPED = np.zeros(FRAMES.shape[:3], bool)

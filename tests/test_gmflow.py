@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors import gmflow, weights
-from hdr_nsff.priors.flow_networks import both_ways, load
-from hdr_nsff.priors.gmflow import GMFlow
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors import weights
+from hdr_nsff.priors.flow import gmflow
+from hdr_nsff.priors.flow.gmflow import GMFlow
+from hdr_nsff.priors.flow.networks import both_ways, load
 
 rng = torch.Generator().manual_seed(0)
 

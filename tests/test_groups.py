@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.groups import PARTS, Tracks, View, advance, fit, follow, gather, parts, rigid, settled
+from hdr_nsff.priors.movers.rigid_groups import PARTS, Tracks, View, advance, fit, follow, gather, parts, rigid, settled
 
 TIMES = 14
 

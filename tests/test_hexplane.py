@@ -9,19 +9,19 @@ import torch
 from presets import HEXPLANE, random_field, small
 from torch import nn
 
-from hdr_nsff import io
-from hdr_nsff.batch import Look, PixelBatch, draw_pixels
-from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import EvaluateConfig, evaluate
-from hdr_nsff.export import ExportConfig, export
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
 from hdr_nsff.fields.base import recorded
-from hdr_nsff.fields.hexplane import GROWTHS, HexPlane
-from hdr_nsff.fields.planes import AXES, Planes
-from hdr_nsff.render import RenderConfig, render
-from hdr_nsff.run import Run
-from hdr_nsff.scene import Scene
-from hdr_nsff.shots import Output
-from hdr_nsff.train import train
+from hdr_nsff.fields.baselines.hexplane import GROWTHS, HexPlane
+from hdr_nsff.fields.baselines.planes import AXES, Planes
+from hdr_nsff.rendering.export import ExportConfig, export
+from hdr_nsff.rendering.render import RenderConfig, render
+from hdr_nsff.rendering.shots import Output
+from hdr_nsff.scene.batch import Look, PixelBatch, draw_pixels
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.run_folder import Run
+from hdr_nsff.training.train import train
 
 
 def test_features_are_products_of_the_planes_in_closed_form() -> None:

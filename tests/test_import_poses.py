@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors.colmap import read_model
-from hdr_nsff.priors.import_poses import import_poses
-from hdr_nsff.priors.poses import project
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.colmap import read_model
+from hdr_nsff.footage.pose_files import import_poses
+from hdr_nsff.geometry.poses import project
 
 W, H, FOCAL = 64, 48, 50.0
 POINT = np.array([0.3, -0.2, 5.0])

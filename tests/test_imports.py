@@ -8,16 +8,16 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
-VERBS = {"prepare", "synth", "reexpose", "train", "render", "export", "evaluate", "report", "finetune_flow", "weights"}
+VERBS = {"prepare.prepare", "synth.synth", "synth.reexpose", "training.train", "rendering.render", "rendering.export", "evaluation.evaluate", "evaluation.report", "flow_training.finetune_flow", "prepare.weights"}
 TRUTH = {  # who reads it, for `evaluate` and for `export --truth`, and the last three, which write it
-    "scores.targets",
-    "scores.geometry",
-    "scores.camera",
-    "evaluate",
-    "datasets.to_held_out",
-    "synth",
-    "reexpose",
-    "datasets.held_out",
+    "evaluation.targets",
+    "evaluation.scores.geometry",
+    "evaluation.scores.camera",
+    "evaluation.evaluate",
+    "footage.layouts.held_out",
+    "synth.synth",
+    "synth.reexpose",
+    "footage.datasets.held_out",
 }
 HEAVY = {
     "torchvision",
@@ -38,9 +38,10 @@ def module_of(path: Path) -> str:
     return ".".join(path.with_suffix("").parts).removesuffix(".__init__")
 
 
-def readme_order() -> list[str]:
-    """The modules as the README's tree lists them."""
-    listing = (ROOT / "README.md").read_text(encoding="utf-8").partition("\nsrc/hdr_nsff/\n")[2].partition("```")[0]
+def documented_order() -> list[str]:
+    """The modules as the tree of docs/architecture.md lists them, top floor first."""
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    listing = page.partition("\nsrc/hdr_nsff/\n")[2].partition("```")[0]
     folders: list[str] = []
     order = []
     for line in listing.splitlines():
@@ -54,9 +55,7 @@ def readme_order() -> list[str]:
 
 
 def imports(tree: ast.AST) -> set[str]:
-    """Every dotted name imported anywhere in a file, but for what only a type checker reads."""
-    if isinstance(tree, ast.If) and ast.unparse(tree.test) == "TYPE_CHECKING":
-        return set()
+    """Every dotted name imported anywhere in a file, for type checkers too."""
     if isinstance(tree, ast.Import):
         return {a.name for a in tree.names}
     if isinstance(tree, ast.ImportFrom):
@@ -66,7 +65,7 @@ def imports(tree: ast.AST) -> set[str]:
 
 
 SOURCES = {module_of(p.relative_to(PACKAGE)): ast.parse(p.read_text(encoding="utf-8")) for p in PACKAGE.rglob("*.py")}
-ORDER = readme_order()
+ORDER = documented_order()
 
 
 def own_imports(module: str) -> set[str]:
@@ -75,16 +74,16 @@ def own_imports(module: str) -> set[str]:
     return {next((m for m in (name, name.rpartition(".")[0]) if m in SOURCES), "__init__") for name in inner}
 
 
-def test_every_file_has_one_line_in_the_readme():
+def test_every_file_has_one_line_in_the_tree():
     bare = {m for m, tree in SOURCES.items() if all(isinstance(node, ast.Expr) for node in tree.body)}  # a docstring at most
     assert sorted(ORDER) == sorted(set(ORDER))
     assert set(ORDER) - bare == set(SOURCES) - bare
 
 
 @pytest.mark.parametrize("module", sorted(SOURCES))
-def test_imports_point_up_the_tree(module: str):
-    above = set(ORDER[: ORDER.index(module)]) if module in ORDER else set()
-    assert own_imports(module) <= above
+def test_imports_point_down_the_tree(module: str):
+    below = set(ORDER[ORDER.index(module) + 1 :]) if module in ORDER else set()
+    assert own_imports(module) <= below
 
 
 @pytest.mark.parametrize("verb", sorted(VERBS))
@@ -93,7 +92,7 @@ def test_verbs_never_import_each_other(verb: str):
 
 
 def test_the_truth_is_read_for_evaluate_and_export_alone():
-    assert {m for m in SOURCES if "truth" in own_imports(m)} == TRUTH
+    assert {m for m in SOURCES if "scene.truth" in own_imports(m)} == TRUTH
 
 
 def reached(module: str, without: frozenset[str] = frozenset()) -> set[str]:
@@ -109,33 +108,33 @@ def reached(module: str, without: frozenset[str] = frozenset()) -> set[str]:
 
 def knows_the_truth(modules: set[str]) -> set[str]:
     """Which of these can open a truth folder, or what data sets keep back."""
-    return {m for m in modules if m in TRUTH | {"truth"} or m.startswith("scores.")}
+    return {m for m in modules if m in TRUTH | {"scene.truth"} or m.startswith("evaluation.scores.")}
 
 
-LEARNERS = ["train", "steps.footage", "steps.priors", "datasets", "scene", "batch", "config", "run", "render"]
+LEARNERS = ["training.train", "prepare.steps.footage", "prepare.steps.priors", "footage.datasets", "scene.scene", "scene.batch", "training.config", "training.run_folder", "rendering.render"]
 
 
 @pytest.mark.parametrize("module", LEARNERS)
 def test_nothing_that_learns_or_prepares_can_reach_held_out_truth(module: str):
     assert not knows_the_truth(reached(module))
     assert (
-        knows_the_truth(reached("evaluate")) >= {"truth", "scores.targets"} and len(SOURCES) > 50
+        knows_the_truth(reached("evaluation.evaluate")) >= {"scene.truth", "evaluation.targets"} and len(SOURCES) > 50
     )  # the search finds what is there
 
 
 def test_prepare_reaches_the_truth_through_its_writer_alone():
-    assert knows_the_truth(reached("prepare")) == {"datasets.held_out", "truth"}
-    assert not knows_the_truth(reached("prepare", without=frozenset({"datasets.held_out"})))
+    assert knows_the_truth(reached("prepare.prepare")) == {"footage.datasets.held_out", "scene.truth"}
+    assert not knows_the_truth(reached("prepare.prepare", without=frozenset({"footage.datasets.held_out"})))
 
 
 def test_export_reaches_the_truth_through_what_it_writes_it_with():
-    door = "datasets.to_held_out"
-    assert knows_the_truth(reached("export")) == {door, "truth"} and {m for m in SOURCES if door in own_imports(m)} == {"export"}
-    assert not knows_the_truth(reached("export", without=frozenset({door})))
+    door = "footage.layouts.held_out"
+    assert knows_the_truth(reached("rendering.export")) == {door, "scene.truth"} and {m for m in SOURCES if door in own_imports(m)} == {"rendering.export"}
+    assert not knows_the_truth(reached("rendering.export", without=frozenset({door})))
 
 
 def test_only_prepare_writes_what_data_sets_keep_back():
-    assert {m for m in SOURCES if "datasets.held_out" in own_imports(m)} == {"prepare"}
+    assert {m for m in SOURCES if "footage.datasets.held_out" in own_imports(m)} == {"prepare.prepare"}
 
 
 @pytest.mark.parametrize("library", sorted(HEAVY))

@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.ingest import (
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_exr, write_png, write_video
+from hdr_nsff.footage.ingest import (
     every_of,
     held_out,
     log2_seconds,
@@ -22,7 +23,6 @@ from hdr_nsff.ingest import (
     read_frames,
     shrink,
 )
-from hdr_nsff.io import write_exr, write_png, write_video
 
 
 def picture(value: float, height: int = 24, width: int = 32) -> np.ndarray:

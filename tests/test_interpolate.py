@@ -9,9 +9,9 @@ import torch
 from fakes import FOCAL, WALL, DiscBeforeWall, H, W, camera
 from torch import Tensor
 
-from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import Layers
-from hdr_nsff.interpolate import Picture, neighbours, render_at, splat
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.rendering.interpolate import Picture, neighbours, render_at, splat
 
 CAMERA = camera()
 

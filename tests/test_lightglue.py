@@ -11,9 +11,10 @@ import torch
 from scipy.spatial.transform import Rotation
 from test_poses import FOCAL, PLACES, H, W, sliding
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors import lightglue, poses
-from hdr_nsff.priors.lightglue import check_matcher, match_pictures
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.poses import estimate as poses
+from hdr_nsff.priors.poses import lightglue
+from hdr_nsff.priors.poses.lightglue import check_matcher, match_pictures
 from hdr_nsff.priors.weights import KNOWN, look
 
 

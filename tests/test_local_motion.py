@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hdr_nsff.priors import local_motion
-from hdr_nsff.priors.flow import MISSED, detail, told
-from hdr_nsff.priors.local_motion import LINEAR, QUADRATIC, SAMPLES, filled, fit, solve
+from hdr_nsff.priors.flow import local_motion
+from hdr_nsff.priors.flow.dense import MISSED, detail, told
+from hdr_nsff.priors.flow.local_motion import LINEAR, QUADRATIC, SAMPLES, filled, fit, solve
 
 H, W = 48, 72
 ALL = np.ones((H, W))
@@ -142,7 +142,7 @@ def asked(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What `told` says of these: trust (H, W), where flow is not sure, and which side pixels are on."""
     seen: list[np.ndarray] = []
-    monkeypatch.setattr("hdr_nsff.priors.flow.filled", lambda flow, *rest: seen.extend(rest) or flow)
+    monkeypatch.setattr("hdr_nsff.priors.flow.dense.filled", lambda flow, *rest: seen.extend(rest) or flow)
     told(*given, moving)
     return seen[0], seen[1], seen[2]
 

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from hdr_nsff import losses
+from hdr_nsff.maths import losses
 
 
 def test_photometric_is_the_mean_absolute_or_squared_difference() -> None:

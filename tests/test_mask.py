@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.priors import mask
-from hdr_nsff.priors.mask import epipolar_miss, geometric_mask, grid, rough_mask, static_miss, steps_from
+from hdr_nsff.priors.masks import geometric as mask
+from hdr_nsff.priors.masks.geometric import epipolar_miss, geometric_mask, grid, rough_mask, static_miss, steps_from
 
 T, H, W, FOCAL = 8, 72, 96, 80.0
 SIZE = 20  # of the square, pixels

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from hdr_nsff.memory import keep_memory
+from hdr_nsff.core.process import keep_memory
 
 PICTURES = """
 import resource

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff import metrics
-from hdr_nsff.errors import InputError
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.maths import metrics
 
 
 def pictures(height=40, width=50, seed=0):

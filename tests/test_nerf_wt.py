@@ -7,10 +7,10 @@ import torch
 from presets import random_field, small
 from torch import Tensor
 
-from hdr_nsff.batch import Look, draw_pixels
 from hdr_nsff.fields import build_field
-from hdr_nsff.fields.nerf_wt import NerfWT
-from hdr_nsff.scene import Scene
+from hdr_nsff.fields.baselines.nerf_wt import NerfWT
+from hdr_nsff.scene.batch import Look, draw_pixels
+from hdr_nsff.scene.scene import Scene
 
 
 def look(*images: int) -> Look:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from tiny_networks import tiny_depth_anything, tiny_sam2
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_mask, read_npy, write_npy, write_png, write_text
-from hdr_nsff.prepare import PrepareConfig, prepare
-from hdr_nsff.priors.semantic import SemanticConfig
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_mask, read_npy, write_npy, write_png, write_text
+from hdr_nsff.prepare.prepare import PrepareConfig, prepare
+from hdr_nsff.prepare.steps.neural import weights_of
+from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.weights import KNOWN
-from hdr_nsff.scene import Manifest
-from hdr_nsff.steps.neural import weights_of
+from hdr_nsff.scene.scene import Manifest
 
 COUNT, H, W, FOCAL, SIDE = 9, 64, 96, 80.0, 20
 

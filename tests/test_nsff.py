@@ -9,11 +9,11 @@ import torch
 from presets import random_field
 from torch import Tensor, nn
 
-from hdr_nsff.batch import PixelBatch, draw_pixels
-from hdr_nsff.camera import Camera
-from hdr_nsff.fields.nsff import NSFF, NSFFConfig
+from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.space import build_space
-from hdr_nsff.scene import Scene
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.batch import PixelBatch, draw_pixels
+from hdr_nsff.scene.scene import Scene
 
 W, H, FOCAL = 48, 32, 40.0
 NEAR, FAR = 1.0, 8.0

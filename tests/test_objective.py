@@ -6,12 +6,12 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
-from hdr_nsff.batch import PixelBatch, draw_pixels
-from hdr_nsff.config import PRESETS
 from hdr_nsff.fields.base import Render, Warp
-from hdr_nsff.objective import LossWeights, Objective
-from hdr_nsff.scene import Scene
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.scene.batch import PixelBatch, draw_pixels
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.objective import LossWeights, Objective
 
 N = 20
 OBJECTIVE = Objective(LossWeights(), "scene", near=1.8)

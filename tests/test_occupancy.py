@@ -2,7 +2,7 @@
 
 import torch
 
-from hdr_nsff.fields.occupancy import Occupancy
+from hdr_nsff.fields.nsff.occupancy import Occupancy
 
 CENTRE = torch.tensor([[0.45, 0.45, 0.45]])  # cell (4, 4, 4) of ten
 

@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.priors.exposure import equalise
-from hdr_nsff.priors.one_exposure import at_one_exposure, matched_samples, response_from_flow
-from hdr_nsff.priors.response import linked
-from hdr_nsff.recording import Noise, record, response_curve
+from hdr_nsff.priors.flow.one_exposure import at_one_exposure, matched_samples, response_from_flow
+from hdr_nsff.radiometry.debevec import linked
+from hdr_nsff.radiometry.exposure_cycle import equalise
+from hdr_nsff.radiometry.recording import Noise, record, response_curve
 
 T, H, W = 6, 72, 108
 EV = (0.0, 2.0, 4.0)

@@ -8,14 +8,14 @@ import pytest
 import torch
 from presets import random_field, small, trainer
 
-from hdr_nsff.batch import PixelBatch, gather
 from hdr_nsff.fields import build_field
-from hdr_nsff.fields.branches import GridConfig
-from hdr_nsff.fields.encodings import AdditiveGrid
-from hdr_nsff.fields.nsff import NSFF
-from hdr_nsff.fields.painting import Splash, exposure_trust, paint, paint_radiance
-from hdr_nsff.scene import Scene
-from hdr_nsff.train import Trainer
+from hdr_nsff.fields.nsff.branches import GridConfig
+from hdr_nsff.fields.nsff.encodings import AdditiveGrid
+from hdr_nsff.fields.nsff.initialize_grid import Splash, exposure_trust, paint, paint_radiance
+from hdr_nsff.fields.nsff.nsff import NSFF
+from hdr_nsff.scene.batch import PixelBatch, gather
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.train import Trainer
 
 FINE = GridConfig(finest=1.0, depth_cells=48, levels=4, max_rows=2**20)
 
@@ -102,7 +102,7 @@ def test_clipped_recordings_are_hardly_trusted() -> None:
 
 def left_over(sweeps: int, monkeypatch: pytest.MonkeyPatch) -> float:
     """RMS of what painting leaves of a chequered wall, three cells to a square."""
-    monkeypatch.setattr("hdr_nsff.fields.painting.SWEEPS", sweeps)
+    monkeypatch.setattr("hdr_nsff.fields.nsff.initialize_grid.SWEEPS", sweeps)
     axis = (torch.arange(64) + 0.5) / 64
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     coords = torch.stack([x, y, torch.full_like(x, 0.5)], -1).reshape(-1, 3)

@@ -8,9 +8,9 @@ import math
 import pytest
 import torch
 
-from hdr_nsff import paths
-from hdr_nsff.camera import Camera
-from hdr_nsff.errors import InputError
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry import paths
+from hdr_nsff.geometry.cameras import Camera
 
 K = torch.tensor([[50.0, 0, 16], [0, 50, 12], [0, 0, 1]])
 

@@ -14,19 +14,19 @@ from safetensors.torch import load_file
 from torch import Tensor
 from toy_scene import ToyScene
 
-from hdr_nsff.batch import PixelBatch, whole_frame
-from hdr_nsff.camera import Camera
-from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.errors import InputError
-from hdr_nsff.fields import splat
-from hdr_nsff.fields.nsff import NSFF
-from hdr_nsff.fields.rasterize import dense
-from hdr_nsff.fields.splat import Splat, SplatConfig
-from hdr_nsff.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
-from hdr_nsff.run import Run
-from hdr_nsff.scene import Manifest, Scene
-from hdr_nsff.tensors import tree_map
-from hdr_nsff.train import Trainer, train
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import tree_map
+from hdr_nsff.fields.nsff.nsff import NSFF
+from hdr_nsff.fields.splat import splat
+from hdr_nsff.fields.splat.rasterize import dense
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.batch import PixelBatch, whole_frame
+from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
+from hdr_nsff.training.run_folder import Run
+from hdr_nsff.training.train import Trainer, train
 
 
 def edited(folder: Path, toy: ToyScene | None = None, **frames: dict[int, list[list[float]]]) -> Path:

@@ -13,14 +13,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff import cli, io
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors import poses as module
-from hdr_nsff.priors import sfm
-from hdr_nsff.priors.colmap import ColmapCamera, ColmapImage, ColmapModel
-from hdr_nsff.priors.matching import PairMatches, keypoints, match_all, picture, spread_pairs, usable, view_pairs
-from hdr_nsff.priors.poses import Poses, estimate_poses, interpolate, plausible, project, ranges, trusted_points, worth
-from hdr_nsff.priors.rotation import derivatives, panorama, turned
+from hdr_nsff import cli
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.colmap import ColmapCamera, ColmapImage, ColmapModel
+from hdr_nsff.geometry.poses import Poses, interpolate, project, ranges, trusted_points
+from hdr_nsff.priors.poses import estimate as module
+from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.estimate import estimate_poses, plausible, worth
+from hdr_nsff.priors.poses.matching import PairMatches, keypoints, match_all, picture, spread_pairs, usable, view_pairs
+from hdr_nsff.priors.poses.rotation import derivatives, panorama, turned
 
 W, H, FOCAL = 160, 96, 150.0
 K = np.array([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1.0]])
@@ -292,7 +294,7 @@ def test_a_worker_that_breaks_down_says_why(tmp_path):
 def test_a_worker_does_not_outlive_its_parent(tmp_path):
     code = (
         "import subprocess, sys, time\n"
-        "worker = 'import time; from hdr_nsff.priors.sfm import die_with_parent; die_with_parent(); time.sleep(60)'\n"
+        "worker = 'import time; from hdr_nsff.priors.poses.sfm import die_with_parent; die_with_parent(); time.sleep(60)'\n"
         "print(subprocess.Popen([sys.executable, '-c', worker]).pid, flush=True)\n"
         "time.sleep(60)\n"
     )

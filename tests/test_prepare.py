@@ -12,11 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.io import read_image, read_mask, write_npy, write_png
-from hdr_nsff.prepare import STEPS, PrepareConfig, begin, do, prepare
-from hdr_nsff.priors.flow import MISSED, halfway, round_trip
-from hdr_nsff.scene import Manifest, Scene
-from hdr_nsff.steps.priors import through_response
+from hdr_nsff.core.io import read_image, read_mask, write_npy, write_png
+from hdr_nsff.geometry.round_trip import round_trip
+from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, begin, do, prepare
+from hdr_nsff.prepare.steps.priors import through_response
+from hdr_nsff.priors.flow.dense import MISSED, halfway
+from hdr_nsff.scene.scene import Manifest, Scene
 
 COUNT, H, W, FOCAL = 12, 32, 48, 40.0
 EVS = (-2.0, 0.0, 2.0)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from test_prepare import COUNT, footage, given
 
-from hdr_nsff import io
-from hdr_nsff.config import PRESETS
-from hdr_nsff.errors import InputError
-from hdr_nsff.ingest import between
-from hdr_nsff.prepare import PrepareConfig, prepare
-from hdr_nsff.run import latest_checkpoint
-from hdr_nsff.scene import Manifest, Scene
-from hdr_nsff.train import train
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff.core import io
+from hdr_nsff.core.checkpoints import latest_checkpoint
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.ingest import between
+from hdr_nsff.prepare.prepare import PrepareConfig, prepare
+from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.train import train
 
 
 def kept(count: int, cycle: int) -> list[int]:

@@ -14,10 +14,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.camera import Camera
-from hdr_nsff.fields import rasterize_cuda
 from hdr_nsff.fields.kernels import compositing, projection
-from hdr_nsff.fields.rasterize import Maps, dense, front_to_back, project, rasterize, rotation_matrices
+from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
+from hdr_nsff.fields.splat.rasterize import Maps, dense, front_to_back, project, rasterize, rotation_matrices
+from hdr_nsff.geometry.cameras import Camera
 
 FOCAL = 40.0
 NAMES = ("means", "quaternions", "scales", "opacities", "features", "c2w", "focal")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.recording import Noise, record, response_curve, vignette
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.radiometry.recording import Noise, record, response_curve, vignette
 
 GREY = (1.0, 1.0, 1.0)
 NAMES = ["film", "log", "gamma", "srgb"]

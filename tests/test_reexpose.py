@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import read_exr, read_image, write_npy, write_png
-from hdr_nsff.priors.exposure import detect_cycle
-from hdr_nsff.priors.import_poses import import_poses
-from hdr_nsff.recording import response_curve
-from hdr_nsff.reexpose import ReexposeConfig, plan, reexpose
-from hdr_nsff.truth import Truth
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_exr, read_image, write_npy, write_png
+from hdr_nsff.footage.pose_files import import_poses
+from hdr_nsff.radiometry.exposure_cycle import detect_cycle
+from hdr_nsff.radiometry.recording import response_curve
+from hdr_nsff.scene.truth import Truth
+from hdr_nsff.synth.reexpose import ReexposeConfig, plan, reexpose
 
 
 def ordinary_clip(folder: Path, count: int = 20, width: int = 40) -> Path:

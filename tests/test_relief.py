@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.bundle import Shape
-from hdr_nsff.priors.groups import Group, Tracks
-from hdr_nsff.priors.parallax import Shots
-from hdr_nsff.priors.relief import apply, relief
+from hdr_nsff.priors.movers.bundle import Shape
+from hdr_nsff.priors.movers.mover_shape import apply, relief
+from hdr_nsff.priors.movers.rigid_groups import Group, Tracks
+from hdr_nsff.scene.posed_video import Shots
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

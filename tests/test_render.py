@@ -12,12 +12,12 @@ import pytest
 import torch
 from fakes import SPEED, DiscBeforeWall, H, W, camera, fake_run
 
-from hdr_nsff import io
-from hdr_nsff.errors import InputError
-from hdr_nsff.paths import View
-from hdr_nsff.render import RenderConfig, cut, plan_shot, render, render_all, three_exposures
-from hdr_nsff.run import Run
-from hdr_nsff.shots import Output, Shot, render_shot, take
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.paths import View
+from hdr_nsff.rendering.render import RenderConfig, cut, plan_shot, render, render_all, three_exposures
+from hdr_nsff.rendering.shots import Output, Shot, render_shot, take
+from hdr_nsff.training.run_folder import Run
 
 
 def test_exr_holds_radiance_depth_motion_and_motion_vectors(tmp_path: Path) -> None:

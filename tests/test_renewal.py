@@ -9,12 +9,12 @@ import torch
 from presets import small, trainer
 from test_splat import CAMERA, card_field, scattered
 
-from hdr_nsff.camera import Camera
 from hdr_nsff.fields.base import Misfit
-from hdr_nsff.fields.rasterize import dense
-from hdr_nsff.fields.renewal import MOST, NARROWER, PARTED, halve
-from hdr_nsff.fields.splat import Splat
-from hdr_nsff.scene import Scene
+from hdr_nsff.fields.splat.rasterize import dense
+from hdr_nsff.fields.splat.relocate import MOST, NARROWER, PARTED, halve
+from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.scene import Scene
 
 
 def misfit(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> Misfit:

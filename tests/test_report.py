@@ -13,12 +13,12 @@ import pytest
 from fakes import fake_run
 from test_scores import truth_of, with_flow
 
-from hdr_nsff.evaluate import evaluate_run
-from hdr_nsff.page import figure, table
-from hdr_nsff.render import render_all
-from hdr_nsff.report import ReportConfig, report, smoothed, write_report
-from hdr_nsff.run import Run
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.core.page import figure, table
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.evaluation.report import ReportConfig, report, smoothed, write_report
+from hdr_nsff.rendering.render import render_all
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.training.run_folder import Run
 
 VOID = {"meta", "img", "link", "br", "path", "use", "rect", "line", "circle"}
 
@@ -131,7 +131,7 @@ def test_every_tone_mapper_can_be_reported(tmp_path: Path, kind) -> None:
 
 def test_long_videos_are_linked_by_relative_path(finished: tuple[Run, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     run, folder = finished
-    monkeypatch.setattr("hdr_nsff.report.EMBED", 10)
+    monkeypatch.setattr("hdr_nsff.evaluation.report.EMBED", 10)
     text = write_report(run, folder / "report.html", folder / "render").read_text()
     assert 'href="render/bullet.mp4"' in text and "<video" not in text
 

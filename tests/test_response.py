@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.camera import Camera
-from hdr_nsff.priors.response import (
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.radiometry.debevec import (
     HIGH,
     LOW,
     SATURATED,
@@ -16,15 +16,15 @@ from hdr_nsff.priors.response import (
     View,
     brightness_ev,
     debevec,
-    initialise,
     linked,
     response_of,
     saturation,
     static_samples,
     typical_factor,
 )
-from hdr_nsff.scene import Frame, Manifest, Scene
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper
+from hdr_nsff.scene.scene import Frame, Manifest, Scene
+from hdr_nsff.tonemap.initialize import initialise
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 
 U = np.linspace(0, 1, 2001)
 X = U**2.2

@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.response_kernel import Respond, bin_of, bin_table
-from hdr_nsff.tonemap import GAMMA, ToneMapConfig, ToneMapper, knot_positions, leaky_ends, piecewise_linear
+from hdr_nsff.tonemap.kernel import Respond, bin_of, bin_table
+from hdr_nsff.tonemap.tonemapper import GAMMA, ToneMapConfig, ToneMapper, knot_positions, leaky_ends, piecewise_linear
 
 LEAK = 0.01
 POWER = {"gamma": 1 / GAMMA, "even": 1.0}

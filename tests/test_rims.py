@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.priors.rims import MOST, mended
+from hdr_nsff.priors.flow.masked_least_squares import MOST, mended
 
 H, W = 64, 96
 DISC, WALL = np.float32([2.4, 0.6]), np.float32([-0.8, 0.3])

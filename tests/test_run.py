@@ -11,20 +11,13 @@ import torch
 from presets import small, trainer
 from safetensors.torch import save_file
 
-from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.errors import InputError
-from hdr_nsff.run import (
-    Run,
-    latest_checkpoint,
-    pick_device,
-    read_checkpoint,
-    read_config,
-    read_log,
-    save_checkpoint,
-    write_config,
-)
-from hdr_nsff.scene import Scene
-from hdr_nsff.train import train
+from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, save_checkpoint
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import pick_device
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.run_folder import Run, read_config, read_log, write_config
+from hdr_nsff.training.train import train
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +71,7 @@ def test_a_failed_write_leaves_the_checkpoints_as_they_were(tmp_path: Path, monk
         path.write_bytes(b"half of it")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("hdr_nsff.run.save_file", full)
+    monkeypatch.setattr("hdr_nsff.core.checkpoints.save_file", full)
     with pytest.raises(OSError, match="No space"):
         save_checkpoint(tmp_path, 2, 0.0, {"a": torch.ones(2)})
     assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["step_00000001.safetensors"]

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from test_prepare import H, W, given
 
-from hdr_nsff import io, run_all
-from hdr_nsff.config import PRESETS
-from hdr_nsff.errors import InputError
-from hdr_nsff.reexpose import ReexposeConfig, reexpose
-from hdr_nsff.run_all import RunConfig, held_out_every
-from hdr_nsff.scene import Scene
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff import pipeline as run_all
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.pipeline import RunConfig, held_out_every
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
+from hdr_nsff.training.config import PRESETS
 
 COUNT = 21
 

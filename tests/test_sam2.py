@@ -8,10 +8,10 @@ import pytest
 import torch
 from tiny_networks import tiny_sam2
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.priors import sam2
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.masks import sam2
+from hdr_nsff.priors.masks.prompts import Mover, PointsFile, Prompt, as_file, corrected, movers, read_points
 from hdr_nsff.priors.pretrained import pretrained
-from hdr_nsff.priors.prompts import Mover, PointsFile, Prompt, as_file, corrected, movers, read_points
 
 HEIGHT, WIDTH = 80, 120
 Y, X = np.indices((HEIGHT, WIDTH)) + 0.5

@@ -9,7 +9,7 @@ import pytest
 import torch
 from toy_scene import CARD, EV, WALL, ToyScene
 
-from hdr_nsff.scene import FrameEntry, Manifest, Scene, Step, neighbours, outline
+from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene, Step, neighbours, outline
 
 
 def entry(index: int, time: float, camera: int = 0) -> FrameEntry:

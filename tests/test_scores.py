@@ -15,18 +15,18 @@ from fakes import DISC, FOCAL, SPEED, DiscBeforeWall, H, W, fake_run
 from test_evaluate import TURN, field_of, write_truth
 from torch import Tensor
 
-from hdr_nsff import io, notes
-from hdr_nsff.camera import Camera
-from hdr_nsff.errors import InputError
-from hdr_nsff.evaluate import evaluate_run
+from hdr_nsff.core import io, notes
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.evaluation.predictions import intervals
+from hdr_nsff.evaluation.scores.camera import camera_errors
+from hdr_nsff.evaluation.scores.stability import MOST_PAIRS, stability
+from hdr_nsff.evaluation.targets import choose_targets
 from hdr_nsff.fields.base import Render
-from hdr_nsff.run import Run
-from hdr_nsff.scores.camera import camera_errors
-from hdr_nsff.scores.predictions import intervals
-from hdr_nsff.scores.stability import MOST_PAIRS, stability
-from hdr_nsff.scores.targets import choose_targets
-from hdr_nsff.tonemap import ToneMapConfig, ToneMapper, knot_positions
-from hdr_nsff.truth import Truth, TruthView
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper, knot_positions
+from hdr_nsff.training.run_folder import Run
 
 MOTION = SPEED / 4  # of the fake run's disc, scene units per frame
 PIXELS = FOCAL / DISC * float(MOTION.norm())  # the same in its picture

@@ -9,11 +9,20 @@ import torch
 from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
-from hdr_nsff.fields.gaussians import Gaussians
-from hdr_nsff.fields.seeding import drift, neighbour_distance, place, quaternions, seed, spread, surely_moving, views_of
-from hdr_nsff.fields.splat import FAINTEST, Splat, SplatConfig
+from hdr_nsff.fields.splat.gaussians import Gaussians
+from hdr_nsff.fields.splat.initialize_gaussians import (
+    drift,
+    neighbour_distance,
+    place,
+    quaternions,
+    seed,
+    spread,
+    surely_moving,
+    views_of,
+)
+from hdr_nsff.fields.splat.splat import FAINTEST, Splat, SplatConfig
 from hdr_nsff.fields.surface import Points
-from hdr_nsff.scene import Frame, Scene, outline
+from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")
 

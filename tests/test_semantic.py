@@ -4,10 +4,10 @@ import cv2
 import numpy as np
 import torch
 
-from hdr_nsff.priors.adapt import colours
-from hdr_nsff.priors.features import Features
-from hdr_nsff.priors.flow import flow
-from hdr_nsff.priors.semantic import SemanticFlow, coarse, equal_tracks, fill, matched, spread
+from hdr_nsff.priors.flow.adapt import colours
+from hdr_nsff.priors.flow.dense import flow
+from hdr_nsff.priors.flow.features import Features
+from hdr_nsff.priors.flow.semantic import SemanticFlow, coarse, equal_tracks, fill, matched, spread
 
 H, W = 64, 96
 

@@ -5,8 +5,8 @@ import math
 import pytest
 import torch
 
-from hdr_nsff.camera import Camera
 from hdr_nsff.fields.space import ContractedSpace, FrustumSpace, build_space, frustum_corners, mean_pose
+from hdr_nsff.geometry.cameras import Camera
 
 K = torch.tensor([[50.0, 0, 32], [0, 50.0, 18], [0, 0, 1]])
 

@@ -11,14 +11,14 @@ from presets import small, trainer
 from torch import Tensor
 from toy_scene import CARD, card_offset
 
-from hdr_nsff.batch import PixelBatch, whole_frame
-from hdr_nsff.camera import Camera
 from hdr_nsff.fields import start_field
 from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.fields.gaussians import BRIGHTEST
-from hdr_nsff.fields.splat import Splat, SplatConfig, picked
-from hdr_nsff.fields.trajectories import WINDOW
-from hdr_nsff.scene import Scene
+from hdr_nsff.fields.splat.gaussians import BRIGHTEST
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig, picked
+from hdr_nsff.fields.splat.trajectories import WINDOW
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.batch import PixelBatch, whole_frame
+from hdr_nsff.scene.scene import Scene
 
 TIMES = 10
 STEP = torch.tensor([0.05, 0.02, 0.03])  # scene units from one time to the next

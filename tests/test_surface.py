@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.camera import Camera
 from hdr_nsff.fields.surface import CELLS, Points, cells_for, exposure_trust, joined, lift, thinned, thinned_to
-from hdr_nsff.scene import Frame
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.scene import Frame
 
 CAMERA = Camera(
     torch.tensor([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]]), torch.tensor([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]), 4, 2

@@ -7,20 +7,22 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff import io, pathtracer, synth_textures
-from hdr_nsff import synth as verb
-from hdr_nsff.camera import Camera
-from hdr_nsff.errors import InputError
-from hdr_nsff.ingest import open_footage, read_exposure_csv
-from hdr_nsff.pathtracer import PASS, Surface, Tracer, smooth
-from hdr_nsff.scene import Scene
-from hdr_nsff.synth import SynthConfig, clip_shots, parse_ev, parse_size, synth, truth_shots
-from hdr_nsff.synth_motion import exact_flow
-from hdr_nsff.synth_oracle import visible
-from hdr_nsff.synth_scenes.base import Views
-from hdr_nsff.synth_scenes.geometry import intrinsics, look_at, project
-from hdr_nsff.synth_scenes.interior import BACK, CORD, FLOOR, INTERIOR, PIVOT, ball_pose, box_pose, camera_pose
-from hdr_nsff.truth import Truth, true_pictures
+from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.ingest import open_footage, read_exposure_csv
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.scene.truth import Truth, true_pictures
+from hdr_nsff.synth import pathtracer
+from hdr_nsff.synth import synth as verb
+from hdr_nsff.synth import textures as synth_textures
+from hdr_nsff.synth.motion import exact_flow
+from hdr_nsff.synth.oracle import visible
+from hdr_nsff.synth.pathtracer import PASS, Surface, Tracer, smooth
+from hdr_nsff.synth.scenes.base import Views
+from hdr_nsff.synth.scenes.geometry import intrinsics, look_at, project
+from hdr_nsff.synth.scenes.interior import BACK, CORD, FLOOR, INTERIOR, PIVOT, ball_pose, box_pose, camera_pose
+from hdr_nsff.synth.synth import SynthConfig, clip_shots, parse_ev, parse_size, synth, truth_shots
 
 ROOM, BOX, BALL = 0, 1, 2
 

@@ -3,13 +3,13 @@
 import numpy as np
 from test_synth import BALL, BOX, ROOM, flat, tracer  # noqa: F401  (fixtures)
 
-from hdr_nsff import io
-from hdr_nsff.pathtracer import Tracer
-from hdr_nsff.synth import SynthConfig, synth
-from hdr_nsff.synth_motion import view_geometry
-from hdr_nsff.synth_scenes.geometry import intrinsics
-from hdr_nsff.synth_scenes.interior import CORD, INTERIOR, ball_pose, box_pose, camera_pose
-from hdr_nsff.truth import GEOMETRY, Truth
+from hdr_nsff.core import io
+from hdr_nsff.scene.truth import GEOMETRY, Truth
+from hdr_nsff.synth.motion import view_geometry
+from hdr_nsff.synth.pathtracer import Tracer
+from hdr_nsff.synth.scenes.geometry import intrinsics
+from hdr_nsff.synth.scenes.interior import CORD, INTERIOR, ball_pose, box_pose, camera_pose
+from hdr_nsff.synth.synth import SynthConfig, synth
 
 POSES = {0: lambda t: np.eye(4), 1: box_pose, 2: ball_pose}
 

@@ -5,14 +5,14 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
-from hdr_nsff.pathtracer import Surface, Tracer
-from hdr_nsff.synth import SynthConfig
-from hdr_nsff.synth_motion import UV, view_geometry
-from hdr_nsff.synth_scenes import SCENES
-from hdr_nsff.synth_scenes.base import SynthScene
-from hdr_nsff.synth_scenes.geometry import back_project, intrinsics, look_at, project
-from hdr_nsff.synth_scenes.night import DROP, bulb_pose
-from hdr_nsff.synth_scenes.shapes import Builder
+from hdr_nsff.synth.motion import UV, view_geometry
+from hdr_nsff.synth.pathtracer import Surface, Tracer
+from hdr_nsff.synth.scenes import SCENES
+from hdr_nsff.synth.scenes.base import SynthScene
+from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at, project
+from hdr_nsff.synth.scenes.night import DROP, bulb_pose
+from hdr_nsff.synth.scenes.shapes import Builder
+from hdr_nsff.synth.synth import SynthConfig
 
 NAMES = sorted(SCENES)
 SIZE = (48, 27)

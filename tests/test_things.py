@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.bundle import Cameras, adjust
-from hdr_nsff.priors.groups import Tracks, fit
-from hdr_nsff.priors.things import groups_by_motion, may_be_one, members_of, same, share_out, things
+from hdr_nsff.priors.movers.bundle import Cameras, adjust
+from hdr_nsff.priors.movers.motion_segmentation import groups_by_motion, may_be_one, members_of, same, share_out, things
+from hdr_nsff.priors.movers.rigid_groups import Tracks, fit
 
 TIMES, COUNT, FOCAL = 20, 140, 200.0
 T = np.arange(TIMES)

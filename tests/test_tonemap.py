@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.tonemap import GAMMA, ToneMapConfig, ToneMapper, informative, leaky_ends, piecewise_linear
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.tonemap.tonemapper import GAMMA, ToneMapConfig, ToneMapper, informative, leaky_ends, piecewise_linear
 
 EV = [-4.0, -2.0, 0.0]
 

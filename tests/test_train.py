@@ -17,14 +17,14 @@ from presets import interrupted_at, small, trainer
 from safetensors.torch import load_file
 from torch import Tensor
 
-from hdr_nsff import distributed
-from hdr_nsff.config import PRESETS, TrainConfig
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import write_json
-from hdr_nsff.run import Run, read_log, snapshots
-from hdr_nsff.scene import Scene
-from hdr_nsff.tonemap import ToneMapConfig
-from hdr_nsff.train import Clock, Trainer, train
+from hdr_nsff.core import distributed
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_json
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig
+from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.run_folder import Run, read_log, snapshots
+from hdr_nsff.training.train import Clock, Trainer, train
 
 STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
 
@@ -81,7 +81,7 @@ def command(settings: TrainConfig, *launcher: str) -> subprocess.Popen[bytes]:
     """`hdr-nsff train` in processes of its own."""
     script = settings.out.parent / "again.py"
     script.write_text(
-        "import json, sys\nfrom hdr_nsff.config import TrainConfig\nfrom hdr_nsff.train import Trainer, train\n"
+        "import json, sys\nfrom hdr_nsff.training.config import TrainConfig\nfrom hdr_nsff.training.train import Trainer, train\n"
         "Trainer.preview = lambda self: None\n"
         "train(TrainConfig.from_json(json.loads(open(sys.argv[1]).read())))\n"
     )

@@ -5,8 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.rasterize import rotation_matrices
-from hdr_nsff.fields.trajectories import WINDOW, Trajectories, quaternion_product
+from hdr_nsff.fields.splat.rasterize import rotation_matrices
+from hdr_nsff.fields.splat.trajectories import WINDOW, Trajectories, quaternion_product
 
 KNOTS = 10
 

@@ -13,16 +13,16 @@ from bad_input import FRAMES, Capture, call, edit, poses, refused, truth
 from bad_input import clip as frames_of
 from toy_scene import ToyScene, camera_centre
 
-from hdr_nsff.config import PRESETS
-from hdr_nsff.errors import InputError
-from hdr_nsff.notes import Trained, Trial
-from hdr_nsff.scene import Manifest
-from hdr_nsff.synth_oracle import NOTE
-from hdr_nsff.trials import tables
-from hdr_nsff.trials.curve import spread
-from hdr_nsff.trials.plan import BenchConfig, BenchScene, Cell, arguments, make_plan, minutes_of, safe_name
-from hdr_nsff.trials.pool import last_words
-from hdr_nsff.trials.tables import Row, best_cells, means
+from hdr_nsff.bench import tables
+from hdr_nsff.bench.curve import spread
+from hdr_nsff.bench.plan import BenchConfig, BenchScene, Cell, arguments, make_plan, minutes_of, safe_name
+from hdr_nsff.bench.pool import last_words
+from hdr_nsff.bench.tables import Row, best_cells, means
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.notes import Trained, Trial
+from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.synth.oracle import NOTE
+from hdr_nsff.training.config import PRESETS
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hdr_nsff.io import encode
-from hdr_nsff.priors import sfm
-from hdr_nsff.priors.colmap import read_model
-from hdr_nsff.priors.trimming import NEEDED
-from hdr_nsff.synth_scenes.geometry import look_at
+from hdr_nsff.core.io import encode
+from hdr_nsff.footage.colmap import read_model
+from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.trimming import NEEDED
+from hdr_nsff.synth.scenes.geometry import look_at
 
 pytest.importorskip("pycolmap")
 

@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from hdr_nsff import volume
+from hdr_nsff.maths import volume
 
 
 def random(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -10,7 +10,7 @@ import torch
 from safetensors.torch import save_file
 
 from hdr_nsff import cli
-from hdr_nsff.errors import InputError
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors import weights
 from hdr_nsff.priors.weights import KNOWN, find
 

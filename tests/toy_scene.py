@@ -5,8 +5,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff import io
-from hdr_nsff.scene import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.core import io
+from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest
 
 EV = [2.0, 0.0, -2.0]
 WALL, CARD = 4.0, 2.5

@@ -11,22 +11,22 @@ try:
     import tyro
 
     from hdr_nsff import __version__
-    from hdr_nsff.bench import BenchConfig, bench
-    from hdr_nsff.config import ABLATIONS, PRESETS, TrainConfig
-    from hdr_nsff.errors import InputError
-    from hdr_nsff.evaluate import EvaluateConfig, evaluate
-    from hdr_nsff.export import ExportConfig, export
-    from hdr_nsff.finetune_flow import FinetuneConfig, finetune_flow
-    from hdr_nsff.io import writing_to
-    from hdr_nsff.prepare import PrepareConfig, prepare
-    from hdr_nsff.progress import say
-    from hdr_nsff.reexpose import ReexposeConfig, reexpose
-    from hdr_nsff.render import RenderConfig, render
-    from hdr_nsff.report import ReportConfig, report
-    from hdr_nsff.run_all import RunConfig, run_all
-    from hdr_nsff.synth import SynthConfig, synth
-    from hdr_nsff.train import train
-    from hdr_nsff.weights import WeightsConfig, weights
+    from hdr_nsff.bench.bench import BenchConfig, bench
+    from hdr_nsff.core.errors import InputError
+    from hdr_nsff.core.io import writing_to
+    from hdr_nsff.core.progress import say
+    from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
+    from hdr_nsff.evaluation.report import ReportConfig, report
+    from hdr_nsff.flow_training.finetune_flow import FinetuneConfig, finetune_flow
+    from hdr_nsff.pipeline import RunConfig, run_all
+    from hdr_nsff.prepare.prepare import PrepareConfig, prepare
+    from hdr_nsff.prepare.weights import WeightsConfig, weights
+    from hdr_nsff.rendering.export import ExportConfig, export
+    from hdr_nsff.rendering.render import RenderConfig, render
+    from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
+    from hdr_nsff.synth.synth import SynthConfig, synth
+    from hdr_nsff.training.config import ABLATIONS, PRESETS, TrainConfig
+    from hdr_nsff.training.train import train
 except KeyboardInterrupt:  # while the libraries load, which takes seconds
     raise SystemExit(130) from None
 

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import assert_never
 
-from hdr_nsff.fields.hexplane import HexPlane, HexPlaneConfig
-from hdr_nsff.fields.nerf_wt import NerfWT, NerfWTConfig
-from hdr_nsff.fields.nsff import NSFF, NSFFConfig
-from hdr_nsff.fields.painting import paint
-from hdr_nsff.fields.seeding import seed
+from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
+from hdr_nsff.fields.baselines.nerf_wt import NerfWT, NerfWTConfig
+from hdr_nsff.fields.nsff.initialize_grid import paint
+from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.space import build_space
-from hdr_nsff.fields.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.initialize_gaussians import seed
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.fields.surface import ToRadiance
-from hdr_nsff.scene import Scene
+from hdr_nsff.scene.scene import Scene
 
 FieldConfig = NSFFConfig | NerfWTConfig | HexPlaneConfig | SplatConfig
 AnyField = NSFF | NerfWT | HexPlane | Splat

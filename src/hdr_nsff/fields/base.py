@@ -13,8 +13,8 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
-from hdr_nsff.batch import Look, PixelBatch
-from hdr_nsff.camera import Camera
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.batch import Look, PixelBatch
 
 HIGHEST = 0.999  # radiance below 1 that a sigmoid is asked to start from at most
 

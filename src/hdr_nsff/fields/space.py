@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.camera import Camera
+from hdr_nsff.geometry.cameras import Camera
 
 MARGIN = 0.02  # of the cube, left free on every side
 

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from hdr_nsff.losses import saturation_weight
-from hdr_nsff.scene import Frame
+from hdr_nsff.maths.losses import saturation_weight
+from hdr_nsff.scene.scene import Frame
 
 CELLS = 2**57  # that `cells_for` tells apart
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import torch
 
-from hdr_nsff.errors import InputError
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.weights import find
 
 IMAGENET_MEAN = torch.tensor([0.485, 0.456, 0.406])[:, None, None]  # of rgb in [0, 1]: what nearly all of them were trained with

@@ -16,9 +16,9 @@ import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 
-from hdr_nsff.errors import InputError
-from hdr_nsff.io import atomic
-from hdr_nsff.progress import say
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import atomic
+from hdr_nsff.core.progress import say
 
 TORCHVISION = "https://download.pytorch.org/models"
 

@@ -1,0 +1,299 @@
+"""Notes: JSON files of fixed shape that verbs leave beside what they make, so that a restart goes on and `report` can tell.
+
+A note that was cut short, or edited into another shape, counts as missing, and that is said: whoever needs it makes it again. A JSON
+file of the same name that no verb has written is somebody else's, and is left alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_json, write_json
+from hdr_nsff.core.progress import say
+
+Brightness = Annotated[float, Field(gt=0, lt=1e30)]
+Count = Annotated[int, Field(ge=0)]
+
+
+class Note(BaseModel):
+    """What all notes have in common."""
+
+    model_config = ConfigDict(frozen=True, allow_inf_nan=False)
+    marks: ClassVar[tuple[str, ...]] = ()  # keys that tell a note of this kind from other people's files
+
+
+N = TypeVar("N", bound=Note)
+
+
+class Share(Note):
+    """How much of a shot fits into the time there is."""
+
+    scale: float = Field(ge=0.05, le=1)
+    views: list[Count] = Field(min_length=1)  # positions in the shot
+
+
+class Plan(Note):
+    """`plan.json`: how the standard set spends its time budget."""
+
+    marks = ("key", "shots")
+    key: str
+    seconds_at_a_time: float
+    seconds_between: float
+    refused: list[str]  # sentences about what the clip does not allow
+    shots: dict[str, Share]
+
+
+class SequenceView(Note):
+    """One view of a shot."""
+
+    time: float  # in frames
+    ev: float | None
+
+
+class Sequence(Note):
+    """`sequence.json` of a rendered shot."""
+
+    marks = ("key", "views")
+    key: str
+    step: int
+    fps: float
+    display_exposure: Brightness
+    views: list[SequenceView] = Field(min_length=1)
+    seconds: float  # spent so far
+    complete: bool = False
+
+
+class Exported(Note):
+    """`sequence.json` of exported Gaussians."""
+
+    marks = ("key", "times")
+    key: str
+    step: int
+    times: list[float]  # in frames, one per file
+    display_exposure: Brightness
+
+
+class Made(Note):
+    """`made_of.json`: what a truth folder was made of."""
+
+    marks = ("key",)
+    key: str
+
+
+class Layout(Note):
+    """`hdr_nsff_export.json` of a scene exported in a public layout."""
+
+    marks = ("layout",)
+    layout: str = Field(min_length=1)
+    scene: str
+
+
+class Coloured(Note):
+    """`views.json`: the ranges of the coloured pictures of the standard set."""
+
+    marks = ("key", "depth_range")
+    key: str
+    depth_range: tuple[Brightness, Brightness]  # z-depth, scene units
+    fastest: Brightness  # motion until the next frame, pixels
+    moves: bool
+    exposures: list[float]  # EV
+
+
+class FlowError(Note):
+    """End-point error, in pixels."""
+
+    mean: float = Field(ge=0)
+    median: float = Field(ge=0)
+
+
+class FlowErrors(Note):
+    """`before.json` of `finetune-flow`: what the network it starts from does to the pairs kept out of training."""
+
+    by_stops: dict[str, FlowError] = Field(min_length=1)  # EV between the two pictures -> error
+
+
+class LogLine(Note):
+    """One line of a run's `log.jsonl`."""
+
+    step: Count
+    seconds: float
+    psnr: float
+    rays_per_second: float
+    losses: dict[str, float]
+
+
+class Bench(Note):
+    """`bench.json`: what all runs of a benchmark have in common."""
+
+    marks = ("settings", "scenes")
+    settings: dict[str, str | int | float | bool | None]
+    scenes: dict[str, str]  # name -> where it was found
+
+
+class Trained(Note):
+    """What training a run of a benchmark took."""
+
+    steps: Count
+    seconds: float  # of training
+    start_seconds: float  # from reading the scene to the first step, and writing; in the process that finished the training
+    memory: Count  # bytes, the most that process held
+    gpu_memory: Count | None = None
+    device: str
+    threads: Count
+    frame_seconds: float  # to render a frame of the scene
+
+
+class CurvePoint(Note):
+    """Quality on a few held-out views, part of the way through the training."""
+
+    share: float
+    step: Count
+    seconds: float  # of training
+    scores: dict[str, float]
+
+
+class ShownView(Note):
+    """A held-out view of which pictures were kept, and its scores."""
+
+    name: str = Field(pattern=r"^[^/\x00]+$", max_length=200)
+    time: float  # in frames
+    scores: dict[str, float]
+
+
+class Trial(Note):
+    """`trial.json`: a run of a benchmark."""
+
+    marks = ("scene_key", "trained")
+    scene_key: str  # of the scene folder it was trained on
+    trained: Trained | None = None
+    measured: str | None = None  # key of what was measured, and how
+    seconds: float = 0.0  # of measuring
+    curve: list[CurvePoint] = []
+    shown: list[ShownView] = []
+
+
+class Failure(Note):
+    """`failure.json`: why a run of a benchmark has no result."""
+
+    marks = ("reason", "log")
+    reason: str
+    log: str | None
+
+
+class Scores(BaseModel):
+    """Means over some views; every further key is a score."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    __pydantic_extra__: dict[str, float | None]
+    views: int
+
+
+class ViewScores(BaseModel):
+    """One view; every further key is a score."""
+
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False)
+    __pydantic_extra__: dict[str, float | None]
+    name: str = Field(pattern=r"^[^/\x00]+$", max_length=200)
+    group: str
+    protocol: str | None = None
+    time: float
+    bracket: int
+    psnr: float
+
+
+class TrueResponse(Note):
+    """The curve of the true camera."""
+
+    x: list[float]
+    y: list[list[float]] = Field(min_length=3, max_length=3)
+
+    @model_validator(mode="after")
+    def fits(self) -> Self:
+        if any(len(channel) != len(self.x) for channel in self.y):
+            raise ValueError("x and y differ in length")
+        return self
+
+
+class Pu21(Note):
+    """The luminance that scores in PU21 assume."""
+
+    white: float
+    nits: float
+
+
+Names = dict[str, tuple[str, Annotated[int, Field(ge=0, le=9)]]]  # of scores: what they are called, and digits to show
+
+
+class Metrics(Note):
+    """`metrics.json`: what `evaluate` found."""
+
+    kind: str
+    notes: list[str]
+    headline: Scores
+    protocol: str | None = None
+    groups: dict[str, Scores]
+    protocols: dict[str, Scores] = {}
+    views: list[ViewScores]
+    lpips: str
+    seconds: float
+    hdr_scores: Names | None = None
+    peak: float | None = None
+    recordable_peak: float | None = None
+    scale: float | None = None
+    scale_per_channel: list[float] | None = None
+    pu21: Pu21 | None = None
+    geometry_scores: Names | None = None
+    depth_scale: float | None = None
+    world_scale: float | None = None
+    camera: dict[str, int | float | list[float] | TrueResponse] | None = None
+    poses: dict[str, int | float] | None = None
+    stability: dict[str, int | float] | None = None
+
+    @model_validator(mode="after")
+    def fits(self) -> Self:
+        if empty := set(self.groups) - {v.group for v in self.views}:
+            raise ValueError(f"no view is of the group {min(empty)}")
+        if self.hdr_scores is not None and None in (self.peak, self.recordable_peak, self.scale, self.scale_per_channel):
+            raise ValueError("hdr_scores without their scale")
+        if self.geometry_scores is not None and self.depth_scale is None:
+            raise ValueError("geometry_scores without their scale")
+        if not isinstance((self.camera or {}).get("true_response"), TrueResponse | None):
+            raise ValueError("true_response is no curve")
+        return self
+
+
+def read(path: Path, kind: type[N]) -> N | None:
+    """The note at `path`; None where there is none, or, which is said, none that makes sense. InputError where it is no note of ours."""
+    if not path.is_file():
+        return None
+    try:
+        data = read_json(path)
+        if kind.marks and not (isinstance(data, dict) and set(kind.marks) <= data.keys()):
+            raise InputError(f"{path}: is there already and was not made by hdr-nsff; move it away, or choose another place")
+        return kind.model_validate(data)
+    except InputError:
+        raise
+    except ValueError as error:
+        say(f"{path}: cut short or edited, and taken for missing ({first_problem(error)})")
+        return None
+
+
+def write(path: Path, note: Note) -> None:
+    """Write a note, atomically."""
+    write_json(path, note.model_dump())
+
+
+def first_problem(error: Exception) -> str:
+    """The first thing pydantic or json complained about, in a few words."""
+    if isinstance(error, ValidationError):
+        e = error.errors()[0]
+        return f"{'.'.join(str(p) for p in e['loc']) or 'top level'}: {e['msg']}"
+    return str(error)
+
+
+def plain(note: Note) -> dict[str, Any]:
+    """What a note holds, without what it leaves open."""
+    return note.model_dump(exclude_none=True)

@@ -1,1 +1,0 @@
-"""What `evaluate` measures, one kind of error a file."""

@@ -1,0 +1,9 @@
+"""The synthetic scenes: each is hard in another way."""
+
+from hdr_nsff.synth.scenes.base import SynthScene
+from hdr_nsff.synth.scenes.cloth import CLOTH
+from hdr_nsff.synth.scenes.interior import INTERIOR
+from hdr_nsff.synth.scenes.lamp import LAMP
+from hdr_nsff.synth.scenes.night import NIGHT
+
+SCENES: dict[str, SynthScene] = {"interior": INTERIOR, "lamp": LAMP, "night": NIGHT, "cloth": CLOTH}

@@ -1,1 +1,0 @@
-"""What `bench` runs, and how it tells of it."""
