@@ -111,7 +111,7 @@ def at_length(frames: list[Frame], count: int) -> list[Frame]:
         near = {o: t + o for o in (1, -1) if 0 <= t + o < count}
         told = {o for o in near if o in f.flow} if t < len(frames) else set()
         flow, valid = {o: f.flow[o] for o in told}, {o: f.flow_valid[o] for o in told}
-        longer.append(replace(f, time=float(t), neighbours=near, flow=flow, flow_valid=valid))
+        longer.append(replace(f, time=float(t), neighbors=near, flow=flow, flow_valid=valid))
     return longer
 
 

@@ -3,8 +3,8 @@
     hdr-nsff synth SCENE
     python benchmarks/flow.py SCENE [SCENE ...] --flows prepared dis gmflow raft-finetuned --finetuned TUNED
 
-The frames' exact radiance (SCENE/exact/clip_*.exr) is recorded again, as a clip whose two exposures alternate: the same pairs of neighbours,
-with nothing changed between rows but how many stops apart they are. `raw` matches what was recorded; `equalised` what `prepare` makes of it.
+The frames' exact radiance (SCENE/exact/clip_*.exr) is recorded again, as a clip whose two exposures alternate: the same pairs of neighbors,
+with nothing changed between rows but how many stops apart they are. `raw` matches what was recorded; `equalized` what `prepare` makes of it.
 `prepared` is the flow of a scene that `prepare` made of those frames, nothing else given: the default, with the masks that it found itself.
 Errors are those of pixels that both frames show, in both directions, clipped or not; seconds are CPU seconds per pair, both directions."""
 
@@ -25,8 +25,8 @@ from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.flow.dense import checked, dense_inverse_search, flow, halfway, told
 from hdr_nsff.priors.flow.networks import both_ways, load, matched_flow
 from hdr_nsff.priors.flow.semantic import SemanticConfig, SemanticFlow, semantic_flow
-from hdr_nsff.radiometry.common_range import LUMA, common_grey, recorded_range
-from hdr_nsff.radiometry.exposure_cycle import equalise
+from hdr_nsff.radiometry.common_range import LUMA, common_gray, recorded_range
+from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import Noise, record, response_curve
 from hdr_nsff.scene.scene import Manifest
 
@@ -39,9 +39,9 @@ def main() -> None:
     parser.add_argument("--flows", nargs="+", choices=FLOWS, default=["dis"])
     parser.add_argument("--weights", type=Path, help="of gmflow or raft; default: where weights are kept")
     parser.add_argument("--finetuned", type=Path, help="what `finetune-flow` wrote")
-    parser.add_argument("--ev", nargs="+", type=float, default=[0, 2, 4], help="stops between neighbours")
-    parser.add_argument("--pairs", type=int, default=4, help="pairs of neighbours per scene, evenly over the clip")
-    parser.add_argument("--only", choices=("raw", "equalised"))
+    parser.add_argument("--ev", nargs="+", type=float, default=[0, 2, 4], help="stops between neighbors")
+    parser.add_argument("--pairs", type=int, default=4, help="pairs of neighbors per scene, evenly over the clip")
+    parser.add_argument("--only", choices=("raw", "equalized"))
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -49,13 +49,13 @@ def main() -> None:
     for scene in args.scenes:
         frames = [read_exr(path) for path in sorted((scene / "exact").glob("clip_*.exr"))]
         assert len(frames) > args.pairs, f"{scene}: {len(frames)} frames in exact/"
-        pairs = neighbours(len(frames), args.pairs)
+        pairs = neighbors(len(frames), args.pairs)
         print(f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}")
         for name in args.flows:
             network = None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
             both = (
-                ("equalised",) if name in ("prepared", "semantic") else ("raw", "equalised")
-            )  # these two equalise by themselves
+                ("equalized",) if name in ("prepared", "semantic") else ("raw", "equalized")
+            )  # these two equalize by themselves
             for treated in both if args.only is None else (args.only,):
                 for stops in args.ev:
                     rows.append({"scene": scene.name, "flow": name, "frames": treated, "ev": stops})
@@ -72,8 +72,8 @@ def named(name: str, weights: Path | None, finetuned: Path | None) -> object:
     return load(None, finetuned) if name == "raft-finetuned" else load(name, weights)  # type: ignore[arg-type]
 
 
-def neighbours(frames: int, count: int) -> np.ndarray:
-    """`count` pairs (count, 2) of neighbours, evenly over the clip."""
+def neighbors(frames: int, count: int) -> np.ndarray:
+    """`count` pairs (count, 2) of neighbors, evenly over the clip."""
     first = np.unique(np.linspace(0, frames - 2, count).round().astype(int))
     return np.stack([first, first + 1], -1)
 
@@ -91,8 +91,8 @@ def prior(network, treated: str) -> Callable:
 
         return checked(match, np.zeros(video.shape[:3], bool), pairs, None, threads=1)
 
-    def on_equalised(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        frames = equalise(video, groups)
+    def on_equalized(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        frames = equalize(video, groups)
         if isinstance(network, SemanticFlow):
             network.features = None  # of another clip
             found, valid = network(*frames, pairs)
@@ -100,7 +100,7 @@ def prior(network, treated: str) -> Callable:
             found, valid = flow(*frames, pairs, None) if network is None else matched_flow(network, *frames, pairs)
         return completed(found, *frames, pairs), valid
 
-    return on_raw if treated == "raw" else on_equalised
+    return on_raw if treated == "raw" else on_equalized
 
 
 def as_prepared(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -118,13 +118,13 @@ def as_prepared(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tupl
 
 
 def completed(found: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """The flow (P, H, W, 2) px of pairs and their reverses, ended as the step `rims` of `prepare` does, without its masks: where it is not sure
+    """The flow (P, H, W, 2) px of pairs and their reverses, ended as the step `refined_flow` of `prepare` does, without its masks: where it is not sure
     told by what is around, and both ways met halfway."""
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
     one_way = {(int(i), int(j)): one for (i, j), one in zip(pairs, found, strict=True)}
     still = np.zeros(clipped.shape[1:], bool)
     ended = {
-        (i, j): told(one, one_way[j, i], *common_grey(video, ranges, i, j), clipped[i], clipped[j], still)
+        (i, j): told(one, one_way[j, i], *common_gray(video, ranges, i, j), clipped[i], clipped[j], still)
         for (i, j), one in one_way.items()
     }
     return np.stack([halfway(one, ended[j, i]) for (i, j), one in ended.items()])

@@ -3,7 +3,7 @@
     hdr-nsff prepare CLIP SCENE --hold-out 0
     python benchmarks/poses.py SCENE POSES
 
-POSES is whatever `prepare --poses` reads. Prints the share of frames that were placed; the root mean square distance of their centres after the
+POSES is whatever `prepare --poses` reads. Prints the share of frames that were placed; the root mean square distance of their centers after the
 best similarity (ATE) as a share of the path's extent, the mean angle left after the best common rotation, and by how much focal lengths differ."""
 
 import argparse

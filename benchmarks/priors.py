@@ -7,7 +7,7 @@
 IoU of the moving masks over the whole clip, with precision and recall. Depth: |ln(estimated / true)| as a percentage, median, at the scale of
 the camera path (`metric`), and after the best scale per clip (`aligned`), of pixels that move and of the others; `known` is the share whose
 confidence is above 0.5. Poses: registered share, ATE as a share of the path's extent after the best similarity, mean rotation left, error of the focal
-length. Flow to both neighbours: median and mean end-point error, of moving pixels and of the others that the check believes."""
+length. Flow to both neighbors: median and mean end-point error, of moving pixels and of the others that the check believes."""
 
 import argparse
 from pathlib import Path

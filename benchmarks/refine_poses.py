@@ -5,7 +5,7 @@ depth and flow), not what the product does on a clip.
     python benchmarks/refine_poses.py CLIP/oracle OUT --truth CLIP/truth
 
 Every camera of the scene is turned by 1 degree about a random axis and shifted by 1 % of the median depth in a random direction. Trained with and without
-corrections, from wrong and from good poses. Errors are those of the training cameras after the best similarity (centres) and the best common
+corrections, from wrong and from good poses. Errors are those of the training cameras after the best similarity (centers) and the best common
 rotation; pixels are the root mean square distance between where a camera sees its points and where it should, after the same alignment.
 FOUND is 1 - error after / error before. DRIFT of good poses is the error after / that of the wrong poses before training."""
 
@@ -91,7 +91,7 @@ def perturbed(folder: Path, out: Path, seed: int) -> Path:
 
 
 def errors(scene: Scene, found: list[Frame]) -> dict[str, float]:
-    """Rotation (mean degrees), centres (root mean square, scene units) and pixels."""
+    """Rotation (mean degrees), centers (root mean square, scene units) and pixels."""
     true, unit = scene.train, typical_depth(scene)
     a, b = (torch.stack([f.camera.c2w for f in frames]).double() for frames in (true, found))
     between = Rotation.from_matrix((b[:, :, :3] @ a[:, :, :3].mT).numpy()).as_rotvec()

@@ -48,7 +48,7 @@ def main() -> None:
 
 def steps_of(what: list[str]) -> set[str]:
     """The steps of `prepare` that are no longer the clip's own."""
-    return {{"masks": "mask", "mover-depth": "depth"}.get(w, w) for w in what}
+    return {{"mover-depth": "depth"}.get(w, w) for w in what}
 
 
 def replace_depth(out: Path, own: FrameEntry, oracle: Path, exact: FrameEntry, scale: float, everywhere: bool) -> None:

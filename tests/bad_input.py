@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from toy_scene import ToyScene, camera_centre
+from toy_scene import ToyScene, camera_center
 
 from hdr_nsff import cli
 from hdr_nsff.core import io
@@ -100,7 +100,7 @@ def poses(path: Path, count: int = FRAMES) -> Path:
     """The cameras of the toy scene as LLFF writes them."""
     s, rows = ToyScene(), []
     for t in range(count):
-        x, y, z = camera_centre(t)
+        x, y, z = camera_center(t)
         pose = np.array([[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]])  # columns: down, right, back
         rows.append([*pose.ravel(), 1.8, 5.0])
     io.write_npy(path, np.array(rows))
@@ -115,8 +115,8 @@ def truth(folder: Path) -> Path:
         io.write_exr(folder / f"radiance/{t}.exr", {"RGB": scene.see(t)[0].astype(np.float32)})
         views.append({"name": f"{t:05d}", "time": t, "bracket": 1, "anchor": t, "radiance": f"radiance/{t}.exr"})
     told = {"bracket_ev": [2.0, 0.0, -2.0], "reference_bracket": 1, "response_x": x, "response_y": [x] * 3, "views": views}
-    centres = [np.c_[np.eye(3), camera_centre(t)].tolist() for t in range(6)]
-    io.write_json(folder / "truth.json", {**told, "K": scene.K.tolist(), "clip_c2w": centres})
+    centers = [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(6)]
+    io.write_json(folder / "truth.json", {**told, "K": scene.K.tolist(), "clip_c2w": centers})
     return folder
 
 

@@ -32,8 +32,8 @@ def pose(x: float) -> np.ndarray:
 
 def opengl(c2w: np.ndarray) -> list[list[float]]:
     """4x4 with columns right, up, back."""
-    right, down, forward, centre = c2w.T
-    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(centre, 1)], 1).tolist()
+    right, down, forward, center = c2w.T
+    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(center, 1)], 1).tolist()
 
 
 def dot_pixel(c2w: np.ndarray, scale: float = 1.0) -> np.ndarray:
@@ -83,8 +83,8 @@ def gopro(root: Path, scale: int = 1, held_out: bool = True) -> Path:
     rows = []
     for i in range(COUNT):
         c2w, ev = gopro_pose(i % CAMERAS), EV[i % CAMERAS]
-        right, down, forward, centre = c2w.T
-        matrix = np.stack([down, right, -forward, centre, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
+        right, down, forward, center = c2w.T
+        matrix = np.stack([down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
         rows.append(np.append(matrix.ravel(), [3.0, 5.0]))
         picture = see(c2w, ev, scale)
         write_png(dense / f"images_{W * scale}x{H * scale}/{i:05d}.png", picture)
@@ -203,8 +203,8 @@ def hdr_nerf_real(root: Path) -> Path:
     rows = []
     for n in range(12):
         c2w = pose(0.1 * n)
-        right, down, forward, centre = c2w.T
-        matrix = np.stack([down, right, -forward, centre, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
+        right, down, forward, center = c2w.T
+        matrix = np.stack([down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
         for e in range(5):
             ev = 2.0 * (e - 2)
             rows.append([*matrix.ravel(), 3.0, 5.0, 2.0**ev])
@@ -217,7 +217,7 @@ def hdr_nerf_real(root: Path) -> Path:
 
 
 def nerfstudio(root: Path, **changes: Any) -> Path:
-    """Eight pictures in no order of the list, one of them held out, with depth in millimetres."""
+    """Eight pictures in no order of the list, one of them held out, with depth in millimeters."""
     frames = []
     for n in (3, 0, 1, 2, 4, 5, 7, 6):
         c2w = pose(0.15 * n)

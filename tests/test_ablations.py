@@ -23,7 +23,7 @@ def test_an_ablation_differs_from_its_preset_in_one_part(name: str) -> None:
     base, changed = (asdict(PRESETS[n]) for n in (name.partition("-")[0], name))
     parts = {k for k in base if base[k] != changed[k]}
     assert parts == {
-        "no-flow": {"loss"}, "no-depth": {"loss", "paint"}, "no-saturation": {"saturation"}, "sigmoid": {"field"},
+        "no-flow": {"loss"}, "no-depth": {"loss", "from_priors"}, "no-saturation": {"saturation"}, "sigmoid": {"field"},
     }.get(name.partition("-")[2], {"tonemap"})  # fmt: skip
 
 
@@ -40,7 +40,7 @@ def test_without_flow_nothing_is_started_from_it(toy: Scene) -> None:
 
 def test_without_depth_the_prior_neither_paints_nor_pulls() -> None:
     config = ablated(PRESETS["grid"], "no-depth")
-    assert not config.paint and config.loss.depth == 0 and config.loss.flow == PRESETS["grid"].loss.flow
+    assert not config.from_priors and config.loss.depth == 0 and config.loss.flow == PRESETS["grid"].loss.flow
 
 
 def test_a_sigmoid_keeps_radiance_below_one_and_starts_where_it_is_painted(toy: Scene) -> None:
@@ -61,7 +61,7 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     assert isinstance(field, Splat)
     start_field(field, toy, lambda rgb, i: 3 * rgb, 0.5, True)  # brighter than 1, the background too
     for g in (field.static, field.moving):
-        for p in (g.offsets, g.sheen):  # shades, colours in time, colours by direction
+        for p in (g.offsets, g.sh1):  # shades, colors in time, colors by direction
             p.data.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
     for time in (0.0, 2.4):
         radiance = field.render(toy.train[0].camera, time).radiance
@@ -69,13 +69,13 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     render, _ = field(whole_frame(toy, 2))
     render.radiance.sum().backward()
     for g in (field.static, field.moving):
-        assert all(float(p.grad.abs().max()) > 0 for p in (g.log_radiance, g.offsets, g.sheen) if p.grad is not None)
-        assert None not in (g.log_radiance.grad, g.offsets.grad, g.sheen.grad)
+        assert all(float(p.grad.abs().max()) > 0 for p in (g.log_radiance, g.offsets, g.sh1) if p.grad is not None)
+        assert None not in (g.log_radiance.grad, g.offsets.grad, g.sh1.grad)
     assert field.background.grad is not None and float(field.background.grad.abs().min()) > 0
 
 
 @pytest.mark.parametrize("from_priors", [True, False])
-def test_gaussians_with_a_sigmoid_start_in_the_colours_that_are_below_it(from_priors: bool, toy: Scene) -> None:
+def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(from_priors: bool, toy: Scene) -> None:
     fields = [build_field(small(name).field, toy) for name in ("splat-sigmoid", "splat")]
     for field in fields:
         start_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)

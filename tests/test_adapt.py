@@ -15,7 +15,7 @@ from hdr_nsff.priors.flow.adapt import (
     adapt,
     best_buddies,
     buddies_term,
-    colours,
+    colors,
     cycle_term,
     near_term,
     trajectory_term,
@@ -33,10 +33,10 @@ def sliding(frames: int = 3, step: int = 4, size: tuple[int, int] = (48, 64)) ->
 
 
 def lesson() -> Lesson:
-    """A clip whose features are its colours with noise, slides one cell per frame, and is followed from the first frame to the third."""
+    """A clip whose features are its colors with noise, slides one cell per frame, and is followed from the first frame to the third."""
     video = sliding()
     bare = Features(torch.zeros(3, 1, 12, 16), 4.0, 2.0)
-    maps = colours(video, bare, 2) - 0.5
+    maps = colors(video, bare, 2) - 0.5
     noise = 0.2 * torch.randn(maps.shape, generator=torch.Generator().manual_seed(0))
     place = cells(12, 16)
     inner = place[(place[:, 0] > 2) & (place[:, 0] < 12)]
@@ -49,10 +49,10 @@ def test_the_network_starts_as_the_identity():
     assert torch.equal(Residual(5, 2.0)(maps, detail), maps)
 
 
-def test_a_cells_colours_are_read_where_it_looks():
-    """A ramp of value x (pixel centres): with cells of 4 pixels whose first middle is at 2, cell k sees 4 k + 2."""
+def test_a_cells_colors_are_read_where_it_looks():
+    """A ramp of value x (pixel centers): with cells of 4 pixels whose first middle is at 2, cell k sees 4 k + 2."""
     ramp = np.broadcast_to((np.arange(32) + 0.5)[None, None, :, None] / 32, (1, 16, 32, 3)).astype(np.float32)
-    seen = colours(ramp, Features(torch.zeros(1, 1, 4, 8), 4.0, 2.0), 1)
+    seen = colors(ramp, Features(torch.zeros(1, 1, 4, 8), 4.0, 2.0), 1)
     assert seen.shape == (1, 3, 4, 8)
     assert np.allclose(seen[0, 0, 1, 2:6] * 32, [10, 14, 18, 22], atol=0.05)
 
@@ -64,7 +64,7 @@ def test_best_buddies_are_each_others():
     assert 0 < len(there[0]) < 30
 
 
-def test_buddies_do_not_push_their_neighbours_away():
+def test_buddies_do_not_push_their_neighbors_away():
     """With features that only one far cell shares, making that cell alike costs; making a cell beside the buddy alike does not."""
     target, query = torch.zeros(2, 5, 6), torch.tensor([[1.0, 0.0]])
     target[1], target[:, 2, 2] = 1, torch.tensor([1.0, 0.0])

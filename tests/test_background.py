@@ -20,7 +20,7 @@ def square(t: int) -> np.ndarray:
 
 
 def clip() -> tuple[np.ndarray, np.ndarray]:
-    """A white square before a plain grey wall with a little noise, and where the square is."""
+    """A white square before a plain gray wall with a little noise, and where the square is."""
     video = np.full((T, H, W, 3), 0.3, np.float32) + np.random.default_rng(0).normal(size=(T, H, W, 3)).astype(np.float32) * 0.005
     truth = np.stack([square(t) for t in range(T)])
     video[truth] = 0.8

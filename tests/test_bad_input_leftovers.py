@@ -70,7 +70,7 @@ Change = Callable[[dict], object]
 PLAN, VIEWS, METRICS = "run/render/plan.json", "run/render/views.json", "run/metrics.json"
 SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply/sequence.json"
 KINDS: dict[str, type[notes.Note]] = {
-    PLAN: notes.Plan, VIEWS: notes.Coloured, SEQUENCE: notes.Sequence, EXPORTED: notes.Exported, METRICS: notes.Metrics
+    PLAN: notes.Plan, VIEWS: notes.Colored, SEQUENCE: notes.Sequence, EXPORTED: notes.Exported, METRICS: notes.Metrics
 }  # fmt: skip
 NONSENSE: dict[str, tuple[str, Change]] = {
     "views beyond the shot": (PLAN, lambda d: d["shots"]["fixed"].update(views=[999])),
@@ -168,11 +168,11 @@ def test_the_mark_of_footage_that_was_made_is_not_written_over(text: str, tmp_pa
 
 SETTINGS: dict[str, tuple[Change, str]] = {
     "a word for a number": (lambda d: d["field"].update(bases="many"), "--field.bases"),
-    "nothing for a number": (lambda d: d["field"].update(presence_knots=None), "--field.presence-knots"),
+    "nothing for a number": (lambda d: d["field"].update(opacity_knots=None), "--field.opacity-knots"),
     "less than none": (lambda d: d["field"].update(static=-1), "--field.static"),
     "more than there can be": (lambda d: d["field"].update(moving=10**300), "--field.moving"),
     "half a Gaussian": (lambda d: d["field"].update(moving=0.5), "--field.moving"),
-    "a number for a switch": (lambda d: d.update(paint=3), "--paint"),
+    "a number for a switch": (lambda d: d.update(from_priors=3), "--from-priors"),
     "a curve nobody knows": (lambda d: d["tonemap"].update(kind="round"), "--tonemap.kind"),
     "a weight below zero": (lambda d: d["loss"].update(depth=-1.0), "--loss.depth"),
     "a weight that is no number": (lambda d: d["loss"].update(depth=float("nan")), "--loss.depth"),

@@ -51,6 +51,7 @@ NONSENSE: dict[str, tuple[Change, str]] = {
     "a key nobody knows": (top("sparkle", 1), "sparkle"),
     "a key nobody knows in a frame": (frame("sparkle", 1), "frames.2.sparkle"),
     "another version": (top("version", 99), "version"),
+    "version 1": (top("version", 1), "again into a new folder"),
     "frames that are no list": (top("frames", "many"), "frames"),
     "a frame that is no frame": (lambda d: d["frames"].append(7), "frames.6"),
     "an unknown split": (frame("split", "both"), "frames.2.split"),
@@ -133,18 +134,30 @@ MAPS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "a small image": ("images/00002.png", lambda p: write_png(p, np.zeros((9, 9, 3))), "image of frame 2 has shape (9, 9, 3)"),
     "a small mask": ("masks/00002.png", lambda p: write_png(p, np.zeros((H, 9), bool)), "mask of frame 2 has shape (34, 9)"),
     "a small depth": ("disparity/00002.npy", lambda p: write_npy(p, np.ones((9, W))), "disparity of frame 2 has shape (9, 60)"),
-    "a flow without y": ("flow/00002_00003.npy", lambda p: write_npy(p, np.ones((H, W))), "flow of frame 2 has shape (34, 60)"),
-    "a small flow": ("flow/00002_00003.npy", lambda p: write_npy(p, np.ones((3, 3, 2))), "flow of frame 2 has shape (3, 3, 2)"),
-    "a small flow mask": ("flow/00002_00003_valid.png", lambda p: write_png(p, np.zeros((3, 3), bool)), "flow mask of frame 2"),
+    "a flow without y": (
+        "raw_flow/00002_00003.npy",
+        lambda p: write_npy(p, np.ones((H, W))),
+        "flow of frame 2 has shape (34, 60)",
+    ),
+    "a small flow": (
+        "raw_flow/00002_00003.npy",
+        lambda p: write_npy(p, np.ones((3, 3, 2))),
+        "flow of frame 2 has shape (3, 3, 2)",
+    ),
+    "a small flow mask": (
+        "raw_flow/00002_00003_valid.png",
+        lambda p: write_png(p, np.zeros((3, 3), bool)),
+        "flow mask of frame 2",
+    ),
     "a depth with NaN": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), np.nan)), "NaN or Inf"),
-    "a flow with Inf": ("flow/00002_00003.npy", lambda p: write_npy(p, np.full((H, W, 2), np.inf)), "NaN or Inf"),
+    "a flow with Inf": ("raw_flow/00002_00003.npy", lambda p: write_npy(p, np.full((H, W, 2), np.inf)), "NaN or Inf"),
     "a depth behind the camera": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), -1.0)), "negative"),
     "a depth of words": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), "far")), "disparity of frame 2"),
     "an image cut short": ("images/00002.png", lambda p: p.write_bytes(p.read_bytes()[:200]) and None, "cut short"),
     "a depth cut short": ("disparity/00002.npy", lambda p: p.write_bytes(p.read_bytes()[:200]) and None, "not a readable .npy"),
     "a text file for a mask": ("masks/00002.png", lambda p: p.write_text("not a mask") and None, "cut short"),
     "a pickle for a flow": (
-        "flow/00002_00003.npy",
+        "raw_flow/00002_00003.npy",
         lambda p: np.save(p, np.array([{}]), allow_pickle=True),
         "not a readable .npy",
     ),
@@ -176,7 +189,7 @@ def test_a_link_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
 def test_a_scene_with_a_single_frame_opens(folder: Path) -> None:
     edit(folder / "scene.json", lambda d: d.update(frames=[{**d["frames"][1], "flow": {}}]))
     scene = Scene.open(folder)
-    assert len(scene.train) == 1 and scene.train[0].neighbours == {}
+    assert len(scene.train) == 1 and scene.train[0].neighbors == {}
 
 
 def test_a_manifest_survives_saving(folder: Path) -> None:
@@ -227,7 +240,7 @@ def test_a_prepared_scene_whose_frames_are_out_of_order_is_not_built_on(
 def test_missing_maps_and_maps_of_the_wrong_size(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
     scene = run_folder.parent / "scene"
     commands = [training(scene, tmp_path / "new", 1), *reading(run_folder, tmp_path / "new")]
-    for name, wrong in (("masks/00002.png", np.zeros((9, 60))), ("flow/00002_00003.npy", np.zeros((9, 60, 2)))):
+    for name, wrong in (("masks/00002.png", np.zeros((9, 60))), ("raw_flow/00002_00003.npy", np.zeros((9, 60, 2)))):
         kept = (scene / name).read_bytes()
         (io.write_png if name.endswith("png") else io.write_npy)(scene / name, wrong)
         assert all(name in said and "shape (9, 60" in said for said in (refused(capsys, *c) for c in commands))

@@ -51,7 +51,7 @@ def flat_problem() -> Problem:
 
 
 def true_state(problem: Problem) -> State:
-    return State(LOCAL, ROTATIONS, PLACES - EYES + problem.eye)  # shifts are counted from the group's centre, as its eyes are
+    return State(LOCAL, ROTATIONS, PLACES - EYES + problem.eye)  # shifts are counted from the group's center, as its eyes are
 
 
 def likeness(points: np.ndarray, which: slice | np.ndarray = slice(None)) -> np.ndarray:
@@ -65,7 +65,7 @@ def of_shape(shape: Shape) -> np.ndarray:
 
 
 def of_state(s: State) -> np.ndarray:
-    """(N, TIMES, 3) about the centre, which likeness does not see."""
+    """(N, TIMES, 3) about the center, which likeness does not see."""
     return np.einsum("tij,nj->nti", s.rotations, s.points) + s.shifts
 
 
@@ -167,7 +167,7 @@ def test_no_prior_but_the_one_on_distance_changes_with_scale() -> None:
 
 
 @pytest.mark.parametrize("split", [8, 11, TIMES])
-def test_a_reversed_solution_is_recognised_and_undone(split: int) -> None:
+def test_a_reversed_solution_is_recognized_and_undone(split: int) -> None:
     problem = flat_problem()
     wrong, cost = problem.solve(problem.reversed(true_state(problem), split), 25)
     assert likeness(of_state(wrong)).min() < 0  # the steps alone do not find out

@@ -53,7 +53,7 @@ def test_one_stop_doubles():
     np.testing.assert_allclose(color.scale_ev(LINEAR, 1.0), 2 * LINEAR)
 
 
-def test_auto_exposure_brings_grey_to_the_key_whatever_lamp_is_in_view():
+def test_auto_exposure_brings_gray_to_the_key_whatever_lamp_is_in_view():
     room = np.full((1000, 3), 0.02)
     lamp = room.copy()
     lamp[:15] = 500.0  # 1.5 % of the pixels
@@ -62,14 +62,14 @@ def test_auto_exposure_brings_grey_to_the_key_whatever_lamp_is_in_view():
 
 
 def test_the_display_shows_five_decades_in_order_and_in_range():
-    grey = np.geomspace(1e-3, 1e2, 60)[:, None].repeat(3, 1)
-    shown = color.display(grey)
+    gray = np.geomspace(1e-3, 1e2, 60)[:, None].repeat(3, 1)
+    shown = color.display(gray)
     assert shown.min() >= 0 and shown.max() <= 1
-    below_white = grey[:, 0] < 40
+    below_white = gray[:, 0] < 40
     assert (np.diff(shown[below_white, 0]) > 0).all() and (shown[~below_white] > 0.999).all()
 
 
-def test_bright_colours_lose_saturation_not_hue():
+def test_bright_colors_lose_saturation_not_hue():
     red = np.array([[30.0, 3.0, 1.0]])
     shown = color.srgb_decode(color.display(red))[0]
     assert shown[0] == pytest.approx(1.0, abs=1e-6) and shown[0] > shown[1] > shown[2] > 0.1

@@ -1,4 +1,4 @@
-"""Public layouts: each is recognised for what it is, footage for none of them, and in every convention a known point is where its
+"""Public layouts: each is recognized for what it is, footage for none of them, and in every convention a known point is where its
 picture shows it, in training pictures and held-out ones."""
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ import pytest
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_image, write_png, write_video
-from hdr_nsff.footage.datasets import held_out, layout_of, recognise
+from hdr_nsff.footage.datasets import held_out, layout_of, recognize
 from hdr_nsff.footage.datasets.capture import Capture, Clock, turns
 from hdr_nsff.footage.pose_files import Given, placed
 
@@ -33,7 +33,7 @@ NAMES = {
 
 def read(root: Path) -> Capture:
     """The training part of a data set."""
-    capture = recognise(root)
+    capture = recognize(root)
     assert capture is not None
     return capture
 
@@ -49,7 +49,7 @@ def misses(root: Path, files: list[Path], given: Given, over: float | None, size
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_a_layout_is_recognised_and_named(name: str, tmp_path: Path) -> None:
+def test_a_layout_is_recognized_and_named(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
     assert capture.layout == NAMES[name]
     assert capture.withheld and all((tmp_path / p.source).is_file() for p in capture.pictures)
@@ -126,7 +126,7 @@ def test_a_missing_file_is_named_with_what_it_was_for(name: str, lost: str, word
     SETS[name](tmp_path)
     (tmp_path / lost).unlink()
     with pytest.raises(InputError, match=words) as error:
-        recognise(tmp_path)
+        recognize(tmp_path)
     assert Path(lost).stem in str(error.value) or Path(lost).parent.name in str(error.value)
 
 
@@ -159,7 +159,7 @@ def test_a_transforms_file_cut_short_is_one_sentence(name: str, text: str, tmp_p
     path = tmp_path / ("transforms.json" if name == "nerfstudio" else "transforms_train.json")
     path.write_text(text)
     with pytest.raises(InputError, match=path.name):
-        recognise(tmp_path)
+        recognize(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -177,7 +177,7 @@ def test_cameras_of_real_hdr_nerf_scenes_that_make_no_sense_are_one_sentence(
     path = mini.hdr_nerf_real(tmp_path) / "poses_bounds_exps.npy"
     np.save(path, change(np.load(path)))
     with pytest.raises(InputError, match=words):
-        recognise(tmp_path)
+        recognize(tmp_path)
 
 
 def test_a_file_name_that_leaves_the_data_set_is_refused(tmp_path: Path) -> None:
@@ -186,4 +186,4 @@ def test_a_file_name_that_leaves_the_data_set_is_refused(tmp_path: Path) -> None
     text = (root / "transforms_train.json").read_text().replace("./train/0000", "../secret")
     (root / "transforms_train.json").write_text(text)
     with pytest.raises(InputError, match="outside the data set"):
-        recognise(root)
+        recognize(root)

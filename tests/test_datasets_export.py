@@ -16,11 +16,11 @@ from toy_scene import ToyScene
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_image, read_mask, read_npy, write_exr, write_json, write_npy, write_png
 from hdr_nsff.footage.colmap import read_model
-from hdr_nsff.footage.datasets import recognise
+from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.layouts import colmap as to_colmap
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.radiometry.recording import response_curve
-from hdr_nsff.rendering.export import ExportConfig, Look, export
+from hdr_nsff.rendering.export import Coloring, ExportConfig, export
 from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene
 from hdr_nsff.scene.truth import Truth, TruthView, true_pictures
 
@@ -125,7 +125,7 @@ def test_hidden_points_are_not_seen() -> None:
     assert view.index.tolist() == [0] and view.depth.tolist() == [4] and view.xy.tolist() == [[mini.W / 2, mini.H / 2]]
 
 
-def test_nerfstudio_gets_opengl_poses_and_millimetres(scene: Path) -> None:
+def test_nerfstudio_gets_opengl_poses_and_millimeters(scene: Path) -> None:
     out = export(ExportConfig(scene, scene.with_name("out"), layout="nerfstudio"))
     document, m = json.loads((out / "transforms.json").read_text()), Manifest.load(scene)
     assert [f["time"] for f in document["frames"]] == [k / 5 for k in range(6)]
@@ -183,10 +183,10 @@ def test_an_exported_folder_without_one_of_its_notes_is_refused(scene: Path) -> 
     told = json.loads(note.read_text())
     note.write_text(json.dumps(told | {"frames": {k: v for k, v in told["frames"].items() if k != "00003.png"}}))
     with pytest.raises(InputError, match="no entry for picture 00003"):
-        recognise(out)
+        recognize(out)
     note.write_text(json.dumps({k: v for k, v in told.items() if k != "near"}))
     with pytest.raises(InputError, match="near"):
-        recognise(out)
+        recognize(out)
 
 
 def test_exporting_again_replaces_what_was_there_but_nothing_else(scene: Path, tmp_path: Path) -> None:
@@ -208,7 +208,11 @@ def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(scene: Path,
     for wrong in (replace(config, ply=True), replace(config, layout=None)):
         with pytest.raises(InputError, match="say what to write"):
             export(wrong)
-    for wrong in (replace(config, time=1.0), replace(config, look=Look(ev=1.0)), replace(config, look=Look(linear=True))):
+    for wrong in (
+        replace(config, time=1.0),
+        replace(config, coloring=Coloring(ev=1.0)),
+        replace(config, coloring=Coloring(linear=True)),
+    ):
         with pytest.raises(InputError, match="are for Gaussians"):
             export(wrong)
     with pytest.raises(InputError, match="neither a scene folder nor a run folder"):
@@ -345,7 +349,7 @@ def test_what_export_noted_of_held_out_views_is_checked(kept: tuple[Path, Path, 
     ):
         note.write_text(json.dumps(told | {"held_out": wrong}))
         with pytest.raises(InputError, match=words):
-            recognise(out)
+            recognize(out)
     note.write_text(json.dumps(told | {"held_out": {"../../scene/images/00000.png": entry}}))
     with pytest.raises(InputError, match="points outside the data set"):
         prepare(PrepareConfig(out, scene.with_name("again")))

@@ -50,7 +50,7 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
     told = capsys.readouterr().err
     assert "HDR-GoPro / NSFF (LLFF), 9 pictures, with its own poses, flow, masks, depth" in " ".join(told.split())
     assert provenance(gopro.out) == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "given",
+        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "masks": "given", "refined_flow": "given",
         "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 3 and not scene.test
@@ -133,7 +133,7 @@ def test_every_second_frame_leaves_the_others_to_be_tested(gopro: PrepareConfig)
     scene, truth = Scene.open(gopro.out), Truth.open(gopro.out.with_name("scene_truth"))
     assert [f.time for f in scene.train] == [0, 1, 2, 3, 4]
     assert {v.time for v in truth.views} == {t / 4 for t in range(0, 17)}
-    assert provenance(gopro.out)["flow"] == "estimated"  # the set has flow between neighbours alone
+    assert provenance(gopro.out)["flow"] == "estimated"  # the set has flow between neighbors alone
 
 
 def test_a_protocol_splits_a_data_set_and_keeps_its_times(gopro: PrepareConfig) -> None:
@@ -143,7 +143,7 @@ def test_a_protocol_splits_a_data_set_and_keeps_its_times(gopro: PrepareConfig) 
     assert scene.manifest.protocol == "novel-view-time"
     assert {v.time for v in truth.views} == {t / 2 for t in range(0, 17)}  # all, to be told apart by `evaluate`
     flow = Manifest.load(gopro.out).steps["flow"].note
-    assert "24 pairs" in flow and "16 given, 8 estimated" in flow  # the set has flow between neighbours alone
+    assert "24 pairs" in flow and "16 given, 8 estimated" in flow  # the set has flow between neighbors alone
     prepare(replace(gopro, protocol="novel-view"))
     assert len(Scene.open(gopro.out).train) == 9
 
@@ -158,7 +158,7 @@ def test_a_truth_of_other_settings_does_not_stay(gopro: PrepareConfig) -> None:
 
 def test_parts_can_be_estimated_although_they_are_given(gopro: PrepareConfig) -> None:
     prepare(replace(gopro, estimate=("flow",)))
-    assert provenance(gopro.out)["flow"] == "estimated" and provenance(gopro.out)["mask"] == "given"
+    assert provenance(gopro.out)["flow"] == "estimated" and provenance(gopro.out)["masks"] == "given"
     assert not (Scene.open(gopro.out).train[4].flow[1].numpy() == [1, 0.5]).all()
 
 
@@ -176,7 +176,7 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
     prepare(gopro)
     steps = Manifest.load(gopro.out).steps
     assert {n: s.details["attempt"] for n, s in steps.items()} == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "mask": 2, "rims": 2, "depth": 2, "sheet": 2,
+        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "masks": 2, "refined_flow": 2, "depth": 2, "sheet": 2,
     }  # fmt: skip
 
 
@@ -289,7 +289,7 @@ def reference_of_rounds(m: Manifest) -> float:
     """The EV of the first picture of a still scene whose first, third and fifth exposures, all given, come in turn."""
     gauge = m.frames[0].ev
     assert gauge is not None and [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
-    assert m.steps["mask"].provenance == "given" and m.exposure_given
+    assert m.steps["masks"].provenance == "given" and m.exposure_given
     return gauge
 
 
@@ -335,20 +335,20 @@ def test_every_second_pose_of_a_real_hdr_nerf_scene_is_held_out(tmp_path: Path) 
             assert (read_image(folder / name) == np.float32(expected)).all()
 
 
-def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimetres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimeters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = PrepareConfig(mini.nerfstudio(tmp_path / "set"), tmp_path / "scene", max_size=W)
     m = Manifest.load(prepare(config))
     assert [f.source for f in m.frames] == [f"images/frame_{n:05d}.png" for n in (0, 1, 2, 3, 5, 6, 7)]
     assert [f.time for f in m.frames] == [0, 1, 2, 3, 5, 6, 7]
     assert float(1 / Scene.open(config.out).train[0].disparity[0, 0]) == pytest.approx(mini.WALL, rel=1e-3)
-    assert provenance(config.out)["mask"] == "estimated" and "not what moves: not used" in " ".join(
+    assert provenance(config.out)["masks"] == "estimated" and "not what moves: not used" in " ".join(
         capsys.readouterr().err.split()
     )
     view = Truth.open(tmp_path / "scene_truth").views[0]
     assert (view.name, view.time) == ("images_frame_00004", 4.0)
 
 
-def test_depth_in_16_bit_pictures_is_in_millimetres_too(tmp_path: Path) -> None:
+def test_depth_in_16_bit_pictures_is_in_millimeters_too(tmp_path: Path) -> None:
     root = mini.nerfstudio(tmp_path / "set")
     for path in (root / "depth").glob("*.npy"):
         write_png(path.with_suffix(".png"), np.full((H, W, 3), 1000 * mini.WALL / 65535), bits=16)

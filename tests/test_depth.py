@@ -14,7 +14,7 @@ from hdr_nsff.priors.depth.geometric import geometric_depth
 from hdr_nsff.priors.depth.parallax import choose_views, triangulate
 from hdr_nsff.priors.depth.plane_sweep import aggregate, best_share, box
 from hdr_nsff.priors.movers.distance import differences, link, mover_depth, regions, smoothest_path, split, steps_in_time
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 H, W, F = 48, 64, 60.0
 K = np.array([[F, 0, W / 2], [0, F, H / 2], [0, 0, 1.0]])
@@ -55,8 +55,8 @@ def exact_flow(c2w: np.ndarray, depth: np.ndarray, pairs: np.ndarray) -> np.ndar
     return np.stack([m[..., :2] / m[..., 2:] * F + [W / 2, H / 2] - np.stack([X, Y], -1) for m in moved]).astype(np.float32)
 
 
-def neighbours(count: int) -> np.ndarray:
-    """Pairs (P, 2) of neighbours, both ways."""
+def neighbors(count: int) -> np.ndarray:
+    """Pairs (P, 2) of neighbors, both ways."""
     return np.array([p for i in range(count - 1) for p in ((i, i + 1), (i + 1, i))])
 
 
@@ -64,18 +64,20 @@ def solve(c2w, video, depth, moving=None, clipped=None, **given):
     """`geometric_depth` with exact flow of the static scene."""
     nothing = np.zeros(video.shape[:3], bool)
     moving, clipped = (nothing if m is None else m for m in (moving, clipped))
-    pairs = neighbours(len(c2w))
+    pairs = neighbors(len(c2w))
     flow = exact_flow(c2w, depth, pairs)
     valid = ~clipped[pairs[:, 0]] & ~clipped[pairs[:, 1]]
     return geometric_depth(K, c2w, flow, valid, pairs, moving, given.pop("points", NO_POINTS), video, clipped, **given)
 
 
-def shots(c2w, moving=None, video=None) -> Shots:
-    """Frames with poses, grey unless given."""
+def clip(c2w, moving=None, video=None) -> PosedVideo:
+    """Frames with poses, gray unless given."""
     size = (len(c2w), H, W)
     video = np.full((*size, 3), 0.5, np.float32) if video is None else video
     moving = np.zeros(size, bool) if moving is None else moving
-    return Shots(np.broadcast_to(K, (len(c2w), 3, 3)), c2w, np.arange(len(c2w), dtype=float), video, np.zeros(size, bool), moving)
+    return PosedVideo(
+        np.broadcast_to(K, (len(c2w), 3, 3)), c2w, np.arange(len(c2w), dtype=float), video, np.zeros(size, bool), moving
+    )
 
 
 @pytest.mark.parametrize(("z0", "slope"), [(4.0, 0.0), (4.0, 0.6), (2.5, -0.4)])
@@ -159,14 +161,14 @@ def test_frames_without_anything_to_match_do_not_crash():
 def test_points_triangulated_from_exact_flow_are_exact():
     c2w = SWEEPING[:3]
     _, depth = plane(c2w, 4.0, 0.5)
-    pairs = neighbours(3)
-    points = triangulate(shots(c2w), exact_flow(c2w, depth, pairs), np.ones((4, H, W), bool), pairs)
+    pairs = neighbors(3)
+    points = triangulate(clip(c2w), exact_flow(c2w, depth, pairs), np.ones((4, H, W), bool), pairs)
     assert len(points) > 500
     assert np.abs(points[:, 2] - (4.0 + 0.5 * points[:, 0])).max() < 1e-3
 
 
 def test_transfer_is_projection_of_the_unprojected_pixel():
-    s = shots(at((0, 0, 0), (0.3, -0.2, 0.5)))
+    s = clip(at((0, 0, 0), (0.3, -0.2, 0.5)))
     turn, shift = s.transfer(0, 1)
     pixel, disparity = np.array([[20.5, 11.5]]), np.array([0.4])
     q = turn @ [20.5, 11.5, 1] + disparity * shift
@@ -178,7 +180,7 @@ def test_transfer_is_projection_of_the_unprojected_pixel():
 def test_views_with_good_parallax_are_chosen_first():
     """Points at z = 4, focal 60: baselines of 0.01, 0.2 and 2 move them by 0.15, 3 and 30 px; 5 % of 64 px is 3.2 px."""
     points = np.stack([RAYS[..., 0] * 4, RAYS[..., 1] * 4, np.full((H, W), 4.0)], -1)[::8, ::8].reshape(-1, 3)
-    views, largest = choose_views(shots(at((0, 0, 0), (0.01, 0, 0), (0.2, 0, 0), (2, 0, 0))), points, 12)
+    views, largest = choose_views(clip(at((0, 0, 0), (0.01, 0, 0), (0.2, 0, 0), (2, 0, 0))), points, 12)
     assert views[0][0] == 2
     assert np.isclose(largest, 30, rtol=0.02)
 
@@ -204,7 +206,7 @@ def test_matching_is_smooth_where_costs_say_nothing():
 
 def test_a_map_carried_over_shifts_by_its_parallax_and_the_nearer_surface_wins():
     """Baseline 1, focal 60: disparity 0.05 moves by 3 px, 0.1 by 6 px; both land on column 20, the nearer stays."""
-    s = shots(at((0, 0, 0), (-1, 0, 0)))
+    s = clip(at((0, 0, 0), (-1, 0, 0)))
     disparity, weight = np.zeros((H, W), np.float32), np.zeros((H, W), np.float32)
     disparity[10, 17], disparity[10, 14] = 0.05, 0.1
     weight[10, 17], weight[10, 14] = 1.0, 0.5
@@ -277,7 +279,7 @@ def crossing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         owner[t, 20:28, 34:44] = 2
         owner[t, 16:32, 10 + 3 * t : 26 + 3 * t] = 1
         moving[t] = owner[t] > 0
-    pairs = neighbours(6)
+    pairs = neighbors(6)
     speed = np.array([0, 3, 0])
     flow = np.zeros((len(pairs), H, W, 2), np.float32)
     for k, (i, j) in enumerate(pairs):
@@ -317,12 +319,12 @@ def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth():
     """A square at z = 2 before a wall at z = 4, moving by 0.03 per frame."""
     rng = np.random.default_rng(3)
     eyes = np.concatenate([0.03 * rng.standard_normal((20, 2)), np.zeros((20, 1))], 1)
-    centre = (np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1) - eyes[:, :2]) / 2 * F + [W / 2, H / 2]  # (20, 2) px
-    moving = np.stack([(np.abs(X - x) < 7) & (np.abs(Y - y) < 7) for x, y in centre])
-    pairs = neighbours(20)
-    flow = np.stack([np.broadcast_to(centre[j] - centre[i], (H, W, 2)) for i, j in pairs]).astype(np.float32)
+    center = (np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1) - eyes[:, :2]) / 2 * F + [W / 2, H / 2]  # (20, 2) px
+    moving = np.stack([(np.abs(X - x) < 7) & (np.abs(Y - y) < 7) for x, y in center])
+    pairs = neighbors(20)
+    flow = np.stack([np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]).astype(np.float32)
     wall = np.full((20, H, W), 0.25, np.float32)
-    disparity, confidence = mover_depth(shots(at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall)
+    disparity, confidence = mover_depth(clip(at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall)
     assert np.abs(disparity[moving] * 2 - 1).mean() < 0.03
     assert (disparity[~moving] == 0.25).all()
     assert confidence[~moving].max() == 0 and 0.4 < confidence[moving].mean() <= 0.5

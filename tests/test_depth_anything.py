@@ -8,7 +8,7 @@ from tiny_networks import tiny_depth_anything
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.depth.depth_anything import align, anchored_depth, network_disparity, picture
 from hdr_nsff.priors.pretrained import pretrained
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 H, W, F = 48, 64, 60.0
 K = np.array([[F, 0, W / 2], [0, F, H / 2], [0, 0, 1.0]])
@@ -50,7 +50,7 @@ def test_a_metric_network_needs_one_scale_per_frame_and_gets_no_shift():
     np.testing.assert_allclose(lines[:, 0], scales[:, 0], rtol=0.01)
 
 
-def test_a_frame_without_points_takes_the_middle_of_its_neighbours():
+def test_a_frame_without_points_takes_the_middle_of_its_neighbors():
     seen = frames_of(np.array([[0.1, 0.2], [0.1, 0.2], [0.14, 0.1]]))
     seen[1] = seen[1][:0]
     lines, errors = align(seen, shift=True)
@@ -64,19 +64,19 @@ def test_a_frame_at_the_end_without_points_takes_that_of_the_frame_before():
     np.testing.assert_allclose(align(seen, shift=True)[0][2], CHANGING[1], rtol=1e-4)
 
 
-def test_two_wrong_points_of_a_frame_are_overruled_by_its_neighbours():
+def test_two_wrong_points_of_a_frame_are_overruled_by_its_neighbors():
     same = np.tile([0.1, 0.2], (3, 1))
     seen = frames_of(same, noise=0.002)
     seen[1] = np.array([[2.0, 2.5], [8.0, 0.1]])  # near is far
     np.testing.assert_allclose(align(seen, shift=True)[0][1], same[1], rtol=0.05)
 
 
-def test_many_points_are_not_bent_towards_the_neighbours():
+def test_many_points_are_not_bent_towards_the_neighbors():
     own = np.array([[0.1, 0.0], [0.3, 0.5], [0.1, 0.0]])
     np.testing.assert_allclose(align(frames_of(own, number=40), shift=True)[0], own, atol=1e-6)
 
 
-def slanted(count: int = 3) -> tuple[Shots, np.ndarray, np.ndarray]:
+def slanted(count: int = 3) -> tuple[PosedVideo, np.ndarray, np.ndarray]:
     """Cameras beside each other that see a slanted wall, its disparity (T, H, W), and points on it."""
     c2w = np.stack([np.concatenate([np.eye(3), [[0.1 * t], [0], [0]]], 1) for t in range(count)])
     _, x = np.indices((H, W)) + 0.5
@@ -85,44 +85,44 @@ def slanted(count: int = 3) -> tuple[Shots, np.ndarray, np.ndarray]:
     wall = np.random.default_rng(0).uniform([-0.8, -0.6], [0.8, 0.6], (400, 2))
     points = np.stack([wall[:, 0], wall[:, 1], 2 + 0.5 * wall[:, 0]], 1)
     empty = np.zeros((count, H, W), bool)
-    shots = Shots(
+    clip = PosedVideo(
         np.tile(K, (count, 1, 1)), c2w, np.arange(count, dtype=float), np.zeros((count, H, W, 3), np.float32), empty, empty.copy()
     )
-    return shots, disparity.astype(np.float32), points
+    return clip, disparity.astype(np.float32), points
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
 def test_answers_of_a_wall_become_its_disparity_in_scene_units(kind):
-    shots, true, points = slanted()
+    clip, true, points = slanted()
     answered = 7 * true + (3 if kind == "relative" else 0)
-    disparity, confidence, near, far = anchored_depth(answered, kind, shots, points, *NONE)
+    disparity, confidence, near, far = anchored_depth(answered, kind, clip, points, *NONE)
     np.testing.assert_allclose(disparity, true, rtol=2e-3)
     assert confidence.min() > 0.95 and near < 1 / true.max() and far > 1 / true.min()
 
 
 def test_points_behind_a_mover_have_no_say():
-    shots, true, points = slanted()
-    shots.moving[:, :, : W // 2] = True
-    answered = np.where(shots.moving, 40, 7 * true + 3).astype(np.float32)  # something near in front of that half
-    disparity, _, _, _ = anchored_depth(answered, "relative", shots, points, *NONE)
-    np.testing.assert_allclose(disparity[~shots.moving], true[~shots.moving], rtol=2e-3)
-    assert disparity[shots.moving].min() > 1.5 * true.max()
+    clip, true, points = slanted()
+    clip.moving[:, :, : W // 2] = True
+    answered = np.where(clip.moving, 40, 7 * true + 3).astype(np.float32)  # something near in front of that half
+    disparity, _, _, _ = anchored_depth(answered, "relative", clip, points, *NONE)
+    np.testing.assert_allclose(disparity[~clip.moving], true[~clip.moving], rtol=2e-3)
+    assert disparity[clip.moving].min() > 1.5 * true.max()
 
 
 def test_answers_that_do_not_fit_the_points_are_believed_less_and_never_negative():
-    shots, true, points = slanted()
+    clip, true, points = slanted()
     noise = np.random.default_rng(1).normal(size=true.shape).astype(np.float32)
     answered = true + 0.3 * true * noise
     answered[:, 0, 0] = -100
-    disparity, confidence, _, _ = anchored_depth(answered, "relative", shots, points, *NONE)
+    disparity, confidence, _, _ = anchored_depth(answered, "relative", clip, points, *NONE)
     assert disparity.min() > 0 and (confidence[:, 0, 0] == 0).all()
     assert confidence.max() < 0.6
 
 
 def test_without_points_there_is_one_sentence():
-    shots, true, _ = slanted()
+    clip, true, _ = slanted()
     with pytest.raises(InputError, match="static points"):
-        anchored_depth(true, "relative", shots, np.zeros((0, 3)), *NONE)
+        anchored_depth(true, "relative", clip, np.zeros((0, 3)), *NONE)
 
 
 @pytest.fixture(scope="module", params=["relative", "metric"])

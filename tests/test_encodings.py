@@ -1,4 +1,4 @@
-"""Grids: the numba kernels against their plain-torch twin, hand-worked interpolation, the touched-only optimiser."""
+"""Grids: the numba kernels against their plain-torch twin, hand-worked interpolation, the touched-only optimizer."""
 
 import numpy as np
 import torch
@@ -85,15 +85,15 @@ def test_touched_adam_is_adam_where_every_row_has_a_gradient() -> None:
 
 def test_touched_adam_leaves_unmarked_rows_alone_and_clears_what_it_used() -> None:
     p, marks = torch.ones(2, 4, requires_grad=True), marked(2)
-    optimiser = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
+    optimizer = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
     p.grad = torch.ones(2, 4)
-    optimiser.step()
+    optimizer.step()
     assert float(p.grad.abs().sum()) == 0 and int(marks.sum()) == 0
-    before, moment = p.detach().clone(), optimiser.state[p]["exp_avg"].clone()
+    before, moment = p.detach().clone(), optimizer.state[p]["exp_avg"].clone()
     p.grad[0] = 1.0
     marks[0] = 1
-    optimiser.step()
-    assert torch.equal(p[1], before[1]) and torch.equal(optimiser.state[p]["exp_avg"][1], moment[1])
+    optimizer.step()
+    assert torch.equal(p[1], before[1]) and torch.equal(optimizer.state[p]["exp_avg"][1], moment[1])
     assert (p[0] < before[0]).all()
 
 
@@ -115,8 +115,8 @@ def test_frequencies_hold_identity_sines_and_cosines() -> None:
 
 def test_marks_stay_the_grids_own_through_a_loaded_state() -> None:
     p, marks = torch.ones(1, 4, requires_grad=True), marked(1)
-    optimiser = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
-    optimiser.load_state_dict(optimiser.state_dict())
+    optimizer = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
+    optimizer.load_state_dict(optimizer.state_dict())
     p.grad = torch.ones(1, 4)
-    optimiser.step()
+    optimizer.step()
     assert float(p.detach().max()) < 1 and int(marks.sum()) == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from toy_scene import WALL, ToyScene, camera_centre
+from toy_scene import WALL, ToyScene, camera_center
 
 from hdr_nsff import cli
 from hdr_nsff.core import io
@@ -19,7 +19,7 @@ EXPOSURES = (0.0, -1.5, -3.0)  # EV; the brightest clips a little
 
 
 def made_scene() -> ToyScene:
-    """The wall and the card with softer textures, so that neighbouring frames can be matched."""
+    """The wall and the card with softer textures, so that neighboring frames can be matched."""
     scene = ToyScene(WIDTH, HEIGHT, FRAMES)
     soft = [cv2.GaussianBlur(t, (0, 0), 3.0) for t in scene.textures]
     scene.textures = [np.clip((t - t.mean()) * 3 + 0.5, 0.02, 1).astype(np.float32) for t in soft]
@@ -32,7 +32,7 @@ def write_clip(folder: Path) -> list[str]:
     for t in range(FRAMES):
         radiance, _, _ = scene.see(t)
         io.write_png(folder / f"frames/{t:05d}.png", np.clip(radiance * 2.0 ** EXPOSURES[t % 3], 0, 1) ** (1 / 2.2))
-        x, y, z = camera_centre(t)
+        x, y, z = camera_center(t)
         pose = np.array([[0, 1, 0, x, HEIGHT], [1, 0, 0, y, WIDTH], [0, 0, -1, z, scene.f]])  # columns: down, right, back
         rows.append([*pose.ravel(), 1.8, 5.0])
     io.write_npy(folder / "poses_bounds.npy", np.array(rows))
@@ -83,7 +83,7 @@ def test_radiance_comes_out_linear_unclipped_and_at_the_right_scale(out: Path) -
         ratio = channels["RGB"] / truth
         assert 0.8 < float(np.median(ratio)) < 1.25
         error, flat = np.abs(channels["RGB"] - truth).mean(), np.abs(truth - truth.mean()).mean()
-        assert error < 0.75 * flat, "no better than one grey"
+        assert error < 0.75 * flat, "no better than one gray"
         assert float(channels["motion"].min()) >= 0 and float(channels["motion"].max()) <= 1
         assert abs(float(np.median(channels["Z"])) / WALL - 1) < 0.15
 
@@ -104,12 +104,12 @@ def test_ldr_views_depth_and_scene_flow_are_there_for_every_frame(out: Path) -> 
         assert len(list((out / "render" / name).glob("*.png"))) == 12
 
 
-def test_held_out_frames_are_met_better_than_by_one_grey(out: Path) -> None:
+def test_held_out_frames_are_met_better_than_by_one_gray(out: Path) -> None:
     metrics = json.loads((out / "run/metrics.json").read_text())
     assert metrics["headline"]["views"] == 2 and metrics["kind"] == "held-out frames"
     test = Run.open(out / "run").scene.test
-    grey = np.mean([-10 * np.log10(float(f.image.var(unbiased=False))) for f in test])
-    assert metrics["headline"]["psnr"] > grey + 1
+    gray = np.mean([-10 * np.log10(float(f.image.var(unbiased=False))) for f in test])
+    assert metrics["headline"]["psnr"] > gray + 1
 
 
 def test_the_report_is_one_page_that_needs_nothing_else(out: Path) -> None:

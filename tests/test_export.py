@@ -19,13 +19,13 @@ from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths import color
 from hdr_nsff.rendering import export, ply
-from hdr_nsff.rendering.export import ExportConfig, GaussianField, Look, export_one, export_sequence
+from hdr_nsff.rendering.export import Coloring, ExportConfig, GaussianField, export_one, export_sequence
 from hdr_nsff.rendering.shots import develop
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 from hdr_nsff.training.run_folder import Run, write_config
 
-LINEAR = Look(linear=True)
+LINEAR = Coloring(linear=True)
 
 
 def make_run(toy: Scene, folder: Path, preset: str = "splat") -> Run:
@@ -74,7 +74,7 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     given = ply.Splats(g.normal(size=(9, 3)), quaternions, g.random((9, 3)) + 0.01, g.random(9), 100 * g.random((9, 3)))
     ply.write(tmp_path / "a.ply", given, ["a remark"])
     found = ply.read(tmp_path / "a.ply")
-    for name in ("means", "quaternions", "scales", "opacities", "colours"):
+    for name in ("means", "quaternions", "scales", "opacities", "colors"):
         np.testing.assert_allclose(getattr(found, name), getattr(given, name), rtol=1e-5, atol=1e-6)
 
 
@@ -89,7 +89,7 @@ def test_extremes_stay_finite(tmp_path: Path) -> None:
 def test_the_file_renders_the_fields_own_picture(run: Run, tmp_path: Path, time: float) -> None:
     v = ply.read(export_one(run, tmp_path / "a.ply", time, LINEAR))
     camera = run.scene.train[2].camera
-    parts = (v.means, v.quaternions, v.scales, v.opacities, v.colours)
+    parts = (v.means, v.quaternions, v.scales, v.opacities, v.colors)
     seen = rasterize(*(torch.from_numpy(np.array(p, np.float32)) for p in parts), camera)
     behind = (1 - seen.alpha)[..., None] * splat(run).background.detach().exp()
     picture = (seen.features + behind).reshape(-1, 3)
@@ -116,18 +116,18 @@ def test_moving_gaussians_are_at_their_place(run: Run) -> None:
     assert float((early.means[moving] - late.means[moving]).norm(dim=1).min()) > 0
 
 
-def test_colours_are_developed_by_the_learned_camera(run: Run, tmp_path: Path) -> None:
-    radiance = ply.read(export_one(run, tmp_path / "linear.ply", 1.0, LINEAR)).colours
-    rgb = ply.read(export_one(run, tmp_path / "rgb.ply", 1.0, Look(ev=-1.0))).colours
+def test_colors_are_developed_by_the_learned_camera(run: Run, tmp_path: Path) -> None:
+    radiance = ply.read(export_one(run, tmp_path / "linear.ply", 1.0, LINEAR)).colors
+    rgb = ply.read(export_one(run, tmp_path / "rgb.ply", 1.0, Coloring(ev=-1.0))).colors
     np.testing.assert_allclose(rgb, develop(run, radiance, -1.0, 0, 1.0), atol=1e-5)
     expected = (0.5 * radiance).clip(0, 1) ** (1 / 2.2)  # the untrained curve
     np.testing.assert_allclose(rgb, expected, atol=0.01)
 
 
-def test_without_an_ev_colours_are_tone_mapped_for_a_display(run: Run, tmp_path: Path) -> None:
-    radiance = ply.read(export_one(run, tmp_path / "linear.ply", 1.0, LINEAR)).colours
-    shown = ply.read(export_one(run, tmp_path / "shown.ply", 1.0, Look())).colours
-    np.testing.assert_allclose(shown, color.display(radiance, export.exposure_of(run, Look())), atol=1e-4)
+def test_without_an_ev_colors_are_tone_mapped_for_a_display(run: Run, tmp_path: Path) -> None:
+    radiance = ply.read(export_one(run, tmp_path / "linear.ply", 1.0, LINEAR)).colors
+    shown = ply.read(export_one(run, tmp_path / "shown.ply", 1.0, Coloring())).colors
+    np.testing.assert_allclose(shown, color.display(radiance, export.exposure_of(run, Coloring())), atol=1e-4)
     assert shown.min() >= -1e-6 and shown.max() <= 1 + 1e-6 and 0.1 < np.median(shown) < 0.9
 
 
@@ -154,7 +154,7 @@ def test_another_checkpoint_or_look_starts_the_sequence_over(run: Run, tmp_path:
     splat(run).static.means.data += 0.01
     export_sequence(replace(run, step=8), tmp_path, LINEAR)
     second = (tmp_path / "00002.ply").read_bytes()
-    export_sequence(replace(run, step=8), tmp_path, Look(ev=0.0))
+    export_sequence(replace(run, step=8), tmp_path, Coloring(ev=0.0))
     assert len({first, second, (tmp_path / "00002.ply").read_bytes()}) == 3
 
 
@@ -174,7 +174,7 @@ def test_times_outside_the_clip_are_refused(run: Run, tmp_path: Path, time: floa
 
 def test_a_camera_the_run_has_not_learned_is_refused(run: Run, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="learned cameras 0 to 0"):
-        export_sequence(run, tmp_path / "out", Look(ev=0.0, camera_id=3))
+        export_sequence(run, tmp_path / "out", Coloring(ev=0.0, camera_id=3))
 
 
 def test_no_file_of_the_users_is_overwritten(run: Run, tmp_path: Path) -> None:
@@ -193,8 +193,8 @@ def test_no_file_of_the_users_is_overwritten(run: Run, tmp_path: Path) -> None:
         ({"ply": True, "ply_sequence": True}, "--ply-sequence"),
         ({"ply": True, "out": Path("a.obj")}, "ends in .ply"),
         ({"ply_sequence": True, "time": 1.0}, "every training time"),
-        ({"ply": True, "look": Look(ev=1.0, linear=True)}, "not developed"),
-        ({"ply": True, "look": Look(ev=float("nan"))}, "in stops"),
+        ({"ply": True, "coloring": Coloring(ev=1.0, linear=True)}, "not developed"),
+        ({"ply": True, "coloring": Coloring(ev=float("nan"))}, "in stops"),
     ],
 )
 def test_settings_that_make_no_sense_are_one_sentence(change: dict, word: str) -> None:

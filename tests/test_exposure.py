@@ -10,7 +10,7 @@ from hdr_nsff.radiometry.exposure_cycle import (
     common_brackets,
     detect_cycle,
     doubts,
-    equalise,
+    equalize,
     period,
     reference_bracket,
     value_ranks,
@@ -105,37 +105,37 @@ def test_reference_is_the_best_exposed_bracket():
     assert reference_bracket(clip([-7, 0.5, 5]), [0, 1, 2] * 8) == 1
 
 
-def test_equalised_exposures_agree_where_both_recorded():
+def test_equalized_exposures_agree_where_both_recorded():
     video = clip([-2, 0, 2], frames=9)
-    equalised, clipped = equalise(video, [0, 1, 2] * 3)
+    equalized, clipped = equalize(video, [0, 1, 2] * 3)
     for a, b in ((0, 1), (1, 2)):
         both = ~clipped[a] & ~clipped[b]
-        before, after = (np.abs(v[a] - v[b])[both].mean() for v in (video, equalised))
+        before, after = (np.abs(v[a] - v[b])[both].mean() for v in (video, equalized))
         assert after < 0.02 < 0.1 < before
 
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=2, max_size=3), st.integers(0, 5))
-def test_equalising_keeps_the_order_of_values_in_every_frame(evs, seed):
+def test_equalizing_keeps_the_order_of_values_in_every_frame(evs, seed):
     video = clip(evs, frames=6, seed=seed)
-    equalised, _ = equalise(video, [t % len(evs) for t in range(6)])
+    equalized, _ = equalize(video, [t % len(evs) for t in range(6)])
     for t in range(6):
         order = np.argsort(video[t, ..., 1].ravel(), kind="stable")
-        assert (np.diff(equalised[t, ..., 1].ravel()[order]) >= -1e-6).all()
-    assert equalised.min() >= 0 and equalised.max() <= 1
+        assert (np.diff(equalized[t, ..., 1].ravel()[order]) >= -1e-6).all()
+    assert equalized.min() >= 0 and equalized.max() <= 1
 
 
 def test_one_exposure_is_left_as_it_is():
     video = clip([-1], frames=4)
-    equalised, _ = equalise(video, [0] * 4)
-    assert np.abs(equalised - video)[video < 0.97].max() < 3 / 255
+    equalized, _ = equalize(video, [0] * 4)
+    assert np.abs(equalized - video)[video < 0.97].max() < 3 / 255
 
 
 def test_saturated_and_black_pixels_are_marked():
     video = np.full((2, 4, 4, 3), 0.5, np.float32)
     video[0, 0, 0], video[0, 1, 1], video[0, 2, 2] = 1.0, 0.0, (1.0, 0.5, 0.5)
     video[1, :2] = 0.1
-    _, clipped = equalise(video, [0, 0])
+    _, clipped = equalize(video, [0, 0])
     assert clipped[0, 0, 0] and clipped[0, 1, 1]
     assert not clipped[0, 2, 2] and clipped.sum() == 2
 
@@ -144,7 +144,7 @@ def test_held_out_frames_do_not_shape_the_histograms():
     video, pool = clip([-2, 2], frames=8), np.arange(8) != 3
     changed = video.copy()
     changed[3] = 0.7
-    a, b = (equalise(v, [0, 1] * 4, pool)[0] for v in (video, changed))
+    a, b = (equalize(v, [0, 1] * 4, pool)[0] for v in (video, changed))
     assert np.array_equal(a[pool], b[pool])
 
 

@@ -54,7 +54,7 @@ def dino(tmp_path_factory):
     return folder
 
 
-def test_a_folded_normalisation_is_convolution_then_batch_norm():
+def test_a_folded_normalization_is_convolution_then_batch_norm():
     state = random_state()
     network, x = XFeat(state), torch.rand(1, 1, 8, 8)
     plain = torch.nn.functional.conv2d(x, state["block1.0.layer.0.weight"], padding=1)

@@ -13,11 +13,11 @@ from hdr_nsff.fields.baselines.hexplane import HexPlane
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths.volume import transmittance, weighted_sum
-from hdr_nsff.scene.batch import Look, draw_pixels
+from hdr_nsff.scene.batch import Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.config import METHODS, PRESETS
 
-LOOK = Look(lambda radiance: (radiance / 2).clamp(0, 1), (1, 4))
+LOOK = Recorder(lambda radiance: (radiance / 2).clamp(0, 1), (1, 4))
 
 
 @pytest.fixture(scope="module", params=list(NETWORKS))
@@ -67,7 +67,7 @@ def test_rendering_in_chunks_changes_nothing(field: AnyField, toy: Scene) -> Non
 
 def test_what_is_recorded_of_a_field_has_the_shape_and_range_of_a_picture(field: AnyField, toy: Scene) -> None:
     camera = toy.train[2].camera
-    darker = Look(lambda radiance: LOOK.rgb(radiance / 4), LOOK.images)
+    darker = Recorder(lambda radiance: LOOK.rgb(radiance / 4), LOOK.images)
     rgb, dark = recorded(field, camera, 2.0, [LOOK, darker])
     torch.testing.assert_close(dark, recorded(field, camera, 2.0, [darker])[0])  # as alone
     assert dark.shape == rgb.shape and dark.mean() < rgb.mean()
@@ -114,7 +114,7 @@ def test_layers_composite_to_the_render(nsff: NSFF, toy: Scene) -> None:
     assert float((motion - render.motion).abs().mean()) < 0.03
 
 
-def test_a_training_pass_has_warps_and_regularisers(nsff: NSFF, toy: Scene) -> None:
+def test_a_training_pass_has_warps_and_regularizers(nsff: NSFF, toy: Scene) -> None:
     batch = replace(draw_pixels(toy, 3, 40, 10, torch.Generator().manual_seed(0)), seed=1, chain=-1)
     nsff.train()
     render, own = nsff(batch)
@@ -135,9 +135,9 @@ def test_a_pass_is_told_by_its_seed(nsff: NSFF, toy: Scene) -> None:
     assert torch.equal(one, same) and not torch.equal(one, other)
 
 
-def test_at_the_ends_of_the_clip_there_is_one_neighbour(field: AnyField, toy: Scene) -> None:
+def test_at_the_ends_of_the_clip_there_is_one_neighbor(field: AnyField, toy: Scene) -> None:
     for frame, offset in ((0, 1), (len(toy.train) - 1, -1)):
-        batch = replace(draw_pixels(toy, frame, 20, 0, torch.Generator().manual_seed(0)), chain=-offset, look=LOOK)
+        batch = replace(draw_pixels(toy, frame, 20, 0, torch.Generator().manual_seed(0)), chain=-offset, recorder=LOOK)
         wanted = [offset] if isinstance(field, NSFF | Splat) else []
         assert [w.offset for w in field(batch)[0].warps] == wanted
 

@@ -9,7 +9,7 @@ from hdr_nsff.core.io import write_npy, write_png
 from hdr_nsff.footage.flow_files import read_flow
 from hdr_nsff.geometry.round_trip import agreement, follow
 from hdr_nsff.priors.flow.dense import flow, halfway
-from hdr_nsff.radiometry.common_range import common_grey, recorded_range
+from hdr_nsff.radiometry.common_range import common_gray, recorded_range
 
 H, W = 64, 96
 NOTHING = np.zeros((H, W), bool)
@@ -101,12 +101,12 @@ def test_what_an_occluder_hides_fails_the_check():
 
 
 def test_both_frames_are_cut_to_what_both_recorded():
-    """Frame 0 holds greys 0.2 to 1, frame 1 only up to 0.5: white is 0.5 in both, black 0.2."""
+    """Frame 0 holds grays 0.2 to 1, frame 1 only up to 0.5: white is 0.5 in both, black 0.2."""
     ramp = np.repeat(np.linspace(0.2, 1, W, dtype=np.float32)[None, :, None], H, 0).repeat(3, -1)
     video = np.stack([ramp, np.minimum(ramp, 0.5)])
     clipped = np.stack([NOTHING, video[1, ..., 0] >= 0.5])
     ranges = [recorded_range(f, c) for f, c in zip(video, clipped, strict=True)]
-    a, b = common_grey(video, ranges, 0, 1)
+    a, b = common_gray(video, ranges, 0, 1)
     assert np.abs(a.astype(int) - b).max() <= 1
     assert a.min() == 0 and a.max() == 255
 

@@ -65,8 +65,8 @@ def test_a_network_is_a_flow_prior_that_checks_itself():
 def test_the_search_mends_what_is_nearly_right_and_leaves_the_rest():
     """Noise that slides by (3, 0): from (3.4, 0) it is found; from (9, 6), whatever the search says is no more than half a pixel away."""
     noise = cv2.GaussianBlur(np.random.default_rng(0).random((64, 110)).astype(np.float32), (0, 0), 2)
-    grey = np.rint(255 * (noise - noise.min()) / np.ptp(noise)).astype(np.uint8)
-    a, b = grey[:, 5:-9].copy(), grey[:, 2:-12].copy()
+    gray = np.rint(255 * (noise - noise.min()) / np.ptp(noise)).astype(np.uint8)
+    a, b = gray[:, 5:-9].copy(), gray[:, 2:-12].copy()
     near, far = (np.broadcast_to(np.float32(f), (*a.shape, 2)).copy() for f in ((3.4, 0), (9, 6)))
     assert np.median(np.abs(mended(a, b, near) - [3, 0])) < 0.1
     assert np.linalg.norm(mended(a, b, far) - far, axis=-1).max() <= 0.5

@@ -84,7 +84,7 @@ def test_flyingthings_has_both_eyes_and_both_ways(tmp_path: Path):
     assert np.array_equal(sample.flow[0], FLOW) and np.array_equal(sample.flow[1], -FLOW) and sample.known.all()
 
 
-def test_rendered_scenes_are_pairs_of_neighbours(tmp_path: Path):
+def test_rendered_scenes_are_pairs_of_neighbors(tmp_path: Path):
     pairs = flow_pairs(synth(tmp_path))
     sample = read_sample(pairs[1])
     assert len(pairs) == 2 and sample.known.all()
@@ -100,7 +100,7 @@ def test_unknown_flow_is_not_known(tmp_path: Path):
     assert not sample.known[0][4, 4] and (sample.flow[0][4, 4] == 0).all()
 
 
-def test_big_endian_and_grey_float_maps(tmp_path: Path):
+def test_big_endian_and_gray_float_maps(tmp_path: Path):
     (tmp_path / "a.pfm").write_bytes(b"Pf\n2 2\n1.0\n" + np.array([3, 4, 1, 2], ">f4").tobytes())
     assert read_pfm(tmp_path / "a.pfm")[..., 0].tolist() == [[1, 2], [3, 4]]  # from the bottom to the top
 
@@ -136,7 +136,7 @@ def test_exposures_are_as_far_apart_as_asked():
     assert np.abs(same[0] - same[1]).mean() < 0.02
 
 
-def test_equalised_pairs_look_alike():
+def test_equalized_pairs_look_alike():
     raw, equal = (recorded_pair(sample().radiance, 4, e) for e in (False, True))
     assert np.abs(equal[0] - equal[1]).mean() < 0.3 * np.abs(raw[0] - raw[1]).mean()
 

@@ -87,8 +87,8 @@ def test_features_learn_from_training_frames_of_one_camera_at_a_time():
         )
         for k in range(7)
     ]
-    neighbours, equal = learning_pairs(frames)
-    assert neighbours == [(0, 2), (2, 3), (3, 4), (5, 6)]
+    neighbors, equal = learning_pairs(frames)
+    assert neighbors == [(0, 2), (2, 3), (3, 4), (5, 6)]
     assert equal == [(0, 2), (2, 4)]
 
 

@@ -130,6 +130,6 @@ def test_sizes_that_do_not_fall_into_windows_are_our_own_mistake():
         small()(torch.zeros(2, 3, 32, 40))
 
 
-def test_normalisation_is_that_of_the_encoder():
-    grey = gmflow.normalised(torch.full((1, 3, 1, 1), 0.485))
-    assert grey[0, 0].item() == pytest.approx(0) and grey[0, 1].item() == pytest.approx((0.485 - 0.456) / 0.224)
+def test_normalization_is_that_of_the_encoder():
+    gray = gmflow.normalized(torch.full((1, 3, 1, 1), 0.485))
+    assert gray[0, 0].item() == pytest.approx(0) and gray[0, 1].item() == pytest.approx((0.485 - 0.456) / 0.224)

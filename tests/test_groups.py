@@ -118,7 +118,7 @@ def test_tracks_end_between_two_things() -> None:
     assert out[0, 0] == pytest.approx(25) and np.isnan(out[1, 0]) and out[2, 0] == pytest.approx(18.2)
 
 
-def test_tracks_without_neighbours_are_parts_by_themselves() -> None:
+def test_tracks_without_neighbors_are_parts_by_themselves() -> None:
     points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1, count=12)
     near = tracked(points)
     far = [replace(near, pixels=near.pixels + 1000.0 * k) for k in range(12)]

@@ -18,7 +18,7 @@ from hdr_nsff.fields.baselines.planes import AXES, Planes
 from hdr_nsff.rendering.export import ExportConfig, export
 from hdr_nsff.rendering.render import RenderConfig, render
 from hdr_nsff.rendering.shots import Output
-from hdr_nsff.scene.batch import Look, PixelBatch, draw_pixels
+from hdr_nsff.scene.batch import PixelBatch, Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
@@ -88,7 +88,7 @@ class Slab(nn.Module):
 
 
 def see_through(toy: Scene, bright: float, dark: float) -> tuple[HexPlane, PixelBatch]:
-    """A field of a dark veil before a bright wall, and a batch of one ray's neighbourhood."""
+    """A field of a dark veil before a bright wall, and a batch of one ray's neighborhood."""
     field = random_field("hdr-hexplane", toy)
     assert isinstance(field, HexPlane)
     field.config = replace(field.config, samples=200, cull_after=0)
@@ -100,8 +100,8 @@ def see_through(toy: Scene, bright: float, dark: float) -> tuple[HexPlane, Pixel
 def test_recording_samples_and_then_compositing_is_not_recording_the_composite(toy: Scene) -> None:
     bright, dark = 8.0, 0.05
     field, batch = see_through(toy, bright, dark)
-    sigmoid = Look(lambda e: e / (1 + e), (0,))
-    seen = field(replace(batch, look=sigmoid))[0]
+    sigmoid = Recorder(lambda e: e / (1 + e), (0,))
+    seen = field(replace(batch, recorder=sigmoid))[0]
     assert seen.rgb is not None
     seen_through = (seen.radiance - dark * seen.opacity[:, None]) / (
         bright - dark
@@ -111,20 +111,20 @@ def test_recording_samples_and_then_compositing_is_not_recording_the_composite(t
     torch.testing.assert_close(seen.rgb, veil * dark / (1 + dark) + seen_through * bright / (1 + bright), atol=1e-4, rtol=1e-3)
     after = sigmoid.rgb(seen.radiance)
     assert bool((seen.rgb < after - 0.01).all())  # Jensen: the response is concave
-    straight = field(replace(batch, look=Look(lambda e: e, (0,))))[0]
+    straight = field(replace(batch, recorder=Recorder(lambda e: e, (0,))))[0]
     torch.testing.assert_close(straight.rgb, straight.radiance)  # a straight response commutes with compositing
 
 
 def test_one_radiance_along_an_opaque_ray_is_recorded_alike_both_ways(toy: Scene) -> None:
     field, batch = see_through(toy, 2.0, 2.0)
-    seen = field(replace(batch, look=Look(lambda e: e / (1 + e), (0,))))[0]
+    seen = field(replace(batch, recorder=Recorder(lambda e: e / (1 + e), (0,))))[0]
     torch.testing.assert_close(seen.rgb, torch.full_like(seen.rgb, 2 / 3), atol=2e-3, rtol=0)
 
 
 def test_the_recording_teaches_planes_networks_and_exposure(toy: Scene) -> None:
     field, gain = random_field("hdr-hexplane", toy), torch.zeros(1, requires_grad=True)
     batch = draw_pixels(toy, 2, 60, 0, torch.Generator().manual_seed(0))
-    render, own = field(replace(batch, look=Look(lambda e: e * gain.exp() / (1 + e * gain.exp()), (2,))))
+    render, own = field(replace(batch, recorder=Recorder(lambda e: e * gain.exp() / (1 + e * gain.exp()), (2,))))
     assert render.rgb is not None and set(own) == {"total_variation"}
     (render.rgb - batch.rgb).square().mean().backward()
     assert gain.grad is not None and float(gain.grad.abs()) > 0
@@ -134,7 +134,7 @@ def test_the_recording_teaches_planes_networks_and_exposure(toy: Scene) -> None:
 def test_density_is_the_published_softplus_of_a_shifted_number(toy: Scene) -> None:
     field, batch = see_through(toy, 1.0, 1.0)
     field.density_planes = Slab({0.5: 9.0})  # type: ignore[assignment]
-    render = field(replace(batch, look=Look(lambda e: e, (0,))))[0]
+    render = field(replace(batch, recorder=Recorder(lambda e: e, (0,))))[0]
     thickness = 75 * math.log(1 + math.exp(-1)) * 0.06  # softplus(9 - 10) = log(1 + 1 / e), over a slab of 0.06, at a right angle
     assert float(render.opacity.mean()) == pytest.approx(1 - math.exp(-thickness), rel=0.12)  # rays are slanted, samples coarse
 
@@ -152,7 +152,7 @@ def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(run_of:
     camera = run.scene.train[3].camera  # the middle frame's
     torch.testing.assert_close(exr, run.field.render(camera, 2.0).radiance, atol=1e-5, rtol=1e-4)
     png = torch.from_numpy(io.read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
-    torch.testing.assert_close(png, recorded(run.field, camera, 2.0, [run.tonemapper.look_at(2.0)])[0], atol=0.003, rtol=0)
+    torch.testing.assert_close(png, recorded(run.field, camera, 2.0, [run.tonemapper.recorder_at(2.0)])[0], atol=0.003, rtol=0)
 
 
 def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(run_of: Path, tmp_path: Path) -> None:
@@ -160,7 +160,7 @@ def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(run
     assert all(math.isfinite(result["headline"][name]) for name in ("psnr", "psnr_moving", "psnr_all_exposures"))
     run = Run.open(run_of)
     f = run.scene.train[1]
-    rgb = recorded(run.field, f.camera, f.time, [run.tonemapper.look(f.bracket, f.camera_id)])[0].view_as(f.image)
+    rgb = recorded(run.field, f.camera, f.time, [run.tonemapper.recorder(f.bracket, f.camera_id)])[0].view_as(f.image)
     psnr = next(v["psnr"] for v in result["views"] if v["time"] == f.time)
     assert psnr == pytest.approx(-10 * math.log10(float((rgb - f.image).square().mean())), abs=0.05)
     with pytest.raises(InputError, match="Gaussian"):

@@ -35,16 +35,16 @@ def expected() -> np.ndarray:
 
 def opengl(c2w: np.ndarray) -> list:
     """A 4x4 with columns right, up, back."""
-    right, down, forward, centre = c2w.T
-    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(centre, 1)], 1).tolist()
+    right, down, forward, center = c2w.T
+    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(center, 1)], 1).tolist()
 
 
 def llff_table() -> np.ndarray:
     """poses_bounds (3, 17): columns down, right, back."""
     rows = []
     for c in C2W:
-        right, down, forward, centre = c.T
-        matrix = np.stack([down, right, -forward, centre, np.array([H, W, FOCAL])], 1)
+        right, down, forward, center = c.T
+        matrix = np.stack([down, right, -forward, center, np.array([H, W, FOCAL])], 1)
         rows.append(np.append(matrix.ravel(), [2.0, 10.0]))
     return np.stack(rows)
 
@@ -151,7 +151,7 @@ def test_frames_of_a_video_are_matched_in_order(tmp_path):
     assert np.allclose(pixels(poses), expected())
 
 
-def test_a_frame_that_colmap_left_out_lies_between_its_neighbours(tmp_path):
+def test_a_frame_that_colmap_left_out_lies_between_its_neighbors(tmp_path):
     colmap_text(tmp_path)
     text = (tmp_path / "images.txt").read_text().splitlines()
     (tmp_path / "images.txt").write_text("\n".join(text[:3] + text[5:]) + "\n")  # without the second image

@@ -8,7 +8,18 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
-VERBS = {"prepare.prepare", "synth.synth", "synth.reexpose", "training.train", "rendering.render", "rendering.export", "evaluation.evaluate", "evaluation.report", "flow_training.finetune_flow", "prepare.weights"}
+VERBS = {
+    "prepare.prepare",
+    "synth.synth",
+    "synth.reexpose",
+    "training.train",
+    "rendering.render",
+    "rendering.export",
+    "evaluation.evaluate",
+    "evaluation.report",
+    "flow_training.finetune_flow",
+    "prepare.weights",
+}
 TRUTH = {  # who reads it, for `evaluate` and for `export --truth`, and the last three, which write it
     "evaluation.targets",
     "evaluation.scores.geometry",
@@ -111,7 +122,17 @@ def knows_the_truth(modules: set[str]) -> set[str]:
     return {m for m in modules if m in TRUTH | {"scene.truth"} or m.startswith("evaluation.scores.")}
 
 
-LEARNERS = ["training.train", "prepare.steps.footage", "prepare.steps.priors", "footage.datasets", "scene.scene", "scene.batch", "training.config", "training.run_folder", "rendering.render"]
+LEARNERS = [
+    "training.train",
+    "prepare.steps.footage",
+    "prepare.steps.priors",
+    "footage.datasets",
+    "scene.scene",
+    "scene.batch",
+    "training.config",
+    "training.run_folder",
+    "rendering.render",
+]
 
 
 @pytest.mark.parametrize("module", LEARNERS)
@@ -129,7 +150,9 @@ def test_prepare_reaches_the_truth_through_its_writer_alone():
 
 def test_export_reaches_the_truth_through_what_it_writes_it_with():
     door = "footage.layouts.held_out"
-    assert knows_the_truth(reached("rendering.export")) == {door, "scene.truth"} and {m for m in SOURCES if door in own_imports(m)} == {"rendering.export"}
+    assert knows_the_truth(reached("rendering.export")) == {door, "scene.truth"} and {
+        m for m in SOURCES if door in own_imports(m)
+    } == {"rendering.export"}
     assert not knows_the_truth(reached("rendering.export", without=frozenset({door})))
 
 

@@ -183,11 +183,11 @@ def test_held_out_frames_go_through_all_exposures():
 
 
 def write_dng(path: Path, level: float) -> None:
-    """A small raw photograph of a grey card, its upper half at half `level` of the sensor's range."""
+    """A small raw photograph of a gray card, its upper half at half `level` of the sensor's range."""
     tifffile = pytest.importorskip("tifffile")
     raw = np.full((64, 96), int(level * 65535), np.uint16)
     raw[:32] //= 2
-    matrix = (3.1339, -1.6169, -0.4906, -0.9785, 1.9160, 0.0333, 0.0720, -0.2290, 1.4057)  # XYZ to the camera's own colours
+    matrix = (3.1339, -1.6169, -0.4906, -0.9785, 1.9160, 0.0333, 0.0720, -0.2290, 1.4057)  # XYZ to the camera's own colors
 
     def ratios(values: tuple[float, ...]) -> tuple[int, ...]:
         return tuple(n for v in values for n in (round(v * 10000), 10000))

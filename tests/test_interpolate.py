@@ -11,12 +11,12 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import Layers
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.rendering.interpolate import Picture, neighbours, render_at, splat
+from hdr_nsff.rendering.interpolate import Picture, neighbors, render_at, splat
 
 CAMERA = camera()
 
 
-def red_centre(radiance: Tensor) -> Tensor:
+def red_center(radiance: Tensor) -> Tensor:
     """The centroid (x, y) in pixels of what is redder than the wall."""
     weight = (radiance[:, 0] - radiance[:, 1]).clamp_min(0)[:, None]
     return (CAMERA.pixel_grid() * weight).sum(0) / weight.sum()
@@ -26,9 +26,9 @@ def red_centre(radiance: Tensor) -> Tensor:
 @pytest.mark.parametrize("empty_moves", [False, True])
 def test_a_disc_at_constant_velocity_lands_at_the_closed_form_place(fraction: float, empty_moves: bool) -> None:
     field = DiscBeforeWall(empty_moves=empty_moves)
-    start, step = red_centre(field.render(CAMERA, 0.0).radiance), torch.tensor([8.0, 2.0])
+    start, step = red_center(field.render(CAMERA, 0.0).radiance), torch.tensor([8.0, 2.0])
     seen = render_at(field, CAMERA, fraction, [0.0, 1.0])
-    assert torch.allclose(red_centre(seen.radiance), start + fraction * step, atol=0.2)
+    assert torch.allclose(red_center(seen.radiance), start + fraction * step, atol=0.2)
     truth = field.render(CAMERA, fraction)
     assert (seen.radiance - truth.radiance).abs().mean() < 2.0  # 100 x half of the disc's edge (31 of 1536 pixels)
     assert abs(seen.motion.sum() - truth.motion.sum()) < 9  # the disc keeps its 79 pixels
@@ -43,7 +43,7 @@ def test_unmoved_wall_is_exact_and_nothing_tears_open() -> None:
 
 
 def one_layer(alpha: Tensor, value: Tensor, shift: Tensor) -> Picture:
-    """A single layer at z = 2 of `alpha` (S,) and grey radiance `value` (S,) after its samples moved by `shift` (S, 2) pixels."""
+    """A single layer at z = 2 of `alpha` (S,) and gray radiance `value` (S,) after its samples moved by `shift` (S, 2) pixels."""
     rays = CAMERA.rays(CAMERA.pixel_grid())
     flow = torch.cat([shift * 2 / FOCAL, torch.zeros(W * H, 1)], -1)[:, None]
     radiance = value[:, None, None].expand(-1, 1, 3)
@@ -60,22 +60,22 @@ def test_whole_pixels_of_flow_shift_the_picture_and_zero_flow_leaves_it() -> Non
         inside = slice(2, H - 2), slice(3, W)  # what came in from beyond the border is not known
         expected = alpha.view(H, W).roll((dy, dx), (0, 1)), (alpha * value).view(H, W).roll((dy, dx), (0, 1))
         assert torch.allclose(moved.opacity.view(H, W)[inside], expected[0][inside], atol=1e-4)
-        assert torch.allclose(moved.colour[:, 0].view(H, W)[inside], expected[1][inside], atol=1e-4)
+        assert torch.allclose(moved.color[:, 0].view(H, W)[inside], expected[1][inside], atol=1e-4)
 
 
 def test_splatting_keeps_the_energy_of_what_moves() -> None:
     alpha = torch.zeros(H, W)
     alpha[10:14, 10:14] = 0.5  # 16 pixels, over empty samples; they move by a quarter and three quarters of a pixel
     moved = one_layer(alpha.view(-1), torch.full((W * H,), 3.0), torch.tensor([0.25, 0.75]).expand(W * H, 2))
-    assert moved.opacity.sum().item() == pytest.approx(8.0, rel=0.06) and moved.colour[:, 0].sum().item() == pytest.approx(
+    assert moved.opacity.sum().item() == pytest.approx(8.0, rel=0.06) and moved.color[:, 0].sum().item() == pytest.approx(
         24.0, rel=0.06
     )
 
 
 def test_spreading_samples_leave_no_cracks() -> None:
-    centre = torch.tensor([W / 2, H / 2])
-    moved = one_layer(torch.ones(W * H), torch.ones(W * H), (CAMERA.pixel_grid() - centre) * 0.1)
-    assert moved.opacity.min() > 0.95 and torch.allclose(moved.colour[:, 0], moved.opacity[:, 0], atol=1e-5)
+    center = torch.tensor([W / 2, H / 2])
+    moved = one_layer(torch.ones(W * H), torch.ones(W * H), (CAMERA.pixel_grid() - center) * 0.1)
+    assert moved.opacity.min() > 0.95 and torch.allclose(moved.color[:, 0], moved.opacity[:, 0], atol=1e-5)
 
 
 def test_a_mover_over_empty_samples_stays_opaque_and_leaves_nothing_behind() -> None:
@@ -101,10 +101,10 @@ def test_where_neither_time_shows_anything_the_nearer_one_stands() -> None:
     assert torch.allclose(seen[:, : W // 2], torch.tensor(1.75))  # 0.25 * 1 + 0.75 * 2
 
 
-def test_neighbours_of_uneven_times() -> None:
-    assert neighbours(2.5, [0.0, 1.0, 4.0]) == (1.0, 4.0, 0.5)
-    assert neighbours(1.00001, [0.0, 1.0, 4.0]) == (1.0, 1.0, 0.0)
-    assert neighbours(9.0, [0.0, 1.0, 4.0]) == (4.0, 4.0, 0.0)
+def test_neighbors_of_uneven_times() -> None:
+    assert neighbors(2.5, [0.0, 1.0, 4.0]) == (1.0, 4.0, 0.5)
+    assert neighbors(1.00001, [0.0, 1.0, 4.0]) == (1.0, 1.0, 0.0)
+    assert neighbors(9.0, [0.0, 1.0, 4.0]) == (4.0, 4.0, 0.0)
 
 
 def test_direct_query_and_training_times_ask_the_field_itself() -> None:

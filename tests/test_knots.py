@@ -60,7 +60,7 @@ def test_a_parabola_is_reproduced_by_the_cubic_away_from_the_ends() -> None:
         torch.testing.assert_close(catmull_rom(v, position), torch.tensor([position**2], dtype=torch.float64))
 
 
-def test_the_cubics_velocity_is_continuous_and_that_of_the_neighbours() -> None:
+def test_the_cubics_velocity_is_continuous_and_that_of_the_neighbors() -> None:
     v, e = values(), 1e-6
     for k in range(1, 5):
         before = (catmull_rom(v, float(k)) - catmull_rom(v, k - e)) / e

@@ -15,7 +15,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.poses import estimate as poses
 from hdr_nsff.priors.poses import lightglue
 from hdr_nsff.priors.poses.lightglue import check_matcher, match_pictures
-from hdr_nsff.priors.weights import KNOWN, look
+from hdr_nsff.priors.weights import KNOWN, locate
 
 
 def test_given_matches_are_what_poses_come_from(tmp_path, monkeypatch):
@@ -106,7 +106,7 @@ def test_weights_that_lack_something_are_refused(random_weights, monkeypatch):
 @pytest.mark.parametrize("matcher", ["aliked", "disk"])
 def test_real_weights_match_a_picture_with_its_shifted_brighter_self(matcher):
     pytest.importorskip("kornia")
-    if look(KNOWN[matcher]) is None or look(KNOWN[f"{matcher}-lightglue"]) is None:
+    if locate(KNOWN[matcher]) is None or locate(KNOWN[f"{matcher}-lightglue"]) is None:
         pytest.skip("weights not on this machine")
     whole = np.kron(np.random.default_rng(0).random((30, 40, 3)), np.ones((8, 8, 1)))
     pair = [whole[:200, :280], np.clip(1.5 * whole[16:216, 24:304], 0, 1)]

@@ -159,8 +159,8 @@ def test_hdr_tae_of_two_constants_worked_by_hand():
     assert metrics.hdr_tae(one, one, rest, everywhere(one)) == (0, 20)
     assert metrics.hdr_tae(0 * one, 0 * one, rest, everywhere(one)) == (0, 20)  # black stays black
     assert metrics.hdr_tae(one, 0 * one, rest, everywhere(one)) == (pytest.approx(1), 20)  # the most there is
-    coloured = one * torch.tensor([1.0, 3.0, 9.0])
-    assert metrics.hdr_tae(one, coloured, rest, everywhere(one))[0] == pytest.approx((0 + 2 / 4 + 8 / 10) / 3)
+    colored = one * torch.tensor([1.0, 3.0, 9.0])
+    assert metrics.hdr_tae(one, colored, rest, everywhere(one))[0] == pytest.approx((0 + 2 / 4 + 8 / 10) / 3)
 
 
 def test_hdr_tae_follows_the_flow_between_pixels_and_leaves_out_what_leaves_the_picture():
@@ -287,7 +287,7 @@ def test_nothing_but_arrays_is_unpickled(tmp_path):
 
 
 def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):
-    """Bilinear by hand: pixel centre (i + 0.5) of n lies at (i + 0.5) m / n - 0.5 of m samples, ends repeated."""
+    """Bilinear by hand: pixel center (i + 0.5) of n lies at (i + 0.5) m / n - 0.5 of m samples, ends repeated."""
     net, linear = alexnet_weights()
     torch.save(net | linear, tmp_path / "w.pth")
     model, (a, b) = metrics.Lpips(tmp_path / "w.pth"), (p.float() for p in pictures(80, 96))

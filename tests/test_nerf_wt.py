@@ -9,12 +9,12 @@ from torch import Tensor
 
 from hdr_nsff.fields import build_field
 from hdr_nsff.fields.baselines.nerf_wt import NerfWT
-from hdr_nsff.scene.batch import Look, draw_pixels
+from hdr_nsff.scene.batch import Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
 
 
-def look(*images: int) -> Look:
-    return Look(lambda rgb: rgb.clamp(0, 1), images)
+def recorder(*images: int) -> Recorder:
+    return Recorder(lambda rgb: rgb.clamp(0, 1), images)
 
 
 @pytest.fixture(params=["nerf-wt", "nerf-wt-paper"])
@@ -24,9 +24,9 @@ def field(request: pytest.FixtureRequest, toy: Scene) -> NerfWT:
     return field
 
 
-def test_a_code_changes_colours_and_nothing_else(field: NerfWT, toy: Scene) -> None:
+def test_a_code_changes_colors_and_nothing_else(field: NerfWT, toy: Scene) -> None:
     camera = toy.train[2].camera
-    a, b = (field.render(camera, 2.0, look=look(i)) for i in (0, 4))
+    a, b = (field.render(camera, 2.0, recorder=recorder(i)) for i in (0, 4))
     assert float((a.radiance - b.radiance).abs().max()) > 1e-3
     assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("depth", "opacity", "motion"))
 
@@ -36,23 +36,25 @@ def test_movers_do_not_know_the_code(field: NerfWT, toy: Scene) -> None:
     field.static_content = lambda m, keep: field.spread(  # type: ignore[method-assign]
         m.coords.new_full((0, 5), 0.0), torch.zeros(0, dtype=torch.long), keep.shape, 0.0
     )  # nothing stands
-    a, b = (field.render(camera, 2.0, look=look(i)) for i in (0, 4))
+    a, b = (field.render(camera, 2.0, recorder=recorder(i)) for i in (0, 4))
     assert float(a.motion.max()) > 0.01 and torch.equal(a.radiance, b.radiance)
 
 
 def test_another_view_borrows_the_mean_code_of_its_exposure(field: NerfWT, toy: Scene) -> None:
     camera, table = toy.train[2].camera, field.codes.table.data
-    mean = field.render(camera, 2.0, look=look(1, 4)).radiance
+    mean = field.render(camera, 2.0, recorder=recorder(1, 4)).radiance
     table[0] = (table[1] + table[4]) / 2
-    torch.testing.assert_close(field.render(camera, 2.0, look=look(0)).radiance, mean)
+    torch.testing.assert_close(field.render(camera, 2.0, recorder=recorder(0)).radiance, mean)
 
 
 def test_radiance_without_a_look_is_that_of_the_reference_exposure(field: NerfWT, toy: Scene) -> None:
     camera = toy.train[2].camera
     reference = tuple(i for i, f in enumerate(toy.train) if f.bracket == toy.manifest.reference_bracket)
     assert reference == (1, 4)
-    field.render(camera, 2.0, look=look(3))  # leaves nothing behind
-    torch.testing.assert_close(field.render(camera, 2.0).radiance, field.render(camera, 2.0, look=look(*reference)).radiance)
+    field.render(camera, 2.0, recorder=recorder(3))  # leaves nothing behind
+    torch.testing.assert_close(
+        field.render(camera, 2.0).radiance, field.render(camera, 2.0, recorder=recorder(*reference)).radiance
+    )
 
 
 def touched(table: Tensor) -> list[int]:
@@ -61,14 +63,14 @@ def touched(table: Tensor) -> list[int]:
 
 
 def test_a_recording_teaches_the_code_of_its_image_alone(field: NerfWT, toy: Scene) -> None:
-    batch = replace(draw_pixels(toy, 3, 60, 0, torch.Generator().manual_seed(0)), look=look(3))
+    batch = replace(draw_pixels(toy, 3, 60, 0, torch.Generator().manual_seed(0)), recorder=recorder(3))
     render, own = field(batch)
     (render.radiance - batch.rgb).square().mean().backward()
     assert touched(field.codes.table) == [3] and render.warps == () and render.scene_flow == {}
     assert set(own) == {"transient"} and float(own["transient"].detach()) > 0
 
 
-def test_beside_grids_the_colour_network_starts_by_changing_nothing(toy: Scene) -> None:
+def test_beside_grids_the_color_network_starts_by_changing_nothing(toy: Scene) -> None:
     field = build_field(small("nerf-wt").field, toy)
     coords = torch.rand(20, 3)
     field.branches.static_grid.table.data.normal_()

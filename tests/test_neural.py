@@ -71,7 +71,7 @@ def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it
     scene = shutil.copytree(motion, tmp_path / "scene")
     prepare(replace(clip, out=scene, masks="sam2", mask_weights=str(tiny_sam2(tmp_path / "sam2"))))
     m = Manifest.load(scene)
-    assert m.steps["mask"].provenance == "estimated" and m.steps["mask"].details["source"] == "sam2"
+    assert m.steps["masks"].provenance == "estimated" and m.steps["masks"].details["source"] == "sam2"
     assert m.steps["poses"].details["attempt"] == 1  # whoever outlines the masks, the poses stay
     prompts = json.loads((scene / "masks/prompts.json").read_text())
     train = {f.index for f in m.frames if f.split == "train"}
@@ -161,7 +161,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
     read = {
         "gmflow": ("flow", {"flow": "gmflow"}), "raft": ("flow", {"flow": "raft"}), "xfeat": ("flow", {"flow": "semantic"}),
         "dinov2-small": ("flow", {"flow": "semantic", "semantic": SemanticConfig(features="dinov2-small")}), "tuned": ("flow", tuned),
-        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("mask", {"masks": "sam2"}),
+        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("masks", {"masks": "sam2"}),
         "depth-anything": ("depth", {"depth": "depth-anything"}),
     }  # fmt: skip
     for name, (step, chosen) in read.items():
@@ -172,7 +172,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         write_text(file, "something else")
         assert found and weights_of(config, step) != found, name
         assert not any(weights_of(config, other) for other in ("frames", "exposure", "sheet"))
-    assert not any(weights_of(replace(clip, flow="dis", depth=None, poses=None), s) for s in ("flow", "poses", "mask", "depth"))
+    assert not any(weights_of(replace(clip, flow="dis", depth=None, poses=None), s) for s in ("flow", "poses", "masks", "depth"))
 
 
 def test_a_known_file_that_changed_is_refused(clip, tmp_path, monkeypatch):

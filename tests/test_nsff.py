@@ -37,8 +37,8 @@ class Blob(nn.Module):
     def dynamic(self, coords: Tensor, knot: float, directions: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
         local = coords - START - knot * self.velocity
         inside = (local.norm(dim=-1) < RADIUS) & self.blob
-        shade = torch.cat([3 * local[:, :1], 2 + local[:, 1:2], 0 * local[:, :1]], -1)
-        raw = torch.cat([shade, self.density(inside), torch.where(inside, 30.0, -30.0)[:, None]], -1)
+        brightness_drift = torch.cat([3 * local[:, :1], 2 + local[:, 1:2], 0 * local[:, :1]], -1)
+        raw = torch.cat([brightness_drift, self.density(inside), torch.where(inside, 30.0, -30.0)[:, None]], -1)
         both = torch.cat([self.velocity, torch.tensor([self.disocclusion]), -self.velocity, torch.tensor([self.disocclusion])])
         scale = torch.tensor([20.0, 20, 20, 1, 20, 20, 20, 1])  # raw flow is in units of `flow_scale`, 0.05
         return raw, (both * scale).expand(len(coords), 8) if motion else None
@@ -64,12 +64,12 @@ def blob_field(branches: Blob, compositing: Any = "add", times: tuple[float, ...
     return field
 
 
-def batch(time: float = 1.0, x: float = 0.1, neighbours: tuple[float, float] = (0.0, 0.2)) -> PixelBatch:
-    """Every pixel of the camera at `x`; the previous and the next camera are at `neighbours`."""
+def batch(time: float = 1.0, x: float = 0.1, neighbors: tuple[float, float] = (0.0, 0.2)) -> PixelBatch:
+    """Every pixel of the camera at `x`; the previous and the next camera are at `neighbors`."""
     c = camera(x)
     pixels = c.pixel_grid()
     n = len(pixels)
-    around = {-1: camera(neighbours[0]), 1: camera(neighbours[1])}
+    around = {-1: camera(neighbors[0]), 1: camera(neighbors[1])}
     return PixelBatch(0, time, c, 0, 0, around, pixels, torch.zeros(n, 3), torch.ones(n, dtype=torch.bool))
 
 
@@ -125,9 +125,9 @@ def test_a_static_scene_flows_as_the_camera_moves() -> None:
     assert float(render.motion.max()) < 1e-3
 
 
-def test_flow_into_the_neighbours_camera_adds_motion_and_parallax() -> None:
+def test_flow_into_the_neighbors_camera_adds_motion_and_parallax() -> None:
     field = blob_field(Blob())
-    render, _ = field(batch(neighbours=(0.1, 0.1)))  # nobody moves but the blob
+    render, _ = field(batch(neighbors=(0.1, 0.1)))  # nobody moves but the blob
     blob = render.motion > 0.99
     ends = [camera(0.1).project(field.space.decode(START + k * VELOCITY))[0] for k in (1, 2)]
     torch.testing.assert_close(render.warps[0].flow[blob].mean(0), ends[1] - ends[0], atol=0.3, rtol=0)
@@ -135,7 +135,7 @@ def test_flow_into_the_neighbours_camera_adds_motion_and_parallax() -> None:
 
 
 @pytest.mark.parametrize("compositing", ["add", "blend"])
-def test_content_that_follows_its_flow_looks_the_same_through_both_neighbours(compositing: str) -> None:
+def test_content_that_follows_its_flow_looks_the_same_through_both_neighbors(compositing: str) -> None:
     field = blob_field(Blob(), compositing)
     render, own = field(replace(batch(time=1.0), chain=0))
     blob = render.motion > 0.99
@@ -203,7 +203,7 @@ def test_the_picture_teaches_both_branches_but_not_the_flow(toy: Scene) -> None:
     assert all(size(g.table) == 0 for g in field.branches.motion_grids)
 
 
-def test_the_warped_picture_teaches_scene_flow_and_the_neighbours_content(toy: Scene) -> None:
+def test_the_warped_picture_teaches_scene_flow_and_the_neighbors_content(toy: Scene) -> None:
     field = random_field("grid", toy)
     render, _, b = pass_of(field, toy)
     (render.warps[0].radiance - b.rgb).abs().mean().backward()
@@ -242,15 +242,15 @@ def test_a_field_learns_the_way_things_went_from_warped_pictures_alone() -> None
         return content(c, k, d, False)[0], both.expand(len(c), 8) if motion else None
 
     branches.dynamic = dynamic  # type: ignore[method-assign]
-    field, optimiser, b = blob_field(branches), torch.optim.Adam([learned], lr=4e-3), batch()
+    field, optimizer, b = blob_field(branches), torch.optim.Adam([learned], lr=4e-3), batch()
     core = field(b)[0].motion > 0.99
     b = replace(b, pixels=b.pixels[core], uniform=b.uniform[core])
     for _ in range(25):
         render, _ = field(b)
         loss = sum((w.radiance - render.radiance.detach()).abs().mean() for w in render.warps)
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        optimiser.step()
+        optimizer.step()
     assert float((learned.detach() - truth)[:2].norm()) < 0.3 * float((wrong - truth)[:2].norm())
 
 
@@ -290,7 +290,7 @@ def test_a_clip_in_which_nothing_moves_trains(toy: Scene) -> None:
 
 
 def test_one_frame_alone_trains(toy: Scene) -> None:
-    alone = replace(toy, train=[replace(toy.train[0], neighbours={}, flow={}, flow_valid={})])
+    alone = replace(toy, train=[replace(toy.train[0], neighbors={}, flow={}, flow_valid={})])
     render, own, _ = pass_of(random_field("grid", alone), alone, frame=0)
     assert render.warps == () and render.scene_flow == {} and set(own) == {"disocclusion"}
 

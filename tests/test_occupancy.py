@@ -4,7 +4,7 @@ import torch
 
 from hdr_nsff.fields.nsff.occupancy import Occupancy
 
-CENTRE = torch.tensor([[0.45, 0.45, 0.45]])  # cell (4, 4, 4) of ten
+CENTER = torch.tensor([[0.45, 0.45, 0.45]])  # cell (4, 4, 4) of ten
 
 
 def test_cells_are_counted_x_fastest_and_slices_slowest() -> None:
@@ -14,23 +14,23 @@ def test_cells_are_counted_x_fastest_and_slices_slowest() -> None:
     assert grid.cells(coords, 0.8).tolist() == [24 + 21, 24, 47]  # the nearest slice
 
 
-def test_centres_lie_in_their_own_cells_in_order() -> None:
+def test_centers_lie_in_their_own_cells_in_order() -> None:
     grid = Occupancy((4, 3, 2))
-    assert grid.cells(grid.centres()).tolist() == list(range(24))
+    assert grid.cells(grid.centers()).tolist() == list(range(24))
 
 
 def test_everything_is_asked_until_refreshed_then_only_around_what_was_seen() -> None:
     grid = Occupancy((10, 10, 10))
-    assert bool(grid.asks(grid.centres(), 0.0, 0.0, None).all())
-    grid.observe(CENTRE, torch.tensor([0.5]))
+    assert bool(grid.asks(grid.centers(), 0.0, 0.0, None).all())
+    grid.observe(CENTER, torch.tensor([0.5]))
     grid.refresh(threshold=0.1, decay=0.5)
-    asked = grid.asks(grid.centres(), 0.0, 0.0, None).view(10, 10, 10)
+    asked = grid.asks(grid.centers(), 0.0, 0.0, None).view(10, 10, 10)
     assert int(asked.sum()) == 27 and bool(asked[3:6, 3:6, 3:6].all())
 
 
 def test_the_largest_weight_is_remembered_and_fades() -> None:
     grid = Occupancy((10, 10, 10))
-    grid.observe(CENTRE.expand(2, 3), torch.tensor([0.8, 0.2]))
+    grid.observe(CENTER.expand(2, 3), torch.tensor([0.8, 0.2]))
     for count, kept in ((1, 27), (2, 27), (3, 27), (4, 0)):  # 0.8, 0.4, 0.2, 0.1: the fourth is not above the threshold
         grid.refresh(threshold=0.1001, decay=0.5)
         assert int(grid.mask.sum()) == kept, count
@@ -50,13 +50,13 @@ def test_exploration_asks_its_share_of_the_others_but_never_where_it_is_not_allo
 def test_what_is_not_allowed_stays_culled_however_bright() -> None:
     grid = Occupancy((10, 10, 10))
     grid.allowed[0, 4, 4, 4] = False
-    grid.observe(CENTRE, torch.tensor([1.0]))
+    grid.observe(CENTER, torch.tensor([1.0]))
     grid.refresh(threshold=0.1, decay=0.5)
-    assert int(grid.mask.sum()) == 26 and not bool(grid.asks(CENTRE, 0.0, 0.0, None))
+    assert int(grid.mask.sum()) == 26 and not bool(grid.asks(CENTER, 0.0, 0.0, None))
 
 
 def test_slices_do_not_see_each_other() -> None:
     grid = Occupancy((10, 10, 10), slices=3)
-    grid.observe(CENTRE, torch.tensor([1.0]), knot=1.0)
+    grid.observe(CENTER, torch.tensor([1.0]), knot=1.0)
     grid.refresh(threshold=0.1, decay=0.5)
     assert grid.mask.flatten(1).sum(1).tolist() == [0, 27, 0]

@@ -6,7 +6,7 @@ import pytest
 
 from hdr_nsff.priors.flow.one_exposure import at_one_exposure, matched_samples, response_from_flow
 from hdr_nsff.radiometry.debevec import linked
-from hdr_nsff.radiometry.exposure_cycle import equalise
+from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import Noise, record, response_curve
 
 T, H, W = 6, 72, 108
@@ -48,7 +48,7 @@ def flows(believed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, n
 
 
 def unlike(frames: np.ndarray, video: np.ndarray) -> float:
-    """How much neighbours differ where both recorded the wall, mean absolute."""
+    """How much neighbors differ where both recorded the wall, mean absolute."""
     parts = []
     for t in range(T - 1):
         a, b = frames[t, :, SLIDE:], frames[t + 1, :, :-SLIDE]
@@ -76,7 +76,7 @@ def test_what_comes_and_goes_bends_brightness_but_not_the_response() -> None:
     wall[:, :, : W // 3 + SLIDE] = False
     fit = response_from_flow(video, BRACKETS, [None] * 3, 0, flows(wall), STILL)
     assert fit is not None
-    by_response, by_brightness = at_one_exposure(video, BRACKETS, fit), equalise(video, BRACKETS.tolist())[0]
+    by_response, by_brightness = at_one_exposure(video, BRACKETS, fit), equalize(video, BRACKETS.tolist())[0]
     assert unlike(by_response, video) < 0.5 * unlike(by_brightness, video)
 
 

@@ -44,7 +44,7 @@ def test_a_painted_field_renders_the_recordings_and_the_depth(painted: Trainer, 
 
 
 def flat(scene: Scene, rgb: float, moving: float) -> Scene:
-    """The scene with one colour for what stands and one for what moves."""
+    """The scene with one color for what stands and one for what moves."""
     frames = [
         replace(f, image=torch.where(f.moving[..., None], moving, rgb).expand(*f.moving.shape, 3).clone()) for f in scene.train
     ]
@@ -57,7 +57,7 @@ def field_of(scene: Scene, rgb: float, moving: float) -> NSFF:
     return field
 
 
-def test_a_flat_colour_is_painted_exactly(toy: Scene) -> None:
+def test_a_flat_color_is_painted_exactly(toy: Scene) -> None:
     f = toy.train[2]
     pixels = (~f.moving).nonzero().flip(-1)[::7]
     radiance = surface(field_of(toy, 0.5, 0.8), toy, pixels)
@@ -73,7 +73,7 @@ def surface(field: NSFF, scene: Scene, pixels: torch.Tensor) -> torch.Tensor:
         return field.to_radiance(field.branches.static(coords, coords)[:, :3])
 
 
-def test_moving_pixels_paint_no_static_colour(toy: Scene) -> None:
+def test_moving_pixels_paint_no_static_color(toy: Scene) -> None:
     one, other = field_of(toy, 0.5, 0.8), field_of(toy, 0.5, 0.2)
     assert torch.equal(one.branches.static_grid.table, other.branches.static_grid.table)
     assert not torch.equal(one.branches.dynamic_grid.table, other.branches.dynamic_grid.table)

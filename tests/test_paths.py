@@ -25,7 +25,7 @@ def camera(*place: float) -> Camera:
     return Camera(K, pose(*place), 32, 24)
 
 
-def test_bullet_time_starts_at_the_frame_and_keeps_the_focus_point_centred() -> None:
+def test_bullet_time_starts_at_the_frame_and_keeps_the_focus_point_centered() -> None:
     start = camera(20.0, 1.0, 2.0, 3.0)
     views = paths.bullet_time(start, 7.0, 4.0, torch.tensor([0.5, 0.3, 0.2]), num_views=12)
     focus = start.c2w[:, 3] + 4.0 * start.c2w[:, 2]
@@ -40,8 +40,8 @@ def test_bullet_time_starts_at_the_frame_and_keeps_the_focus_point_centred() -> 
 def test_bullet_time_stays_within_its_radius_and_uses_it() -> None:
     radius = torch.tensor([0.5, 0.3, 0.2])
     views = paths.bullet_time(camera(), 0.0, 4.0, radius, num_views=96)
-    centres = torch.stack([v.camera.c2w[:, 3] for v in views]).abs().amax(0)
-    assert (centres <= radius + 1e-6).all() and (centres > 0.6 * radius).all()
+    centers = torch.stack([v.camera.c2w[:, 3] for v in views]).abs().amax(0)
+    assert (centers <= radius + 1e-6).all() and (centers > 0.6 * radius).all()
 
 
 def test_reach_is_half_the_range_in_the_axes_of_the_camera() -> None:

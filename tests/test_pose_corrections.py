@@ -73,7 +73,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def seen(field: NSFF | Splat, batch: PixelBatch, weights: dict[str, Tensor]) -> Tensor:
-    """A sum over everything that a training render says, depth and flow into the neighbour included."""
+    """A sum over everything that a training render says, depth and flow into the neighbor included."""
     render, _ = field(batch)
     parts = {"radiance": render.radiance, "depth": render.depth, "flow": render.warps[0].flow}
     return sum((parts[k].double() * w).sum() for k, w in weights.items())  # type: ignore[return-value]
@@ -143,7 +143,7 @@ def test_a_camera_has_the_gradient_of_its_picture(preset: str, what: str, toy: S
     assert float((found - expected).norm() / expected.norm()) < 0.03, (found, expected)
 
 
-def test_the_neighbours_camera_has_the_gradient_of_the_flow_into_it(toy: Scene) -> None:
+def test_the_neighbors_camera_has_the_gradient_of_the_flow_into_it(toy: Scene) -> None:
     field, corrections = random_field("splat", toy), PoseCorrections(toy)
     batch = whole_frame(toy, 2)
     seen(field, corrections(batch), {"flow": smooth_weights(batch)["flow"]}).backward()
@@ -160,8 +160,8 @@ def test_a_common_similarity_is_taken_out_of_the_corrections(toy: Scene) -> None
     corrections.fix_gauge()
     torch.testing.assert_close(corrections.twists(), kept)
     turn, shift, scale = torch.tensor([0.004, -0.003, 0.002]), torch.tensor([0.01, 0.02, -0.01]), 1.003
-    centres = torch.stack([f.camera.c2w[:, 3] for f in toy.train]) / corrections.unit
-    common = torch.cat([turn.expand(6, 3), shift + (scale - 1) * centres + torch.linalg.cross(turn.expand(6, 3), centres)], 1)
+    centers = torch.stack([f.camera.c2w[:, 3] for f in toy.train]) / corrections.unit
+    common = torch.cat([turn.expand(6, 3), shift + (scale - 1) * centers + torch.linalg.cross(turn.expand(6, 3), centers)], 1)
     set_twists(corrections, kept + common)
     assert float((corrections.twists().detach() - kept).abs().max()) > 0.01
     corrections.fix_gauge()

@@ -26,7 +26,7 @@ from hdr_nsff.priors.poses.rotation import derivatives, panorama, turned
 
 W, H, FOCAL = 160, 96, 150.0
 K = np.array([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1.0]])
-HALF = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # array index -> pixel centre
+HALF = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # array index -> pixel center
 
 
 def texture(seed: int, width: int, height: int) -> np.ndarray:
@@ -170,7 +170,7 @@ def test_cameras_of_a_rig_that_stand_still_share_one_view():
     assert np.abs(views.pictures[0] - left).max() < 0.03  # the median does not know the passer-by
 
 
-def test_missing_poses_lie_between_their_neighbours():
+def test_missing_poses_lie_between_their_neighbors():
     c2w = np.tile(np.eye(4)[:3], (4, 1, 1))
     c2w[2, :, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     c2w[2, 0, 3] = 2.0
@@ -251,7 +251,7 @@ def test_keypoints_keep_away_from_what_is_ignored():
     assert len(found.xy) > 20 and found.xy[:, 0].min() > W / 2 + 1
 
 
-def test_keypoints_know_pixel_centres():
+def test_keypoints_know_pixel_centers():
     dot = np.zeros((1, H, W, 3), np.float32)
     y, x = np.mgrid[:H, :W] + 0.5
     dot[0] = np.exp(-((x - 60.5) ** 2 + (y - 40.5) ** 2) / 2 / 3**2)[..., None]  # a blob whose middle is pixel (60, 40)

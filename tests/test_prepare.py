@@ -72,7 +72,7 @@ def test_footage_becomes_a_scene_that_opens(config):
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 4
     middle = scene.train[5]
     assert (middle.camera.K[0, 0], middle.camera.c2w[0, 3]) == (FOCAL, pytest.approx(0.5))
-    assert middle.neighbours == {-1: 4, 1: 6}
+    assert middle.neighbors == {-1: 4, 1: 6}
     assert (middle.flow[1] == -2 * np.array([1, 0])).all() and (middle.flow[-1] == 2 * np.array([1, 0])).all()
     assert middle.flow_valid[1][:, 8:-8].all()
     assert middle.moving.sum() == 4 * H
@@ -82,7 +82,7 @@ def test_footage_becomes_a_scene_that_opens(config):
 def test_the_manifest_says_where_everything_came_from(config):
     m = Manifest.load(prepare(config))
     assert {name: step.provenance for name, step in m.steps.items()} == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "mask": "given", "rims": "given",
+        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "masks": "given", "refined_flow": "given",
         "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert m.inputs.keys() == {f"{t:03d}.png" for t in range(COUNT)} and all(len(h) == 64 for h in m.inputs.values())
@@ -109,7 +109,7 @@ def test_redo_does_a_step_and_what_builds_on_it(config):
     prepare(config)
     prepare(replace(config, redo=("poses",)))
     assert attempts(config.out) == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 2, "mask": 2, "rims": 2, "depth": 2, "sheet": 2,
+        "frames": 1, "exposure": 1, "flow": 1, "poses": 2, "masks": 2, "refined_flow": 2, "depth": 2, "sheet": 2,
     }  # fmt: skip
 
 
@@ -118,7 +118,7 @@ def test_frames_are_matched_again_through_the_response_that_flow_tells(config):
     work = begin(replace(config, flow="dis"))
     for name in STEPS:
         do(work, name)
-    assert "at one exposure through the response that flow tells (misfit 0." in work.manifest.steps["rims"].note
+    assert "at one exposure through the response that flow tells (misfit 0." in work.manifest.steps["refined_flow"].note
     level, _ = through_response(work, np.zeros((COUNT, H, W), bool))
     dark, bright = level[0, :, 8:-8], level[1, :, 6:-10]  # the wall has gone two pixels to the left
     recorded = [work.video[0, :, 8:-8], work.video[1, :, 6:-10]]
@@ -132,8 +132,8 @@ def test_frames_are_matched_again_through_the_response_that_flow_tells(config):
         f.camera_id = 1
     level, how = through_response(work, moving)
     assert "in 1 of 2 cameras, else by brightness" in how
-    assert np.array_equal(level[first:], work.equalised[0][first:]) and not np.array_equal(
-        level[:first], work.equalised[0][:first]
+    assert np.array_equal(level[first:], work.equalized[0][first:]) and not np.array_equal(
+        level[:first], work.equalized[0][:first]
     )
 
 
@@ -141,24 +141,24 @@ def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(confi
     estimated = replace(config, flow="dis")
     m = Manifest.load(prepare(estimated))
     f = m.frames[4]
-    assert (f.flow[5].flow, f.flow[5].valid) == ("rims/00004_00005.npy", "rims/00004_00005_valid.png")
-    assert (f.matched[5].flow, f.matched[5].valid) == ("flow/00004_00005.npy", "flow/00004_00005_valid.png")
-    assert m.steps["rims"].provenance == "estimated"
-    before, after = (np.load(config.out / files[5].flow).astype(np.float32) for files in (f.matched, f.flow))
-    back = np.load(config.out / m.frames[5].matched[4].flow).astype(np.float32)
-    sure = read_mask(config.out / f.matched[5].valid) & (round_trip(before, back) < MISSED - 0.02)
+    assert (f.flow[5].flow, f.flow[5].valid) == ("refined_flow/00004_00005.npy", "refined_flow/00004_00005_valid.png")
+    assert (f.raw_flow[5].flow, f.raw_flow[5].valid) == ("raw_flow/00004_00005.npy", "raw_flow/00004_00005_valid.png")
+    assert m.steps["refined_flow"].provenance == "estimated"
+    before, after = (np.load(config.out / files[5].flow).astype(np.float32) for files in (f.raw_flow, f.flow))
+    back = np.load(config.out / m.frames[5].raw_flow[4].flow).astype(np.float32)
+    sure = read_mask(config.out / f.raw_flow[5].valid) & (round_trip(before, back) < MISSED - 0.02)
     changed = np.abs(halfway(before, back) - after).max(-1)
     assert changed[:, :4].max() > 0.05 and sure[:, 7:].mean() > 0.5  # 4 columns move, and others go there
     assert np.quantile(changed[:, 7:][sure[:, 7:]], 0.95) < 0.01  # the way back meets it halfway
-    assert m.steps["rims"].note.endswith("equalised by brightness: too few pixels at rest in several exposures")
+    assert m.steps["refined_flow"].note.endswith("equalized by brightness: too few pixels at rest in several exposures")
 
-    (config.out / "rims/00004_00005.npy").unlink()
+    (config.out / "refined_flow/00004_00005.npy").unlink()
     prepare(estimated)
-    assert np.array_equal(np.load(config.out / "rims/00004_00005.npy"), after)
+    assert np.array_equal(np.load(config.out / "refined_flow/00004_00005.npy"), after)
     write_png(config.masks / "004.png", np.ones((H, W), bool))
     prepare(estimated)
-    assert attempts(config.out)["flow"] == 1 and attempts(config.out)["rims"] == 2
-    assert np.array_equal(np.load(config.out / f.matched[5].flow), before)
+    assert attempts(config.out)["flow"] == 1 and attempts(config.out)["refined_flow"] == 2
+    assert np.array_equal(np.load(config.out / f.raw_flow[5].flow), before)
     assert not np.array_equal(np.load(config.out / f.flow[5].flow), after)
 
 
@@ -167,7 +167,7 @@ def test_a_changed_setting_redoes_what_depends_on_it(config):
     write_npy(config.depth / "003.npy", np.full((H, W), 3.0, np.float32))  # the contents of a given folder count
     prepare(config)
     assert attempts(config.out) == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "mask": 1, "rims": 1, "depth": 2, "sheet": 2,
+        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "masks": 1, "refined_flow": 1, "depth": 2, "sheet": 2,
     }  # fmt: skip
     prepare(replace(config, ev="-2,0,2"))
     assert attempts(config.out)["frames"] == 1 and attempts(config.out)["exposure"] == 2 and attempts(config.out)["flow"] == 2
@@ -175,13 +175,13 @@ def test_a_changed_setting_redoes_what_depends_on_it(config):
 
 def test_a_lost_file_is_made_again_and_the_others_stay(config):
     before = stamps(prepare(config))
-    (config.out / "flow/00003_00004.npy").unlink()
+    (config.out / "raw_flow/00003_00004.npy").unlink()
     prepare(config)
     after = stamps(config.out)
     assert after.keys() == before.keys()
-    assert {n for n in after if n.startswith("flow/") and after[n] != before[n]} == {
-        "flow/00003_00004.npy",
-        "flow/00003_00004_valid.png",
+    assert {n for n in after if n.startswith("raw_flow/") and after[n] != before[n]} == {
+        "raw_flow/00003_00004.npy",
+        "raw_flow/00003_00004_valid.png",
     }
 
 
@@ -254,7 +254,7 @@ def test_held_out_frames_feed_nothing_of_training(config):
     scene = Scene.open(prepare(replace(config, hold_out=4)))
     assert [f.index for f in scene.test] == [2, 6, 10]
     assert [f.time for f in scene.train] == [0, 1, 3, 4, 5, 7, 8, 9, 11]
-    assert scene.train[1].neighbours == {-1: 0, 1: 2} and (scene.train[1].flow[1] == -4 * np.array([1, 0])).all()  # over the gap
+    assert scene.train[1].neighbors == {-1: 0, 1: 2} and (scene.train[1].flow[1] == -4 * np.array([1, 0])).all()  # over the gap
     assert all(f.disparity is None and f.moving is not None for f in scene.test)
 
 
@@ -279,7 +279,7 @@ def test_a_rig_has_one_camera_per_folder(tmp_path):
     scene = Scene.open(prepare(config))
     assert [f.camera_id for f in scene.train] == [0] * 6 + [1] * 6
     assert [f.time for f in scene.train] == [*range(6)] * 2
-    assert scene.train[5].neighbours == {-1: 4} and scene.train[6].neighbours == {1: 7}  # never across cameras
+    assert scene.train[5].neighbors == {-1: 4} and scene.train[6].neighbors == {1: 7}  # never across cameras
     assert abs(float(scene.train[2].flow[1][8:-8, 8:-8, 0].median()) + 2) < 0.5
 
 

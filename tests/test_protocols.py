@@ -49,7 +49,7 @@ def test_novel_view_time_trains_on_every_second_frame_and_links_those(tmp_path: 
     assert scene.manifest.protocol == "novel-view-time"
     assert [f.time for f in scene.train] == [0, 2, 4, 6, 8, 10, 11] and [f.time for f in scene.test] == [1, 3, 5, 7, 9]
     middle = scene.train[2]
-    assert middle.neighbours == {-1: 1, 1: 3} and (middle.flow[1] == -4 * np.array([1, 0])).all()  # two frames of -2 pixels
+    assert middle.neighbors == {-1: 1, 1: 3} and (middle.flow[1] == -4 * np.array([1, 0])).all()  # two frames of -2 pixels
     assert all(f.disparity is None and not f.flow for f in scene.test)
 
 

@@ -1,4 +1,4 @@
-"""The rasteriser: numba kernels against the plain-torch twin in float64, that one against finite differences, closed forms, and what
+"""The rasterizer: numba kernels against the plain-torch twin in float64, that one against finite differences, closed forms, and what
 no scene should hold but some day one does."""
 
 import hashlib
@@ -24,7 +24,7 @@ NAMES = ("means", "quaternions", "scales", "opacities", "features", "c2w", "foca
 
 
 def camera(width: int = 41, height: int = 27) -> Camera:
-    """A camera that stands aside and looks askew, its centre off the middle of the picture."""
+    """A camera that stands aside and looks askew, its center off the middle of the picture."""
     turn = rotation_matrices(torch.tensor([[1.0, 0.05, -0.1, 0.2]], dtype=torch.float64))[0]
     c2w = torch.cat([turn, torch.tensor([[0.1], [-0.2], [0.3]], dtype=torch.float64)], 1)
     K = torch.tensor([[FOCAL, 0, 0.45 * width], [0, 1.1 * FOCAL, 0.6 * height], [0, 0, 1]], dtype=torch.float64)
@@ -76,8 +76,8 @@ def drawn(twin: Callable[..., Maps], gaussians: list[Tensor], view: Camera, weig
 
 def sure(gaussians: list[Tensor], view: Camera) -> Tensor:
     """(H, W) pixels where no alpha is so close to the cut or to the largest one that rounding decides."""
-    centres, covariance, z = project(*gaussians[:3], view)
-    d = view.pixel_grid()[:, None] - centres
+    centers, covariance, z = project(*gaussians[:3], view)
+    d = view.pixel_grid()[:, None] - centers
     alpha = gaussians[3] * torch.exp(-0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0])
     unsure = ((alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01) | (
         (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
@@ -133,9 +133,9 @@ def test_kernels_equal_plain_torch_across_the_near_plane(size: float) -> None:
 def test_kernels_equal_plain_torch_at_the_frames_edge_and_beyond_it() -> None:
     view = camera()
     gaussians = placed(view, (1.0, 2.0), 3.0)
-    centres = project(*gaussians[:3], view)[0]
-    outside = ((centres < -0.3 * 0.5 * 41) | (centres > 1.3 * 41)).any(1)
-    assert 10 < int(outside.sum()) < 50  # there the projection is linearised at the edge, not at the mean
+    centers = project(*gaussians[:3], view)[0]
+    outside = ((centers < -0.3 * 0.5 * 41) | (centers > 1.3 * 41)).any(1)
+    assert 10 < int(outside.sum()) < 50  # there the projection is linearized at the edge, not at the mean
     gradients = drawn(dense, gaussians, view, torch.ones(27, 41, 6, dtype=torch.float64))[1]
     assert int((gradients[0][outside] != 0).any(1).sum()) > 5
     compare(gaussians, view)
@@ -149,10 +149,10 @@ def test_kernels_equal_plain_torch_on_needles(length: float) -> None:
     assert float(compare(gaussians, view)[..., -1].max()) > 0.1
 
 
-def test_kernels_show_needles_whose_centre_is_far_outside_as_plain_torch_does() -> None:
+def test_kernels_show_needles_whose_center_is_far_outside_as_plain_torch_does() -> None:
     view, g = camera().moved(torch.eye(4, dtype=torch.float64)[:3]), torch.Generator().manual_seed(7)
     angle, z = 6.28 * torch.rand(60, generator=g), 2 + torch.rand(60, 1, generator=g)
-    through = (torch.rand(60, 2, generator=g) - 0.5) * z  # a point in the frame that the needle passes, 30 units from its centre
+    through = (torch.rand(60, 2, generator=g) - 0.5) * z  # a point in the frame that the needle passes, 30 units from its center
     gaussians = scene(5, view)
     gaussians[0] = torch.cat([through + 30 * torch.stack([angle.cos(), angle.sin()], 1), z], 1)
     gaussians[1] = torch.stack([(angle / 2).cos(), 0 * angle, 0 * angle, (angle / 2).sin()], 1)
@@ -208,7 +208,7 @@ both = pytest.mark.parametrize("twin", [rasterize, dense])
 
 
 @both
-def test_alpha_at_the_centre_is_the_opacity_and_depth_is_z(twin: Callable[..., Maps]) -> None:
+def test_alpha_at_the_center_is_the_opacity_and_depth_is_z(twin: Callable[..., Maps]) -> None:
     gaussians, view = facing(0.7, z=(2.5,))
     seen = twin(*gaussians, view)
     assert float(seen.alpha.max()) == float(seen.alpha[3, 4]) == pytest.approx(0.7)

@@ -6,7 +6,7 @@ import pytest
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.radiometry.recording import Noise, record, response_curve, vignette
 
-GREY = (1.0, 1.0, 1.0)
+GRAY = (1.0, 1.0, 1.0)
 NAMES = ["film", "log", "gamma", "srgb"]
 
 
@@ -36,7 +36,7 @@ def test_film_is_no_gamma_curve_and_differs_between_channels() -> None:
 def test_one_stop_more_doubles_the_linear_value() -> None:
     radiance = np.full((4, 4, 3), 0.2)
     curve, rng = response_curve("film"), np.random.default_rng(0)
-    dark, bright = (curve.invert(record(radiance, ev, GREY, curve, None, rng)) for ev in (0.0, 1.0))
+    dark, bright = (curve.invert(record(radiance, ev, GRAY, curve, None, rng)) for ev in (0.0, 1.0))
     np.testing.assert_allclose(bright / dark, 2.0, rtol=0.03)  # 8 bits: half a level of about 100
 
 
@@ -50,7 +50,7 @@ def test_white_balance_is_a_gain_per_channel_before_the_response() -> None:
 
 def test_recorded_values_are_whole_levels_and_clip() -> None:
     radiance = np.geomspace(1e-5, 1e5, 300).reshape(10, 10, 3)
-    rgb = record(radiance, 0.0, GREY, response_curve("film"), Noise(), np.random.default_rng(0))
+    rgb = record(radiance, 0.0, GRAY, response_curve("film"), Noise(), np.random.default_rng(0))
     assert rgb.dtype == np.float32 and rgb.min() >= 0 and rgb.max() == 1
     np.testing.assert_allclose(rgb * 255, np.rint(rgb * 255), atol=1e-4)
 
@@ -59,7 +59,7 @@ def test_noise_has_the_stated_variance_and_the_seed_repeats_it() -> None:
     """At exposure 0.24: read 1e-3, shot 1/6000: sqrt(1e-6 + 4e-5) = 0.0064."""
     radiance = np.full((200, 200, 3), 0.24)
     curve = response_curve("gamma")
-    a, b = (record(radiance, 0.0, GREY, curve, Noise(), np.random.default_rng(7)) for _ in range(2))
+    a, b = (record(radiance, 0.0, GRAY, curve, Noise(), np.random.default_rng(7)) for _ in range(2))
     np.testing.assert_array_equal(a, b)
     assert curve.invert(a).std() == pytest.approx(0.0064, rel=0.05)
 
@@ -67,7 +67,7 @@ def test_noise_has_the_stated_variance_and_the_seed_repeats_it() -> None:
 def test_a_short_exposure_is_relatively_noisier() -> None:
     radiance = np.full((100, 100, 3), 0.5)
     curve, rng = response_curve("film"), np.random.default_rng(0)
-    long, short = (curve.invert(record(radiance, ev, GREY, curve, Noise(), rng)) for ev in (0.0, -4.0))
+    long, short = (curve.invert(record(radiance, ev, GRAY, curve, Noise(), rng)) for ev in (0.0, -4.0))
     assert short.std() / short.mean() > 3 * long.std() / long.mean()  # shot noise alone: sqrt(16) = 4
 
 

@@ -24,7 +24,7 @@ def ordinary_clip(folder: Path, count: int = 20, width: int = 40) -> Path:
 
 
 def llff(count: int, width: int = 40, height: int = 24) -> np.ndarray:
-    """poses_bounds rows (count, 17): axes of the world (columns down, right, back of an OpenCV identity), centre (t, 0, 0), focal 50."""
+    """poses_bounds rows (count, 17): axes of the world (columns down, right, back of an OpenCV identity), center (t, 0, 0), focal 50."""
     pose = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
     rows = [np.concatenate([pose, [[t], [0], [0]], [[height], [width], [50]]], 1).ravel() for t in range(count)]
     return np.concatenate([np.array(rows), np.full((count, 1), 1.0), np.full((count, 1), 9.0)], 1)
@@ -37,7 +37,7 @@ def test_without_poses_truth_frames_stay_in_the_clip(tmp_path):
     assert [(v.time, v.anchor, v.bracket, v.c2w) for v in truth.views] == [(4, 4, 1, None), (12, 12, 0, None)]
 
 
-def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbours(tmp_path):
+def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbors(tmp_path):
     write_npy(tmp_path / "poses_bounds.npy", llff(20))
     out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"))
     truth = Truth.open(out / "truth")

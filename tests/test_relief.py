@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from hdr_nsff.priors.movers.bundle import Shape
 from hdr_nsff.priors.movers.mover_shape import apply, relief
 from hdr_nsff.priors.movers.rigid_groups import Group, Tracks
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -60,13 +60,13 @@ class Clip:
         self.confidence = np.where(self.moving, np.float32(0.3), np.float32(0.9))
         c2w = np.concatenate([np.tile(np.eye(3), (times, 1, 1)), EYES[:times, :, None]], 2)
         video = np.full((times, H, W, 3), 0.5, np.float32)
-        self.shots = Shots(
+        self.clip = PosedVideo(
             np.tile(K, (times, 1, 1)), c2w, np.arange(times) * 1.0, video, np.zeros((times, H, W), bool), self.moving
         )
 
     def relief(self, **other) -> tuple[np.ndarray, np.ndarray]:
         """With some of the arguments replaced."""
-        given = {"shots": self.shots, "flow": self.flow, "valid": self.valid, "pairs": self.pairs, "disparity": self.flat} | other
+        given = {"clip": self.clip, "flow": self.flow, "valid": self.valid, "pairs": self.pairs, "disparity": self.flat} | other
         return relief(**given, confidence=self.confidence)
 
     def wrong(self, disparity: np.ndarray) -> np.ndarray:
@@ -128,13 +128,13 @@ def test_what_was_given_stays_as_it_was(clip: Clip, found: tuple[np.ndarray, np.
     assert np.array_equal(clip.flat, fresh.flat) and np.array_equal(clip.confidence, fresh.confidence)
 
 
-def untouched(clip: Clip, **other) -> bool:
-    disparity, confidence = clip.relief(**other)
-    return np.array_equal(disparity, other.get("disparity", clip.flat)) and np.array_equal(confidence, clip.confidence)
+def untouched(short: Clip, **other) -> bool:
+    disparity, confidence = short.relief(**other)
+    return np.array_equal(disparity, other.get("disparity", short.flat)) and np.array_equal(confidence, short.confidence)
 
 
 def test_without_movers_nothing_changes(short: Clip) -> None:
-    assert untouched(short, shots=replace(short.shots, moving=np.zeros_like(short.moving)))
+    assert untouched(short, clip=replace(short.clip, moving=np.zeros_like(short.moving)))
 
 
 def test_without_flow_nothing_changes(short: Clip) -> None:
@@ -145,7 +145,7 @@ def test_without_flow_nothing_changes(short: Clip) -> None:
 def test_too_few_tracks_change_nothing(short: Clip) -> None:
     few = np.zeros_like(short.moving)
     few[:, 28:36, 44:52] = True
-    assert untouched(short, shots=replace(short.shots, moving=few & short.moving))
+    assert untouched(short, clip=replace(short.clip, moving=few & short.moving))
 
 
 @pytest.mark.parametrize("times", [1, 3])
@@ -155,16 +155,16 @@ def test_too_few_frames_change_nothing(times: int) -> None:
 
 def test_a_mover_in_one_frame_alone_changes_nothing(short: Clip) -> None:
     moving = short.moving & (np.arange(6) == 2)[:, None, None]
-    assert untouched(short, shots=replace(short.shots, moving=moving))
+    assert untouched(short, clip=replace(short.clip, moving=moving))
 
 
 def test_of_several_frames_of_one_time_the_first_speaks(short: Clip) -> None:
     again = [0, 1, 2, 3, 4, 5, 3]  # one more frame of time 3
-    s = short.shots
-    shots = Shots(s.K[again], s.c2w[again], s.times[again], s.video[again], s.clipped[again], s.moving[again])
+    s = short.clip
+    clip = PosedVideo(s.K[again], s.c2w[again], s.times[again], s.video[again], s.clipped[again], s.moving[again])
     twice = Clip(6)
     twice.confidence = short.confidence[again]
-    disparity, _ = twice.relief(shots=shots, disparity=short.flat[again])
+    disparity, _ = twice.relief(clip=clip, disparity=short.flat[again])
     assert np.array_equal(disparity[:6], short.relief()[0]) and np.array_equal(disparity[6], short.flat[3])
 
 
@@ -175,7 +175,7 @@ def test_a_pixel_takes_the_depth_of_the_tracks_near_it_unless_it_differs_much(sh
     place = np.array([[[48.5, 32.5]]])
     tracks = Tracks(place, points[None], np.ones((1, 1)), np.ones((1, 1), int), np.zeros((1, 1), int))
     group = Group(np.eye(3)[None], np.zeros((1, 3)), np.zeros(3), np.array([0]), np.array([True]))
-    apply(short.shots.moving[0], short.shots.c2w[0], 0, tracks, [Shape(group, points, 0.1)], disparity, confidence)
+    apply(short.clip.moving[0], short.clip.c2w[0], 0, tracks, [Shape(group, points, 0.1)], disparity, confidence)
     assert disparity[32, [48, 49, 50, 51, 57]] == pytest.approx([1 / 2.2, 1 / 2.2, 0, 0.2, 0.4])  # 57 is out of reach
     assert confidence[32, [48, 49, 50, 57]] == pytest.approx([0.5, 0.9, 0, 0])
 

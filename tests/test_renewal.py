@@ -9,17 +9,17 @@ import torch
 from presets import small, trainer
 from test_splat import CAMERA, card_field, scattered
 
-from hdr_nsff.fields.base import Misfit
+from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.splat.rasterize import dense
-from hdr_nsff.fields.splat.relocate import MOST, NARROWER, PARTED, halve
+from hdr_nsff.fields.splat.relocate import MOST, NARROWER, PARTED, relocate
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 
 
-def misfit(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> Misfit:
+def misfit(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> FrameError:
     wrong = torch.ones(camera.height, camera.width) if error is None else error
-    return Misfit(camera, time, lambda radiance: wrong.flatten())
+    return FrameError(camera, time, lambda radiance: wrong.flatten())
 
 
 def corner() -> torch.Tensor:
@@ -34,7 +34,7 @@ def test_blame_is_the_weights_of_the_slow_twin_times_the_error() -> None:
     cloud = field.cloud(field.knot(3.0))
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
     own = dense(*(p.detach() for p in parts), torch.eye(len(cloud.means)), CAMERA)  # weights
-    told = field.blame(misfit(error))
+    told = field.error_scores(misfit(error))
     torch.testing.assert_close(told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(told[:, 1], own.features.sum((0, 1)), atol=1e-3, rtol=1e-3)
 
@@ -51,7 +51,7 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
     field = card_field()
     field.static.logits.data[::20] = -10.0  # faded away; others lie outside the picture
     there = in_corner(field)
-    count = field.renew([misfit(corner())], torch.Generator().manual_seed(0))
+    count = field.relocate([misfit(corner())], torch.Generator().manual_seed(0))
     assert count == int(MOST * len(field.static))  # more are unseen
     assert there + 0.6 * count < in_corner(field) <= there + count  # some were faint ones of that quarter
 
@@ -59,7 +59,7 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
 def test_floaters_that_no_view_sees_are_put_to_use() -> None:
     field = card_field()
     field.static.means.data[:5] = torch.tensor([0.0, 0.0, -3.0])  # behind every camera
-    field.renew([misfit()], torch.Generator().manual_seed(0))
+    field.relocate([misfit()], torch.Generator().manual_seed(0))
     assert bool((field.static.means[:5, 2] > 3).all())
 
 
@@ -67,8 +67,8 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
     field = card_field()
     away = CAMERA.moved(torch.tensor([[1.0, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0]]))  # sees nothing
     before = {n: p.detach().clone() for n, p in field.named_parameters()}
-    field.renew([misfit(), misfit(camera=away)], torch.Generator().manual_seed(0))
-    seen = field.blame(misfit())[: len(field.static), 1] > 1
+    field.relocate([misfit(), misfit(camera=away)], torch.Generator().manual_seed(0))
+    seen = field.error_scores(misfit())[: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
     assert int((~kept & seen).sum()) <= 2 * MOST * len(field.static)  # the halves and what they were cut from
@@ -77,32 +77,36 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
 def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
     field = scattered()
     g, told = field.moving, torch.zeros(30, 2)
-    told[:, 1], told[4, 0], told[7, 1] = 1.0, 3.0, 0.0  # all seen but the eighth; only the fifth is to blame
+    told[:, 1], told[4, 0], told[7, 1] = 1.0, 3.0, 0.0  # all seen but the eighth; only the fifth is to error_scores
     g.quaternions.data[4], g.log_scales.data[4] = torch.tensor([1.0, 0, 0, 0]), torch.tensor([-2.0, -1.0, -3.0])
-    mean, mixture, presence = g.means[4].detach().clone(), field.mixture_logits[:, 4].clone(), field.presence[:, 4].clone()
+    mean, mixture, opacity_offsets = (
+        g.means[4].detach().clone(),
+        field.mixture_logits[:, 4].clone(),
+        field.opacity_offsets[:, 4].clone(),
+    )
     others = g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]].clone()
-    assert halve(g, told, [field.presence, field.mixture_logits], torch.Generator().manual_seed(0)) == 1
+    assert relocate(g, told, [field.opacity_offsets, field.mixture_logits], torch.Generator().manual_seed(0)) == 1
     along = torch.tensor([0.0, PARTED * math.exp(-1.0), 0.0])
     torch.testing.assert_close(g.means[4].detach(), mean - along)
     torch.testing.assert_close(g.means[7].detach(), mean + along)
     for i in (4, 7):
         torch.testing.assert_close(g.log_scales[i].detach(), torch.tensor([-2.0, -1.0 + math.log(NARROWER), -3.0]))
         torch.testing.assert_close(field.mixture_logits[:, i], mixture)
-        torch.testing.assert_close(field.presence[:, i], presence)
+        torch.testing.assert_close(field.opacity_offsets[:, i], opacity_offsets)
     torch.testing.assert_close(g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]], others)
 
 
 def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]
-    assert field.renew([misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
+    assert field.relocate([misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
     assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("shiny", [False, True])
 def test_training_renews_until_late_in_the_run(toy: Scene, toy_folder: Path, tmp_path: Path, shiny: bool) -> None:
     config = small("splat", toy_folder, tmp_path / "run", steps=10)
-    config = replace(config, field=replace(config.field, renew_every=1, view_dependence=shiny))
+    config = replace(config, field=replace(config.field, relocate_every=1, view_dependence=shiny))
     t = trainer(config, toy)
     assert isinstance(t.field, Splat)
     t.field.static.means.data[:40] = torch.tensor([0.0, 0.0, -50.0])  # floaters
@@ -118,11 +122,11 @@ def test_training_renews_until_late_in_the_run(toy: Scene, toy_folder: Path, tmp
 
 def test_misfits_are_the_recorded_differences(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
     t = trainer(small("splat", toy_folder, tmp_path / "run"), toy)
-    found = t.misfits(len(toy.train))
+    found = t.frame_errors(len(toy.train))
     assert [x.time for x in found] == [f.time for f in toy.train]
     f = toy.train[2]
     radiance = t.field.render(f.camera, f.time).radiance
     rgb = t.tonemapper(radiance, f.bracket, f.camera_id, 2, leaky=False)
     expected = (rgb.detach().view_as(f.image) - f.image).abs().mean(-1)
     torch.testing.assert_close(found[2].error(radiance).view_as(expected), expected)
-    assert len({x.time for x in t.misfits(3)}) == 3
+    assert len({x.time for x in t.frame_errors(3)}) == 3

@@ -1,4 +1,4 @@
-"""Debevec's initialisation against simulated cameras: response and exposures come back, outliers and misplaced points do not matter."""
+"""Debevec's initialization against simulated cameras: response and exposures come back, outliers and misplaced points do not matter."""
 
 import math
 from pathlib import Path
@@ -23,7 +23,7 @@ from hdr_nsff.radiometry.debevec import (
     typical_factor,
 )
 from hdr_nsff.scene.scene import Frame, Manifest, Scene
-from hdr_nsff.tonemap.initialize import initialise
+from hdr_nsff.tonemap.initialize import initialize
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 
 U = np.linspace(0, 1, 2001)
@@ -210,25 +210,25 @@ def scene_of(views, bracket_ev):
     return Scene(Path("."), frames, [], 1.0, 10.0, torch.zeros(0, 3), manifest)
 
 
-def test_initialise_finds_the_curve_through_noisy_depth():
+def test_initialize_finds_the_curve_through_noisy_depth():
     rng = np.random.default_rng(0)
     scene = scene_of([wall_view(i, S_CURVE, rng, depth_noise=0.02) for i in range(18)], EV)
     tonemapper = ToneMapper.for_scene(ToneMapConfig(), scene)
-    note = initialise(tonemapper, scene, num=1800)
+    note = initialize(tonemapper, scene, num=1800)
     x, y = tonemapper.curve()
     assert rmse(x.numpy(), y.numpy(), S_CURVE) < 0.01
     assert "static points" in note and "as given" in note
     assert tonemapper.anchored  # what was measured is held from the first step on
 
 
-def test_initialise_falls_back_on_brightness_and_says_so():
+def test_initialize_falls_back_on_brightness_and_says_so():
     rng = np.random.default_rng(0)
     views = [wall_view(i, GAMMA22, rng) for i in range(6)]
     for v in views:
         v.moving[:] = True
     scene = scene_of(views, [None, None, None])
     tonemapper = ToneMapper.for_scene(ToneMapConfig(), scene)
-    note = initialise(tonemapper, scene)
+    note = initialize(tonemapper, scene)
     assert "too few static points" in note and "brightness" in note
     assert not tonemapper.anchored
     assert tonemapper.exposures().tolist() == pytest.approx(EV, abs=0.4)
@@ -240,5 +240,5 @@ def test_the_papers_tone_mapper_is_left_as_published():
     rng = np.random.default_rng(0)
     scene = scene_of([wall_view(i, S_CURVE, rng) for i in range(3)], [None, None, None])
     tonemapper = ToneMapper.for_scene(ToneMapConfig(kind="per_image", knots="even", from_recordings=False), scene)
-    assert "published" in initialise(tonemapper, scene)
+    assert "published" in initialize(tonemapper, scene)
     assert (tonemapper.gains() == 0).all()

@@ -67,15 +67,15 @@ def test_at_the_ends_and_far_beyond_them_the_twins_agree(spacing: str, leak: flo
 
 
 @every_kind
-def test_at_a_knot_the_curve_is_its_value_and_the_slope_that_of_a_neighbour(spacing: str, leak: float | None) -> None:
+def test_at_a_knot_the_curve_is_its_value_and_the_slope_that_of_a_neighbor(spacing: str, leak: float | None) -> None:
     knots, (_, gain, values) = knot_positions(spacing), inputs()
     tensors = [knots[:, None].expand(-1, 3), torch.ones_like(gain), values]
     y, to_radiance, _, to_values = answers(fused, tensors, torch.ones(256, 3), knots, spacing, leak)
     torch.testing.assert_close(y, values.T)
     torch.testing.assert_close(to_values, torch.ones(3, 256))
     slopes = (values.diff() / knots.diff()).T
-    neighbours = torch.cat([slopes[:1], slopes]), torch.cat([slopes, slopes[-1:]])
-    assert torch.stack([torch.isclose(to_radiance, s, rtol=1e-4) for s in neighbours]).any(0).all()
+    neighbors = torch.cat([slopes[:1], slopes]), torch.cat([slopes, slopes[-1:]])
+    assert torch.stack([torch.isclose(to_radiance, s, rtol=1e-4) for s in neighbors]).any(0).all()
 
 
 @every_kind

@@ -76,8 +76,8 @@ def test_exact_flow_stays_as_it_is() -> None:
 
 
 def test_where_nothing_shows_nothing_is_corrected() -> None:
-    grey = np.full((H, W, 3), 0.5, np.float32)
-    assert np.abs(mended(grey, grey, blurred(), disc(0 * DISC)) - blurred()).max() < 1e-4
+    gray = np.full((H, W, 3), 0.5, np.float32)
+    assert np.abs(mended(gray, gray, blurred(), disc(0 * DISC)) - blurred()).max() < 1e-4
 
 
 def test_what_would_go_far_was_wrong_otherwise_and_is_left() -> None:

@@ -54,7 +54,7 @@ def test_the_first_point_is_the_middle_of_a_disc():
     assert np.linalg.norm(prompt.points[0] - [40 + 3 * prompt.frame, 40]) < 1.5
 
 
-def test_a_frame_whose_outline_fits_its_neighbours_is_preferred_over_a_larger_ragged_one():
+def test_a_frame_whose_outline_fits_its_neighbors_is_preferred_over_a_larger_ragged_one():
     moving = np.stack([disc(40 + 2 * t, 40, 12) for t in range(7)])
     moving[3] |= (np.abs(X - 46) < 2) & (Y < 76)  # a spike: larger, but nothing like the frames around it
     assert movers(moving)[0].prompts[0].frame not in (2, 3, 4)
@@ -123,7 +123,7 @@ def test_a_missing_points_file_is_named(tmp_path):
         read_points(tmp_path / "nowhere.json", 9, (HEIGHT, WIDTH))
 
 
-def test_coordinates_scale_with_pixel_centres_kept():
+def test_coordinates_scale_with_pixel_centers_kept():
     inputs = sam2.coordinates(np.array([[0.5, 0.5], [60, 40]]), np.array([1, 0]), np.array([0, 0, 120, 80]), (HEIGHT, WIDTH), 240)
     # a network that adds 0.5 sees 2 x the first in x and 3 x in y, the middle in the middle, the box's corners at the corners
     assert (inputs["point_coords"][0, 0] + 0.5).tolist() == [[0, 0], [240, 240], [1, 1.5], [120, 120]]

@@ -198,9 +198,9 @@ def with_flow(run: Run) -> Run:
     """The run with the exact flow of its clip, believed everywhere but at the disc's edge and where the other frame hides it."""
     field, frames = DiscBeforeWall(speed=MOTION, red=3.0), []
     for k, frame in enumerate(run.scene.train):
-        neighbours = {o: k + o for o in (-1, 1) if 0 <= k + o < len(run.scene.train)}
+        neighbors = {o: k + o for o in (-1, 1) if 0 <= k + o < len(run.scene.train)}
         flow, valid = {}, {}
-        for side, j in neighbours.items():
+        for side, j in neighbors.items():
             seen, there = field.render(frame.camera, frame.time), run.scene.train[j].camera
             rays = frame.camera.rays(frame.camera.pixel_grid())
             points = rays.origins + seen.depth[:, None] * rays.directions + seen.scene_flow[side]
@@ -211,7 +211,7 @@ def with_flow(run: Run) -> Run:
             ]
             flow[side] = (landing - frame.camera.pixel_grid()).view(H, W, 2)
             valid[side] = torch.stack([(a - depth).abs() < 0.1 for a in around]).all(0).view(H, W)
-        frames.append(replace(frame, neighbours=neighbours, flow=flow, flow_valid=valid))
+        frames.append(replace(frame, neighbors=neighbors, flow=flow, flow_valid=valid))
     return replace(run, scene=replace(run.scene, train=frames))
 
 

@@ -12,7 +12,7 @@ from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
     drift,
-    neighbour_distance,
+    neighbor_distance,
     place,
     quaternions,
     seed,
@@ -188,7 +188,7 @@ def test_frozen_footage(toy: Scene) -> None:
     scene = changed(
         toy,
         lambda f: replace(
-            first, time=f.time, neighbours=f.neighbours, flow=same, flow_valid={o: ~first.moving | True for o in same}
+            first, time=f.time, neighbors=f.neighbors, flow=same, flow_valid={o: ~first.moving | True for o in same}
         ),
     )
     started, _ = seeded(scene)
@@ -197,7 +197,7 @@ def test_frozen_footage(toy: Scene) -> None:
 
 def test_a_second_camera_speaks_where_the_first_has_no_frame(toy: Scene) -> None:
     f = toy.train[2]
-    twin = replace(f, camera_id=1, neighbours={}, flow={}, flow_valid={})
+    twin = replace(f, camera_id=1, neighbors={}, flow={}, flow_valid={})
     views, chosen = views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=[*toy.train, twin]))
     assert chosen == [0, 1, 2, 3, 4, 5] and len(views) == 6
 
@@ -206,7 +206,7 @@ def test_flow_to_a_frame_that_does_not_speak_is_left_out(toy: Scene) -> None:
     train = [*toy.train]
     train[2] = replace(train[2], camera_id=1)
     train.append(replace(toy.train[2]))  # what frames 1 and 3 know the flow to; its time is spoken for
-    train[1], train[3] = (replace(train[i], neighbours=train[i].neighbours | {o: 6}) for i, o in ((1, 1), (3, -1)))
+    train[1], train[3] = (replace(train[i], neighbors=train[i].neighbors | {o: 6}) for i, o in ((1, 1), (3, -1)))
     views, chosen = views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=train))
     assert chosen == [0, 1, 2, 3, 4, 5]
     assert [sorted(v.flow) for v in views] == [[1], [-1], [-1, 1], [1], [-1, 1], [-1]]
@@ -231,7 +231,7 @@ def test_movers_are_hidden_while_nothing_of_them_is_seen(toy: Scene) -> None:
 # Parts
 
 
-def test_a_gaussian_is_as_wide_as_its_neighbours_are_away() -> None:
+def test_a_gaussian_is_as_wide_as_its_neighbors_are_away() -> None:
     grid = torch.tensor([[x, y, 0.0] for x in range(6) for y in range(6)])
     gaussians = Gaussians(40, 1, 1)
     with torch.no_grad():
@@ -248,7 +248,7 @@ def test_few_points_are_placed_with_finite_sizes(count: int) -> None:
     with torch.no_grad():
         assert place(gaussians, Points(at, torch.zeros(count, 3), torch.ones(count), torch.ones(count))) == count
     assert torch.isfinite(gaussians.log_scales).all() and int(seen(gaussians).sum()) == count
-    assert len(neighbour_distance(at.numpy())) == count
+    assert len(neighbor_distance(at.numpy())) == count
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])

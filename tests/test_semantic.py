@@ -1,10 +1,10 @@
-"""Flow by features: right across exposures and beyond the reach of plain matching, clean at edges; features here are colours."""
+"""Flow by features: right across exposures and beyond the reach of plain matching, clean at edges; features here are colors."""
 
 import cv2
 import numpy as np
 import torch
 
-from hdr_nsff.priors.flow.adapt import colours
+from hdr_nsff.priors.flow.adapt import colors
 from hdr_nsff.priors.flow.dense import flow
 from hdr_nsff.priors.flow.features import Features
 from hdr_nsff.priors.flow.semantic import SemanticFlow, coarse, equal_tracks, fill, matched, spread
@@ -21,7 +21,7 @@ def texture(seed: int, size: tuple[int, int], blur: float) -> np.ndarray:
 def source(video: np.ndarray) -> Features:
     """What each cell of 4 pixels shows, its mean over the cells around taken off: alike under any gain and offset."""
     bare = Features(torch.zeros(1, 1, H // 4, W // 4), 4.0, 2.0)
-    seen = colours(video, bare, 2)
+    seen = colors(video, bare, 2)
     return Features(seen - torch.nn.functional.avg_pool2d(seen, 5, 1, 2, count_include_pad=False), 4.0, 2.0)
 
 
@@ -73,7 +73,7 @@ def test_flow_is_not_rounded_to_cells_or_pixels():
 
 
 def test_what_lies_beyond_an_edge_is_not_mixed_in():
-    """Unsure cells hold nonsense, cells of another colour another motion: neither shows within the edge."""
+    """Unsure cells hold nonsense, cells of another color another motion: neither shows within the edge."""
     values, sure, rgb = np.zeros((6, 8, 2), np.float32), np.ones((6, 8), bool), np.zeros((6, 8, 3), np.float32)
     values[:, :4], values[:, 4:], rgb[:, 4:] = 3, -50, 1
     values[2, 2], sure[2, 2] = np.nan, False

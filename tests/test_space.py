@@ -64,7 +64,7 @@ def test_contraction_is_linear_inside_and_bounded_outside() -> None:
     assert float(space.encode(torch.tensor([[1e9, 0, 0]])).max()) <= 1.0
 
 
-def test_mean_pose_is_a_rotation_at_the_mean_centre() -> None:
+def test_mean_pose_is_a_rotation_at_the_mean_center() -> None:
     pose = mean_pose([camera(-1.0, -0.3), camera(2.0, 0.3)])
     torch.testing.assert_close(pose, camera(0.5).c2w, atol=1e-6, rtol=0)
     tilted = mean_pose(all_round()[:2])

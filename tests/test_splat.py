@@ -44,11 +44,11 @@ def card_field(bases: int = 2) -> Splat:
 
 
 def batch_of(knot: int, offset: int, seed: int = 0) -> PixelBatch:
-    """The whole picture at a time; flow is asked for towards one neighbour, seen from `BESIDE`."""
+    """The whole picture at a time; flow is asked for towards one neighbor, seen from `BESIDE`."""
     pixels = CAMERA.pixel_grid()
-    grey, flow = torch.full((len(pixels), 3), 0.5), {offset: torch.zeros(len(pixels), 2)}
+    gray, flow = torch.full((len(pixels), 3), 0.5), {offset: torch.zeros(len(pixels), 2)}
     every = torch.ones(len(pixels), dtype=torch.bool)
-    return PixelBatch(knot, float(knot), CAMERA, 0, 0, {offset: BESIDE}, pixels, grey, every, seed=seed, flow=flow)
+    return PixelBatch(knot, float(knot), CAMERA, 0, 0, {offset: BESIDE}, pixels, gray, every, seed=seed, flow=flow)
 
 
 def pixel_of(point: Tensor) -> int:
@@ -91,7 +91,7 @@ def test_at_the_ends_of_the_clip_scene_flow_goes_straight_on(time: float) -> Non
 
 
 @pytest.mark.parametrize("offset", [1, -1])
-def test_flow_to_the_neighbour_is_the_projected_displacement(offset: int) -> None:
+def test_flow_to_the_neighbor_is_the_projected_displacement(offset: int) -> None:
     render, _ = card_field()(batch_of(4, offset))
     (warp,) = render.warps
     z = 2 + 4 * 0.03
@@ -121,7 +121,7 @@ def test_flow_through_a_faint_card_is_the_same() -> None:
 
 def test_flow_to_one_side_and_rigidity_take_turns_as_the_seed_says() -> None:
     batch = batch_of(4, 1)
-    both = replace(batch, neighbours={1: BESIDE, -1: BESIDE}, flow={o: batch.flow[1] for o in (1, -1)})
+    both = replace(batch, neighbors={1: BESIDE, -1: BESIDE}, flow={o: batch.flow[1] for o in (1, -1)})
     seen = [card_field()(replace(both, seed=s)) for s in range(5)]
     assert [[w.offset for w in render.warps] for render, _ in seen] == [[1], [], [-1], [], [1]]
     assert ["rigidity" in own for _, own in seen] == [False, True, False, True, False]
@@ -166,7 +166,7 @@ def test_gradients_reach_every_parameter() -> None:
 
 
 def test_a_step_moves_only_the_poses_near_the_drawn_frame(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
-    long = replace(toy, train=[replace(toy.train[i % 6], time=float(i), neighbours={}) for i in range(12)])
+    long = replace(toy, train=[replace(toy.train[i % 6], time=float(i), neighbors={}) for i in range(12)])
     t = trainer(small("splat", toy_folder, tmp_path / "run"), long)
     field = t.field
     assert isinstance(field, Splat)
@@ -181,7 +181,7 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(toy: Scene, toy_folder
         assert float(p.grad.abs().max()) == 0  # a step clears what it used
 
 
-def test_invisible_gaussians_are_left_alone_by_the_regularisers() -> None:
+def test_invisible_gaussians_are_left_alone_by_the_regularizers() -> None:
     field = scattered()
     field.static.logits.data[:10] = -10.0
     own = field.regularizers(field.cloud(3.0), 3.0)
@@ -192,17 +192,17 @@ def test_invisible_gaussians_are_left_alone_by_the_regularisers() -> None:
     torch.testing.assert_close(field.regularizers(field.cloud(3.0), 3.0)["scale"], own["scale"])
 
 
-def test_the_regularisers_of_a_plain_field_by_hand() -> None:
+def test_the_regularizers_of_a_plain_field_by_hand() -> None:
     field = card_field()
     own = {k: float(v.detach()) for k, v in field.regularizers(field.cloud(3.0), 3.0).items()}
     assert own["opacity"] == pytest.approx(1 / (1 + math.exp(-6)))
     assert own["scale"] == pytest.approx((825 * (0.2 + 1e-3) + 121 * (0.08 + 1e-3)) / 3 / 946, rel=1e-5)  # near is 1
-    assert own["trajectory"] < 1e-12 and own["shade"] == own["colour_change"] == 0  # even steps, constant colours
+    assert own["trajectory"] < 1e-12 and own["brightness_drift"] == own["color_change"] == 0  # even steps, constant colors
     field.moving.offsets.data[3] = 2.0  # up and down between 7 times: 2 of 6 differences; 1 of 7 times
-    assert float(field.regularizers(field.cloud(3.0), 3.0)["colour_change"].detach()) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
+    assert float(field.regularizers(field.cloud(3.0), 3.0)["color_change"].detach()) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
 
 
-@pytest.mark.parametrize("config", [{"moving": 0}, {"static": 0}, {"colour_knots": 1, "presence_knots": 1, "shade_knots": 1}])
+@pytest.mark.parametrize("config", [{"moving": 0}, {"static": 0}, {"color_knots": 1, "opacity_knots": 1, "brightness_knots": 1}])
 def test_a_field_may_lack_a_kind_of_gaussian_or_all_change(config: dict[str, int]) -> None:
     field = Splat(replace(SplatConfig(static=20, moving=20), **config), torch.arange(TIMES), 1.0, 6.0, 1200)
     render, own = field(batch_of(4, 1))
@@ -213,7 +213,7 @@ def test_a_field_may_lack_a_kind_of_gaussian_or_all_change(config: dict[str, int
 
 def test_moving_gaussians_come_and_go() -> None:
     field = card_field()
-    field.presence.data[:7] = -20.0  # 13 knots over 10 times: gone until the middle
+    field.opacity_offsets.data[:7] = -20.0  # 13 knots over 10 times: gone until the middle
     before, after = field.render(CAMERA, 3.0), field.render(CAMERA, 8.0)
     assert float(before.motion.max()) < 0.01 and float(after.motion.max()) > 0.99
     assert field.gaussians(3.0).motion.sum() == 0 and field.gaussians(8.0).motion.sum() == 121
@@ -286,7 +286,7 @@ def test_one_training_time_has_no_flow() -> None:
     assert float(render.motion.max()) > 0.1 and torch.isfinite(field(replace(batch_of(0, 1), flow={}))[1]["trajectory"])
 
 
-def test_colours_change_over_the_clip_and_static_ones_in_brightness_only() -> None:
+def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> None:
     field = card_field()
     field.moving.offsets.data = torch.linspace(0, 1, 7)[:, None, None] * torch.tensor([1.0, 0.0, -1.0]).expand(121, 3)
     field.static.offsets.data = torch.linspace(0, 2, 5)[:, None, None].expand(5, 825, 1).clone()
@@ -319,32 +319,32 @@ def test_a_picture_without_scene_flow_is_the_same_picture() -> None:
 def test_flow_with_a_camera_that_learns_reaches_its_pose() -> None:
     field, batch = card_field(), batch_of(4, 1)
     pose = BESIDE.c2w.clone().requires_grad_()
-    moved = field.displacements(replace(batch, neighbours={1: BESIDE.moved(pose)}), field.cloud(4.0).means, 4.0, 1)
+    moved = field.displacements(replace(batch, neighbors={1: BESIDE.moved(pose)}), field.cloud(4.0).means, 4.0, 1)
     torch.testing.assert_close(moved, field.displacements(batch, field.cloud(4.0).means, 4.0, 1))
     moved[:, 0].sum().backward()
     assert pose.grad is not None and float(pose.grad[0, 3]) < 0  # a camera that goes right sees everything go left
 
 
-def test_neighbours_that_mix_alike_are_rigid_and_others_pay() -> None:
+def test_neighbors_that_mix_alike_are_rigid_and_others_pay() -> None:
     field = card_field()  # all mixtures alike; a grid of 11 x 11 Gaussians
-    field.look_around()
-    assert set(field.beside[60].tolist()) == {49, 59, 61, 71}  # the middle one's four
+    field.find_neighbors()
+    assert set(field.neighbors[60].tolist()) == {49, 59, 61, 71}  # the middle one's four
     assert float(field.rigidity().detach()) == 0
     field.mixture_logits.data[:, 60] = torch.tensor([1.0, -1.0])  # 0.8808 and 0.1192 instead of halves
-    pairs = int((field.beside == 60).sum()) + 4  # it looks at its four neighbours, and some look at it
+    pairs = int((field.neighbors == 60).sum()) + 4  # it looks at its four neighbors, and some look at it
     assert float(field.rigidity().detach()) == pytest.approx(pairs * 2 * 0.3808**2 / (121 * 4 * 2), rel=1e-3)
     field.rigidity().backward()
     assert field.mixture_logits.grad is not None and float(field.mixture_logits.grad[0, 60]) > 0
 
 
-def test_colours_depend_on_the_direction_of_view_only_where_wanted() -> None:
+def test_colors_depend_on_the_direction_of_view_only_where_wanted() -> None:
     plain, shiny = (Splat(SplatConfig(1, 0, view_dependence=v), torch.arange(2), 1.0, 6.0, 1200) for v in (False, True))
-    assert plain.static.sheen.numel() == 0
+    assert plain.static.sh1.numel() == 0
     with torch.no_grad():
         for field in (plain, shiny):
             field.static.means[:] = torch.tensor([0.0, 0.0, 2.0])
             field.static.log_scales[:], field.static.logits[:] = 0.0, 9.0
-        shiny.static.sheen[0, 1, 0] = 1.0  # green grows to the right
+        shiny.static.sh1[0, 1, 0] = 1.0  # green grows to the right
         beside = CAMERA.moved(torch.tensor([[0.8, 0, 0.6, -1.5], [0, 1, 0, 0], [-0.6, 0, 0.8, 0]]))  # sees it along (0.6, 0, 0.8)
         middle = torch.tensor([[20.0, 15.0]])
         for camera, direction in ((CAMERA, 0.0), (beside, 0.6)):

@@ -1,4 +1,4 @@
-"""Coloured points from depth: lifting worked by hand, trust, and thinning."""
+"""Colored points from depth: lifting worked by hand, trust, and thinning."""
 
 import math
 
@@ -16,7 +16,7 @@ CAMERA = Camera(
 
 
 def frame(disparity: Tensor, image: Tensor | None = None, confidence: Tensor | None = None) -> Frame:
-    """A frame of 4 x 2 pixels, grey unless given."""
+    """A frame of 4 x 2 pixels, gray unless given."""
     image = torch.full((2, 4, 3), 0.5) if image is None else image
     return Frame(0, 0.0, CAMERA, 0, 0, None, image, disparity=disparity, disparity_confidence=confidence)
 
@@ -40,7 +40,7 @@ EVERY = torch.ones(8, dtype=torch.bool)
 
 
 def test_a_pixel_is_lifted_to_its_depth_on_its_ray() -> None:
-    chosen = torch.arange(8) == 7  # column 3, row 1: centre (3.5, 1.5), so x / z = 0.15 and y / z = 0.05
+    chosen = torch.arange(8) == 7  # column 3, row 1: center (3.5, 1.5), so x / z = 0.15 and y / z = 0.05
     p = lift(frame(torch.full((2, 4), 0.25)), 0, chosen, 1.0, 100.0, double)
     torch.testing.assert_close(p.positions, torch.tensor([[5 + 0.15 * 4, 0.05 * 4, 4.0]]))
     torch.testing.assert_close(p.footprint, torch.tensor([4.0 / 10]))
@@ -66,13 +66,13 @@ def test_black_has_a_finite_log_radiance() -> None:
 def test_confidence_is_part_of_trust() -> None:
     confidence = torch.tensor([[0.0, 0.5, 1.0, 1.0], [0.0, 0.5, 1.0, 1.0]])
     p = lift(frame(torch.ones(2, 4), confidence=confidence), 0, EVERY, 0.5, 9.0, double)
-    torch.testing.assert_close(p.trust[:3], torch.tensor([0.02, 0.52, 1.02]) * 0.5)  # grey, mean 0.5, is well exposed
+    torch.testing.assert_close(p.trust[:3], torch.tensor([0.02, 0.52, 1.02]) * 0.5)  # gray, mean 0.5, is well exposed
 
 
 @pytest.mark.parametrize("rgb", [[0.98, 0.5, 0.5], [0.5, 0.5, 1.0], [0.005, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
 def test_one_clipped_channel_takes_all_trust(rgb: list[float]) -> None:
-    clipped, grey = exposure_trust(torch.tensor([rgb, [0.5, 0.5, 0.5]])).tolist()
-    assert 0 < clipped < 0.01 * grey
+    clipped, gray = exposure_trust(torch.tensor([rgb, [0.5, 0.5, 0.5]])).tolist()
+    assert 0 < clipped < 0.01 * gray
 
 
 def test_darks_are_trusted_less() -> None:

@@ -57,10 +57,10 @@ def test_projection_agrees_with_the_camera_of_the_package() -> None:
 def test_ball_swings_on_a_circle_about_its_pivot() -> None:
     """At angle a the ball hangs CORD cos(a) below the pivot and CORD sin(a) beside it."""
     for t in (0.0, 3.5, 17.0):
-        centre = (ball_pose(t) @ [0, CORD, 0, 1])[:3] - PIVOT
+        center = (ball_pose(t) @ [0, CORD, 0, 1])[:3] - PIVOT
         angle = np.radians(18) * np.sin(2 * np.pi * (t + 4) / 30)
-        assert centre[1] == pytest.approx(CORD * np.cos(angle))
-        assert np.hypot(centre[0], centre[2]) == pytest.approx(CORD * abs(np.sin(angle)))
+        assert center[1] == pytest.approx(CORD * np.cos(angle))
+        assert np.hypot(center[0], center[2]) == pytest.approx(CORD * abs(np.sin(angle)))
 
 
 def test_moved_carries_movers_rigidly_and_leaves_the_room() -> None:
@@ -74,11 +74,11 @@ def test_moved_carries_movers_rigidly_and_leaves_the_room() -> None:
 
 
 def test_flow_of_a_known_point_is_exact() -> None:
-    """A pixel that shows the ball's centre flows to where the next camera projects the next position of that centre."""
-    K, centre = intrinsics(240, 136), [0, CORD, 0, 1]
-    pixel, _ = project((ball_pose(7) @ centre)[:3], K, camera_pose(7))
-    after, _ = project((ball_pose(8) @ centre)[:3], K, camera_pose(8))
-    points = np.broadcast_to((ball_pose(7) @ centre)[:3], (136, 240, 3))
+    """A pixel that shows the ball's center flows to where the next camera projects the next position of that center."""
+    K, center = intrinsics(240, 136), [0, CORD, 0, 1]
+    pixel, _ = project((ball_pose(7) @ center)[:3], K, camera_pose(7))
+    after, _ = project((ball_pose(8) @ center)[:3], K, camera_pose(8))
+    points = np.broadcast_to((ball_pose(7) @ center)[:3], (136, 240, 3))
     x, y = np.floor(pixel).astype(int)
     there = INTERIOR.moved(points, np.full((136, 240), BALL), np.zeros((136, 240, 2)), 7, 8)
     flow = exact_flow(there, K, camera_pose(8))[y, x]
@@ -119,9 +119,9 @@ def test_the_rig_is_two_rows_of_cameras_that_look_at_one_place() -> None:
 
 def test_every_camera_of_the_rig_always_sees_both_movers() -> None:
     K = intrinsics(240, 136)
-    centres = [(b(t) @ p)[:3] for t in range(36) for b, p in ((box_pose, [0, 0, 0, 1]), (ball_pose, [0, CORD, 0, 1]))]
+    centers = [(b(t) @ p)[:3] for t in range(36) for b, p in ((box_pose, [0, 0, 0, 1]), (ball_pose, [0, CORD, 0, 1]))]
     for k in range(9):
-        pixels, depth = project(np.array(centres), K, INTERIOR.pose("rig", k))
+        pixels, depth = project(np.array(centers), K, INTERIOR.pose("rig", k))
         assert (pixels > 20).all() and (pixels < [220, 116]).all() and (depth > 1.5).all()
 
 
@@ -398,7 +398,7 @@ def test_a_tiny_picture_holds_the_range_it_promises(tracer: Tracer) -> None:
     assert np.abs(pictures[0] - pictures[1]).max() > 0.1  # the room moves
 
 
-def test_surfaces_lie_on_the_rays_through_pixel_centres(tracer: Tracer) -> None:
+def test_surfaces_lie_on_the_rays_through_pixel_centers(tracer: Tracer) -> None:
     size, c2w = (32, 18), camera_pose(3)
     K = intrinsics(*size)
     surface = tracer.surface(3.0, K, c2w, size)

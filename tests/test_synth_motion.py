@@ -56,12 +56,12 @@ def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:  # noqa: F
     size, c2w, time = (96, 54), camera_pose(3), 9.5
     surface = tracer.surface(time, intrinsics(*size), c2w, size)
     channels = view_geometry(INTERIOR, {"Z": surface.depth, "body": surface.bodies}, time, intrinsics(*size), c2w)
-    centre = {s: (ball_pose(time + s) @ [0, CORD, 0, 1])[:3] for s in (0, 1, -1)}
-    distance = np.linalg.norm(surface.points - centre[0], axis=-1)
+    center = {s: (ball_pose(time + s) @ [0, CORD, 0, 1])[:3] for s in (0, 1, -1)}
+    distance = np.linalg.norm(surface.points - center[0], axis=-1)
     ball = (surface.bodies == BALL) & (distance < 0.17)  # and not its cord
     assert ball.sum() > 20 and (surface.bodies == BOX).any()
     for side, name in io.SIDES.items():
         moved = surface.points + np.stack([channels[f"{name}.{a}"] for a in "xyz"], -1)
-        assert np.linalg.norm(centre[side] - centre[0]) > 0.02
-        np.testing.assert_allclose(np.linalg.norm(moved - centre[side], axis=-1)[ball], distance[ball], atol=1e-5)
+        assert np.linalg.norm(center[side] - center[0]) > 0.02
+        np.testing.assert_allclose(np.linalg.norm(moved - center[side], axis=-1)[ball], distance[ball], atol=1e-5)
         np.testing.assert_allclose(distance[ball], 0.165, atol=1e-3)

@@ -43,7 +43,7 @@ def test_a_still_pixel_carried_by_its_depth_lands_where_the_flow_says(tmp_path: 
     frames = oracle(tmp_path, EXACT)
     pixels = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1)
     for k, frame in enumerate(frames):
-        for side, j in frame.neighbours.items():
+        for side, j in frame.neighbors.items():
             points = back_project(1 / frame.disparity.double().numpy(), K, POSES[k])
             landed, _ = project(points, K, POSES[j])
             error = np.linalg.norm(landed - pixels - frame.flow[side].numpy(), axis=-1)
@@ -53,10 +53,10 @@ def test_a_still_pixel_carried_by_its_depth_lands_where_the_flow_says(tmp_path: 
             assert frame.flow_valid[side].numpy()[still & inside].all() and (still & inside).sum() > 500
 
 
-def test_cameras_of_a_rig_are_neighbours_in_time_and_share_one_response(tmp_path: Path) -> None:
+def test_cameras_of_a_rig_are_neighbors_in_time_and_share_one_response(tmp_path: Path) -> None:
     frames = oracle(tmp_path, EXACT)
-    assert [f.neighbours for f in frames] == [{1: 1}, {-1: 0, 1: 2}, {-1: 1, 1: 3}, {-1: 2}]
-    assert {f.camera_id for f in frames} == {0} and all(set(f.flow) == set(f.neighbours) for f in frames)
+    assert [f.neighbors for f in frames] == [{1: 1}, {-1: 0, 1: 2}, {-1: 1, 1: 3}, {-1: 2}]
+    assert {f.camera_id for f in frames} == {0} and all(set(f.flow) == set(f.neighbors) for f in frames)
     eyes = np.array([f.camera.c2w[:, 3].tolist() for f in frames])
     assert (np.linalg.norm(np.diff(eyes, axis=0), axis=1) > 0.25).all()  # and are not the same camera
 
@@ -80,7 +80,7 @@ def test_the_seed_decides_the_noise(tmp_path: Path) -> None:
 
 
 def test_a_mover_has_the_depth_of_where_it_goes() -> None:
-    """Two cameras that look straight at the box, ten frames apart: the middle of three pixels shows its centre."""
+    """Two cameras that look straight at the box, ten frames apart: the middle of three pixels shows its center."""
     eye, (before, after) = np.array([0.4, -0.1, 0.2]), (box_pose(t)[:3, 3] for t in (0, 10))
     channels = {"Z": np.full((3, 3), np.linalg.norm(before - eye)), "body": np.ones((3, 3))}
     poses = [look_at(eye, before)] * 10 + [look_at(eye, after)]
@@ -88,7 +88,7 @@ def test_a_mover_has_the_depth_of_where_it_goes() -> None:
 
 
 def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
-    """A camera two thirds of a metre nearer sees the wall a quarter nearer: other depth, same surface. A pole hides it."""
+    """A camera two thirds of a meter nearer sees the wall a quarter nearer: other depth, same surface. A pole hides it."""
     near = camera_pose(0).copy()
     near[:, 3] += 0.7 * near[:, 2]
     channels = {"Z": np.full(SIZE[::-1], 3.0), "body": np.zeros(SIZE[::-1])}

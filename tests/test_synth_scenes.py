@@ -86,7 +86,7 @@ def surface_is_round(tracer: Tracer, body: str, point: np.ndarray, t: float) -> 
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_depth_is_along_the_ray_through_the_pixel_centre(tracers: dict[str, Tracer], name: str) -> None:
+def test_depth_is_along_the_ray_through_the_pixel_center(tracers: dict[str, Tracer], name: str) -> None:
     scene = SCENES[name]
     for views, t in (("mono", 4.0), ("rig", 5.5)):
         c2w = scene.pose(views, round(t))
@@ -198,7 +198,7 @@ def test_dim_lights_share_a_circuit(tracers: dict[str, Tracer]) -> None:
 
 @pytest.mark.parametrize("body", [1, 2])
 def test_no_rigid_motion_explains_what_deforms(body: int) -> None:
-    """The best one, by Kabsch, is off by centimetres."""
+    """The best one, by Kabsch, is off by centimeters."""
     scene = SCENES["cloth"]
     mesh = next(p for p in scene.build(0) if p.body == scene.bodies[body - 1].name)
     a, b = (scene.vertices(mesh, t) for t in (4.0, 9.0))

@@ -280,10 +280,10 @@ def test_a_network_response_teaches_gains_and_radiance_beyond_saturation():
 
 def test_a_look_is_the_recording_and_names_the_images_it_resembles():
     t = disturb(mapper())
-    assert t.look(1, 0).images == (1, 4) and t.look(1, 0, 4).images == (4,)
-    torch.testing.assert_close(t.look(1, 0, 4, leaky=True).rgb(grid()), t(grid(), bracket=1, frame=4))
-    assert t.look_at(-3.9).images == (0, 3)  # the exposures are -4, -2, 0
-    torch.testing.assert_close(t.look_at(-3.9).rgb(grid()), t.develop(grid(), -3.9))
+    assert t.recorder(1, 0).images == (1, 4) and t.recorder(1, 0, 4).images == (4,)
+    torch.testing.assert_close(t.recorder(1, 0, 4, leaky=True).rgb(grid()), t(grid(), bracket=1, frame=4))
+    assert t.recorder_at(-3.9).images == (0, 3)  # the exposures are -4, -2, 0
+    torch.testing.assert_close(t.recorder_at(-3.9).rgb(grid()), t.develop(grid(), -3.9))
 
 
 def test_black_and_saturated_pixels_tell_nothing():
@@ -304,23 +304,23 @@ def test_a_response_is_learned_from_known_exposures():
     generator = torch.Generator().manual_seed(1)
     truth = lambda x: (x**0.6 * (1.4 - 0.4 * x)).clamp(0, 1)  # noqa: E731
     t = mapper(residual=False)
-    optimiser = torch.optim.Adam(t.param_groups(5e-2))
+    optimizer = torch.optim.Adam(t.param_groups(5e-2))
     for _ in range(250):
         radiance = 2.0 ** (torch.rand(512, 3, generator=generator) * 10 - 6)
         bracket = int(torch.randint(3, (1,), generator=generator))
         loss = (t(radiance, bracket) - truth((radiance * 2 ** EV[bracket]).clamp(0, 1))).abs().mean()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         (loss + 1e-3 * t.smoothness()).backward()
-        optimiser.step()
+        optimizer.step()
     x, y = t.curve()
     assert (y - truth(x))[:, x > 0.002].square().mean().sqrt() < 0.02
 
 
-def test_neutral_gains_make_a_grey_recording_grey() -> None:
+def test_neutral_gains_make_a_gray_recording_gray() -> None:
     t = ToneMapper(ToneMapConfig(), [0, 1], [0, 0], [0.0, -2.0])
     x = torch.linspace(0, 1, 64)
     t.set_curve(x, torch.stack([x ** (1 / 2.2), x ** (1 / 1.6), x ** (1 / 3.0)]))
-    radiance = t.inverse(torch.full((1, 3), 0.5), 0)[0]  # 0.5^2.2, 0.5^1.6, 0.5^3: far from grey
+    radiance = t.inverse(torch.full((1, 3), 0.5), 0)[0]  # 0.5^2.2, 0.5^1.6, 0.5^3: far from gray
     seen = radiance * t.neutral()
     assert float(radiance.max() / radiance.min()) > 2
     torch.testing.assert_close(seen, seen.mean().expand(3), rtol=1e-4, atol=0)

@@ -53,7 +53,7 @@ def unbroken(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def test_the_same_seed_gives_the_same_parameters_bit_for_bit(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
     again = final(train(config(toy_folder, tmp_path / "run")))
     assert_same(final(unbroken), again)
-    assert any(k.startswith("optimiser.touched.") for k in again) and "field.static_cells.weight" in again
+    assert any(k.startswith("optimizer.touched.") for k in again) and "field.static_cells.weight" in again
 
 
 def test_another_seed_gives_others(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
@@ -168,7 +168,7 @@ def test_snapshots_are_kept_on_the_way_and_change_nothing(unbroken: Path, toy_fo
     assert half.step == STEPS // 2 and 0 < half.seconds < Run.open(run).seconds
     table = "branches.static_grid.table"
     assert not torch.equal(half.field.state_dict()[table], Run.open(run).field.state_dict()[table])
-    assert not any(k.startswith("optimiser.") for k in load_file(snapshots(run)[0.5]))
+    assert not any(k.startswith("optimizer.") for k in load_file(snapshots(run)[0.5]))
 
 
 def test_a_resumed_run_keeps_the_snapshots_that_are_still_to_come(

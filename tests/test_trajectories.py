@@ -1,4 +1,4 @@
-"""Shared rigid motions: rotations about a centre, mixtures of shifts, quaternions against rotation matrices."""
+"""Shared rigid motions: rotations about a center, mixtures of shifts, quaternions against rotation matrices."""
 
 import math
 
@@ -16,9 +16,9 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def turning(angle: float) -> Trajectories:
-    """One basis that turns by `angle` (radians) per knot about the z axis through its centre."""
+    """One basis that turns by `angle` (radians) per knot about the z axis through its center."""
     t = Trajectories(1, KNOTS)
-    t.centres[:] = torch.tensor([1.0, 2.0, 3.0])
+    t.centers[:] = torch.tensor([1.0, 2.0, 3.0])
     half = 0.5 * angle * torch.arange(KNOTS)
     t.turns.data = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
     return t
@@ -31,17 +31,17 @@ def about_z(angle: float) -> Tensor:
 
 def test_nothing_moves_before_training() -> None:
     t, points, quaternions = Trajectories(3, KNOTS), random(20, 3), random(20, 4)
-    t.centres[:] = random(3, 3, seed=1)
+    t.centers[:] = random(3, 3, seed=1)
     mixture = random(3, 20, seed=2).softmax(0)
     for knot in (0.0, 3.7, 9.0):
         torch.testing.assert_close(t.move(points, mixture, t.pose(knot)), points)
         torch.testing.assert_close(t.turn(quaternions, mixture, t.pose(knot)), quaternions)
 
 
-def test_a_pure_rotation_turns_about_its_centre() -> None:
+def test_a_pure_rotation_turns_about_its_center() -> None:
     t, points = turning(0.3), random(20, 3)
     for knot in (0, 2, 9):
-        expected = (points - t.centres) @ about_z(0.3 * knot).T + t.centres
+        expected = (points - t.centers) @ about_z(0.3 * knot).T + t.centers
         torch.testing.assert_close(t.move(points, torch.ones(1, 20), t.pose(float(knot))), expected)
 
 
@@ -49,7 +49,7 @@ def test_between_knots_a_rotation_stays_rigid_and_nearly_even() -> None:
     t, points = turning(0.3), random(20, 3)
     moved = t.move(points, torch.ones(1, 20), t.pose(4.5))
     torch.testing.assert_close(torch.cdist(moved, moved), torch.cdist(points, points), atol=1e-4, rtol=1e-4)
-    torch.testing.assert_close(moved, (points - t.centres) @ about_z(0.3 * 4.5).T + t.centres, atol=1e-4, rtol=1e-3)
+    torch.testing.assert_close(moved, (points - t.centers) @ about_z(0.3 * 4.5).T + t.centers, atol=1e-4, rtol=1e-3)
 
 
 def test_a_gaussian_turns_as_its_place_does() -> None:

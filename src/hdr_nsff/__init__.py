@@ -9,4 +9,4 @@ from hdr_nsff.core.process import keep_memory
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 keep_memory()
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"

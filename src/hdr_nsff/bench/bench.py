@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from hdr_nsff.bench.gallery import write_page
-from hdr_nsff.bench.plan import BenchConfig, Cell, Plan, arguments, claim, introduce, make_plan
+from hdr_nsff.bench.plan import BenchConfig, BenchRun, Plan, arguments, claim, introduce, make_plan
 from hdr_nsff.bench.pool import Job, end_with_parent, last_words, run_jobs, shell_line, slots
 from hdr_nsff.bench.run import LOG, complete, get_ready, run_cell
 from hdr_nsff.bench.tables import row_of, write_tables
@@ -112,7 +112,7 @@ class Standing:
     """How far the runs are."""
 
     plan: Plan
-    cells: dict[str, Cell]
+    cells: dict[str, BenchRun]
     done: int = 0
     start: float = field(default_factory=time.monotonic)
 

@@ -36,7 +36,7 @@ NOTES = {
     COSTS: "Training is the clock of the training alone. Before it: reading the scene, starting the field, compiling kernels in the first step, and "
     "writing. Measuring is no part of either. Memory is that of the process; a frame is rendered at the size of the scene's.",
 }
-ERROR_TOP = 0.25  # of the recorded range [0, 1]: where the colours of an error end
+ERROR_TOP = 0.25  # of the recorded range [0, 1]: where the colors of an error end
 MARGIN = 0.3  # around the moving region, of its size
 CROP_WIDTH = 300  # pixels of a crop on the page
 
@@ -170,6 +170,6 @@ def enlarged(rgb: np.ndarray, box: tuple[slice, slice]) -> np.ndarray:
 
 
 def scale_bar() -> np.ndarray:
-    """The colours of an error from 0 (left) to `ERROR_TOP` (right)."""
+    """The colors of an error from 0 (left) to `ERROR_TOP` (right)."""
     ramp = np.linspace(0, ERROR_TOP, 256)[None].repeat(24, 0)
     return io.colorize(ramp, 0.0, ERROR_TOP)

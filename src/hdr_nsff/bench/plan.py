@@ -114,7 +114,7 @@ class BenchScene:
 
 
 @dataclass(frozen=True)
-class Cell:
+class BenchRun:
     """One run: a method on a scene."""
 
     scene: BenchScene
@@ -147,11 +147,11 @@ class Plan:
     methods: dict[str, TrainConfig]
 
     @cached_property
-    def cells(self) -> tuple[Cell, ...]:
+    def cells(self) -> tuple[BenchRun, ...]:
         """The runs, scene by scene."""
         out = self.config.out
         return tuple(
-            Cell(s, name, replace(m, scene=s.folder, out=out / "runs" / s.name / name), out)
+            BenchRun(s, name, replace(m, scene=s.folder, out=out / "runs" / s.name / name), out)
             for s in self.scenes
             for name, m in self.methods.items()
         )
@@ -332,11 +332,11 @@ def claim(plan: Plan) -> None:
     notes.write(path, notes.Bench(settings=settings, scenes=places))
 
 
-def check_cell(cell: Cell) -> None:
+def check_cell(cell: BenchRun) -> None:
     """InputError where the folder of a run holds one with other settings, or of another state of the scene."""
     if (cell.folder / "config.json").is_file():
         open_folder(cell.config)
-    trial = notes.read(cell.folder / "trial.json", notes.Trial)
+    trial = notes.read(cell.folder / "trial.json", notes.RunRecord)
     if trial is not None and cell.scene.ready and trial.scene_key != cell.scene.key:
         raise InputError(
             f"{cell.folder}: was trained before {cell.scene.folder} changed; choose another folder, or delete this run"

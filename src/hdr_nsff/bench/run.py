@@ -19,11 +19,11 @@ import numpy as np
 import torch
 
 from hdr_nsff.bench.curve import SHARES, curve_of
-from hdr_nsff.bench.plan import BenchScene, Cell
+from hdr_nsff.bench.plan import BenchRun, BenchScene
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.notes import Trained, Trial
+from hdr_nsff.core.notes import RunRecord, Trained
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
@@ -58,7 +58,7 @@ def get_ready(scene: BenchScene) -> None:
         prepare(scene.footage)
 
 
-def run_cell(cell: Cell, views: int, lpips: str | None) -> None:
+def run_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
     """All of a run that is not done yet. What makes it fail is kept in `failure.json`, and raised."""
     with alone(cell.folder / ".lock", wait=False):
         (cell.folder / "failure.json").unlink(missing_ok=True)
@@ -76,26 +76,26 @@ def run_cell(cell: Cell, views: int, lpips: str | None) -> None:
 LOG = "HDR_NSFF_BENCH_LOG"  # environment: where what this process says is written
 
 
-def read_trial(cell: Cell) -> Trial:
+def read_trial(cell: BenchRun) -> RunRecord:
     """What is known of a run."""
-    return notes.read(cell.folder / "trial.json", Trial) or Trial(scene_key=cell.scene.key)
+    return notes.read(cell.folder / "trial.json", RunRecord) or RunRecord(scene_key=cell.scene.key)
 
 
-def measure_key(cell: Cell, views: int, lpips: str | None) -> str:
+def measure_key(cell: BenchRun, views: int, lpips: str | None) -> str:
     """A hash of what a run is measured on, and how."""
     truth = cell.scene.truth
     told = hashlib.sha256((truth / "truth.json").read_bytes()).hexdigest() if truth else None
     return hashlib.sha256(json.dumps([told, lpips, views]).encode()).hexdigest()[:16]
 
 
-def complete(cell: Cell, views: int, lpips: str | None) -> bool:
+def complete(cell: BenchRun, views: int, lpips: str | None) -> bool:
     """Whether nothing is left to do."""
     if not cell.scene.ready or not (cell.folder / "metrics.json").is_file():
         return False
     return read_trial(cell).measured == measure_key(cell, views, lpips)
 
 
-def train_cell(cell: Cell, views: int) -> None:
+def train_cell(cell: BenchRun, views: int) -> None:
     """Train, and note what it took."""
     trial = read_trial(cell)
     if trial.trained is not None:
@@ -122,7 +122,7 @@ def train_cell(cell: Cell, views: int) -> None:
     notes.write(cell.folder / "trial.json", trial.model_copy(update={"trained": trained}))
 
 
-def measure_cell(cell: Cell, views: int, lpips: str | None) -> None:
+def measure_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
     """Evaluate the run, and on a few views what it was on the way."""
     key, trial, start = measure_key(cell, views, lpips), read_trial(cell), time.monotonic()
     if trial.measured == key and (cell.folder / "metrics.json").is_file():

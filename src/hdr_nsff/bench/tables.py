@@ -15,11 +15,11 @@ from typing import Any
 import torch
 
 from hdr_nsff import __version__
-from hdr_nsff.bench.plan import OF_THE_WHOLE, Cell, Plan
+from hdr_nsff.bench.plan import OF_THE_WHOLE, BenchRun, Plan
 from hdr_nsff.bench.pool import shell_line
 from hdr_nsff.bench.run import complete, read_trial
 from hdr_nsff.core import io, notes
-from hdr_nsff.core.notes import Trial
+from hdr_nsff.core.notes import RunRecord
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ COSTS = (
 class Row:
     """A run in the tables."""
 
-    cell: Cell
+    cell: BenchRun
     status: str  # done, failed, or not finished
     reason: str  # why not done
     metrics: dict[str, Any] | None
-    trial: Trial | None
+    trial: RunRecord | None
 
     @property
     def values(self) -> dict[str, float]:
@@ -70,7 +70,7 @@ class Row:
         return found | costs
 
 
-def row_of(cell: Cell, plan: Plan) -> Row:
+def row_of(cell: BenchRun, plan: Plan) -> Row:
     """What there is of a run."""
     if complete(cell, plan.config.views, plan.config.lpips):
         found = notes.read(cell.folder / "metrics.json", notes.Metrics)

@@ -76,16 +76,16 @@ def latest_checkpoint(folder: Path) -> Checkpoint | None:
     return None
 
 
-def pack(modules: dict[str, torch.nn.Module], optimisers: dict[str, torch.optim.Optimizer]) -> dict[str, Tensor]:
-    """State of modules and optimisers as one flat dict of tensors."""
+def pack(modules: dict[str, torch.nn.Module], optimizers: dict[str, torch.optim.Optimizer]) -> dict[str, Tensor]:
+    """State of modules and optimizers as one flat dict of tensors."""
     tensors = {f"{name}.{k}": v for name, module in modules.items() for k, v in module.state_dict().items()}
-    for name, optimiser in optimisers.items():
-        for index, state in optimiser.state_dict()["state"].items():
-            tensors |= {f"optimiser.{name}.{index}.{k}": torch.as_tensor(v) for k, v in state.items()}
+    for name, optimizer in optimizers.items():
+        for index, state in optimizer.state_dict()["state"].items():
+            tensors |= {f"optimizer.{name}.{index}.{k}": torch.as_tensor(v) for k, v in state.items()}
     return tensors
 
 
-def unpack(tensors: dict[str, Tensor], modules: dict[str, torch.nn.Module], optimisers: dict[str, torch.optim.Optimizer]) -> None:
+def unpack(tensors: dict[str, Tensor], modules: dict[str, torch.nn.Module], optimizers: dict[str, torch.optim.Optimizer]) -> None:
     """Put a packed state back."""
     for name, module in modules.items():
         own = {k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")}
@@ -95,10 +95,10 @@ def unpack(tensors: dict[str, Tensor], modules: dict[str, torch.nn.Module], opti
             raise InputError(
                 f"the checkpoint does not fit this run's {name}; its scene or config was changed, train again into a new folder"
             ) from error
-    for name, optimiser in optimisers.items():
+    for name, optimizer in optimizers.items():
         state: dict[int, dict[str, Tensor]] = {}
         for key, value in tensors.items():
-            if key.startswith(f"optimiser.{name}."):
-                index, field = key.removeprefix(f"optimiser.{name}.").split(".", 1)
+            if key.startswith(f"optimizer.{name}."):
+                index, field = key.removeprefix(f"optimizer.{name}.").split(".", 1)
                 state.setdefault(int(index), {})[field] = value
-        optimiser.load_state_dict({"state": state, "param_groups": optimiser.state_dict()["param_groups"]})
+        optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})

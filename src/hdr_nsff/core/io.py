@@ -136,7 +136,7 @@ def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
 
 
 def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
-    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]; `over` is the grey in [0, 1] that shows through
+    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]; `over` is the gray in [0, 1] that shows through
     transparent pixels (None: transparency is not looked at)."""
     path = Path(path)
     if not path.is_file():
@@ -228,7 +228,7 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
 def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float = 24.0, crf: int = 16, footage: bool = False) -> int:
     """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4 (8 bits, Rec. 709 tags, fast start), atomically; the number of frames written.
 
-    `footage` keeps the colour of every pixel (4:4:4) and the grain: for video to be measured, browsers do not play it.
+    `footage` keeps the color of every pixel (4:4:4) and the grain: for video to be measured, browsers do not play it.
     Odd sizes lose their last row or column (4:2:0 needs even ones)."""
     import av
 
@@ -257,7 +257,7 @@ def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float = 24.
 
 
 def tag(target: Any) -> None:
-    """Rec. 709 colour tags on a codec context or a frame (players guess otherwise)."""
+    """Rec. 709 color tags on a codec context or a frame (players guess otherwise)."""
     target.colorspace, target.color_range, target.color_primaries, target.color_trc = 1, 1, 1, 1
 
 
@@ -314,7 +314,7 @@ def video_info(path: Path | str) -> VideoInfo:
 
 
 def contact_sheet(rows: list[list[np.ndarray]], gap: int = 4, background: float = 0.12) -> np.ndarray:
-    """One picture (H, W, 3) of a table of pictures; grey (H, W) ones become rgb, all cells take the size of the largest."""
+    """One picture (H, W, 3) of a table of pictures; gray (H, W) ones become rgb, all cells take the size of the largest."""
     cells = [[c if c.ndim == 3 else np.repeat(c[..., None], 3, -1) for c in row] for row in rows]
     h = max(c.shape[0] for row in cells for c in row)
     w = max(c.shape[1] for row in cells for c in row)

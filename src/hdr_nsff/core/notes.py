@@ -91,8 +91,8 @@ class Layout(Note):
     scene: str
 
 
-class Coloured(Note):
-    """`views.json`: the ranges of the coloured pictures of the standard set."""
+class Colored(Note):
+    """`views.json`: the ranges of the colored pictures of the standard set."""
 
     marks = ("key", "depth_range")
     key: str
@@ -163,7 +163,7 @@ class ShownView(Note):
     scores: dict[str, float]
 
 
-class Trial(Note):
+class RunRecord(Note):
     """`trial.json`: a run of a benchmark."""
 
     marks = ("scene_key", "trained")

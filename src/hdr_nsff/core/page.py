@@ -11,8 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-GREY = "#808891"  # reads on light and dark
-COLOURS = ("#d1495b", "#3c9d6b", "#3d7fc4")  # red, green, blue channel
+GRAY = "#808891"  # reads on light and dark
+COLORS = ("#d1495b", "#3c9d6b", "#3d7fc4")  # red, green, blue channel
 
 
 def document(title: str, facts: str, body: str) -> str:
@@ -103,23 +103,23 @@ def number(value: Any, digits: int = 2, unit: str = "") -> str:
 
 
 def plot(width: float, height: float) -> tuple[Any, Any]:
-    """An empty matplotlib figure in inches, transparent, in greys that can be read on light and dark."""
+    """An empty matplotlib figure in inches, transparent, in grays that can be read on light and dark."""
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(width, height), layout="constrained")
     drawing.patch.set_alpha(0)
     axes = drawing.add_subplot()
     axes.patch.set_alpha(0)
-    axes.tick_params(which="both", colors=GREY, labelsize=8)
+    axes.tick_params(which="both", colors=GRAY, labelsize=8)
     for spine in axes.spines.values():
-        spine.set_color(GREY)
-    axes.grid(alpha=0.25, linewidth=0.5, color=GREY)
+        spine.set_color(GRAY)
+    axes.grid(alpha=0.25, linewidth=0.5, color=GRAY)
     return drawing, axes
 
 
 def legend(axes: Any, **place: Any) -> None:
-    """The legend, in the same grey."""
-    axes.legend(fontsize=8, frameon=False, labelcolor=GREY, **place)
+    """The legend, in the same gray."""
+    axes.legend(fontsize=8, frameon=False, labelcolor=GRAY, **place)
 
 
 def svg(drawing: Any) -> str:
@@ -128,7 +128,7 @@ def svg(drawing: Any) -> str:
 
     for axes in drawing.axes:
         for item in (axes.xaxis.label, axes.yaxis.label, axes.title):
-            item.set(color=GREY, fontsize=9)
+            item.set(color=GRAY, fontsize=9)
     text = memory.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "report"}):
         drawing.savefig(text, format="svg", transparent=True, metadata={"Date": None})

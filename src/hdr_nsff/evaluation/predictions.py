@@ -19,7 +19,7 @@ from hdr_nsff.fields import base
 from hdr_nsff.geometry.paths import View
 from hdr_nsff.rendering.interpolate import LayeredField, render_at
 from hdr_nsff.rendering.shots import device_of, fingerprint
-from hdr_nsff.scene.batch import Look
+from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.training.run_folder import Run
 
 
@@ -45,11 +45,11 @@ def predict(run: Run, views: Mapping[str, View], folder: Path, description: str,
         io.write_text(note, key)
     for name, view in track(list(views.items()), description):
         if not (folder / f"{name}.exr").exists():
-            io.write_exr(folder / f"{name}.exr", look(run, view, motion), half=False)
+            io.write_exr(folder / f"{name}.exr", maps_of(run, view, motion), half=False)
     return [folder / f"{name}.exr" for name in views]
 
 
-def look(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
+def maps_of(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
     """The channels of one view. Where a time between frames is splatted, the field itself is asked for its scene flow there."""
     camera, times = to_device(view.camera, device_of(run)), run.scene.times.tolist()
     with torch.no_grad():
@@ -97,19 +97,19 @@ def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
     """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run rendered of the target, at every bracket at which
     the target is known."""
     brackets = list(target.rgb)
-    looks = [run.tonemapper.look(b, target.camera_id) for b in brackets]
-    return dict(zip(brackets, seen_by(run, target, radiance, looks), strict=True))
+    recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]
+    return dict(zip(brackets, seen_by(run, target, radiance, recorders), strict=True))
 
 
 def developed(run: Run, target: Target, radiance: Tensor, evs: Sequence[float]) -> list[Tensor]:
     """The same at any exposures, `evs` relative to the reference bracket."""
-    return seen_by(run, target, radiance, [run.tonemapper.look_at(ev, target.camera_id) for ev in evs]) if evs else []
+    return seen_by(run, target, radiance, [run.tonemapper.recorder_at(ev, target.camera_id) for ev in evs]) if evs else []
 
 
-def seen_by(run: Run, target: Target, radiance: Tensor, looks: Sequence[Look]) -> list[Tensor]:
+def seen_by(run: Run, target: Target, radiance: Tensor, recorders: Sequence[Recorder]) -> list[Tensor]:
     """The same as given recordings look."""
     device = device_of(run)
     with torch.no_grad():
         camera, flat = to_device(target.view.camera, device), radiance.reshape(-1, 3).to(device)
-        pictures = base.recorded(run.field, camera, target.view.time, looks, flat)
+        pictures = base.recorded(run.field, camera, target.view.time, recorders, flat)
     return [p.cpu().reshape(radiance.shape) for p in pictures]

@@ -20,7 +20,7 @@ import tyro
 from hdr_nsff import __version__
 from hdr_nsff.core import io, notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.page import COLOURS, GREY, details, document, figure, legend, missing, number, plot, svg, table, video
+from hdr_nsff.core.page import COLORS, GRAY, details, document, figure, legend, missing, number, plot, svg, table, video
 from hdr_nsff.core.progress import say
 from hdr_nsff.training.run_folder import Run
 
@@ -134,14 +134,14 @@ def why_absent(renders: Path) -> str:
 
 def side_by_side(run: Run, renders: Path) -> str:
     """Rows of recorded frame, tone-mapped HDR, three exposures, depth, scene flow."""
-    coloured = notes.read(renders / "views.json", notes.Coloured)
+    colored = notes.read(renders / "views.json", notes.Colored)
     sequence = notes.read(renders / "training" / "sequence.json", notes.Sequence)
-    if coloured is None or sequence is None:
+    if colored is None or sequence is None:
         return missing("No pictures yet: `hdr-nsff render RUN` makes the standard set.")
-    near, far = coloured.depth_range
+    near, far = colored.depth_range
     columns = [("training", "HDR, tone-mapped"), ("depth", f"depth, {near:.2g} (red) to {far:.2g} (blue)")]
-    columns += [("scene_flow", f"motion until the next frame, up to {coloured.fastest:.2g} px")] if coloured.moves else []
-    columns += [(f"ldr/ev{ev:+.1f}", f"developed at EV {ev:+.1f}") for ev in coloured.exposures]
+    columns += [("scene_flow", f"motion until the next frame, up to {colored.fastest:.2g} px")] if colored.moves else []
+    columns += [(f"ldr/ev{ev:+.1f}", f"developed at EV {ev:+.1f}") for ev in colored.exposures]
     rows = []
     count = len(sequence.views)
     for i in sorted({round(x) for x in np.linspace(0, count - 1, min(3, count)).tolist()}):
@@ -151,7 +151,7 @@ def side_by_side(run: Run, renders: Path) -> str:
         cells = [figure(frame.image.cpu().numpy(), f"recorded, frame {frame.index}, EV {ev:+.1f}")]
         cells += [figure(io.read_image(renders / folder / f"{i:05d}.png"), caption) for folder, caption in columns]
         rows.append(f'<div class="grid">{"".join(cells)}</div>')
-    absent = "" if coloured.moves else missing("No scene flow: this field tells none.")
+    absent = "" if colored.moves else missing("No scene flow: this field tells none.")
     return "".join(rows) + absent
 
 
@@ -196,7 +196,7 @@ ERRORS = {
         "largest_step_error_after_power": "the same once the power of the curves is undone",
     },
     "poses": {
-        "ate": "camera centres, RMS error after alignment, true units",
+        "ate": "camera centers, RMS error after alignment, true units",
         "ate_share": "the same as a share of the path's extent",
         "rotation_degrees": "rotation, mean error in degrees",
         "focal": "focal length, pixels",
@@ -225,7 +225,7 @@ def quality(metrics: dict[str, Any] | None) -> str:
     groups = {**metrics["groups"], **metrics.get("protocols", {}), "headline": metrics["headline"]}
     parts = ["<h3>Recorded rgb</h3>", score_table(groups, SCORES)]
     if (hdr := metrics.get("hdr_scores")) is not None:
-        peaks = f"Normalised by the largest exact radiance, {metrics['peak']:.3g}; recordable pixels by theirs, {metrics['recordable_peak']:.3g}. "
+        peaks = f"Normalized by the largest exact radiance, {metrics['peak']:.3g}; recordable pixels by theirs, {metrics['recordable_peak']:.3g}. "
         scale = f"Predicted radiance was multiplied by {metrics['scale']:.4f} for all views (per channel: {', '.join(f'{x:.4f}' for x in metrics['scale_per_channel'])})."
         parts += ["<h3>Linear radiance</h3>", score_table(groups, tuple((k, *v) for k, v in hdr.items()))]
         shown = (
@@ -271,24 +271,24 @@ def camera_model(run: Run, metrics: dict[str, Any] | None) -> str:
     for camera in range(min(run.tonemapper.num_cameras, 9)):
         drawing, axes = plot(4.2, 3.2)
         x, y = (t.cpu().numpy() for t in run.tonemapper.curve(camera))
-        axes.plot(x, x ** (1 / 2.2), "--", color=GREY, linewidth=1, label="gamma 2.2")
-        for channel, colour, name in zip(range(3), COLOURS, ("red", "green", "blue"), strict=True):
-            axes.plot(x, y[channel], color=colour, linewidth=1.4, label=name)
+        axes.plot(x, x ** (1 / 2.2), "--", color=GRAY, linewidth=1, label="gamma 2.2")
+        for channel, color, name in zip(range(3), COLORS, ("red", "green", "blue"), strict=True):
+            axes.plot(x, y[channel], color=color, linewidth=1.4, label=name)
             if true is not None:
-                axes.plot(true["x"], true["y"][channel], ":", color=colour, linewidth=1.6, label=None)
+                axes.plot(true["x"], true["y"][channel], ":", color=color, linewidth=1.6, label=None)
         if true is not None:
-            axes.plot([], [], ":", color=GREY, label="true")
+            axes.plot([], [], ":", color=GRAY, label="true")
         axes.set(xlabel="exposure (1 saturates)", ylabel="recorded value", title=f"response of camera {camera}")
         legend(axes)
         plots.append(svg(drawing))
     drawing, axes = plot(5.6, 3.2)
     gains = run.tonemapper.gains().cpu().numpy()
     times = [f.time for f in run.scene.train]
-    for channel, colour in enumerate(COLOURS):
-        axes.plot(np.array(times) + 0.2 * (channel - 1), gains[:, channel], ".", color=colour, markersize=4)
+    for channel, color in enumerate(COLORS):
+        axes.plot(np.array(times) + 0.2 * (channel - 1), gains[:, channel], ".", color=color, markersize=4)
     for ev in run.scene.manifest.bracket_ev:
         if ev is not None:
-            axes.axhline(ev, color=GREY, linewidth=0.7, linestyle="--")
+            axes.axhline(ev, color=GRAY, linewidth=0.7, linestyle="--")
     given = "dashed: given" if run.scene.manifest.exposure_given else "none given"
     axes.set(xlabel="time (frames)", ylabel="gain (EV)", title=f"gain of every frame and channel ({given})")
     plots.append(svg(drawing))
@@ -306,17 +306,17 @@ def radiance(run: Run, renders: Path) -> str:
     drawing, axes = plot(9.6, 3.2)
     low, high = np.percentile(log, [0.05, 100]).tolist()
     edges = np.linspace(low, high, 120)
-    for channel, colour, name in zip(range(3), COLOURS, ("red", "green", "blue"), strict=True):
-        axes.hist(10 ** log[:, channel], bins=10**edges, histtype="step", color=colour, linewidth=1.2, label=name)
+    for channel, color, name in zip(range(3), COLORS, ("red", "green", "blue"), strict=True):
+        axes.hist(10 ** log[:, channel], bins=10**edges, histtype="step", color=color, linewidth=1.2, label=name)
     x, y = (t.cpu() for t in run.tonemapper.curve(0))
     dark = float(x[int(torch.searchsorted(y.mean(0).contiguous(), torch.tensor(3 / 255)).clamp(1, len(x) - 1))])
     exposures = sorted(run.tonemapper.exposures().tolist())
     axes.set_xlim(left=min(10**low, dark / 2 ** exposures[-1]) / 20)  # room for the words
     top = axes.get_ylim()[1]
     for i, ev in enumerate(exposures):
-        axes.plot([dark / 2**ev, 1 / 2**ev], [top * (1.04 + 0.06 * i)] * 2, color=GREY, linewidth=3, solid_capstyle="butt")
+        axes.plot([dark / 2**ev, 1 / 2**ev], [top * (1.04 + 0.06 * i)] * 2, color=GRAY, linewidth=3, solid_capstyle="butt")
         axes.text(
-            dark / 2**ev, top * (1.04 + 0.06 * i), f"EV {ev:+.1f} records  ", fontsize=7, va="center", ha="right", color=GREY
+            dark / 2**ev, top * (1.04 + 0.06 * i), f"EV {ev:+.1f} records  ", fontsize=7, va="center", ha="right", color=GRAY
         )
     axes.set(xscale="log", xlabel="linear radiance (1 saturates at the reference exposure)", ylabel="pixels")
     legend(axes)

@@ -42,7 +42,7 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
 
 def start_field(field: AnyField, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool) -> str | None:
     """Give an untrained field what the scene tells before training: `typical` log radiance and, if `from_priors`, the surfaces of
-    the depth prior in the colours that `to_radiance(rgb (P, 3), i)` recovers from training frame i. A sentence about it, if any."""
+    the depth prior in the colors that `to_radiance(rgb (P, 3), i)` recovers from training frame i. A sentence about it, if any."""
     match field:
         case NSFF() | NerfWT():
             field.bias.fill_(typical)

@@ -2,8 +2,8 @@
 
 Fields know nothing of exposure, white balance or response curves: tone mapping happens outside. `S` is the number of
 pixels asked for. Camera, time and pixels are the currency, not rays: an NSFF casts rays through the pixels, a splat
-field rasterises the frame and reads them off. Two published baselines cannot be told without what was recorded (`RecordingField`):
-they are handed a `Look` from outside."""
+field rasterizes the frame and reads them off. Two published baselines cannot be told without what was recorded (`RecordingField`):
+they are handed a `Recorder` from outside."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from typing import Any, Protocol, runtime_checkable
 from torch import Tensor
 
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.batch import Look, PixelBatch
+from hdr_nsff.scene.batch import PixelBatch, Recorder
 
 HIGHEST = 0.999  # radiance below 1 that a sigmoid is asked to start from at most
 
 
 @dataclass(frozen=True)
 class Warp:
-    """The same pixels rendered through the content of a neighbouring frame (eq. 2-3)."""
+    """The same pixels rendered through the content of a neighboring frame (eq. 2-3)."""
 
-    offset: int  # which neighbour: -1, +1, and -2, +2 for the two-step chain
-    flow: Tensor  # (S, 2) pixels: where the content goes in the neighbour's camera, minus where it is here
+    offset: int  # which neighbor: -1, +1, and -2, +2 for the two-step chain
+    flow: Tensor  # (S, 2) pixels: where the content goes in the neighbor's camera, minus where it is here
     confidence: Tensor  # (S,) in [0, 1]: 1 - rendered disocclusion
     radiance: Tensor | None  # (S, 3) linear HDR, None where the field offers no warped render
 
@@ -59,7 +59,7 @@ class Layers:
 
 
 @dataclass(frozen=True)
-class Misfit:
+class FrameError:
     """How wrong a picture of one training frame is."""
 
     camera: Camera
@@ -89,15 +89,15 @@ class RadianceField(Protocol):
         ...
 
     def __call__(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A training render with warps, and the field's own per-sample regularisers by their `LossWeights` name."""
+        """A training render with warps, and the field's own per-sample regularizers by their `LossWeights` name."""
         ...
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """Parameter groups with their learning rates, for the optimiser."""
+        """Parameter groups with their learning rates, for the optimizer."""
         ...
 
-    def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
-        """Housekeeping between optimiser steps (culling grids, schedules). `misfits(n)` says of n training frames how wrong their pictures
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+        """Housekeeping between optimizer steps (culling grids, schedules). `frame_errors(n)` says of n training frames how wrong their pictures
         are; None late in a run, when nothing is to be rearranged any more."""
         ...
 
@@ -107,16 +107,16 @@ class RecordingField(RadianceField, Protocol):
     """A field whose recordings do not follow from its composited radiance, because the camera acts on samples (HDR-HexPlane) or inside
     the network (NeRF-W)."""
 
-    def record(self, camera: Camera, time: float, looks: Sequence[Look]) -> list[Tensor]:
-        """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row, without gradients; chunks itself."""
+    def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
+        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row, without gradients; chunks itself."""
         ...
 
 
 def recorded(
-    field: RadianceField, camera: Camera, time: float, looks: Sequence[Look], radiance: Tensor | None = None
+    field: RadianceField, camera: Camera, time: float, recorders: Sequence[Recorder], radiance: Tensor | None = None
 ) -> list[Tensor]:
-    """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row; `radiance` (S, 3) is what the field rendered, if it was."""
+    """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row; `radiance` (S, 3) is what the field rendered, if it was."""
     if isinstance(field, RecordingField):
-        return field.record(camera, time, looks)
+        return field.record(camera, time, recorders)
     seen = field.render(camera, time, scene_flow=False).radiance if radiance is None else radiance
-    return [look.rgb(seen) for look in looks]
+    return [recorder.rgb(seen) for recorder in recorders]

@@ -1,6 +1,6 @@
 """Where a field lives: an invertible map from the world onto the unit cube in which it is sampled and stored.
 
-`FrustumSpace` is NDC generalised to any bounds: (x / z, y / z, 1 / z) in a reference camera, so that cells are pixel-sized at
+`FrustumSpace` is NDC generalized to any bounds: (x / z, y / z, 1 / z) in a reference camera, so that cells are pixel-sized at
 every distance. `ContractedSpace` squeezes all of space into a ball (mip-NeRF 360, eq. 10) for cameras that look every way."""
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ class FrustumSpace(nn.Module):
 
 
 class ContractedSpace(nn.Module):
-    """All of space: linear within `radius` of `centre`, squeezed beyond, scaled to [0, 1]."""
+    """All of space: linear within `radius` of `center`, squeezed beyond, scaled to [0, 1]."""
 
-    centre: Tensor
+    center: Tensor
     radius: Tensor
 
-    def __init__(self, centre: Tensor, radius: Tensor) -> None:
+    def __init__(self, center: Tensor, radius: Tensor) -> None:
         super().__init__()
-        self.register_buffer("centre", centre)
+        self.register_buffer("center", center)
         self.register_buffer("radius", radius)
 
     def encode(self, points: Tensor) -> Tensor:
         """World points (..., 3) to cube coordinates (..., 3)."""
-        x = (points - self.centre) / self.radius
+        x = (points - self.center) / self.radius
         norm = x.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         squeezed = torch.where(norm <= 1, x, (2 - 1 / norm) * (x / norm))
         return squeezed / 4 + 0.5
@@ -63,14 +63,14 @@ class ContractedSpace(nn.Module):
         x = (coords - 0.5) * 4
         norm = x.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         full = torch.where(norm <= 1, x, x / norm / (2 - norm).clamp_min(1e-3))
-        return full * self.radius + self.centre
+        return full * self.radius + self.center
 
 
 Space = FrustumSpace | ContractedSpace
 
 
 def mean_pose(cameras: list[Camera]) -> Tensor:
-    """The cameras' average pose (3, 4), camera to world: mean centre, mean viewing and down directions made orthogonal."""
+    """The cameras' average pose (3, 4), camera to world: mean center, mean viewing and down directions made orthogonal."""
     poses = torch.stack([c.c2w for c in cameras]).double()
     forward = torch.nn.functional.normalize(poses[:, :, 2].mean(0), dim=0)
     right = torch.nn.functional.normalize(torch.linalg.cross(poses[:, :, 1].mean(0), forward), dim=0)
@@ -100,6 +100,6 @@ def build_space(cameras: list[Camera], near: float, far: float) -> Space:
         low = torch.cat([(low - margin)[:2], (low[2:] - margin[2:]).clamp_min(0.5 / far)])
         w2c = torch.cat([pose[:, :3].T, -(pose[:, :3].T @ pose[:, 3:])], -1)
         return FrustumSpace(w2c, low, high + margin)
-    centres = torch.stack([c.c2w[:, 3] for c in cameras])
-    centre = centres.mean(0)
-    return ContractedSpace(centre, (centres - centre).norm(dim=-1).max() + near * 2)
+    centers = torch.stack([c.c2w[:, 3] for c in cameras])
+    center = centers.mean(0)
+    return ContractedSpace(center, (centers - center).norm(dim=-1).max() + near * 2)

@@ -1,4 +1,4 @@
-"""What `prepare` knows of the scene as coloured points: every pixel at the z-depth of its prior, in the radiance it recorded, with a
+"""What `prepare` knows of the scene as colored points: every pixel at the z-depth of its prior, in the radiance it recorded, with a
 trust; and how a multitude of them is thinned to one per cell. Where fields start from."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ToRadiance = Callable[[Tensor, int], Tensor]  # recorded rgb (P, 3) of training 
 
 @dataclass(frozen=True)
 class Points:
-    """`P` coloured points."""
+    """`P` colored points."""
 
     positions: Tensor  # (P, 3) scene units
     log_radiance: Tensor  # (P, 3)

@@ -157,11 +157,11 @@ def settings_in(path: Path) -> Any:
 def train(network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig) -> float:
     """Train to the last step from where the folder's checkpoints are; the seconds it took."""
     network.requires_grad_(True)
-    optimiser = torch.optim.AdamW(network.parameters(), config.lr, weight_decay=1e-4)
+    optimizer = torch.optim.AdamW(network.parameters(), config.lr, weight_decay=1e-4)
     found = latest_checkpoint(config.out) if (config.out / "checkpoints").is_dir() else None
     first, before, started = 0, 0.0, time.monotonic()
     if found is not None:
-        unpack(found.tensors, {"network": network}, {"adam": optimiser})
+        unpack(found.tensors, {"network": network}, {"adam": optimizer})
         first, before = found.step, found.seconds
     device = next(network.parameters()).device
     for step in track(range(first, config.steps), "finetune-flow"):
@@ -172,15 +172,15 @@ def train(network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], co
         )
         if not torch.isfinite(loss):
             raise FloatingPointError(f"step {step}: the loss is {float(loss)}")
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = config.lr * rate(step / config.steps)
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimiser.step()
+        optimizer.step()
         if (step + 1) % config.checkpoint_steps == 0 or step + 1 == config.steps:
             save_checkpoint(
-                config.out, step + 1, before + time.monotonic() - started, pack({"network": network}, {"adam": optimiser})
+                config.out, step + 1, before + time.monotonic() - started, pack({"network": network}, {"adam": optimizer})
             )
     network.requires_grad_(False)
     return before + time.monotonic() - started

@@ -13,11 +13,11 @@ from torch.nn import functional
 from hdr_nsff.flow_training.flow_sets import Sample
 from hdr_nsff.priors.flow.networks import resized, resized_flow, working_size
 from hdr_nsff.radiometry.common_range import LUMA, common_rgb, recorded_range
-from hdr_nsff.radiometry.exposure_cycle import equalise
+from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import POINTS, Curve, Noise, film, record, response_curve
 
 MIDDLE = 0.18  # sensor exposure that the median of a pair gets, give or take
-EQUALISED = 0.75  # the share of pairs seen as `prepare` shows them; the others as recorded
+EQUALIZED = 0.75  # the share of pairs seen as `prepare` shows them; the others as recorded
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ def example(sample: Sample, stops: float, size: tuple[int, int], rng: np.random.
     white = np.exp(rng.normal(0, 0.1, 3))
     noise = 2.0 ** rng.uniform(-1, 2)
     images = seen(
-        sample.radiance, around + np.array([-0.5, 0.5]) * apart, white, random_curve(rng), noise, rng, rng.random() < EQUALISED
+        sample.radiance, around + np.array([-0.5, 0.5]) * apart, white, random_curve(rng), noise, rng, rng.random() < EQUALIZED
     )
     return cropped(images, sample, size, rng)
 
@@ -67,7 +67,7 @@ def seen(
     video = np.stack([record(r, ev, tuple(white), curve, sensor, rng) for r, ev in zip(radiance, evs, strict=True)])
     if not equal:
         return video
-    frames, clipped = equalise(video, [0, 1])
+    frames, clipped = equalize(video, [0, 1])
     ranges = [recorded_range(f, c) for f, c in zip(frames, clipped, strict=True)]
     return np.stack(common_rgb(frames, ranges, 0, 1))
 

@@ -57,13 +57,13 @@ def flow_pairs(folder: Path) -> list[FlowPair]:
 
 
 def synth_pairs(folder: Path) -> list[FlowPair]:
-    """Neighbours of a rendered clip."""
+    """Neighbors of a rendered clip."""
     frames = sorted((folder / "exact").glob("clip_*.exr"))
     return [FlowPair(a, b, a, b, str(folder)) for a, b in pairwise(frames)]
 
 
 def sintel_pairs(folder: Path) -> list[FlowPair]:
-    """Neighbours of Sintel's final pass."""
+    """Neighbors of Sintel's final pass."""
     root = folder / "training" if (folder / "training").is_dir() else folder
     found = []
     for flow in sorted((root / "flow").glob("*/frame_*.flo")):
@@ -76,7 +76,7 @@ def sintel_pairs(folder: Path) -> list[FlowPair]:
 
 
 def things_pairs(folder: Path) -> list[FlowPair]:
-    """Neighbours of FlyingThings3D's final pass, both eyes."""
+    """Neighbors of FlyingThings3D's final pass, both eyes."""
     found = []
     for flow in sorted((folder / "optical_flow").glob("*/*/*/into_future/*/OpticalFlowIntoFuture_*.pfm")):
         eye, scene = flow.parent.name, flow.parents[2]

@@ -1,6 +1,6 @@
 """A COLMAP model on disk: cameras, images and points3D, binary or text, as COLMAP's documentation describes the format.
 
-Poses in these files are world to camera, quaternions (w, x, y, z), OpenCV axes; pixel centres at +0.5, like ours."""
+Poses in these files are world to camera, quaternions (w, x, y, z), OpenCV axes; pixel centers at +0.5, like ours."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ def read_flow(folder: Path | str, pairs: Iterable[tuple[int, int]], size: tuple[
     """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` of frame numbers, made elsewhere, for frames of `size` (H, W).
 
     Two layouts: `00003_00004.npy` (H, W, 2) px with an optional mask `00003_00004_valid.png`, or the public NSFF layout
-    `00003_fwd.npz`, `00004_bwd.npz` with `flow` and `mask` for neighbours. A pair without a mask is checked against its
+    `00003_fwd.npz`, `00004_bwd.npz` with `flow` and `mask` for neighbors. A pair without a mask is checked against its
     reverse in the same folder. InputError for what is missing, of another size or not finite."""
     folder, pairs = Path(folder), [(int(i), int(j)) for i, j in pairs]
     if not folder.is_dir():
@@ -39,8 +39,8 @@ def read_flow(folder: Path | str, pairs: Iterable[tuple[int, int]], size: tuple[
 
 def pair_file(folder: Path, i: int, j: int) -> Path | None:
     """The file that holds the flow from frame `i` to frame `j`, or None."""
-    neighbour = {1: [f"{i:05d}_fwd.npz"], -1: [f"{i:05d}_bwd.npz"]}.get(j - i, [])
-    names = [f"{i:05d}_{j:05d}.npy", *neighbour]
+    neighbor = {1: [f"{i:05d}_fwd.npz"], -1: [f"{i:05d}_bwd.npz"]}.get(j - i, [])
+    names = [f"{i:05d}_{j:05d}.npy", *neighbor]
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 

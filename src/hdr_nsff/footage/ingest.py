@@ -36,7 +36,7 @@ class Footage:
     count: int  # frames per camera; 0 where a video's header does not say
     fps: float
     linear: bool  # EXR or DNG
-    over: float | None = None  # grey that shows through transparent pixels; None: transparency is not looked at
+    over: float | None = None  # gray that shows through transparent pixels; None: transparency is not looked at
 
     @property
     def files(self) -> dict[str, Path]:
@@ -147,7 +147,7 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
 
 
 def read_frame(path: Path, over: float | None = None) -> np.ndarray:
-    """One frame file as float32 (H, W, 3): recorded rgb (`over` the grey that shows through it), or linear radiance for EXR and DNG."""
+    """One frame file as float32 (H, W, 3): recorded rgb (`over` the gray that shows through it), or linear radiance for EXR and DNG."""
     suffix = path.suffix.lower()
     if suffix == ".dng":
         return read_dng(path)

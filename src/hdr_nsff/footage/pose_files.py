@@ -1,6 +1,6 @@
 """Poses made elsewhere: a COLMAP model, `transforms.json` (nerfstudio, Blender), `poses_bounds.npy` (LLFF) or the JSON of LLFF poses that
 non-rigid NeRF publishes. Every convention becomes ours here: c2w OpenCV (+x right, +y down, +z forward), pixels of the working size
-with centres at +0.5. The world and its units stay the giver's."""
+with centers at +0.5. The world and its units stay the giver's."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def check_lens(path: Path, K: np.ndarray, width: float, height: float, distortio
 
 
 def from_llff(path: Path) -> Given:
-    """`poses_bounds.npy` (N, 17): 3x5 row by row (columns down, right, back, centre, (height, width, focal)), then near, far."""
+    """`poses_bounds.npy` (N, 17): 3x5 row by row (columns down, right, back, center, (height, width, focal)), then near, far."""
     return llff_rows(llff_table(path, 17))
 
 
@@ -265,9 +265,9 @@ def placed(path: Path, given: Given, chosen: list[int | None], size: tuple[int, 
         )
     c2w[off, :, :3] = (u @ vt)[off]
     registered = np.array([k is not None for k in chosen])
-    centres = c2w[registered, :, 3]
+    centers = c2w[registered, :, 3]
     turns = np.abs(c2w[registered, :, :3] - c2w[registered][:1, :, :3]).max()
-    moves = np.linalg.norm(centres - centres[:1], axis=1).max() > 1e-6 * (given.near or 1.0)
+    moves = np.linalg.norm(centers - centers[:1], axis=1).max() > 1e-6 * (given.near or 1.0)
     parallax: Parallax = "full" if moves else ("rotation" if turns > 1e-6 else "none")
     return Poses(K, c2w, registered, parallax, near=given.near, far=given.far, notes=(f"poses given: {path.name}",))
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FLAT = 1e-6  # centres that spread less than this share of their distance from the origin (or of 1) fix no scale
+FLAT = 1e-6  # centers that spread less than this share of their distance from the origin (or of 1) fix no scale
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ def mean_rotation(rotations: np.ndarray) -> np.ndarray:
 def pose_errors(true: np.ndarray, estimated: np.ndarray) -> dict[str, float]:
     """How far `estimated` (N, 3, 4) is from `true` (N, 3, 4) once aligned.
 
-    `ate`: root mean square distance of the centres after the best similarity, in true units; `ate_share`: the same as a share of
+    `ate`: root mean square distance of the centers after the best similarity, in true units; `ate_share`: the same as a share of
     the true path's extent (both absent where the cameras do not spread); `rotation_degrees`: mean angle left after the best
-    common rotation (from the rotations themselves: centres along a line would not tell it)."""
+    common rotation (from the rotations themselves: centers along a line would not tell it)."""
     errors: dict[str, float] = {}
     fit = umeyama(true[:, :, 3], estimated[:, :, 3])
     if fit is not None:

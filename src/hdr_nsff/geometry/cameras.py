@@ -1,4 +1,4 @@
-"""Cameras and rays. OpenCV axes everywhere (+x right, +y down, +z forward); pixels are (x, y) with centres at +0.5;
+"""Cameras and rays. OpenCV axes everywhere (+x right, +y down, +z forward); pixels are (x, y) with centers at +0.5;
 depth is z-depth (distance along the optical axis, scene units), never distance along the ray."""
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class Camera:
     height: int
 
     def rays(self, pixels: Tensor) -> Rays:
-        """Rays through `pixels` (S, 2), xy with centres at +0.5."""
+        """Rays through `pixels` (S, 2), xy with centers at +0.5."""
         x = (pixels[..., 0] - self.K[0, 2]) / self.K[0, 0]
         y = (pixels[..., 1] - self.K[1, 2]) / self.K[1, 1]
         local = torch.stack([x, y, torch.ones_like(x)], -1)
@@ -48,7 +48,7 @@ class Camera:
         return torch.stack([x, y], -1), depth
 
     def pixel_grid(self) -> Tensor:
-        """Every pixel centre, row by row: (height * width, 2)."""
+        """Every pixel center, row by row: (height * width, 2)."""
         y, x = torch.meshgrid(torch.arange(self.height), torch.arange(self.width), indexing="ij")
         return (torch.stack([x, y], -1).reshape(-1, 2) + 0.5).to(self.K)
 

@@ -52,8 +52,8 @@ def fixed(camera: Camera, times: Sequence[float]) -> list[View]:
 def reach(cameras: Sequence[Camera], camera: Camera) -> Tensor:
     """How far the clip's cameras spread around their middle along the axes of `camera`: (3,) scene units, half of the
     range between the 10th and the 90th percentile."""
-    centres = torch.stack([c.c2w[:, 3] for c in cameras]) @ camera.c2w[:, :3]  # (T, 3) right, down, forward
-    low, high = centres.quantile(torch.tensor([0.1, 0.9]).to(centres), dim=0)
+    centers = torch.stack([c.c2w[:, 3] for c in cameras]) @ camera.c2w[:, :3]  # (T, 3) right, down, forward
+    low, high = centers.quantile(torch.tensor([0.1, 0.9]).to(centers), dim=0)
     return (high - low) / 2
 
 
@@ -81,7 +81,7 @@ def bullet_time(
 
 def slow_motion(cameras: Sequence[Camera], times: Sequence[float], factor: int) -> list[View]:
     """`factor` views per recorded frame: times between the recorded ones (which need not be evenly spaced), the camera
-    gliding between its neighbours (centre linearly, rotation along the shortest arc). `times` rise strictly."""
+    gliding between its neighbors (center linearly, rotation along the shortest arc). `times` rise strictly."""
     assert factor >= 1 and len(cameras) == len(times) and all(a < b for a, b in itertools.pairwise(times)), list(times)
     views = []
     for i in range(len(times) - 1):
@@ -99,8 +99,8 @@ def between(a: Camera, b: Camera, fraction: float) -> Camera:
 
     turn = Slerp([0, 1], Rotation.from_matrix(torch.stack([a.c2w[:, :3], b.c2w[:, :3]]).double().cpu().numpy()))
     rotation = torch.from_numpy(turn(fraction).as_matrix()).to(a.c2w)
-    centre = torch.lerp(a.c2w[:, 3], b.c2w[:, 3], fraction)
-    return replace(a, K=torch.lerp(a.K, b.K, fraction), c2w=torch.cat([rotation, centre[:, None]], 1))
+    center = torch.lerp(a.c2w[:, 3], b.c2w[:, 3], fraction)
+    return replace(a, K=torch.lerp(a.K, b.K, fraction), c2w=torch.cat([rotation, center[:, None]], 1))
 
 
 def from_json(path: Path | str, like: Camera) -> list[View]:

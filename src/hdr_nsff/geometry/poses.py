@@ -72,7 +72,7 @@ def trusted_points(poses: Poses, views: int = 3, error: float = 2.0) -> Poses:
 
 
 def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
-    """Poses of frames that did not register, between their registered neighbours of the same camera (held at the ends of the clip)."""
+    """Poses of frames that did not register, between their registered neighbors of the same camera (held at the ends of the clip)."""
     c2w, lost = poses.c2w.copy(), []
     for group in groups:
         known = [t for t in group if poses.registered[t]]

@@ -111,11 +111,11 @@ def display(radiance: A, exposure: float = 1.0, white: float = 40.0) -> A:
     """An sRGB picture (..., 3) in [0, 1] of linear HDR `radiance` (..., 3): Reinhard's curve `L (1 + L / white^2) / (1 + L)` on luminance.
 
     `exposure` is a factor (see `auto_exposure`); one per shot, never per frame. Luminance `white / exposure` becomes display
-    white. Hue is kept; a colour too bright for the display is desaturated towards white rather than clipped per channel."""
+    white. Hue is kept; a color too bright for the display is desaturated towards white rather than clipped per channel."""
     x = (radiance * exposure).clip(min=0)
     y = luminance(x)
     mapped = (y * (1 + y / white**2) / (1 + y)).clip(max=1)[..., None]
     rgb = x * (mapped / y.clip(min=1e-9)[..., None])
     top = library(rgb).amax(rgb, -1)[..., None]
-    share = ((top - 1) / (top - mapped).clip(min=1e-9)).clip(0, 1)  # how far towards grey of the same luminance, until it fits
+    share = ((top - 1) / (top - mapped).clip(min=1e-9)).clip(0, 1)  # how far towards gray of the same luminance, until it fits
     return srgb_encode(rgb + share * (mapped - rgb))

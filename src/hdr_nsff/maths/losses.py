@@ -23,7 +23,7 @@ def saturation_weight(rgb: Tensor, low: float = 0.15, high: float = 0.9, floor: 
 
 
 def cycle(there: Tensor, back: Tensor, confidence: Tensor) -> Tensor:
-    """(1 - disocclusion) |f_{i->j}(x) + f_{j->i}(x + f)|, normalised by the confidences (N,)."""
+    """(1 - disocclusion) |f_{i->j}(x) + f_{j->i}(x + f)|, normalized by the confidences (N,)."""
     residual = (there + back).abs().sum(-1)
     return (confidence * residual).sum() / confidence.sum().clamp_min(1e-6)
 
@@ -34,7 +34,7 @@ def kinetic(forward: Tensor, backward: Tensor) -> Tensor:
 
 
 def smoothness(a: Tensor, b: Tensor) -> Tensor:
-    """Mean absolute difference of scene flow (N, 3) between neighbouring samples; 0 where there are none."""
+    """Mean absolute difference of scene flow (N, 3) between neighboring samples; 0 where there are none."""
     return (a - b).abs().sum(-1).mean() if len(a) else a.sum()
 
 
@@ -48,15 +48,15 @@ def entropy(share: Tensor) -> Tensor:
     return -(share * share.clamp_min(1e-6).log()).mean()
 
 
-def normalised(values: Tensor) -> Tensor:
+def normalized(values: Tensor) -> Tensor:
     """Shift by the median, scale by the mean absolute deviation (MiDaS; METHOD.md 3): invariant to scale and shift."""
     shifted = values - values.median()
     return shifted / shifted.abs().mean().clamp_min(1e-6)
 
 
 def depth_relative(depth: Tensor, prior_disparity: Tensor) -> Tensor:
-    """Squared difference of normalised disparities (N,): for priors known up to scale and shift."""
-    return (normalised(1 / depth) - normalised(prior_disparity)).square().mean()
+    """Squared difference of normalized disparities (N,): for priors known up to scale and shift."""
+    return (normalized(1 / depth) - normalized(prior_disparity)).square().mean()
 
 
 def depth_scene(depth: Tensor, prior_disparity: Tensor, confidence: Tensor, near: float) -> Tensor:

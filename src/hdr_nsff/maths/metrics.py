@@ -2,7 +2,7 @@
 where it says so; masks (H, W) bool say where to look, None everywhere. Every metric gives back plain floats.
 
 Radiance is compared as METHOD.md 7 says: LDR recordings leave its scale free, so `align` fits one scale (or one per channel) for
-the whole sequence on pixels that some exposure records, and one `peak` normalises the whole sequence; neither is ever fitted
+the whole sequence on pixels that some exposure records, and one `peak` normalizes the whole sequence; neither is ever fitted
 per frame, which would hide flicker."""
 
 from __future__ import annotations

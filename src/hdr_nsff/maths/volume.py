@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def stratified_disparity(num_rays: int, num_samples: int, near: float, far: float, jitter: Tensor | None) -> Tensor:
-    """z-depths (N, S), evenly spaced in 1 / z from near to far; `jitter` (N, S) in [0, 1) moves each within its bin (None: centres)."""
+    """z-depths (N, S), evenly spaced in 1 / z from near to far; `jitter` (N, S) in [0, 1) moves each within its bin (None: centers)."""
     bins = torch.arange(num_samples).expand(num_rays, num_samples) + (0.5 if jitter is None else jitter)
     fraction = bins / num_samples
     return 1.0 / (1 / near + fraction * (1 / far - 1 / near))

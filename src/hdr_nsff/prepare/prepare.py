@@ -1,4 +1,4 @@
-"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, mask, rims, depth, sheet.
+"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, masks, refined flow, depth, sheet.
 
 Every step writes its files and then its record into `scene.json`; its key is a hash of its settings, of the weights of the networks that it
 asks, and of the steps and inputs it builds on. A finished step with the same key is skipped, an unfinished one goes on with the files it has, one with another key
@@ -22,7 +22,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
-from hdr_nsff.footage.datasets import recognise
+from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.capture import Picture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.prepare.steps import footage as on_footage
@@ -72,7 +72,7 @@ def held_out_truth(config: PrepareConfig) -> Path | None:
 def begin(config: PrepareConfig) -> Work:
     """Look at the footage and at the scene folder; InputError where they do not belong together."""
     check_settings(config)
-    capture = recognise(config.clip)
+    capture = recognize(config.clip)
     footage = capture.footage() if capture else ingest.open_footage(config.clip)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
@@ -95,7 +95,7 @@ def begin(config: PrepareConfig) -> Work:
 
 
 def introduce(work: Work) -> None:
-    """Say which data set was recognised, if it is one, and what of it is used."""
+    """Say which data set was recognized, if it is one, and what of it is used."""
     capture, clip = work.capture, work.config.clip
     if capture is None:
         return
@@ -216,7 +216,7 @@ def capture_part(work: Work, name: StepName) -> Any:
         case "poses" if work.gives("poses") and (given := capture.poses) is not None:
             points = None if capture.points is None else capture.points.tolist()
             return [given.K.tolist(), given.c2w.tolist(), given.size.tolist(), given.near, given.far, points]
-        case "mask" if work.gives("masks"):
+        case "masks" if work.gives("masks"):
             return [capture.still, capture.white_moves, files(lambda p: p.mask)]
         case "depth" if work.gives("depth"):
             return [capture.depth_kind, capture.depth_units, files(lambda p: p.depth), files(lambda p: p.confidence)]
@@ -269,8 +269,8 @@ STEPS: dict[StepName, StepKind] = {
         on_priors.flow_step,
         needs=("exposure",),
         settings=("flow", "flow_weights", "semantic"),
-        outputs=("flow",),
-        complete=all_have("matched"),
+        outputs=("raw_flow",),
+        complete=all_have("raw_flow"),
     ),
     "poses": StepKind(
         on_priors.poses_step,
@@ -279,17 +279,17 @@ STEPS: dict[StepName, StepKind] = {
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),
-    "mask": StepKind(
-        on_priors.mask_step,
+    "masks": StepKind(
+        on_priors.masks_step,
         needs=("poses",),
         settings=("masks", "mask_weights", "mask_points"),
         outputs=("masks",),
         complete=all_have("mask"),
     ),
-    "rims": StepKind(on_priors.rims_step, needs=("mask",), outputs=("rims",), complete=all_have("flow")),
+    "refined_flow": StepKind(on_priors.refined_flow_step, needs=("masks",), outputs=("refined_flow",), complete=all_have("flow")),
     "depth": StepKind(
         on_priors.depth_step,
-        needs=("rims",),
+        needs=("refined_flow",),
         settings=("depth", "depth_weights", "depth_kind"),
         outputs=("disparity", "disparity_confidence"),
         complete=all_have("disparity", "train"),

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.priors.weights import KNOWN, Weights, advice, cache, check_hash, entry, look, missing, size
+from hdr_nsff.priors.weights import KNOWN, Weights, advice, cache, check_hash, entry, locate, missing, size
 
 WIDE = 220  # characters of a line where no terminal says
 
@@ -33,7 +33,7 @@ def weights(config: WeightsConfig) -> None:
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = WIDE
-    table = Table("name", "for", "size and licence", "here", "get it by", box=None)
+    table = Table("name", "for", "size and license", "here", "get it by", box=None)
     for known in KNOWN.values():
         here = state(known)
         table.add_row(known.name, known.purpose, size(known), here or "no", "" if here else way(known))
@@ -52,7 +52,7 @@ def way(known: Weights) -> str:
 
 def report(known: Weights) -> str:
     """A sentence about weights that are here and whole; InputError otherwise."""
-    found = look(known)
+    found = locate(known)
     if found is None:
         raise InputError(f"{missing(known)}; {advice(known)}")
     fault, checked = verified(known, found.path)
@@ -63,7 +63,7 @@ def report(known: Weights) -> str:
 
 def state(known: Weights) -> str | None:
     """Where weights are and how far they were checked; None where they are not here."""
-    found = look(known)
+    found = locate(known)
     if found is None:
         return None
     fault, checked = verified(known, found.path)

@@ -24,7 +24,7 @@ DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
 # flow (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)
 Flows = tuple[np.ndarray, np.ndarray, np.ndarray]
-StepName = Literal["frames", "exposure", "flow", "poses", "mask", "rims", "depth", "sheet"]
+StepName = Literal["frames", "exposure", "flow", "poses", "masks", "refined_flow", "depth", "sheet"]
 
 
 @dataclass(frozen=True)
@@ -146,19 +146,19 @@ class Work:
         return np.stack([read_image(self.folder / f.image) for f in self.manifest.frames])
 
     @cached_property
-    def equalised(self) -> tuple[np.ndarray, np.ndarray]:
+    def equalized(self) -> tuple[np.ndarray, np.ndarray]:
         """All frames at one brightness (T, H, W, 3) and where they say nothing (T, H, W); the histograms are those of training frames."""
         frames = self.manifest.frames
         groups = [f.camera_id * (1 + max(g.bracket for g in frames)) + f.bracket for f in frames]
-        return exposure.equalise(self.video, groups, np.array([f.split == "train" for f in frames]))
+        return exposure.equalize(self.video, groups, np.array([f.split == "train" for f in frames]))
 
     @cached_property
-    def flows(self) -> Flows:
+    def raw_flows(self) -> Flows:
         """All flow as it was matched, which poses and masks come from."""
-        return self.read_flows([(f.index, f.matched) for f in self.manifest.frames])
+        return self.read_flows([(f.index, f.raw_flow) for f in self.manifest.frames])
 
     @cached_property
-    def mended_flows(self) -> Flows:
+    def refined_flows(self) -> Flows:
         """All flow as training sees it: that of what moves told by what moves alone."""
         return self.read_flows([(f.index, f.flow) for f in self.manifest.frames])
 

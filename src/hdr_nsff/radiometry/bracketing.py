@@ -38,6 +38,6 @@ def likely_factor(ev: Sequence[float] | np.ndarray) -> float:
 
 
 def usual_steps() -> dict[float, float]:
-    """Stops between neighbouring exposures and how often they are chosen."""
+    """Stops between neighboring exposures and how often they are chosen."""
     odd = [k / 3 for k in range(1, 15) if k % 3]
     return {float(k): p for k, p in USUAL.items()} | {k + 0.5: HALVES for k in range(5)} | dict.fromkeys(odd, THIRDS)

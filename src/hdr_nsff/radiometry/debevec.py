@@ -72,14 +72,14 @@ class ResponseFit:
 
 @dataclass
 class Equations:
-    """One channel's linear equations `design @ [H, a, log exposures] = target`, the points' own radiance eliminated by centring."""
+    """One channel's linear equations `design @ [H, a, log exposures] = target`, the points' own radiance eliminated by centering."""
 
     design: np.ndarray  # (P, B, unknowns)
     target: np.ndarray  # (P, B)
     weight: np.ndarray  # (P, B) inverse variance of an observation up to a factor, 0 where it is not valid
     robust: np.ndarray  # (P, B) in (0, 1]
 
-    def centred(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def centered(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Weights (P, B), design and target, the last two minus their weighted mean over every point's observations."""
         w = self.weight * self.robust
         total = np.maximum(w.sum(1, keepdims=True), 1e-12)
@@ -87,8 +87,8 @@ class Equations:
         return w, design, self.target - (w * self.target).sum(1, keepdims=True) / total
 
     def residuals(self, solution: np.ndarray) -> np.ndarray:
-        """Misfit (P, B) of log exposure; 0 where nothing was observed."""
-        _, design, target = self.centred()
+        """FrameError (P, B) of log exposure; 0 where nothing was observed."""
+        _, design, target = self.centered()
         return np.where(self.weight > 0, target - design @ solution, 0.0)
 
 
@@ -155,7 +155,7 @@ def solve(equations: list[Equations], noise: float, num_free: int) -> tuple[np.n
     second = np.diff(np.eye(NODES), 2, axis=0)
     curvature = np.einsum("ki,kj->ij", second, second)
     for c, e in enumerate(equations):
-        w, design, target = e.centred()
+        w, design, target = e.centered()
         at = np.r_[c * UNKNOWNS : (c + 1) * UNKNOWNS, 3 * UNKNOWNS : size]
         weighted = (w[..., None] * design).reshape(-1, len(at))
         matrix[np.ix_(at, at)] += weighted.T @ design.reshape(-1, len(at))
@@ -252,7 +252,7 @@ def brightness_ratio(samples: Samples, bracket: int, reference: int) -> float:
 
 
 def brightness_ev(images: Sequence[np.ndarray], brackets: Sequence[int], reference: int, num_brackets: int) -> list[float]:
-    """EV of every bracket (B,) from brightness alone: the grey levels' quantiles, compared between brackets next to each other in
+    """EV of every bracket (B,) from brightness alone: the gray levels' quantiles, compared between brackets next to each other in
     brightness where both are away from black and saturation, through gamma 2.2. Good to half a stop where all see the same scene."""
     share = np.linspace(0.02, 0.98, 97)
     levels = {
@@ -298,7 +298,7 @@ def static_samples(views: Sequence[View], num_brackets: int, num: int, rng: np.r
 
 
 @dataclass(frozen=True)
-class Neighbourhoods:
+class Neighborhoods:
     """What the 3x3 pixels around every pixel of a frame are good for."""
 
     mean: np.ndarray  # (H, W, 3) recorded
@@ -307,7 +307,7 @@ class Neighbourhoods:
     good: np.ndarray  # (H, W) bool: smooth, and known to be found again
 
 
-def usable(view: View) -> Neighbourhoods:
+def usable(view: View) -> Neighborhoods:
     """Where a frame's points can be trusted to be found again in other frames."""
     known = view.disparity > 0
     if view.moving is not None:
@@ -317,36 +317,36 @@ def usable(view: View) -> Neighbourhoods:
     return smooth(view.image, known)
 
 
-def smooth(image: np.ndarray, known: np.ndarray) -> Neighbourhoods:
-    """The neighbourhoods of a recorded `image` (H, W, 3), good where they are smooth and `known` (H, W) bool."""
+def smooth(image: np.ndarray, known: np.ndarray) -> Neighborhoods:
+    """The neighborhoods of a recorded `image` (H, W, 3), good where they are smooth and `known` (H, W) bool."""
     kernel = np.ones((3, 3), np.uint8)
     image = np.ascontiguousarray(image, np.float32)
     low, high = np.asarray(cv2.erode(image, kernel)), np.asarray(cv2.dilate(image, kernel))
     good = ((high - low) < 0.03 + 0.12 * high).all(-1) & known
-    return Neighbourhoods(np.asarray(cv2.blur(image, (3, 3))), (low >= LOW) & (high <= HIGH), low >= SATURATED, good)
+    return Neighborhoods(np.asarray(cv2.blur(image, (3, 3))), (low >= LOW) & (high <= HIGH), low >= SATURATED, good)
 
 
 def spread_over_levels(image: np.ndarray, mask: np.ndarray, num: int, rng: np.random.Generator) -> np.ndarray:
-    """Up to `num` pixels (p, 2; column, row) of `mask` (H, W) whose grey levels are as evenly spread as the image allows."""
+    """Up to `num` pixels (p, 2; column, row) of `mask` (H, W) whose gray levels are as evenly spread as the image allows."""
     rows, columns = np.nonzero(mask)
-    grey = image[rows, columns].mean(-1)
-    informative = (grey > LOW) & (grey < HIGH)
-    rows, columns, grey = rows[informative], columns[informative], grey[informative]
+    gray = image[rows, columns].mean(-1)
+    informative = (gray > LOW) & (gray < HIGH)
+    rows, columns, gray = rows[informative], columns[informative], gray[informative]
     if not len(rows):
         return np.zeros((0, 2), np.int64)
-    bins = np.minimum((grey * 16).astype(int), 15)
+    bins = np.minimum((gray * 16).astype(int), 15)
     chance = 1 / np.bincount(bins, minlength=16)[bins]
     chosen = rng.choice(len(rows), min(num, len(rows)), replace=False, p=chance / chance.sum())
     return np.stack([columns[chosen], rows[chosen]], -1)
 
 
 def unproject(view: View, pixels: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """World points (p, 3) at `pixels` (p, 2; centres at +0.5) and z-depth (p,)."""
+    """World points (p, 3) at `pixels` (p, 2; centers at +0.5) and z-depth (p,)."""
     rays = np.concatenate([pixels, np.ones((len(pixels), 1))], -1) @ np.linalg.inv(view.K).T
     return (rays * depth[:, None]) @ view.c2w[:, :3].T + view.c2w[:, 3]
 
 
-def sees(view: View, maps: Neighbourhoods, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def sees(view: View, maps: Neighborhoods, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Which world `points` (p, 3) `view` sees undisturbed (p,), and the pixel each falls into: row (p,), column (p,)."""
     height, width = view.disparity.shape
     local = (points - view.c2w[:, 3]) @ view.c2w[:, :3]

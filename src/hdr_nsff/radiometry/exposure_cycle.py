@@ -142,8 +142,8 @@ def reference_bracket(video: np.ndarray, brackets: list[int]) -> int:
     return int(np.argmax([good[group == b].mean() if (group == b).any() else 0.0 for b in range(group.max() + 1)]))
 
 
-def equalise(video: np.ndarray, groups: list[int], pool: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """All frames at one common brightness, for matching only: (equalised (T, H, W, 3) in [0, 1], clipped (T, H, W) bool).
+def equalize(video: np.ndarray, groups: list[int], pool: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """All frames at one common brightness, for matching only: (equalized (T, H, W, 3) in [0, 1], clipped (T, H, W) bool).
 
     `groups` says which frames of `video` (T, H, W, 3) share an exposure (and a camera); `pool` (T,) bool which frames the
     histograms are taken from (all). Each group shows about the same content, so the value of rank r in one histogram is the
@@ -152,7 +152,7 @@ def equalise(video: np.ndarray, groups: list[int], pool: np.ndarray | None = Non
     `clipped`: at least two channels say only "darker than" or "brighter than"."""
     group = np.array(groups)
     pool = np.ones(len(group), bool) if pool is None else pool
-    equalised, outside = np.empty(video.shape, np.float32), np.empty(video.shape, bool)
+    equalized, outside = np.empty(video.shape, np.float32), np.empty(video.shape, bool)
     ranks = np.linspace(0, 1, 4 * BINS)
     for channel in range(3):
         curves = {}
@@ -163,10 +163,10 @@ def equalise(video: np.ndarray, groups: list[int], pool: np.ndarray | None = Non
         for t, g in enumerate(group):
             value, rank = curves[g]
             recorded = video[t, ..., channel]
-            equalised[t, ..., channel] = np.interp(recorded, value, np.interp(rank, ranks, common))
+            equalized[t, ..., channel] = np.interp(recorded, value, np.interp(rank, ranks, common))
             black = LOW + np.interp(0.001, rank, value)  # some cameras add a pedestal
             outside[t, ..., channel] = (recorded < black) | (recorded > HIGH)
-    return equalised, outside.sum(-1) >= 2
+    return equalized, outside.sum(-1) >= 2
 
 
 def value_ranks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,7 +2,7 @@
 methods, in a public data layout (the writers are in `datasets/`).
 
 Coordinates are the scene's: OpenCV axes (+x right, +y down, +z forward of the first cameras), the units of its poses. A PLY knows
-neither background nor tone curve, so every Gaussian gets a colour of its own, developed as `render` develops pixels, or its linear
+neither background nor tone curve, so every Gaussian gets a color of its own, developed as `render` develops pixels, or its linear
 radiance. The background is left out."""
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ from hdr_nsff.training.run_folder import Run, read_config
 
 
 @dataclass(frozen=True)
-class Look:
-    """How radiance becomes the colour of a Gaussian."""
+class Coloring:
+    """How radiance becomes the color of a Gaussian."""
 
     ev: float | None = None
-    """Develop colours at this exposure, relative to the reference; default: tone-map for a display."""
+    """Develop colors at this exposure, relative to the reference; default: tone-map for a display."""
     linear: bool = False
-    """Linear radiance instead of developed colours, unbounded."""
+    """Linear radiance instead of developed colors, unbounded."""
     camera_id: int = 0
-    """Whose learned response and white balance develop the colours (with --ev)."""
+    """Whose learned response and white balance develop the colors (with --ev)."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class ExportConfig:
     """In frames of the clip, may be fractional; default: the middle one."""
     device: str = "auto"
     """auto, cpu or cuda."""
-    look: Annotated[Look, tyro.conf.arg(name="")] = field(default_factory=Look)
+    coloring: Annotated[Coloring, tyro.conf.arg(name="")] = field(default_factory=Coloring)
 
 
 @runtime_checkable
@@ -85,7 +85,7 @@ class GaussianField(RadianceField, Protocol):
         ...
 
 
-Colours = Callable[[np.ndarray], np.ndarray]  # radiance (G, 3) to what is written (G, 3)
+Colors = Callable[[np.ndarray], np.ndarray]  # radiance (G, 3) to what is written (G, 3)
 
 
 def export(config: ExportConfig) -> Path:
@@ -96,18 +96,18 @@ def export(config: ExportConfig) -> Path:
     run = Run.open(config.run, config.device)
     with io.writing_to(config.out):
         if config.ply_sequence:
-            return export_sequence(run, config.out, config.look)
+            return export_sequence(run, config.out, config.coloring)
         times = sorted({f.time for f in run.scene.train})
         time = times[len(times) // 2] if config.time is None else config.time
-        return export_one(run, config.out, time, config.look)
+        return export_one(run, config.out, time, config.coloring)
 
 
 def check_settings(config: ExportConfig) -> None:
     """InputError for settings that make no sense whatever the run is."""
-    look = config.look
+    coloring = config.coloring
     if config.ply + config.ply_sequence + (config.layout is not None) != 1:
         raise InputError("export: say what to write, one of --ply (a file), --ply-sequence and --layout NAME (a folder)")
-    if config.layout is not None and (config.time is not None or look != Look()):
+    if config.layout is not None and (config.time is not None or coloring != Coloring()):
         raise InputError("--layout: writes the recorded frames; --time, --ev, --linear and --camera-id are for Gaussians")
     if config.layout is None and config.truth is not None:
         raise InputError("--truth: held-out views are pictures, and Gaussians have none; use it with --layout NAME")
@@ -117,10 +117,10 @@ def check_settings(config: ExportConfig) -> None:
         raise InputError(f"{config.out}: is a file; --ply-sequence writes a folder, name another one")
     if config.ply_sequence and config.time is not None:
         raise InputError("--time: --ply-sequence writes every training time; use --ply for one time")
-    if look.linear and look.ev is not None:
+    if coloring.linear and coloring.ev is not None:
         raise InputError("--linear --ev: linear radiance is not developed; leave one of them out")
-    if look.ev is not None and not abs(look.ev) < 60:
-        raise InputError(f"--ev {look.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5")
+    if coloring.ev is not None and not abs(coloring.ev) < 60:
+        raise InputError(f"--ev {coloring.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5")
 
 
 def export_scene(folder: Path, out: Path, layout: Literal["hdr-gopro", "nerfstudio"], truth: Path | None = None) -> Path:
@@ -144,36 +144,36 @@ def export_scene(folder: Path, out: Path, layout: Literal["hdr-gopro", "nerfstud
     return out
 
 
-def export_one(run: Run, path: Path, time: float, look: Look) -> Path:
+def export_one(run: Run, path: Path, time: float, coloring: Coloring) -> Path:
     """Write the Gaussians at `time` in frames to `path`; what it was called."""
-    source = gaussian_field(run, look)
+    source = gaussian_field(run, coloring)
     times = [f.time for f in run.scene.train]
     if not (math.isfinite(time) and min(times) <= time <= max(times)):
         raise InputError(f"--time {time:g}: outside the clip ({min(times):g} to {max(times):g} frames)")
     if path.exists() and not ply.is_ours(path):
         raise InputError(f"{path}: is there already and was not made by export; choose another name")
-    colours = colours_of(run, look, exposure_of(run, look))
-    count = write_time(source, path, time, colours, look)
+    colors = colors_of(run, coloring, exposure_of(run, coloring))
+    count = write_time(source, path, time, colors, coloring)
     say(f"{path}: {count} Gaussians at time {time:g}")
     return path
 
 
-def export_sequence(run: Run, folder: Path, look: Look) -> Path:
+def export_sequence(run: Run, folder: Path, coloring: Coloring) -> Path:
     """Write `folder/00000.ply`, ... at the training times, in order; files already there with the same fingerprint are kept."""
-    source = gaussian_field(run, look)
+    source = gaussian_field(run, coloring)
     times = sorted({f.time for f in run.scene.train})
-    note = open_folder(run, folder, times, look)
-    colours = colours_of(run, look, note.display_exposure)
+    note = open_folder(run, folder, times, coloring)
+    colors = colors_of(run, coloring, note.display_exposure)
     for i, time in enumerate(track(times, "exporting")):
         if not (path := folder / f"{i:05d}.ply").exists():
-            write_time(source, path, time, colours, look)
+            write_time(source, path, time, colors, coloring)
     say(f"{folder}: {len(times)} files, one per training time")
     return folder
 
 
-def open_folder(run: Run, folder: Path, times: list[float], look: Look) -> notes.Exported:
+def open_folder(run: Run, folder: Path, times: list[float], coloring: Coloring) -> notes.Exported:
     """The sidecar of a sequence. Where the one on disk is of other settings or of another checkpoint, its files are removed."""
-    key, sidecar = fingerprint(run, times, look), folder / "sequence.json"
+    key, sidecar = fingerprint(run, times, coloring), folder / "sequence.json"
     there = sorted(folder.glob("[0-9]*.ply"))
     foreign = next((p for p in there if not ply.is_ours(p)), None)
     if foreign is not None:
@@ -185,38 +185,38 @@ def open_folder(run: Run, folder: Path, times: list[float], look: Look) -> notes
         say(f"{folder}: settings or checkpoint changed, exporting again")
     for path in there:
         path.unlink()
-    note = notes.Exported(key=key, step=run.step, times=times, display_exposure=exposure_of(run, look))
+    note = notes.Exported(key=key, step=run.step, times=times, display_exposure=exposure_of(run, coloring))
     notes.write(sidecar, note)
     return note
 
 
-def gaussian_field(run: Run, look: Look) -> GaussianField:
+def gaussian_field(run: Run, coloring: Coloring) -> GaussianField:
     """The run's field; InputError where it is not made of Gaussians, or for a camera that the run has not learned."""
     if not isinstance(run.field, GaussianField):
         raise InputError(
             f"{run.folder}: its field is not made of Gaussians, so there are none to export; train one with `train splat`"
         )
-    if not 0 <= look.camera_id < run.tonemapper.num_cameras:
-        raise InputError(f"camera {look.camera_id}: the run has learned cameras 0 to {run.tonemapper.num_cameras - 1}")
+    if not 0 <= coloring.camera_id < run.tonemapper.num_cameras:
+        raise InputError(f"camera {coloring.camera_id}: the run has learned cameras 0 to {run.tonemapper.num_cameras - 1}")
     return run.field
 
 
-def exposure_of(run: Run, look: Look) -> float:
+def exposure_of(run: Run, coloring: Coloring) -> float:
     """The display exposure of the clip as filmed, one for all times; 1 where it is not asked for."""
-    if look.linear or look.ev is not None:
+    if coloring.linear or coloring.ev is not None:
         return 1.0
     frames = sorted(run.scene.train, key=lambda f: f.time)
     return display_exposure(run, training_path([f.camera for f in frames], [f.time for f in frames]))
 
 
-def colours_of(run: Run, look: Look, exposure: float) -> Colours:
-    """How radiance becomes colour."""
-    if look.linear:
+def colors_of(run: Run, coloring: Coloring, exposure: float) -> Colors:
+    """How radiance becomes color."""
+    if coloring.linear:
         return lambda radiance: radiance
-    return lambda radiance: develop(run, radiance, look.ev, look.camera_id, exposure)
+    return lambda radiance: develop(run, radiance, coloring.ev, coloring.camera_id, exposure)
 
 
-def write_time(source: GaussianField, path: Path, time: float, colours: Colours, look: Look) -> int:
+def write_time(source: GaussianField, path: Path, time: float, colors: Colors, coloring: Coloring) -> int:
     """Write the visible Gaussians at `time` in frames; how many there are."""
     cloud = source.gaussians(time)
     whole = torch.cat([cloud.means, cloud.quaternions, cloud.scales, cloud.radiance], 1).isfinite().all(1)
@@ -225,12 +225,12 @@ def write_time(source: GaussianField, path: Path, time: float, colours: Colours,
         return values[whole].float().cpu().numpy()
 
     splats = ply.Splats(
-        array(cloud.means), array(cloud.quaternions), array(cloud.scales), array(cloud.opacities), colours(array(cloud.radiance))
+        array(cloud.means), array(cloud.quaternions), array(cloud.scales), array(cloud.opacities), colors(array(cloud.radiance))
     )
     comments = [
         f"time {time:g} frames",
         "axes OpenCV: +x right, +y down, +z forward",
-        "colour linear radiance" if look.linear else "colour developed rgb",
+        "color linear radiance" if coloring.linear else "color developed rgb",
     ]
     ply.write(path, splats, comments)
     return int(whole.sum())

@@ -1,6 +1,6 @@
 """Pictures at times between the training frames (METHOD.md section 4). Two ways:
 
-- `splat`: both neighbouring training times are seen from the target camera as layers, every sample is moved by the fraction
+- `splat`: both neighboring training times are seen from the target camera as layers, every sample is moved by the fraction
   of its scene flow, splatted into the picture layer by layer, composited front to back; the two pictures are blended by the
   fraction. Plain torch scatter-adds, any device.
 - `direct`: the field is asked at the fractional time itself.
@@ -44,10 +44,10 @@ class Picture:
     """A composited view; every quantity is premultiplied by opacity."""
 
     opacity: Tensor  # (S, 1)
-    colour: Tensor  # (S, C): radiance, disparity, motion
+    color: Tensor  # (S, C): radiance, disparity, motion
 
 
-def neighbours(time: float, times: Sequence[float]) -> tuple[float, float, float]:
+def neighbors(time: float, times: Sequence[float]) -> tuple[float, float, float]:
     """The training times just before and after `time`, and the fraction in [0, 1] of the way between them.
 
     At a training time, and outside their range, both are the nearest one and the fraction is 0."""
@@ -66,7 +66,7 @@ def render_at(
 
     `auto` splats where the field has layers and asks directly where it has none; `splat` demands layers. A splatted
     `Render` carries no scene flow, nor does one without `scene_flow`."""
-    before, after, fraction = neighbours(time, times)
+    before, after, fraction = neighbors(time, times)
     if fraction == 0 or mode == "direct" or (mode == "auto" and not isinstance(field, LayeredField)):
         return field.render(camera, time, scene_flow=scene_flow)
     assert isinstance(field, LayeredField), f"{type(field).__name__} has no layers to splat"
@@ -116,7 +116,7 @@ def settle(mass: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def corners(pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """The four pixels around each of `pixels` (M, 2; centres at +0.5) as positions row by row (4 M,), and their bilinear weights
+    """The four pixels around each of `pixels` (M, 2; centers at +0.5) as positions row by row (4 M,), and their bilinear weights
     (4 M,), which add up to 1; weight 0 outside the picture."""
     corner = (pixels - 0.5).floor()
     share = (pixels - 0.5) - corner  # (M, 2) of the way to the next column, row
@@ -138,12 +138,12 @@ def composite(alpha: Tensor, value: Tensor, num_layers: int, changes: tuple[Tens
         alpha = alpha.index_copy(0, changes[0], changes[1])
     layers = alpha.view(-1, num_layers)
     weights = transmittance(layers) * layers  # (S, L)
-    colour = weighted_sum(weights, value.view(-1, num_layers, value.shape[1]))
+    color = weighted_sum(weights, value.view(-1, num_layers, value.shape[1]))
     if changes is not None:
         at, _, other = changes
         difference = weights.view(-1, 1)[at] * (other - value[at])
-        colour = colour.index_add(0, torch.div(at, num_layers, rounding_mode="floor"), difference)
-    return Picture(weights.sum(-1, keepdim=True), colour)
+        color = color.index_add(0, torch.div(at, num_layers, rounding_mode="floor"), difference)
+    return Picture(weights.sum(-1, keepdim=True), color)
 
 
 def inverse(depth: Tensor) -> Tensor:
@@ -164,12 +164,12 @@ def blend(moved: Sequence[Picture], nearer: Picture, unmoved: Sequence[Picture],
         for share, now, still in zip(shares, moved, unmoved, strict=True)
     )
     opacity = sum_of(share * now.opacity for share, now in zip(shares, moved, strict=True))
-    colour = sum_of(share * now.colour for share, now in zip(shares, moved, strict=True))
+    color = sum_of(share * now.color for share, now in zip(shares, moved, strict=True))
     lack = (1 - presence / FAINT).clamp_min(0)  # > 0 only where hardly anything landed from either side
     scale = 1 / presence.clamp_min(FAINT)
     opacity = (opacity * scale + lack * nearer.opacity).clamp(0, 1)  # (S, 1)
-    colour = colour * scale + lack * nearer.colour  # (S, 5)
-    rest = colour[:, 3:] / opacity.clamp_min(1e-6)
+    color = color * scale + lack * nearer.color  # (S, 5)
+    rest = color[:, 3:] / opacity.clamp_min(1e-6)
     return Render(
-        radiance=colour[:, :3], depth=1 / rest[:, 0].clamp_min(1e-6), opacity=opacity[:, 0], motion=rest[:, 1].clamp(0, 1)
+        radiance=color[:, :3], depth=1 / rest[:, 0].clamp_min(1e-6), opacity=opacity[:, 0], motion=rest[:, 1].clamp(0, 1)
     )

@@ -1,6 +1,6 @@
 """3D Gaussians as a PLY file, the common exchange format (Kerbl et al. 2023): binary little-endian float32, one vertex per Gaussian.
 
-Colour is the constant term of spherical harmonics, opacity a logit, scales natural logs of standard deviations, rotation a unit
+Color is the constant term of spherical harmonics, opacity a logit, scales natural logs of standard deviations, rotation a unit
 quaternion w x y z; normals are there because readers expect them, and are zero."""
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
 
-SH_0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_0 * f_dc
+SH_0 = 0.28209479177387814  # the constant spherical harmonic, 1 / (2 sqrt(pi)): color = 0.5 + SH_0 * f_dc
 PROPERTIES = (
     "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity",
     "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3",
@@ -32,7 +32,7 @@ class Splats:
     quaternions: np.ndarray  # (G, 4) w x y z
     scales: np.ndarray  # (G, 3) standard deviations > 0, scene units
     opacities: np.ndarray  # (G,) in [0, 1]
-    colours: np.ndarray  # (G, 3) what is to be composited: rgb in [0, 1], or linear radiance
+    colors: np.ndarray  # (G, 3) what is to be composited: rgb in [0, 1], or linear radiance
 
 
 def write(path: Path | str, splats: Splats, comments: Sequence[str] = ()) -> None:
@@ -42,7 +42,7 @@ def write(path: Path | str, splats: Splats, comments: Sequence[str] = ()) -> Non
     columns = [
         splats.means,
         np.zeros((count, 3)),
-        (splats.colours.astype(np.float64) - 0.5) / SH_0,
+        (splats.colors.astype(np.float64) - 0.5) / SH_0,
         np.log(opacities / (1 - opacities))[:, None],
         np.log(splats.scales.astype(np.float64).clip(SMALLEST)),
         splats.quaternions / np.linalg.norm(splats.quaternions, axis=1, keepdims=True).clip(SMALLEST),

@@ -147,11 +147,11 @@ def check_views(run: Run, path: str, views: Sequence[View]) -> None:
     """InputError where a path file leaves the clip's time, or its viewpoint where the clip has no parallax."""
     times = run.scene.times
     first, last = float(times[0]), float(times[-1])
-    centres = torch.stack([f.camera.c2w[:, 3] for f in run.scene.train])
+    centers = torch.stack([f.camera.c2w[:, 3] for f in run.scene.train])
     for i, view in enumerate(views):
         if not first <= view.time <= last:
             raise InputError(f"{path}: view {i} is at time {view.time:g}, outside the clip ({first:g} to {last:g} frames)")
-        distance = (centres - view.camera.c2w[:, 3]).norm(dim=-1).min()
+        distance = (centers - view.camera.c2w[:, 3]).norm(dim=-1).min()
         if run.scene.manifest.parallax != "full" and distance > 1e-3 * run.scene.near:
             raise InputError(f"{path}: view {i} leaves the clip's viewpoint, but the clip has no parallax and so no depth")
 
@@ -286,7 +286,7 @@ def write_views(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
     evs = three_exposures(run.tonemapper.exposures().tolist())
     key = fingerprint(run, shot.views, evs)
     results = {f"LDR at EV {ev:+.1f}": out / "ldr" / f"ev{ev:+.1f}" for ev in evs} | {"depth": out / "depth"}
-    done = notes.read(note, notes.Coloured)
+    done = notes.read(note, notes.Colored)
     if done is None or done.key != key:
         near, far, fastest, moves = ranges(sources)
         for i, source in enumerate(track(sources, "LDR, depth and motion pictures")):
@@ -299,7 +299,7 @@ def write_views(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
                 flow = np.stack([seen["forward.u"], seen["forward.v"]], -1)
                 io.write_png(out / "scene_flow" / f"{i:05d}.png", io.colorize_flow(flow, fastest))
         write_overview(run, out, shot, evs, moves)
-        done = notes.Coloured(key=key, depth_range=(near, far), fastest=fastest, moves=moves, exposures=evs)
+        done = notes.Colored(key=key, depth_range=(near, far), fastest=fastest, moves=moves, exposures=evs)
         notes.write(note, done)
     if done.moves:
         results["scene flow"] = out / "scene_flow"

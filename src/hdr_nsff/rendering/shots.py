@@ -110,7 +110,7 @@ def picture_of(run: Run, view: View, radiance: np.ndarray, ev: float | None, cam
     flat = torch.from_numpy(radiance.reshape(-1, 3)).to(device_of(run))
     camera = to_device(view.camera, device_of(run))
     return (
-        recorded(run.field, camera, view.time, [run.tonemapper.look_at(ev, camera_id)], flat)[0]
+        recorded(run.field, camera, view.time, [run.tonemapper.recorder_at(ev, camera_id)], flat)[0]
         .cpu()
         .numpy()
         .reshape(radiance.shape)

@@ -13,7 +13,7 @@ from hdr_nsff.scene.scene import Frame, Scene
 
 
 @dataclass(frozen=True)
-class Look:
+class Recorder:
     """One recording, for the baselines' fields that must know of it before samples are composited; the others never ask."""
 
     rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to what is recorded of it (M, 3)
@@ -31,12 +31,12 @@ class PixelBatch:
     camera: Camera
     camera_id: int
     bracket: int
-    neighbours: dict[int, Camera]  # {+-1: camera of the next / previous training frame}; a missing side is absent
-    pixels: Tensor  # (N, 2) xy, centres at +0.5
+    neighbors: dict[int, Camera]  # {+-1: camera of the next / previous training frame}; a missing side is absent
+    pixels: Tensor  # (N, 2) xy, centers at +0.5
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
     seed: int = 0  # for the field's own randomness (jitter, noise): the same seed gives the same pass
-    look: Look | None = None  # the recording, while training
+    recorder: Recorder | None = None  # the recording, while training
     chain: int = 0  # direction of the two-step warp: +1, -1, or 0 for none
     moving: Tensor | None = None  # (N,) bool
     outline: Tensor | None = None  # (N,) bool: near the moving mask's outline
@@ -60,7 +60,7 @@ def whole_frame(scene: Scene, frame: int) -> PixelBatch:
 def read_off(
     scene: Scene, frame: int, pixels: Tensor, at: Callable[[Tensor], Tensor], uniform: Tensor | None = None
 ) -> PixelBatch:
-    """The batch of `pixels` (N, 2; centres at +0.5) of training frame `frame`; `at` takes an image (H, W, ...) to its values there."""
+    """The batch of `pixels` (N, 2; centers at +0.5) of training frame `frame`; `at` takes an image (H, W, ...) to its values there."""
     f: Frame = scene.train[frame]
 
     def maybe(image: Tensor | None) -> Tensor | None:
@@ -72,7 +72,7 @@ def read_off(
         camera=f.camera,
         camera_id=f.camera_id,
         bracket=f.bracket,
-        neighbours={o: scene.train[j].camera for o, j in f.neighbours.items()},
+        neighbors={o: scene.train[j].camera for o, j in f.neighbors.items()},
         pixels=pixels.to(f.image),
         rgb=at(f.image),
         uniform=torch.ones(len(pixels), dtype=torch.bool, device=f.image.device) if uniform is None else uniform,

@@ -11,13 +11,13 @@ from hdr_nsff.radiometry.common_range import recorded_range
 
 
 @dataclass(frozen=True)
-class Shots:
+class PosedVideo:
     """Frames with known poses; T frames of H x W pixels."""
 
     K: np.ndarray  # (T, 3, 3) pixels
     c2w: np.ndarray  # (T, 3, 4) OpenCV, scene units
     times: np.ndarray  # (T,) in frames
-    video: np.ndarray  # (T, H, W, 3) exposure-equalised rgb in [0, 1]
+    video: np.ndarray  # (T, H, W, 3) exposure-equalized rgb in [0, 1]
     clipped: np.ndarray  # (T, H, W) bool: no information
     moving: np.ndarray  # (T, H, W) bool
 
@@ -28,11 +28,11 @@ class Shots:
 
     @cached_property
     def ranges(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Per frame the lowest and highest equalised rgb it recorded."""
+        """Per frame the lowest and highest equalized rgb it recorded."""
         return [recorded_range(frame, clip) for frame, clip in zip(self.video, self.clipped, strict=True)]
 
     def project(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """World `points` (P, 3) in frame `i`: pixels (P, 2) with centres at +0.5, z-depth (P,), which are inside the frame (P,)."""
+        """World `points` (P, 3) in frame `i`: pixels (P, 2) with centers at +0.5, z-depth (P,), which are inside the frame (P,)."""
         local = (points - self.c2w[i, :, 3]) @ self.c2w[i, :, :3]
         z = local[:, 2]
         homogeneous = local @ self.K[i].T

@@ -61,12 +61,12 @@ class FrameEntry(Strict):
     disparity: str | None = None  # .npy (H, W) half, 1 / z-depth
     disparity_confidence: str | None = None  # .npy (H, W) half, in [0, 1]
     flow: dict[int, FlowFiles] = {}  # other frame's index -> flow towards it
-    matched: dict[int, FlowFiles] = {}  # the same as it was before masks were known, which poses and masks come from
+    raw_flow: dict[int, FlowFiles] = {}  # the same as it was before masks were known, which poses and masks come from
 
     @property
     def files(self) -> list[str]:
         """The names of all files of this frame."""
-        flow = [n for kind in (self.flow, self.matched) for f in kind.values() for n in (f.flow, f.valid)]
+        flow = [n for kind in (self.flow, self.raw_flow) for f in kind.values() for n in (f.flow, f.valid)]
         return [n for n in (self.image, self.mask, self.disparity, self.disparity_confidence, *flow) if n is not None]
 
 
@@ -84,7 +84,7 @@ class Step(Strict):
 class Manifest(Strict):
     """`scene.json`."""
 
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     source: str  # the footage, as the user named it
     inputs: dict[str, str] = {}  # input file name -> sha256
     width: int = Field(gt=0)
@@ -114,13 +114,24 @@ class Manifest(Strict):
         if not path.is_file():
             raise InputError(f"{folder}: no scene.json here; make a scene folder with `hdr-nsff prepare CLIP {folder}`")
         try:
-            manifest = Manifest.model_validate(read_json(path))
+            data = read_json(path)
+            manifest = None if is_version_1(data) else Manifest.model_validate(data)
         except ValueError as error:
             raise InputError(
                 f"{path}: not a valid scene ({first_problem(error)}); restore it or run `prepare` with `--redo frames`"
             ) from error
+        if manifest is None:
+            raise InputError(
+                f"{path}: a scene of hdr-nsff 0.1, which this version cannot read; "
+                "run `hdr-nsff prepare CLIP` again into a new folder"
+            )
         check_manifest(Path(folder), manifest)
         return manifest
+
+
+def is_version_1(data: Any) -> bool:
+    """Whether a `scene.json` is in the format of hdr-nsff 0.1."""
+    return isinstance(data, dict) and data.get("version") == 1
 
 
 @dataclass(frozen=True)
@@ -134,7 +145,7 @@ class Frame:
     bracket: int
     exposure: float | None  # EV relative to the reference bracket, None = unknown
     image: Tensor  # (H, W, 3) recorded rgb in [0, 1]
-    neighbours: dict[int, int] = field(default_factory=dict)  # {+-1: position in `Scene.train`}, same physical camera
+    neighbors: dict[int, int] = field(default_factory=dict)  # {+-1: position in `Scene.train`}, same physical camera
     moving: Tensor | None = None  # (H, W) bool
     outline: Tensor | None = None  # (H, W) bool: within `OUTLINE` pixels of the mask's outline, on either side
     disparity: Tensor | None = None  # (H, W)
@@ -172,7 +183,7 @@ class Scene:
                 f"{folder}: the scene has no camera poses yet; run `hdr-nsff prepare` again, it goes on where it stopped"
             )
         train = [e for e in m.frames if e.split == "train"]
-        links = neighbours(train)
+        links = neighbors(train)
         return Scene(
             folder=folder,
             train=[
@@ -272,10 +283,10 @@ def load_points(folder: Path, name: str) -> Tensor:
     return torch.from_numpy(points.astype(np.float32))
 
 
-def neighbours(entries: list[FrameEntry]) -> list[dict[int, int]]:
+def neighbors(entries: list[FrameEntry]) -> list[dict[int, int]]:
     """For each frame the positions of the frames at the previous (-1) and next (+1) training time of the same physical camera.
 
-    A camera that has no frame at that time has no neighbour there: fields know scene flow from one training time to the next."""
+    A camera that has no frame at that time has no neighbor there: fields know scene flow from one training time to the next."""
     result: list[dict[int, int]] = [{} for _ in entries]
     place = {time: k for k, time in enumerate(sorted({e.time for e in entries}))}
     for camera_id in {e.camera_id for e in entries}:
@@ -287,7 +298,7 @@ def neighbours(entries: list[FrameEntry]) -> list[dict[int, int]]:
     return result
 
 
-def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[int, int], links: dict[int, int]) -> Frame:
+def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbor_index: dict[int, int], links: dict[int, int]) -> Frame:
     """One frame with its maps, every size checked against the manifest."""
     size = (m.height, m.width)
 
@@ -312,11 +323,11 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
         raise InputError(
             f"{folder / str(e.disparity)}: disparity of frame {e.index} is negative; run `prepare` with `--redo depth`"
         )
-    flows = {o: e.flow[i] for o, i in neighbour_index.items() if i in e.flow}
+    flows = {o: e.flow[i] for o, i in neighbor_index.items() if i in e.flow}
     flow = {o: checked(f.flow, read_npy, "flow", (2,)) for o, f in flows.items()}
     valid = {o: checked(f.valid, read_mask, "flow mask") for o, f in flows.items()}
     moving = checked(e.mask, read_mask, "mask")
-    guessed = moving is not None and m.steps.get("mask", Step()).provenance == "estimated"
+    guessed = moving is not None and m.steps.get("masks", Step()).provenance == "estimated"
     return Frame(
         index=e.index,
         time=e.time,
@@ -325,7 +336,7 @@ def load_frame(folder: Path, m: Manifest, e: FrameEntry, neighbour_index: dict[i
         bracket=e.bracket,
         exposure=e.ev,
         image=image,
-        neighbours=links,
+        neighbors=links,
         moving=moving,
         outline=outline(moving) if moving is not None and guessed else None,
         disparity=disparity,

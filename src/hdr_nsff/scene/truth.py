@@ -21,7 +21,7 @@ from hdr_nsff.core.notes import first_problem
 from hdr_nsff.radiometry.recording import Curve, vignette
 from hdr_nsff.scene.scene import LARGEST_EV, FrameEntry, Strict, inside, is_intrinsic, is_matrix, is_pose
 
-# Channels of a view's geometry, of the ray through each pixel's centre: z-depth in true units (0 where it hits nothing); pixels that the surface
+# Channels of a view's geometry, of the ray through each pixel's center: z-depth in true units (0 where it hits nothing); pixels that the surface
 # moves in this camera, standing still, until one frame later and one frame earlier; the same in the truth's world, in true units.
 GEOMETRY = ("Z", *(f"{side}.{axis}" for side in SIDES.values() for axis in "uvxyz"))
 

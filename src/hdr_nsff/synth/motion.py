@@ -1,4 +1,4 @@
-"""Exact motion of what a rendered picture shows, from the depth, the body and the place on it at every pixel's centre, and how the bodies
+"""Exact motion of what a rendered picture shows, from the depth, the body and the place on it at every pixel's center, and how the bodies
 move."""
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ UV = ("surface.u", "surface.v")  # channels: texture coordinates, where the scen
 
 
 def place(channels: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The body (H, W) int and the texture coordinates (H, W, 2) at every pixel's centre, from the channels of a rendered picture."""
+    """The body (H, W) int and the texture coordinates (H, W, 2) at every pixel's center, from the channels of a rendered picture."""
     bodies = channels["body"].astype(int)
     return bodies, np.stack([channels.get(name, np.zeros(bodies.shape)) for name in UV], -1).astype(np.float64)
 
 
 def exact_flow(there: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
-    """Optical flow (H, W, 2) px of pixel centres whose surface is at world points `there` (H, W, 3) at another time, seen then by a camera
+    """Optical flow (H, W, 2) px of pixel centers whose surface is at world points `there` (H, W, 3) at another time, seen then by a camera
     `c2w` (3, 4)."""
     height, width = there.shape[:2]
     pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)

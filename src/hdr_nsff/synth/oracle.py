@@ -2,7 +2,7 @@
 
 It measures a field and its training apart from the priors. It is made from the truth, says so in every step of its
 manifest, and is no input a user could have. Flow goes from a frame to the ones before and after, whichever cameras they are of:
-`scene.neighbours` links consecutive times of one `camera_id`, so the cameras of a rig that take turns share id 0."""
+`scene.neighbors` links consecutive times of one `camera_id`, so the cameras of a rig that take turns share id 0."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def write_oracle(
         frames=entries,
         steps={
             name: Step(done=True, provenance="given", note=NOTE)
-            for name in ("frames", "exposure", "poses", "mask", "flow", "depth")
+            for name in ("frames", "exposure", "poses", "masks", "flow", "depth")
         },
     )
     manifest.save(folder)

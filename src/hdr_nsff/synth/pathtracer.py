@@ -1,9 +1,9 @@
-"""Mitsuba's only door: radiance by path tracing, and exact surfaces by one ray through each pixel centre
+"""Mitsuba's only door: radiance by path tracing, and exact surfaces by one ray through each pixel center
 (Mitsuba's own depth and position channels are averaged over the pixel, and its depth runs along the ray).
 
 Radiance is made in two parts, which gives a tenth of the plain path tracer's noise in the same time: light that comes
 straight from a lamp, one lamp (or circuit of lamps) at a time, as sharp as it is; and light that bounced, which is what full paths see beyond
-that, divided by albedo, averaged over a few centimetres of each surface, and multiplied by albedo again.
+that, divided by albedo, averaged over a few centimeters of each surface, and multiplied by albedo again.
 
 The LLVM variant is some four times faster than the scalar one; it needs LLVM 16 or newer (Debian: `libllvm19`)."""
 
@@ -31,7 +31,7 @@ FLIP = np.diag([-1.0, -1.0, 1.0, 1.0])  # OpenCV's camera axes to Mitsuba's
 
 @dataclass(frozen=True)
 class Surface:
-    """What the ray through each pixel centre hits."""
+    """What the ray through each pixel center hits."""
 
     points: np.ndarray  # (H, W, 3) world
     normals: np.ndarray  # (H, W, 3) world
@@ -121,7 +121,7 @@ class Tracer:
         return mesh
 
     def material(self, part: Part, lit: bool) -> dict[str, Any]:
-        """How a part reflects or shines, for Mitsuba. One colour is no bitmap: lamps of one colour are sampled by solid angle."""
+        """How a part reflects or shines, for Mitsuba. One color is no bitmap: lamps of one color are sampled by solid angle."""
         texture: dict[str, Any] = {"type": "rgb", "value": np.ravel(part.texture).tolist()}
         if part.texture.size > 3:
             bitmap = self.mi.Bitmap(np.ascontiguousarray(part.texture, np.float32))
@@ -181,7 +181,7 @@ class Tracer:
         return np.sum([np.array(image, np.float64) for image in images], 0) / passes
 
     def surface(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]) -> Surface:
-        """The first surface along the ray through every pixel centre."""
+        """The first surface along the ray through every pixel center."""
         width, height = size
         x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1).reshape(-1, 3)
@@ -219,7 +219,7 @@ def circuit(part: Part) -> str:
 
 
 def smooth(light: np.ndarray, surface: Surface, blur: float) -> np.ndarray:
-    """Light (H, W, 3) averaged over what is near on the same surface: a Gaussian of `blur` metres, cut where the normal turns."""
+    """Light (H, W, 3) averaged over what is near on the same surface: a Gaussian of `blur` meters, cut where the normal turns."""
     height, width = light.shape[:2]
     light, points, normals = (a.astype(np.float32) for a in (light, surface.points, surface.normals))
     total, weights = np.zeros_like(light), np.zeros((height, width, 1), np.float32)

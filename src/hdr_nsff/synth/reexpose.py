@@ -1,10 +1,10 @@
 """Any ordinary clip -> an alternating-exposure problem whose truth is the clip itself.
 
-The clip is linearised (gamma 2.2) and taken for the scene's radiance; a camera with another response records it again with
+The clip is linearized (gamma 2.2) and taken for the scene's radiance; a camera with another response records it again with
 alternating exposures, noise and 8 bits. Into `OUT`: `clip/` (the footage), `truth/` (radiance of the held-out frames, for `evaluate`),
 `poses_bounds.npy` (where poses are given: those of the footage, for `prepare --poses`), `reexpose.json` (what was done).
 
-With poses, held-out frames are missing from the footage, and their time lies between their neighbours'. Without, nobody
+With poses, held-out frames are missing from the footage, and their time lies between their neighbors'. Without, nobody
 could say where a missing frame was seen from, so they stay in the footage and `prepare --hold-out`, or `run --truth`, keeps them out of
 training."""
 
@@ -95,8 +95,8 @@ def reexpose(config: ReexposeConfig) -> Path:
             size = (frame.rgb.shape[0], frame.rgb.shape[1])
         work = plan(len(numbers), len(evs), config.hold_out, remove=config.poses is not None)
         poses = read_poses(config.poses, footage, numbers, size) if config.poses is not None else None
-        if (colour := exposure.all_clipped(extents)) is not None:
-            raise InputError(f"{config.clip}: all frames are {colour}; re-exposed they stay so, choose another clip")
+        if (color := exposure.all_clipped(extents)) is not None:
+            raise InputError(f"{config.clip}: all frames are {color}; re-exposed they stay so, choose another clip")
         masks = frame_masks(config.masks, work.test, numbers, size) if config.masks is not None else {}
         claim(config, footage)  # once nothing can be wrong with the settings any more
         write_frames(config, footage, work, evs, response)
@@ -221,7 +221,7 @@ def read_poses(path: Path, footage: ingest.Footage, numbers: list[int], size: tu
 
 
 def llff_rows(poses: Poses, size: tuple[int, int]) -> np.ndarray:
-    """(N, 17) as in poses_bounds.npy: 3x5 (columns down, right, back, centre, (height, width, focal)), then near and far (0: unknown)."""
+    """(N, 17) as in poses_bounds.npy: 3x5 (columns down, right, back, center, (height, width, focal)), then near and far (0: unknown)."""
     c = poses.c2w
     last = np.stack([np.full(len(c), size[0]), np.full(len(c), size[1]), poses.K[:, 0, 0]], -1)
     matrices = np.stack([c[..., 1], c[..., 0], -c[..., 2], c[..., 3], last], -1)  # (N, 3, 5)

@@ -10,7 +10,7 @@ Every picture is cached in exact/: a run that was killed goes on where it was.
 
 `--views mono` is one moving camera. `--views rig` is nine synchronized ones that stand still, and the clip goes around them:
 frame i is what camera i modulo nine records at time i. They are of one make and share one response, so the clip is prepared
-and trained on as that of one camera (`camera_id` 0), whose neighbour in time stands beside it."""
+and trained on as that of one camera (`camera_id` 0), whose neighbor in time stands beside it."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from hdr_nsff.synth.scenes.base import SynthScene, Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
-OFF_PATH = ((0.06, -0.03, 0.03), (-0.05, 0.05, -0.02))  # metres in the camera's axes from the frame's pose
+OFF_PATH = ((0.06, -0.03, 0.03), (-0.05, 0.05, -0.02))  # meters in the camera's axes from the frame's pose
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ def noise(height: int, width: int, rng: np.random.Generator, cells: int = 4, oct
     return np.clip((total - low) / (high - low), 0, 1)
 
 
-def colour(rng: np.random.Generator, low: float = DARK, high: float = BRIGHT, saturation: float = 0.5) -> np.ndarray:
+def color(rng: np.random.Generator, low: float = DARK, high: float = BRIGHT, saturation: float = 0.5) -> np.ndarray:
     """A random albedo (3,), its lightness spread evenly in log scale."""
     lightness = np.exp(rng.uniform(np.log(low), np.log(high)))
     return np.clip(lightness * (1 + saturation * (rng.random(3) - 0.5) * 2), DARK / 2, BRIGHT).astype(np.float32)
@@ -54,8 +54,8 @@ def planks(height: int, width: int, rng: np.random.Generator, rows: int = 9, bas
     grain = cv2.resize(noise(height, max(8, width // 8), rng, 8, 5), (width, height), interpolation=cv2.INTER_CUBIC)
     image *= (0.5 + grain)[..., None]
     for _ in range(height * width // 4000):
-        centre = (int(rng.integers(width)), int(rng.integers(height)))
-        cv2.ellipse(image, centre, (int(rng.integers(3, 8)), int(rng.integers(2, 4))), 0, 0, 360, (0.05, 0.03, 0.02), -1)
+        center = (int(rng.integers(width)), int(rng.integers(height)))
+        cv2.ellipse(image, center, (int(rng.integers(3, 8)), int(rng.integers(2, 4))), 0, 0, 360, (0.05, 0.03, 0.02), -1)
     return grained(image, rng, 0.3)
 
 
@@ -66,14 +66,14 @@ def tiles(height: int, width: int, rng: np.random.Generator, rows: int = 10) -> 
     for i in range(rows):
         for j in range(int(np.ceil(width / side))):
             top, left, size = int(i * side), int(j * side), int(side) - 2
-            image[top : top + size, left : left + size] = colour(rng, 0.08, 0.75, 0.35)
-            centre = (int(left + size / 2), int(top + size / 2))
+            image[top : top + size, left : left + size] = color(rng, 0.08, 0.75, 0.35)
+            center = (int(left + size / 2), int(top + size / 2))
             match rng.integers(4):
                 case 0:
-                    cv2.circle(image, centre, int(size * rng.uniform(0.2, 0.4)), colour(rng).tolist(), -1, cv2.LINE_AA)
+                    cv2.circle(image, center, int(size * rng.uniform(0.2, 0.4)), color(rng).tolist(), -1, cv2.LINE_AA)
                 case 1:
-                    box = cv2.boxPoints((centre, (size * 0.6, size * 0.3), float(rng.uniform(0, 180))))
-                    cv2.fillPoly(image, [box.astype(np.int32)], colour(rng).tolist(), cv2.LINE_AA)
+                    box = cv2.boxPoints((center, (size * 0.6, size * 0.3), float(rng.uniform(0, 180))))
+                    cv2.fillPoly(image, [box.astype(np.int32)], color(rng).tolist(), cv2.LINE_AA)
                 case _:
                     pass
     return grained(image, rng, 0.5)
@@ -81,11 +81,11 @@ def tiles(height: int, width: int, rng: np.random.Generator, rows: int = 10) -> 
 
 def poster(height: int, width: int, rng: np.random.Generator, paper: float = 0.6, figures: int = 60) -> np.ndarray:
     """Print: overlapping discs, bars and triangles from large to small, and lines of letters."""
-    image = np.full((height, width, 3), 255 * paper * (0.7 + 0.6 * colour(rng, 0.3, 0.8))).astype(np.uint8)  # letters need 8 bits
+    image = np.full((height, width, 3), 255 * paper * (0.7 + 0.6 * color(rng, 0.3, 0.8))).astype(np.uint8)  # letters need 8 bits
     for k in range(figures):
         size = max(4.0, 0.7 * min(height, width) / (1 + k) ** 0.4)
         x, y = int(rng.integers(width)), int(rng.integers(height))
-        ink = (255 * colour(rng, DARK, BRIGHT, 0.7)).tolist()
+        ink = (255 * color(rng, DARK, BRIGHT, 0.7)).tolist()
         match rng.integers(4):
             case 0:
                 cv2.circle(image, (x, y), int(size / 2), ink, -1, cv2.LINE_AA)
@@ -106,8 +106,8 @@ def plaster(height: int, width: int, rng: np.random.Generator, base: float = 0.5
     stains = noise(height, width, rng, 6, 6)
     image = base * (0.35 + 1.0 * stains)[..., None] * np.array([1.0, 0.96, 0.88], np.float32)
     for _ in range(height * width // 700):
-        centre = (int(rng.integers(width)), int(rng.integers(height)))
-        cv2.circle(image, centre, int(rng.integers(1, 5)), colour(rng, 0.06, 0.6, 0.2).tolist(), -1, cv2.LINE_AA)
+        center = (int(rng.integers(width)), int(rng.integers(height)))
+        cv2.circle(image, center, int(rng.integers(1, 5)), color(rng, 0.06, 0.6, 0.2).tolist(), -1, cv2.LINE_AA)
     return np.clip(image, DARK, BRIGHT).astype(np.float32)
 
 
@@ -118,10 +118,10 @@ def books(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     while x < width:
         w = int(rng.integers(max(3, width // 30), max(5, width // 12)))
         top = int(height * rng.uniform(0.02, 0.3))
-        image[top:, x : x + w - 1] = colour(rng, 0.06, 0.75, 0.7)
+        image[top:, x : x + w - 1] = color(rng, 0.06, 0.75, 0.7)
         for _ in range(3):
             y = int(rng.uniform(top, height * 0.92))
-            image[y : y + max(2, height // 16), x + 1 : x + w - 2] = colour(rng)
+            image[y : y + max(2, height // 16), x + 1 : x + w - 2] = color(rng)
         x += w
     return grained(image, rng, 0.2)
 
@@ -138,10 +138,10 @@ def sky(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     while x < width:
         w = int(rng.integers(width // 14, width // 6))
         top = int(height * rng.uniform(0.6, 0.85))
-        image[top:, x : x + w] = colour(rng, 0.15, 0.7, 0.4)
+        image[top:, x : x + w] = color(rng, 0.15, 0.7, 0.4)
         for row in range(top + 4, height - 4, 9):
             for column in range(x + 4, min(x + w, width) - 6, 8):
-                image[row : row + 4, column : column + 4] = colour(rng, 0.06, 1.6, 0.3)
+                image[row : row + 4, column : column + 4] = color(rng, 0.06, 1.6, 0.3)
         x += w
     return np.ascontiguousarray(image, np.float32)
 

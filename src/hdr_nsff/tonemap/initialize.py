@@ -10,7 +10,7 @@ from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapper
 
 
-def initialise(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int = 0) -> str:
+def initialize(tonemapper: ToneMapper, scene: Scene, num: int = 4000, seed: int = 0) -> str:
     """Start the response and the unknown exposures of `tonemapper` from the recordings of `scene`; says in a sentence how.
 
     From static points where there are enough of them; otherwise gamma 2.2, and exposures from the frames' brightness."""

@@ -3,7 +3,7 @@
 A value's bin comes without a power. Floats in [0, 1] that share their upper 16 bits make a cell; a table says in which bin a cell
 begins, and since no cell holds two knots, the bin is that one or the next. Pixels are taken in a fixed number of chunks that add up
 what they say of curve and gain each for itself: the same sums whatever the number of threads. The plain-torch twin is in `tonemap.py`;
-a test compares them. At a knot, where the slope jumps, either neighbour's is right and the twins may differ."""
+a test compares them. At a knot, where the slope jumps, either neighbor's is right and the twins may differ."""
 
 from __future__ import annotations
 

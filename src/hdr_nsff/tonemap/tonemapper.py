@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.scene.batch import Look
+from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.scene import Scene, bracket_problem
 from hdr_nsff.tonemap.kernel import Respond, bin_table
 from hdr_nsff.tonemap.responses import GAMMA, ImageResponse, NetworkResponse, SharedResponse
@@ -173,7 +173,7 @@ class ToneMapper(nn.Module):
 
     @staticmethod
     def for_scene(config: ToneMapConfig, scene: Scene) -> ToneMapper:
-        """The tone mapper of a prepared scene, before `priors.response.initialise`."""
+        """The tone mapper of a prepared scene, before `priors.response.initialize`."""
         frames = scene.train
         num_brackets = max(f.bracket for f in frames + scene.test) + 1
         ev = scene.manifest.bracket_ev or [None] * num_brackets
@@ -196,15 +196,15 @@ class ToneMapper(nn.Module):
             else self.respond(radiance, gain, self.curve_values(bracket, camera_id, frame), leaky)
         )
 
-    def look(self, bracket: int, camera_id: int, frame: int | None = None, leaky: bool = False) -> Look:
+    def recorder(self, bracket: int, camera_id: int, frame: int | None = None, leaky: bool = False) -> Recorder:
         """One recording, for fields that record before they composite."""
         images = self.images_of(bracket).tolist() if frame is None else [frame]
-        return Look(lambda radiance: self(radiance, bracket, camera_id, frame, leaky), tuple(images))
+        return Recorder(lambda radiance: self(radiance, bracket, camera_id, frame, leaky), tuple(images))
 
-    def look_at(self, ev: float, camera_id: int = 0) -> Look:
+    def recorder_at(self, ev: float, camera_id: int = 0) -> Recorder:
         """A picture developed at `ev`, the same; it looks like the training images of the nearest exposure."""
         nearest = int((self.exposures() - ev).abs().argmin())
-        return Look(lambda radiance: self.develop(radiance, ev, camera_id), tuple(self.images_of(nearest).tolist()))
+        return Recorder(lambda radiance: self.develop(radiance, ev, camera_id), tuple(self.images_of(nearest).tolist()))
 
     @property
     def has_formula(self) -> bool:
@@ -262,13 +262,13 @@ class ToneMapper(nn.Module):
             return x.T * (-self.log_gain(bracket, camera_id, frame)).exp()
 
     def neutral(self, camera_id: int = 0) -> Tensor:
-        """Gains (3,), geometric mean 1, that make neutral what the camera records as mid grey at the reference exposure.
+        """Gains (3,), geometric mean 1, that make neutral what the camera records as mid gray at the reference exposure.
 
         Radiance is in the camera's own units, per channel (the gauge): for looking at, its white balance has to be put in."""
         bracket = self.frame_brackets[self.reference_frame]
         frame = self.reference_frame if self.config.kind == "per_image" else None
-        grey = self.inverse(torch.full((1, 3), 0.5, device=self.knots.device), bracket, camera_id, frame)[0].clamp_min(1e-9)
-        return grey.log().mean().exp() / grey
+        gray = self.inverse(torch.full((1, 3), 0.5, device=self.knots.device), bracket, camera_id, frame)[0].clamp_min(1e-9)
+        return gray.log().mean().exp() / gray
 
     def log_gain(self, bracket: int, camera_id: int, frame: int | None) -> Tensor:
         """Natural log gain (3,), eq. 10. per_image and sigmoid without a frame borrow the mean of the bracket's training images."""
@@ -399,7 +399,7 @@ class ToneMapper(nn.Module):
             parameter.requires_grad_(not frozen and parameter.numel() > 0)
 
     def param_groups(self, lr: float) -> list[dict[str, Any]]:
-        """Optimiser groups `response` and `gain`; empty ones are left out."""
+        """Optimizer groups `response` and `gain`; empty ones are left out."""
         response = [] if self.response is None else list(self.response.parameters())
         own = {id(p) for p in response}
         gain = [p for p in self.parameters() if id(p) not in own and p.numel()]

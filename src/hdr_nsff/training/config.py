@@ -18,6 +18,8 @@ from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig
 from hdr_nsff.training.objective import LossWeights
 
+VERSION = 2  # of a run's config.json
+
 
 @dataclass(frozen=True)
 class TrainConfig:
@@ -51,8 +53,8 @@ class TrainConfig:
     tonemap_lr: float = 2e-3
     anchor_at: float = 0.05
     """Share of the run after which response and exposures are held where they are (1: never), unless static points told them: then at once."""
-    paint: bool = True
-    """Start the field from the depth prior and the recorded colours (no effect on the published network)."""
+    from_priors: bool = True
+    """Start the field from the depth prior and the recorded colors (no effect on the published network)."""
     refine_poses: bool = False
     """Correct the training cameras (poses and focal length) a little, by the picture."""
     pose_lr: float = 6e-4
@@ -76,13 +78,16 @@ class TrainConfig:
         kinds = [type(self.field).__name__]
         if isinstance(self.field, BranchesConfig):
             kinds.append(type(self.field.encoding).__name__)
-        return asdict(self) | {"scene": str(self.scene), "out": str(self.out), "kinds": kinds}
+        names = {"version": VERSION, "scene": str(self.scene), "out": str(self.out), "kinds": kinds}
+        return names | {k: v for k, v in asdict(self).items() if k not in names}
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> TrainConfig:
-        """The config of a run. InputError where a key is missing or unknown (another version)."""
+        """The config of a run. InputError where it is of another version, or a key is missing or unknown."""
+        if not isinstance(data, dict) or data.get("version") != VERSION:
+            raise InputError("the run's config.json is of another version of hdr-nsff; train again into a new folder")
         try:
-            data = dict(data)
+            data = {k: v for k, v in data.items() if k != "version"}
             parts = {
                 "field": read_field(data.pop("kinds"), data["field"]),
                 "tonemap": ToneMapConfig(**data["tonemap"]),
@@ -111,7 +116,17 @@ def read_field(kinds: list[str], values: dict[str, Any]) -> FieldConfig:
 
 
 ABOVE_ZERO = {"minutes", "finest", "motion_cell"}
-FROM_ONE = {"steps", "batches", "bases", "colour_knots", "shade_knots", "presence_knots", "samples", "render_samples", "levels"}
+FROM_ONE = {
+    "steps",
+    "batches",
+    "bases",
+    "color_knots",
+    "brightness_knots",
+    "opacity_knots",
+    "samples",
+    "render_samples",
+    "levels",
+}
 FROM_ONE |= {"depth_cells", "max_rows", "layers", "width", "static", "code_size", "head_width", "grow_every"}
 FROM_ONE |= {"density_components", "appearance_components", "coarsest", "finest"}
 AT_MOST = {
@@ -178,7 +193,7 @@ def paper() -> TrainConfig:
     )
     return TrainConfig(
         field=network, tonemap=ToneMapConfig(kind="per_image", knots="even", from_recordings=False), loss=weights, steps=250_000, minutes=None, rays=1024,
-        moving_rays=512, batches=1, paint=False, period=0.0, prior_fade=0.1, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, torch_threads=0, checkpoint_seconds=600,
+        moving_rays=512, batches=1, from_priors=False, period=0.0, prior_fade=0.1, lr_final=0.0, tonemap_lr=5e-4, anchor_at=1.0, torch_threads=0, checkpoint_seconds=600,
     )  # fmt: skip
 
 
@@ -208,7 +223,7 @@ def nsff() -> TrainConfig:
     field = NSFFConfig(compositing="blend", radiance="sigmoid")
     weights = replace(published.loss, depth=0.5, flow=0.01)
     return replace(
-        published, field=field, loss=weights, steps=None, minutes=5.0, rays=1536, paint=True, period=0.12, moving_until=0.12,
+        published, field=field, loss=weights, steps=None, minutes=5.0, rays=1536, from_priors=True, period=0.12, moving_until=0.12,
         prior_fade=0.5, lr_final=0.05, torch_threads=1, checkpoint_seconds=60,
     )  # fmt: skip
 
@@ -229,7 +244,7 @@ def hexplane_paper() -> TrainConfig:
     """HDR-HexPlane at its published size."""
     return TrainConfig(
         field=HexPlaneConfig(), tonemap=ToneMapConfig(kind="sigmoid"), loss=replace(NOTHING, total_variation=1e-4), steps=25_000,
-        minutes=None, rays=4096, moving_rays=0, lr_final=0.1, tonemap_lr=1e-3, anchor_at=1.0, paint=False, squared=True,
+        minutes=None, rays=4096, moving_rays=0, lr_final=0.1, tonemap_lr=1e-3, anchor_at=1.0, from_priors=False, squared=True,
         saturation=False, torch_threads=0, checkpoint_seconds=600,
     )  # fmt: skip
 
@@ -260,7 +275,7 @@ def ablated(config: TrainConfig, name: str) -> TrainConfig:
         case "no-flow":  # nor is the flow looked at before training
             return replace(config, loss=replace(config.loss, flow=0.0))
         case "no-depth":
-            return replace(config, loss=replace(config.loss, depth=0.0), paint=False)
+            return replace(config, loss=replace(config.loss, depth=0.0), from_priors=False)
         case "no-saturation":
             return replace(config, saturation=False)
         case "sigmoid":

@@ -1,6 +1,6 @@
 """The paper's objective (eq. 16, METHOD.md 3), term by term, for any field: everything here needs a `Render` and a tone mapper only.
 
-The field's own per-sample regularisers and the tone mapper's come in by name. Keys are the field names of `LossWeights`;
+The field's own per-sample regularizers and the tone mapper's come in by name. Keys are the field names of `LossWeights`;
 a term without a weight is an error. `phase` is the time since the start in units of the schedule's period K."""
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class LossWeights:
     dynamic: float = 1.0
     """The dynamic branch alone (eq. 7) or the moving pixels again (densities that add up), saturation-weighted."""
     temporal: float = 0.3
-    """Eq. 13: renders warped from the neighbouring times."""
+    """Eq. 13: renders warped from the neighboring times."""
     chain: float = 0.1
     """The same through two steps, from phase 2 on."""
     cycle: float = 0.5
@@ -46,25 +46,25 @@ class LossWeights:
     """Mean scale of Gaussians, in units of the near depth."""
     trajectory: float = 30.0
     """Square of third differences of the shared motions, in units of the near depth."""
-    shade: float = 0.01
+    brightness_drift: float = 0.01
     """Square of static Gaussians' changes of log radiance in time."""
-    presence: float = 1e-3
+    opacity_offsets: float = 1e-3
     """Square of moving Gaussians' changes of opacity logit from one knot to the next."""
-    colour_change: float = 0.01
-    """Square of moving Gaussians' changes of log radiance from one colour knot to the next."""
+    color_change: float = 0.01
+    """Square of moving Gaussians' changes of log radiance from one color knot to the next."""
     rigidity: float = 1.0
-    """Square of the differences in how neighbouring moving Gaussians mix the shared motions."""
-    sheen: float = 0.01
+    """Square of the differences in how neighboring moving Gaussians mix the shared motions."""
+    sh1: float = 0.01
     """Square of Gaussians' changes of log radiance with the direction of view."""
     transient: float = 0.01
     """Mean optical thickness of a sample of NeRF-W's transient branch."""
     total_variation: float = 1e-4
-    """Mean square differences of neighbours in HexPlane's planes."""
+    """Mean square differences of neighbors in HexPlane's planes."""
     pose: float = 1e-4
     """What the drawn camera's corrections cost: of its pose by a Cauchy prior, of its focal length squared (`refine_poses`)."""
     response_smoothness: float = 1e-3
     unit_exposure: float = 0.5
-    """Distance of a network response from mid grey at the unit exposure."""
+    """Distance of a network response from mid gray at the unit exposure."""
     gain_residual: float = 1.0
     response_anchor: float = 100.0
 
@@ -114,7 +114,7 @@ class Objective:
         return {"dynamic": losses.photometric(rgb, batch.rgb, trust * extra, self.squared)}
 
     def warped(self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float) -> dict[str, Tensor]:
-        """Eq. 13 for the neighbours, and through two steps from phase 2 on; weighted by what is not disoccluded."""
+        """Eq. 13 for the neighbors, and through two steps from phase 2 on; weighted by what is not disoccluded."""
         seen = [w for w in render.warps if w.radiance is not None]
         if not seen:
             return {}

@@ -1,6 +1,6 @@
 """Small corrections of the training cameras, learned with the field through the tone-mapped picture (`train --refine-poses`).
 
-A camera turns by an axis-angle in world axes and its centre shifts by a share of the scene's typical depth; focal lengths are multiplied
+A camera turns by an axis-angle in world axes and its center shifts by a share of the scene's typical depth; focal lengths are multiplied
 by a factor. Frames of one physical camera that have the same pose share its correction, frames that have the same K share the factor.
 
 *Steps.* Turning and shifting a camera move its picture in almost the same way, so what is learned is preconditioned (after CamP, Park et
@@ -28,7 +28,7 @@ ZOOM = 3.0  # log focal length per parameter: pixels lie about a third of the wi
 BETAS = (0.9, 0.9999)  # a long memory of how large gradients were: steps shrink as the pictures come to fit
 START = 0.05  # share of the run after which cameras move: the first surfaces are rough
 ZOOM_RATE = 0.1  # a factor is of many frames and moves at every step: slowly
-DEGREE, SHIFT, LENGTHENING = torch.pi / 180, 0.01, 0.002  # turn, typical depths, share of the focal length: 1 in the regulariser
+DEGREE, SHIFT, LENGTHENING = torch.pi / 180, 0.01, 0.002  # turn, typical depths, share of the focal length: 1 in the regularizer
 DOUBT = 0.1  # of those: a correction this small is held, a larger one is let go (Cauchy)
 FOCAL = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]])  # entries of K that are focal lengths
 
@@ -47,7 +47,7 @@ class PoseCorrections(nn.Module):
                 f"{scene.folder}: the camera stands still, there are no poses to refine; train without --refine-poses"
             )
         self.unit = typical_depth(scene)
-        self.links = [f.neighbours for f in scene.train]
+        self.links = [f.neighbors for f in scene.train]
         keys = [pose_key(f) for f in scene.train]
         self.cameras = {key: i for i, key in enumerate(dict.fromkeys(keys))}  # which correction
         self.lenses = {key: i for i, key in enumerate(dict.fromkeys(lens_key(f) for f in scene.train))}  # which factor
@@ -61,8 +61,8 @@ class PoseCorrections(nn.Module):
         precondition, judge = roots(metric)
         self.register_buffer("precondition", free[:, None] * precondition, persistent=False)  # (C, 6, 6) parameters to twists
         self.register_buffer("judge", judge * free, persistent=False)  # (C, 6, 6) twists to parameters
-        centres = torch.stack([f.camera.c2w[:, 3] for f in views]) / self.unit
-        self.register_buffer("gauge", similarities(centres, turns_only), persistent=False)  # (G, C * 6)
+        centers = torch.stack([f.camera.c2w[:, 3] for f in views]) / self.unit
+        self.register_buffer("gauge", similarities(centers, turns_only), persistent=False)  # (G, C * 6)
 
     def twists(self) -> Tensor:
         """Turns in radians about the world's axes and shifts in typical depths: (C, 6)."""
@@ -75,10 +75,10 @@ class PoseCorrections(nn.Module):
         return camera if correction is None else moved(camera, self.twists()[correction], self.unit)
 
     def forward(self, batch: PixelBatch) -> PixelBatch:
-        """The batch seen by its corrected camera, and its neighbours likewise."""
+        """The batch seen by its corrected camera, and its neighbors likewise."""
         there = self.links[batch.frame]
-        neighbours = {o: self.camera(c, *self.frames[there[o]]) for o, c in batch.neighbours.items()}
-        return replace(batch, camera=self.camera(batch.camera, *self.frames[batch.frame]), neighbours=neighbours)
+        neighbors = {o: self.camera(c, *self.frames[there[o]]) for o, c in batch.neighbors.items()}
+        return replace(batch, camera=self.camera(batch.camera, *self.frames[batch.frame]), neighbors=neighbors)
 
     def regularizers(self, frame: int) -> dict[str, Tensor]:
         """What a correction of a training frame's camera costs. Turn (degrees) and shift (percents of the typical depth) together: log(1 + (c / 0.1)^2), the
@@ -136,7 +136,7 @@ def lens_key(f: Frame) -> tuple[float, ...]:
 
 
 def moved(camera: Camera, twist: Tensor, unit: float) -> Camera:
-    """`camera` turned by `twist[:3]`, an axis-angle in radians and world axes, about its centre, which shifts by `twist[3:]` * `unit`."""
+    """`camera` turned by `twist[:3]`, an axis-angle in radians and world axes, about its center, which shifts by `twist[3:]` * `unit`."""
     x, y, z = twist[:3].unbind()
     zero = torch.zeros_like(x)
     turn = torch.linalg.matrix_exp(torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3))
@@ -179,10 +179,10 @@ def roots(metric: Tensor) -> tuple[Tensor, Tensor]:
     return power(-0.5), power(0.5)
 
 
-def similarities(centres: Tensor, turns_only: bool) -> Tensor:
-    """An orthonormal basis (G, C * 6) of the twists that a similarity gives to cameras at `centres` (C, 3; typical depths): three turns about
+def similarities(centers: Tensor, turns_only: bool) -> Tensor:
+    """An orthonormal basis (G, C * 6) of the twists that a similarity gives to cameras at `centers` (C, 3; typical depths): three turns about
     their mean, three shifts and a scale; of the turns alone where cameras only turn."""
-    arms = (centres - centres.mean(0)).double()
+    arms = (centers - centers.mean(0)).double()
     axes = torch.eye(3, dtype=torch.float64)
     count = len(arms)
     turns = [torch.cat([a.expand(count, 3), torch.linalg.cross(a.expand(count, 3), arms)], 1) for a in axes]

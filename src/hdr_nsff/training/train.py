@@ -23,12 +23,12 @@ from hdr_nsff.core.io import write_png, writing_to
 from hdr_nsff.core.progress import bar, say
 from hdr_nsff.core.tensors import hold_threads, pick_device, to_device
 from hdr_nsff.fields import build_field, start_field
-from hdr_nsff.fields.base import Misfit, Render, recorded
+from hdr_nsff.fields.base import FrameError, Render, recorded
 from hdr_nsff.fields.nsff.encodings import TouchedAdam
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, draw_pixels, whole_frame
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.initialize import initialise
+from hdr_nsff.tonemap.initialize import initialize
 from hdr_nsff.tonemap.tonemapper import ToneMapper, informative
 from hdr_nsff.training.config import TrainConfig, check
 from hdr_nsff.training.objective import LossWeights, Objective
@@ -104,7 +104,7 @@ def heeded(scene: Scene, weights: LossWeights) -> Scene:
 
 
 class Trainer:
-    """Field, tone mapper, optimisers and clock of one run."""
+    """Field, tone mapper, optimizers and clock of one run."""
 
     def __init__(self, config: TrainConfig, scene: Scene, device: torch.device, ranks: distributed.Ranks) -> None:
         torch.manual_seed(config.seed)
@@ -119,44 +119,44 @@ class Trainer:
         self.poses = PoseCorrections(scene) if config.refine_poses else None
         dense += self.poses.param_groups(config.pose_lr) if self.poses else []
         touched = [g for g in groups if g.get("touched")]
-        self.optimisers: dict[str, torch.optim.Optimizer] = {}
+        self.optimizers: dict[str, torch.optim.Optimizer] = {}
         if dense:  # grids without a tone mapper have nothing dense
-            self.optimisers["dense"] = torch.optim.Adam(dense, fused=True)
+            self.optimizers["dense"] = torch.optim.Adam(dense, fused=True)
         if touched:
-            self.optimisers["touched"] = TouchedAdam(touched)
+            self.optimizers["touched"] = TouchedAdam(touched)
         self.marks = [marks for g in touched for marks in g["touched"]]  # rows with a gradient, of any process
-        self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimisers.items()}
+        self.base_lr = {name: [g["lr"] for g in o.param_groups] for name, o in self.optimizers.items()}
         self.clock = Clock(config, len(scene.train), 0, 0.0)
-        self.resume_or_initialise()
+        self.resume_or_initialize()
         self.scene = to_device(scene, device)
         self.field.to(device)
         self.tonemapper.to(device)
         if self.poses:
             self.poses.to(device)
-        for optimiser in self.optimisers.values():
-            optimiser.load_state_dict(optimiser.state_dict())  # moments follow their parameters
+        for optimizer in self.optimizers.values():
+            optimizer.load_state_dict(optimizer.state_dict())  # moments follow their parameters
 
     @property
     def modules(self) -> dict[str, torch.nn.Module]:
-        """What a checkpoint holds besides the optimisers."""
+        """What a checkpoint holds besides the optimizers."""
         learned: dict[str, torch.nn.Module] = {"field": self.field, "tonemapper": self.tonemapper}
         return {**learned, "poses": self.poses} if self.poses else learned
 
-    def resume_or_initialise(self) -> None:
+    def resume_or_initialize(self) -> None:
         """Continue from the newest checkpoint, or start response and brightness from the recordings."""
         found = latest_checkpoint(self.config.out)
         if found is not None:
-            unpack(found.tensors, self.modules, self.optimisers)
+            unpack(found.tensors, self.modules, self.optimizers)
             self.clock = replace(self.clock, step=found.step, seconds=found.seconds)
             self.report(f"going on at step {found.step}, {found.seconds:.0f} s into the training")
             return
-        self.report(f"response curve: {initialise(self.tonemapper, self.scene)}")
+        self.report(f"response curve: {initialize(self.tonemapper, self.scene)}")
         told = start_field(
             self.field,
             heeded(self.scene, self.config.loss),
             self.recorded_radiance,
             self.typical_log_radiance(),
-            self.config.paint,
+            self.config.from_priors,
         )
         if told:
             self.report(told)
@@ -229,7 +229,7 @@ class Trainer:
             self.report(self.poses.told())
 
     def step(self) -> dict[str, float]:
-        """One optimiser step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
+        """One optimizer step over this process's share of the batches; the terms' values, and the PSNR where a line of the log is due."""
         clock, config = self.clock, self.config
         self.field.train()
         hold_threads(config.torch_threads)
@@ -251,30 +251,30 @@ class Trainer:
                 totals[name] = totals.get(name, 0.0) + value / len(slots)
             if (clock.step + 1) % LOG_EVERY == 0:
                 totals["mse"] = totals.get("mse", 0.0) + self.squared_error(render, batch) / len(slots)
-        self.ranks.sum_gradients(p for o in self.optimisers.values() for g in o.param_groups for p in g["params"])
+        self.ranks.sum_gradients(p for o in self.optimizers.values() for g in o.param_groups for p in g["params"])
         self.ranks.max_buffers(self.marks)
-        for name, optimiser in self.optimisers.items():
-            for group, lr in zip(optimiser.param_groups, self.base_lr[name], strict=True):
+        for name, optimizer in self.optimizers.items():
+            for group, lr in zip(optimizer.param_groups, self.base_lr[name], strict=True):
                 group["lr"] = lr * clock.lr_share * (clock.progress >= group.get("start", 0.0))
-            optimiser.step()
+            optimizer.step()
             if name == "dense":  # the touched one clears what it used
-                optimiser.zero_grad()
+                optimizer.zero_grad()
         if self.poses:
             self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
-        self.field.after_step(clock.step + 1, self.misfits if clock.progress < SETTLED else None)
+        self.field.after_step(clock.step + 1, self.frame_errors if clock.progress < SETTLED else None)
         if "mse" in totals:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
 
-    def misfits(self, count: int) -> list[Misfit]:
+    def frame_errors(self, count: int) -> list[FrameError]:
         """How wrong pictures of `count` training frames are, evenly spread; others every step."""
         num = len(self.scene.train)
         chosen = sorted({int((i + self.clock.step % 97 / 97) * num / count) % num for i in range(min(count, num))})
-        return [Misfit(self.camera(i), self.scene.train[i].time, partial(self.misfit, i)) for i in chosen]
+        return [FrameError(self.camera(i), self.scene.train[i].time, partial(self.frame_error, i)) for i in chosen]
 
     @torch.no_grad()
-    def misfit(self, frame: int, radiance: Tensor) -> Tensor:
+    def frame_error(self, frame: int, radiance: Tensor) -> Tensor:
         """Mean absolute difference (S,) of what training frame `frame` recorded and would record of `radiance` (S, 3)."""
         f = self.scene.train[frame]
         return (self.tonemapper(radiance, f.bracket, f.camera_id, frame, leaky=False) - f.image.flatten(0, 1)).abs().mean(-1)
@@ -297,8 +297,8 @@ class Trainer:
         moving = config.moving_rays if when < config.moving_until else 0
         batch = draw_pixels(self.scene, frame, config.rays, moving, generator) if config.rays else whole_frame(self.scene, frame)
         chain = (1 if clock.step % 2 else -1) if clock.phase >= 2 and config.loss.chain else 0
-        look = self.tonemapper.look(batch.bracket, batch.camera_id, frame, leaky=True)
-        return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), look=look, chain=chain)
+        recorder = self.tonemapper.recorder(batch.bracket, batch.camera_id, frame, leaky=True)
+        return replace(batch, seed=int(torch.randint(2**31, (1,), generator=generator)), recorder=recorder, chain=chain)
 
     def check(self, values: dict[str, float], batch: PixelBatch, radiance: Tensor) -> None:
         """NaN and Inf are errors with the step, the term and the ray."""
@@ -333,7 +333,7 @@ class Trainer:
 
     def save(self) -> None:
         """A checkpoint of everything that counts."""
-        save_checkpoint(self.config.out, self.clock.step, self.clock.seconds, pack(self.modules, self.optimisers))
+        save_checkpoint(self.config.out, self.clock.step, self.clock.seconds, pack(self.modules, self.optimizers))
 
     def keep(self, share: float) -> None:
         """What was learned by now, to stay."""
@@ -345,6 +345,8 @@ class Trainer:
         """The middle frame as recorded and as rendered, side by side."""
         i = len(self.scene.train) // 2
         f = self.scene.train[i]
-        rgb = recorded(self.field, self.camera(i), f.time, [self.tonemapper.look(f.bracket, f.camera_id, i)])[0].view_as(f.image)
+        rgb = recorded(self.field, self.camera(i), f.time, [self.tonemapper.recorder(f.bracket, f.camera_id, i)])[0].view_as(
+            f.image
+        )
         pair = torch.cat([f.image, rgb], 1).cpu().numpy()
         write_png(self.config.out / "previews" / f"step_{self.clock.step:08d}.png", pair)

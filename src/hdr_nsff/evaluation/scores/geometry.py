@@ -1,5 +1,5 @@
 """Depth and motion against the exact ones. A scene's scale is its own: depth takes one scale for all views, the median ratio, and scene
-flow that of the similarity between estimated and true camera centres. Motion is per frame, to later and to earlier times."""
+flow that of the similarity between estimated and true camera centers. Motion is per frame, to later and to earlier times."""
 
 from __future__ import annotations
 

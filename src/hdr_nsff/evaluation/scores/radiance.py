@@ -65,8 +65,8 @@ HDR_SCORES = {  # what they are called, and digits after the point
 
 
 def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, float]:
-    """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`. Normalised by the largest exact radiance of all
-    views; `recordable`: over recordable pixels only, normalised by the largest of them. Empty where the exact one is not known."""
+    """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`. Normalized by the largest exact radiance of all
+    views; `recordable`: over recordable pixels only, normalized by the largest of them. Empty where the exact one is not known."""
     if target.radiance is None:
         return {}
     exact, known, moving = exact_of(target), recordable(target), moving_of(target)

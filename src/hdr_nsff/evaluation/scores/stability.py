@@ -17,9 +17,9 @@ MOST_PAIRS = 12
 
 
 def chosen_pairs(run: Run) -> list[tuple[Frame, Frame]]:
-    """Training frames with flow to their neighbour, and that neighbour: all, or `MOST_PAIRS` spread evenly over the clip."""
+    """Training frames with flow to their neighbor, and that neighbor: all, or `MOST_PAIRS` spread evenly over the clip."""
     frames = run.scene.train
-    pairs = [(f, frames[f.neighbours[1]]) for f in frames if 1 in f.neighbours and 1 in f.flow and 1 in f.flow_valid]
+    pairs = [(f, frames[f.neighbors[1]]) for f in frames if 1 in f.neighbors and 1 in f.flow and 1 in f.flow_valid]
     return [pairs[round(k)] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS))]
 
 

@@ -1,8 +1,8 @@
-"""NeRF-W with time (METHOD.md 6): what changes from image to image with the camera is a code of numbers per image that the colours of the
+"""NeRF-W with time (METHOD.md 6): what changes from image to image with the camera is a code of numbers per image that the colors of the
 static branch know (Martin-Brualla et al. 2021); what moves is the transient branch, whose density adds up with the static one and
 which knows the time. No scene flow and no tone mapper: "radiance" is recorded rgb.
 
-A picture of another image than those of training borrows the mean code of the training images of its exposure (`Look.images`); asked for
+A picture of another image than those of training borrows the mean code of the training images of its exposure (`Recorder.images`); asked for
 radiance, the field shows the look of the reference exposure. As published, only the static branch knows the code: what moves keeps
 the exposure of the frames that show it."""
 
@@ -22,7 +22,7 @@ from hdr_nsff.fields.nsff.two_branches import BranchesConfig, TwoBranches
 from hdr_nsff.fields.space import Space
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import volume
-from hdr_nsff.scene.batch import Look, PixelBatch
+from hdr_nsff.scene.batch import PixelBatch, Recorder
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class NerfWTConfig(BranchesConfig):
     code_size: int = 48
     """Numbers of an image's appearance code."""
     head_width: int = 128
-    """Width of the network that makes colours of a grid's values and the code."""
+    """Width of the network that makes colors of a grid's values and the code."""
     head_lr: float = 5e-3
     """Of the codes and of that network, beside grids."""
 
@@ -52,7 +52,7 @@ class Codes(nn.Module):
 
 
 class CodedGrids(GridBranches):
-    """Grids whose static colours pass a small network that knows the code; at the start it changes nothing."""
+    """Grids whose static colors pass a small network that knows the code; at the start it changes nothing."""
 
     def __init__(self, config: GridConfig, width: int, height: int, num_knots: int, codes: Codes, wt: NerfWTConfig) -> None:
         super().__init__(config, width, height, num_knots)
@@ -80,7 +80,7 @@ class CodedGrids(GridBranches):
 
 
 class CodedMlp(MlpBranches):
-    """The published network; the static colour head has the code as further inputs, the dynamic trunk only the time."""
+    """The published network; the static color head has the code as further inputs, the dynamic trunk only the time."""
 
     def __init__(self, config: MlpConfig, num_knots: int, codes: Codes) -> None:
         nn.Module.__init__(self)
@@ -124,8 +124,8 @@ class NerfWT(TwoBranches):
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
         """A render of the batch's pixels in the look of its recording, and the mean optical thickness of the transient branch."""
-        assert batch.look is not None
-        self.codes.images = batch.look.images
+        assert batch.recorder is not None
+        self.codes.images = batch.recorder.images
         p = self.ask(batch, motion=False)
         render = self.compose(p.static, p.dynamic, p.w, p.m.depths)
         return render, {"transient": (p.dynamic.density * p.m.deltas).mean()}
@@ -138,15 +138,15 @@ class NerfWT(TwoBranches):
 
     @torch.no_grad()
     def render(
-        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True, look: Look | None = None
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True, recorder: Recorder | None = None
     ) -> Render:
         """Every pixel of `camera` (row by row) or `pixels` (S, 2) at `time` in frames, in the given look or that of the reference exposure."""
-        self.codes.images = self.codes.reference if look is None else look.images
+        self.codes.images = self.codes.reference if recorder is None else recorder.images
         return in_chunks(self, camera, pixels, lambda chunk: self.render_chunk(camera, time, chunk))
 
-    def record(self, camera: Camera, time: float, looks: Sequence[Look]) -> list[Tensor]:
-        """What each of the `looks` records (S, 3) in [0, 1] of every pixel, row by row."""
-        return [look.rgb(self.render(camera, time, look=look).radiance) for look in looks]
+    def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
+        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row."""
+        return [recorder.rgb(self.render(camera, time, recorder=recorder).radiance) for recorder in recorders]
 
     def render_chunk(self, camera: Camera, time: float, pixels: Tensor) -> Render:
         """A few thousand pixels at once."""

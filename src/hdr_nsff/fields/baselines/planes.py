@@ -50,7 +50,7 @@ class Planes(nn.Module):
         self.cells.fill_(cells)
 
     def total_variation(self) -> Tensor:
-        """Mean square difference of neighbours along both axes of every plane."""
+        """Mean square difference of neighbors along both axes of every plane."""
         return sum_of_squares(*self.used)
 
 

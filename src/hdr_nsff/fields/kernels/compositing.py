@@ -1,13 +1,13 @@
-"""Numba kernels of the Gaussian rasteriser on the CPU: projected Gaussians to pictures, and back by hand.
+"""Numba kernels of the Gaussian rasterizer on the CPU: projected Gaussians to pictures, and back by hand.
 
 Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing, above 0.999 as 0.999 (Kerbl
 et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come behind. Each (Gaussian, tile)
 pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and the same result whatever the
 number of threads. The plain-torch twin is `rasterize.dense`.
 
-Loops over the pixels of a tile are written so that LLVM vectorises them: one flat array, unsigned ranges, no library call, no maximum
+Loops over the pixels of a tile are written so that LLVM vectorizes them: one flat array, unsigned ranges, no library call, no maximum
 carried along, no error for a division by zero. `FAST` lets it reorder sums; NaN and Inf stay what they are. What a pixel's BLOCK of
-channels does stands in `mixed`, `poured` and `gathered`, written out, for a loop inside would not be vectorised over pixels."""
+channels does stands in `mixed`, `poured` and `gathered`, written out, for a loop inside would not be vectorized over pixels."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ NOTHING = (F0, F0, F0, F0, F0, F0, F0, F0)
 
 @numba.njit(inline="always", fastmath=FAST)
 def exp_minus(s):
-    """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three times; vectorises, unlike a library call."""
+    """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three times; vectorizes, unlike a library call."""
     x = -s * EIGHTH
     y = F1 + x * (F1 + x * (E2 + x * (E3 + x * (E4 + x * E5))))
     y = y * y
@@ -88,7 +88,7 @@ def planes(count, tile, tiles_x):
 
 @numba.njit(cache=True)
 def span(rows, g, y0):
-    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows: unsigned, or LLVM would not vectorise over them, and in a
+    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows: unsigned, or LLVM would not vectorize over them, and in a
     way that it sees whole vectors, or it would look for what is left over."""
     first, last = max(rows[g, 0] - y0, 0) // 2, (min(rows[g, 1] - y0, TILE_Y) + 1) // 2
     start = np.uint64(first) * TWO_ROWS
@@ -146,13 +146,13 @@ def gathered(t, z, p, v):
 
 @numba.njit(inline="always")
 def moved(m, u, dx, dy):
-    """The moments `m` plus those of `u` at an offset from the centre."""
+    """The moments `m` plus those of `u` at an offset from the center."""
     ux, uy = u * dx, u * dy
     return m[0] + u, m[1] + ux, m[2] + uy, m[3] + ux * dx, m[4] + ux * dy, m[5] + uy * dy
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def forward(starts, members, centres, conics, opacities, features, rows, maps, alpha):
+def forward(starts, members, centers, conics, opacities, features, rows, maps, alpha):
     """Composite features (G, D), D a multiple of BLOCK, into `maps` (C, H, W), the first C of them, and `alpha` (H, W)."""
     height, width = alpha.shape
     channels = features.shape[1]
@@ -161,7 +161,7 @@ def forward(starts, members, centres, conics, opacities, features, rows, maps, a
         x0, y0, z = planes(OWN + channels, tile, tiles_x)
         for i in range(starts[tile], starts[tile + 1]):
             g = members[i]
-            cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
+            cx, cy, o = centers[g, 0], centers[g, 1], opacities[g]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
             f = block(features, g, 0)
@@ -212,7 +212,7 @@ def tell(grad, d, t):
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def backward(starts, members, places, centres, conics, opacities, features, rows, maps, alpha, grad_maps, grad_alpha, out):
+def backward(starts, members, places, centers, conics, opacities, features, rows, maps, alpha, grad_maps, grad_alpha, out):
     """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its pixels, then its features."""
     channels = features.shape[1]
     tiles_x = (alpha.shape[1] + TILE_X - 1) // TILE_X
@@ -225,7 +225,7 @@ def backward(starts, members, places, centres, conics, opacities, features, rows
             if done:
                 grad[:] = F0
                 continue
-            cx, cy, o = centres[g, 0], centres[g, 1], opacities[g]
+            cx, cy, o = centers[g, 0], centers[g, 1], opacities[g]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = span(rows, g, y0)
             if channels > BLOCK:

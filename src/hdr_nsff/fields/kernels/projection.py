@@ -1,8 +1,8 @@
-"""Numba kernels of the Gaussian rasteriser on the CPU: world Gaussians to projected ones and the tiles that they touch, and all of it
+"""Numba kernels of the Gaussian rasterizer on the CPU: world Gaussians to projected ones and the tiles that they touch, and all of it
 backwards by hand.
 
-A projected Gaussian is a pixel centre, a conic, a z-depth, an opacity and D features. The conic is the inverse 2D covariance in
-factors, alpha = opacity * exp(-(a dx)^2 - (b dx + c dy)^2): multiplied out, float32 would lose needles whose centre is far away. The
+A projected Gaussian is a pixel center, a conic, a z-depth, an opacity and D features. The conic is the inverse 2D covariance in
+factors, alpha = opacity * exp(-(a dx)^2 - (b dx + c dy)^2): multiplied out, float32 would lose needles whose center is far away. The
 plain-torch twin is `rasterize.project`; `compositing.py` draws what comes out."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ALPHA_MIN = np.float32(1 / 255)  # alpha below this counts as nothing
 NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn
 BLUR = 0.3  # pixels^2 added to 2D variances, so that no Gaussian falls between pixels
 FAST = {"contract", "reassoc", "nsz", "arcp"}  # sums may be reordered, division be multiplication; NaN and Inf stay what they are
-MARGIN = 0.3  # of half the picture: how far outside it the projection is still linearised where the Gaussian is
+MARGIN = 0.3  # of half the picture: how far outside it the projection is still linearized where the Gaussian is
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
@@ -64,14 +64,14 @@ def gaussian(means, quaternions, scales, g):
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def jacobian(k, held):
-    """The entries 00, 02, 11, 12 of J (2, 3), the projection linearised at the point `held`; the others are 0."""
+    """The entries 00, 02, 11, 12 of J (2, 3), the projection linearized at the point `held`; the others are 0."""
     x, y, z, _, _ = held
     return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def footprint(m, q, s, v, k, width, height):
-    """A Gaussian in the picture: camera point t, the point where the projection is linearised and whether x and y are held there,
+    """A Gaussian in the picture: camera point t, the point where the projection is linearized and whether x and y are held there,
     T = J W (2, 3), the rotation R of `rotation`, V = T R S (2, 3), and the 2D covariance V V^T + blur (xx, xy, yy)."""
     t = (
         v[0, 0] * m[0] + v[0, 1] * m[1] + v[0, 2] * m[2] + v[0, 3],
@@ -95,8 +95,8 @@ def footprint(m, q, s, v, k, width, height):
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def project(means, quaternions, scales, opacities, w2c, k, width, height, centres, depths, conics, rows, boxes):
-    """Fill pixel `centres` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G, 2) and tile `boxes` (G, 4: x0, y0, x1, y1, ends
+def project(means, quaternions, scales, opacities, w2c, k, width, height, centers, depths, conics, rows, boxes):
+    """Fill pixel `centers` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G, 2) and tile `boxes` (G, 4: x0, y0, x1, y1, ends
     excluded; empty where nothing shows) of world Gaussians seen by `w2c` (3, 4) and `k` = (fx, fy, cx, cy). Lengths in scene units."""
     tiles_x, tiles_y = (width + TILE_X - 1) // TILE_X, (height + TILE_Y - 1) // TILE_Y
     for g in numba.prange(means.shape[0]):
@@ -105,7 +105,7 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         depths[g] = t[2]
         boxes[g, 0] = boxes[g, 1] = boxes[g, 2] = boxes[g, 3] = 0
         rows[g, 0] = rows[g, 1] = 0
-        centres[g, 0] = centres[g, 1] = conics[g, 0] = conics[g, 1] = conics[g, 2] = F0
+        centers[g, 0] = centers[g, 1] = conics[g, 0] = conics[g, 1] = conics[g, 2] = F0
         o = float(opacities[g])
         if not (t[2] > NEAREST and o >= ALPHA_MIN):
             continue  # behind, too faint, or not a number
@@ -117,7 +117,7 @@ def project(means, quaternions, scales, opacities, w2c, k, width, height, centre
         det = xx * yy - xy * xy
         if not det > 0:
             continue  # too long and thin for float64
-        centres[g, 0], centres[g, 1] = x, y
+        centers[g, 0], centers[g, 1] = x, y
         across = math.sqrt(0.5 * xx / det)
         conics[g, 0], conics[g, 1], conics[g, 2] = math.sqrt(0.5 / xx), -xy / xx * across, across
         left, right, top, bottom = max(x - rx, 0.0), min(x + rx, float(width)), max(y - ry, 0.0), min(y + ry, float(height))
@@ -152,11 +152,11 @@ def project_backward(
         grad_opacities[g] = -sums[0] / opacities[g]
         m, q, s = gaussian(means, quaternions, scales, g)
         t, held, projection, (unit, r, n), spread, covariance = footprint(m, q, s, w2c, k, width, height)
-        centre, d_covariance = picture_gradient(covariance, sums)
+        center, d_covariance = picture_gradient(covariance, sums)
         d_scales, d_rotation, d_projection = shape_gradient(d_covariance, projection, spread, r, s)
         grad_scales[g, 0], grad_scales[g, 1], grad_scales[g, 2] = d_scales
         quaternion_gradient(unit, n, d_rotation, grad_quaternions[g])
-        dx, dy, dz = point_gradient(centre, d_projection, t, held, w2c, k)
+        dx, dy, dz = point_gradient(center, d_projection, t, held, w2c, k)
         dz += float(grad_features[g, channels - 1])
         for j in range(3):
             grad_means[g, j] = w2c[0, j] * dx + w2c[1, j] * dy + w2c[2, j] * dz
@@ -180,7 +180,7 @@ def sum_moments(pairs, first, last):
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
 def picture_gradient(covariance, u):
-    """From the moments `u` to dL / d pixel centre (2,) and dL / d 2D covariance (xx, xy, yy), with Q its inverse: -Q (dL / dQ) Q."""
+    """From the moments `u` to dL / d pixel center (2,) and dL / d 2D covariance (xx, xy, yy), with Q its inverse: -Q (dL / dQ) Q."""
     xx, xy, yy = covariance
     det = xx * yy - xy * xy
     a, b, c = yy / det, -xy / det, xx / det  # in float64: needles thousands of pixels long need it
@@ -220,9 +220,9 @@ def shape_gradient(g, projection, spread, r, s):
 
 
 @numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def point_gradient(centre, d_projection, t, held, w2c, k):
-    """dL / d camera point (3,), through the pixel centre and through J in T = J W, which does not see x or y where they are held."""
-    (gx, gy), (dt0, dt1), (x, y, z, held_x, held_y), (fx, fy) = centre, d_projection, held, (k[0], k[1])
+def point_gradient(center, d_projection, t, held, w2c, k):
+    """dL / d camera point (3,), through the pixel center and through J in T = J W, which does not see x or y where they are held."""
+    (gx, gy), (dt0, dt1), (x, y, z, held_x, held_y), (fx, fy) = center, d_projection, held, (k[0], k[1])
     w0, w1, w2 = (w2c[0, 0], w2c[0, 1], w2c[0, 2]), (w2c[1, 0], w2c[1, 1], w2c[1, 2]), (w2c[2, 0], w2c[2, 1], w2c[2, 2])
     dj00, dj02, dj11, dj12 = dot(dt0, w0), dot(dt0, w2), dot(dt1, w1), dot(dt1, w2)
     dz = -(fx * dj00 + fy * dj11) / (z * z) - (fx * t[0] * gx + fy * t[1] * gy) / (z * z)

@@ -28,7 +28,7 @@ class GridConfig:
     max_rows: int = 2**20
     """Rows of a hashed level (a power of two)."""
     motion_cell: float = 8.0
-    """Cell of the finer of the two scene-flow grids, in pixels: scene flow is smooth by construction."""
+    """BenchRun of the finer of the two scene-flow grids, in pixels: scene flow is smooth by construction."""
     lr: float = 0.1
     motion_lr: float = 0.01
 

@@ -62,7 +62,7 @@ def static_density_level(grid: AdditiveGrid) -> int:
 
 
 def splash(field: TwoBranches, f: Frame, position: int, to_radiance: ToRadiance) -> Splash:
-    """Points, colours and crossed space of the frame at `position` of the training frames."""
+    """Points, colors and crossed space of the frame at `position` of the training frames."""
     assert f.disparity is not None
     rays = f.camera.rays(f.camera.pixel_grid())
     disparity = f.disparity.reshape(-1).clamp(1 / field.far, 1 / field.near)

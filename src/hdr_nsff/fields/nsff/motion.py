@@ -1,4 +1,4 @@
-"""The part of an NSFF's training pass that scene flow makes: warped renders (eq. 2-3), rendered flow, and the regularisers of
+"""The part of an NSFF's training pass that scene flow makes: warped renders (eq. 2-3), rendered flow, and the regularizers of
 METHOD.md 3 that live on samples. One object per pass, so that the pieces can name what they share."""
 
 from __future__ import annotations
@@ -104,12 +104,12 @@ class Motion:
         return 1 - self.gather((packed * disocclusion)[:, None])[:, 0].clamp(0, 1)
 
     def warp(self, offset: int, radiance: Tensor, depth: Tensor, opacity: Tensor, scene_flow: Tensor) -> Warp | None:
-        """The render through the neighbouring time, and the 2D flow into the neighbouring frame's camera."""
-        if offset not in self.batch.neighbours:
+        """The render through the neighboring time, and the 2D flow into the neighboring frame's camera."""
+        if offset not in self.batch.neighbors:
             return None
         rays = self.batch.camera.rays(self.batch.pixels)
         point = rays.origins + depth[:, None] * rays.directions + scene_flow / opacity[:, None].clamp_min(1e-3)
-        pixel, _ = self.batch.neighbours[offset].project(point, min_depth=0.05 * self.field.near)
+        pixel, _ = self.batch.neighbors[offset].project(point, min_depth=0.05 * self.field.near)
         confidence = self.confidence(self.disocclusion[:, self.side(offset)])
         return Warp(offset, pixel - self.batch.pixels, confidence, self.warped_radiance(self.contents[offset], radiance))
 

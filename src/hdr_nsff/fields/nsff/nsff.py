@@ -42,7 +42,7 @@ class NSFF(TwoBranches):
     # Training
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A render of the batch's pixels with its warps, and the per-sample regularisers."""
+        """A render of the batch's pixels with its warps, and the per-sample regularizers."""
         p = self.ask(batch, motion=True)
         assert p.raw_motion is not None
         motion = Motion(self, self.to_flow, batch, p.m, p.knot, p.index, p.coords, p.raw_motion, p.static, p.dynamic, p.w)
@@ -70,7 +70,7 @@ class NSFF(TwoBranches):
         return Render(radiance, volume.expected_depth(both, m.depths, self.far), w.opacity, w.dynamic.sum(-1), scene_flow)
 
     def dynamic_between(self, m: March, knot: float) -> tuple[Content, Tensor]:
-        """Dynamic content at a knot, or between two: each neighbour's content moved along its scene flow and cross-faded.
+        """Dynamic content at a knot, or between two: each neighbor's content moved along its scene flow and cross-faded.
         Also the scene flow (N, S, 2, 3) in scene units to the next and the previous training time."""
         low = int(knot + 1e-6)
         fraction = knot - low

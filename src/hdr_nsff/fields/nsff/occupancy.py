@@ -29,8 +29,8 @@ class Occupancy(nn.Module):
         i = torch.minimum((coords.detach().clamp(0, 1) * top).long(), top - 1)
         return ((round(knot) * z + i[:, 2]) * y + i[:, 1]) * x + i[:, 0]
 
-    def centres(self) -> Tensor:
-        """Cube coordinates of one slice's cell centres, in storage order: (Z * Y * X, 3)."""
+    def centers(self) -> Tensor:
+        """Cube coordinates of one slice's cell centers, in storage order: (Z * Y * X, 3)."""
         x, y, z = self.resolution
         axes = [(torch.arange(n) + 0.5) / n for n in (z, y, x)]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)

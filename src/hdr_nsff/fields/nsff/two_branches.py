@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import HIGHEST, Misfit
+from hdr_nsff.fields.base import HIGHEST, FrameError
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpBranches, MlpConfig
 from hdr_nsff.fields.nsff.occupancy import Occupancy
@@ -195,7 +195,7 @@ class TwoBranches(nn.Module):
         return self.branches.param_groups()
 
     @torch.no_grad()
-    def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
         """Refresh the culling grids every 16 steps once they have seen enough."""
         self.step = step
         if self.config.cull and step >= self.config.cull_after and step % 16 == 0:
@@ -209,15 +209,15 @@ class TwoBranches(nn.Module):
     @torch.no_grad()
     def allow_motion(self, frames: list[Any], dilate: int = 9) -> None:
         """Dynamic content may only be where the moving masks (dilated by `dilate` pixels) of its time say; everywhere where a time has none."""
-        centres = self.space.decode(self.dynamic_cells.centres())
+        centers = self.space.decode(self.dynamic_cells.centers())
         for k, time in enumerate(self.times.tolist()):
             views = [f for f in frames if f.time == time and f.moving is not None]
             if not views:
                 continue
-            allowed = torch.zeros(len(centres), dtype=torch.bool)
+            allowed = torch.zeros(len(centers), dtype=torch.bool)
             for f in views:
                 moving = nn.functional.max_pool2d(f.moving[None, None].float(), 2 * dilate + 1, 1, dilate)[0, 0] > 0
-                xy, depth = f.camera.project(centres)
+                xy, depth = f.camera.project(centers)
                 x, y = xy[:, 0].long(), xy[:, 1].long()
                 seen = (depth > 0) & (xy[:, 0] >= 0) & (xy[:, 1] >= 0) & (x < f.camera.width) & (y < f.camera.height)
                 allowed |= seen & moving[y.clamp(0, f.camera.height - 1), x.clamp(0, f.camera.width - 1)]

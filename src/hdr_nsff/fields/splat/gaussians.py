@@ -1,6 +1,6 @@
 """Gaussians at rest: what each is made of, as learned numbers.
 
-Colours are kept as a log radiance, unbounded; or, of a bounded field, as the logarithm of the odds `E / (1 - E)` of a radiance E below
+Colors are kept as a log radiance, unbounded; or, of a bounded field, as the logarithm of the odds `E / (1 - E)` of a radiance E below
 1, whose sigmoid E is. Offsets in time and by direction of view add to either."""
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def brightened(radiance: Tensor, log_factor: Tensor, bounded: bool) -> Tensor:
 
 
 class Gaussians(nn.Module):
-    """`count` Gaussians at rest, with `knots` log-radiance offsets in time of `channels` (3: colours, 1: brightness)."""
+    """`count` Gaussians at rest, with `knots` log-radiance offsets in time of `channels` (3: colors, 1: brightness)."""
 
     def __init__(self, count: int, knots: int, channels: int, shiny: bool = False, bounded: bool = False) -> None:
         super().__init__()
@@ -47,7 +47,7 @@ class Gaussians(nn.Module):
         self.logits = nn.Parameter(torch.full((count,), -10.0))  # of opacity
         self.log_radiance = nn.Parameter(torch.zeros(count, 3))  # or log odds
         self.offsets = nn.Parameter(torch.zeros(knots, count, channels))  # of log radiance, over the clip's time
-        self.sheen = nn.Parameter(torch.zeros(count if shiny else 0, 3, 3))  # change of log radiance by direction of view (xyz)
+        self.sh1 = nn.Parameter(torch.zeros(count if shiny else 0, 3, 3))  # change of log radiance by direction of view (xyz)
 
     def __len__(self) -> int:
         return len(self.means)

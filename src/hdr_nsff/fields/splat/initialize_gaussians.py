@@ -26,7 +26,7 @@ from hdr_nsff.scene.scene import Frame, Scene
 
 DEPTH_CELLS = 12.0  # a cell is this many times longer along the view than across, as shares of the frustum
 FILL = 0.95  # of the places are used at once; the rest go where the error is
-OVERLAP = 0.6  # standard deviation relative to the distance to the neighbours
+OVERLAP = 0.6  # standard deviation relative to the distance to the neighbors
 OPACITY = 0.7
 KEY_FRAMES = 12  # times whose moving pixels become Gaussians
 ABSENT = -6.0  # logit offset of what is not seen
@@ -66,11 +66,11 @@ def thin(points: Points, scene: Scene, limit: int) -> Points:
 
 
 def place(gaussians: Gaussians, points: Points) -> int:
-    """Put the first Gaussians at the points, as wide as their neighbours are away; the others stay invisible. How many."""
+    """Put the first Gaussians at the points, as wide as their neighbors are away; the others stay invisible. How many."""
     n = min(len(points), len(gaussians))
     if n == 0:
         return 0
-    apart = torch.from_numpy(neighbour_distance(points.positions[:n].numpy())).float()
+    apart = torch.from_numpy(neighbor_distance(points.positions[:n].numpy())).float()
     spacing = apart.clamp(min=0.3 * points.footprint[:n], max=8 * points.footprint[:n])
     gaussians.means[:n] = points.positions[:n]
     gaussians.log_scales[:n] = (OVERLAP * spacing).log()[:, None]
@@ -79,7 +79,7 @@ def place(gaussians: Gaussians, points: Points) -> int:
     return n
 
 
-def neighbour_distance(points: np.ndarray) -> np.ndarray:
+def neighbor_distance(points: np.ndarray) -> np.ndarray:
     """Mean distance (P,) to the three nearest other points."""
     if len(points) < 4:
         return np.full(len(points), np.inf)
@@ -127,7 +127,7 @@ def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, in
     count = place(field.moving, kept)
     hide_unseen(field, tracks, groups, kept_owner[:count])
     share_bases(field, groups, kept.positions[:count], kept_owner[:count])
-    field.look_around()
+    field.find_neighbors()
     return len(groups), count
 
 
@@ -180,7 +180,7 @@ def views_of(field: Splat, scene: Scene) -> tuple[list[View], list[int]]:
         rays = f.camera.rays(f.camera.pixel_grid())
         points = rays.origins + rays.directions / f.disparity.reshape(-1, 1).clamp(1 / scene.far, 1 / scene.near)
         trust = np.ones(shape) if f.disparity_confidence is None else f.disparity_confidence.numpy()
-        leads = [o for o in f.flow if chosen.get(k + o) == f.neighbours.get(o)]  # to a frame that speaks for its time
+        leads = [o for o in f.flow if chosen.get(k + o) == f.neighbors.get(o)]  # to a frame that speaks for its time
         flow, valid = ({o: v[o].numpy() for o in leads} for v in (f.flow, f.flow_valid))
         views.append(View(moving, points.view(*shape, 3).double().numpy(), trust, flow, valid))
     return views, [chosen[k] for k in sorted(chosen)]
@@ -188,11 +188,11 @@ def views_of(field: Splat, scene: Scene) -> tuple[list[View], list[int]]:
 
 def drift(views: list[View]) -> Group:
     """The fallback where flow gives no chains: all that moves follows the median of its points."""
-    centres = np.array([np.median(v.points[v.moving], 0) if v.moving.any() else np.full(3, np.nan) for v in views])
-    at, times = np.nonzero(np.isfinite(centres[:, 0]))[0], np.arange(len(views))
-    centres = np.stack([np.interp(times, at, c[at]) for c in centres.T], 1)
-    centres = ndimage.gaussian_filter1d(centres, 1.0, axis=0, mode="nearest")
-    return Group(np.tile(np.eye(3), (len(views), 1, 1)), centres - centres[0], centres[0], np.zeros(0, int), np.isin(times, at))
+    centers = np.array([np.median(v.points[v.moving], 0) if v.moving.any() else np.full(3, np.nan) for v in views])
+    at, times = np.nonzero(np.isfinite(centers[:, 0]))[0], np.arange(len(views))
+    centers = np.stack([np.interp(times, at, c[at]) for c in centers.T], 1)
+    centers = ndimage.gaussian_filter1d(centers, 1.0, axis=0, mode="nearest")
+    return Group(np.tile(np.eye(3), (len(views), 1, 1)), centers - centers[0], centers[0], np.zeros(0, int), np.isin(times, at))
 
 
 def owner_of(f: Frame, t: int, tracks: Tracks, groups: list[Group]) -> np.ndarray:
@@ -213,7 +213,7 @@ def owner_of(f: Frame, t: int, tracks: Tracks, groups: list[Group]) -> np.ndarra
 
 def hide_unseen(field: Splat, tracks: Tracks, groups: list[Group], owner: Tensor) -> None:
     """Make moving Gaussians invisible at the times their group (P,) is not seen: it has left, or is hidden."""
-    knots, num = len(field.presence), field.trajectories.num_knots
+    knots, num = len(field.opacity_offsets), field.trajectories.num_knots
     for g, group in enumerate(groups):
         if not len(group.members):
             continue
@@ -221,7 +221,7 @@ def hide_unseen(field: Splat, tracks: Tracks, groups: list[Group], owner: Tensor
         for k in range(knots):
             low, high = (int(np.clip(round((k + o) / max(knots - 1, 1) * (num - 1)), 0, num - 1)) for o in (-1, 1))
             if not seen[low : high + 1].any():
-                field.presence[k, : len(owner)][owner == g] = ABSENT
+                field.opacity_offsets[k, : len(owner)][owner == g] = ABSENT
 
 
 def share_bases(field: Splat, groups: list[Group], points: Tensor, owner: Tensor) -> None:
@@ -237,28 +237,28 @@ def share_bases(field: Splat, groups: list[Group], points: Tensor, owner: Tensor
     b = 0
     for g, (group, count) in enumerate(zip(groups, given, strict=True)):
         own = owner == g
-        centres = spread(points[own], count, torch.from_numpy(group.centre).float())
+        centers = spread(points[own], count, torch.from_numpy(group.center).float())
         rotations = torch.from_numpy(group.rotations).float()
-        for c in centres:
-            t.centres[b] = c
+        for c in centers:
+            t.centers[b] = c
             turns[:, b] = quaternions(rotations)
-            moved = (rotations @ (c - torch.from_numpy(group.centre).float())) + torch.from_numpy(
-                group.centre + group.shifts
+            moved = (rotations @ (c - torch.from_numpy(group.center).float())) + torch.from_numpy(
+                group.center + group.shifts
             ).float()
             shifts[:, b, :3] = moved - c
             b += 1
-        distance = torch.cdist(points[own], centres)
+        distance = torch.cdist(points[own], centers)
         logits = torch.full((num_bases, int(own.sum())), -OWN)
         logits[b - count : b] = -OWN * 0.5
         logits.scatter_(0, (distance.argmin(1) + b - count)[None], 0.0)
         field.mixture_logits[:, : len(points)][:, own] = logits
 
 
-def spread(points: Tensor, count: int, centre: Tensor) -> Tensor:
+def spread(points: Tensor, count: int, center: Tensor) -> Tensor:
     """`count` places (count, 3) spread over points by farthest-point choice and a few rounds of k-means; the given
-    centre where one is enough, or the points are too few."""
+    center where one is enough, or the points are too few."""
     if count == 1 or len(points) < count:
-        return centre.expand(count, 3).clone()
+        return center.expand(count, 3).clone()
     chosen = [points[(points - points.mean(0)).norm(dim=-1).argmax()]]
     for _ in range(count - 1):
         chosen.append(points[torch.cdist(points, torch.stack(chosen)).amin(1).argmax()])

@@ -85,14 +85,14 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
 
 
 def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixel centres (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,)."""
+    """Pixel centers (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,)."""
     w2c, K = world_to_camera(camera), camera.K
     t = means @ w2c[:, :3].T + w2c[:, 3]
     z = t[:, 2].clamp_min(projection.NEAREST)
     size = torch.tensor([camera.width, camera.height]).to(means)
-    focal, centre = K[[0, 1], [0, 1]], K[:2, 2]
+    focal, center = K[[0, 1], [0, 1]], K[:2, 2]
     edge = projection.MARGIN * 0.5 * size / focal
-    xy = z[:, None] * torch.minimum(torch.maximum(t[:, :2] / z[:, None], -centre / focal - edge), (size - centre) / focal + edge)
+    xy = z[:, None] * torch.minimum(torch.maximum(t[:, :2] / z[:, None], -center / focal - edge), (size - center) / focal + edge)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [focal[0] / z, zero, -focal[0] * xy[:, 0] / z**2, zero, focal[1] / z, -focal[1] * xy[:, 1] / z**2], -1
@@ -100,7 +100,7 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     half_axes = rotation_matrices(quaternions) * scales[:, None]
     spread = jacobian @ w2c[:, :3] @ half_axes
     covariance = spread @ spread.mT + projection.BLUR * torch.eye(2).to(means)
-    return t[:, :2] / z[:, None] * focal + centre, covariance, t[:, 2]
+    return t[:, :2] / z[:, None] * focal + center, covariance, t[:, 2]
 
 
 def dense(
@@ -109,10 +109,10 @@ def dense(
     """The plain-torch twin: every Gaussian at every pixel, any dtype and device. Without `cut`, no alpha is too small to count."""
     known = torch.cat([means, quaternions, scales, opacities[:, None]], 1).isfinite().all(1)
     means, quaternions, scales, opacities, features = (t[known] for t in (means, quaternions, scales, opacities, features))
-    centres, covariance, z = project(means, quaternions, scales, camera)
+    centers, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > projection.NEAREST]
-    d = camera.pixel_grid().to(means)[:, None] - centres[order]  # (S, G, 2)
+    d = camera.pixel_grid().to(means)[:, None] - centers[order]  # (S, G, 2)
     s = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance[order]) @ d[..., None])[..., 0, 0]
     alpha = (opacities[order] * torch.exp(-s)).clamp_max(float(compositing.ALPHA_MAX))
     if cut:
@@ -157,16 +157,16 @@ class Rasterize(torch.autograd.Function):
         pose = w2c.detach().double().numpy()
         k = camera.K.detach().double().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
         count, size = len(means), (camera.width, camera.height)
-        centres, depths, conics = (np.empty(s, np.float32) for s in ((count, 2), count, (count, 3)))
+        centers, depths, conics = (np.empty(s, np.float32) for s in ((count, 2), count, (count, 3)))
         rows, boxes = np.empty((count, 2), np.int64), np.empty((count, 4), np.int64)
-        projection.project(*arrays, pose, k, *size, centres, depths, conics, rows, boxes)
+        projection.project(*arrays, pose, k, *size, centers, depths, conics, rows, boxes)
         order = front_to_back(depths)
         tiles = -(-size[0] // projection.TILE_X), -(-size[1] // projection.TILE_Y)
         starts, members, places, owned = compositing.bin_tiles(boxes, order, *tiles)
         values, channels = blocks(features.detach().numpy(), depths), features.shape[1] + 1
         maps = torch.empty(channels, size[1], size[0])
         alpha = torch.empty(size[1], size[0])
-        drawn = (starts, members, centres, conics, arrays[3], values, rows)
+        drawn = (starts, members, centers, conics, arrays[3], values, rows)
         compositing.forward(*drawn, maps.numpy(), alpha.numpy())
         ctx.kept = (arrays, pose, k, size, drawn, places, owned)
         ctx.save_for_backward(maps, alpha)

@@ -1,5 +1,5 @@
-"""The rasteriser's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`. It draws by the same rules as the kernels for the CPU: 0.3
-pixels^2 of blur, alpha between 1/255 and 0.999, nothing nearer than 0.01, held linearisation outside the frame."""
+"""The rasterizer's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`. It draws by the same rules as the kernels for the CPU: 0.3
+pixels^2 of blur, alpha between 1/255 and 0.999, nothing nearer than 0.01, held linearization outside the frame."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def available() -> bool:
     try:
         import gsplat  # noqa: F401
     except ImportError:
-        say("gsplat is not installed, so Gaussians are rasterised on the CPU, which is slower: pip install 'hdr-nsff[gpu]'")
+        say("gsplat is not installed, so Gaussians are rasterized on the CPU, which is slower: pip install 'hdr-nsff[gpu]'")
         return False
     return True
 

@@ -18,8 +18,8 @@ NARROWER = 0.7  # times as long as the whole is a half, along the axis it was cu
 
 
 @torch.no_grad()
-def halve(gaussians: Gaussians, told: Tensor, companions: list[Tensor], generator: torch.Generator) -> int:
-    """Cut the Gaussians most to blame in two across their longest axis; the unseen ones become the other halves. How many.
+def relocate(gaussians: Gaussians, told: Tensor, companions: list[Tensor], generator: torch.Generator) -> int:
+    """Cut the Gaussians most to error_scores in two across their longest axis; the unseen ones become the other halves. How many.
 
     `told` (G, 2) are each one's weights summed over the pixels, times their error and alone; `companions` are what else belongs to each, in their last dimension."""
     unseen = (told[:, 1] < UNSEEN).nonzero()[:, 0]
@@ -35,8 +35,8 @@ def halve(gaussians: Gaussians, told: Tensor, companions: list[Tensor], generato
     offset = PARTED * reach[:, None] * rotations[torch.arange(count), :, axis]
     for values in (gaussians.means, gaussians.quaternions, gaussians.log_scales, gaussians.log_radiance, gaussians.logits):
         values[half] = values[whole]
-    if len(gaussians.sheen):
-        gaussians.sheen[half] = gaussians.sheen[whole]
+    if len(gaussians.sh1):
+        gaussians.sh1[half] = gaussians.sh1[whole]
     for c in [gaussians.offsets.movedim(1, -1), *companions]:
         c[..., half] = c[..., whole]
     gaussians.means[half] += offset

@@ -1,4 +1,4 @@
-"""Dynamic radiance as 4D Gaussians in linear HDR: static ones, and moving ones on shared trajectories. Colour is the exponential of
+"""Dynamic radiance as 4D Gaussians in linear HDR: static ones, and moving ones on shared trajectories. Color is the exponential of
 a log radiance, unbounded (a sigmoid bounds it for the ablation); movers' changes in time, and static ones' brightens or darkens slowly (shadows of movers).
 
 The number of Gaussians is fixed by the settings; ones that fade away draw nothing and cost next to nothing."""
@@ -14,18 +14,18 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from hdr_nsff.core.tensors import tree_map
-from hdr_nsff.fields.base import GaussianCloud, Misfit, Render, Warp
+from hdr_nsff.fields.base import FrameError, GaussianCloud, Render, Warp
 from hdr_nsff.fields.knots import knot_of, linear
 from hdr_nsff.fields.splat.gaussians import Gaussians, brightened, to_radiance
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
-from hdr_nsff.fields.splat.relocate import halve
+from hdr_nsff.fields.splat.relocate import relocate
 from hdr_nsff.fields.splat.trajectories import Trajectories
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
 
-BESIDE = 4  # neighbours of a moving Gaussian
+NUM_NEIGHBORS = 4  # neighbors of a moving Gaussian
 GLOSSIEST = 2.0  # log radiance may change by this much with the direction
-RENEW_FRAMES = 24  # training frames that say what is wrong and what is seen
+RELOCATE_FRAMES = 24  # training frames that say what is wrong and what is seen
 FAINTEST = 0.003  # opacity below which a Gaussian draws nothing
 
 
@@ -39,24 +39,24 @@ class SplatConfig:
     """Moving Gaussians; default: 0.15 for every pixel of a frame, at most 20,000."""
     bases: int = 6
     """Shared rigid motions that the moving ones mix."""
-    colour_knots: int = 7
-    """Times at which a moving Gaussian has a colour of its own."""
-    shade_knots: int = 5
+    color_knots: int = 7
+    """Times at which a moving Gaussian has a color of its own."""
+    brightness_knots: int = 5
     """Times at which a static Gaussian has a brightness of its own (1: none)."""
-    presence_knots: int = 13
+    opacity_knots: int = 13
     """Times at which a moving Gaussian has an opacity of its own: things come and go."""
     view_dependence: bool = False
-    """Colours change with the direction of view (to first order, in log radiance): for shiny things seen from many sides."""
+    """Colors change with the direction of view (to first order, in log radiance): for shiny things seen from many sides."""
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or one below 1."""
-    renew_every: int = 200
+    relocate_every: int = 200
     """Steps after which Gaussians that nobody sees are put where the picture is wrong (0: never)."""
     lr: float = 1.0
     """Multiplies all learning rates below."""
-    place_lr: float = 2e-3
+    position_lr: float = 2e-3
     """Of positions, per typical scale of the scene (its near depth)."""
     pose_lr: float = 2e-3
-    colour_lr: float = 2e-2
+    color_lr: float = 2e-2
     shape_lr: float = 2e-2
     opacity_lr: float = 5e-2
 
@@ -72,7 +72,7 @@ class Splat(nn.Module):
 
     times: Tensor
     background: Tensor
-    beside: Tensor
+    neighbors: Tensor
 
     def __init__(self, config: SplatConfig, times: Tensor, near: float, far: float, num_pixels: int) -> None:
         super().__init__()
@@ -80,14 +80,16 @@ class Splat(nn.Module):
         self.register_buffer("times", times.double())
         static, moving = config.counts(num_pixels)
         self.bounded = config.radiance == "sigmoid"
-        self.static = Gaussians(static, config.shade_knots, 1, config.view_dependence, self.bounded)
-        self.moving = Gaussians(moving, config.colour_knots, 3, config.view_dependence, self.bounded)
-        self.presence = nn.Parameter(torch.zeros(config.presence_knots, moving))  # offsets to the moving ones' opacity logits
+        self.static = Gaussians(static, config.brightness_knots, 1, config.view_dependence, self.bounded)
+        self.moving = Gaussians(moving, config.color_knots, 3, config.view_dependence, self.bounded)
+        self.opacity_offsets = nn.Parameter(
+            torch.zeros(config.opacity_knots, moving)
+        )  # offsets to the moving ones' opacity logits
         self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
         self.trajectories = Trajectories(config.bases, len(times))
         self.register_buffer(
-            "beside", torch.arange(moving, dtype=torch.int32)[:, None].repeat(1, BESIDE)
-        )  # (M, BESIDE) neighbours
+            "neighbors", torch.arange(moving, dtype=torch.int32)[:, None].repeat(1, NUM_NEIGHBORS)
+        )  # (M, NUM_NEIGHBORS) neighbors
         self.background = nn.Parameter(torch.zeros(3))  # log radiance (or log odds) where no Gaussian is
 
     def knot(self, time: float) -> float:
@@ -115,7 +117,7 @@ class Splat(nn.Module):
         )
 
     def draw(self, camera: Camera, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
-        """Rasterise radiance (3), motion (1) and `extra` features (G, ...)."""
+        """Rasterize radiance (3), motion (1) and `extra` features (G, ...)."""
         radiance = cloud.radiance
         if self.config.view_dependence:
             radiance = brightened(radiance, self.gloss(camera, cloud.means), self.bounded)
@@ -125,12 +127,12 @@ class Splat(nn.Module):
     def gloss(self, camera: Camera, means: Tensor) -> Tensor:
         """What the directions in which `camera` sees the `means` (G, 3) add to log radiance, (G, 3): spherical harmonics of degree 1."""
         toward = nn.functional.normalize(means - camera.c2w[:, 3], dim=-1)
-        sheen = torch.cat([self.static.sheen, self.moving.sheen])
-        return (sheen @ toward[..., None])[..., 0].clamp(-GLOSSIEST, GLOSSIEST)
+        sh1 = torch.cat([self.static.sh1, self.moving.sh1])
+        return (sh1 @ toward[..., None])[..., 0].clamp(-GLOSSIEST, GLOSSIEST)
 
     def opacities(self, share: float) -> Tensor:
         """(G,) in [0, 1] at a share of the clip."""
-        present = linear(self.presence, share * (len(self.presence) - 1))
+        present = linear(self.opacity_offsets, share * (len(self.opacity_offsets) - 1))
         return torch.cat([self.static.logits, self.moving.logits + present]).sigmoid()
 
     def positions(self, knot: float) -> Tensor:
@@ -178,10 +180,10 @@ class Splat(nn.Module):
         return steps
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A training render of the whole frame, read off at the batch's pixels; regularisers. Two dear things take turns, at random: flow
-        to one of the neighbours, as a warp, and rigidity."""
+        """A training render of the whole frame, read off at the batch's pixels; regularizers. Two dear things take turns, at random: flow
+        to one of the neighbors, as a warp, and rigidity."""
         knot = self.knot(batch.time)
-        sides = [o for o in batch.neighbours if o in batch.flow]
+        sides = [o for o in batch.neighbors if o in batch.flow]
         side, flow_turn = batch.seed // 2 % max(len(sides), 1), batch.seed % 2 == 0
         wanted = sides[side : side + 1] if flow_turn else []
         cloud = self.cloud(knot)
@@ -196,49 +198,49 @@ class Splat(nn.Module):
         return picked(render, batch.camera, batch.pixels), own
 
     def displacements(self, batch: PixelBatch, means: Tensor, knot: float, offset: int) -> Tensor:
-        """Pixels (G, 2) from where the batch's camera sees each Gaussian's mean (G, 3) to where the neighbour sees it at its time."""
+        """Pixels (G, 2) from where the batch's camera sees each Gaussian's mean (G, 3) to where the neighbor sees it at its time."""
         there = self.positions(min(max(knot + offset, 0), len(self.times) - 1))
-        camera, neighbour, limit = batch.camera, batch.neighbours[offset], 2.0 * batch.camera.width
-        return (neighbour.project(there)[0] - camera.project(means)[0]).clamp(-limit, limit)
+        camera, neighbor, limit = batch.camera, batch.neighbors[offset], 2.0 * batch.camera.width
+        return (neighbor.project(there)[0] - camera.project(means)[0]).clamp(-limit, limit)
 
     def regularizers(self, cloud: GaussianCloud, knot: float) -> dict[str, Tensor]:
-        """Terms of the field's own: opacities and scales (Kheradmand et al. 2024) of the `cloud` at `knot`, smooth poses, slow colours."""
+        """Terms of the field's own: opacities and scales (Kheradmand et al. 2024) of the `cloud` at `knot`, smooth poses, slow colors."""
         still, moving = self.static, self.moving
         alive = cloud.opacities.detach() > FAINTEST
         terms = {
             "opacity": (cloud.opacities * alive).mean(),
             "scale": (cloud.scales * alive[:, None]).mean() / self.unit,
             "trajectory": self.trajectories.roughness(knot, self.unit),
-            "shade": mean_square(still.offsets),
-            "presence": mean_square(self.presence.diff(dim=0)),
-            "colour_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),
+            "brightness_drift": mean_square(still.offsets),
+            "opacity_offsets": mean_square(self.opacity_offsets.diff(dim=0)),
+            "color_change": mean_square(moving.offsets.diff(dim=0)) + 0.01 * mean_square(moving.offsets),
         }
-        return terms | ({"sheen": mean_square(still.sheen) + mean_square(moving.sheen)} if self.config.view_dependence else {})
+        return terms | ({"sh1": mean_square(still.sh1) + mean_square(moving.sh1)} if self.config.view_dependence else {})
 
     def rigidity(self) -> Tensor:
-        """Mean square difference of the mixtures of neighbouring moving Gaussians: those that mix alike keep their distances."""
+        """Mean square difference of the mixtures of neighboring moving Gaussians: those that mix alike keep their distances."""
         mixture = self.mixture_logits.softmax(0)
-        return mean_square(mixture[:, self.beside.long().flatten()] - mixture.repeat_interleave(self.beside.shape[1], 1))
+        return mean_square(mixture[:, self.neighbors.long().flatten()] - mixture.repeat_interleave(self.neighbors.shape[1], 1))
 
     @torch.no_grad()
-    def look_around(self) -> None:
-        """Find out anew which moving Gaussians lie beside each other."""
-        if len(self.moving) > BESIDE:
+    def find_neighbors(self) -> None:
+        """Find out anew which moving Gaussians lie neighbors each other."""
+        if len(self.moving) > NUM_NEIGHBORS:
             places = self.moving.means.cpu().numpy()
-            self.beside.copy_(torch.from_numpy(cKDTree(places).query(places, BESIDE + 1)[1][:, 1:]))
+            self.neighbors.copy_(torch.from_numpy(cKDTree(places).query(places, NUM_NEIGHBORS + 1)[1][:, 1:]))
 
     def param_groups(self) -> list[dict[str, Any]]:
-        """One group for every learning rate, as an optimiser works group by group; only the poses near the drawn frame move."""
+        """One group for every learning rate, as an optimizer works group by group; only the poses near the drawn frame move."""
         c, both = self.config, (self.static, self.moving)
         rates = {
-            "means": c.place_lr * self.unit, "quaternions": c.shape_lr, "log_scales": c.shape_lr, "logits": c.opacity_lr,
-            "log_radiance": c.colour_lr, "offsets": c.colour_lr, "sheen": c.colour_lr,
+            "means": c.position_lr * self.unit, "quaternions": c.shape_lr, "log_scales": c.shape_lr, "logits": c.opacity_lr,
+            "log_radiance": c.color_lr, "offsets": c.color_lr, "sh1": c.color_lr,
         }  # fmt: skip
         at_rate: dict[float, list[Tensor]] = {}
         for name, rate in rates.items():
             at_rate.setdefault(rate, []).extend(p for p in (getattr(g, name) for g in both) if p.numel())
-        at_rate[c.opacity_lr].append(self.presence)
-        at_rate[c.colour_lr] += [self.mixture_logits, self.background]
+        at_rate[c.opacity_lr].append(self.opacity_offsets)
+        at_rate[c.color_lr] += [self.mixture_logits, self.background]
         groups: list[dict[str, Any]] = [{"params": p, "lr": c.lr * rate, "eps": 1e-15} for rate, p in at_rate.items()]
         t = self.trajectories
         touched = [t.turns_touched, t.shifts_touched]
@@ -246,29 +248,29 @@ class Splat(nn.Module):
         return groups
 
     @torch.no_grad()
-    def renew(self, misfits: list[Misfit], generator: torch.Generator) -> int:
-        """Put unseen Gaussians beside those with most error in their pixels, static and moving ones apart; how many."""
-        told = torch.stack([self.blame(m) for m in misfits]).mean(0)
+    def relocate(self, frame_errors: list[FrameError], generator: torch.Generator) -> int:
+        """Put unseen Gaussians neighbors those with most error in their pixels, static and moving ones apart; how many."""
+        told = torch.stack([self.error_scores(m) for m in frame_errors]).mean(0)
         still, moving = told.split([len(self.static), len(self.moving)])
-        return halve(self.static, still, [], generator) + halve(
-            self.moving, moving, [self.presence, self.mixture_logits], generator
+        return relocate(self.static, still, [], generator) + relocate(
+            self.moving, moving, [self.opacity_offsets, self.mixture_logits], generator
         )
 
     @torch.no_grad()
-    def blame(self, misfit: Misfit) -> Tensor:
+    def error_scores(self, frame_error: FrameError) -> Tensor:
         """(G, 2): the weights of every Gaussian summed over the pixels of a frame, times their error and alone: the gradients of two features."""
-        cloud = self.cloud(self.knot(misfit.time))
+        cloud = self.cloud(self.knot(frame_error.time))
         told = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
         with torch.enable_grad():
-            radiance, _, _, _, drawn = self.composed(self.draw(misfit.camera, cloud, [told]))
-            error = misfit.error(radiance.detach())
+            radiance, _, _, _, drawn = self.composed(self.draw(frame_error.camera, cloud, [told]))
+            error = frame_error.error(radiance.detach())
             return torch.autograd.grad((drawn * torch.stack([error, torch.ones_like(error)], 1)).sum(), told)[0]
 
-    def after_step(self, step: int, misfits: Callable[[int], list[Misfit]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
         """Now and then, Gaussians that nobody sees go where the picture is wrong."""
-        if misfits is not None and self.config.renew_every and step % self.config.renew_every == 0:
-            self.renew(misfits(RENEW_FRAMES), torch.Generator().manual_seed(step))
-            self.look_around()
+        if frame_errors is not None and self.config.relocate_every and step % self.config.relocate_every == 0:
+            self.relocate(frame_errors(RELOCATE_FRAMES), torch.Generator().manual_seed(step))
+            self.find_neighbors()
 
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""

@@ -1,6 +1,6 @@
 """How moving Gaussians move: a few shared rigid motions over the training times; each Gaussian follows its own mixture of them.
 
-Basis b turns by R_b(t) about its centre c_b and shifts by s_b(t): x(t) = sum_b w_b (R_b(t) (x - c_b) + c_b + s_b(t)). Poses are kept
+Basis b turns by R_b(t) about its center c_b and shifts by s_b(t): x(t) = sum_b w_b (R_b(t) (x - c_b) + c_b + s_b(t)). Poses are kept
 at the training times (knots) and interpolated by a cubic with continuous velocity, so any time between can be asked for."""
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HAMILTON = products("ww -xx -yy -zz", "wx xw yz -zy", "wy -xz yw zx", "wz xy -yx
 class Trajectories(nn.Module):
     """`num_bases` rigid motions over `num_knots` training times."""
 
-    centres: Tensor
+    centers: Tensor
     turns_touched: Tensor
     shifts_touched: Tensor
 
@@ -29,7 +29,7 @@ class Trajectories(nn.Module):
         still = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num_knots * num_bases, 1)
         self.turns = nn.Parameter(still)  # (T * B, 4) quaternions w x y z of any length
         self.shifts = nn.Parameter(torch.zeros(num_knots * num_bases, 4))  # (T * B, 3) scene units, and one unused column
-        self.register_buffer("centres", torch.zeros(num_bases, 3))  # scene units
+        self.register_buffer("centers", torch.zeros(num_bases, 3))  # scene units
         for name in ("turns_touched", "shifts_touched"):  # rows with a gradient
             self.register_buffer(name, torch.zeros(num_knots * num_bases, dtype=torch.uint8), persistent=False)
 
@@ -43,7 +43,7 @@ class Trajectories(nn.Module):
         """Where canonical `points` (G, 3) are in the bases' `pose`, given each one's `mixture` (B, G) of them."""
         q, s = pose
         r = rotation_matrices(q)  # (B, 3, 3)
-        offset = self.centres + s - (r @ self.centres[..., None])[..., 0]
+        offset = self.centers + s - (r @ self.centers[..., None])[..., 0]
         motions = (mixture.T @ torch.cat([r, offset[..., None]], 2).flatten(1)).unflatten(1, (3, 4))  # each point's own
         return torch.baddbmm(motions[..., 3:], motions[..., :3], points[..., None])[..., 0]
 

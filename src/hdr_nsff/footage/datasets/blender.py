@@ -28,7 +28,7 @@ from hdr_nsff.footage.pose_files import Given, from_transforms
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 
 
-def recognised(folder: Path) -> bool:
+def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
     return (folder / TRAIN).is_file()
 

@@ -19,7 +19,7 @@ COUNT = 5
 TRAINED = (0, 2, 4)
 
 
-def recognised(folder: Path) -> bool:
+def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
     return (folder / TRAIN).is_file() and any((folder / f"exposure_{split}.json").is_file() for split in ("train", "test"))
 

@@ -20,7 +20,7 @@ NAME = "poses_bounds_exps.npy"
 PICTURES = "input_images"
 
 
-def recognised(folder: Path) -> bool:
+def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
     return (folder / NAME).is_file()
 

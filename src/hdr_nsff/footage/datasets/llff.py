@@ -35,7 +35,7 @@ def dense_folder(folder: Path) -> Path:
     return folder / "dense" if (folder / "dense").is_dir() else folder
 
 
-def recognised(folder: Path) -> bool:
+def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
     dense = dense_folder(folder)
     if (dense / "poses_bounds.npy").is_file():
@@ -169,7 +169,7 @@ def depth_maps(dense: Path, count: int, extra: Extra | None) -> tuple[list[Path]
 
 
 def flow_maps(dense: Path, names: list[str]) -> tuple[list[dict[str, Path]], list[str]]:
-    """Per picture the flow to its neighbours, and which folder it is from."""
+    """Per picture the flow to its neighbors, and which folder it is from."""
     folder = next((dense / n for n in FLOWS if (dense / n).is_dir()), None)
     flow: list[dict[str, Path]] = [{} for _ in names]
     if folder is None:

@@ -1,5 +1,5 @@
 """nerfstudio's layout: `transforms.json` with OpenGL poses and intrinsics for all or per frame; pictures named in `val_filenames` and
-`test_filenames` are held out. `depth_file_path` holds millimetres, as nerfstudio's default unit has it.
+`test_filenames` are held out. `depth_file_path` holds millimeters, as nerfstudio's default unit has it.
 
 Its `mask_path` says which pixels to leave out of training, not what moves, and is not used. What the layout cannot say (exposures,
 times in frames, flow, moving masks) stands under the key `hdr_nsff` where `export` wrote the file."""
@@ -34,10 +34,10 @@ NAME = "transforms.json"
 HELD_OUT = ("val_filenames", "test_filenames")
 EXTRA = "hdr_nsff"
 VIEWS = "held_out/"  # where `export` puts the views of a truth folder
-MILLIMETRES = 1000.0  # a unit of the poses in what depth files hold
+MILLIMETERS = 1000.0  # a unit of the poses in what depth files hold
 
 
-def recognised(folder: Path) -> bool:
+def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout: poses, and the pictures that they are of. Poses of pictures elsewhere are for `--poses`; a
     file cut short is one, so that somebody says so."""
     if not (folder / NAME).is_file():
@@ -72,7 +72,7 @@ def read(folder: Path) -> Capture:
         pictures=[picture(folder, frames[k], clock(times[k]), cameras[k]) for k in order],
         poses=reorder(given, order),
         withheld=bool(outside),
-        depth_scale=1 / MILLIMETRES,
+        depth_scale=1 / MILLIMETERS,
         notes=notes(frames),
     )
 

@@ -1,7 +1,7 @@
 """A scene folder -> the HDR-GoPro / NSFF layout (LLFF), as `llff.py` describes it: training frames in time, and
 what a truth folder keeps back.
 
-The layout has one focal length and a principal point at the centre, one picture per time, and no place for exposures and trust in the
+The layout has one focal length and a principal point at the center, one picture per time, and no place for exposures and trust in the
 depth: `dense/hdr_nsff.json` and `dense/disp_confidence/` hold those, and other readers pass over them. Held-out views it knows from the
 poses of training pictures (camera k stands where training picture k - 1 does), at their times and half-way to the next."""
 
@@ -114,7 +114,7 @@ def write_frame(source: Source, f: FrameEntry, i: int, out: Path) -> None:
 
 
 def write_flow(source: Source, f: FrameEntry, to: FrameEntry, path: Path) -> None:
-    """`flow` (H, W, 2) px and `mask` (H, W) to a neighbour, float32."""
+    """`flow` (H, W, 2) px and `mask` (H, W) to a neighbor, float32."""
     if to.index not in f.flow:
         raise InputError(f"{source.folder}: no flow from frame {f.index} to frame {to.index}; run `hdr-nsff prepare` again")
     files = f.flow[to.index]
@@ -130,9 +130,9 @@ def write_poses(source: Source, frames: list[FrameEntry], dense: Path) -> None:
     points that a frame sees, else the scene's near and far."""
     m = source.manifest
     K, c2w = np.array([f.K for f in frames], np.float64), np.array([f.c2w for f in frames], np.float64)
-    centred = np.abs(K[:, :2, 2] - [m.width / 2, m.height / 2]).max()
-    if max(centred, np.abs(K[:, 0, 0] - K[:, 1, 1]).max()) > 0.5:
-        say("the layout has one focal length and a centred principal point: exact only in dense/hdr_nsff.json and dense/sparse")
+    centered = np.abs(K[:, :2, 2] - [m.width / 2, m.height / 2]).max()
+    if max(centered, np.abs(K[:, 0, 0] - K[:, 1, 1]).max()) > 0.5:
+        say("the layout has one focal length and a centered principal point: exact only in dense/hdr_nsff.json and dense/sparse")
     views = []
     if source.points is not None:
         for f, k, pose in zip(frames, K, c2w, strict=True):

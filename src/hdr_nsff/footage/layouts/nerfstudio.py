@@ -1,4 +1,4 @@
-"""A scene folder -> nerfstudio's `transforms.json` with pictures, depth in millimetres and held-out frames and views as `test_filenames`.
+"""A scene folder -> nerfstudio's `transforms.json` with pictures, depth in millimeters and held-out frames and views as `test_filenames`.
 What nerfstudio has no word for (exposures, times in frames, flow, moving masks, trust in the depth) stands under `hdr_nsff`."""
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 from hdr_nsff.core.io import write_json, write_npy
 from hdr_nsff.core.progress import track
 from hdr_nsff.footage.datasets.capture import ExtraFrame
-from hdr_nsff.footage.datasets.nerfstudio import EXTRA, MILLIMETRES, NAME, VIEWS
+from hdr_nsff.footage.datasets.nerfstudio import EXTRA, MILLIMETERS, NAME, VIEWS
 from hdr_nsff.footage.layouts.writer import HeldOutPicture, Source, claim, copy, z_depth
 from hdr_nsff.footage.pose_files import FROM_OPENGL
 from hdr_nsff.scene.scene import FrameEntry
@@ -62,7 +62,7 @@ def frame_entry(source: Source, f: FrameEntry, out: Path, name: str, time: float
     disparity = source.disparity(f)
     if disparity is not None and source.manifest.depth_kind == "scene":
         entry["depth_file_path"] = f"depth/{f.index:05d}.npy"
-        write_npy(out / f"depth/{f.index:05d}.npy", np.float32(MILLIMETRES) * z_depth(disparity))
+        write_npy(out / f"depth/{f.index:05d}.npy", np.float32(MILLIMETERS) * z_depth(disparity))
     return entry
 
 

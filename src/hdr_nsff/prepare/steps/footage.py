@@ -42,8 +42,8 @@ def frames_step(work: Work) -> Step:
     times = len({e.time for e in entries})
     if times < MIN_FRAMES:
         raise InputError(f"{c.clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are needed to see motion")
-    if (colour := exposure.all_clipped(extents)) is not None:
-        raise InputError(f"{c.clip}: all frames are {colour}; nothing can be learned from them, choose other frames")
+    if (color := exposure.all_clipped(extents)) is not None:
+        raise InputError(f"{c.clip}: all frames are {color}; nothing can be learned from them, choose other frames")
     m.frames, m.fps = entries, work.footage.fps / c.stride
     vars(work).pop("video", None)
     linear = "; linear frames, scaled by one constant and encoded as x^(1/2.2)" if work.footage.linear else ""
@@ -82,7 +82,7 @@ def exposure_step(work: Work) -> Step:
         check_protocol(m.protocol, brackets, test)
     for f, bracket in zip(m.frames, brackets, strict=True):
         f.bracket, f.ev, f.split = bracket, m.bracket_ev[bracket], "test" if f.index in test else "train"
-    vars(work).pop("equalised", None)
+    vars(work).pop("equalized", None)
     what = "no alternation" if m.cycle == 1 else f"cycle of {m.cycle}, {len(values)} exposures"
     step: Literal["given", "estimated"] = "given" if stored or given is not None else "estimated"
     details = {"source": source, "doubts": notes}

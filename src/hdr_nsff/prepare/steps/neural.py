@@ -19,7 +19,7 @@ from hdr_nsff.priors.masks.sam2 import sam2_mask
 from hdr_nsff.priors.poses.lightglue import check_matcher, matcher_weights
 from hdr_nsff.priors.pretrained import architecture, pretrained
 from hdr_nsff.priors.weights import content, find
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 SAM2, DEPTH_ANYTHING = "Sam2VideoModel", "DepthAnythingForDepthEstimation"
 PROMPTS = "masks/prompts.json"
@@ -47,7 +47,7 @@ def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
             paths = flow_weights(config.flow, config.flow_weights, config.semantic)
         case "poses" if config.poses is None:
             paths = matcher_weights(config.matcher)
-        case "mask" if config.masks == "sam2":
+        case "masks" if config.masks == "sam2":
             paths = [find(config.mask_weights)]
         case "depth" if config.depth == "depth-anything":
             paths = [find(config.depth_weights)]
@@ -70,7 +70,7 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     if other := sorted({e.frame for e in (*given.points, *given.boxes) if m.frames[e.frame].split != "train"}):
         raise InputError(f"{c.mask_points}: frame {other[0]} is held out of training; point at frames beside it")
     network = ready(SAM2, c.mask_weights)
-    video = work.equalised[0]
+    video = work.equalized[0]
     outlined = np.zeros_like(moving)
     written: dict[str, list[Any]] = {"points": [], "boxes": []}
     number = 0  # of objects of the cameras before
@@ -95,13 +95,13 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
 def network_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float, Kind]:
     """Disparity and confidence of the frames `index` (increasing), near and far, by Depth Anything; and its kind."""
     m = work.manifest
-    video, clipped = work.equalised
+    video, clipped = work.equalized
     answered, kind = network_disparity(ready(DEPTH_ANYTHING, work.config.depth_weights), video[index])
     K, c2w = work.cameras()
     moving = np.stack([read_mask(work.folder / str(m.frames[i].mask)) for i in index])
     times = np.array([m.frames[i].time for i in index], np.float64)
-    shots = Shots(K[index], c2w[index], times, video[index], clipped[index], moving)
+    clip = PosedVideo(K[index], c2w[index], times, video[index], clipped[index], moving)
     points = np.array(read_npy(work.folder / m.points)) if m.points else np.zeros((0, 3))
-    flow, valid, pairs = work.flows
+    flow, valid, pairs = work.raw_flows
     among = np.isin(pairs, index).all(1)
-    return *anchored_depth(answered, kind, shots, points, flow[among], valid[among], np.searchsorted(index, pairs[among])), kind
+    return *anchored_depth(answered, kind, clip, points, flow[among], valid[among], np.searchsorted(index, pairs[among])), kind

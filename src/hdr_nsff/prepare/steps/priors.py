@@ -30,7 +30,7 @@ from hdr_nsff.priors.flow.one_exposure import at_one_exposure, response_from_flo
 from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolved
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses
-from hdr_nsff.radiometry.common_range import common_grey, common_rgb, recorded_range
+from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
 from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Step
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
@@ -41,7 +41,7 @@ SPHERE_NEAR, SPHERE_FAR = 0.5, 2.0  # around distance 1, where everything lies w
 
 
 def flow_pairs(frames: list[FrameEntry]) -> list[tuple[int, int]]:
-    """The pairs (from, to) that flow is wanted for, both directions side by side: neighbours in the clip, and neighbours among the
+    """The pairs (from, to) that flow is wanted for, both directions side by side: neighbors in the clip, and neighbors among the
     training frames, of each camera."""
     pairs = dict.fromkeys(
         pair
@@ -53,21 +53,23 @@ def flow_pairs(frames: list[FrameEntry]) -> list[tuple[int, int]]:
 
 
 def learning_pairs(frames: list[FrameEntry]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Of the training frames of each camera: neighbours, and consecutive ones of equal exposure."""
+    """Of the training frames of each camera: neighbors, and consecutive ones of equal exposure."""
     among: list[dict[tuple[int, ...], list[int]]] = [{}, {}]
     for f in frames:
         if f.split == "train":
             among[0].setdefault((f.camera_id,), []).append(f.index)
             among[1].setdefault((f.camera_id, f.bracket), []).append(f.index)
-    neighbours, equal = ([pair for line in lines.values() for pair in pairwise(line)] for lines in among)
-    return neighbours, equal
+    neighbors, equal = ([pair for line in lines.values() for pair in pairwise(line)] for lines in among)
+    return neighbors, equal
 
 
 def flow_step(work: Work) -> Step:
-    """Optical flow between neighbours, from a folder or estimated, a few pairs at a time so that a killed run keeps them."""
+    """Optical flow between neighbors, from a folder or estimated, a few pairs at a time so that a killed run keeps them."""
     m, c = work.manifest, work.config
     pairs = flow_pairs(m.frames)
-    names = {(i, j): FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png") for i, j in pairs}
+    names = {
+        (i, j): FlowFiles(flow=f"raw_flow/{i:05d}_{j:05d}.npy", valid=f"raw_flow/{i:05d}_{j:05d}_valid.png") for i, j in pairs
+    }
     missing = [p for p in pairs if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))]
     own = given_flow(work, names)
     missing = [p for p in missing if p not in own]
@@ -75,11 +77,11 @@ def flow_step(work: Work) -> Step:
     source = flow_source(c.flow, c.flow_weights, c.semantic, *learning_pairs(m.frames))
     size = max(len(missing), 1) if from_folder else FLOW_CHUNK
     for chunk in track([missing[k : k + size] for k in range(0, len(missing), size)], "flow"):
-        found, valid = source(*work.equalised, np.array(chunk))
+        found, valid = source(*work.equalized, np.array(chunk))
         for pair, f, v in zip(chunk, found, valid, strict=True):
             write_flow(work, names[pair], f, v)
     for f in m.frames:
-        f.flow = f.matched = {j: names[i, j] for i, j in pairs if i == f.index}
+        f.flow = f.raw_flow = {j: names[i, j] for i, j in pairs if i == f.index}
     share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
     vars(work).pop("flows", None)
     given = len(pairs) if from_folder else len(own)
@@ -130,13 +132,13 @@ def poses_step(work: Work) -> Step:
     else:
         first = work.folder / "poses" / "first_masks.npy"
         if not first.is_file():
-            moving = rough_mask(*work.flows, work.equalised[0])
+            moving = rough_mask(*work.raw_flows, work.equalized[0])
             store(work, estimate(work, moving))
             work.save()
             write_npy(first, moving)
         before = read_npy(first)
         for _ in range(ROUNDS if work.manifest.parallax == "full" else 0):
-            moving = geometric_mask(*work.flows, work.equalised[0], *work.cameras())
+            moving = geometric_mask(*work.raw_flows, work.equalized[0], *work.cameras())
             agreement = (before & moving).sum() / max((before | moving).sum(), 1)
             again = agreement < SAME_MASKS
             say(f"poses: masks from these poses agree to {agreement:.0%} with those before{': once more' if again else ''}")
@@ -161,8 +163,8 @@ def given_poses(work: Work) -> Poses:
 
 
 def estimate(work: Work, moving: np.ndarray) -> Poses:
-    """Poses by structure from motion on equalised frames, leaving out what is `moving` (T, H, W) bool."""
-    video, clipped = work.equalised
+    """Poses by structure from motion on equalized frames, leaving out what is `moving` (T, H, W) bool."""
+    video, clipped = work.equalized
     return estimate_poses(
         video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames], matcher=work.config.matcher
     )
@@ -217,20 +219,20 @@ def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
     return found
 
 
-def mask_step(work: Work) -> Step:
+def masks_step(work: Work) -> Step:
     """What moves, per frame. Training frames are judged by flow among training frames alone; held-out ones by all."""
     m, c = work.manifest, work.config
     given = isinstance(c.masks, Path) or work.gives("masks") is not None
     if given:
         moving = given_masks(work)
     else:
-        found, valid, pairs = work.flows
+        found, valid, pairs = work.raw_flows
         train = np.array([f.split == "train" for f in m.frames])
         among = train[pairs].all(1)
         K, c2w = work.cameras()
-        moving = geometric_mask(found[among], valid[among], pairs[among], work.equalised[0], K, c2w)
+        moving = geometric_mask(found[among], valid[among], pairs[among], work.equalized[0], K, c2w)
         if not train.all():
-            moving[~train] = geometric_mask(found, valid, pairs, work.equalised[0], K, c2w)[~train]
+            moving[~train] = geometric_mask(found, valid, pairs, work.equalized[0], K, c2w)[~train]
         if c.masks == "sam2":
             moving = sam2_masks(work, moving)
     for f, mask in zip(m.frames, moving, strict=True):
@@ -243,25 +245,28 @@ def mask_step(work: Work) -> Step:
     )
 
 
-def rims_step(work: Work) -> Step:
+def refined_flow_step(work: Work) -> Step:
     """Estimated flow once more where things move, from what moves alone, and where it is not sure, from what is around; given flow stays as it is."""
     m = work.manifest
-    own = [(f.index, j) for f in m.frames for j in f.matched if not flow_is_given(work, f.index, j)]
-    clipped = work.equalised[1]
+    own = [(f.index, j) for f in m.frames for j in f.raw_flow if not flow_is_given(work, f.index, j)]
+    clipped = work.equalized[1]
     moving = np.stack([read_mask(work.folder / str(f.mask)) for f in m.frames])
-    video, how = through_response(work, moving) if own else (work.equalised[0], "")
+    video, how = through_response(work, moving) if own else (work.equalized[0], "")
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
-    names = {(i, j): FlowFiles(flow=f"rims/{i:05d}_{j:05d}.npy", valid=f"rims/{i:05d}_{j:05d}_valid.png") for i, j in own}
+    names = {
+        (i, j): FlowFiles(flow=f"refined_flow/{i:05d}_{j:05d}.npy", valid=f"refined_flow/{i:05d}_{j:05d}_valid.png")
+        for i, j in own
+    }
 
     def mend(i: int, j: int) -> None:
         if all((work.folder / n).is_file() for p in ((i, j), (j, i)) for n in (names[p].flow, names[p].valid)):
             return  # by a run that was killed
         seen = common_rgb(video, ranges, i, j), common_rgb(video, ranges, j, i)
         there, back = (
-            mended(*pictures, read_npy(work.folder / m.frames[a].matched[b].flow).astype(np.float32), moving[a] & ~clipped[a])
+            mended(*pictures, read_npy(work.folder / m.frames[a].raw_flow[b].flow).astype(np.float32), moving[a] & ~clipped[a])
             for pictures, (a, b) in zip(seen, ((i, j), (j, i)), strict=True)
         )
-        a, b = common_grey(video, ranges, i, j)
+        a, b = common_gray(video, ranges, i, j)
         sure = agreement(there, back, clipped[i], clipped[j]), agreement(back, there, clipped[j], clipped[i])
         there, back = (
             told(there, back, a, b, clipped[i], clipped[j], moving[i]),
@@ -272,8 +277,8 @@ def rims_step(work: Work) -> Step:
 
     in_threads(lambda pair: mend(*pair), [(i, j) for i, j in own if i < j], "flow of movers")
     for f in m.frames:
-        f.flow = {j: names.get((f.index, j), files) for j, files in f.matched.items()}
-    for name in ("flows", "mended_flows"):
+        f.flow = {j: names.get((f.index, j), files) for j, files in f.raw_flow.items()}
+    for name in ("raw_flows", "refined_flows"):
         vars(work).pop(name, None)
     return Step(
         provenance="estimated" if own else "given",
@@ -289,7 +294,7 @@ def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
     frames, ev = work.manifest.frames, work.manifest.bracket_ev
     bracket, train = np.array([f.bracket for f in frames]), np.array([f.split == "train" for f in frames])
     known, reference = ev or [None] * int(bracket.max() + 1), work.manifest.reference_bracket
-    video, (flow, valid, pairs) = work.equalised[0].copy(), work.flows
+    video, (flow, valid, pairs) = work.equalized[0].copy(), work.raw_flows
     cameras = [np.array(own) for own in work.camera_frames()]
     told = []
     for own in cameras:
@@ -304,7 +309,7 @@ def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
     if told:
         where = "" if len(told) == len(cameras) else f" in {len(told)} of {len(cameras)} cameras, else by brightness"
         return video, f", at one exposure through the response that flow tells{where} (misfit {max(told):.3f} stops)"
-    return video, ", frames equalised by brightness: too few pixels at rest in several exposures" if len(set(bracket)) > 1 else ""
+    return video, ", frames equalized by brightness: too few pixels at rest in several exposures" if len(set(bracket)) > 1 else ""
 
 
 def flow_is_given(work: Work, i: int, j: int) -> bool:
@@ -359,9 +364,9 @@ def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
     """Depth of the frames `index` (increasing) from those frames alone."""
     m = work.manifest
     frames = [m.frames[i] for i in index]
-    found, valid, pairs = work.mended_flows
+    found, valid, pairs = work.refined_flows
     among = np.isin(pairs, index).all(1)
-    video, clipped = work.equalised
+    video, clipped = work.equalized
     K, c2w = work.cameras()
     return geometric_depth(
         K[index],
@@ -378,7 +383,7 @@ def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def sheet_step(work: Work) -> Step:
-    """`contact_sheet.png`: a few training frames as recorded, equalised, with moving pixels red, flow to the next frame (from the last to the one before), and disparity."""
+    """`contact_sheet.png`: a few training frames as recorded, equalized, with moving pixels red, flow to the next frame (from the last to the one before), and disparity."""
     m = work.manifest
     train = [f for f in m.frames if f.split == "train"]
     some = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, 6).astype(int))]
@@ -386,7 +391,7 @@ def sheet_step(work: Work) -> Step:
     low, high = (float(v) for v in np.percentile(np.stack(disparity), [1, 99]))
     rows: list[list[np.ndarray]] = [[], [], [], [], []]
     for f, d in zip(some, disparity, strict=True):
-        shown = work.equalised[0][f.index]
+        shown = work.equalized[0][f.index]
         moving = read_mask(work.folder / f.mask) if f.mask else np.zeros(d.shape, bool)
         red = np.where(moving[..., None], 0.5 * shown + [0.5, 0, 0], shown)
         names = f.flow[max(f.flow)]
@@ -397,4 +402,4 @@ def sheet_step(work: Work) -> Step:
     if m.parallax != "full":
         rows.pop()  # the same disparity everywhere
     write_png(work.folder / "contact_sheet.png", contact_sheet(rows))
-    return Step(note="recorded, equalised, moving, flow (grey: not believed), disparity")
+    return Step(note="recorded, equalized, moving, flow (gray: not believed), disparity")

@@ -1,8 +1,8 @@
 """Depth of every frame by Depth Anything V2 (Yang et al. 2024), laid onto the static points of structure from motion.
 
 The network answers each frame by itself: relative variants with disparity up to an unknown scale and shift, metric ones with depth
-in metres of its own making. So each frame gets the scale (and shift) that its points ask for, robustly, since points err and so does
-the network; where a frame has few points its neighbours in time decide along with it. It sees exposure-equalised frames."""
+in meters of its own making. So each frame gets the scale (and shift) that its points ask for, robustly, since points err and so does
+the network; where a frame has few points its neighbors in time decide along with it. It sees exposure-equalized frames."""
 
 from __future__ import annotations
 
@@ -19,19 +19,19 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.priors.depth.geometric import LEAST_POINTS, depth_range, doubt_edges
 from hdr_nsff.priors.depth.parallax import triangulate
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 Kind = Literal["relative", "metric"]
 TRIALS = 200  # pairs of points tried for a first scale and shift
 ROUNDS = 10  # of reweighting
-FEW = 30  # points below which a frame listens to its neighbours in time
+FEW = 30  # points below which a frame listens to its neighbors in time
 QUIET = 0.005  # least noise of disparity, as a share of it: no network is better
 HALF = 0.1  # relative error of disparity at the points that halves the confidence
 FLOOR = 0.25  # of the smallest disparity of the points (all but 1 %): nothing is farther
 
 
 def network_disparity(network: Any, video: np.ndarray) -> tuple[np.ndarray, Kind]:
-    """What the network says of `video` (T, H, W, 3), equalised rgb in [0, 1]: disparity (T, H, W), up to scale and shift per frame
+    """What the network says of `video` (T, H, W, 3), equalized rgb in [0, 1]: disparity (T, H, W), up to scale and shift per frame
     ("relative") or up to scale ("metric"). `network`: transformers' DepthAnythingForDepthEstimation."""
     kind: Kind = network.config.depth_estimation_type
     found = np.empty(video.shape[:3], np.float32)
@@ -44,7 +44,7 @@ def network_disparity(network: Any, video: np.ndarray) -> tuple[np.ndarray, Kind
 
 
 def picture(network: Any, rgb: np.ndarray) -> Tensor:
-    """A frame (H, W, 3) as the network wants it: (1, 3, h, w), normalised, the shorter side what it was trained with, both multiples of its patches."""
+    """A frame (H, W, 3) as the network wants it: (1, 3, h, w), normalized, the shorter side what it was trained with, both multiples of its patches."""
     patch, short = network.config.patch_size, network.config.backbone_config.image_size
     height, width = (max(1, round(n * short / min(rgb.shape[:2]) / patch)) * patch for n in rgb.shape[:2])
     values = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
@@ -53,7 +53,7 @@ def picture(network: Any, rgb: np.ndarray) -> Tensor:
 
 
 def anchored_depth(
-    answered: np.ndarray, kind: Kind, shots: Shots, points: np.ndarray, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray
+    answered: np.ndarray, kind: Kind, clip: PosedVideo, points: np.ndarray, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Disparity (T, H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], near and far z-depth, as `geometric_depth` gives them, from
     disparity (T, H, W) that the network `answered`.
@@ -61,10 +61,10 @@ def anchored_depth(
     `points` (N, 3) static; where there are too few, more are triangulated from `flow` (P, H, W, 2) px, `valid` (P, H, W) of `pairs`
     (P, 2). InputError where there still are too few."""
     count = len(answered)
-    seen = [sample(shots, t, points, answered[t]) for t in range(count)]
+    seen = [sample(clip, t, points, answered[t]) for t in range(count)]
     if sum(len(s) for s in seen) < LEAST_POINTS * count:
-        points = np.concatenate([np.asarray(points).reshape(-1, 3), triangulate(shots, flow, valid, pairs)])
-        seen = [sample(shots, t, points, answered[t]) for t in range(count)]
+        points = np.concatenate([np.asarray(points).reshape(-1, 3), triangulate(clip, flow, valid, pairs)])
+        seen = [sample(clip, t, points, answered[t]) for t in range(count)]
     if sum(len(s) for s in seen) < LEAST_POINTS:
         raise InputError(
             f"--depth depth-anything: only {sum(len(s) for s in seen)} static points to bring the network's depth to scale; use --depth geometric, "
@@ -79,19 +79,19 @@ def anchored_depth(
     few = sum(len(s) < FEW for s in seen)
     say(
         f"depth: {kind} answers laid onto {np.mean([len(s) for s in seen]):.0f} points a frame, off by {np.median(errors):.1%} of the disparity there"
-        + (f"; {few} frames with few points follow their neighbours" if few else "")
+        + (f"; {few} frames with few points follow their neighbors" if few else "")
     )
     return disparity, confidence, *depth_range(disparity, confidence)
 
 
-def sample(shots: Shots, t: int, points: np.ndarray, answered: np.ndarray) -> np.ndarray:
+def sample(clip: PosedVideo, t: int, points: np.ndarray, answered: np.ndarray) -> np.ndarray:
     """What the network `answered` (H, W) for frame `t` where static `points` are seen, and their disparity: (N, 2). Points behind something
     that moves are left out."""
-    pixels, z, inside = shots.project(t, np.asarray(points, np.float64).reshape(-1, 3))
+    pixels, z, inside = clip.project(t, np.asarray(points, np.float64).reshape(-1, 3))
     height, width = answered.shape
     at = pixels[inside]
     x, y = np.clip(at[:, 0].astype(int), 0, width - 1), np.clip(at[:, 1].astype(int), 0, height - 1)
-    still = ~shots.moving[t, y, x]
+    still = ~clip.moving[t, y, x]
     there = map_coordinates(answered, (at[:, 1] - 0.5, at[:, 0] - 0.5), order=1, mode="nearest")
     return np.stack([there, 1 / z[inside]], 1)[still].astype(np.float64)
 
@@ -101,7 +101,7 @@ def align(seen: list[np.ndarray], shift: bool) -> tuple[np.ndarray, np.ndarray]:
     and how far the points are from it, (T,), as a share of their disparity (median; of frames without points that of all).
 
     Each frame's line starts from the best of many through two of its points (RANSAC) and is refined by reweighting; then all
-    frames are solved together, those that lack points to `FEW` drawn to their neighbours as strongly as the lacking points would."""
+    frames are solved together, those that lack points to `FEW` drawn to their neighbors as strongly as the lacking points would."""
     own = [first_line(s, shift) for s in seen]
     everything = np.concatenate([s for s in seen if len(s)])
     middle = first_line(everything, shift)
@@ -143,7 +143,7 @@ def first_line(s: np.ndarray, shift: bool) -> np.ndarray | None:
 
 def solve(seen: list[np.ndarray], lines: np.ndarray, spread: float, shift: bool, answers: np.ndarray) -> np.ndarray:
     """One round: the lines (T, 2) that fit all points, each weighted by how well it fits now (Geman-McClure: plainly wrong points have no say),
-    and in frames with few points the neighbours' lines. Two lines differ by what they differ by at the clip's `answers`."""
+    and in frames with few points the neighbors' lines. Two lines differ by what they differ by at the clip's `answers`."""
     count, size = len(seen), 2 if shift else 1
     matrix, vector = np.zeros((count, size, count, size)), np.zeros((count, size))
     for t, s in enumerate(seen):

@@ -1,4 +1,4 @@
-"""Many noisy disparity maps of one static scene into one good map per frame: carry the neighbours' maps over, let them vote,
+"""Many noisy disparity maps of one static scene into one good map per frame: carry the neighbors' maps over, let them vote,
 and fill what nobody saw along the image's edges."""
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from hdr_nsff.priors.depth.parallax import choose_views, disparity_range, triang
 from hdr_nsff.priors.depth.plane_sweep import sweep
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.mover_shape import relief
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 CANDIDATES = 64  # disparities tried per pixel
 VIEWS = 12  # other frames compared per frame
@@ -67,55 +67,55 @@ def geometric_depth(
     """Disparity (T, H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], near and far z-depth, from known poses.
 
     `K` (3, 3) or (T, 3, 3) px, `c2w` (T, 3, 4) OpenCV; `flow` (P, H, W, 2) px, `valid` (P, H, W) of `pairs` (P, 2), both directions
-    of neighbours; `moving`, `clipped` (T, H, W) bool; `points` (N, 3) static, may be none; `video` (T, H, W, 3) equalised rgb;
+    of neighbors; `moving`, `clipped` (T, H, W) bool; `points` (N, 3) static, may be none; `video` (T, H, W, 3) equalized rgb;
     `times` (T,) in frames, 0, 1, 2, ... if not given. Without parallax all is at distance 1, confidence 0."""
     count, size = len(video), video.shape[1:3]
     times = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, np.float64)
-    shots = Shots(
+    clip = PosedVideo(
         np.broadcast_to(np.asarray(K, np.float64), (count, 3, 3)), np.asarray(c2w, np.float64), times, video, clipped, moving
     )
-    if sum(shots.project(i, points)[2].sum() for i in range(count)) < LEAST_POINTS * count:
-        points = np.concatenate([np.asarray(points).reshape(-1, 3), triangulate(shots, flow, valid, pairs)])
-    views, parallax = choose_views(shots, points, VIEWS) if len(points) >= LEAST_POINTS else ([], 0.0)
+    if sum(clip.project(i, points)[2].sum() for i in range(count)) < LEAST_POINTS * count:
+        points = np.concatenate([np.asarray(points).reshape(-1, 3), triangulate(clip, flow, valid, pairs)])
+    views, parallax = choose_views(clip, points, VIEWS) if len(points) >= LEAST_POINTS else ([], 0.0)
     if parallax < LEAST_PARALLAX:
         say(f"depth: {parallax:.1f} pixels of parallax between the frames are too few: everything is put at distance 1")
         return np.ones((count, *size), np.float32), np.zeros((count, *size), np.float32), 0.5, 2.0
-    disparity, confidence, still = static_depth(shots, views, *disparity_range(shots, points))
+    disparity, confidence, still = static_depth(clip, views, *disparity_range(clip, points))
     moves = moving & ~still
-    with_movers, mover_confidence = mover_depth(replace(shots, moving=moves), flow, valid, pairs, disparity)
+    with_movers, mover_confidence = mover_depth(replace(clip, moving=moves), flow, valid, pairs, disparity)
     disparity, confidence = np.where(moves, with_movers, disparity), np.where(moves, mover_confidence, confidence)
-    disparity, confidence = relief(replace(shots, moving=moves), flow, valid, pairs, disparity, confidence)
+    disparity, confidence = relief(replace(clip, moving=moves), flow, valid, pairs, disparity, confidence)
     confidence = np.stack([doubt_edges(d, c) for d, c in zip(disparity, confidence, strict=True)])
     return disparity, confidence, *depth_range(disparity, confidence)
 
 
-def static_depth(shots: Shots, views: list[list[int]], low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def static_depth(clip: PosedVideo, views: list[list[int]], low: float, high: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Disparity of the static scene, also behind what moves, its confidence, and which moving pixels stand still after all
     (T, H, W): by sweep, fusion and cleaning."""
     frames = list(range(len(views)))
     candidates = np.linspace(low, high, CANDIDATES).astype(np.float32)
-    swept = in_threads(lambda i: sweep(shots, i, views[i], candidates), frames, "depth: plane sweep")
+    swept = in_threads(lambda i: sweep(clip, i, views[i], candidates), frames, "depth: plane sweep")
     disparity, matched = (np.stack(x) for x in zip(*swept, strict=True))
     disparity[(matched == 0).all((1, 2))] = np.sqrt(low * high)  # a frame that no view could match
-    doubtful = shots.moving & (matched < STILL)
+    doubtful = clip.moving & (matched < STILL)
     weight = np.where(doubtful, GUESSED**2, np.maximum(matched, GUESSED)).astype(np.float32)
-    fused = in_threads(lambda i: fuse(shots, i, views[i], disparity, weight), frames, "depth: fusion")
+    fused = in_threads(lambda i: fuse(clip, i, views[i], disparity, weight), frames, "depth: fusion")
     result, confidence = (np.stack(x) for x in zip(*fused, strict=True))
     still = ~doubtful & (np.abs(disparity - result) < AGREE * result) & (confidence > STILL_CONFIDENCE)
     return result, confidence, np.stack([cv2.medianBlur(s.astype(np.uint8), 5) > 0 for s in still])
 
 
-def fuse(shots: Shots, i: int, views: list[int], disparity: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def fuse(clip: PosedVideo, i: int, views: list[int], disparity: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Disparity and confidence (H, W) of frame `i` from its own map and those of its `views`, carried over."""
     maps, weights = [disparity[i]], [weight[i]]
     for j in views:
         there, there_weight = np.empty_like(disparity[i]), np.empty_like(disparity[i])
-        carry_over(disparity[j], weight[j], *shots.transfer(j, i), there, there_weight)
+        carry_over(disparity[j], weight[j], *clip.transfer(j, i), there, there_weight)
         maps.append(there)
         weights.append(there_weight)
     voted, agreeing, everything = vote(np.stack(maps), np.stack(weights))
     confidence = agreeing / (everything + 1)
-    cleaned = clean(voted, confidence, np.ascontiguousarray(shots.video[i], np.float32))
+    cleaned = clean(voted, confidence, np.ascontiguousarray(clip.video[i], np.float32))
     return cleaned, confidence.astype(np.float32)
 
 

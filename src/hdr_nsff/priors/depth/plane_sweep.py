@@ -1,7 +1,7 @@
 """Plane sweep: inverse depth of every pixel of one frame from other frames with known poses.
 
 For each candidate disparity (1 / z-depth) the other frames are warped as if everything lay there, compared with the frame by
-normalised cross-correlation (blind to exposure), and the costs are made smooth along eight scan directions (semi-global
+normalized cross-correlation (blind to exposure), and the costs are made smooth along eight scan directions (semi-global
 matching, Hirschmueller 2008) before the best candidate wins. Written in numba without the GIL: one thread per frame."""
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import numba
 import numpy as np
 
 from hdr_nsff.radiometry.common_range import LUMA
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 RADIUS = 2  # of the correlation window, pixels
 SHIFTS = np.ones((5, 5), np.uint8)  # a pixel may also use the best window that still holds it: sharper edges of objects
-NOISE = 1e-4  # variance of grey values that carries no information; greys in [0, 1]
+NOISE = 1e-4  # variance of gray values that carries no information; grays in [0, 1]
 BEST = 0.75  # share of the views that counts: those that match worst may be occluded
 UNKNOWN = 1.0  # cost where no view can tell: no correlation
-STEP_PENALTY, JUMP_PENALTY = 0.1, 2.0  # of a neighbour one candidate off, and of any further jump
+STEP_PENALTY, JUMP_PENALTY = 0.1, 2.0  # of a neighbor one candidate off, and of any further jump
 EDGE = 20.0  # how much an image edge lowers the price of a jump
 
 OUTSIDE = 3  # obstacle where a view does not look at all
@@ -81,14 +81,14 @@ def warp(image, obstacles, rotation, shift, disparity, warped, met):
 
 
 @jit
-def correlation_cost(grey, mean, square, other, scratch, result):
-    """1 - normalised cross-correlation of two images over the window, per pixel, into `result`; in [0, 2]."""
+def correlation_cost(gray, mean, square, other, scratch, result):
+    """1 - normalized cross-correlation of two images over the window, per pixel, into `result`; in [0, 2]."""
     other_mean, other_square, product = scratch
     box(other, RADIUS, other_mean)
     box(other * other, RADIUS, other_square)
-    box(grey * other, RADIUS, product)
-    for y in range(grey.shape[0]):
-        for x in range(grey.shape[1]):
+    box(gray * other, RADIUS, product)
+    for y in range(gray.shape[0]):
+        for x in range(gray.shape[1]):
             variance = square[y, x] - mean[y, x] ** 2 + NOISE
             other_variance = other_square[y, x] - other_mean[y, x] ** 2 + NOISE
             covariance = product[y, x] - mean[y, x] * other_mean[y, x]
@@ -114,25 +114,25 @@ def best_share(values, n):
 
 
 @jit
-def matching_costs(greys, others, tolerance, obstacles, rotations, shifts, disparities):
+def matching_costs(grays, others, tolerance, obstacles, rotations, shifts, disparities):
     """Costs (H, W, D) of each candidate disparity over `n` views.
 
-    `greys` (n, H, W): the frame, cut to the range each view recorded too; `others` (n, H, W) the views. A view counts for a pixel
+    `grays` (n, H, W): the frame, cut to the range each view recorded too; `others` (n, H, W) the views. A view counts for a pixel
     where its obstacle (n, H, W) is below the pixel's `tolerance` (n, H, W): see `obstacles_of`. Pixels go to
     `rotations` (n, 3, 3) (x, y, 1) + disparity `shifts` (n, 3), homogeneous."""
-    n, h, w = greys.shape
+    n, h, w = grays.shape
     costs = np.empty((h, w, len(disparities)), np.float32)
     means, squares = np.empty((n, h, w), np.float32), np.empty((n, h, w), np.float32)
     for i in range(n):
-        box(greys[i], RADIUS, means[i])
-        box(greys[i] * greys[i], RADIUS, squares[i])
+        box(grays[i], RADIUS, means[i])
+        box(grays[i] * grays[i], RADIUS, squares[i])
     scratch = np.empty((3, h, w), np.float32)
     warped, cost, met = np.empty((h, w), np.float32), np.empty((n, h, w), np.float32), np.empty((n, h, w), np.uint8)
     values = np.empty(n, np.float32)
     for k in range(len(disparities)):
         for i in range(n):
             warp(others[i], obstacles[i], rotations[i], shifts[i], disparities[k], warped, met[i])
-            correlation_cost(greys[i], means[i], squares[i], warped, scratch, cost[i])
+            correlation_cost(grays[i], means[i], squares[i], warped, scratch, cost[i])
         for y in range(h):
             for x in range(w):
                 count = 0
@@ -148,7 +148,7 @@ def matching_costs(greys, others, tolerance, obstacles, rotations, shifts, dispa
 def aggregate(costs, guide):
     """Semi-global matching: the sum over eight directions of the cheapest path to each candidate (H, W, D).
 
-    A jump between neighbours costs less where the grey `guide` (H, W) has an edge."""
+    A jump between neighbors costs less where the gray `guide` (H, W) has an edge."""
     h, w, d = costs.shape
     total = np.zeros((h, w, d), np.float32)
     step = np.float32(STEP_PENALTY)
@@ -184,31 +184,31 @@ def aggregate(costs, guide):
     return total
 
 
-def sweep(shots: Shots, i: int, views: list[int], disparities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def sweep(clip: PosedVideo, i: int, views: list[int], disparities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Disparity (H, W) of frame `i` of the static scene, and how well it matched (H, W) in [0, 1], 0 where no view could tell."""
     if not views:
-        return np.full(shots.size, disparities.mean(), np.float32), np.zeros(shots.size, np.float32)
-    greys, others, tolerance, obstacles, geometry = [], [], [], [], []
+        return np.full(clip.size, disparities.mean(), np.float32), np.zeros(clip.size, np.float32)
+    grays, others, tolerance, obstacles, geometry = [], [], [], [], []
     for j in views:
-        low, high = np.maximum(shots.ranges[i][0], shots.ranges[j][0]), np.minimum(shots.ranges[i][1], shots.ranges[j][1])
-        greys.append(np.clip(shots.video[i], low, high) @ LUMA)  # what saturates in one frame looks saturated in the other too
-        others.append(np.clip(shots.video[j], low, high) @ LUMA)
-        frozen = bool(shots.times[i] == shots.times[j])  # two cameras at one instant: nothing moves between them
-        obstacles.append(obstacles_of(shots, j, frozen))
-        tolerance.append(np.array([1, 2, 0], np.uint8)[obstacles_of(shots, i, frozen)])
-        geometry.append(shots.transfer(i, j))
+        low, high = np.maximum(clip.ranges[i][0], clip.ranges[j][0]), np.minimum(clip.ranges[i][1], clip.ranges[j][1])
+        grays.append(np.clip(clip.video[i], low, high) @ LUMA)  # what saturates in one frame looks saturated in the other too
+        others.append(np.clip(clip.video[j], low, high) @ LUMA)
+        frozen = bool(clip.times[i] == clip.times[j])  # two cameras at one instant: nothing moves between them
+        obstacles.append(obstacles_of(clip, j, frozen))
+        tolerance.append(np.array([1, 2, 0], np.uint8)[obstacles_of(clip, i, frozen)])
+        geometry.append(clip.transfer(i, j))
     turns, shifts = (np.stack(x) for x in zip(*geometry, strict=True))
-    costs = matching_costs(*(np.stack(x) for x in (greys, others, tolerance, obstacles)), turns, shifts, disparities)
-    return winner(costs, shots.video[i] @ LUMA, disparities)
+    costs = matching_costs(*(np.stack(x) for x in (grays, others, tolerance, obstacles)), turns, shifts, disparities)
+    return winner(costs, clip.video[i] @ LUMA, disparities)
 
 
-def obstacles_of(shots: Shots, i: int, frozen: bool) -> np.ndarray:
+def obstacles_of(clip: PosedVideo, i: int, frozen: bool) -> np.ndarray:
     """0 where frame `i` shows the static scene, 1 where it moves (unless `frozen`), 2 where clipped: (H, W) uint8.
 
     Static pixels are compared with static ones only. Pixels in a moving mask may match anything: if one depth fits many views all the
     same, the mask was wrong there."""
-    moving = np.zeros_like(shots.moving[i]) if frozen else shots.moving[i]
-    return np.where(shots.clipped[i], 2, moving).astype(np.uint8)
+    moving = np.zeros_like(clip.moving[i]) if frozen else clip.moving[i]
+    return np.where(clip.clipped[i], 2, moving).astype(np.uint8)
 
 
 def winner(costs: np.ndarray, guide: np.ndarray, disparities: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

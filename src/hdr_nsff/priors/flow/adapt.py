@@ -20,7 +20,7 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.priors.flow.correlation import cells, costs, locate, sample
 from hdr_nsff.priors.flow.features import Features
 
-DETAIL = 4  # by how many colours across a cell is shown to the network
+DETAIL = 4  # by how many colors across a cell is shown to the network
 HIDDEN = 32
 POINTS = 128  # per term and step
 RATE = 1e-3
@@ -56,7 +56,7 @@ class Track(NamedTuple):
 
 
 class Residual(nn.Module):
-    """Features plus a correction that starts at zero, seen from the features and from colours finer than them."""
+    """Features plus a correction that starts at zero, seen from the features and from colors finer than them."""
 
     def __init__(self, channels: int, size: float) -> None:
         """`channels` C of the features, `size` their mean length, which is the unit of the correction."""
@@ -74,7 +74,7 @@ class Residual(nn.Module):
         return maps + self.size * self.outer(functional.gelu(self.middle(x)))
 
 
-def colours(video: np.ndarray, features: Features, across: int) -> Tensor:
+def colors(video: np.ndarray, features: Features, across: int) -> Tensor:
     """What `video` (T, H, W, 3) shows in each cell, in `across` x `across` samples: (T, 3 * across^2, h, w)."""
     h, w = features.maps.shape[-2:]
     step = features.stride / across
@@ -124,21 +124,21 @@ def near_term(refined: Tensor, original: Tensor) -> Tensor:
 
 
 class Lesson:
-    """A clip to learn from: its features and colours, tracks, and the pairs of neighbours."""
+    """A clip to learn from: its features and colors, tracks, and the pairs of neighbors."""
 
     def __init__(
-        self, features: Features, video: np.ndarray, tracks: list[Track], neighbours: list[tuple[int, int]], matching: Matching
+        self, features: Features, video: np.ndarray, tracks: list[Track], neighbors: list[tuple[int, int]], matching: Matching
     ) -> None:
-        """`video` (T, H, W, 3) exposure-equalised; `neighbours`: pairs of frames one after the other, whatever their exposures."""
-        self.maps, self.detail = features.maps, colours(video, features, DETAIL)
-        self.tracks, self.neighbours, self.matching = tracks, neighbours, matching
-        frames = sorted({t for pair in neighbours for t in pair})  # to learn from; the others may be held out
+        """`video` (T, H, W, 3) exposure-equalized; `neighbors`: pairs of frames one after the other, whatever their exposures."""
+        self.maps, self.detail = features.maps, colors(video, features, DETAIL)
+        self.tracks, self.neighbors, self.matching = tracks, neighbors, matching
+        frames = sorted({t for pair in neighbors for t in pair})  # to learn from; the others may be held out
         self.size = float(features.maps[frames].norm(dim=1).mean())
-        self.buddies = {(i, j): best_buddies(self.maps[i], self.maps[j], matching.reach) for i, j in neighbours}
+        self.buddies = {(i, j): best_buddies(self.maps[i], self.maps[j], matching.reach) for i, j in neighbors}
 
     def terms(self, network: Residual, rng: np.random.Generator) -> dict[str, Tensor]:
-        """The terms of one step, each a mean, over one pair of neighbours and one track."""
-        i, j = self.neighbours[rng.integers(len(self.neighbours))]
+        """The terms of one step, each a mean, over one pair of neighbors and one track."""
+        i, j = self.neighbors[rng.integers(len(self.neighbors))]
         refined, original = self.refine(network, [i, j]), self.maps[[i, j]]
         m = self.matching
         h, w = self.maps.shape[-2:]
@@ -175,16 +175,16 @@ def adapt(lesson: Lesson, steps: int, seed: int, weights: AdaptWeights) -> Tenso
         torch.manual_seed(seed)
         network = Residual(lesson.maps.shape[1], lesson.size)
     rng = np.random.default_rng(seed)
-    optimiser = torch.optim.Adam(network.parameters(), RATE)
+    optimizer = torch.optim.Adam(network.parameters(), RATE)
     begun = time.monotonic()
     for step in track(range(steps), "features of this clip"):
-        for group in optimiser.param_groups:
+        for group in optimizer.param_groups:
             group["lr"] = RATE * (1 - step / steps)
         terms = lesson.terms(network, rng)
         loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
-        optimiser.step()
+        optimizer.step()
     say(f"features of this clip: {steps} steps, {steps / (time.monotonic() - begun):.1f} a second")
     with torch.no_grad():
         return torch.cat([lesson.refine(network, [t]) for t in range(len(lesson.maps))])

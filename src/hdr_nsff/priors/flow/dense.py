@@ -16,11 +16,11 @@ import numpy as np
 from hdr_nsff.core.parallel import in_threads
 from hdr_nsff.geometry.round_trip import agreement, allowed, follow, round_trip
 from hdr_nsff.priors.flow.local_motion import filled
-from hdr_nsff.radiometry.common_range import common_grey, recorded_range
+from hdr_nsff.radiometry.common_range import common_gray, recorded_range
 
 SMALL = 100_000  # frames of fewer pixels are matched at twice their size
 MISSED = 0.1  # pixels: a round trip that misses by so much is trusted exp(-1/2); one that misses by more, or is clipped, is told by what is around
-PLAIN = 64.0  # squared greys per pixel: the smaller eigenvalue of the structure tensor at which a pixel is trusted by half
+PLAIN = 64.0  # squared grays per pixel: the smaller eigenvalue of the structure tensor at which a pixel is trusted by half
 BLIND = 0.1  # trust in a clipped pixel, relative to others: patches around it may show something
 
 
@@ -28,7 +28,7 @@ class FlowPrior(Protocol):
     """What `prepare` calls, whatever is behind it."""
 
     def __call__(self, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Exposure-equalised rgb `video` (T, H, W, 3) in [0, 1], `clipped` (T, H, W) bool, `pairs` (P, 2) of frames (from, to)
+        """Exposure-equalized rgb `video` (T, H, W, 3) in [0, 1], `clipped` (T, H, W) bool, `pairs` (P, 2) of frames (from, to)
         -> flow (P, H, W, 2) float32 px, valid (P, H, W) bool."""
         ...
 
@@ -38,12 +38,12 @@ def flow(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flow (P, H, W, 2) float32 px and valid (P, H, W) bool of `pairs` (P, 2) by dense inverse search, checked against the reverse.
 
-    `video` (T, H, W, 3) is exposure-equalised rgb in [0, 1], `clipped` (T, H, W) bool marks pixels without information.
+    `video` (T, H, W, 3) is exposure-equalized rgb in [0, 1], `clipped` (T, H, W) bool marks pixels without information.
     The answer does not depend on the order of the pairs or on the number of cores. `report` None shows no progress."""
     ranges = {int(k): recorded_range(video[k], clipped[k]) for k in np.unique(np.asarray(pairs, np.int64))}
 
     def both_ways(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-        a, b = common_grey(video, ranges, i, j)
+        a, b = common_gray(video, ranges, i, j)
         return dense_inverse_search(a, b), dense_inverse_search(b, a)
 
     return checked(both_ways, clipped, pairs, report)
@@ -72,7 +72,7 @@ def checked(
 
 
 def dense_inverse_search(a: np.ndarray, b: np.ndarray, initial: np.ndarray | None = None) -> np.ndarray:
-    """Flow (H, W, 2) px between grey uint8 (H, W) images, by OpenCV's DIS with a long variational refinement.
+    """Flow (H, W, 2) px between gray uint8 (H, W) images, by OpenCV's DIS with a long variational refinement.
 
     With `initial` flow (H, W, 2) the search starts from it and at half the size, so it only mends what is nearly right.
     Small frames are doubled first: measured on moving objects, the median error falls by a quarter; larger ones only gain noise."""
@@ -105,7 +105,7 @@ def told(
     clipped_there: np.ndarray,
     moving: np.ndarray,
 ) -> np.ndarray:
-    """`flow` (H, W, 2) px between grey uint8 pictures (H, W), where it is not sure told by the trusted pixels around that move alike.
+    """`flow` (H, W, 2) px between gray uint8 pictures (H, W), where it is not sure told by the trusted pixels around that move alike.
 
     What stands still tells nothing of what is `moving` (H, W) bool. Masks miss some of that, so the rest is told by all; of what is clipped
     they know nothing. Trusted is what agrees with its `reverse`, shows something in both pictures, and is clipped at neither end."""
@@ -124,6 +124,6 @@ def halfway(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
     return forward - 0.5 * missed * near[..., None]
 
 
-def detail(grey: np.ndarray) -> np.ndarray:
-    """The smaller eigenvalue (H, W) of the structure tensor over 5x5 pixels, in squared greys per pixel (Shi & Tomasi 1994)."""
-    return cv2.cornerMinEigenVal(cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 0.6), 5) / 4
+def detail(gray: np.ndarray) -> np.ndarray:
+    """The smaller eigenvalue (H, W) of the structure tensor over 5x5 pixels, in squared grays per pixel (Shi & Tomasi 1994)."""
+    return cv2.cornerMinEigenVal(cv2.GaussianBlur(gray.astype(np.float32), (0, 0), 0.6), 5) / 4

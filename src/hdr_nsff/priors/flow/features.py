@@ -31,8 +31,8 @@ BLOCKS: dict[str, tuple[tuple[int, int, int, int], ...]] = {
     "block5": ((64, 128, 3, 2), (128, 128, 3, 1), (128, 128, 3, 1), (128, 64, 1, 1)),
     "block_fusion": ((64, 64, 3, 1), (64, 64, 3, 1)),
 }
-LINEAR = {"skip1.1": (1, 24), "block_fusion.2": (64, 64)}  # 1x1 convolutions without normalisation
-NORM_EPSILON = 1e-5  # of torch's normalisation layers, with which the weights were trained
+LINEAR = {"skip1.1": (1, 24), "block_fusion.2": (64, 64)}  # 1x1 convolutions without normalization
+NORM_EPSILON = 1e-5  # of torch's normalization layers, with which the weights were trained
 XFEAT_STRIDE, XFEAT_MULTIPLE = 8, 32  # pixels per cell; the sides of its input are multiples of that
 XFEAT_ORIGIN = 2.0  # pixels: the middle of what its first cell looks at, measured by gradients (1.9 +- 0.5)
 SMALL = 100_000  # frames of fewer pixels are doubled before XFeat sees them
@@ -45,12 +45,12 @@ IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # wh
 class Features:
     """Features of every frame on a grid of cells."""
 
-    maps: Tensor  # (T, C, h, w) float32, not normalised
+    maps: Tensor  # (T, C, h, w) float32, not normalized
     stride: float  # pixels of the frame from cell to cell
-    origin: float  # pixel coordinate (centres at +0.5), in x and y, of the middle of what cell (0, 0) looks at
+    origin: float  # pixel coordinate (centers at +0.5), in x and y, of the middle of what cell (0, 0) looks at
 
 
-Source = Callable[[np.ndarray], Features]  # exposure-equalised rgb (T, H, W, 3) in [0, 1] -> Features
+Source = Callable[[np.ndarray], Features]  # exposure-equalized rgb (T, H, W, 3) in [0, 1] -> Features
 FeatureName = Literal["xfeat", "dinov2-small", "dinov2-base", "dinov2-large"]
 
 
@@ -83,7 +83,7 @@ def magnified(frame: np.ndarray, scale: float, multiple: int) -> Tensor:
 
 
 class XFeat(nn.Module):
-    """XFeat's dense descriptors: 64 channels at an eighth of the picture. Each normalisation is folded into its convolution."""
+    """XFeat's dense descriptors: 64 channels at an eighth of the picture. Each normalization is folded into its convolution."""
 
     def __init__(self, state: dict[str, Tensor]) -> None:
         """`state` holds the published weights by their names; those of its keypoint heads are not used."""
@@ -118,8 +118,8 @@ class XFeat(nn.Module):
 
     def forward(self, rgb: Tensor) -> Tensor:
         """Descriptors (T, 64, H/8, W/8) of rgb (T, 3, H, W), any scale and offset of brightness; sides are multiples of 32."""
-        grey = functional.instance_norm(rgb.mean(1, keepdim=True), eps=NORM_EPSILON)
-        quarter = self.block(grey, "block1") + self.convolve(functional.avg_pool2d(grey, 4), "skip1_1")
+        gray = functional.instance_norm(rgb.mean(1, keepdim=True), eps=NORM_EPSILON)
+        quarter = self.block(gray, "block1") + self.convolve(functional.avg_pool2d(gray, 4), "skip1_1")
         eighth = self.block(self.block(quarter, "block2"), "block3")
         sixteenth = self.block(eighth, "block4")
         coarse = self.block(sixteenth, "block5")
@@ -163,9 +163,9 @@ def tokens(network: Any, layer: int, stride: int, rgb: Tensor) -> Tensor:
     """What DINOv2's patch tokens are after `layer` layers: (1, C, h, w) of rgb (1, 3, H, W), patches `stride` pixels apart, so that
     they overlap; the position encodings are interpolated to as many."""
     embeddings, shape = network.embeddings, (1, 3, 1, 1)
-    normalised = (rgb - torch.tensor(IMAGENET_MEAN).view(shape)) / torch.tensor(IMAGENET_STD).view(shape)
+    normalized = (rgb - torch.tensor(IMAGENET_MEAN).view(shape)) / torch.tensor(IMAGENET_STD).view(shape)
     projection = embeddings.patch_embeddings.projection
-    patches = functional.conv2d(normalised, projection.weight, projection.bias, stride)  # (1, C, h, w)
+    patches = functional.conv2d(normalized, projection.weight, projection.bias, stride)  # (1, C, h, w)
     position = embeddings.position_embeddings  # (1, 1 + n * n, C), the class token's first
     n = round((position.shape[1] - 1) ** 0.5)
     grid = position[:, 1:].unflatten(1, (n, n)).permute(0, 3, 1, 2)

@@ -47,7 +47,7 @@ class GMFlow(nn.Module):
         No gradient runs from one part to those before through flow: each is trained by its own prediction."""
         assert images.shape[0] % 2 == 0 and not any(s % MULTIPLE for s in images.shape[2:]), f"images {tuple(images.shape)}"
         with self.arithmetic(images):
-            fine, coarse = (f.to(images.dtype) for f in self.backbone(normalised(images)))
+            fine, coarse = (f.to(images.dtype) for f in self.backbone(normalized(images)))
         features = self.acquainted(coarse, WINDOWS[0])
         matched = match_everywhere(features)
         spread = self.spread_everywhere(features, matched.detach())
@@ -109,7 +109,7 @@ class Encoder(nn.Module):
 
 
 class Residual(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut, every one normalised over its image."""
+    """Two 3 x 3 convolutions beside a shortcut, every one normalized over its image."""
 
     def __init__(self, channels: int, out: int, stride: int = 1) -> None:
         super().__init__()
@@ -181,7 +181,7 @@ class Attention(nn.Module):
         return tokens + message
 
 
-def normalised(images: Tensor) -> Tensor:
+def normalized(images: Tensor) -> Tensor:
     """Images (N, 3, H, W) in [0, 1] in units of the deviation from the mean that the encoder was trained with."""
     return (images - images.new_tensor(MEAN).view(3, 1, 1)) / images.new_tensor(DEVIATION).view(3, 1, 1)
 
@@ -205,7 +205,7 @@ def out_of_windows(cut: Tensor, shape: torch.Size, windows: int) -> Tensor:
 
 
 def together(size: tuple[int, ...], move: tuple[int, int], windows: int, device: torch.device) -> Tensor:
-    """Which tokens of a window (windows^2, L, L) bool were neighbours before the image of `size` (H, W) was rolled by `move`."""
+    """Which tokens of a window (windows^2, L, L) bool were neighbors before the image of `size` (H, W) was rolled by `move`."""
     down, right = (torch.arange(s, device=device) >= s - m for s, m in zip(size, move, strict=True))
     part = in_windows((2 * down[:, None] + right)[None, ..., None], windows)[0, ..., 0]  # (windows^2, L)
     return part[:, :, None] == part[:, None]

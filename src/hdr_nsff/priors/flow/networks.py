@@ -20,7 +20,7 @@ from hdr_nsff.priors.flow.dense import checked, dense_inverse_search
 from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.priors.flow.raft import Raft
 from hdr_nsff.priors.weights import find
-from hdr_nsff.radiometry.common_range import common_grey, common_rgb, recorded_range
+from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
 
 Network = Literal["gmflow", "raft"]
 FINETUNED = "weights.safetensors"  # what `finetune-flow` leaves in its folder
@@ -41,14 +41,14 @@ def matched_flow(
 
     def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         there, back = both_ways(network, *common_rgb(video, ranges, i, j))
-        a, b = common_grey(video, ranges, i, j)
+        a, b = common_gray(video, ranges, i, j)
         return mended(a, b, there), mended(b, a, back)
 
     return checked(match, clipped, pairs, report, threads=1)
 
 
 def mended(a: np.ndarray, b: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """Flow (H, W, 2) px between grey uint8 (H, W) images, searched on from a network's `flow`, which stays where the search leaves it.
+    """Flow (H, W, 2) px between gray uint8 (H, W) images, searched on from a network's `flow`, which stays where the search leaves it.
 
     Networks find large motion, the search is exact to a tenth of a pixel on what they found; where it goes farther than `MEND`, it is lost."""
     found = dense_inverse_search(a, b, flow)

@@ -1,8 +1,8 @@
 """Frames brought to one exposure through the camera's response, which the frames tell themselves as soon as flow is there.
 
-Equalising by brightness (`exposure.equalise`) assumes that all exposures saw the same things, equally often; whatever moves in or out bends
+Equalizing by brightness (`exposure.equalize`) assumes that all exposures saw the same things, equally often; whatever moves in or out bends
 it. Pixels that flow has found in two exposures assume nothing: from those at rest the response and the steps are estimated
-(`response.debevec`), and what is matched from then on is equalised through them."""
+(`response.debevec`), and what is matched from then on is equalized through them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
-    Neighbourhoods,
+    Neighborhoods,
     ResponseFit,
     Samples,
     debevec,
@@ -70,7 +70,7 @@ def matched_samples(
     return Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("rgb", "valid", "saturated")))
 
 
-def read(found: Samples, bracket: int, maps: Neighbourhoods, y: np.ndarray, x: np.ndarray, some: np.ndarray) -> None:
+def read(found: Samples, bracket: int, maps: Neighborhoods, y: np.ndarray, x: np.ndarray, some: np.ndarray) -> None:
     """Enter what `some` (P,) of the points are at pixels `y`, `x` (P,) of a frame, where nothing is entered for its bracket."""
     some = some & ~(found.valid | found.saturated)[:, bracket].any(-1)
     found.rgb[some, bracket] = maps.mean[y, x][some]

@@ -1,7 +1,7 @@
 """Flow by what things look like to a network (paper section 3.4), which changes little with the exposure.
 
 Features of all frames, fitted to the clip (`adapt`), are matched between two frames by cosine cost volume and soft-argmax; cells
-whose round trip fails are filled from believed ones of like colour, and dense inverse search goes on from there to sub-pixel flow.
+whose round trip fails are filled from believed ones of like color, and dense inverse search goes on from there to sub-pixel flow.
 Measured on rendered scenes with exact flow, this beats matching from nothing wherever things move by more than a few pixels and
 is as good elsewhere, so it is asked everywhere and not on moving pixels alone, as the paper has to with its noisy background."""
 
@@ -16,15 +16,15 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.round_trip import follow, round_trip
-from hdr_nsff.priors.flow.adapt import AdaptWeights, Lesson, Matching, Track, adapt, colours
+from hdr_nsff.priors.flow.adapt import AdaptWeights, Lesson, Matching, Track, adapt, colors
 from hdr_nsff.priors.flow.correlation import motion
 from hdr_nsff.priors.flow.dense import checked, dense_inverse_search
 from hdr_nsff.priors.flow.features import FeatureName, Features, Source, feature_source
-from hdr_nsff.radiometry.common_range import common_grey, recorded_range
+from hdr_nsff.radiometry.common_range import common_gray, recorded_range
 
 REACH = 1 / 6  # of the longer side: how far things may move from frame to frame
 LOST = 1.5  # cells by which a round trip may miss
-ALIKE = 0.05  # difference of rgb at which a neighbour's motion counts exp(-1/2)
+ALIKE = 0.05  # difference of rgb at which a neighbor's motion counts exp(-1/2)
 FILL_RADIUS, PIXEL_RADIUS = 4, 1  # cells around from which a cell is filled, and a pixel gets its motion
 ENOUGH = 100  # believed pixels, below which a pair of equal exposure teaches nothing
 
@@ -47,22 +47,22 @@ class SemanticConfig:
     """Randomness of that fitting."""
 
 
-def semantic_flow(config: SemanticConfig, weights: Path | None, neighbours: Pairs, equal: Pairs) -> SemanticFlow:
+def semantic_flow(config: SemanticConfig, weights: Path | None, neighbors: Pairs, equal: Pairs) -> SemanticFlow:
     """The flow prior of these settings; `weights` of the features, None for wherever they are found; pairs as of `SemanticFlow`."""
     steps = (0 if config.features == "xfeat" else 300) if config.steps is None else config.steps
     if steps < 0:
         raise InputError(f"--semantic.steps {steps}: must be 0 or more")
     source = feature_source(config.features, weights, config.layer, config.stride)
-    return SemanticFlow(source, neighbours, equal, steps, config.seed)
+    return SemanticFlow(source, neighbors, equal, steps, config.seed)
 
 
 class SemanticFlow:
     """`FlowPrior` by features. It looks at the clip once, when the first pairs are asked for: features, and their fitting to it."""
 
-    def __init__(self, source: Source, neighbours: Pairs = (), equal: Pairs = (), steps: int = 0, seed: int = 0) -> None:
-        """What the features are fitted to: `neighbours`, pairs of frames one after the other, and `equal`, pairs of consecutive frames
-        of equal exposure. No `steps`, or no neighbours, leaves the features as they are."""
-        self.source, self.neighbours, self.equal = source, list(neighbours), list(equal)
+    def __init__(self, source: Source, neighbors: Pairs = (), equal: Pairs = (), steps: int = 0, seed: int = 0) -> None:
+        """What the features are fitted to: `neighbors`, pairs of frames one after the other, and `equal`, pairs of consecutive frames
+        of equal exposure. No `steps`, or no neighbors, leaves the features as they are."""
+        self.source, self.neighbors, self.equal = source, list(neighbors), list(equal)
         self.steps, self.seed = steps, seed
         self.features: Features | None = None
 
@@ -75,10 +75,10 @@ class SemanticFlow:
     def fitted(self, video: np.ndarray, clipped: np.ndarray) -> Features:
         """The clip's features, fitted to it."""
         found = self.source(video)
-        if self.steps == 0 or not self.neighbours:
+        if self.steps == 0 or not self.neighbors:
             return found
         tracks = equal_tracks(found, video, clipped, self.equal)
-        lesson = Lesson(found, video, tracks, self.neighbours, how(found, video))
+        lesson = Lesson(found, video, tracks, self.neighbors, how(found, video))
         return Features(adapt(lesson, self.steps, self.seed, AdaptWeights()), found.stride, found.origin)
 
 
@@ -94,7 +94,7 @@ def matched(
     ranges = {int(k): recorded_range(video[k], clipped[k]) for k in np.unique(np.asarray(pairs, np.int64))}
 
     def both_ways(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-        a, b = common_grey(video, ranges, i, j)
+        a, b = common_gray(video, ranges, i, j)
         there, back = coarse(features, video, i, j)
         return dense_inverse_search(a, b, there), dense_inverse_search(b, a, back)
 
@@ -107,7 +107,7 @@ def coarse(features: Features, video: np.ndarray, i: int, j: int) -> tuple[np.nd
     with torch.no_grad():
         there = motion(maps[i], maps[j], m.reach, m.radius, m.temperature).numpy()
         back = motion(maps[j], maps[i], m.reach, m.radius, m.temperature).numpy()
-        shown = colours(video[[i, j]], features, 1).permute(0, 2, 3, 1).numpy()
+        shown = colors(video[[i, j]], features, 1).permute(0, 2, 3, 1).numpy()
     flows = []
     for one, other, k, cell_rgb in ((there, back, i, shown[0]), (back, there, j, shown[1])):
         sure = round_trip(one, other) < LOST

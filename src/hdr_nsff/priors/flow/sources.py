@@ -14,7 +14,7 @@ from hdr_nsff.footage.flow_files import read_flow
 from hdr_nsff.priors.flow.dense import FlowPrior, flow
 from hdr_nsff.priors.flow.networks import load, matched_flow, weights_file
 from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, semantic_flow
-from hdr_nsff.priors.weights import entry, find, look
+from hdr_nsff.priors.weights import entry, find, locate
 
 FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
 NETWORKS = frozenset({"semantic", "gmflow", "raft", "raft-finetuned"})  # the names that `--flow-weights` is for
@@ -24,7 +24,7 @@ def resolved(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
     """What was chosen; None stands for `semantic` where the weights of its `features` are on this machine, else for `dis`, which needs none."""
     if chosen is not None:
         return chosen
-    return "dis" if look(entry(features)) is None else "semantic"
+    return "dis" if locate(entry(features)) is None else "semantic"
 
 
 def fallback_note(chosen: FlowName | Path | None, features: str) -> str:
@@ -60,12 +60,12 @@ def flow_source(
     chosen: FlowName | Path | None,
     weights: Path | None = None,
     semantic: SemanticConfig | None = None,
-    neighbours: Pairs = (),
+    neighbors: Pairs = (),
     equal: Pairs = (),
 ) -> FlowPrior:
     """The flow prior that `--flow` chose, None for what it stands for; its `video` and `pairs` are those of the whole clip.
 
-    `semantic` (its defaults where None), `neighbours` and `equal` are what `SemanticFlow` fits its features by."""
+    `semantic` (its defaults where None), `neighbors` and `equal` are what `SemanticFlow` fits its features by."""
     semantic = semantic or SemanticConfig()
     match source := resolved(chosen, semantic.features):
         case Path():
@@ -73,7 +73,7 @@ def flow_source(
         case "dis":
             return partial(flow, report=None)
         case "semantic":
-            return semantic_flow(semantic, weights, neighbours, equal)
+            return semantic_flow(semantic, weights, neighbors, equal)
         case "gmflow" | "raft":
             return partial(matched_flow, load(source, weights, device()))
         case "raft-finetuned":

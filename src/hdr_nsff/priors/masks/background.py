@@ -14,8 +14,8 @@ from hdr_nsff.core.parallel import in_threads
 from hdr_nsff.radiometry.common_range import LUMA, recorded_range
 
 SOURCES = 16  # frames the background is taken from
-DIFFERENT = 0.06  # of equalised rgb in [0, 1], beyond noise
-TEXTURED = 0.06  # standard deviation of grey in a window, from which flow can be believed
+DIFFERENT = 0.06  # of equalized rgb in [0, 1], beyond noise
+TEXTURED = 0.06  # standard deviation of gray in a window, from which flow can be believed
 PART = 0.25  # share of a differing patch that must be known to move
 
 
@@ -24,7 +24,7 @@ def correct_masks(
 ) -> np.ndarray:
     """`moving` (T, H, W) bool corrected by the background.
 
-    `video` (T, H, W, 3) exposure-equalised rgb, `clipped` (T, H, W) bool, `K` (T, 3, 3) px, `c2w` (T, 3, 4) without parallax;
+    `video` (T, H, W, 3) exposure-equalized rgb, `clipped` (T, H, W) bool, `K` (T, 3, 3) px, `c2w` (T, 3, 4) without parallax;
     `sources` indices of the frames that may show the background."""
     chosen = sources[np.unique(np.linspace(0, len(sources) - 1, min(SOURCES, len(sources))).astype(int))]
 
@@ -62,15 +62,15 @@ def different(i: int, video: np.ndarray, clipped: np.ndarray, K: np.ndarray, c2w
 
 
 def laid_over(K_from: np.ndarray, from_c2w: np.ndarray, K_to: np.ndarray, to_c2w: np.ndarray) -> np.ndarray:
-    """The homography (3, 3) from array indices (x, y) of one frame to those of another with the same centre."""
+    """The homography (3, 3) from array indices (x, y) of one frame to those of another with the same center."""
     shift = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
     return np.linalg.inv(shift) @ K_to @ to_c2w[:, :3].T @ from_c2w[:, :3] @ np.linalg.inv(K_from) @ shift
 
 
 def textured(frame: np.ndarray) -> np.ndarray:
-    """Where grey varies enough in a 9 x 9 window for flow to hold on to: (H, W) bool."""
-    grey = (frame @ LUMA).astype(np.float32)
-    variance = cv2.blur(grey * grey, (9, 9)) - cv2.blur(grey, (9, 9)) ** 2
+    """Where gray varies enough in a 9 x 9 window for flow to hold on to: (H, W) bool."""
+    gray = (frame @ LUMA).astype(np.float32)
+    variance = cv2.blur(gray * gray, (9, 9)) - cv2.blur(gray, (9, 9)) ** 2
     return np.sqrt(np.maximum(variance, 0)) > TEXTURED
 
 

@@ -1,6 +1,6 @@
 """Which pixels move by themselves: those whose optical flow the camera's own motion does not explain.
 
-Flow between neighbours is chained over a few frames, so that slow motion rises above the noise of flow. `rough_mask` needs no
+Flow between neighbors is chained over a few frames, so that slow motion rises above the noise of flow. `rough_mask` needs no
 poses: it asks whether a pixel obeys the epipolar geometry (or the homography) that most pixels obey. `geometric_mask` has poses: it
 asks whether one depth explains where a pixel goes in all frames around it. That also finds what moves along epipolar lines, and
 asks no depth of cameras that only turn. Either way the static answer must also explain the pictures worse than the flow does:
@@ -19,12 +19,12 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.geometry.round_trip import follow
 from hdr_nsff.priors.poses.rotation import epipolar, homography
 
-REACH = 6  # neighbours looked at on each side
+REACH = 6  # neighbors looked at on each side
 WORKING = 100_000  # pixels: larger frames are judged on a coarser grid
 QUIET, LOUD = 0.6, 1.0  # pixels: bounds of the noise of flow; the best flow still errs by so much beside edges
 LIKELY, SURE = 1.25, 2.5  # residual in units of noise: how far a moving object reaches, and what proves one
 HIGHEST = 4.0  # residuals beyond this many units of noise say no more than this
-TEXTURE = 0.6  # pixels: where image noise alone shifts a patch by more than this, it is asked little and its neighbours instead
+TEXTURE = 0.6  # pixels: where image noise alone shifts a patch by more than this, it is asked little and its neighbors instead
 SMALLEST = 0.0012  # share of the frame below which nothing counts as an object
 HOLE = 0.05  # share of the frame below which what movers (and the frame's edge) enclose moves too
 LARGEST = 0.6  # share of a frame beyond which a mask is doubted
@@ -45,7 +45,7 @@ class Step:
 class Footage:
     """A clip on the working grid, and for every frame the flow that leads to the next and to the previous one."""
 
-    grey: np.ndarray  # (T, H, W) float32, equalised
+    gray: np.ndarray  # (T, H, W) float32, equalized
     flow: np.ndarray  # (P, H, W, 2) px of the working grid
     valid: np.ndarray  # (P, H, W) bool
     to: tuple[dict[int, tuple[int, int]], dict[int, tuple[int, int]]]  # forward, backward: frame -> (pair, other frame)
@@ -62,7 +62,7 @@ def rough_mask(flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, video: np
     """Moving pixels (T, H, W) bool from flow alone: those that disagree with any one epipolar geometry, or with any one homography
     where that explains the footage.
 
-    `flow` (P, H, W, 2) px and `valid` (P, H, W) bool of `pairs` (P, 2) (from, to); `video` (T, H, W, 3) equalised rgb in [0, 1].
+    `flow` (P, H, W, 2) px and `valid` (P, H, W) bool of `pairs` (P, 2) (from, to); `video` (T, H, W, 3) equalized rgb in [0, 1].
     A frame that no pair starts from has nothing moving."""
     footage = prepared(flow, valid, pairs, video)
     miss = homography_miss if planar(footage) else epipolar_miss
@@ -96,7 +96,7 @@ def prepared(flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, video: np.n
         return cv2.resize(image, small, interpolation=cv2.INTER_AREA) if coarseness > 1 else image
 
     return Footage(
-        grey=np.stack([shrunk(cv2.GaussianBlur(frame @ LUMA, (0, 0), 0.7)) for frame in video]),
+        gray=np.stack([shrunk(cv2.GaussianBlur(frame @ LUMA, (0, 0), 0.7)) for frame in video]),
         flow=np.array([shrunk(f) / coarseness for f in flow], np.float32).reshape(-1, *small[::-1], 2),
         valid=np.array([shrunk(v) > 0.5 for v in valid], bool).reshape(-1, *small[::-1]),
         to=to,
@@ -109,7 +109,7 @@ def steps_from(footage: Footage, frame: int) -> list[Step]:
     """The frames up to `REACH` links after and before `frame`, with the flow chained to them."""
     found = []
     for direction in footage.to:
-        at, total, valid = frame, np.zeros((*footage.grey.shape[1:], 2), np.float32), np.ones(footage.grey.shape[1:], bool)
+        at, total, valid = frame, np.zeros((*footage.gray.shape[1:], 2), np.float32), np.ones(footage.gray.shape[1:], bool)
         for count in range(1, REACH + 1):
             if at not in direction:
                 break
@@ -121,7 +121,7 @@ def steps_from(footage: Footage, frame: int) -> list[Step]:
 
 
 def grid(shape: tuple[int, ...]) -> np.ndarray:
-    """Pixel centres (H, W, 2), xy."""
+    """Pixel centers (H, W, 2), xy."""
     y, x = np.mgrid[: shape[0], : shape[1]]
     return np.stack([x, y], -1) + 0.5
 
@@ -137,7 +137,7 @@ def sample(flow: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 def planar(footage: Footage) -> bool:
     """Whether homographies explain most of what epipolar geometries explain, over a few frames: a camera that only turns."""
     planar = general = 0
-    for frame in range(0, len(footage.grey), max(1, len(footage.grey) // 12)):
+    for frame in range(0, len(footage.gray), max(1, len(footage.gray) // 12)):
         steps = [s for s in steps_from(footage, frame) if s.valid.mean() > 0.1]
         if steps:
             p, q = sample(steps[-1].flow, steps[-1].valid)
@@ -195,7 +195,7 @@ def static_miss(frame: int, steps: list[Step], K: np.ndarray, c2w: np.ndarray) -
 
 def judge(footage: Footage, misses: Misses, report: str) -> np.ndarray:
     """Moving pixels (T, H, W) from how far flow is from a static scene's."""
-    scores = np.zeros_like(footage.grey)
+    scores = np.zeros_like(footage.gray)
     for frame in track(range(len(scores)), report):
         steps = steps_from(footage, frame)
         if steps:
@@ -217,10 +217,10 @@ def judge(footage: Footage, misses: Misses, report: str) -> np.ndarray:
 
 
 def score(footage: Footage, frame: int, steps: list[Step], misses: np.ndarray) -> np.ndarray:
-    """How much (H, W) the `misses` (steps, H, W, 2) speak against a static scene, in units of its noise, smoothed over a neighbourhood.
+    """How much (H, W) the `misses` (steps, H, W, 2) speak against a static scene, in units of its noise, smoothed over a neighborhood.
 
-    The root mean square over valid flow; where none is valid, the smaller one of the two neighbours: what one side hides, the other shows."""
-    textured = texture(footage.grey[frame])
+    The root mean square over valid flow; where none is valid, the smaller one of the two neighbors: what one side hides, the other shows."""
+    textured = texture(footage.gray[frame])
     units = np.empty(misses.shape[:3], np.float32)
     for n, s in enumerate(steps):
         residual = np.linalg.norm(misses[n], axis=-1)
@@ -239,25 +239,25 @@ def score(footage: Footage, frame: int, steps: list[Step], misses: np.ndarray) -
 
 def worse(footage: Footage, frame: int, step: Step, miss: np.ndarray) -> np.ndarray:
     """How clearly (H, W), in [0, 1], the static answer matches the other picture worse than the flow does."""
-    here, there = footage.grey[frame], footage.grey[step.frame]
+    here, there = footage.gray[frame], footage.gray[step.frame]
     by_flow = cv2.boxFilter(np.abs(follow(there, step.flow) - here), -1, (5, 5))
     static = cv2.boxFilter(np.abs(follow(there, step.flow + miss) - here), -1, (5, 5))
     return np.clip((static - by_flow) / (0.3 * by_flow + 0.003), 0, 1)
 
 
-def texture(grey: np.ndarray) -> np.ndarray:
+def texture(gray: np.ndarray) -> np.ndarray:
     """How far (H, W), in [0, 1], a pixel's surroundings fix its position: `1 / (1 + (std / TEXTURE)^2)`, std in pixels by the smaller
     eigenvalue of the structure tensor and the image's own noise (Foerstner and Guelch 1987)."""
-    rough = cv2.Laplacian(grey, cv2.CV_32F, ksize=1)
+    rough = cv2.Laplacian(gray, cv2.CV_32F, ksize=1)
     noise = np.clip(np.percentile(np.sqrt(cv2.boxFilter(rough**2, -1, (5, 5)) / 20), 20), 0.003, 0.012)
-    x, y = (cv2.Sobel(grey, cv2.CV_32F, *d, ksize=3, scale=0.125) for d in ((1, 0), (0, 1)))
+    x, y = (cv2.Sobel(gray, cv2.CV_32F, *d, ksize=3, scale=0.125) for d in ((1, 0), (0, 1)))
     xx, xy, yy = (cv2.boxFilter(v, -1, (5, 5), normalize=False) for v in (x * x, x * y, y * y))
     smaller = (xx + yy) / 2 - np.sqrt(((xx - yy) / 2) ** 2 + xy**2)
     return 1 / (1 + (noise / TEXTURE) ** 2 / np.maximum(smaller, 1e-9))
 
 
 def spread(values: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-    """`values` (H, W) averaged by `confidence` (H, W) over as small a neighbourhood as has any: from coarse to fine."""
+    """`values` (H, W) averaged by `confidence` (H, W) over as small a neighborhood as has any: from coarse to fine."""
     filled = np.full_like(values, float(np.sum(values * confidence) / max(float(confidence.sum()), 1e-6)))
     for sigma in (16.0, 8.0, 4.0, 2.0, 1.0):
         total = cv2.GaussianBlur(confidence, (0, 0), sigma)

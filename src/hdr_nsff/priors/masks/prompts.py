@@ -1,7 +1,7 @@
 """What to ask a segmentation network about a clip, made from its motion masks instead of mouse clicks: which things move, the frame in
 which each shows best, and there points on it, points beside it and a box around it. A file of points corrects or adds to that.
 
-Points are pixels of the scene's frames, x right and y down, centres at +0.5; label 1 lies on the object, 0 beside it."""
+Points are pixels of the scene's frames, x right and y down, centers at +0.5; label 1 lies on the object, 0 beside it."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Part:
     frame: int
     mask: np.ndarray  # (H, W) bool
     area: int
-    centre: np.ndarray  # (2,) pixels
+    center: np.ndarray  # (2,) pixels
 
 
 def movers(moving: np.ndarray, first: int = 1) -> list[Mover]:
@@ -76,10 +76,10 @@ def movers(moving: np.ndarray, first: int = 1) -> list[Mover]:
 
 def parts(mask: np.ndarray, frame: int) -> list[Part]:
     """The connected parts of `mask` (H, W) bool that are not tiny."""
-    _, labels, stats, centres = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    _, labels, stats, centers = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     areas = stats[:, cv2.CC_STAT_AREA]
     return [
-        Part(frame, labels == k, int(areas[k]), centres[k] + 0.5)
+        Part(frame, labels == k, int(areas[k]), centers[k] + 0.5)
         for k in range(1, len(areas))
         if areas[k] >= SMALLEST * mask.size
     ]
@@ -107,20 +107,20 @@ def link(frames: list[list[Part]]) -> list[list[Part]]:
 
 def likeness(a: Part, b: Part) -> float:
     """How well two parts fit in place and size, 1 at best; 0 where they lie farther apart than the larger one is wide."""
-    apart = float(np.linalg.norm(a.centre - b.centre)) / np.sqrt(max(a.area, b.area))
+    apart = float(np.linalg.norm(a.center - b.center)) / np.sqrt(max(a.area, b.area))
     return max(0.0, 1 - apart) * min(a.area, b.area) / max(a.area, b.area)
 
 
 def clearest(track: list[Part]) -> Part:
-    """The part that is largest and most certain: certain where its neighbours in time have the same outline, moved."""
+    """The part that is largest and most certain: certain where its neighbors in time have the same outline, moved."""
     return max(
         track, key=lambda p: p.area * (0.1 + np.mean([agreement(p, q) for q in track if abs(p.frame - q.frame) == 1] or [0]))
     )
 
 
 def agreement(a: Part, b: Part) -> float:
-    """Intersection over union of two outlines, centre laid on centre."""
-    shift = (a.centre - b.centre).astype(np.float32)
+    """Intersection over union of two outlines, center laid on center."""
+    shift = (a.center - b.center).astype(np.float32)
     moved = cv2.warpAffine(
         b.mask.astype(np.uint8), np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32), b.mask.shape[::-1]
     )
@@ -163,7 +163,7 @@ def beside_it(part: Part, moving: np.ndarray) -> np.ndarray:
     away = cv2.distanceTransform(1 - part.mask.astype(np.uint8), cv2.DIST_L2, 5)
     free = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
     y, x = np.indices(part.mask.shape) + 0.5
-    angle = np.arctan2(y - part.centre[1], x - part.centre[0])
+    angle = np.arctan2(y - part.center[1], x - part.center[0])
     points: list[tuple[float, float]] = []
     for direction in np.arange(BESIDE) * 2 * np.pi / BESIDE:
         turn = np.abs(np.angle(np.exp(1j * (angle - direction))))

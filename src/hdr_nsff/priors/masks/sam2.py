@@ -34,14 +34,14 @@ class Pictures(Mapping[int, Tensor]):
         return iter(range(len(self.video)))
 
     def __getitem__(self, frame: int) -> Tensor:
-        """(3, size, size), normalised."""
+        """(3, size, size), normalized."""
         rgb = torch.from_numpy(np.ascontiguousarray(self.video[frame], np.float32)).permute(2, 0, 1)[None]
         rgb = functional.interpolate(rgb, (self.size, self.size), mode="bilinear", antialias=True)
         return ((rgb - IMAGENET_MEAN) / IMAGENET_STD)[0]
 
 
 def sam2_mask(network: Any, video: np.ndarray, asked: Sequence[Mover], report: str = "sam2") -> np.ndarray:
-    """What moves, (T, H, W) bool: all that `asked` points at, outlined in every frame of `video` (T, H, W, 3) equalised rgb in [0, 1].
+    """What moves, (T, H, W) bool: all that `asked` points at, outlined in every frame of `video` (T, H, W, 3) equalized rgb in [0, 1].
 
     `network`: transformers' Sam2VideoModel. Where it outlines something else than the motion mask saw, the motion mask's outline stays."""
     total = np.zeros(video.shape[:3], bool)
@@ -91,8 +91,8 @@ def follow(network: Any, video: np.ndarray, mover: Mover) -> np.ndarray:
 def coordinates(
     points: np.ndarray, labels: np.ndarray, box: np.ndarray | None, size: tuple[int, int], image_size: int
 ) -> dict[str, Tensor]:
-    """Points (N, 2) and box in pixels of frames of `size` (height, width), as the network wants them: a box as its two corners, labelled 2 and
-    3, before the points; centres of the pixels of its square picture at whole numbers."""
+    """Points (N, 2) and box in pixels of frames of `size` (height, width), as the network wants them: a box as its two corners, labeled 2 and
+    3, before the points; centers of the pixels of its square picture at whole numbers."""
     corners = np.zeros((0, 2)) if box is None else np.asarray(box).reshape(2, 2)
     places = np.concatenate([corners, points]) * image_size / np.array(size[::-1]) - 0.5
     meaning = np.concatenate([np.array([2, 3])[: len(corners)], labels])

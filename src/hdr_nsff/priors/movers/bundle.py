@@ -22,7 +22,7 @@ QUICK = 8  # iterations that tell whether a try is better
 BETTER = 0.98  # of the cost: what a reversal must gain
 MOST = 200  # tracks that poses are found from
 FEWEST = 3  # tracks that have a shape
-NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbours share their errors
+NOISE = 0.4  # pixels: standard deviation of one step of a track; neighbors share their errors
 FAR_SIGMA = 0.25  # how well mean z-depth is known, as a share of it: one observation of all times that tracks join ...
 UNSURE, FAR_SIGMA_SURE = 0.52, 0.01  # ... where it is trusted no more than the one (geometry claims 0.5), and fully
 FAR_SIGMA_ALONE = 0.02  # the same of every time of a path too short to tell
@@ -53,7 +53,7 @@ class Shape:
     def at(self, t: int) -> np.ndarray:
         """World points (N, 3) at a time."""
         g = self.group
-        return (self.points - g.centre) @ g.rotations[t].T + g.centre + g.shifts[t]
+        return (self.points - g.center) @ g.rotations[t].T + g.center + g.shifts[t]
 
 
 def adjust(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
@@ -81,7 +81,7 @@ def adjusted(tracks: Tracks, group: Group, cameras: Cameras) -> Shape:
         state, _ = problem.solve(state, ITERATIONS)
     every = Problem(tracks, start, cameras)
     state = every.points_for(state)
-    points[every.use] = state.points + group.centre
+    points[every.use] = state.points + group.center
     error = (np.linalg.norm(every.residuals(state)[0], axis=-1) / every.noise)[every.seen]
     return Shape(replace(start, rotations=state.rotations, shifts=state.shifts), points, float(np.median(error)))
 
@@ -114,7 +114,7 @@ def without_turning(tracks: Tracks, group: Group) -> Group:
 
 @dataclass(frozen=True)
 class State:
-    """What is looked for, about the group's centre."""
+    """What is looked for, about the group's center."""
 
     points: np.ndarray  # (N, 3)
     rotations: np.ndarray  # (T, 3, 3)
@@ -126,7 +126,7 @@ class Problem:
 
     def __init__(self, tracks: Tracks, group: Group, cameras: Cameras) -> None:
         seen = (tracks.trust[group.members] > 0) & group.known
-        points = tracks.points[group.members] - group.centre
+        points = tracks.points[group.members] - group.center
         start = canonical_points(points, seen.astype(float), group.rotations, group.shifts, group.known)
         use = np.isfinite(start[:, 0]) & (seen.sum(1) >= 2)
         seen, start, self.use = seen[use], start[use], use  # which members can be placed at all
@@ -134,10 +134,10 @@ class Problem:
         self.seen, self.start, self.K = seen, start, cameras.K
         self.noise = NOISE * np.sqrt(1.0 + tracks.age[group.members][use])  # (N, T) pixels
         self.w2c = np.swapaxes(cameras.c2w[:, :, :3], 1, 2)  # (T, 3, 3)
-        self.eye = cameras.c2w[:, :, 3] - group.centre
+        self.eye = cameras.c2w[:, :, 3] - group.center
         self.middle = np.median(start, 0) if len(start) else np.zeros(3)
         self.size = np.median(np.linalg.norm(start - self.middle, axis=-1)) + 1e-9 if len(start) else 1.0
-        prior = np.einsum("tj,ntj->nt", self.w2c[:, 2], tracks.points[group.members][use] - group.centre - self.eye)
+        prior = np.einsum("tj,ntj->nt", self.w2c[:, 2], tracks.points[group.members][use] - group.center - self.eye)
         count = np.maximum(seen.sum(0), 1)
         self.mean_depth = np.where(seen, np.nan_to_num(prior), 0).sum(0) / count  # (T,)
         self.told = seen.sum(0) >= 3
@@ -182,7 +182,7 @@ class Problem:
         return replace(state, points=points)
 
     def on_rays(self, s: State) -> np.ndarray:
-        """Canonical places (N, 3) of points as far away as the thing's centre: the median over time."""
+        """Canonical places (N, 3) of points as far away as the thing's center: the median over time."""
         depth = np.einsum("tj,tj->t", self.w2c[:, 2], s.shifts - self.eye)
         rays = (self.pixels - self.K[:, :2, 2]) / self.K[:, [0, 1], [0, 1]]
         local = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) * depth[:, None]
@@ -222,8 +222,8 @@ class Problem:
         turned = np.einsum("tij,nj->nti", s.rotations, s.points)
         local = np.einsum("tij,ntj->nti", self.w2c, turned + s.shifts - self.eye)
         z = np.maximum(local[..., 2:], 1e-3 * self.unit)
-        focal, centre = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
-        return np.where(self.seen[..., None], local[..., :2] / z * focal + centre - self.pixels, 0), turned, local
+        focal, center = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
+        return np.where(self.seen[..., None], local[..., :2] / z * focal + center - self.pixels, 0), turned, local
 
     def priors(self, s: State, local: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Residuals in standard deviations: mean z-depth (T,), third differences of the path (T - 3, 3), second ones of the turning

@@ -2,7 +2,7 @@
 
 Two frames cannot tell: any distance fits some motion. But a camera in a hand shakes, objects do not shake with it: of all
 distances, the true one gives the object the smoothest path through the world (trajectory triangulation after Park et al.,
-"3D reconstruction of a moving point from a series of 2D projections", ECCV 2010; we penalise third differences). A prior holds
+"3D reconstruction of a moving point from a series of 2D projections", ECCV 2010; we penalize third differences). A prior holds
 where that says little: an object is nearer than the static scene behind it, and about as far as what it stands on. Every connected
 moving region is one patch of constant disparity per frame."""
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from hdr_nsff.scene.posed_video import Shots
+from hdr_nsff.scene.posed_video import PosedVideo
 
 LEAST_AREA = 1e-3  # of the frame: smaller moving regions are no objects of their own
 DIFFERENT = 1.0  # pixels per step by which two objects in one region must move apart to be told apart
@@ -158,7 +158,7 @@ def link(labels: np.ndarray, times: np.ndarray, steps: list[Step]) -> list[Track
     return tracks
 
 
-def centres(track: Track, labels: np.ndarray, times: np.ndarray) -> np.ndarray:
+def centers(track: Track, labels: np.ndarray, times: np.ndarray) -> np.ndarray:
     """Where the region is in each frame of the track, (n, 2) px: fast changes from its flow, slow ones from its centroid."""
     centroid = np.array(
         [np.argwhere(labels[f] == n).mean(0)[::-1] + 0.5 for f, n in zip(track.frames, track.labels, strict=True)]
@@ -232,28 +232,28 @@ def robust_weights(A: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, float]:
 
 
 def mover_depth(
-    shots: Shots, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, behind: np.ndarray
+    clip: PosedVideo, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, behind: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparity and confidence (T, H, W) inside the moving masks (elsewhere `behind` and 0).
 
     `behind` (T, H, W): the static scene's disparity, also under the masks; `flow` (P, H, W, 2) px of `pairs` (P, 2)."""
-    disparity, confidence = behind.copy(), np.where(shots.moving, np.float32(LEAST_CONFIDENCE), np.float32(0))
-    labels = regions(shots.moving)
-    steps = steps_in_time(shots.times, flow, valid, pairs)
+    disparity, confidence = behind.copy(), np.where(clip.moving, np.float32(LEAST_CONFIDENCE), np.float32(0))
+    labels = regions(clip.moving)
+    steps = steps_in_time(clip.times, flow, valid, pairs)
     split(labels, steps)
     split(labels, [step.reversed() for step in steps[::-1]])
-    for track in link(labels, shots.times, steps):
+    for track in link(labels, clip.times, steps):
         frames = np.array(track.frames)
         inside = [labels[f] == n for f, n in zip(frames, track.labels, strict=True)]
         wall = np.array([np.percentile(behind[f][m], 95) for f, m in zip(frames, inside, strict=True)])
-        pixels = centres(track, labels, shots.times)
+        pixels = centers(track, labels, clip.times)
         rays = np.stack(
-            [shots.unproject(f, p[None], np.ones(1))[0] - shots.c2w[f, :, 3] for f, p in zip(frames, pixels, strict=True)]
+            [clip.unproject(f, p[None], np.ones(1))[0] - clip.c2w[f, :, 3] for f, p in zip(frames, pixels, strict=True)]
         )
         known = np.array([m is not None for m in track.motions[:-1]], bool)
         prior = 1 / (NEARER * np.maximum(wall, np.median(wall)))
-        pose = shots.c2w[frames]
-        z, sigma = smoothest_path(pose[..., 3], pose[..., 2], rays, shots.times[frames], known, prior)
+        pose = clip.c2w[frames]
+        z, sigma = smoothest_path(pose[..., 3], pose[..., 2], rays, clip.times[frames], known, prior)
         for f, m, d, s, w in zip(frames, inside, 1 / np.maximum(z, 1e-9), sigma, wall, strict=True):
             disparity[f][m] = np.clip(d, np.median(behind[f][m]), MOST * w)
             confidence[f][m] = np.clip(TRUSTED * KNOWN / max(s, KNOWN), LEAST_CONFIDENCE, TRUSTED)

@@ -1,5 +1,5 @@
 """Moving things told apart by what their motions explain in pixels: groups of tracks (`groups.py`), found with depth that may be wrong,
-get shapes (`bundle.py`), and every track goes to the motion that explains it over its whole life, its neighbours' lives included."""
+get shapes (`bundle.py`), and every track goes to the motion that explains it over its whole life, its neighbors' lives included."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 
 from hdr_nsff.core.progress import track
 from hdr_nsff.priors.movers.bundle import Cameras, Problem, Shape, State, adjust
-from hdr_nsff.priors.movers.rigid_groups import GAP, SHORTEST, SMALLEST, Group, Tracks, affinity, apart, fit, gather, neighbours
+from hdr_nsff.priors.movers.rigid_groups import GAP, SHORTEST, SMALLEST, Group, Tracks, affinity, apart, fit, gather, neighbors
 
 LEAST_TRACKS = 60  # of a group that can be adjusted
 GOOD = 1.5  # standard deviations: reprojection error of a shape, or of a track by one, that is believed
@@ -133,8 +133,8 @@ def same(before: np.ndarray, after: np.ndarray) -> bool:
 
 
 def nearness(tracks: Tracks) -> csr_matrix:
-    """How much tracks listen to their neighbours in the pictures (N, N), rows of sum 1 at most."""
-    n, pairs = len(tracks.trust), neighbours(tracks)
+    """How much tracks listen to their neighbors in the pictures (N, N), rows of sum 1 at most."""
+    n, pairs = len(tracks.trust), neighbors(tracks)
     graph = coo_matrix((affinity(tracks, pairs), pairs.T), (n, n)).tocsr()
     graph = graph + graph.T
     total = np.maximum(np.asarray(graph.sum(1)).ravel(), 1e-9)
@@ -142,7 +142,7 @@ def nearness(tracks: Tracks) -> csr_matrix:
 
 
 def misfits(tracks: Tracks, shapes: list[Shape | None], cameras: Cameras, near: csr_matrix) -> np.ndarray:
-    """Reprojection errors (N, K) of every track by every motion in standard deviations, averaged with its neighbours'; inf where
+    """Reprojection errors (N, K) of every track by every motion in standard deviations, averaged with its neighbors'; inf where
     there is no shape or its motion is not known."""
     life = (tracks.trust > 0).sum(1).astype(float)  # a long track tells more
     out = np.full((len(life), len(shapes)), np.inf)

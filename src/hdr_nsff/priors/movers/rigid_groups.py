@@ -20,8 +20,8 @@ STARTS = 12  # frames in which tracks start
 AVERAGE = 2  # pixels: how far around flow is averaged before it is followed
 UNLIKE = 2.0  # pixels: flows that differ more are of different things
 SHORTEST = 3  # frames a track must last
-LINK = 6.0  # pixels: neighbours in a picture
-PARTING = 1.0  # pixels a frame: neighbours that part faster hardly belong together
+LINK = 6.0  # pixels: neighbors in a picture
+PARTING = 1.0  # pixels a frame: neighbors that part faster hardly belong together
 PARTS = 10  # the graph is cut into, before joining
 RESTARTS = {"rng": 0} if "rng" in signature(eigsh).parameters else {}  # newer SciPy draws restarts from chance otherwise
 CUTTING = 1000  # iterations; a graph that holds together takes ten
@@ -40,7 +40,7 @@ class View:
     moving: np.ndarray  # (H, W) bool
     points: np.ndarray  # (H, W, 3) every pixel at its depth, scene units
     trust: np.ndarray  # (H, W) of the depth
-    flow: dict[int, np.ndarray]  # {+-1: (H, W, 2)} pixels to the neighbouring times
+    flow: dict[int, np.ndarray]  # {+-1: (H, W, 2)} pixels to the neighboring times
     valid: dict[int, np.ndarray]  # {+-1: (H, W) bool}
 
 
@@ -64,14 +64,14 @@ class Group:
     """A thing that moves as one."""
 
     rotations: np.ndarray  # (T, 3, 3) from the canonical place
-    shifts: np.ndarray  # (T, 3): x(t) = R (x - centre) + centre + shift
-    centre: np.ndarray  # (3,) canonical
+    shifts: np.ndarray  # (T, 3): x(t) = R (x - center) + center + shift
+    center: np.ndarray  # (3,) canonical
     members: np.ndarray  # indices of its tracks
     known: np.ndarray  # (T,) bool: times at which enough of it was seen; poses between are interpolated, outer ones held
 
     def between(self, a: int, b: int) -> Group:
         """The motion at the times from `a` to before `b`."""
-        return Group(self.rotations[a:b], self.shifts[a:b], self.centre, self.members, self.known[a:b])
+        return Group(self.rotations[a:b], self.shifts[a:b], self.center, self.members, self.known[a:b])
 
     def extended(self, start: int, known: np.ndarray) -> Group:
         """The motion over all times, `known` (T,) at some of them, of one that begins at `start`: before and after it goes straight on."""
@@ -79,11 +79,11 @@ class Group:
         inside = at.clip(0, num - 1)
         speed = np.stack([self.shifts[min(1, num - 1)] - self.shifts[0], self.shifts[-1] - self.shifts[max(num - 2, 0)]])
         beyond = (at - inside)[:, None] * speed[(at > 0).astype(int)]
-        return Group(self.rotations[inside], self.shifts[inside] + beyond, self.centre, self.members, known)
+        return Group(self.rotations[inside], self.shifts[inside] + beyond, self.center, self.members, known)
 
     def canonical(self, points: np.ndarray, t: int) -> np.ndarray:
         """Where `points` (P, 3) of time t are canonically."""
-        return (points - self.centre - self.shifts[t]) @ self.rotations[t] + self.centre
+        return (points - self.center - self.shifts[t]) @ self.rotations[t] + self.center
 
 
 def follow(views: list[View]) -> Tracks:
@@ -150,7 +150,7 @@ def advance(view: View, following: View, step: int, at: np.ndarray) -> np.ndarra
 
 def gather(tracks: Tracks, smallest: float = SMALLEST) -> list[Group]:
     """Things that move as one, of a share `smallest` of the tracks at least, largest first: parts of the graph of
-    neighbouring tracks, joined again where one rigid motion explains both."""
+    neighboring tracks, joined again where one rigid motion explains both."""
     label = parts(tracks)
     few = np.unique(np.linspace(0, len(label) - 1, MOST).astype(int))  # enough to tell motions apart
     members = [np.nonzero(label == k)[0] for k in range(label.max() + 1)]
@@ -194,11 +194,11 @@ def size_of(tracks: Tracks, group: Group) -> float:
 
 
 def parts(tracks: Tracks) -> np.ndarray:
-    """A part (N,) for every track: normalised cuts (Shi & Malik 2000) through the graph of neighbours, too many rather than too few."""
+    """A part (N,) for every track: normalized cuts (Shi & Malik 2000) through the graph of neighbors, too many rather than too few."""
     n, num = tracks.trust.shape
     if num < 2 or n < 3 * PARTS:
         return np.zeros(n, int)
-    pairs = neighbours(tracks)
+    pairs = neighbors(tracks)
     strength = affinity(tracks, pairs)
     graph = coo_matrix((strength, pairs.T), (n, n)).tocsr()
     graph = graph + graph.T + diags(np.full(n, 1e-6))
@@ -214,7 +214,7 @@ def parts(tracks: Tracks) -> np.ndarray:
     return kmeans2(vectors, PARTS, minit="++", rng=np.random.default_rng(0))[1]
 
 
-def neighbours(tracks: Tracks) -> np.ndarray:
+def neighbors(tracks: Tracks) -> np.ndarray:
     """Pairs (P, 2) of tracks that come near each other in a picture."""
     found = [np.zeros((0, 2), int)]
     for t in range(tracks.trust.shape[1]):
@@ -239,8 +239,8 @@ def affinity(tracks: Tracks, pairs: np.ndarray) -> np.ndarray:
 def residuals(tracks: Tracks, group: Group, members: np.ndarray) -> np.ndarray:
     """Median distance (N,) of each of some tracks from where a group's motion puts its canonical place, scene units; NaN if never known."""
     points, trust = tracks.points[members], tracks.trust[members] * group.known
-    canonical = canonical_points(points - group.centre, trust, group.rotations, group.shifts, group.known)
-    moved = np.einsum("tij,nj->nti", group.rotations, canonical) + group.shifts + group.centre
+    canonical = canonical_points(points - group.center, trust, group.rotations, group.shifts, group.known)
+    moved = np.einsum("tij,nj->nti", group.rotations, canonical) + group.shifts + group.center
     distance = np.where(trust > 0, np.linalg.norm(moved - points, axis=-1), np.nan)
     out = np.full(len(members), np.nan)
     enough = (trust > 0).sum(1) >= 0.7 * (tracks.trust[members] > 0).sum(1)
@@ -297,8 +297,8 @@ def fit(tracks: Tracks, members: np.ndarray) -> Group:
     points, trust = tracks.points[members], tracks.trust[members]
     num = points.shape[1]
     start = int(np.argmax((trust > 0).sum(0)))
-    centre = np.nanmedian(points[:, start], 0)
-    points = points - centre
+    center = np.nanmedian(points[:, start], 0)
+    points = points - center
     rotations, shifts, known = np.tile(np.eye(3), (num, 1, 1)), np.zeros((num, 3)), np.zeros(num, bool)
     known[start] = True
     for step in (1, -1):
@@ -315,7 +315,7 @@ def fit(tracks: Tracks, members: np.ndarray) -> Group:
                 last = t
     for _ in range(ROUNDS):
         rotations, shifts = smoothed(*refit(points, trust, rotations, shifts, known), known)
-    return Group(rotations, shifts, centre, members, known)
+    return Group(rotations, shifts, center, members, known)
 
 
 def canonical_points(
@@ -344,7 +344,7 @@ def refit(
 
 
 def smoothed(rotations: np.ndarray, shifts: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Poses averaged with their neighbours in time (1, 2, 1); unknown ones between known ones interpolated, outer ones held."""
+    """Poses averaged with their neighbors in time (1, 2, 1); unknown ones between known ones interpolated, outer ones held."""
     at, times = np.nonzero(known)[0], np.arange(len(known))
     flat = np.concatenate([rotations.reshape(-1, 9), shifts], 1)
     flat = np.stack([np.interp(times, at, column[at]) for column in flat.T], 1)

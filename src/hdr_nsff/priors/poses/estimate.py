@@ -1,7 +1,7 @@
-"""Camera poses from frames alone: structure from motion on exposure-equalised frames with moving objects left out.
+"""Camera poses from frames alone: structure from motion on exposure-equalized frames with moving objects left out.
 
-Footage without parallax (tripod, pan) is recognised first and gets rotations instead (`rotation.py`). Otherwise pycolmap maps the
-frames (`sfm.py`): incrementally, then globally, with and without levelled contrast, until nine frames in ten register with a focal
+Footage without parallax (tripod, pan) is recognized first and gets rotations instead (`rotation.py`). Otherwise pycolmap maps the
+frames (`sfm.py`): incrementally, then globally, with and without leveled contrast, until nine frames in ten register with a focal
 length that a lens can have. Poses are camera to world, OpenCV axes; the world's +z is the mean viewing direction, near is 1."""
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ LOOK = 24  # frames looked at to decide about parallax
 class Views:
     """The pictures to map: one per frame, but a single one for all frames of a camera that stands still."""
 
-    pictures: np.ndarray  # (V, H, W, 3) equalised rgb in [0, 1]
+    pictures: np.ndarray  # (V, H, W, 3) equalized rgb in [0, 1]
     ignore: np.ndarray  # (V, H, W) bool
     groups: list[list[int]]  # views of each physical camera
     of_frame: np.ndarray  # (T,) which view shows each frame
@@ -59,7 +59,7 @@ def estimate_poses(
     threads: int = 0,
     matcher: Matcher = "sift",
 ) -> Poses:
-    """Poses of every frame of `video` (T, H, W, 3), exposure-equalised rgb in [0, 1].
+    """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
     `masks` (T, H, W) bool moving; `clipped` (T, H, W) bool without information; `camera_ids` (T,) the physical camera of each frame
     (each has its own focal length), by default one. `matcher` finds and matches keypoints for structure from motion. Temporary files go into `workdir`. InputError where poses cannot be had."""
@@ -165,7 +165,7 @@ def best_model(views: Views, workdir: Path, threads: int, matcher: Matcher) -> t
     workdir.mkdir(parents=True, exist_ok=True)
     for level in (
         (True, False) if matcher == "sift" else (False,)
-    ):  # learned keypoints see colour, and one contrast is as good as another
+    ):  # learned keypoints see color, and one contrast is as good as another
         with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
             job = write_job(Path(folder), views, scale, level, threads, matcher)
             for mapping in ("incremental", "global"):
@@ -178,7 +178,7 @@ def best_model(views: Views, workdir: Path, threads: int, matcher: Matcher) -> t
                 if best is not None and worth(best, count)[:2] == (True, True):
                     return best, scale
                 got = 0 if best is None else len(best.images)
-                say(f"poses: {mapping} mapping ({'levelled' if level else 'plain'} contrast): at best {got} of {count} so far")
+                say(f"poses: {mapping} mapping ({'leveled' if level else 'plain'} contrast): at best {got} of {count} so far")
     if best is None or not plausible(best) or len(best.images) < LEAST * count:
         raise InputError(sentence(best, views, failures))
     return best, scale
@@ -249,7 +249,7 @@ def assemble(model: ColmapModel, views: Views, scale: int, size: tuple[int, int]
     tracks = gather_tracks(model, views, scale)
     poses = Poses(K, c2w, registered, "full", model.points, model.errors / scale, tracks)
     poses = trusted_points(poses)
-    poses = interpolate(centred(poses), [list(np.flatnonzero(np.isin(views.of_frame, g))) for g in views.groups])
+    poses = interpolate(centered(poses), [list(np.flatnonzero(np.isin(views.of_frame, g))) for g in views.groups])
     return replace(poses, notes=(*poses.notes, summary(poses)))
 
 
@@ -264,18 +264,18 @@ def gather_tracks(model: ColmapModel, views: Views, scale: int) -> np.ndarray:
     return np.array(seen, np.float64).reshape(-1, 4)
 
 
-def centred(poses: Poses) -> Poses:
+def centered(poses: Poses) -> Poses:
     """The same cameras and points with the mean registered camera at the origin looking along +z, scaled so that near is 1."""
     if len(poses.points) < 10:
         raise InputError(f"poses failed: only {len(poses.points)} static points could be placed; {ADVICE}")
     placed = poses.c2w[poses.registered]
     turn = Rotation.from_matrix(placed[:, :, :3]).mean().as_matrix()
-    centre = placed[:, :, 3].mean(0)
+    center = placed[:, :, 3].mean(0)
     depth = project(poses, poses.tracks[:, 0].astype(int), poses.points[poses.tracks[:, 1].astype(int)])[1]
     near, far = 0.7 * np.percentile(depth, 1), 1.3 * np.percentile(depth, 99)
-    moved = (poses.c2w[:, :, 3] - centre) @ turn / near
+    moved = (poses.c2w[:, :, 3] - center) @ turn / near
     c2w = np.concatenate([turn.T @ poses.c2w[:, :, :3], moved[:, :, None]], 2)
-    return replace(poses, c2w=c2w, points=(poses.points - centre) @ turn / near, near=1.0, far=float(far / near))
+    return replace(poses, c2w=c2w, points=(poses.points - center) @ turn / near, near=1.0, far=float(far / near))
 
 
 def summary(poses: Poses) -> str:

@@ -1,7 +1,7 @@
 """Learned keypoints and matches: ALIKED (Zhao et al. 2023) or DISK (Tyszkiewicz et al. 2020), matched by LightGlue (Lindenberger et al. 2023),
 for structure from motion where SIFT finds too little in common. kornia's implementations; this is its only door.
 
-Keypoints are pixels of the pictures, centres at +0.5."""
+Keypoints are pixels of the pictures, centers at +0.5."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def fill(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
 
 
 def describe(extractor: Any, picture: np.ndarray, usable: np.ndarray, device: torch.device) -> dict[str, Tensor]:
-    """The `LIMIT` strongest usable keypoints of a picture as LightGlue takes them: keypoints (1, N, 2) with centres at whole numbers,
+    """The `LIMIT` strongest usable keypoints of a picture as LightGlue takes them: keypoints (1, N, 2) with centers at whole numbers,
     descriptors (1, N, 128), image_size (1, 2) width and height."""
     rgb = torch.from_numpy(np.ascontiguousarray(picture, np.float32)).permute(2, 0, 1)[None].to(device)
     if type(extractor).__name__ == "DISK":

@@ -1,7 +1,7 @@
-"""Sparse correspondences: SIFT keypoints on exposure-equalised frames, matched between chosen pairs of frames.
+"""Sparse correspondences: SIFT keypoints on exposure-equalized frames, matched between chosen pairs of frames.
 
-Small frames are doubled and their local contrast is levelled first: at 240x136 there are too few keypoints otherwise, and too
-coarse ones. Positions are pixels of the frames as given, centres at +0.5."""
+Small frames are doubled and their local contrast is leveled first: at 240x136 there are too few keypoints otherwise, and too
+coarse ones. Positions are pixels of the frames as given, centers at +0.5."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Keypoints:
 
 @dataclass(frozen=True)
 class PairMatches:
-    """Mutual nearest neighbours between two frames."""
+    """Mutual nearest neighbors between two frames."""
 
     i: int
     j: int
@@ -40,11 +40,11 @@ def upsampling(width: int) -> int:
 
 
 def picture(frame: np.ndarray, scale: int, level_contrast: bool) -> np.ndarray:
-    """The 8-bit grey picture (H * scale, W * scale) in which keypoints are looked for, from rgb (H, W, 3) in [0, 1]."""
-    grey = cv2.cvtColor(np.rint(np.clip(frame, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
+    """The 8-bit gray picture (H * scale, W * scale) in which keypoints are looked for, from rgb (H, W, 3) in [0, 1]."""
+    gray = cv2.cvtColor(np.rint(np.clip(frame, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     if scale != 1:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
-    return cv2.createCLAHE(2.0, (8, 8)).apply(grey) if level_contrast else grey
+        gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    return cv2.createCLAHE(2.0, (8, 8)).apply(gray) if level_contrast else gray
 
 
 def usable(ignore: np.ndarray, scale: int, margin: int = 2) -> np.ndarray:
@@ -70,7 +70,7 @@ def keypoints(video: np.ndarray, ignore: np.ndarray, limit: int = 1500) -> list[
 
 
 def match(a: Keypoints, b: Keypoints, ratio: float = 0.85) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (M, 2), (M, 2) of mutual nearest neighbours whose second-best match is at least `1 / ratio` times farther."""
+    """Positions (M, 2), (M, 2) of mutual nearest neighbors whose second-best match is at least `1 / ratio` times farther."""
     if len(a.xy) < 2 or len(b.xy) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     cosine = a.descriptors @ b.descriptors.T
@@ -84,11 +84,11 @@ def match(a: Keypoints, b: Keypoints, ratio: float = 0.85) -> tuple[np.ndarray, 
     return a.xy[good], b.xy[best[good]]
 
 
-def spread_pairs(count: int, neighbours: int = 4) -> list[tuple[int, int]]:
+def spread_pairs(count: int, neighbors: int = 4) -> list[tuple[int, int]]:
     """Pairs (i, j), i < j, of `count` frames: the next few of each, then gaps of 6, 8, 12, 16, 24, 32, ... frames.
 
     Gaps in this series are multiples of 2 or 3 or both, so that for every usual exposure cycle each frame also meets frames of its own exposure."""
-    gaps = set(range(1, neighbours + 1))
+    gaps = set(range(1, neighbors + 1))
     gaps |= {g for k in range(1, 20) for g in (2 * 2**k, 3 * 2**k)}
     return [(i, i + g) for g in sorted(gaps) for i in range(count - g)]
 

@@ -29,7 +29,7 @@ class Panorama:
     slides: bool  # a sideways shift before something flat explains the matches much better than any turn does
     explained: float  # share of the matches that these rotations explain to 2 px
     errors: np.ndarray  # (T,) median residual in pixels, NaN where not linked
-    motion: float  # pixels: how far the image centre or a corner ever strays from where it lies in the middle frame
+    motion: float  # pixels: how far the image center or a corner ever strays from where it lies in the middle frame
 
 
 def default_focal(width: int) -> float:
@@ -61,7 +61,7 @@ def rotation_share(matches: list[PairMatches], found: Panorama, width: int, heig
     Near 1 for a camera that only turns, well below with parallax; a flat scene does not deceive it. Explained means to 1.5 pixels,
     or 0.4 % of the width. None where too few pairs far apart match at all."""
     wide = max((m.j - m.i for m in matches), default=0) / 6
-    centre, tolerance = np.array([width / 2, height / 2]), max(1.5, 0.004 * width)
+    center, tolerance = np.array([width / 2, height / 2]), max(1.5, 0.004 * width)
     rotational = general = 0
     for m in matches:
         if m.j - m.i < wide or len(m.p) < least:
@@ -70,8 +70,8 @@ def rotation_share(matches: list[PairMatches], found: Panorama, width: int, heig
         if static.sum() < least:
             continue
         ends = np.tile([m.i, m.j], (int(static.sum()), 1))
-        predicted = turned(found.rotations, found.focal, ends, m.p[static] - centre)[0]
-        rotational += int((np.linalg.norm(predicted + centre - m.q[static], axis=1) < tolerance).sum())
+        predicted = turned(found.rotations, found.focal, ends, m.p[static] - center)[0]
+        rotational += int((np.linalg.norm(predicted + center - m.q[static], axis=1) < tolerance).sum())
         general += int(static.sum())
     return rotational / general if general >= 5 * least else None
 
@@ -81,11 +81,11 @@ def panorama(matches: list[PairMatches], count: int, width: int, height: int) ->
     kept, homographies = planar_matches(matches)
     if not kept:
         return None
-    centre = np.array([width / 2, height / 2])
-    rotations, linked = chain(kept, homographies, count, default_focal(width), centre)
+    center = np.array([width / 2, height / 2])
+    rotations, linked = chain(kept, homographies, count, default_focal(width), center)
     kept = [m for m in kept if linked[m.i] and linked[m.j]]
     ends = np.repeat([(m.i, m.j) for m in kept], [len(m.p) for m in kept], axis=0)  # (M, 2)
-    p, q = (np.concatenate(x) - centre for x in ([m.p for m in kept], [m.q for m in kept]))
+    p, q = (np.concatenate(x) - center for x in ([m.p for m in kept], [m.q for m in kept]))
     rotations, _, _ = refine(rotations, default_focal(width), ends, p, q, False)
     free, focal, spread = refine(rotations, default_focal(width), ends, p, q, True)
     fov = np.degrees(2 * np.arctan(width / 2 / focal))
@@ -126,10 +126,10 @@ def planar_matches(matches: list[PairMatches], least: int = 20, most: int = 60) 
 
 
 def chain(
-    kept: list[PairMatches], homographies: list[np.ndarray], count: int, focal: float, centre: np.ndarray
+    kept: list[PairMatches], homographies: list[np.ndarray], count: int, focal: float, center: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """First rotations (T, 3, 3) along the best-matched tree of pairs, and which frames (T,) it reaches from the best-linked one."""
-    K = np.array([[focal, 0, centre[0]], [0, focal, centre[1]], [0, 0, 1]])
+    K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
     edges = {(m.i, m.j): nearest_rotation(np.linalg.inv(K) @ h @ K) for m, h in zip(kept, homographies, strict=True)}  # R_j^T R_i
     i, j = np.array(list(edges)).T
     lengths = 1.0 / np.array([len(m.p) for m in kept]) * (1 + 0.01 * (j - i))
@@ -153,7 +153,7 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
 
 
 def turned(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where frame j sees points `p` (M, 2) of frame i, both in pixels from the image centre, and their directions (M, 3) in frame j."""
+    """Where frame j sees points `p` (M, 2) of frame i, both in pixels from the image center, and their directions (M, 3) in frame j."""
     bearing = np.concatenate([p / focal, np.ones((len(p), 1))], 1)
     seen = np.einsum("mji,mj->mi", rotations[ends[:, 1]], np.einsum("mij,mj->mi", rotations[ends[:, 0]], bearing))
     return focal * seen[:, :2] / np.maximum(seen[:, 2:], 1e-3), seen
@@ -165,7 +165,7 @@ def refine(
     """Rotations and focal length with the least robust (Cauchy, 1 px) residual over all matches, by Levenberg-Marquardt; and how
     uncertain the logarithm of the focal length is (standard deviation).
 
-    `rotations` (T, 3, 3) camera to world; `ends` (M, 2) the frames i, j of each match; `p`, `q` (M, 2) pixels from the image centre."""
+    `rotations` (T, 3, 3) camera to world; `ends` (M, 2) the frames i, j of each match; `p`, `q` (M, 2) pixels from the image center."""
     damping, least = 1e-4, cost(rotations, focal, ends, p, q)
     normal, right = normal_equations(rotations, focal, ends, p, q, free_focal)
     for _ in range(steps):
@@ -207,7 +207,7 @@ def normal_equations(
 
 
 def cost(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray) -> float:
-    """The mean robust residual that `refine` lowers, `log(1 + r^2)`, of matches in pixels from the image centre."""
+    """The mean robust residual that `refine` lowers, `log(1 + r^2)`, of matches in pixels from the image center."""
     return float(np.mean(np.log1p(np.sum((turned(rotations, focal, ends, p)[0] - q) ** 2, 1))))
 
 
@@ -234,7 +234,7 @@ def cross(v: np.ndarray) -> np.ndarray:
 
 
 def stray(rotations: np.ndarray, focal: float, width: int, height: int) -> float:
-    """The farthest, in pixels, that any of `rotations` (T, 3, 3) carries the image's centre or a corner from where the middle frame has it."""
+    """The farthest, in pixels, that any of `rotations` (T, 3, 3) carries the image's center or a corner from where the middle frame has it."""
     spots = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * np.array([width, height]) / 2
     middle = len(rotations) // 2
     ends = np.stack([np.repeat(np.arange(len(rotations)), 5), np.full(5 * len(rotations), middle)], 1)

@@ -77,7 +77,7 @@ def run(job: Job) -> list[Path]:
 def write_matches(
     folder: Path, names: list[str], keypoints: list[np.ndarray], pairs: list[tuple[str, str]], matches: list[np.ndarray]
 ) -> None:
-    """Put keypoints (N, 2) of each image, pixels with centres at +0.5, and matches (M, 2) of each pair, rows of both, beside a job."""
+    """Put keypoints (N, 2) of each image, pixels with centers at +0.5, and matches (M, 2) of each pair, rows of both, beside a job."""
     points = {f"points_{name}": xy.astype(np.float32) for name, xy in zip(names, keypoints, strict=True)}
     rows = {f"matches_{a}|{b}": m.astype(np.uint32) for (a, b), m in zip(pairs, matches, strict=True)}
     np.savez(folder / GIVEN, allow_pickle=False, **points, **rows)

@@ -79,8 +79,8 @@ def triangulated(model: Any, track: Any) -> tuple[np.ndarray, float]:
     rays = np.einsum("vji,vjk,vk->vi", turn, np.linalg.inv(K), np.concatenate([seen, np.ones((len(seen), 1))], 1))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None]  # what lies beside the ray
-    centres = -np.einsum("vji,vj->vi", turn, shift)
-    place = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centres), rcond=None)[0]
+    centers = -np.einsum("vji,vj->vi", turn, shift)
+    place = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centers), rcond=None)[0]
     local = turn @ place + shift
     if (local[:, 2] <= 0).any():
         return place, np.inf

@@ -1,6 +1,6 @@
 """What a synthetic scene is: parts on bodies, how the bodies move, what lights them, and the cameras that film them.
 
-World axes are OpenCV's (+x right, +y down, +z forward), metres; time is in frames. Body 0 stands still. Of every other body the place of
+World axes are OpenCV's (+x right, +y down, +z forward), meters; time is in frames. Body 0 stands still. Of every other body the place of
 each point of its surface is known at any time: a rigid one by its pose, a deforming one by its mesh of that time and the point's triangle
 and barycentric coordinates. So depth and motion of what a picture shows are exact."""
 
@@ -26,7 +26,7 @@ class Part:
     vertices: np.ndarray  # (V, 3)
     faces: np.ndarray  # (F, 3) counter-clockwise seen from outside
     uv: np.ndarray  # (V, 2) in [0, 1], v down the texture
-    texture: np.ndarray  # (H, W, 3) albedo, radiance where it emits; (1, 1, 3) for one colour
+    texture: np.ndarray  # (H, W, 3) albedo, radiance where it emits; (1, 1, 3) for one color
     body: str = STILL
     emits: bool = False
     circuit: str | None = None  # lamps on one circuit are traced together: less time, and more noise where one outshines another
@@ -110,7 +110,7 @@ class SynthScene:
     ev: str = "-4,-2,0"  # exposures that suit it
     spp: int = 128  # paths per pixel that suit it
     truth_spp: int = 384  # the same of the held-out views
-    blur: float = 0.05  # metres of a surface over which bounced light is averaged
+    blur: float = 0.05  # meters of a surface over which bounced light is averaged
     sky: Callable[[], np.ndarray] | None = None  # radiance (H, W, 3) from all around: latitude down, longitude across
 
     @property

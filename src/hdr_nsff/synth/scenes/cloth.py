@@ -63,7 +63,7 @@ def sky() -> np.ndarray:
 
 def build(seed: int) -> list[Part]:
     """Every part of the courtyard."""
-    b = Builder(seed, per_metre=90)
+    b = Builder(seed, per_meter=90)
     walls(b)
     yard(b)
     movers(b)

@@ -1,4 +1,4 @@
-"""Pinhole cameras and rotations as plain arrays: OpenCV axes (+x right, +y down, +z forward), metres, pixel centres at +0.5."""
+"""Pinhole cameras and rotations as plain arrays: OpenCV axes (+x right, +y down, +z forward), meters, pixel centers at +0.5."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
 
 
 def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2), centres at +0.5, and z-depth (...) of world points (..., 3)."""
+    """Pixels (..., 2), centers at +0.5, and z-depth (...) of world points (..., 3)."""
     local = (points - c2w[:, 3]) @ c2w[:, :3]
     depth = local[..., 2]
     return local[..., :2] / depth[..., None] * K[[0, 1], [0, 1]] + K[:2, 2], depth
 
 
 def back_project(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
-    """World points (H, W, 3) at z-depth (H, W) on the rays through the pixel centres."""
+    """World points (H, W, 3) at z-depth (H, W) on the rays through the pixel centers."""
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)

@@ -12,7 +12,7 @@ from hdr_nsff.synth.scenes.shapes import Builder, cylinder, quad, sphere
 LEFT, RIGHT, TOP, FLOOR, FRONT, BACK = -1.45, 1.45, -1.15, 0.95, -1.6, 3.4  # the room
 WINDOW = (-1.0, -0.25, -0.72, 0.12)  # left, right, top, bottom in the back wall
 PIVOT = np.array([0.26, TOP, 2.65])  # of the pendulum
-CORD = 0.98  # metres from the pivot to the ball's centre
+CORD = 0.98  # meters from the pivot to the ball's center
 
 
 def box_pose(t: float) -> np.ndarray:
@@ -63,14 +63,14 @@ def walls(b: Builder) -> None:
     b.panel((RIGHT, TOP, FRONT), (0, 0, depth), (0, height, 0), textures.bricks, rows=24)
     b.panel((LEFT, TOP, FRONT), (width, 0, 0), (0, height, 0), textures.plaster)
     left, right, top, bottom = WINDOW
-    wall = textures.bricks(int(b.per_metre * height), int(b.per_metre * width), b.rng, rows=26, base=(0.34, 0.3, 0.24))
+    wall = textures.bricks(int(b.per_meter * height), int(b.per_meter * width), b.rng, rows=26, base=(0.34, 0.3, 0.24))
     for x0, x1, y0, y1 in [
         (LEFT, left, TOP, FLOOR),
         (right, RIGHT, TOP, FLOOR),
         (left, right, TOP, top),
         (left, right, bottom, FLOOR),
     ]:
-        ys, ye, xs, xe = (int(b.per_metre * v) for v in (y0 - TOP, y1 - TOP, x0 - LEFT, x1 - LEFT))
+        ys, ye, xs, xe = (int(b.per_meter * v) for v in (y0 - TOP, y1 - TOP, x0 - LEFT, x1 - LEFT))
         b.add(
             quad(np.array([x0, y0, BACK]), np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])),
             np.ascontiguousarray(wall[ys:ye, xs:xe]),

@@ -16,8 +16,8 @@ LEFT, RIGHT, TOP, FLOOR, FRONT, BACK = -1.75, 1.75, -1.25, 1.0, -1.5, 3.7
 GLOBE = np.array([0.05, -0.1, 2.75])  # the lamp
 RAIL = np.array([0.0, -0.5, 1.95])  # the crate hangs below its middle
 HINGE = np.array([-0.1, -0.98, 2.3])  # of the hammer
-ROD = 0.84  # metres from the hinge to the hammer's head
-ARM = 0.62  # metres from the lamp to the ball
+ROD = 0.84  # meters from the hinge to the hammer's head
+ARM = 0.62  # meters from the lamp to the ball
 
 
 def crate_pose(t: float) -> np.ndarray:

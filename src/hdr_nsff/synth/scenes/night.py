@@ -14,7 +14,7 @@ from hdr_nsff.synth.scenes.shapes import Builder, cylinder, revolved, room, sphe
 
 LEFT, RIGHT, TOP, FLOOR, FRONT, BACK = -3.3, 3.3, -5.5, 1.5, -4.0, 12.5
 CABLE = np.array([0.9, -2.9, 6.4])  # where the swinging lamp hangs from
-DROP = 1.9  # metres from there to the lamp
+DROP = 1.9  # meters from there to the lamp
 DIM = "dim lights"
 BLACK = np.full((1, 1, 3), 0.02)  # close to lamps: what is lit so brightly would sparkle
 HAND = np.array([0.44, -1.02, -0.12])  # of the walker, above the ground
@@ -68,7 +68,7 @@ def camera_pose(t: float) -> np.ndarray:
 
 def build(seed: int) -> list[Part]:
     """Every part of the alley."""
-    b = Builder(seed, per_metre=70)
+    b = Builder(seed, per_meter=70)
     houses(b)
     clutter(b)
     car(b)

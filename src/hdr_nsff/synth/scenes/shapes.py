@@ -70,9 +70,9 @@ def sheet(rows: int, columns: int) -> Mesh:
 class Builder:
     """Collects parts; every texture is drawn from one generator, in order."""
 
-    def __init__(self, seed: int, per_metre: int = 150):
+    def __init__(self, seed: int, per_meter: int = 150):
         self.rng = np.random.default_rng(seed)
-        self.per_metre = per_metre  # texture pixels
+        self.per_meter = per_meter  # texture pixels
         self.parts: list[Part] = []
 
     def add(self, mesh: Mesh, texture: np.ndarray, at=(0, 0, 0), turn=0.0, body=STILL):
@@ -82,12 +82,12 @@ class Builder:
 
     def panel(self, corner, u, v, paint: Callable[..., np.ndarray], **style) -> None:
         """A flat panel painted at the scene's texture resolution."""
-        w, h = (max(16, int(self.per_metre * np.linalg.norm(e))) for e in (u, v))
+        w, h = (max(16, int(self.per_meter * np.linalg.norm(e))) for e in (u, v))
         self.add(quad(corner, u, v), paint(h, w, self.rng, **style))
 
     def block(self, size, at, paint: Callable[..., np.ndarray], turn=0.0, body=STILL, **style) -> None:
         """A box whose sides show cells of one painting."""
-        side = max(16, int(self.per_metre * max(size)))
+        side = max(16, int(self.per_meter * max(size)))
         self.add(cuboid(size), paint(2 * side, 3 * side, self.rng, **style), at, turn, body)
 
     def light(self, corner, u, v, radiance: np.ndarray, circuit: str | None = None) -> None:
@@ -96,10 +96,10 @@ class Builder:
         self.parts.append(Part(f"light{len(self.parts)}", vertices, faces, uv, radiance, emits=True, circuit=circuit))
 
     def bulb(self, at, radius: float, radiance: np.ndarray, body=STILL, circuit: str | None = None) -> None:
-        """A round light of one colour (3,)."""
+        """A round light of one color (3,)."""
         none, glow = np.zeros((0, 3), int), np.reshape(radiance, (1, 1, 3)).astype(float)
-        name, centre = f"bulb{len(self.parts)}", np.asarray(at, float)[None]
-        self.parts.append(Part(name, centre, none, np.zeros((1, 2)), glow, body, emits=True, circuit=circuit, radius=radius))
+        name, center = f"bulb{len(self.parts)}", np.asarray(at, float)[None]
+        self.parts.append(Part(name, center, none, np.zeros((1, 2)), glow, body, emits=True, circuit=circuit, radius=radius))
 
 
 def room(b: Builder, bounds: tuple[float, ...], ceiling: Callable | None, sides: Callable, back: Callable) -> None:
