@@ -1,10 +1,15 @@
-"""What a step of training and a picture cost, against Gaussians, pixels, frames of the clip and processor cores.
+"""What a step of training and a picture cost, against Gaussians, pixels, frames of the
+clip and processor cores.
 
-    python benchmarks/cost.py SCENE [--plot PLOT.png] [--steps 60] [--only gaussians,pixels,frames,cores]
+    python benchmarks/cost.py SCENE [--plot PLOT.png] [--steps 60] [--only
+    gaussians,pixels,frames,cores]
 
-SCENE is a prepared clip; its frames are resized, left out or played again backwards in memory. One thing at a time varies, the others
-stay at 240x136 pixels, 20,000 Gaussians, all frames and all cores. Prints one JSON line per measurement: the median milliseconds of a
-step with all its losses and of a picture (radiance, depth, motion share, tone-mapped), and the peak memory of that measurement's own process."""
+SCENE is a prepared clip; its frames are resized, left out or played again backwards in
+memory. One thing at a time varies, the others stay at 240x136 pixels, 20,000 Gaussians,
+all frames and all cores. Prints one JSON line per measurement: the median milliseconds
+of a step with all its losses and of a picture (radiance, depth, motion share,
+tone-mapped), and the peak memory of that measurement's own process.
+"""
 
 import argparse
 import json
@@ -43,7 +48,9 @@ AXES: dict[str, tuple[str, list[int]]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scene", type=Path)
     parser.add_argument("--plot", type=Path)
     parser.add_argument("--steps", type=int, default=60)
@@ -55,8 +62,13 @@ def main() -> None:
         for value in values:
             if setting == "cores" and value > CORES:
                 continue
-            with multiprocessing.get_context("spawn").Pool(1) as process:  # a process of its own, for its peak memory
-                rows.append({"axis": axis} | process.apply(measured, (args.scene, USUAL | {setting: value}, args.steps)))
+            with multiprocessing.get_context("spawn").Pool(
+                1
+            ) as process:  # a process of its own, for its peak memory
+                rows.append(
+                    {"axis": axis}
+                    | process.apply(measured, (args.scene, USUAL | {setting: value}, args.steps))
+                )
             print(json.dumps(rows[-1]), flush=True)
     if args.plot:
         plot(rows, args.plot)
@@ -72,7 +84,14 @@ def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any
     moving = round(MOVING * setting["gaussians"])
     with tempfile.TemporaryDirectory() as out:
         field = SplatConfig(static=setting["gaussians"] - moving, moving=moving)
-        config = replace(PRESETS["splat"], field=field, scene=folder, out=Path(out), steps=100 * steps, minutes=None)
+        config = replace(
+            PRESETS["splat"],
+            field=field,
+            scene=folder,
+            out=Path(out),
+            steps=100 * steps,
+            minutes=None,
+        )
         trainer = Trainer(config, scene, torch.device("cpu"), distributed.Ranks())
         numba.set_num_threads(setting["cores"])
 
@@ -87,8 +106,17 @@ def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any
             trainer.tonemapper.develop(render.radiance, 0.0)
 
         spent = {"step_ms": timed(step, steps), "picture_ms": timed(picture, steps)}
-    about = {"gaussians": setting["gaussians"], "pixels": width * height, "frames": len(frames), "cores": setting["cores"]}
-    return about | spent | {"peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)}
+    about = {
+        "gaussians": setting["gaussians"],
+        "pixels": width * height,
+        "frames": len(frames),
+        "cores": setting["cores"],
+    }
+    return (
+        about
+        | spent
+        | {"peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)}
+    )
 
 
 def timed(do: Any, times: int) -> float:
@@ -103,7 +131,9 @@ def timed(do: Any, times: int) -> float:
 
 
 def at_length(frames: list[Frame], count: int) -> list[Frame]:
-    """The first `count` frames; where there are too few, the clip goes on backwards and forwards again, without flow."""
+    """The first `count` frames; where there are too few, the clip goes on backwards and
+    forwards again, without flow.
+    """
     there_and_back = [*frames, *reversed(frames)]
     longer = []
     for t in range(count):
@@ -122,9 +152,13 @@ def resized(frame: Frame, width: int, height: int) -> Frame:
     def nearest(image: Tensor | None) -> Any:
         if image is None:
             return None
-        layers = image[None, None].float() if image.ndim == 2 else image.permute(2, 0, 1)[None].float()
+        layers = (
+            image[None, None].float() if image.ndim == 2 else image.permute(2, 0, 1)[None].float()
+        )
         other = interpolate(layers, (height, width), mode="nearest")[0]
-        return (other[0] if image.ndim == 2 else other.permute(1, 2, 0).contiguous()).to(image.dtype)
+        return (other[0] if image.ndim == 2 else other.permute(1, 2, 0).contiguous()).to(
+            image.dtype
+        )
 
     return replace(
         frame,
@@ -147,18 +181,24 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib.pyplot as plt
 
     axes_measured = list(dict.fromkeys(r["axis"] for r in rows))
-    figure, panels = plt.subplots(1, len(axes_measured), figsize=(3.4 * len(axes_measured), 3.2), sharey=True, squeeze=False)
+    figure, panels = plt.subplots(
+        1, len(axes_measured), figsize=(3.4 * len(axes_measured), 3.2), sharey=True, squeeze=False
+    )
     for axis, panel in zip(axes_measured, panels[0], strict=True):
         some = [r for r in rows if r["axis"] == axis]
         for what, label in (("step_ms", "a training step"), ("picture_ms", "a picture")):
             panel.plot([r[axis] for r in some], [r[what] for r in some], marker="o", label=label)
         values = [r[axis] for r in some]
         panel.set(xlabel=axis, xscale="log", yscale="log")
-        panel.set_xticks(values, [f"{round(v / 1000)}k" if v >= 1000 else str(v) for v in values], fontsize=8)
+        panel.set_xticks(
+            values, [f"{round(v / 1000)}k" if v >= 1000 else str(v) for v in values], fontsize=8
+        )
         panel.minorticks_off()
         panel.grid(alpha=0.3)
     panels[0][0].set_ylabel("milliseconds")
-    panels[0][0].set_yticks([2, 5, 10, 20, 50, 100, 200], ["2", "5", "10", "20", "50", "100", "200"])
+    panels[0][0].set_yticks(
+        [2, 5, 10, 20, 50, 100, 200], ["2", "5", "10", "20", "50", "100", "200"]
+    )
     panels[0][0].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=110)

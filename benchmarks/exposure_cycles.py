@@ -1,6 +1,9 @@
-"""Exposure cycles found from brightness alone: `python benchmarks/exposure_cycles.py CLIP...`.
+"""Exposure cycles found from brightness alone: `python benchmarks/exposure_cycles.py
+CLIP...`.
 
-Prints what `prepare` finds in each clip, and in how many of its short pieces (7, 9, 12, 20 frames) the same cycle is found."""
+Prints what `prepare` finds in each clip, and in how many of its short pieces (7, 9, 12,
+20 frames) the same cycle is found.
+"""
 
 import sys
 from pathlib import Path

@@ -1,12 +1,18 @@
-"""How well flow holds when the exposure changes: end-point error on rendered scenes, whose flow is exact, for EV differences of one's choice.
+"""How well flow holds when the exposure changes: end-point error on rendered scenes,
+whose flow is exact, for EV differences of one's choice.
 
     hdr-nsff synth SCENE
-    python benchmarks/flow.py SCENE [SCENE ...] --flows prepared dis gmflow raft-finetuned --finetuned TUNED
+    python benchmarks/flow.py SCENE [SCENE ...] --flows prepared dis gmflow
+    raft-finetuned --finetuned TUNED
 
-The frames' exact radiance (SCENE/exact/clip_*.exr) is recorded again, as a clip whose two exposures alternate: the same pairs of neighbors,
-with nothing changed between rows but how many stops apart they are. `raw` matches what was recorded; `equalized` what `prepare` makes of it.
-`prepared` is the flow of a scene that `prepare` made of those frames, nothing else given: the default, with the masks that it found itself.
-Errors are those of pixels that both frames show, in both directions, clipped or not; seconds are CPU seconds per pair, both directions."""
+The frames' exact radiance (SCENE/exact/clip_*.exr) is recorded again, as a clip whose
+two exposures alternate: the same pairs of neighbors, with nothing changed between rows
+but how many stops apart they are. `raw` matches what was recorded; `equalized` what
+`prepare` makes of it. `prepared` is the flow of a scene that `prepare` made of those
+frames, nothing else given: the default, with the masks that it found itself. Errors are
+those of pixels that both frames show, in both directions, clipped or not; seconds are
+CPU seconds per pair, both directions.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +40,21 @@ FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--flows", nargs="+", choices=FLOWS, default=["dis"])
-    parser.add_argument("--weights", type=Path, help="of gmflow or raft; default: where weights are kept")
+    parser.add_argument(
+        "--weights", type=Path, help="of gmflow or raft; default: where weights are kept"
+    )
     parser.add_argument("--finetuned", type=Path, help="what `finetune-flow` wrote")
-    parser.add_argument("--ev", nargs="+", type=float, default=[0, 2, 4], help="stops between neighbors")
-    parser.add_argument("--pairs", type=int, default=4, help="pairs of neighbors per scene, evenly over the clip")
+    parser.add_argument(
+        "--ev", nargs="+", type=float, default=[0, 2, 4], help="stops between neighbors"
+    )
+    parser.add_argument(
+        "--pairs", type=int, default=4, help="pairs of neighbors per scene, evenly over the clip"
+    )
     parser.add_argument("--only", choices=("raw", "equalized"))
     parser.add_argument("--json", type=Path)
     args = parser.parse_args()
@@ -50,23 +64,34 @@ def main() -> None:
         frames = [read_exr(path) for path in sorted((scene / "exact").glob("clip_*.exr"))]
         assert len(frames) > args.pairs, f"{scene}: {len(frames)} frames in exact/"
         pairs = neighbors(len(frames), args.pairs)
-        print(f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}")
+        print(
+            f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}"
+        )
         for name in args.flows:
-            network = None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
+            network = (
+                None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
+            )
             both = (
                 ("equalized",) if name in ("prepared", "semantic") else ("raw", "equalized")
             )  # these two equalize by themselves
             for treated in both if args.only is None else (args.only,):
                 for stops in args.ev:
                     rows.append({"scene": scene.name, "flow": name, "frames": treated, "ev": stops})
-                    rows[-1] |= measure(frames, pairs, stops, as_prepared if name == "prepared" else prior(network, treated))
+                    rows[-1] |= measure(
+                        frames,
+                        pairs,
+                        stops,
+                        as_prepared if name == "prepared" else prior(network, treated),
+                    )
                     print(line(rows[-1]), flush=True)
     if args.json:
         write_json(args.json, rows)
 
 
 def named(name: str, weights: Path | None, finetuned: Path | None) -> object:
-    """A loaded network, or the features of `--flow semantic` as they are: fitting them to a clip moved no median by 0.01 px."""
+    """A loaded network, or the features of `--flow semantic` as they are: fitting them
+    to a clip moved no median by 0.01 px.
+    """
     if name == "semantic":
         return semantic_flow(SemanticConfig(steps=0), weights, (), ())
     return load(None, finetuned) if name == "raft-finetuned" else load(name, weights)  # type: ignore[arg-type]
@@ -81,7 +106,9 @@ def neighbors(frames: int, count: int) -> np.ndarray:
 def prior(network, treated: str) -> Callable:
     """(recorded video, groups, pairs (P, 2)) -> flow and where it is believed."""
 
-    def on_raw(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def on_raw(
+        video: np.ndarray, groups: list[int], pairs: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
             if network is not None:
                 assert not isinstance(network, SemanticFlow)
@@ -91,20 +118,30 @@ def prior(network, treated: str) -> Callable:
 
         return checked(match, np.zeros(video.shape[:3], bool), pairs, None, threads=1)
 
-    def on_equalized(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def on_equalized(
+        video: np.ndarray, groups: list[int], pairs: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         frames = equalize(video, groups)
         if isinstance(network, SemanticFlow):
             network.features = None  # of another clip
             found, valid = network(*frames, pairs)
         else:
-            found, valid = flow(*frames, pairs, None) if network is None else matched_flow(network, *frames, pairs)
+            found, valid = (
+                flow(*frames, pairs, None)
+                if network is None
+                else matched_flow(network, *frames, pairs)
+            )
         return completed(found, *frames, pairs), valid
 
     return on_raw if treated == "raw" else on_equalized
 
 
-def as_prepared(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The flow that training sees of a clip, by all steps of `prepare` with their defaults, and where it is believed."""
+def as_prepared(
+    video: np.ndarray, groups: list[int], pairs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The flow that training sees of a clip, by all steps of `prepare` with their
+    defaults, and where it is believed.
+    """
     with TemporaryDirectory() as folder:
         clip, scene = Path(folder) / "clip", Path(folder) / "scene"
         clip.mkdir()
@@ -117,25 +154,36 @@ def as_prepared(video: np.ndarray, groups: list[int], pairs: np.ndarray) -> tupl
         return np.stack(found), np.stack([read_mask(scene / one.valid) for one in files])
 
 
-def completed(found: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """The flow (P, H, W, 2) px of pairs and their reverses, ended as the step `refined_flow` of `prepare` does, without its masks: where it is not sure
-    told by what is around, and both ways met halfway."""
+def completed(
+    found: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+) -> np.ndarray:
+    """The flow (P, H, W, 2) px of pairs and their reverses, ended as the step
+    `refined_flow` of `prepare` does, without its masks: where it is not sure told by
+    what is around, and both ways met halfway.
+    """
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
     one_way = {(int(i), int(j)): one for (i, j), one in zip(pairs, found, strict=True)}
     still = np.zeros(clipped.shape[1:], bool)
     ended = {
-        (i, j): told(one, one_way[j, i], *common_gray(video, ranges, i, j), clipped[i], clipped[j], still)
+        (i, j): told(
+            one, one_way[j, i], *common_gray(video, ranges, i, j), clipped[i], clipped[j], still
+        )
         for (i, j), one in one_way.items()
     }
     return np.stack([halfway(one, ended[j, i]) for (i, j), one in ended.items()])
 
 
-def measure(frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float, match: Callable) -> dict:
+def measure(
+    frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float, match: Callable
+) -> dict:
     """Errors at a difference of `stops` EV, moving and still pixels apart."""
     groups = [k % 2 if stops else 0 for k in range(len(frames))]
     rng, camera = np.random.default_rng(0), response_curve("film")
     video = np.stack(
-        [record(f["RGB"], (g - 0.5) * stops, (1, 1, 1), camera, Noise(), rng) for f, g in zip(frames, groups, strict=True)]
+        [
+            record(f["RGB"], (g - 0.5) * stops, (1, 1, 1), camera, Noise(), rng)
+            for f, g in zip(frames, groups, strict=True)
+        ]
     )
     both = np.concatenate([pairs, pairs[:, ::-1]])
     start = time.process_time()
@@ -152,7 +200,10 @@ def measure(frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float
     return {
         "moving": summary(error[counts & moves]),
         "still": summary(error[counts & ~moves]),
-        "believed": {"share": float(valid[counts].mean()), "mean": float(error[counts & valid].mean())},
+        "believed": {
+            "share": float(valid[counts].mean()),
+            "mean": float(error[counts & valid].mean()),
+        },
         "seconds": seconds,
     }
 
@@ -182,8 +233,15 @@ def line(row: dict) -> str:
     m, s, b = row["moving"], row["still"], row["believed"]
     cells = [row["flow"], row["frames"], f"{row['ev']:g}"]
     for part in (m, s):
-        cells += [f"{part['mean']:.2f}, {part['median']:.2f}", f"{part['within1']:.0%}, {part['within3']:.0%}"]
-    return "| " + " | ".join([*cells, f"{b['share']:.0%}, {b['mean']:.2f}", f"{row['seconds']:.1f}"]) + " |"
+        cells += [
+            f"{part['mean']:.2f}, {part['median']:.2f}",
+            f"{part['within1']:.0%}, {part['within3']:.0%}",
+        ]
+    return (
+        "| "
+        + " | ".join([*cells, f"{b['share']:.0%}, {b['mean']:.2f}", f"{row['seconds']:.1f}"])
+        + " |"
+    )
 
 
 if __name__ == "__main__":

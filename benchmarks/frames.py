@@ -1,11 +1,16 @@
-"""Frames per second of a field of Gaussians: they move to the frame's time and are drawn as radiance, depth and motion share, tone-mapped
-to what a camera records; and the same with the scene flow to either side.
+"""Frames per second of a field of Gaussians: they move to the frame's time and are
+drawn as radiance, depth and motion share, tone-mapped to what a camera records; and the
+same with the scene flow to either side.
 
-    python benchmarks/frames.py [--run RUN] [--sizes 240x136,720x480] [--counts 5000,20000,80000] [--threads 1,2] [--plot PLOT.png]
+    python benchmarks/frames.py [--run RUN] [--sizes 240x136,720x480] [--counts
+    5000,20000,80000] [--threads 1,2] [--plot PLOT.png]
 
-Without a run, the Gaussians lie on a wall behind a row of movers as a trained field has them: as many and as large as pixels ask for.
-With one, its own Gaussians are drawn from a camera of its scene, at the sizes given. Prints one JSON line per measurement: the median
-of repeated frames, each at another time. `--plot` draws milliseconds against each."""
+Without a run, the Gaussians lie on a wall behind a row of movers as a trained field has
+them: as many and as large as pixels ask for. With one, its own Gaussians are drawn from
+a camera of its scene, at the sizes given. Prints one JSON line per measurement: the
+median of repeated frames, each at another time. `--plot` draws milliseconds against
+each.
+"""
 
 import argparse
 import json
@@ -31,7 +36,9 @@ TIMES = 36  # training times of the made-up field
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--run", type=Path)
     parser.add_argument("--sizes", default="240x136,720x480")
     parser.add_argument("--counts", default="5000,20000,80000", help="Gaussians, without a run")
@@ -50,7 +57,11 @@ def main() -> None:
                 numba.set_num_threads(threads)
                 where = replace(camera, K=camera.K.to(device), c2w=camera.c2w.to(device))
                 for flow in (False, True):
-                    about = {"gaussians": len(field.static) + len(field.moving), "width": width, "height": height}
+                    about = {
+                        "gaussians": len(field.static) + len(field.moving),
+                        "width": width,
+                        "height": height,
+                    }
                     about |= {"threads": threads, "scene_flow": flow}
                     rows.append(about | measure(field, tonemapper, where, args.frames, flow))
                     print(json.dumps(rows[-1] | {"device": name_of(device)}), flush=True)
@@ -62,36 +73,60 @@ def name_of(device: torch.device) -> str:
     return torch.cuda.get_device_name() if device.type == "cuda" else platform.machine()
 
 
-def subjects(args: argparse.Namespace, width: int, height: int) -> list[tuple[Any, ToneMapper, Camera]]:
+def subjects(
+    args: argparse.Namespace, width: int, height: int
+) -> list[tuple[Any, ToneMapper, Camera]]:
     """Fields with their tone mapper and a camera of that size."""
     if args.run:
         run = Run.open(args.run, args.device)
         assert isinstance(run.field, Splat), "only fields of Gaussians are measured here"
         return [(run.field, run.tonemapper, run.scene.train[0].camera.resized(width, height))]
-    camera = Camera(torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]]), torch.eye(3, 4), width, height)
+    camera = Camera(
+        torch.tensor([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1.0]]),
+        torch.eye(3, 4),
+        width,
+        height,
+    )
     return [
-        (made_up(int(count), camera), ToneMapper(ToneMapConfig(), [0], [0], [0.0]), camera) for count in args.counts.split(",")
+        (made_up(int(count), camera), ToneMapper(ToneMapConfig(), [0], [0], [0.0]), camera)
+        for count in args.counts.split(",")
     ]
 
 
 @torch.no_grad()
 def made_up(count: int, camera: Camera) -> Splat:
-    """Static Gaussians on a wall at 3, moving ones around 2, spread over the picture, as wide as they are apart."""
+    """Static Gaussians on a wall at 3, moving ones around 2, spread over the picture,
+    as wide as they are apart.
+    """
     moving = round(MOVING * count)
-    field = Splat(SplatConfig(static=count - moving, moving=moving), torch.arange(TIMES), 1.0, 6.0, camera.width * camera.height)
+    field = Splat(
+        SplatConfig(static=count - moving, moving=moving),
+        torch.arange(TIMES),
+        1.0,
+        6.0,
+        camera.width * camera.height,
+    )
     generator = torch.Generator().manual_seed(0)
     for gaussians, distance, share in ((field.static, 3.0, 1.0), (field.moving, 2.0, MOVING)):
         spread = torch.rand(len(gaussians), 3, generator=generator) - 0.5
-        extent = distance * torch.tensor([1.0, camera.height / camera.width, 0.1]) * torch.tensor([share**0.5, share**0.5, 1])
+        extent = (
+            distance
+            * torch.tensor([1.0, camera.height / camera.width, 0.1])
+            * torch.tensor([share**0.5, share**0.5, 1])
+        )
         gaussians.means.copy_(spread * extent + torch.tensor([0, 0, distance]))
         apart = (extent[0] * extent[1] / len(gaussians)).sqrt()
-        gaussians.log_scales.copy_(apart.log() + 0.3 * torch.randn(len(gaussians), 3, generator=generator) - 0.5)
+        gaussians.log_scales.copy_(
+            apart.log() + 0.3 * torch.randn(len(gaussians), 3, generator=generator) - 0.5
+        )
         gaussians.logits.fill_(1.0)
     return field
 
 
 @torch.no_grad()
-def measure(field: Splat, tonemapper: ToneMapper, camera: Camera, frames: int, flow: bool) -> dict[str, float]:
+def measure(
+    field: Splat, tonemapper: ToneMapper, camera: Camera, frames: int, flow: bool
+) -> dict[str, float]:
     """Median milliseconds of a frame, and how many a second that are."""
 
     def frame(i: int) -> Tensor:
@@ -115,7 +150,9 @@ def measure(field: Splat, tonemapper: ToneMapper, camera: Camera, frames: int, f
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Milliseconds against Gaussians without scene flow, a line for every size and number of threads."""
+    """Milliseconds against Gaussians without scene flow, a line for every size and
+    number of threads.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -124,7 +161,9 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     rows = [r for r in rows if not r["scene_flow"]]
     figure, axes = plt.subplots(figsize=(6, 4))
     for width, height, threads in sorted({(r["width"], r["height"], r["threads"]) for r in rows}):
-        some = [r for r in rows if (r["width"], r["height"], r["threads"]) == (width, height, threads)]
+        some = [
+            r for r in rows if (r["width"], r["height"], r["threads"]) == (width, height, threads)
+        ]
         axes.plot(
             [r["gaussians"] for r in some],
             [r["ms"] for r in some],

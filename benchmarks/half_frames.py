@@ -1,12 +1,17 @@
-"""How much worse views between two frames are than views at them: the same cameras, the same exposures, at whole and at half times.
+"""How much worse views between two frames are than views at them: the same cameras, the
+same exposures, at whole and at half times.
 
     hdr-nsff synth interior RIG --views rig --oracle
     hdr-nsff train splat --scene RIG/oracle --out RUN --minutes 2
     python benchmarks/half_frames.py RIG OUT RUN [RUN ...]
 
-OUT becomes a folder like RIG whose truth is, for every half-time view that RIG holds out, that view half a frame earlier, at its own time, and half
-a frame later: path-traced anew, which is resumable. Compared are the means over the cameras, the whole times' taken together. `group` of RUN's
-own metrics.json compares other cameras at other times, and so more than interpolation. RUN's metrics.json is overwritten: evaluate it again."""
+OUT becomes a folder like RIG whose truth is, for every half-time view that RIG holds
+out, that view half a frame earlier, at its own time, and half a frame later:
+path-traced anew, which is resumable. Compared are the means over the cameras, the whole
+times' taken together. `group` of RUN's own metrics.json compares other cameras at other
+times, and so more than interpolation. RUN's metrics.json is overwritten: evaluate it
+again.
+"""
 
 import argparse
 from dataclasses import fields, replace
@@ -18,18 +23,33 @@ from hdr_nsff.core import io
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.geometry import intrinsics
-from hdr_nsff.synth.synth import SynthConfig, claim, clip_shots, parse_ev, parse_size, render, truth_shots, write_truth
+from hdr_nsff.synth.synth import (
+    SynthConfig,
+    claim,
+    clip_shots,
+    parse_ev,
+    parse_size,
+    render,
+    truth_shots,
+    write_truth,
+)
 from hdr_nsff.training.run_folder import Run
 
 SHOWN = ("psnr", "psnr_moving", "ssim", "mu5000", "mu5000_moving")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("rig", type=Path, help="what `synth` wrote")
     parser.add_argument("out", type=Path)
     parser.add_argument("runs", type=Path, nargs="+")
-    parser.add_argument("--spp", type=int, help="paths per pixel of the views; default: those of RIG's held-out views")
+    parser.add_argument(
+        "--spp",
+        type=int,
+        help="paths per pixel of the views; default: those of RIG's held-out views",
+    )
     args = parser.parse_args()
     make_truth(args.rig, args.out, args.spp)
     for run in args.runs:
@@ -42,7 +62,9 @@ def main() -> None:
 
 
 def make_truth(rig: Path, out: Path, spp: int | None) -> None:
-    """OUT/truth of the half times' cameras, half a frame before, at, and half a frame after."""
+    """OUT/truth of the half times' cameras, half a frame before, at, and half a frame
+    after.
+    """
     settings = io.read_json(rig / "truth" / "truth.json")["settings"]
     known = {f.name for f in fields(SynthConfig)}
     config = SynthConfig(out=out, **{k: v for k, v in settings.items() if k in known})
@@ -51,9 +73,13 @@ def make_truth(rig: Path, out: Path, spp: int | None) -> None:
     K, reference = intrinsics(*size), int(np.argsort(evs)[len(evs) // 2])
     held = truth_shots(scene, config.frames, int(config.truth_spp or 0), config.seed, config.views)
     halves = [s for s in held if s.time % 1]
-    assert len(halves) % len(evs) == 0, "exposures go round with the views: each camera must meet one exposure"
+    assert len(halves) % len(evs) == 0, (
+        "exposures go round with the views: each camera must meet one exposure"
+    )
     shots = [
-        replace(s, time=s.time + d, name=f"view_{k}_{s.time + d:04.1f}") for d in (-0.5, 0.0, 0.5) for k, s in enumerate(halves)
+        replace(s, time=s.time + d, name=f"view_{k}_{s.time + d:04.1f}")
+        for d in (-0.5, 0.0, 0.5)
+        for k, s in enumerate(halves)
     ]
     claim(config)
     render(shots, K, size, config)

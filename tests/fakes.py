@@ -1,4 +1,6 @@
-"""A closed-form scene for tests: a bright disc that moves before a wall of horizontal gradient, seen by cameras that slide along x."""
+"""A closed-form scene for tests: a bright disc that moves before a wall of horizontal
+gradient, seen by cameras that slide along x.
+"""
 
 from __future__ import annotations
 
@@ -28,11 +30,25 @@ def camera(x: float = 0.0) -> Camera:
 
 
 class DiscBeforeWall:
-    """The scene as a field: samples on two planes. `layered` fields show them; `wall` false leaves the disc alone; `empty_moves`
-    lets the empty samples around the disc flow with it."""
+    """The scene as a field: samples on two planes. `layered` fields show them; `wall`
+    false leaves the disc alone; `empty_moves` lets the empty samples around the disc
+    flow with it.
+    """
 
-    def __init__(self, wall: bool = True, empty_moves: bool = False, speed: Tensor = SPEED, red: float = 100.0) -> None:
-        self.wall, self.empty_moves, self.speed, self.red, self.calls = wall, empty_moves, speed, red, 0
+    def __init__(
+        self,
+        wall: bool = True,
+        empty_moves: bool = False,
+        speed: Tensor = SPEED,
+        red: float = 100.0,
+    ) -> None:
+        self.wall, self.empty_moves, self.speed, self.red, self.calls = (
+            wall,
+            empty_moves,
+            speed,
+            red,
+            0,
+        )
 
     def layers(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Layers:
         rays = camera.rays(camera.pixel_grid() if pixels is None else pixels)
@@ -46,9 +62,13 @@ class DiscBeforeWall:
         flow[:, 0] = self.speed * (1.0 if self.empty_moves else inside[:, None])
         alpha = torch.stack([inside, torch.full_like(inside, float(self.wall))], -1)
         motion = torch.tensor([1.0, 0.0]).expand_as(alpha)
-        return Layers(positions, alpha, torch.stack([red, gradient], 1), {1: flow, -1: -flow}, motion)
+        return Layers(
+            positions, alpha, torch.stack([red, gradient], 1), {1: flow, -1: -flow}, motion
+        )
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
+    def render(
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
+    ) -> Render:
         self.calls += 1
         layers = self.layers(camera, time, pixels)
         near = layers.alpha[:, 0, None]
@@ -74,13 +94,20 @@ class DiscBeforeWall:
 
 
 def fake_run(
-    folder: Path, num_frames: int = 6, parallax: Any = "full", held_out: int = 0, field: DiscBeforeWall | None = None
+    folder: Path,
+    num_frames: int = 6,
+    parallax: Any = "full",
+    held_out: int = 0,
+    field: DiscBeforeWall | None = None,
 ) -> Run:
-    """A run whose field is the truth itself and whose camera records through gamma 2.2 at EV -4, -2, 0 in turn; the last
-    `held_out` frames are test frames."""
+    """A run whose field is the truth itself and whose camera records through gamma 2.2
+    at EV -4, -2, 0 in turn; the last `held_out` frames are test frames.
+    """
     field = field or DiscBeforeWall(speed=SPEED / 4, red=3.0)
     spacing = 0.05 if parallax == "full" else 0.0
-    tonemapper = ToneMapper(ToneMapConfig(residual=False), [i % 3 for i in range(num_frames)], [0] * num_frames, EV, 2)
+    tonemapper = ToneMapper(
+        ToneMapConfig(residual=False), [i % 3 for i in range(num_frames)], [0] * num_frames, EV, 2
+    )
     frames = []
     for i in range(num_frames):
         c = camera(spacing * i)
@@ -105,5 +132,15 @@ def fake_run(
         exposure_given=True, parallax=parallax, near=1.0, far=8.0, frames=entries, steps=steps,
     )  # fmt: skip
     cut = num_frames - held_out
-    scene = Scene(folder / "scene", frames[:cut], frames[cut:], 1.0, 8.0, torch.zeros(0, 3), manifest)
-    return Run(folder, TrainConfig(scene=folder / "scene", out=folder), scene, field, tonemapper, step=7, seconds=3.0)
+    scene = Scene(
+        folder / "scene", frames[:cut], frames[cut:], 1.0, 8.0, torch.zeros(0, 3), manifest
+    )
+    return Run(
+        folder,
+        TrainConfig(scene=folder / "scene", out=folder),
+        scene,
+        field,
+        tonemapper,
+        step=7,
+        seconds=3.0,
+    )

@@ -1,6 +1,9 @@
-"""Miniature public data sets that tests write: a textured wall at z = 4 with one red dot, seen by cameras along x that turn a little.
+"""Miniature public data sets that tests write: a textured wall at z = 4 with one red
+dot, seen by cameras along x that turn a little.
 
-`see` is the only way to a picture, so a reader that gets a convention wrong finds the dot elsewhere."""
+`see` is the only way to a picture, so a reader that gets a convention wrong finds the
+dot elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,9 @@ DOT = np.array([0.25, -0.15, WALL])
 EV = (-2.0, 0.0, 2.0)
 K = np.array([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1]])
 ANGLE = 2 * np.arctan(W / 2 / FOCAL)  # camera_angle_x
-TEXTURE = cv2.GaussianBlur(np.kron(np.random.default_rng(3).random((80, 80)), np.ones((4, 4))), (0, 0), 2).astype(np.float32)
+TEXTURE = cv2.GaussianBlur(
+    np.kron(np.random.default_rng(3).random((80, 80)), np.ones((4, 4))), (0, 0), 2
+).astype(np.float32)
 
 
 def pose(x: float) -> np.ndarray:
@@ -33,7 +38,9 @@ def pose(x: float) -> np.ndarray:
 def opengl(c2w: np.ndarray) -> list[list[float]]:
     """4x4 with columns right, up, back."""
     right, down, forward, center = c2w.T
-    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(center, 1)], 1).tolist()
+    return np.stack(
+        [np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(center, 1)], 1
+    ).tolist()
 
 
 def dot_pixel(c2w: np.ndarray, scale: float = 1.0) -> np.ndarray:
@@ -43,13 +50,19 @@ def dot_pixel(c2w: np.ndarray, scale: float = 1.0) -> np.ndarray:
 
 
 def radiance(c2w: np.ndarray, scale: int = 1) -> np.ndarray:
-    """What a camera sees (H, W, 3), linear; the dot is 10 times as bright as the wall and red."""
+    """What a camera sees (H, W, 3), linear; the dot is 10 times as bright as the wall
+    and red.
+    """
     y, x = (np.mgrid[: H * scale, : W * scale] + 0.5) / scale
     rays = np.stack([(x - W / 2) / FOCAL, (y - H / 2) / FOCAL, np.ones_like(x)], -1) @ c2w[:, :3].T
     points = c2w[:, 3] + rays * ((WALL - c2w[2, 3]) / rays[..., 2:])
-    wall = cv2.remap(TEXTURE, *((points[..., k].astype(np.float32) + 4) * 40 for k in (0, 1)), cv2.INTER_LINEAR)
+    wall = cv2.remap(
+        TEXTURE, *((points[..., k].astype(np.float32) + 4) * 40 for k in (0, 1)), cv2.INTER_LINEAR
+    )
     dot = np.linalg.norm(points - DOT, axis=-1) < 0.16
-    return np.where(dot[..., None], [2.0, 0, 0], 0.4 * np.stack([wall, wall, 0.8 * wall], -1) ** 2 + 0.01).astype(np.float32)
+    return np.where(
+        dot[..., None], [2.0, 0, 0], 0.4 * np.stack([wall, wall, 0.8 * wall], -1) ** 2 + 0.01
+    ).astype(np.float32)
 
 
 def see(c2w: np.ndarray, ev: float = 0.0, scale: int = 1) -> np.ndarray:
@@ -84,19 +97,27 @@ def gopro(root: Path, scale: int = 1, held_out: bool = True) -> Path:
     for i in range(COUNT):
         c2w, ev = gopro_pose(i % CAMERAS), EV[i % CAMERAS]
         right, down, forward, center = c2w.T
-        matrix = np.stack([down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
+        matrix = np.stack(
+            [down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1
+        )  # of pictures twice as large
         rows.append(np.append(matrix.ravel(), [3.0, 5.0]))
         picture = see(c2w, ev, scale)
         write_png(dense / f"images_{W * scale}x{H * scale}/{i:05d}.png", picture)
         write_png(dense / f"images/{i:05d}.png", see(c2w, ev, 2))
         write_png(dense / f"motion_masks/{i:05d}.png", left(3))
         write_png(root / f"masks/{i:05d}.png", ~left(5))
-        write_npy(dense / f"depth-anything/{i:05d}.npy", np.full((H, W), 2.0, np.float32))  # its unit is 2 scene units
+        write_npy(
+            dense / f"depth-anything/{i:05d}.npy", np.full((H, W), 2.0, np.float32)
+        )  # its unit is 2 scene units
         for j, side in ((i + 1, "fwd"), (i - 1, "bwd")):
             if 0 <= j < COUNT:
                 flow = np.full((H, W, 2), [j - i, 0.5], np.float32)
                 (dense / "flow_i1").mkdir(exist_ok=True)
-                np.savez(dense / f"flow_i1/{i:05d}_{side}.npz", flow=flow, mask=left(30).astype(np.float32))
+                np.savez(
+                    dense / f"flow_i1/{i:05d}_{side}.npz",
+                    flow=flow,
+                    mask=left(30).astype(np.float32),
+                )
         if held_out:
             gopro_held_out(dense, i)
     np.save(dense / "poses_bounds.npy", np.array(rows))
@@ -121,15 +142,23 @@ def colmap(dense: Path, points: np.ndarray) -> None:
     """`sparse/` of the tree: every picture sees every point of `points` (P, 3)."""
     folder = dense / "sparse"
     folder.mkdir()
-    (folder / "cameras.bin").write_bytes(struct.pack("<QiiQQ3d", 1, 1, 0, W, H, FOCAL, W / 2, H / 2))
+    (folder / "cameras.bin").write_bytes(
+        struct.pack("<QiiQQ3d", 1, 1, 0, W, H, FOCAL, W / 2, H / 2)
+    )
     images = struct.pack("<Q", COUNT)
     for i in range(COUNT):
         c2w = gopro_pose(i % CAMERAS)
         q = np.roll(Rotation.from_matrix(c2w[:, :3].T).as_quat(), 1)
         local = (points - c2w[:, 3]) @ c2w[:, :3]
         xy = local[:, :2] / local[:, 2:] * FOCAL + [W / 2, H / 2]
-        images += struct.pack("<i7di", i + 1, *q, *(-c2w[:, :3].T @ c2w[:, 3]), 1) + f"{i:05d}.png".encode() + b"\0"
-        images += struct.pack("<Q", len(points)) + b"".join(struct.pack("<ddq", *p, k + 1) for k, p in enumerate(xy))
+        images += (
+            struct.pack("<i7di", i + 1, *q, *(-c2w[:, :3].T @ c2w[:, 3]), 1)
+            + f"{i:05d}.png".encode()
+            + b"\0"
+        )
+        images += struct.pack("<Q", len(points)) + b"".join(
+            struct.pack("<ddq", *p, k + 1) for k, p in enumerate(xy)
+        )
     (folder / "images.bin").write_bytes(images)
     cloud = struct.pack("<Q", len(points))
     for k, p in enumerate(points):
@@ -146,7 +175,9 @@ def blender_pose(t: float) -> np.ndarray:
 
 
 def blender(root: Path, kind: str = "hexplane", transparent: bool = True) -> Path:
-    """Ten times: 4 and 8 are held out. `kind`: dnerf (times in [0, 1]), hexplane (stops), hdr4d (exposure times, EXR), nerf (still)."""
+    """Ten times: 4 and 8 are held out. `kind`: dnerf (times in [0, 1]), hexplane
+    (stops), hdr4d (exposure times, EXR), nerf (still).
+    """
     for split, times in (("train", [0, 1, 2, 3, 5, 6, 7, 9]), ("test", [4, 8])):
         frames = []
         for n, t in enumerate(times):
@@ -165,7 +196,10 @@ def blender(root: Path, kind: str = "hexplane", transparent: bool = True) -> Pat
                 frame["file_path"] += ".png"
             write_rgba(root / f"{name}.png", see(c2w, ev), transparent)
             frames.append(frame)
-        write_json(root / f"transforms_{split}.json", {"camera_angle_x": ANGLE, "near": 2.0, "far": 6.0, "frames": frames})
+        write_json(
+            root / f"transforms_{split}.json",
+            {"camera_angle_x": ANGLE, "near": 2.0, "far": 6.0, "frames": frames},
+        )
     return root
 
 
@@ -174,7 +208,9 @@ def write_rgba(path: Path, rgb: np.ndarray, transparent: bool) -> None:
     alpha = np.ones((*rgb.shape[:2], 1))
     alpha[-2:] = 0.25 if transparent else 1.0
     path.parent.mkdir(parents=True, exist_ok=True)
-    cv2.imwrite(str(path), np.rint(np.concatenate([rgb[..., ::-1], alpha], -1) * 255).astype(np.uint8))
+    cv2.imwrite(
+        str(path), np.rint(np.concatenate([rgb[..., ::-1], alpha], -1) * 255).astype(np.uint8)
+    )
 
 
 # HDR-NeRF
@@ -204,7 +240,9 @@ def hdr_nerf_real(root: Path) -> Path:
     for n in range(12):
         c2w = pose(0.1 * n)
         right, down, forward, center = c2w.T
-        matrix = np.stack([down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)  # of pictures twice as large
+        matrix = np.stack(
+            [down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1
+        )  # of pictures twice as large
         for e in range(5):
             ev = 2.0 * (e - 2)
             rows.append([*matrix.ravel(), 3.0, 5.0, 2.0**ev])
@@ -217,7 +255,9 @@ def hdr_nerf_real(root: Path) -> Path:
 
 
 def nerfstudio(root: Path, **changes: Any) -> Path:
-    """Eight pictures in no order of the list, one of them held out, with depth in millimeters."""
+    """Eight pictures in no order of the list, one of them held out, with depth in
+    millimeters.
+    """
     frames = []
     for n in (3, 0, 1, 2, 4, 5, 7, 6):
         c2w = pose(0.15 * n)

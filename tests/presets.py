@@ -1,4 +1,6 @@
-"""The presets, shrunk so that a test trains each in seconds: the same code paths, fewer numbers."""
+"""The presets, shrunk so that a test trains each in seconds: the same code paths, fewer
+numbers.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +39,9 @@ NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
 }
 
 
-def small(preset: str, scene: Path = Path("scene"), out: Path = Path("run"), steps: int = 2) -> TrainConfig:
+def small(
+    preset: str, scene: Path = Path("scene"), out: Path = Path("run"), steps: int = 2
+) -> TrainConfig:
     """A preset with a small network, few samples and few rays."""
     config = PRESETS[preset]
     network = NETWORKS.get(preset) or NETWORKS[preset.partition("-")[0]]
@@ -48,7 +52,15 @@ def small(preset: str, scene: Path = Path("scene"), out: Path = Path("run"), ste
     )
     rays = {"rays": 64, "moving_rays": 16} if config.rays else {}
     return replace(
-        config, field=field, scene=scene, out=out, steps=steps, minutes=None, checkpoint_seconds=1e9, device="cpu", **rays
+        config,
+        field=field,
+        scene=scene,
+        out=out,
+        steps=steps,
+        minutes=None,
+        checkpoint_seconds=1e9,
+        device="cpu",
+        **rays,
     )
 
 

@@ -29,7 +29,9 @@ def test_an_ablation_differs_from_its_preset_in_one_part(name: str) -> None:
 
 def test_every_ablation_that_makes_sense_is_a_preset() -> None:
     assert {n.removeprefix("grid-") for n in NAMES if n.startswith("grid-")} == set(ABLATIONS)
-    assert set(ABLATIONS) - {n.removeprefix("splat-") for n in NAMES if n.startswith("splat-")} == {"no-saturation"}
+    assert set(ABLATIONS) - {n.removeprefix("splat-") for n in NAMES if n.startswith("splat-")} == {
+        "no-saturation"
+    }
 
 
 def test_without_flow_nothing_is_started_from_it(toy: Scene) -> None:
@@ -40,7 +42,11 @@ def test_without_flow_nothing_is_started_from_it(toy: Scene) -> None:
 
 def test_without_depth_the_prior_neither_paints_nor_pulls() -> None:
     config = ablated(PRESETS["grid"], "no-depth")
-    assert not config.from_priors and config.loss.depth == 0 and config.loss.flow == PRESETS["grid"].loss.flow
+    assert (
+        not config.from_priors
+        and config.loss.depth == 0
+        and config.loss.flow == PRESETS["grid"].loss.flow
+    )
 
 
 def test_a_sigmoid_keeps_radiance_below_one_and_starts_where_it_is_painted(toy: Scene) -> None:
@@ -54,12 +60,16 @@ def test_a_sigmoid_keeps_radiance_below_one_and_starts_where_it_is_painted(toy: 
     assert float(bounded.to_radiance(bounded.from_radiance(torch.tensor(40.0)))) < 1
 
 
-def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_every_part(toy: Scene) -> None:
+def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_every_part(
+    toy: Scene,
+) -> None:
     config = small("splat-sigmoid").field
     assert isinstance(config, SplatConfig)
     field = build_field(replace(config, view_dependence=True), toy)
     assert isinstance(field, Splat)
-    start_field(field, toy, lambda rgb, i: 3 * rgb, 0.5, True)  # brighter than 1, the background too
+    start_field(
+        field, toy, lambda rgb, i: 3 * rgb, 0.5, True
+    )  # brighter than 1, the background too
     for g in (field.static, field.moving):
         for p in (g.offsets, g.sh1):  # shades, colors in time, colors by direction
             p.data.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
@@ -69,13 +79,19 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     render, _ = field(whole_frame(toy, 2))
     render.radiance.sum().backward()
     for g in (field.static, field.moving):
-        assert all(float(p.grad.abs().max()) > 0 for p in (g.log_radiance, g.offsets, g.sh1) if p.grad is not None)
+        assert all(
+            float(p.grad.abs().max()) > 0
+            for p in (g.log_radiance, g.offsets, g.sh1)
+            if p.grad is not None
+        )
         assert None not in (g.log_radiance.grad, g.offsets.grad, g.sh1.grad)
     assert field.background.grad is not None and float(field.background.grad.abs().min()) > 0
 
 
 @pytest.mark.parametrize("from_priors", [True, False])
-def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(from_priors: bool, toy: Scene) -> None:
+def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
+    from_priors: bool, toy: Scene
+) -> None:
     fields = [build_field(small(name).field, toy) for name in ("splat-sigmoid", "splat")]
     for field in fields:
         start_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)
@@ -85,16 +101,26 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(from_pri
         for a, b in ((bounded.static, free.static), (bounded.moving, free.moving)):
             seeded = b.logits > -10
             torch.testing.assert_close(
-                a.radiance(share)[seeded], b.radiance(share)[seeded].clamp_max(HIGHEST), rtol=1e-4, atol=1e-6
+                a.radiance(share)[seeded],
+                b.radiance(share)[seeded].clamp_max(HIGHEST),
+                rtol=1e-4,
+                atol=1e-6,
             )
-    assert torch.allclose(bounded.background.sigmoid(), torch.tensor(-1.3).exp()) and torch.allclose(
-        free.background, torch.tensor(-1.3)
-    )
+    assert torch.allclose(
+        bounded.background.sigmoid(), torch.tensor(-1.3).exp()
+    ) and torch.allclose(free.background, torch.tensor(-1.3))
     assert not from_priors or bool((free.static.radiance(0.0) > 1).any())  # some had to be held
 
 
 @pytest.mark.parametrize(
-    "name", ["splat-response-mlp", "splat-sigmoid", "grid-response-none", "grid-response-per-image", "splat-no-depth"]
+    "name",
+    [
+        "splat-response-mlp",
+        "splat-sigmoid",
+        "grid-response-none",
+        "grid-response-per-image",
+        "splat-no-depth",
+    ],
 )
 def test_ablations_train(name: str, toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
     t = trainer(small(name, toy_folder, tmp_path / "run"), toy)

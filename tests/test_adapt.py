@@ -1,4 +1,6 @@
-"""Features fitted to a clip: each term by hand, no gradient to what is frozen, and training lowers what it is to lower."""
+"""Features fitted to a clip: each term by hand, no gradient to what is frozen, and
+training lowers what it is to lower.
+"""
 
 import cv2
 import numpy as np
@@ -27,13 +29,19 @@ from hdr_nsff.priors.flow.features import Features
 def sliding(frames: int = 3, step: int = 4, size: tuple[int, int] = (48, 64)) -> np.ndarray:
     """A texture (frames, H, W, 3) that slides to the right by `step` pixels per frame."""
     rng = np.random.default_rng(0)
-    wide = cv2.GaussianBlur(rng.random((size[0], size[1] + step * frames, 3)).astype(np.float32), (0, 0), 2)
+    wide = cv2.GaussianBlur(
+        rng.random((size[0], size[1] + step * frames, 3)).astype(np.float32), (0, 0), 2
+    )
     wide = (wide - wide.min()) / np.ptp(wide)
-    return np.stack([wide[:, step * (frames - t) : step * (frames - t) + size[1]] for t in range(frames)])
+    return np.stack(
+        [wide[:, step * (frames - t) : step * (frames - t) + size[1]] for t in range(frames)]
+    )
 
 
 def lesson() -> Lesson:
-    """A clip whose features are its colors with noise, slides one cell per frame, and is followed from the first frame to the third."""
+    """A clip whose features are its colors with noise, slides one cell per frame, and
+    is followed from the first frame to the third.
+    """
     video = sliding()
     bare = Features(torch.zeros(3, 1, 12, 16), 4.0, 2.0)
     maps = colors(video, bare, 2) - 0.5
@@ -41,7 +49,9 @@ def lesson() -> Lesson:
     place = cells(12, 16)
     inner = place[(place[:, 0] > 2) & (place[:, 0] < 12)]
     tracks = [Track((0, 2), inner, inner + torch.tensor([2.0, 0.0]))]
-    return Lesson(Features(maps + noise, 4.0, 2.0), video, tracks, [(0, 1), (1, 2)], Matching(reach=5))
+    return Lesson(
+        Features(maps + noise, 4.0, 2.0), video, tracks, [(0, 1), (1, 2)], Matching(reach=5)
+    )
 
 
 def test_the_network_starts_as_the_identity():
@@ -50,8 +60,12 @@ def test_the_network_starts_as_the_identity():
 
 
 def test_a_cells_colors_are_read_where_it_looks():
-    """A ramp of value x (pixel centers): with cells of 4 pixels whose first middle is at 2, cell k sees 4 k + 2."""
-    ramp = np.broadcast_to((np.arange(32) + 0.5)[None, None, :, None] / 32, (1, 16, 32, 3)).astype(np.float32)
+    """A ramp of value x (pixel centers): with cells of 4 pixels whose first middle is
+    at 2, cell k sees 4 k + 2.
+    """
+    ramp = np.broadcast_to((np.arange(32) + 0.5)[None, None, :, None] / 32, (1, 16, 32, 3)).astype(
+        np.float32
+    )
     seen = colors(ramp, Features(torch.zeros(1, 1, 4, 8), 4.0, 2.0), 1)
     assert seen.shape == (1, 3, 4, 8)
     assert np.allclose(seen[0, 0, 1, 2:6] * 32, [10, 14, 18, 22], atol=0.05)
@@ -60,12 +74,16 @@ def test_a_cells_colors_are_read_where_it_looks():
 def test_best_buddies_are_each_others():
     a, b = torch.randn(8, 5, 6), torch.randn(8, 5, 6)
     there, back = best_buddies(a, b, 9), best_buddies(b, a, 9)
-    assert {(int(i), int(j)) for i, j in zip(*there, strict=True)} == {(int(j), int(i)) for i, j in zip(*back, strict=True)}
+    assert {(int(i), int(j)) for i, j in zip(*there, strict=True)} == {
+        (int(j), int(i)) for i, j in zip(*back, strict=True)
+    }
     assert 0 < len(there[0]) < 30
 
 
 def test_buddies_do_not_push_their_neighbors_away():
-    """With features that only one far cell shares, making that cell alike costs; making a cell beside the buddy alike does not."""
+    """With features that only one far cell shares, making that cell alike costs; making
+    a cell beside the buddy alike does not.
+    """
     target, query = torch.zeros(2, 5, 6), torch.tensor([[1.0, 0.0]])
     target[1], target[:, 2, 2] = 1, torch.tensor([1.0, 0.0])
     buddy = torch.tensor([2 * 6 + 2])
@@ -98,7 +116,9 @@ def test_frozen_features_get_no_gradient_and_every_term_reaches_the_network():
     for name, term in clip.terms(network, np.random.default_rng(0)).items():
         network.zero_grad()
         term.backward(retain_graph=True)
-        assert network.outer.weight.grad is not None and network.outer.weight.grad.abs().sum() > 0, name
+        assert (
+            network.outer.weight.grad is not None and network.outer.weight.grad.abs().sum() > 0
+        ), name
     assert not clip.maps.requires_grad
 
 

@@ -1,4 +1,6 @@
-"""Masks corrected by the background that a camera without parallax sees behind everything."""
+"""Masks corrected by the background that a camera without parallax sees behind
+everything.
+"""
 
 import numpy as np
 import pytest
@@ -20,8 +22,13 @@ def square(t: int) -> np.ndarray:
 
 
 def clip() -> tuple[np.ndarray, np.ndarray]:
-    """A white square before a plain gray wall with a little noise, and where the square is."""
-    video = np.full((T, H, W, 3), 0.3, np.float32) + np.random.default_rng(0).normal(size=(T, H, W, 3)).astype(np.float32) * 0.005
+    """A white square before a plain gray wall with a little noise, and where the square
+    is.
+    """
+    video = (
+        np.full((T, H, W, 3), 0.3, np.float32)
+        + np.random.default_rng(0).normal(size=(T, H, W, 3)).astype(np.float32) * 0.005
+    )
     truth = np.stack([square(t) for t in range(T)])
     video[truth] = 0.8
     return video, truth
@@ -69,7 +76,9 @@ def test_saturated_pixels_do_not_differ_from_a_brighter_background():
 
 @pytest.mark.parametrize("angle", [0.0, 5.0])
 def test_homography_follows_a_direction(angle):
-    turned = np.concatenate([Rotation.from_euler("y", angle, degrees=True).as_matrix(), np.zeros((3, 1))], 1)
+    turned = np.concatenate(
+        [Rotation.from_euler("y", angle, degrees=True).as_matrix(), np.zeros((3, 1))], 1
+    )
     direction = np.array([0.1, -0.05, 1.0])
     indices = []
     for pose in (STILL[0], turned):

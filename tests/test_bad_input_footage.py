@@ -1,4 +1,6 @@
-"""Footage, and settings for it, that cannot work: every verb that reads footage names them in one sentence, and loses nothing."""
+"""Footage, and settings for it, that cannot work: every verb that reads footage names
+them in one sentence, and loses nothing.
+"""
 
 from __future__ import annotations
 
@@ -16,10 +18,16 @@ from hdr_nsff.core import io
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:
-    """The sentence with which `prepare` refuses to make the folder `scene` beside the footage; it leaves the rest alone."""
+    """The sentence with which `prepare` refuses to make the folder `scene` beside the
+    footage; it leaves the rest alone.
+    """
 
     def rest() -> dict[Path, bytes]:
-        return {p: b for p, b in snapshot(clip.parent).items() if "scene" not in p.relative_to(clip.parent).parts}
+        return {
+            p: b
+            for p, b in snapshot(clip.parent).items()
+            if "scene" not in p.relative_to(clip.parent).parts
+        }
 
     before = rest()
     said = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
@@ -31,7 +39,11 @@ def prepared(capsys: Capture, clip: Path, *options: object) -> str:
 def test_missing_and_empty_footage(verb: str, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty.mp4").touch()
-    for name, word in (("nowhere", "no such file or folder"), ("empty", "no frames"), ("empty.mp4", "is empty")):
+    for name, word in (
+        ("nowhere", "no such file or folder"),
+        ("empty", "no frames"),
+        ("empty.mp4", "is empty"),
+    ):
         assert word in refused(capsys, verb, tmp_path / name, tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -49,7 +61,9 @@ def exr_with(value: float) -> Callable[[Path], None]:
     def damage(path: Path) -> None:
         pixels = np.full((34, 60, 3), 0.5, np.float32)
         pixels[3, 5, 1] = value
-        with OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"RGB": pixels}) as file:
+        with OpenEXR.File(
+            {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"RGB": pixels}
+        ) as file:
             file.write(str(path))
 
     return damage
@@ -71,16 +85,28 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a text file named mp4": (text_video, "not a readable video"),
     "a video cut short": (cut_video, "cut short"),
     "a PNG cut short": (lambda p: one_bad(p, cut), "004.png: the PNG is cut short"),
-    "a text file named PNG": (lambda p: one_bad(p, lambda f: f.write_text("no picture")), "004.png"),
+    "a text file named PNG": (
+        lambda p: one_bad(p, lambda f: f.write_text("no picture")),
+        "004.png",
+    ),
     "an empty PNG": (lambda p: one_bad(p, lambda f: f.write_bytes(b"")), "004.png"),
     "an EXR cut short": (lambda p: one_bad(p, cut, ".exr"), "004.exr"),
-    "a text file named EXR": (lambda p: one_bad(p, lambda f: f.write_text("no picture"), ".exr"), "004.exr: not a readable EXR"),
+    "a text file named EXR": (
+        lambda p: one_bad(p, lambda f: f.write_text("no picture"), ".exr"),
+        "004.exr: not a readable EXR",
+    ),
     "NaN in an EXR": (lambda p: one_bad(p, exr_with(np.nan), ".exr"), "NaN or Inf"),
     "Inf in an EXR": (lambda p: one_bad(p, exr_with(np.inf), ".exr"), "NaN or Inf"),
-    "negative radiance": (lambda p: one_bad(p, exr_with(-0.5), ".exr"), "004.exr: negative radiance"),
+    "negative radiance": (
+        lambda p: one_bad(p, exr_with(-0.5), ".exr"),
+        "004.exr: negative radiance",
+    ),
     "one frame": (lambda p: clip(p, recorded(1)), "1 frame "),
     "two frames": (lambda p: clip(p, recorded(2)), "2 frames "),
-    "frames of two sizes": (lambda p: one_bad(p, lambda f: io.write_png(f, np.full((30, 60, 3), 0.5))), "004.png: 60x30 pixels"),
+    "frames of two sizes": (
+        lambda p: one_bad(p, lambda f: io.write_png(f, np.full((30, 60, 3), 0.5))),
+        "004.png: 60x30 pixels",
+    ),
     "all black": (lambda p: clip(p, [np.zeros((34, 60, 3))] * FRAMES), "all frames are black"),
     "all white": (lambda p: clip(p, [np.ones((34, 60, 3))] * FRAMES), "all frames are white"),
 }
@@ -88,24 +114,34 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
 
 @pytest.mark.parametrize("verb", FOOTAGE_VERBS)
 @pytest.mark.parametrize("what", FOOTAGE)
-def test_footage_that_cannot_be_is_named(what: str, verb: str, tmp_path: Path, capsys: Capture) -> None:
+def test_footage_that_cannot_be_is_named(
+    what: str, verb: str, tmp_path: Path, capsys: Capture
+) -> None:
     make, expected = FOOTAGE[what]
     footage = make(tmp_path / "ein clip ü")
     before = snapshot(tmp_path)
     assert expected in refused(capsys, verb, footage, tmp_path / "out")
     after = snapshot(tmp_path)
-    assert all(after[p] == contents for p, contents in before.items()) and not list(tmp_path.rglob(".partial-*"))
+    assert all(after[p] == contents for p, contents in before.items()) and not list(
+        tmp_path.rglob(".partial-*")
+    )
 
 
-def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     footage = one_bad(tmp_path / "clip", cut, ".exr")
     assert call("prepare", footage, tmp_path / "scene") == 2
-    assert len(capfd.readouterr().err.strip().splitlines()) == 1  # OpenEXR has words of its own for it
+    assert (
+        len(capfd.readouterr().err.strip().splitlines()) == 1
+    )  # OpenEXR has words of its own for it
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
-def test_a_video_cut_short_anywhere(suffix: str, share: float, tmp_path: Path, capsys: Capture) -> None:
+def test_a_video_cut_short_anywhere(
+    suffix: str, share: float, tmp_path: Path, capsys: Capture
+) -> None:
     path = tmp_path / f"clip{suffix}"
     io.write_video(path, recorded(40))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
@@ -144,7 +180,9 @@ def test_exposures_that_cannot_be(verb: str, tmp_path: Path, capsys: Capture) ->
 
 @pytest.mark.parametrize("value", ["1/0", "nan", "dark", ""])
 def test_exposures_that_cannot_be_made(value: str, tmp_path: Path, capsys: Capture) -> None:
-    assert "--ev" in refused(capsys, "reexpose", clip(tmp_path / "clip"), tmp_path / "out", f"--ev={value},0")
+    assert "--ev" in refused(
+        capsys, "reexpose", clip(tmp_path / "clip"), tmp_path / "out", f"--ev={value},0"
+    )
     assert "--ev" in refused(capsys, "synth", "interior", tmp_path / "out", f"--ev={value},0")
     assert not (tmp_path / "out").exists()
 
@@ -157,10 +195,14 @@ def test_an_exposure_list_that_fits_no_cycle(tmp_path: Path, capsys: Capture) ->
 
 
 def test_an_exposure_list_longer_than_the_clip(tmp_path: Path, capsys: Capture) -> None:
-    assert "5 exposures listed for 4 frames" in prepared(capsys, clip(tmp_path / "clip", recorded(4)), "--ev=0,1,2,3,4")
+    assert "5 exposures listed for 4 frames" in prepared(
+        capsys, clip(tmp_path / "clip", recorded(4)), "--ev=0,1,2,3,4"
+    )
 
 
-@pytest.mark.parametrize("exposures", ["1/1000,1/0", "1/60,,1/30", "1/60;1/30", "-1/60,1/30", "0,1/30"])
+@pytest.mark.parametrize(
+    "exposures", ["1/1000,1/0", "1/60,,1/30", "1/60;1/30", "-1/60,1/30", "0,1/30"]
+)
 def test_impossible_exposures(exposures: str, tmp_path: Path, capsys: Capture) -> None:
     assert "--exposures" in prepared(capsys, clip(tmp_path / "clip"), f"--exposures={exposures}")
 
@@ -191,9 +233,13 @@ def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capt
     flow = ["--flow", tmp_path / "flow"]
     assert "flow of shape (17, 30, 2)" in prepared(capsys, folder, "--flow", tmp_path / "small")
     assert "no flow from frame" in prepared(capsys, folder, "--flow", tmp_path / "few")
-    assert "the mask is 59x34, frame 0 is 60x34" in prepared(capsys, folder, *flow, "--masks", tmp_path / "masks")
+    assert "the mask is 59x34, frame 0 is 60x34" in prepared(
+        capsys, folder, *flow, "--masks", tmp_path / "masks"
+    )
     assert "5 maps for 9 frames" in prepared(capsys, folder, *flow, "--masks", tmp_path / "few")
-    assert "the mask is 59x34" in refused(capsys, "reexpose", folder, tmp_path / "out", "--masks", tmp_path / "masks")
+    assert "the mask is 59x34" in refused(
+        capsys, "reexpose", folder, tmp_path / "out", "--masks", tmp_path / "masks"
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -201,7 +247,9 @@ def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capt
 
 
 def test_a_scene_of_other_footage_stays(tmp_path: Path, capsys: Capture) -> None:
-    prepared(capsys, clip(tmp_path / "one", recorded(24)), "--ev=0,1")  # its frames are in the scene already
+    prepared(
+        capsys, clip(tmp_path / "one", recorded(24)), "--ev=0,1"
+    )  # its frames are in the scene already
     before = snapshot(tmp_path / "scene")
     assert "holds the scene of other footage" in prepared(capsys, clip(tmp_path / "other"))
     assert before and snapshot(tmp_path / "scene") == before
@@ -209,7 +257,9 @@ def test_a_scene_of_other_footage_stays(tmp_path: Path, capsys: Capture) -> None
 
 def test_output_in_which_no_step_was_finished_is_free(tmp_path: Path, capsys: Capture) -> None:
     assert "at least 3" in prepared(capsys, clip(tmp_path / "one", recorded(2)))
-    assert "2 exposures listed" in prepared(capsys, clip(tmp_path / "other", recorded(24)), "--ev=0,1")
+    assert "2 exposures listed" in prepared(
+        capsys, clip(tmp_path / "other", recorded(24)), "--ev=0,1"
+    )
 
 
 def test_output_that_is_a_file_or_holds_something_else(tmp_path: Path, capsys: Capture) -> None:
@@ -229,7 +279,9 @@ def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> Non
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)
         assert (tmp_path / "scene/scene.json").read_text() == text
-    assert "at least 3" in prepared(capsys, folder, "--redo", "frames")  # offered by the sentence: starts anew
+    assert "at least 3" in prepared(
+        capsys, folder, "--redo", "frames"
+    )  # offered by the sentence: starts anew
 
 
 def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
@@ -248,6 +300,8 @@ def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
         assert "the disk is full" in prepared(capsys, folder, "--ev=0,1")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "scene/images").glob("*.png")}
     assert kept and not list((tmp_path / "scene").rglob(".partial-*"))
-    assert "2 exposures listed" in prepared(capsys, folder, "--ev=0,1")  # as far as it goes: frames are done
+    assert "2 exposures listed" in prepared(
+        capsys, folder, "--ev=0,1"
+    )  # as far as it goes: frames are done
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert len(list((tmp_path / "scene/images").glob("*.png"))) == 24

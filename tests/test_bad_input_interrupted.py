@@ -1,4 +1,6 @@
-"""A full disk and Ctrl-C: what was complete stays, nothing is half-written, and the same command goes on."""
+"""A full disk and Ctrl-C: what was complete stays, nothing is half-written, and the
+same command goes on.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bad_input import WORKING_VERBS, Capture, call, clip, commands, poses, recorded, refused, snapshot
+from bad_input import (
+    WORKING_VERBS,
+    Capture,
+    call,
+    clip,
+    commands,
+    poses,
+    recorded,
+    refused,
+    snapshot,
+)
 
 from hdr_nsff import cli
 from hdr_nsff.core import io
@@ -41,7 +53,11 @@ def test_a_full_disk_is_one_sentence(
 def test_a_disk_that_fills_up_while_a_flow_network_learns_loses_no_checkpoint(
     run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command, out, sync = commands(run_folder, tmp_path, tmp_path / "out")["finetune-flow"], tmp_path / "out", os.fsync
+    command, out, sync = (
+        commands(run_folder, tmp_path, tmp_path / "out")["finetune-flow"],
+        tmp_path / "out",
+        os.fsync,
+    )
 
     def filled(handle: int) -> None:
         full(handle) if list(out.glob("checkpoints/step_*")) else sync(handle)
@@ -60,12 +76,17 @@ def test_a_full_disk_is_one_sentence_for_every_layout_of_a_scene(
     before = snapshot(run_folder.parent)
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        assert "the disk is full" in refused(capsys, "export", run_folder, tmp_path / "out", "--layout", layout)
+        assert "the disk is full" in refused(
+            capsys, "export", run_folder, tmp_path / "out", "--layout", layout
+        )
     assert not snapshot(tmp_path / "out") and snapshot(run_folder.parent) == before
 
 
 def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path: Path) -> None:
-    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    before, handler = (
+        resource.getrlimit(resource.RLIMIT_FSIZE),
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
+    )
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
         with pytest.raises(io.InputError, match="the disk is full"), io.writing_to(tmp_path):
@@ -95,7 +116,9 @@ gc.collect()
 """
 
 
-def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_later(tmp_path: Path) -> None:
+def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_later(
+    tmp_path: Path,
+) -> None:
     path = os.pathsep.join([str(Path(cli.__file__).parents[1]), *sys.path])
     command = [sys.executable, "-c", FAILING, str(tmp_path / "map.npy")]
     assert subprocess.run(command, env=os.environ | {"PYTHONPATH": path}).returncode == 0
@@ -125,10 +148,16 @@ def test_ctrl_c_loses_nothing_and_the_same_command_goes_on(
         assert call(*command) == 130
     error = capsys.readouterr().err
     assert "Traceback" not in error and "the same command goes on where it was" in error
-    kept = {p: p.stat().st_mtime_ns for p in tmp_path.rglob("*") if p.suffix in (".png", ".exr", ".npy", ".ply")}
+    kept = {
+        p: p.stat().st_mtime_ns
+        for p in tmp_path.rglob("*")
+        if p.suffix in (".png", ".exr", ".npy", ".ply")
+    }
     assert not list(tmp_path.rglob(".partial-*"))
     assert call(*command) == 0
-    pictures = [p for p in kept if verb != "evaluate" or p.suffix != ".png"]  # which draws its comparisons anew
+    pictures = [
+        p for p in kept if verb != "evaluate" or p.suffix != ".png"
+    ]  # which draws its comparisons anew
     assert pictures and all(p.stat().st_mtime_ns == kept[p] for p in pictures)
 
 
@@ -136,5 +165,7 @@ def test_ctrl_c_while_the_libraries_load_leaves_no_traceback(tmp_path: Path) -> 
     (tmp_path / "tyro.py").write_text("raise KeyboardInterrupt\n")
     path = os.pathsep.join([str(tmp_path), str(Path(cli.__file__).parents[1])])
     command = [sys.executable, "-c", "from hdr_nsff.cli import main; main()", "prepare", "a", "b"]
-    result = subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True)
+    result = subprocess.run(
+        command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
+    )
     assert result.returncode == 130 and result.stderr == ""

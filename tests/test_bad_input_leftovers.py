@@ -1,4 +1,6 @@
-"""What earlier verbs have left, damaged or edited by hand: it is made again with a word about it, or named in one sentence."""
+"""What earlier verbs have left, damaged or edited by hand: it is made again with a word
+about it, or named in one sentence.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,19 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from bad_input import Capture, call, clip, commands, cut, edit, reading, refused, snapshot, training, truth
+from bad_input import (
+    Capture,
+    call,
+    clip,
+    commands,
+    cut,
+    edit,
+    reading,
+    refused,
+    snapshot,
+    training,
+    truth,
+)
 from safetensors.torch import save_file
 
 from hdr_nsff.core import io, notes
@@ -21,7 +35,11 @@ from hdr_nsff.training.run_folder import Run
 def other_version(path: Path) -> None:
     import torch
 
-    save_file({"a": torch.ones(1)}, path, metadata={"format": "hdr-nsff checkpoint 99", "step": "2", "seconds": "0"})
+    save_file(
+        {"a": torch.ones(1)},
+        path,
+        metadata={"format": "hdr-nsff checkpoint 99", "step": "2", "seconds": "0"},
+    )
 
 
 @pytest.mark.parametrize("damage", [cut, other_version])
@@ -51,7 +69,9 @@ def test_a_bad_checkpoint_gives_way_to_the_one_before_for_every_verb(
 
 @pytest.fixture(scope="module")
 def worked(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a run, all that verbs make of it, and its Gaussians; mended after every test."""
+    """A folder with a run, all that verbs make of it, and its Gaussians; mended after
+    every test.
+    """
     folder = tmp_path_factory.mktemp("worked")
     shutil.copytree(trained.parent, folder, dirs_exist_ok=True)
     edit(folder / "run/config.json", lambda d: d.update(scene=str(folder / "scene")))
@@ -63,7 +83,12 @@ def worked(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def making(folder: Path) -> list[list[object]]:
     """The commands whose notes are damaged here."""
     run, cpu = folder / "run", ["--device", "cpu"]
-    return [["render", run, *cpu], commands(run, run, folder / "ply")["export"], ["evaluate", run, *cpu], ["report", run]]
+    return [
+        ["render", run, *cpu],
+        commands(run, run, folder / "ply")["export"],
+        ["evaluate", run, *cpu],
+        ["report", run],
+    ]
 
 
 Change = Callable[[dict], object]
@@ -94,14 +119,22 @@ NONSENSE: dict[str, tuple[str, Change]] = {
     "a view outside": (METRICS, lambda d: d["views"][0].update(name="../secret")),
     "a word for a score": (METRICS, lambda d: d["headline"].update(psnr="good")),
     "scores nobody counts": (METRICS, lambda d: d["headline"].pop("views")),
-    "a curve of two channels": (METRICS, lambda d: d.update(camera={"true_response": {"x": [0.0], "y": [[0.0]] * 2}})),
+    "a curve of two channels": (
+        METRICS,
+        lambda d: d.update(camera={"true_response": {"x": [0.0], "y": [[0.0]] * 2}}),
+    ),
     "a white that is none": (METRICS, lambda d: d.update(pu21={"white": None, "nits": 1000})),
-    "radiance without its scale": (METRICS, lambda d: d.update(hdr_scores={"mu5000": ["mu-law", 2]})),
+    "radiance without its scale": (
+        METRICS,
+        lambda d: d.update(hdr_scores={"mu5000": ["mu-law", 2]}),
+    ),
 }
 
 
 @pytest.mark.parametrize("what", NONSENSE)
-def test_a_note_edited_into_nonsense_is_named_and_made_again(what: str, worked: Path, capsys: Capture) -> None:
+def test_a_note_edited_into_nonsense_is_named_and_made_again(
+    what: str, worked: Path, capsys: Capture
+) -> None:
     name, change = NONSENSE[what]
     kind = KINDS[name]
     edit(worked / name, change)
@@ -109,7 +142,14 @@ def test_a_note_edited_into_nonsense_is_named_and_made_again(what: str, worked: 
     capsys.readouterr()
     if name == METRICS:
         assert call(*report) == 0
-    assert call(*{PLAN: render, VIEWS: render, SEQUENCE: render, EXPORTED: export, METRICS: evaluate}[name]) == 0
+    assert (
+        call(
+            *{PLAN: render, VIEWS: render, SEQUENCE: render, EXPORTED: export, METRICS: evaluate}[
+                name
+            ]
+        )
+        == 0
+    )
     said = " ".join(capsys.readouterr().err.split())
     assert f"{name}: cut short or edited" in said or f"{name}: does not fit these shots" in said
     assert call(*report) == 0 and notes.read(worked / name, kind) is not None
@@ -130,13 +170,17 @@ def test_notes_cut_short_are_made_again(text: str, worked: Path, capsys: Capture
 
 
 @pytest.mark.parametrize("name", [PLAN, VIEWS, SEQUENCE, EXPORTED])
-def test_a_json_file_of_the_users_own_is_no_note_and_stays(name: str, worked: Path, capsys: Capture) -> None:
+def test_a_json_file_of_the_users_own_is_no_note_and_stays(
+    name: str, worked: Path, capsys: Capture
+) -> None:
     kept = (worked / name).read_bytes()
     for text in ('{"takes": 3}', "[1, 2]", "7"):
         (worked / name).write_text(text)
         before = snapshot(worked)
         render, export, _, _ = making(worked)
-        assert f"{name}: is there already and was not made by" in refused(capsys, *(export if name == EXPORTED else render))
+        assert f"{name}: is there already and was not made by" in refused(
+            capsys, *(export if name == EXPORTED else render)
+        )
         assert snapshot(worked) == before
     (worked / name).write_bytes(kept)
 
@@ -145,9 +189,18 @@ LINE = {"step": 25, "seconds": 1.0, "psnr": 10.0, "rays_per_second": 9.0, "losse
 
 
 @pytest.mark.parametrize(
-    "change", [{"step": "many"}, {"psnr": None}, {"seconds": [1]}, {"losses": {"depth": "deep"}}, {"step": 1e400}]
+    "change",
+    [
+        {"step": "many"},
+        {"psnr": None},
+        {"seconds": [1]},
+        {"losses": {"depth": "deep"}},
+        {"step": 1e400},
+    ],
 )
-def test_log_lines_edited_into_nonsense_are_left_out(change: dict, run_folder: Path, capsys: Capture) -> None:
+def test_log_lines_edited_into_nonsense_are_left_out(
+    change: dict, run_folder: Path, capsys: Capture
+) -> None:
     lines = [LINE, {**LINE, "step": 50, **change}, {**LINE, "step": 75}, 7, {}]
     (run_folder / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert [line.step for line in Run.open(run_folder).log()] == [25, 75]
@@ -155,11 +208,16 @@ def test_log_lines_edited_into_nonsense_are_left_out(change: dict, run_folder: P
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "7", "\x00", '{"digest": 3}'])
-def test_the_mark_of_footage_that_was_made_is_not_written_over(text: str, tmp_path: Path, capsys: Capture) -> None:
+def test_the_mark_of_footage_that_was_made_is_not_written_over(
+    text: str, tmp_path: Path, capsys: Capture
+) -> None:
     for verb, mark in (("reexpose", "reexpose.json"), ("synth", "exact/key.json")):
         io.write_text(tmp_path / verb / mark, text)
         command = commands(tmp_path, clip(tmp_path / "clip"), tmp_path / verb)[verb]
-        assert "made with other settings" in (said := refused(capsys, *command)) or "rendered with other settings" in said
+        assert (
+            "made with other settings" in (said := refused(capsys, *command))
+            or "rendered with other settings" in said
+        )
         assert (tmp_path / verb / mark).read_text() == text
 
 
@@ -168,7 +226,10 @@ def test_the_mark_of_footage_that_was_made_is_not_written_over(text: str, tmp_pa
 
 SETTINGS: dict[str, tuple[Change, str]] = {
     "a word for a number": (lambda d: d["field"].update(bases="many"), "--field.bases"),
-    "nothing for a number": (lambda d: d["field"].update(opacity_knots=None), "--field.opacity-knots"),
+    "nothing for a number": (
+        lambda d: d["field"].update(opacity_knots=None),
+        "--field.opacity-knots",
+    ),
     "less than none": (lambda d: d["field"].update(static=-1), "--field.static"),
     "more than there can be": (lambda d: d["field"].update(moving=10**300), "--field.moving"),
     "half a Gaussian": (lambda d: d["field"].update(moving=0.5), "--field.moving"),
@@ -179,7 +240,10 @@ SETTINGS: dict[str, tuple[Change, str]] = {
     "a setting nobody knows": (lambda d: d.update(sparkle=1), "sparkle"),
     "no field": (lambda d: d.pop("field"), "field"),
     "a field that is a number": (lambda d: d.update(field=7), "config.json"),
-    "grids for a field": (lambda d: d.update(kinds=["GridConfig"], field={}), "GridConfig is no field"),
+    "grids for a field": (
+        lambda d: d.update(kinds=["GridConfig"], field={}),
+        "GridConfig is no field",
+    ),
     "a kind of field nobody knows": (lambda d: d.update(kinds=["Cloud"]), "Cloud"),
     "no kinds": (lambda d: d.update(kinds=[]), "config.json"),
     "kinds that are a number": (lambda d: d.update(kinds=7), "config.json"),
@@ -194,7 +258,10 @@ def test_a_config_edited_into_nonsense_is_named_by_every_verb_that_reads_it(
     change, expected = SETTINGS[what]
     edit(run_folder / "config.json", change)
     before = snapshot(tmp_path)
-    for command in [*reading(run_folder, tmp_path / "out"), training(run_folder.parent / "scene", run_folder, 2)]:
+    for command in [
+        *reading(run_folder, tmp_path / "out"),
+        training(run_folder.parent / "scene", run_folder, 2),
+    ]:
         said = refused(capsys, *command)
         assert expected in said and "config.json" in said
     assert snapshot(tmp_path) == before
@@ -202,14 +269,27 @@ def test_a_config_edited_into_nonsense_is_named_by_every_verb_that_reads_it(
 
 @pytest.mark.parametrize(
     "option",
-    ["--steps=0", "--minutes=-1", "--minutes=nan", "--rays=-5", "--field.bases=0", "--loss.depth=-1", "--seed=-1", "--batches=0"],
+    [
+        "--steps=0",
+        "--minutes=-1",
+        "--minutes=nan",
+        "--rays=-5",
+        "--field.bases=0",
+        "--loss.depth=-1",
+        "--seed=-1",
+        "--batches=0",
+    ],
 )
 def test_settings_that_cannot_be_are_named_before_anything_is_written(
     option: str, toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    assert option.partition("=")[0] in refused(capsys, *training(toy_folder, tmp_path / "out", 1), option)
+    assert option.partition("=")[0] in refused(
+        capsys, *training(toy_folder, tmp_path / "out", 1), option
+    )
     if option in ("--minutes=-1", "--minutes=nan", "--seed=-1"):
-        assert option.partition("=")[0] in refused(capsys, "run", clip(tmp_path / "clip"), tmp_path / "out", option)
+        assert option.partition("=")[0] in refused(
+            capsys, "run", clip(tmp_path / "clip"), tmp_path / "out", option
+        )
     assert not (tmp_path / "out").exists()
 
 
@@ -222,10 +302,14 @@ def test_json_that_overwhelms_the_parser_is_refused_like_any_other(
         capsys, "render", run_folder, "--path", tmp_path / "path.json", "--device", "cpu"
     )
     (truth(tmp_path / "truth") / "truth.json").write_text(text)
-    assert "not a valid truth file" in refused(capsys, "evaluate", run_folder, "--truth", tmp_path / "truth", "--device", "cpu")
+    assert "not a valid truth file" in refused(
+        capsys, "evaluate", run_folder, "--truth", tmp_path / "truth", "--device", "cpu"
+    )
     (tmp_path / "transforms.json").write_text(text)
     footage, out = clip(tmp_path / "clip"), tmp_path / "out"
-    assert "not readable as poses" in refused(capsys, "reexpose", footage, out, "--poses", tmp_path / "transforms.json")
+    assert "not readable as poses" in refused(
+        capsys, "reexpose", footage, out, "--poses", tmp_path / "transforms.json"
+    )
     (run_folder.parent / "scene/scene.json").write_text(text)
     assert "not a valid scene" in refused(capsys, *training(run_folder.parent / "scene", out, 1))
     (run_folder / "config.json").write_text(text)

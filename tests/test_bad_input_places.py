@@ -1,4 +1,6 @@
-"""Places that are missing, taken, or cannot be written: every verb names them, and replaces nothing but what it made itself."""
+"""Places that are missing, taken, or cannot be written: every verb names them, and
+replaces nothing but what it made itself.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,12 @@ from hdr_nsff.core import io
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
     assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
-    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
+    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {
+        "render",
+        "export",
+        "evaluate",
+        "report",
+    } == set(RUN_VERBS)
 
 
 # Missing and empty
@@ -35,15 +42,26 @@ def test_there_is_a_command_of_every_verb_to_try() -> None:
 def test_a_missing_and_an_empty_run(verb: str, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "empty").mkdir()
     for name in ("nowhere", "empty"):
-        assert "not a run folder" in refused(capsys, *commands(tmp_path / name, tmp_path, tmp_path / "out")[verb])
+        assert "not a run folder" in refused(
+            capsys, *commands(tmp_path / name, tmp_path, tmp_path / "out")[verb]
+        )
     assert [p.name for p in tmp_path.rglob("*")] == ["empty"]
 
 
-def test_what_an_option_names_must_be_there(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_what_an_option_names_must_be_there(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     footage, nowhere = clip(tmp_path / "clip"), tmp_path / "nowhere"
     for option in ("--poses", "--flow", "--mask", "--masks", "--depth"):
-        assert option.removesuffix("ks") in refused(capsys, "prepare", footage, tmp_path / "out", option, nowhere)
-    for verb, option in (("run", "--poses"), ("run", "--truth"), ("reexpose", "--poses"), ("reexpose", "--masks")):
+        assert option.removesuffix("ks") in refused(
+            capsys, "prepare", footage, tmp_path / "out", option, nowhere
+        )
+    for verb, option in (
+        ("run", "--poses"),
+        ("run", "--truth"),
+        ("reexpose", "--poses"),
+        ("reexpose", "--masks"),
+    ):
         assert str(nowhere) in refused(capsys, verb, footage, tmp_path / "out", option, nowhere)
     assert "truth.json" in refused(capsys, "run", footage, tmp_path / "out", "--truth", footage)
     assert "truth.json" in refused(capsys, "evaluate", run_folder, "--truth", nowhere)
@@ -70,7 +88,9 @@ def test_a_place_that_cannot_be_written_is_named(
 ) -> None:
     (tmp_path / "file").write_text("mine")
     footage, out = clip(tmp_path / "clip", recorded(3)), tmp_path / place
-    assert place.partition("/")[0][:40] in refused(capsys, *commands(run_folder, footage, out)[verb])
+    assert place.partition("/")[0][:40] in refused(
+        capsys, *commands(run_folder, footage, out)[verb]
+    )
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -87,15 +107,21 @@ def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("name", ["fixed.mp4", "fixed/00001.png", "fixed/7.exr", "fixed_sheet.png"])
-def test_pictures_of_the_users_own_are_not_replaced(name: str, run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_pictures_of_the_users_own_are_not_replaced(
+    name: str, run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     io.write_text(tmp_path / "mine" / name, "mine")
     assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["render"])
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b"mine"}
 
 
-def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     io.write_text(tmp_path / "mine/depth/00000.png", "mine")
-    assert "depth" in refused(capsys, "render", run_folder, "--out", tmp_path / "mine", "--device", "cpu")
+    assert "depth" in refused(
+        capsys, "render", run_folder, "--out", tmp_path / "mine", "--device", "cpu"
+    )
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine/depth/00000.png": b"mine"}
 
 
@@ -109,7 +135,9 @@ def test_files_of_the_users_own_are_not_replaced_by_gaussians(
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b'{"takes": 3}'}
 
 
-def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     command = commands(run_folder, tmp_path, tmp_path / "out")["export"]
     assert call(*command) == 0
     first = snapshot(tmp_path / "out")
@@ -121,8 +149,12 @@ def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(run_folder:
     assert second.keys() == first.keys() and all(second[p] != first[p] for p in first)
 
 
-def test_footage_is_not_prepared_over_another_scene(toy_folder: Path, tmp_path: Path, capsys: Capture) -> None:
-    scene = shutil.copytree(toy_folder, tmp_path / "out/scene")  # it was not made by `prepare`: none of its steps is done
+def test_footage_is_not_prepared_over_another_scene(
+    toy_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    scene = shutil.copytree(
+        toy_folder, tmp_path / "out/scene"
+    )  # it was not made by `prepare`: none of its steps is done
     before = snapshot(tmp_path / "out")
     footage = clip(tmp_path / "clip")
     assert "other footage" in refused(capsys, "prepare", footage, scene)
@@ -132,11 +164,15 @@ def test_footage_is_not_prepared_over_another_scene(toy_folder: Path, tmp_path: 
 
 def test_a_run_with_other_settings_stays_as_it_is(run_folder: Path, capsys: Capture) -> None:
     before = snapshot(run_folder)
-    assert "other settings" in refused(capsys, *training(run_folder.parent / "scene", run_folder, 3))
+    assert "other settings" in refused(
+        capsys, *training(run_folder.parent / "scene", run_folder, 3)
+    )
     assert snapshot(run_folder) == before
 
 
-def test_checkpoints_without_their_config_are_not_taken_over(run_folder: Path, capsys: Capture, tmp_path: Path) -> None:
+def test_checkpoints_without_their_config_are_not_taken_over(
+    run_folder: Path, capsys: Capture, tmp_path: Path
+) -> None:
     lone = tmp_path / "run"
     shutil.copytree(run_folder, lone)
     (lone / "config.json").unlink()
@@ -145,8 +181,12 @@ def test_checkpoints_without_their_config_are_not_taken_over(run_folder: Path, c
     assert snapshot(lone) == before
 
 
-def test_a_room_is_not_rendered_into_a_folder_of_something_else(capsys: Capture, tmp_path: Path) -> None:
+def test_a_room_is_not_rendered_into_a_folder_of_something_else(
+    capsys: Capture, tmp_path: Path
+) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
-    assert "holds something else" in refused(capsys, "synth", "interior", str(tmp_path), "--size", "16x16", "--frames", "12")
+    assert "holds something else" in refused(
+        capsys, "synth", "interior", str(tmp_path), "--size", "16x16", "--frames", "12"
+    )
     assert (tmp_path / "clip" / "00000.png").read_bytes() == b"mine"

@@ -1,4 +1,6 @@
-"""A scene folder edited by hand into nonsense: one sentence each that names the file and what to do, never a traceback."""
+"""A scene folder edited by hand into nonsense: one sentence each that names the file
+and what to do, never a traceback.
+"""
 
 import shutil
 from collections.abc import Callable
@@ -58,7 +60,10 @@ NONSENSE: dict[str, tuple[Change, str]] = {
     "a negative bracket": (frame("bracket", -1), "frames.2.bracket"),
     "a negative depth": (top("near", -1.0), "near"),
     "no frames at all": (top("frames", []), "no frames"),
-    "no training frames": (lambda d: [f.update(split="test") for f in d["frames"]], "no training frames"),
+    "no training frames": (
+        lambda d: [f.update(split="test") for f in d["frames"]],
+        "no training frames",
+    ),
     "no poses yet": (frame("c2w", None), "no camera poses yet"),
     "a pose of the wrong shape": (frame("c2w", TURNED[:2]), "c2w"),
     "a ragged pose": (frame("c2w", [[1.0], [0.0, 1.0], [0.0]]), "c2w"),
@@ -78,13 +83,25 @@ NONSENSE: dict[str, tuple[Change, str]] = {
     "an image that is not there": (frame("image", "images/none.png"), "images/none.png"),
     "a mask that is not there": (frame("mask", "masks/none.png"), "masks/none.png"),
     "a depth that is not there": (frame("disparity", "disparity/none.npy"), "disparity/none.npy"),
-    "a flow that is not there": (lambda d: d["frames"][2]["flow"]["3"].update(flow="flow/none.npy"), "flow/none.npy"),
-    "a flow mask that is not there": (lambda d: d["frames"][2]["flow"]["3"].update(valid="flow/none.png"), "flow/none.png"),
+    "a flow that is not there": (
+        lambda d: d["frames"][2]["flow"]["3"].update(flow="flow/none.npy"),
+        "flow/none.npy",
+    ),
+    "a flow mask that is not there": (
+        lambda d: d["frames"][2]["flow"]["3"].update(valid="flow/none.png"),
+        "flow/none.png",
+    ),
     "points that are not there": (top("points", "points.npy"), "points.npy"),
-    "a held-out frame without an exposure": (lambda d: d["frames"][2].update(split="test", bracket=3), "bracket 3"),
+    "a held-out frame without an exposure": (
+        lambda d: d["frames"][2].update(split="test", bracket=3),
+        "bracket 3",
+    ),
     "an exposure with NaN": (top("bracket_ev", [2.0, 0.0, float("nan")]), "bracket_ev.2"),
     "an exposure beyond all light": (top("bracket_ev", [2.0, 0.0, 1e9]), "bracket_ev holds 1e+09"),
-    "brackets without end": (lambda d: (d.update(bracket_ev=[]), d["frames"][2].update(bracket=10**12)), "bracket 1000000000000"),
+    "brackets without end": (
+        lambda d: (d.update(bracket_ev=[]), d["frames"][2].update(bracket=10**12)),
+        "bracket 1000000000000",
+    ),
     "cameras without end": (frame("camera_id", 10**12), "camera_ids"),
     "a camera that is left out": (frame("camera_id", 2), "camera_ids"),
     "two frames at one time": (frame("time", 1.0), "same time"),
@@ -101,7 +118,10 @@ NONSENSE: dict[str, tuple[Change, str]] = {
     "a name with a NUL": (frame("image", "a\0.png"), "cannot be the name of a file"),
     "a name without end": (frame("image", "x" * 5000), "cannot be the name of a file"),
     "a name with half a character": (frame("image", "\ud800.png"), "cannot be the name of a file"),
-    "a step counted in words": (top("steps", {"flow": {"details": {"attempt": "first"}}}), "attempt"),
+    "a step counted in words": (
+        top("steps", {"flow": {"details": {"attempt": "first"}}}),
+        "attempt",
+    ),
 }
 
 
@@ -131,9 +151,21 @@ def test_no_folder_and_no_scene_json(tmp_path: Path) -> None:
 
 H, W = 34, 60
 MAPS: dict[str, tuple[str, Callable[[Path], None], str]] = {
-    "a small image": ("images/00002.png", lambda p: write_png(p, np.zeros((9, 9, 3))), "image of frame 2 has shape (9, 9, 3)"),
-    "a small mask": ("masks/00002.png", lambda p: write_png(p, np.zeros((H, 9), bool)), "mask of frame 2 has shape (34, 9)"),
-    "a small depth": ("disparity/00002.npy", lambda p: write_npy(p, np.ones((9, W))), "disparity of frame 2 has shape (9, 60)"),
+    "a small image": (
+        "images/00002.png",
+        lambda p: write_png(p, np.zeros((9, 9, 3))),
+        "image of frame 2 has shape (9, 9, 3)",
+    ),
+    "a small mask": (
+        "masks/00002.png",
+        lambda p: write_png(p, np.zeros((H, 9), bool)),
+        "mask of frame 2 has shape (34, 9)",
+    ),
+    "a small depth": (
+        "disparity/00002.npy",
+        lambda p: write_npy(p, np.ones((9, W))),
+        "disparity of frame 2 has shape (9, 60)",
+    ),
     "a flow without y": (
         "raw_flow/00002_00003.npy",
         lambda p: write_npy(p, np.ones((H, W))),
@@ -149,19 +181,51 @@ MAPS: dict[str, tuple[str, Callable[[Path], None], str]] = {
         lambda p: write_png(p, np.zeros((3, 3), bool)),
         "flow mask of frame 2",
     ),
-    "a depth with NaN": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), np.nan)), "NaN or Inf"),
-    "a flow with Inf": ("raw_flow/00002_00003.npy", lambda p: write_npy(p, np.full((H, W, 2), np.inf)), "NaN or Inf"),
-    "a depth behind the camera": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), -1.0)), "negative"),
-    "a depth of words": ("disparity/00002.npy", lambda p: write_npy(p, np.full((H, W), "far")), "disparity of frame 2"),
-    "an image cut short": ("images/00002.png", lambda p: p.write_bytes(p.read_bytes()[:200]) and None, "cut short"),
-    "a depth cut short": ("disparity/00002.npy", lambda p: p.write_bytes(p.read_bytes()[:200]) and None, "not a readable .npy"),
-    "a text file for a mask": ("masks/00002.png", lambda p: p.write_text("not a mask") and None, "cut short"),
+    "a depth with NaN": (
+        "disparity/00002.npy",
+        lambda p: write_npy(p, np.full((H, W), np.nan)),
+        "NaN or Inf",
+    ),
+    "a flow with Inf": (
+        "raw_flow/00002_00003.npy",
+        lambda p: write_npy(p, np.full((H, W, 2), np.inf)),
+        "NaN or Inf",
+    ),
+    "a depth behind the camera": (
+        "disparity/00002.npy",
+        lambda p: write_npy(p, np.full((H, W), -1.0)),
+        "negative",
+    ),
+    "a depth of words": (
+        "disparity/00002.npy",
+        lambda p: write_npy(p, np.full((H, W), "far")),
+        "disparity of frame 2",
+    ),
+    "an image cut short": (
+        "images/00002.png",
+        lambda p: p.write_bytes(p.read_bytes()[:200]) and None,
+        "cut short",
+    ),
+    "a depth cut short": (
+        "disparity/00002.npy",
+        lambda p: p.write_bytes(p.read_bytes()[:200]) and None,
+        "not a readable .npy",
+    ),
+    "a text file for a mask": (
+        "masks/00002.png",
+        lambda p: p.write_text("not a mask") and None,
+        "cut short",
+    ),
     "a pickle for a flow": (
         "raw_flow/00002_00003.npy",
         lambda p: np.save(p, np.array([{}]), allow_pickle=True),
         "not a readable .npy",
     ),
-    "an empty image": ("images/00002.png", lambda p: p.write_bytes(b"") and None, "images/00002.png"),
+    "an empty image": (
+        "images/00002.png",
+        lambda p: p.write_bytes(b"") and None,
+        "images/00002.png",
+    ),
 }
 
 
@@ -203,12 +267,24 @@ def test_a_manifest_survives_saving(folder: Path) -> None:
 
 EDITS: dict[str, tuple[Change, str]] = {
     "a word for a width": (lambda d: d.update(width="wide"), "width"),
-    "a held-out frame in no bracket": (lambda d: d["frames"][3].update(split="test", bracket=9), "bracket 9"),
-    "a pose with NaN": (lambda d: d["frames"][3].update(c2w=[[float("nan")] * 4] * 3), "frames.3.c2w"),
-    "no focal length": (lambda d: d["frames"][3].update(K=[[0, 0, 30], [0, 0, 17], [0, 0, 1]]), "frame 3 has a K"),
+    "a held-out frame in no bracket": (
+        lambda d: d["frames"][3].update(split="test", bracket=9),
+        "bracket 9",
+    ),
+    "a pose with NaN": (
+        lambda d: d["frames"][3].update(c2w=[[float("nan")] * 4] * 3),
+        "frames.3.c2w",
+    ),
+    "no focal length": (
+        lambda d: d["frames"][3].update(K=[[0, 0, 30], [0, 0, 17], [0, 0, 1]]),
+        "frame 3 has a K",
+    ),
     "near beyond far": (lambda d: d.update(near=9.0), "near 9 and far 5"),
     "two frames of one index": (lambda d: d["frames"][3].update(index=2), "same index"),
-    "a file outside the folder": (lambda d: d["frames"][3].update(image="../clip/003.png"), "outside the scene folder"),
+    "a file outside the folder": (
+        lambda d: d["frames"][3].update(image="../clip/003.png"),
+        "outside the scene folder",
+    ),
 }
 
 
@@ -237,13 +313,21 @@ def test_a_prepared_scene_whose_frames_are_out_of_order_is_not_built_on(
     assert len(Scene.open(scene).train) == 6  # which is nothing to training
 
 
-def test_missing_maps_and_maps_of_the_wrong_size(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_missing_maps_and_maps_of_the_wrong_size(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     scene = run_folder.parent / "scene"
     commands = [training(scene, tmp_path / "new", 1), *reading(run_folder, tmp_path / "new")]
-    for name, wrong in (("masks/00002.png", np.zeros((9, 60))), ("raw_flow/00002_00003.npy", np.zeros((9, 60, 2)))):
+    for name, wrong in (
+        ("masks/00002.png", np.zeros((9, 60))),
+        ("raw_flow/00002_00003.npy", np.zeros((9, 60, 2))),
+    ):
         kept = (scene / name).read_bytes()
         (io.write_png if name.endswith("png") else io.write_npy)(scene / name, wrong)
-        assert all(name in said and "shape (9, 60" in said for said in (refused(capsys, *c) for c in commands))
+        assert all(
+            name in said and "shape (9, 60" in said
+            for said in (refused(capsys, *c) for c in commands)
+        )
         (scene / name).unlink()
         assert all(name in refused(capsys, *c) for c in commands)
         (scene / name).write_bytes(kept)

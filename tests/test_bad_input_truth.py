@@ -1,4 +1,6 @@
-"""A truth folder edited by hand into nonsense: one sentence each, and nothing is written."""
+"""A truth folder edited by hand into nonsense: one sentence each, and nothing is
+written.
+"""
 
 from __future__ import annotations
 
@@ -40,21 +42,29 @@ TRUTHS: dict[str, tuple[Callable[[dict], object], str]] = {
 
 
 @pytest.mark.parametrize("what", TRUTHS)
-def test_truth_edited_into_nonsense_is_named(what: str, run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_truth_edited_into_nonsense_is_named(
+    what: str, run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     change, expected = TRUTHS[what]
     path = truth(tmp_path / "truth") / "truth.json"
     edit(path, change)
     before = snapshot(tmp_path)
-    assert expected in refused(capsys, "evaluate", run_folder, "--truth", path.parent, "--device", "cpu")
+    assert expected in refused(
+        capsys, "evaluate", run_folder, "--truth", path.parent, "--device", "cpu"
+    )
     assert snapshot(tmp_path) == before
 
 
-def test_truth_of_impossible_radiance_is_named(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_truth_of_impossible_radiance_is_named(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     folder = truth(tmp_path / "truth")
     command = ["evaluate", run_folder, "--truth", folder, "--device", "cpu"]
     for value, word in ((-1.0, "negative"), (0.0, "every view is 0")):
         for t in (1, 3):
-            io.write_exr(folder / f"radiance/{t}.exr", {"RGB": np.full((34, 60, 3), value, np.float32)})
+            io.write_exr(
+                folder / f"radiance/{t}.exr", {"RGB": np.full((34, 60, 3), value, np.float32)}
+            )
         assert word in refused(capsys, *command)
     cut(folder / "radiance/1.exr")
     assert "radiance/1.exr" in refused(capsys, *command)

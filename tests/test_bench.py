@@ -1,4 +1,6 @@
-"""`bench` end to end on tiny scenes: the grid of runs, its tables, kills, failures, lines for job arrays."""
+"""`bench` end to end on tiny scenes: the grid of runs, its tables, kills, failures,
+lines for job arrays.
+"""
 
 from __future__ import annotations
 
@@ -45,7 +47,22 @@ def truth_of(folder: Path) -> None:
 def words(scenes: Path, out: Path, methods: str, *more: object, steps: int = 4) -> list[str]:
     """A command on both scenes."""
     both = f"{scenes / 'two/toy'},{scenes / 'three'}"
-    return [str(w) for w in ("bench", out, "--scenes", both, "--methods", methods, "--steps", steps, "--device", "cpu", *more)]
+    return [
+        str(w)
+        for w in (
+            "bench",
+            out,
+            "--scenes",
+            both,
+            "--methods",
+            methods,
+            "--steps",
+            steps,
+            "--device",
+            "cpu",
+            *more,
+        )
+    ]
 
 
 def rows(out: Path) -> dict[str, dict[str, str]]:
@@ -75,11 +92,16 @@ def test_the_tables_hold_the_numbers_of_evaluate(finished: Path) -> None:
             ("psnr", "ssim", "mu5000") if run["scene"] == "toy" else ("psnr", "psnr_moving", "ssim")
         )  # exact radiance, or a mask
         for key in keys:
-            assert run["values"][key] == metrics["headline"][key] == float(rows(finished)[name][key])
+            assert (
+                run["values"][key] == metrics["headline"][key] == float(rows(finished)[name][key])
+            )
         page, shown = (finished / "results.md").read_text(), f"{metrics['headline']['psnr']:.2f}"
         assert shown in page and shown in (finished / "index.html").read_text()
         trained = Run.open(finished / "runs" / name)
-        assert (run["values"]["steps"], run["values"]["train_seconds"]) == (4, round(trained.seconds, 3))
+        assert (run["values"]["steps"], run["values"]["train_seconds"]) == (
+            4,
+            round(trained.seconds, 3),
+        )
         assert run["values"]["memory_gb"] > 0.05 and run["values"]["frame_seconds"] > 0
     assert "camera.response_rmse" in told["runs"][0]["values"] and "mu5000" in told["columns"]
 
@@ -90,14 +112,24 @@ def test_means_are_over_all_scenes_and_name_the_best_and_the_worst(finished: Pat
     assert [m["method"] for m in told["means"]] == ["a", "none"]
     for mean in told["means"]:
         two = {s: value[s, mean["method"]] for s in ("toy", "three")}
-        assert mean["values"]["psnr"] == pytest.approx(sum(two.values()) / 2) and mean["scenes"] == ["toy", "three"]
-        assert (mean["best"], mean["worst"]) == (max(two, key=two.__getitem__), min(two, key=two.__getitem__))
+        assert mean["values"]["psnr"] == pytest.approx(sum(two.values()) / 2) and mean[
+            "scenes"
+        ] == ["toy", "three"]
+        assert (mean["best"], mean["worst"]) == (
+            max(two, key=two.__getitem__),
+            min(two, key=two.__getitem__),
+        )
 
 
 def test_curves_end_at_the_run_and_start_before(finished: Path) -> None:
     told = json.loads((finished / "results.json").read_text())
     for run in told["runs"]:
-        assert [(p["share"], p["step"]) for p in run["curve"]] == [(0.125, 1), (0.25, 1), (0.5, 2), (1.0, 4)]
+        assert [(p["share"], p["step"]) for p in run["curve"]] == [
+            (0.125, 1),
+            (0.25, 1),
+            (0.5, 2),
+            (1.0, 4),
+        ]
         if run["values"]["views"] <= 4:  # then the curve is of all views, and ends at the headline
             assert run["curve"][-1]["scores"]["psnr"] == pytest.approx(run["values"]["psnr"])
 
@@ -106,7 +138,9 @@ def test_the_page_opens_offline_and_shows_curves_and_crops(finished: Path) -> No
     page = (finished / "index.html").read_text()
     assert not re.search(r"""(?:src|href)\s*=\s*["'](?!data:|#)|url\((?!#)|@import|<script""", page)
     assert page.count("<svg") >= 4 and "PSNR moving, dB" in page
-    assert page.count("data:image/jpeg") >= 2 * 2 * 3  # two scenes; pictures and errors; the truth (or the scale) and two methods
+    assert (
+        page.count("data:image/jpeg") >= 2 * 2 * 3
+    )  # two scenes; pictures and errors; the truth (or the scale) and two methods
     assert "absolute error" in page and "0 to 0.25" in page
 
 
@@ -129,15 +163,37 @@ def test_lines_of_the_list_do_one_run_each(scenes: Path, tmp_path: Path, capsys:
     assert len(lines) == 4 and not out.exists()
     name, *arguments = shlex.split(lines[2])
     assert name == "hdr-nsff" and call(*arguments) == 0
-    assert [p.parent.relative_to(out / "runs").as_posix() for p in out.rglob("trial.json")] == ["three/a"]
+    assert [p.parent.relative_to(out / "runs").as_posix() for p in out.rglob("trial.json")] == [
+        "three/a"
+    ]
     assert not (out / "results.csv").exists()
     assert call(*words(scenes, out, METHODS, "--collect")) == 1
-    assert [r["status"] for r in rows(out).values()] == ["not finished", "not finished", "done", "not finished"]
+    assert [r["status"] for r in rows(out).values()] == [
+        "not finished",
+        "not finished",
+        "done",
+        "not finished",
+    ]
 
 
-def test_a_run_that_fails_is_shown_and_the_others_go_on(scenes: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_a_run_that_fails_is_shown_and_the_others_go_on(
+    scenes: Path, tmp_path: Path, capsys: Capture
+) -> None:
     out, methods = tmp_path / "out", f"bad=tiny {SMALL},a=tiny {SMALL}"
-    command = ["bench", out, "--scenes", scenes / "three", "--methods", methods, "--steps", 4, "--views", 0, "--device", "cpu"]
+    command = [
+        "bench",
+        out,
+        "--scenes",
+        scenes / "three",
+        "--methods",
+        methods,
+        "--steps",
+        4,
+        "--views",
+        0,
+        "--device",
+        "cpu",
+    ]
     assert call(*command, "--collect") == 1  # nothing is there yet
     checkpoint = out / "runs/three/bad/checkpoints/step_00000001.safetensors"
     checkpoint.parent.mkdir(parents=True)
@@ -147,14 +203,23 @@ def test_a_run_that_fails_is_shown_and_the_others_go_on(scenes: Path, tmp_path: 
     assert [r["status"] for r in rows(out).values()] == ["failed", "done"]
     reason = rows(out)["three/bad"]["reason"]
     assert "no readable checkpoint" in reason and str(out / "logs/three/bad.log") in reason
-    for text in ((out / "results.md").read_text(), (out / "index.html").read_text(), capsys.readouterr().err):
+    for text in (
+        (out / "results.md").read_text(),
+        (out / "index.html").read_text(),
+        capsys.readouterr().err,
+    ):
         assert "no readable checkpoint" in text and "bad.log" in text
     assert [m["method"] for m in json.loads((out / "results.json").read_text())["means"]] == ["a"]
     checkpoint.unlink()
-    assert call(*command) == 0 and [r["status"] for r in rows(out).values()] == ["done", "done"]  # it is tried again
+    assert call(*command) == 0 and [r["status"] for r in rows(out).values()] == [
+        "done",
+        "done",
+    ]  # it is tried again
 
 
-def test_an_error_of_ours_is_kept_with_its_kind(scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_ours_is_kept_with_its_kind(
+    scenes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def nan(self: Trainer) -> None:
         raise FloatingPointError("step 3: not finite")
 
@@ -167,19 +232,37 @@ def test_an_error_of_ours_is_kept_with_its_kind(scenes: Path, tmp_path: Path, mo
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_killed_in_the_middle_the_same_command_goes_on(number: signal.Signals, scenes: Path, tmp_path: Path) -> None:
+def test_killed_in_the_middle_the_same_command_goes_on(
+    number: signal.Signals, scenes: Path, tmp_path: Path
+) -> None:
     """And the training ends with the process that waits for it, however that ended."""
     methods, run = f"a=tiny {SMALL} --checkpoint-seconds 0.2", tmp_path / "out/runs/toy/a"
-    command = ["bench", tmp_path / "out", "--scenes", scenes / "two/toy", "--methods", methods, "--steps", 300, "--views", 1]
+    command = [
+        "bench",
+        tmp_path / "out",
+        "--scenes",
+        scenes / "two/toy",
+        "--methods",
+        methods,
+        "--steps",
+        300,
+        "--views",
+        1,
+    ]
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from hdr_nsff.cli import main; main()"
-    process = subprocess.Popen([sys.executable, "-c", code, *map(str, command), "--device", "cpu"], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, command), "--device", "cpu"],
+        stderr=subprocess.DEVNULL,
+    )
     deadline = time.monotonic() + 180
     while last_logged(run) is None or not list(run.glob("checkpoints/step_*[1-9].safetensors")):
         assert process.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
     process.send_signal(number)
     assert process.wait(timeout=60) == (130 if number == signal.SIGINT else -number)
-    while any(str(run.parents[2]).encode() in read(p) for p in Path("/proc").glob("[0-9]*/cmdline")):
+    while any(
+        str(run.parents[2]).encode() in read(p) for p in Path("/proc").glob("[0-9]*/cmdline")
+    ):
         assert time.monotonic() < deadline
         time.sleep(0.1)
     reached = Run.open(run).step
@@ -202,7 +285,9 @@ def test_a_run_at_work_is_not_done_twice(scenes: Path, tmp_path: Path, capsys: C
 
     command = words(scenes, tmp_path / "out", METHODS, "--only", "toy/a")
     (tmp_path / "out/runs/toy/a").mkdir(parents=True)
-    (tmp_path / "out/bench.json").write_text(json.dumps({"settings": settings(command), "scenes": {}}))
+    (tmp_path / "out/bench.json").write_text(
+        json.dumps({"settings": settings(command), "scenes": {}})
+    )
     with open(tmp_path / "out/runs/toy/a/.lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert "another process is at work" in refused(capsys, *command)
@@ -212,15 +297,29 @@ def test_a_run_at_work_is_not_done_twice(scenes: Path, tmp_path: Path, capsys: C
 def settings(command: list[str]) -> dict[str, object]:
     """What bench.json holds of a command."""
     steps = int(command[command.index("--steps") + 1])
-    return {"budget": None, "steps": steps, "protocol": None, "oracle": False, "views": 4, "max_size": 640, "seed": 0}
+    return {
+        "budget": None,
+        "steps": steps,
+        "protocol": None,
+        "oracle": False,
+        "views": 4,
+        "max_size": 640,
+        "seed": 0,
+    }
 
 
-def test_other_settings_in_the_same_folder_are_refused(scenes: Path, finished: Path, capsys: Capture) -> None:
+def test_other_settings_in_the_same_folder_are_refused(
+    scenes: Path, finished: Path, capsys: Capture
+) -> None:
     before = snapshot(finished)
     assert "--steps 4, not 5" in refused(capsys, *words(scenes, finished, METHODS, steps=5))
-    assert "other settings" in refused(capsys, *words(scenes, finished, f"a=tiny {SMALL} --loss.cycle 0.123"))
+    assert "other settings" in refused(
+        capsys, *words(scenes, finished, f"a=tiny {SMALL} --loss.cycle 0.123")
+    )
     moved = [
-        w.replace(str(scenes / "two/toy"), f"toy={scenes / 'three'}").replace(f",{scenes / 'three'}", "")
+        w.replace(str(scenes / "two/toy"), f"toy={scenes / 'three'}").replace(
+            f",{scenes / 'three'}", ""
+        )
         for w in words(scenes, finished, METHODS)
     ]
     assert "another name" in refused(capsys, *moved)
@@ -254,7 +353,12 @@ def test_environment_of_a_process_is_its_share(monkeypatch: pytest.MonkeyPatch) 
     for name in THREADS:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    assert [s["OMP_NUM_THREADS"] for s in slots(3, None)] == ["2", "2", "2"] and slots(16, None)[0]["NUMBA_NUM_THREADS"] == "1"
-    assert [s["CUDA_VISIBLE_DEVICES"] for s in slots(1, "0, 3")] == ["0", "3"] and "CUDA_VISIBLE_DEVICES" not in slots(1, None)[0]
+    assert [s["OMP_NUM_THREADS"] for s in slots(3, None)] == ["2", "2", "2"] and slots(16, None)[0][
+        "NUMBA_NUM_THREADS"
+    ] == "1"
+    assert [s["CUDA_VISIBLE_DEVICES"] for s in slots(1, "0, 3")] == [
+        "0",
+        "3",
+    ] and "CUDA_VISIBLE_DEVICES" not in slots(1, None)[0]
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     assert slots(4, None)[0]["OMP_NUM_THREADS"] == slots(4, None)[0]["NUMBA_NUM_THREADS"] == "5"

@@ -1,4 +1,6 @@
-"""The usual steps between exposures settle the common factor that recordings leave open."""
+"""The usual steps between exposures settle the common factor that recordings leave
+open.
+"""
 
 import numpy as np
 import pytest
@@ -41,4 +43,8 @@ def test_the_factor_stays_near_one_whatever_the_steps():
 
 def test_usual_steps_are_chances():
     chances = usual_steps()
-    assert sum(chances.values()) == pytest.approx(1) and min(chances.values()) > 0 and max(chances, key=chances.get) == 2
+    assert (
+        sum(chances.values()) == pytest.approx(1)
+        and min(chances.values()) > 0
+        and max(chances, key=chances.get) == 2
+    )

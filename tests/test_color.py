@@ -1,4 +1,6 @@
-"""Fixed curves: known points, inverses, and the display tone map's promises; numpy and torch give the same."""
+"""Fixed curves: known points, inverses, and the display tone map's promises; numpy and
+torch give the same.
+"""
 
 import numpy as np
 import pytest
@@ -26,7 +28,9 @@ def test_pq_decoding_undoes_encoding():
 
 def test_known_points_of_the_standards():
     assert color.srgb_encode(np.array(0.18)) == pytest.approx(0.4614, abs=1e-4)
-    assert color.pq_encode(np.array(100.0)) == pytest.approx(0.5081, abs=1e-4)  # BT.2100: 100 cd/m^2
+    assert color.pq_encode(np.array(100.0)) == pytest.approx(
+        0.5081, abs=1e-4
+    )  # BT.2100: 100 cd/m^2
     assert color.pq_encode(np.array(10000.0)) == pytest.approx(1.0)
     assert color.hlg_encode(np.array(1 / 12)) == pytest.approx(0.5)
     assert color.pu21_encode(np.array(100.0)) == pytest.approx(256, abs=1)
@@ -45,7 +49,9 @@ def test_numpy_and_torch_agree():
         color.luminance,
     )
     for curve in curves:
-        np.testing.assert_allclose(curve(torch.from_numpy(rgb)).numpy(), curve(rgb), rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(
+            curve(torch.from_numpy(rgb)).numpy(), curve(rgb), rtol=1e-9, atol=1e-12
+        )
     assert color.auto_exposure(torch.from_numpy(rgb)) == pytest.approx(color.auto_exposure(rgb))
 
 
@@ -74,9 +80,12 @@ def test_bright_colors_lose_saturation_not_hue():
     shown = color.srgb_decode(color.display(red))[0]
     assert shown[0] == pytest.approx(1.0, abs=1e-6) and shown[0] > shown[1] > shown[2] > 0.1
     y = color.luminance(red)[0]
-    assert color.luminance(shown) == pytest.approx(y * (1 + y / 1600) / (1 + y), rel=1e-6)  # the curve's luminance is kept
+    assert color.luminance(shown) == pytest.approx(
+        y * (1 + y / 1600) / (1 + y), rel=1e-6
+    )  # the curve's luminance is kept
     np.testing.assert_allclose(
-        (red[0] - y)[1] / (red[0] - y)[2], (shown - color.luminance(shown))[1] / (shown - color.luminance(shown))[2]
+        (red[0] - y)[1] / (red[0] - y)[2],
+        (shown - color.luminance(shown))[1] / (shown - color.luminance(shown))[2],
     )
 
 

@@ -1,4 +1,6 @@
-"""Cosine cost volumes and their soft-argmax: a known shift comes back to a fraction of a cell."""
+"""Cosine cost volumes and their soft-argmax: a known shift comes back to a fraction of
+a cell.
+"""
 
 import numpy as np
 import pytest
@@ -7,23 +9,35 @@ import torch
 from hdr_nsff.priors.flow.correlation import cells, locate, motion, sample, soft_argmax
 
 
-def shifted(dx: float, dy: float, size: tuple[int, int] = (20, 28), channels: int = 48) -> torch.Tensor:
-    """Smooth random features (channels, h, w), shifted by (dx, dy) cells without any interpolation (by phase), periodic."""
+def shifted(
+    dx: float, dy: float, size: tuple[int, int] = (20, 28), channels: int = 48
+) -> torch.Tensor:
+    """Smooth random features (channels, h, w), shifted by (dx, dy) cells without any
+    interpolation (by phase), periodic.
+    """
     rng = np.random.default_rng(0)
     fy, fx = np.fft.fftfreq(size[0])[:, None], np.fft.fftfreq(size[1])
     low = np.exp(-((fx**2 + fy**2) * (2 * np.pi * 1.0) ** 2) / 2)  # a blur of one cell
-    spectrum = np.fft.fft2(rng.normal(size=(channels, *size))) * low * np.exp(-2j * np.pi * (fx * dx + fy * dy))
+    spectrum = (
+        np.fft.fft2(rng.normal(size=(channels, *size)))
+        * low
+        * np.exp(-2j * np.pi * (fx * dx + fy * dy))
+    )
     return torch.from_numpy(np.fft.ifft2(spectrum).real.astype(np.float32))
 
 
-@pytest.mark.parametrize(("dx", "dy"), [(0.0, 0.0), (2.0, -1.0), (0.5, 0.0), (1.3, -0.7), (-2.25, 1.5)])
+@pytest.mark.parametrize(
+    ("dx", "dy"), [(0.0, 0.0), (2.0, -1.0), (0.5, 0.0), (1.3, -0.7), (-2.25, 1.5)]
+)
 def test_a_shift_is_found_to_a_twentieth_of_a_cell(dx: float, dy: float):
     found = motion(shifted(0, 0), shifted(dx, dy), reach=5, radius=3, temperature=0.12)[5:-5, 5:-5]
     assert (found.mean((0, 1)) - torch.tensor([dx, dy])).abs().max() < 0.05
 
 
 def test_a_gaussian_cost_gives_the_middle_of_the_gaussian():
-    """softmax(cost / temperature) of a parabola is a Gaussian, whose mean is the parabola's top."""
+    """softmax(cost / temperature) of a parabola is a Gaussian, whose mean is the
+    parabola's top.
+    """
     place, top = cells(15, 15), torch.tensor([7.3, 6.6])
     cost = 1 - 0.02 * ((place - top) ** 2).sum(-1)[None]
     assert torch.allclose(soft_argmax(cost, place, radius=5, temperature=0.04)[0], top, atol=1e-3)
@@ -44,7 +58,14 @@ def test_sampling_at_a_cell_gives_the_cell_and_between_two_their_mean():
 
 def test_positions_carry_a_gradient_to_the_features():
     a = shifted(0, 0).requires_grad_()
-    locate(sample(a, torch.tensor([[8.0, 9.0]])), torch.tensor([[8.0, 9.0]]), shifted(0.4, 0), 4, 2, 0.05).sum().backward()
+    locate(
+        sample(a, torch.tensor([[8.0, 9.0]])),
+        torch.tensor([[8.0, 9.0]]),
+        shifted(0.4, 0),
+        4,
+        2,
+        0.05,
+    ).sum().backward()
     assert a.grad is not None and a.grad.abs().sum() > 0
 
 

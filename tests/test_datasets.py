@@ -1,5 +1,7 @@
-"""Public layouts: each is recognized for what it is, footage for none of them, and in every convention a known point is where its
-picture shows it, in training pictures and held-out ones."""
+"""Public layouts: each is recognized for what it is, footage for none of them, and in
+every convention a known point is where its picture shows it, in training pictures and
+held-out ones.
+"""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -38,13 +40,24 @@ def read(root: Path) -> Capture:
     return capture
 
 
-def misses(root: Path, files: list[Path], given: Given, over: float | None, size: tuple[int, int] = (mini.H, mini.W)) -> float:
-    """How far the dot of a picture is from where its camera should see it, at worst, in pixels."""
+def misses(
+    root: Path,
+    files: list[Path],
+    given: Given,
+    over: float | None,
+    size: tuple[int, int] = (mini.H, mini.W),
+) -> float:
+    """How far the dot of a picture is from where its camera should see it, at worst, in
+    pixels.
+    """
     poses = placed(root, given, list(range(len(files))), size)
     worst = 0.0
     for path, K, c2w in zip(files, poses.K, poses.c2w, strict=True):
         x, y, z = K @ (c2w[:, :3].T @ (mini.DOT - c2w[:, 3]))
-        worst = max(worst, float(np.abs(np.array([x / z, y / z]) - mini.found_dot(read_image(path, over))).max()))
+        worst = max(
+            worst,
+            float(np.abs(np.array([x / z, y / z]) - mini.found_dot(read_image(path, over))).max()),
+        )
     return worst
 
 
@@ -61,7 +74,9 @@ def test_footage_is_no_data_set(tmp_path: Path) -> None:
     write_video(tmp_path / "clip.mp4", [np.zeros((16, 16, 3))] * 3)
     np.save(tmp_path / "a/poses_bounds.npy", np.zeros((2, 17)))  # poses beside frames, for --poses
     elsewhere = {"frames": [{"file_path": "elsewhere/0.png", "transform_matrix": []}]}
-    mini.write_json(tmp_path / "rig/transforms.json", elsewhere)  # poses of other pictures, for --poses
+    mini.write_json(
+        tmp_path / "rig/transforms.json", elsewhere
+    )  # poses of other pictures, for --poses
     (tmp_path / "rig/dense").mkdir()
     (tmp_path / "empty").mkdir()
     for place in ("a", "rig", "rig/left", "clip.mp4", "empty", "missing"):
@@ -74,10 +89,17 @@ def test_the_picture_shows_the_dot_where_it_was_drawn() -> None:
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_training_cameras_see_the_dot_where_their_pictures_show_it(name: str, tmp_path: Path) -> None:
+def test_training_cameras_see_the_dot_where_their_pictures_show_it(
+    name: str, tmp_path: Path
+) -> None:
     capture = read(SETS[name](tmp_path))
     assert capture.poses is not None
-    assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], capture.poses, capture.over) < 0.6
+    assert (
+        misses(
+            tmp_path, [tmp_path / p.source for p in capture.pictures], capture.poses, capture.over
+        )
+        < 0.6
+    )
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -90,7 +112,9 @@ def test_held_out_cameras_do_too(name: str, tmp_path: Path) -> None:
 def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
     capture = read(mini.blender(tmp_path))
     assert capture.poses is not None
-    flipped = Given(None, capture.poses.K, capture.poses.c2w * [[[1, -1, -1, 1]]], capture.poses.size)
+    flipped = Given(
+        None, capture.poses.K, capture.poses.c2w * [[[1, -1, -1, 1]]], capture.poses.size
+    )
     assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], flipped, 1.0) > 3
 
 
@@ -117,12 +141,18 @@ def test_pictures_of_one_time_are_of_several_cameras() -> None:
         ("d-nerf", "train/0003.png", "training picture 3"),
         ("hdr-nerf", "train/r_1_2.png", "exposure 2 of training view 1"),
         ("hdr-nerf", "exposure_train.json", "exposure times of the train pictures"),
-        ("hdr-nerf-real", "input_images/003_2.png", "59 pictures, but .* cameras and exposures of 60"),
+        (
+            "hdr-nerf-real",
+            "input_images/003_2.png",
+            "59 pictures, but .* cameras and exposures of 60",
+        ),
         ("nerfstudio", "images/frame_00003.png", "a training picture"),
         ("nerfstudio", "depth/3.npy", "depth of images/frame_00003.png"),
     ],
 )
-def test_a_missing_file_is_named_with_what_it_was_for(name: str, lost: str, words: str, tmp_path: Path) -> None:
+def test_a_missing_file_is_named_with_what_it_was_for(
+    name: str, lost: str, words: str, tmp_path: Path
+) -> None:
     SETS[name](tmp_path)
     (tmp_path / lost).unlink()
     with pytest.raises(InputError, match=words) as error:
@@ -153,7 +183,9 @@ def test_a_missing_held_out_file_is_named_and_matters_to_the_truth_alone(
 
 
 @pytest.mark.parametrize("name", ["d-nerf", "hdr-nerf", "nerfstudio"])
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"frames": []}', '{"frames": [{"file_path": "a"}]}'])
+@pytest.mark.parametrize(
+    "text", ["", "{", "[]", '{"frames": []}', '{"frames": [{"file_path": "a"}]}']
+)
 def test_a_transforms_file_cut_short_is_one_sentence(name: str, text: str, tmp_path: Path) -> None:
     SETS[name](tmp_path)
     path = tmp_path / ("transforms.json" if name == "nerfstudio" else "transforms_train.json")

@@ -1,4 +1,6 @@
-"""Held-out views that a data set recorded: a perfect run scores perfectly on them, at the exposures it knows and at new ones."""
+"""Held-out views that a data set recorded: a perfect run scores perfectly on them, at
+the exposures it knows and at new ones.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ BRIGHTER = 1.5  # EV that no frame of the clip has
 
 
 def write_truth(folder: Path, run: Run, radiance: str, **changes: Any) -> Path:
-    """Two views off the path, a and b, as recorded at brackets 0 and 1 and, one of them, at an exposure of its own; of those named in `radiance`
-    it is known too."""
+    """Two views off the path, a and b, as recorded at brackets 0 and 1 and, one of
+    them, at an exposure of its own; of those named in `radiance` it is known too.
+    """
     assert isinstance(run.field, DiscBeforeWall)
     views = []
     for name, time, x, bracket in (("a", 3.0, 0.33, 0), ("b", 1.0, -0.2, 1)):
@@ -37,7 +40,9 @@ def write_truth(folder: Path, run: Run, radiance: str, **changes: Any) -> Path:
         for b, rgb in recorded.items():
             io.write_png(folder / f"recorded/{name}_{b}.png", rgb.reshape(H, W, 3).numpy(), bits=16)
         if name in radiance:
-            io.write_exr(folder / f"radiance/{name}.exr", {"RGB": exact.reshape(H, W, 3).numpy()}, half=False)
+            io.write_exr(
+                folder / f"radiance/{name}.exr", {"RGB": exact.reshape(H, W, 3).numpy()}, half=False
+            )
         views.append(
             TruthView(
                 name=name, time=time, bracket=bracket, anchor=int(time), c2w=c.c2w.tolist(),
@@ -57,7 +62,10 @@ def test_a_perfect_run_is_perfect_on_recorded_views(tmp_path: Path) -> None:
     result = evaluate_run(run, write_truth(tmp_path / "truth", run, radiance=""))
     assert result["kind"] == "held-out views as recorded"
     assert [v["psnr"] > 60 for v in result["views"]] == [True, True]
-    assert result["views"][0]["psnr_novel_exposures"] > 60 and "psnr_novel_exposures" not in result["views"][1]
+    assert (
+        result["views"][0]["psnr_novel_exposures"] > 60
+        and "psnr_novel_exposures" not in result["views"][1]
+    )
     assert "mu5000" not in result["headline"] and result["camera"] == {} and "scale" not in result
     assert result["poses"]["ate"] == pytest.approx(0, abs=1e-6)
 
@@ -76,12 +84,19 @@ def test_views_without_radiance_do_not_count_in_its_scores(tmp_path: Path) -> No
     one = evaluate_run(run, write_truth(tmp_path / "truth", run, radiance="b"))
     a, b = one["views"]
     assert "mu5000" not in a and b["mu5000"] > 55 and one["headline"]["mu5000"] == b["mu5000"]
-    assert one["scale"] == pytest.approx(1, abs=1e-3) and one["peak"] == pytest.approx(3)  # the disc's red
-    assert io.read_image(run.folder / "evaluation/a.png").shape[0] < io.read_image(run.folder / "evaluation/b.png").shape[0]
+    assert one["scale"] == pytest.approx(1, abs=1e-3) and one["peak"] == pytest.approx(
+        3
+    )  # the disc's red
+    assert (
+        io.read_image(run.folder / "evaluation/a.png").shape[0]
+        < io.read_image(run.folder / "evaluation/b.png").shape[0]
+    )
 
 
 def test_moving_pixels_count_alone_at_all_exposures_of_a_view(tmp_path: Path) -> None:
-    """The mask covers the left half; there the recordings are right, elsewhere they are black."""
+    """The mask covers the left half; there the recordings are right, elsewhere they are
+    black.
+    """
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
     for path in (folder / "recorded").glob("*.png"):
@@ -97,55 +112,83 @@ def test_moving_pixels_count_alone_at_all_exposures_of_a_view(tmp_path: Path) ->
 
 
 def test_a_view_is_seen_through_a_lens_of_its_own(tmp_path: Path) -> None:
-    """Recorded with twice the focal length. The clip's own focal length is not that of the view."""
+    """Recorded with twice the focal length. The clip's own focal length is not that of
+    the view.
+    """
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
     truth, K = io.read_json(folder / "truth.json"), camera().K * torch.tensor([[2.0], [2.0], [1.0]])
     K[:2, 2] = camera().K[:2, 2]
     near = Camera(K, torch.tensor(truth["views"][0]["c2w"]), W, H)
-    rgb = run.tonemapper(run.field.render(near, 3.0).radiance, 0, 0, None, leaky=False).detach().reshape(H, W, 3)
+    rgb = (
+        run.tonemapper(run.field.render(near, 3.0).radiance, 0, 0, None, leaky=False)
+        .detach()
+        .reshape(H, W, 3)
+    )
     io.write_png(folder / "recorded/a_0.png", rgb.numpy(), bits=16)
     assert evaluate_run(run, folder)["views"][0]["psnr"] < 40
     truth["views"][0]["K"] = K.tolist()
     io.write_json(folder / "truth.json", truth)
     result = evaluate_run(run, folder)
-    assert result["views"][0]["psnr"] > 60 and result["poses"]["focal_error"] == pytest.approx(0, abs=1e-6)
+    assert result["views"][0]["psnr"] > 60 and result["poses"]["focal_error"] == pytest.approx(
+        0, abs=1e-6
+    )
 
 
 def test_recorded_views_belong_to_protocols(tmp_path: Path) -> None:
-    """View a is at time 3, b at time 1. Of a run that was not trained at time 3 it is between its frames."""
+    """View a is at time 3, b at time 1. Of a run that was not trained at time 3 it is
+    between its frames.
+    """
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
-    assert [v["protocol"] for v in evaluate_run(run, folder)["views"]] == ["novel-view", "novel-view"]
+    assert [v["protocol"] for v in evaluate_run(run, folder)["views"]] == [
+        "novel-view",
+        "novel-view",
+    ]
     frames = run.scene.train
-    some = replace(run, scene=replace(run.scene, train=[f for f in frames if f.index != 3], test=[frames[3]]))
+    some = replace(
+        run, scene=replace(run.scene, train=[f for f in frames if f.index != 3], test=[frames[3]])
+    )
     some.scene.manifest.protocol = "novel-view-time"
     result = evaluate_run(some, folder)
     assert [v["protocol"] for v in result["views"]] == ["novel-view-time", "novel-view"]
-    assert result["headline"]["views"] == 1 and result["headline"]["psnr"] == result["views"][0]["psnr"]
+    assert (
+        result["headline"]["views"] == 1
+        and result["headline"]["psnr"] == result["views"][0]["psnr"]
+    )
 
 
 def test_a_wrong_exposure_is_seen(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
-    result = evaluate_run(run, write_truth(tmp_path / "truth", run, radiance="", bracket_frame=[4, 3, 5, None]))
+    result = evaluate_run(
+        run, write_truth(tmp_path / "truth", run, radiance="", bracket_frame=[4, 3, 5, None])
+    )
     assert result["headline"]["psnr"] < 20
 
 
 def test_given_poses_need_no_spread_to_share_a_world(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run", parallax="none")  # all cameras in one place
-    assert evaluate_run(run, write_truth(tmp_path / "truth", run, radiance=""))["headline"]["views"] == 2
+    assert (
+        evaluate_run(run, write_truth(tmp_path / "truth", run, radiance=""))["headline"]["views"]
+        == 2
+    )
 
 
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"bracket_frame": None, "bracket_ev": [None, 0.0, 1.0, 2.0]}, "bracket_frame does not say"),
+        (
+            {"bracket_frame": None, "bracket_ev": [None, 0.0, 1.0, 2.0]},
+            "bracket_frame does not say",
+        ),
         ({"bracket_frame": [0]}, "bracket_frame lists 1 brackets"),
         ({"bracket_frame": [3, 4, None, 5]}, "no frame of the reference exposure 2"),
         ({"response_x": [0.0, 1.0]}, "not three curves"),
     ],
 )
-def test_a_truth_that_makes_no_sense_is_one_sentence(changes: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_a_truth_that_makes_no_sense_is_one_sentence(
+    changes: dict[str, Any], words: str, tmp_path: Path
+) -> None:
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="", **changes)
     with pytest.raises(InputError, match=words):
@@ -160,7 +203,9 @@ def test_a_truth_that_makes_no_sense_is_one_sentence(changes: dict[str, Any], wo
         ({"K": [[1.0]]}, "a K that is no 3x3"),
     ],
 )
-def test_a_view_that_makes_no_sense_is_one_sentence(update: dict[str, Any], words: str, tmp_path: Path) -> None:
+def test_a_view_that_makes_no_sense_is_one_sentence(
+    update: dict[str, Any], words: str, tmp_path: Path
+) -> None:
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
     truth = io.read_json(folder / "truth.json")
@@ -181,10 +226,14 @@ def test_pictures_of_several_sizes_are_refused(tmp_path: Path) -> None:
 def test_a_clip_without_the_reference_exposure_is_refused(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     with pytest.raises(InputError, match="frame 77 shows the reference exposure"):
-        evaluate_run(run, write_truth(tmp_path / "truth", run, radiance="", bracket_frame=[3, 4, 77, None]))
+        evaluate_run(
+            run, write_truth(tmp_path / "truth", run, radiance="", bracket_frame=[3, 4, 77, None])
+        )
 
 
-def test_run_measures_on_what_the_data_set_held_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_measures_on_what_the_data_set_held_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     run, seen = fake_run(tmp_path / "run"), []
 
     def prepare(config: PrepareConfig) -> Path:

@@ -1,4 +1,6 @@
-"""The way back: a scene written in a public layout and prepared again is the same scene, bit by bit; what does not fit is said."""
+"""The way back: a scene written in a public layout and prepared again is the same
+scene, bit by bit; what does not fit is said.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,15 @@ import pytest
 from toy_scene import ToyScene
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_image, read_mask, read_npy, write_exr, write_json, write_npy, write_png
+from hdr_nsff.core.io import (
+    read_image,
+    read_mask,
+    read_npy,
+    write_exr,
+    write_json,
+    write_npy,
+    write_png,
+)
 from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.layouts import colmap as to_colmap
@@ -29,22 +39,31 @@ LAYOUTS = ("hdr-gopro", "nerfstudio")
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A toy scene with what a real one has: poses that are no round numbers, static points, trust, unknown exposures."""
+    """A toy scene with what a real one has: poses that are no round numbers, static
+    points, trust, unknown exposures.
+    """
     folder = ToyScene().write(tmp_path / "scene")
     m = Manifest.load(folder)
     rng = np.random.default_rng(0)
     for f in m.frames:
         f.c2w = mini.pose(0.013 * f.index).tolist()
         f.disparity_confidence = f"disparity_confidence/{f.index:05d}.npy"
-        write_npy(folder / f.disparity_confidence, rng.random((m.height, m.width)).astype(np.float16))
+        write_npy(
+            folder / f.disparity_confidence, rng.random((m.height, m.width)).astype(np.float16)
+        )
         for files in f.flow.values():
             write_png(folder / files.valid, rng.random((m.height, m.width)) > 0.3)
             noise = rng.normal(size=(m.height, m.width, 2))
-            write_npy(folder / files.flow, (read_npy(folder / files.flow) + noise).astype(np.float16))
+            write_npy(
+                folder / files.flow, (read_npy(folder / files.flow) + noise).astype(np.float16)
+            )
     m.points, m.bracket_ev, m.exposure_given, m.fps = "points.npy", [2.0, 0.0, None], False, 12.5
     for f in m.frames:
         f.ev = m.bracket_ev[f.bracket]
-    write_npy(folder / "points.npy", rng.uniform(-1, 1, (50, 3)).astype(np.float32) + np.float32([0, 0, 4]))
+    write_npy(
+        folder / "points.npy",
+        rng.uniform(-1, 1, (50, 3)).astype(np.float32) + np.float32([0, 0, 4]),
+    )
     m.save(folder)
     return folder
 
@@ -58,7 +77,13 @@ def round_trip(scene: Path, layout: str) -> Path:
 def same_frame(one: Path, f: FrameEntry, other: Path, g: FrameEntry) -> None:
     """Nothing about a frame changed but its name."""
     assert (f.K, f.c2w) == (g.K, g.c2w)
-    assert (f.time, f.camera_id, f.bracket, f.ev, f.split) == (g.time, g.camera_id, g.bracket, g.ev, g.split)
+    assert (f.time, f.camera_id, f.bracket, f.ev, f.split) == (
+        g.time,
+        g.camera_id,
+        g.bracket,
+        g.ev,
+        g.split,
+    )
     assert (one / f.image).read_bytes() == (other / g.image).read_bytes()
     assert f.mask and g.mask and (read_mask(one / f.mask) == read_mask(other / g.mask)).all()
     for name in ("disparity", "disparity_confidence"):
@@ -76,9 +101,21 @@ def test_a_round_trip_is_exact(layout: str, scene: Path) -> None:
     a, b = Manifest.load(scene), Manifest.load(again)
     for f, g in zip(a.frames, b.frames, strict=True):
         same_frame(scene, f, again, g)
-    for name in ("near", "far", "cycle", "reference_bracket", "bracket_ev", "exposure_given", "parallax", "depth_kind", "fps"):
+    for name in (
+        "near",
+        "far",
+        "cycle",
+        "reference_bracket",
+        "bracket_ev",
+        "exposure_given",
+        "parallax",
+        "depth_kind",
+        "fps",
+    ):
         assert getattr(a, name) == getattr(b, name), name
-    assert a.points and b.points and (read_npy(scene / a.points) == read_npy(again / b.points)).all()
+    assert (
+        a.points and b.points and (read_npy(scene / a.points) == read_npy(again / b.points)).all()
+    )
     steps = {n: s.provenance for n, s in b.steps.items() if n != "sheet"}
     assert set(steps.values()) == {"given"}
 
@@ -90,24 +127,43 @@ def test_other_readers_find_what_the_gopro_layout_promises(scene: Path) -> None:
     assert table.shape == (6, 17)
     for f, row in zip(m.frames, table, strict=True):
         matrix, c2w = row[:15].reshape(3, 5), np.array(f.c2w)
-        assert (matrix[:, 0] == c2w[:, 1]).all() and (matrix[:, 1] == c2w[:, 0]).all() and (matrix[:, 2] == -c2w[:, 2]).all()
-        assert (matrix[:, 3] == c2w[:, 3]).all() and matrix[:, 4].tolist() == [m.height, m.width, f.K[0][0] if f.K else None]
+        assert (
+            (matrix[:, 0] == c2w[:, 1]).all()
+            and (matrix[:, 1] == c2w[:, 0]).all()
+            and (matrix[:, 2] == -c2w[:, 2]).all()
+        )
+        assert (matrix[:, 3] == c2w[:, 3]).all() and matrix[:, 4].tolist() == [
+            m.height,
+            m.width,
+            f.K[0][0] if f.K else None,
+        ]
         assert 0 < row[15] < row[16]
     with np.load(dense / "flow_i1/00002_bwd.npz") as flow:
         files = m.frames[2].flow[1]
-        assert (flow["flow"] == read_npy(scene / files.flow)).all() and flow["flow"].dtype == np.float32
+        assert (flow["flow"] == read_npy(scene / files.flow)).all() and flow[
+            "flow"
+        ].dtype == np.float32
         assert (flow["mask"] == read_mask(scene / files.valid)).all()
-    assert not (dense / "flow_i1/00000_bwd.npz").exists() and not (dense / "flow_i1/00005_fwd.npz").exists()
-    assert (read_mask(dense / "motion_masks/00003.png") == ~read_mask(dense.parent / "masks/00003.png")).all()
+    assert (
+        not (dense / "flow_i1/00000_bwd.npz").exists()
+        and not (dense / "flow_i1/00005_fwd.npz").exists()
+    )
+    assert (
+        read_mask(dense / "motion_masks/00003.png") == ~read_mask(dense.parent / "masks/00003.png")
+    ).all()
     z = np.load(dense / "depth-anything/00003.npy")
     assert np.allclose(z * read_npy(scene / (m.frames[3].disparity or "")), 1, rtol=1e-6)
-    assert sorted(p.name for p in (dense / f"images_{m.width}x{m.height}").iterdir()) == [f"{i:05d}.png" for i in range(6)]
+    assert sorted(p.name for p in (dense / f"images_{m.width}x{m.height}").iterdir()) == [
+        f"{i:05d}.png" for i in range(6)
+    ]
 
 
 def test_the_colmap_model_projects_points_onto_their_keypoints(scene: Path) -> None:
     dense = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro")) / "dense"
     model, m = read_model(dense / "sparse"), Manifest.load(scene)
-    assert model.points.shape == (50, 3) and [i.name for i in model.images.values()] == [f"{k:05d}.png" for k in range(6)]
+    assert model.points.shape == (50, 3) and [i.name for i in model.images.values()] == [
+        f"{k:05d}.png" for k in range(6)
+    ]
     seen = 0
     for image, f in zip(model.images.values(), m.frames, strict=True):
         assert np.allclose(image.c2w, f.c2w, atol=1e-12)
@@ -122,7 +178,11 @@ def test_the_colmap_model_projects_points_onto_their_keypoints(scene: Path) -> N
 def test_hidden_points_are_not_seen() -> None:
     points = np.array([[0, 0, 4.0], [0, 0, 6.0], [0, 0, -4.0], [9, 0, 4.0]])
     view = to_colmap.seen(points, mini.K, np.eye(4)[:3], np.full((mini.H, mini.W), 0.25))
-    assert view.index.tolist() == [0] and view.depth.tolist() == [4] and view.xy.tolist() == [[mini.W / 2, mini.H / 2]]
+    assert (
+        view.index.tolist() == [0]
+        and view.depth.tolist() == [4]
+        and view.xy.tolist() == [[mini.W / 2, mini.H / 2]]
+    )
 
 
 def test_nerfstudio_gets_opengl_poses_and_millimeters(scene: Path) -> None:
@@ -132,7 +192,11 @@ def test_nerfstudio_gets_opengl_poses_and_millimeters(scene: Path) -> None:
     for f, entry in zip(m.frames, document["frames"], strict=True):
         matrix, c2w = np.array(entry["transform_matrix"]), np.array(f.c2w)
         assert (matrix[:3] == c2w * [1, -1, -1, 1]).all() and matrix[3].tolist() == [0, 0, 0, 1]
-        assert np.allclose(np.load(out / entry["depth_file_path"]) / 1000, 1 / read_npy(scene / (f.disparity or "")), rtol=1e-3)
+        assert np.allclose(
+            np.load(out / entry["depth_file_path"]) / 1000,
+            1 / read_npy(scene / (f.disparity or "")),
+            rtol=1e-3,
+        )
 
 
 def test_held_out_frames_become_test_pictures_and_come_back_as_truth(scene: Path) -> None:
@@ -150,12 +214,20 @@ def test_held_out_frames_become_test_pictures_and_come_back_as_truth(scene: Path
         assert (scene / f.image).read_bytes() == (again / g.image).read_bytes()
     truth = Truth.open(again.with_name("again_nerfstudio_truth"))
     (view,) = truth.views
-    assert view.time == 3 and view.bracket == m.frames[3].bracket and np.allclose(view.c2w, m.frames[3].c2w)
+    assert (
+        view.time == 3
+        and view.bracket == m.frames[3].bracket
+        and np.allclose(view.c2w, m.frames[3].c2w)
+    )
     exact, pictures = true_pictures(truth, view, again.with_name("again_nerfstudio_truth"))
-    assert exact is None and (pictures[view.bracket] == Scene.open(scene).test[0].image.numpy()).all()
+    assert (
+        exact is None and (pictures[view.bracket] == Scene.open(scene).test[0].image.numpy()).all()
+    )
 
 
-def test_the_gopro_layout_has_no_place_for_held_out_frames_of_the_clip(scene: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_gopro_layout_has_no_place_for_held_out_frames_of_the_clip(
+    scene: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     m = Manifest.load(scene)
     m.frames[3].split, m.frames[3].disparity, m.frames[3].disparity_confidence = "test", None, None
     m.frames[2].flow[4], m.frames[4].flow[2] = m.frames[2].flow[3], m.frames[4].flow[3]
@@ -174,14 +246,18 @@ def test_cameras_that_record_at_once_fit_nerfstudio_alone(scene: Path) -> None:
     with pytest.raises(InputError, match="one picture per time"):
         export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro"))
     again = Manifest.load(round_trip(scene, "nerfstudio"))
-    assert [(f.camera_id, f.time) for f in again.frames] == [(c, t) for c in (0, 1) for t in (0, 1, 2)]
+    assert [(f.camera_id, f.time) for f in again.frames] == [
+        (c, t) for c in (0, 1) for t in (0, 1, 2)
+    ]
 
 
 def test_an_exported_folder_without_one_of_its_notes_is_refused(scene: Path) -> None:
     out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro"))
     note = out / "dense/hdr_nsff.json"
     told = json.loads(note.read_text())
-    note.write_text(json.dumps(told | {"frames": {k: v for k, v in told["frames"].items() if k != "00003.png"}}))
+    note.write_text(
+        json.dumps(told | {"frames": {k: v for k, v in told["frames"].items() if k != "00003.png"}})
+    )
     with pytest.raises(InputError, match="no entry for picture 00003"):
         recognize(out)
     note.write_text(json.dumps({k: v for k, v in told.items() if k != "near"}))
@@ -189,7 +265,9 @@ def test_an_exported_folder_without_one_of_its_notes_is_refused(scene: Path) -> 
         recognize(out)
 
 
-def test_exporting_again_replaces_what_was_there_but_nothing_else(scene: Path, tmp_path: Path) -> None:
+def test_exporting_again_replaces_what_was_there_but_nothing_else(
+    scene: Path, tmp_path: Path
+) -> None:
     config = ExportConfig(scene, tmp_path / "out", layout="hdr-gopro")
     export(config)
     write_png(tmp_path / "out/dense/images/00099.png", np.zeros((4, 4, 3)))
@@ -203,7 +281,9 @@ def test_exporting_again_replaces_what_was_there_but_nothing_else(scene: Path, t
             export(replace(config, out=place))
 
 
-def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(scene: Path, tmp_path: Path) -> None:
+def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(
+    scene: Path, tmp_path: Path
+) -> None:
     config = ExportConfig(scene, tmp_path / "out", layout="nerfstudio")
     for wrong in (replace(config, ply=True), replace(config, layout=None)):
         with pytest.raises(InputError, match="say what to write"):
@@ -226,8 +306,10 @@ EXPOSURES = [2.0, 0.0, -1.0]  # of the toy scene's brackets 0 to 2
 
 
 def write_truth(scene: Path, folder: Path, **changes: Any) -> Truth:
-    """Five views with masks: of another frame's pose at a whole and a half time, as recorded in 16 bits; off the path; at another time.
-    The world of the truth is the scene's, turned, shifted and five times as large."""
+    """Five views with masks: of another frame's pose at a whole and a half time, as
+    recorded in 16 bits; off the path; at another time. The world of the truth is the
+    scene's, turned, shifted and five times as large.
+    """
     m, rng = Manifest.load(scene), np.random.default_rng(5)
     turn, shift = mini.pose(4.0)[:, :3], np.array([1.0, -2.0, 0.5])
 
@@ -236,16 +318,34 @@ def write_truth(scene: Path, folder: Path, **changes: Any) -> Truth:
         return np.concatenate([turn @ c2w[:, :3], (5 * turn @ c2w[:, 3] + shift)[:, None]], 1)
 
     views = []
-    for name, time, anchor, bracket in (("a", 1, 4, 0), ("b", 2.5, 5, 1), ("c", 3, 0, 2), ("off", 2, 2, 1), ("odd", 2.25, 0, 0)):
+    for name, time, anchor, bracket in (
+        ("a", 1, 4, 0),
+        ("b", 2.5, 5, 1),
+        ("c", 3, 0, 2),
+        ("off", 2, 2, 1),
+        ("odd", 2.25, 0, 0),
+    ):
         own = {"c2w": true(mini.pose(0.4)).tolist()} if name == "off" else {}
-        views.append(TruthView(name=name, time=time, anchor=anchor, bracket=bracket, mask=f"masks/{name}.png", **own))
+        views.append(
+            TruthView(
+                name=name,
+                time=time,
+                anchor=anchor,
+                bracket=bracket,
+                mask=f"masks/{name}.png",
+                **own,
+            )
+        )
         write_png(folder / f"masks/{name}.png", rng.random((m.height, m.width)) > 0.5)
         if name == "c":
             views[-1].recorded = {2: "recorded/c.png"}
             write_png(folder / "recorded/c.png", rng.random((m.height, m.width, 3)), bits=16)
         else:
             views[-1].radiance = f"radiance/{name}.exr"
-            write_exr(folder / f"radiance/{name}.exr", {"RGB": rng.random((m.height, m.width, 3), np.float32)})
+            write_exr(
+                folder / f"radiance/{name}.exr",
+                {"RGB": rng.random((m.height, m.width, 3), np.float32)},
+            )
     curve = response_curve("film")
     truth = Truth(
         bracket_ev=EXPOSURES, reference_bracket=1, response_x=curve.x.tolist(), response_y=curve.y.tolist(), white_balance=[1.2, 1, 0.9],
@@ -257,7 +357,9 @@ def write_truth(scene: Path, folder: Path, **changes: Any) -> Truth:
 
 @pytest.fixture
 def kept(scene: Path) -> tuple[Path, Path, Truth]:
-    """A scene whose brackets' brightness is in the order of the truth's exposures, and its truth."""
+    """A scene whose brackets' brightness is in the order of the truth's exposures, and
+    its truth.
+    """
     m = Manifest.load(scene)
     for f in m.frames:
         write_png(scene / f.image, read_image(scene / f.image) * (1.0, 0.5, 0.25)[f.bracket])
@@ -267,10 +369,16 @@ def kept(scene: Path) -> tuple[Path, Path, Truth]:
 def carried(scene: Path, name: str) -> np.ndarray:
     """Where in the scene's world a view stands (3, 4)."""
     anchors = {"a": 4, "b": 5, "c": 0, "odd": 0}
-    return mini.pose(0.4) if name == "off" else np.array(Manifest.load(scene).frames[anchors[name]].c2w)
+    return (
+        mini.pose(0.4)
+        if name == "off"
+        else np.array(Manifest.load(scene).frames[anchors[name]].c2w)
+    )
 
 
-@pytest.mark.parametrize(("layout", "names"), [("hdr-gopro", "abc"), ("nerfstudio", ["a", "b", "c", "off", "odd"])])
+@pytest.mark.parametrize(
+    ("layout", "names"), [("hdr-gopro", "abc"), ("nerfstudio", ["a", "b", "c", "off", "odd"])]
+)
 def test_a_truth_comes_back_with_the_same_views(
     layout: Literal["hdr-gopro", "nerfstudio"], names: Sequence[str], kept: tuple[Path, Path, Truth]
 ) -> None:
@@ -279,17 +387,27 @@ def test_a_truth_comes_back_with_the_same_views(
     again = prepare(PrepareConfig(out, scene.with_name("again")))
     place = again.with_name("again_truth")
     back, before = Truth.open(place), {v.name: v for v in truth.views}
-    assert [v.name for v in back.views] == list(names) and len(Manifest.load(again).frames) == len(Manifest.load(scene).frames)
+    assert [v.name for v in back.views] == list(names) and len(Manifest.load(again).frames) == len(
+        Manifest.load(scene).frames
+    )
     assert back.clip_c2w is not None
     for view in back.views:
         old = before[view.name]
         c2w = np.array(view.c2w or back.clip_c2w[view.anchor])
-        assert np.allclose(c2w, carried(scene, view.name), atol=1e-6 if view.name == "off" else 0, rtol=0)
+        assert np.allclose(
+            c2w, carried(scene, view.name), atol=1e-6 if view.name == "off" else 0, rtol=0
+        )
         assert (view.time, view.bracket) == (old.time, old.bracket) and view.radiance is None
         recorded = true_pictures(truth, old, folder)[1][old.bracket]
         exact = recorded if old.recorded else np.float32(np.rint(recorded * 255) / 255)
-        assert (true_pictures(back, view, place)[1][view.bracket] == exact).all() and exact.std() > 0.05
-        assert view.mask and old.mask and (read_mask(place / view.mask) == read_mask(folder / old.mask)).all()
+        assert (
+            true_pictures(back, view, place)[1][view.bracket] == exact
+        ).all() and exact.std() > 0.05
+        assert (
+            view.mask
+            and old.mask
+            and (read_mask(place / view.mask) == read_mask(folder / old.mask)).all()
+        )
 
 
 def test_a_view_that_the_gopro_layout_cannot_tell_is_named(
@@ -298,7 +416,9 @@ def test_a_view_that_the_gopro_layout_cannot_tell_is_named(
     scene, folder, _ = kept
     out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
     assert "left out 2 of 5 held-out views (off, odd)" in " ".join(capsys.readouterr().err.split())
-    found = sorted(p.relative_to(out / "dense").as_posix() for p in (out / "dense").glob("mv_*/*/*"))
+    found = sorted(
+        p.relative_to(out / "dense").as_posix() for p in (out / "dense").glob("mv_*/*/*")
+    )
     assert found == [
         "mv_images/00001/00005.png", "mv_images/00003/00001.png", "mv_images_time/00002/00006.png",
         "mv_masks/00001/00005.png", "mv_masks/00003/00001.png", "mv_masks_time/00002/00006.png",
@@ -306,7 +426,9 @@ def test_a_view_that_the_gopro_layout_cannot_tell_is_named(
 
 
 def test_cameras_of_a_rig_keep_their_numbers(kept: tuple[Path, Path, Truth]) -> None:
-    """Frames 0 and 3 are of camera 1, and so on: a view from the pose of frame 4 is of camera 2."""
+    """Frames 0 and 3 are of camera 1, and so on: a view from the pose of frame 4 is of
+    camera 2.
+    """
     scene, folder, _ = kept
     m = Manifest.load(scene)
     for f in m.frames:
@@ -314,10 +436,14 @@ def test_cameras_of_a_rig_keep_their_numbers(kept: tuple[Path, Path, Truth]) -> 
     m.save(scene)
     write_truth(scene, folder)
     out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
-    assert (out / "dense/mv_images/00001/00002.png").is_file() and (out / "dense/mv_images_time/00002/00003.png").is_file()
+    assert (out / "dense/mv_images/00001/00002.png").is_file() and (
+        out / "dense/mv_images_time/00002/00003.png"
+    ).is_file()
 
 
-def test_a_truth_that_does_not_fit_is_one_sentence(kept: tuple[Path, Path, Truth], tmp_path: Path) -> None:
+def test_a_truth_that_does_not_fit_is_one_sentence(
+    kept: tuple[Path, Path, Truth], tmp_path: Path
+) -> None:
     scene, folder, truth = kept
     config = ExportConfig(scene, tmp_path / "out", layout="nerfstudio", truth=folder)
     with pytest.raises(InputError, match=r"no truth\.json here"):
@@ -327,7 +453,10 @@ def test_a_truth_that_does_not_fit_is_one_sentence(kept: tuple[Path, Path, Truth
     with pytest.raises(InputError, match="use it with --layout"):
         export(replace(config, layout=None, ply=True, out=tmp_path / "a.ply"))
     assert truth.clip_c2w is not None
-    write_json(folder / "truth.json", truth.model_copy(update={"clip_c2w": truth.clip_c2w[:5]}).model_dump())
+    write_json(
+        folder / "truth.json",
+        truth.model_copy(update={"clip_c2w": truth.clip_c2w[:5]}).model_dump(),
+    )
     with pytest.raises(InputError, match="a clip of 5 frames, the scene has 6"):
         export(config)
     write_json(folder / "truth.json", truth.model_dump())

@@ -1,4 +1,6 @@
-"""Data sets through `prepare`: what they give is taken and said to be given, held-out views land in a truth folder, and nothing else."""
+"""Data sets through `prepare`: what they give is taken and said to be given, held-out
+views land in a truth folder, and nothing else.
+"""
 
 from __future__ import annotations
 
@@ -33,11 +35,15 @@ def gopro(tmp_path: Path) -> PrepareConfig:
 
 
 def still(tmp_path: Path, count: int, root: Path) -> PrepareConfig:
-    """A set that gives no masks and depth, with both from elsewhere, so that it is quick."""
+    """A set that gives no masks and depth, with both from elsewhere, so that it is
+    quick.
+    """
     for k in range(count):
         write_png(tmp_path / f"masks/{k}.png", mini.left(3))
         write_npy(tmp_path / f"depth/{k}.npy", np.full((H, W), 4.0, np.float32))
-    return PrepareConfig(root, tmp_path / "scene", masks=tmp_path / "masks", depth=tmp_path / "depth")
+    return PrepareConfig(
+        root, tmp_path / "scene", masks=tmp_path / "masks", depth=tmp_path / "depth"
+    )
 
 
 # HDR-GoPro / NSFF
@@ -48,15 +54,22 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
 ) -> None:
     scene = Scene.open(prepare(gopro))
     told = capsys.readouterr().err
-    assert "HDR-GoPro / NSFF (LLFF), 9 pictures, with its own poses, flow, masks, depth" in " ".join(told.split())
+    assert (
+        "HDR-GoPro / NSFF (LLFF), 9 pictures, with its own poses, flow, masks, depth"
+        in " ".join(told.split())
+    )
     assert provenance(gopro.out) == {
         "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "masks": "given", "refined_flow": "given",
         "depth": "given", "sheet": "estimated",
     }  # fmt: skip
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 3 and not scene.test
-    assert [f.time for f in scene.train] == list(range(9)) and {f.camera_id for f in scene.train} == {0}
+    assert [f.time for f in scene.train] == list(range(9)) and {
+        f.camera_id for f in scene.train
+    } == {0}
     f = scene.train[4]
-    assert np.allclose(f.camera.K, mini.K) and np.allclose(f.camera.c2w, mini.gopro_pose(1), atol=1e-6)
+    assert np.allclose(f.camera.K, mini.K) and np.allclose(
+        f.camera.c2w, mini.gopro_pose(1), atol=1e-6
+    )
     assert (f.image.numpy() == np.float32(mini.see(mini.gopro_pose(1), EV[1]))).all()
     assert (f.flow[1].numpy() == [1, 0.5]).all() and (f.flow[-1].numpy() == [-1, 0.5]).all()
     assert f.flow_valid[1].sum() == 30 * H and f.moving is not None and f.moving.sum() == 3 * H
@@ -70,7 +83,11 @@ def test_masks_beside_dense_show_what_moves_in_black(gopro: PrepareConfig) -> No
 
 def test_semantic_flow_is_preferred(gopro: PrepareConfig) -> None:
     shutil.copytree(gopro.clip / "dense/flow_i1", gopro.clip / "dense/semantic_flow_i1")
-    np.savez(gopro.clip / "dense/semantic_flow_i1/00000_fwd.npz", flow=np.full((H, W, 2), 7.0), mask=np.ones((H, W)))
+    np.savez(
+        gopro.clip / "dense/semantic_flow_i1/00000_fwd.npz",
+        flow=np.full((H, W, 2), 7.0),
+        mask=np.ones((H, W)),
+    )
     assert (Scene.open(prepare(gopro)).train[0].flow[1] == 7).all()
 
 
@@ -81,14 +98,18 @@ def test_metric_depth_is_brought_to_the_units_of_the_poses(gopro: PrepareConfig)
     scene = Scene.open(prepare(gopro))
     # the map says 2 everywhere, the points lie about 4 away
     depth = [((points - c2w[:, 3]) @ c2w[:, 2]) for c2w in map(mini.gopro_pose, range(3))]
-    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(float(np.median(depth)), rel=2e-3)
+    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(
+        float(np.median(depth)), rel=2e-3
+    )
     assert "360 static points" in Manifest.load(gopro.out).steps["depth"].note
     assert np.allclose(scene.points, points, atol=1e-6)
 
 
 def test_without_points_the_bounds_of_the_pictures_tell_the_scale(gopro: PrepareConfig) -> None:
     scene = Scene.open(prepare(gopro))
-    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(np.sqrt(3 * 5), rel=2e-3)  # near 3, far 5
+    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(
+        np.sqrt(3 * 5), rel=2e-3
+    )  # near 3, far 5
     assert "bounds of the pictures alone" in Manifest.load(gopro.out).steps["depth"].note
 
 
@@ -106,8 +127,12 @@ def test_maps_of_another_size_are_resampled_and_flow_is_scaled(tmp_path: Path) -
     root = mini.gopro(tmp_path / "set", scale=2)  # pictures twice as large as the maps
     m = Manifest.load(prepare(PrepareConfig(root, tmp_path / "scene")))
     scene = Scene.open(tmp_path / "scene")
-    assert (m.width, m.height) == (2 * W, 2 * H) and np.allclose(scene.train[0].camera.K[:2], 2 * mini.K[:2])
-    assert (scene.train[0].flow[1].numpy() == [2, 1]).all() and scene.train[0].flow_valid[1].sum() == 60 * 2 * H
+    assert (m.width, m.height) == (2 * W, 2 * H) and np.allclose(
+        scene.train[0].camera.K[:2], 2 * mini.K[:2]
+    )
+    assert (scene.train[0].flow[1].numpy() == [2, 1]).all() and scene.train[0].flow_valid[
+        1
+    ].sum() == 60 * 2 * H
     write_png(root / "dense/motion_masks/00003.png", np.zeros((H, H), bool))
     with pytest.raises(InputError, match=r"00003\.png: 32x32 for frames of 96x64"):
         prepare(PrepareConfig(root, tmp_path / "other"))
@@ -118,10 +143,19 @@ def test_cameras_that_saw_the_same_times_are_the_truth(gopro: PrepareConfig) -> 
     folder = held_out_truth(gopro)
     assert folder == gopro.out.with_name("scene_truth")
     truth = Truth.open(folder)
-    assert len(truth.views) == 9 * 2 + 8 * 3  # the others at each time, and all of them half a frame later
-    assert truth.bracket_ev == Manifest.load(gopro.out).bracket_ev == [None] * 3 and truth.bracket_frame == [0, 1, 2]
+    assert (
+        len(truth.views) == 9 * 2 + 8 * 3
+    )  # the others at each time, and all of them half a frame later
+    assert truth.bracket_ev == Manifest.load(gopro.out).bracket_ev == [
+        None
+    ] * 3 and truth.bracket_frame == [0, 1, 2]
     view = next(v for v in truth.views if v.name == "t00004.0_camera3")
-    assert (view.time, view.anchor, view.c2w, view.bracket) == (4.0, 2, None, 2)  # the pose and exposure of training frame 2
+    assert (view.time, view.anchor, view.c2w, view.bracket) == (
+        4.0,
+        2,
+        None,
+        2,
+    )  # the pose and exposure of training frame 2
     exact, pictures = true_pictures(truth, view, folder)
     assert exact is None and (pictures[2] == np.float32(mini.see(mini.gopro_pose(2), EV[2]))).all()
     assert view.mask is not None and read_mask(folder / view.mask).sum() == 6 * H
@@ -139,26 +173,45 @@ def test_every_second_frame_leaves_the_others_to_be_tested(gopro: PrepareConfig)
 def test_a_protocol_splits_a_data_set_and_keeps_its_times(gopro: PrepareConfig) -> None:
     prepare(replace(gopro, protocol="novel-view-time"))
     scene, truth = Scene.open(gopro.out), Truth.open(gopro.out.with_name("scene_truth"))
-    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8] and [f.time for f in scene.test] == [1, 3, 5, 7]
+    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8] and [f.time for f in scene.test] == [
+        1,
+        3,
+        5,
+        7,
+    ]
     assert scene.manifest.protocol == "novel-view-time"
-    assert {v.time for v in truth.views} == {t / 2 for t in range(0, 17)}  # all, to be told apart by `evaluate`
+    assert {v.time for v in truth.views} == {
+        t / 2 for t in range(0, 17)
+    }  # all, to be told apart by `evaluate`
     flow = Manifest.load(gopro.out).steps["flow"].note
-    assert "24 pairs" in flow and "16 given, 8 estimated" in flow  # the set has flow between neighbors alone
+    assert (
+        "24 pairs" in flow and "16 given, 8 estimated" in flow
+    )  # the set has flow between neighbors alone
     prepare(replace(gopro, protocol="novel-view"))
     assert len(Scene.open(gopro.out).train) == 9
 
 
 def test_a_truth_of_other_settings_does_not_stay(gopro: PrepareConfig) -> None:
-    """The first three frames are of cameras 1 to 3; when only these times are used, views later than that go."""
+    """The first three frames are of cameras 1 to 3; when only these times are used,
+    views later than that go.
+    """
     prepare(gopro)
     prepare(replace(gopro, end=3, redo=("frames",)))
     folder = held_out_truth(gopro)
-    assert folder is not None and {v.time for v in Truth.open(folder).views} == {0.0, 0.5, 1.0, 1.5, 2.0}
+    assert folder is not None and {v.time for v in Truth.open(folder).views} == {
+        0.0,
+        0.5,
+        1.0,
+        1.5,
+        2.0,
+    }
 
 
 def test_parts_can_be_estimated_although_they_are_given(gopro: PrepareConfig) -> None:
     prepare(replace(gopro, estimate=("flow",)))
-    assert provenance(gopro.out)["flow"] == "estimated" and provenance(gopro.out)["masks"] == "given"
+    assert (
+        provenance(gopro.out)["flow"] == "estimated" and provenance(gopro.out)["masks"] == "given"
+    )
     assert not (Scene.open(gopro.out).train[4].flow[1].numpy() == [1, 0.5]).all()
 
 
@@ -185,10 +238,17 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
 
 def test_held_out_pixels_change_nothing_in_the_scene(tmp_path: Path) -> None:
     one, other = mini.gopro(tmp_path / "one/set"), mini.gopro(tmp_path / "other/set")
-    for path in [p for n in ("mv_images", "mv_images_time", "mv_masks") for p in (other / "dense" / n).rglob("*.png")]:
+    for path in [
+        p
+        for n in ("mv_images", "mv_images_time", "mv_masks")
+        for p in (other / "dense" / n).rglob("*.png")
+    ]:
         write_png(path, np.random.default_rng(0).random((H, W, 3)))
     scenes = [prepare(PrepareConfig(root, root.with_name("scene"))) for root in (one, other)]
-    files = [{p.relative_to(s).as_posix(): p.read_bytes() for p in s.rglob("*") if p.is_file()} for s in scenes]
+    files = [
+        {p.relative_to(s).as_posix(): p.read_bytes() for p in s.rglob("*") if p.is_file()}
+        for s in scenes
+    ]
     noted = [json.loads(f.pop("scene.json")) for f in files]
     assert files[0] == files[1]
     for note in noted:
@@ -210,7 +270,9 @@ def test_the_truth_may_not_lie_where_training_reads(gopro: PrepareConfig) -> Non
         prepare(replace(gopro, truth_out=gopro.out / "truth"))
 
 
-def test_a_folder_of_other_files_is_not_overwritten_with_truth(gopro: PrepareConfig, tmp_path: Path) -> None:
+def test_a_folder_of_other_files_is_not_overwritten_with_truth(
+    gopro: PrepareConfig, tmp_path: Path
+) -> None:
     write_png(tmp_path / "mine/photo.png", np.zeros((4, 4, 3)))
     with pytest.raises(InputError, match="not made by prepare"):
         prepare(replace(gopro, truth_out=tmp_path / "mine"))
@@ -227,12 +289,16 @@ def test_stored_exposures_are_known_in_stops(kind: str, tmp_path: Path) -> None:
     assert m.exposure_given and m.steps["exposure"].details["source"] == "data set"
     gauge = m.frames[0].ev  # of EV[0]
     assert gauge is not None
-    assert [round(f.ev - gauge, 6) for f in m.frames if f.ev is not None] == [EV[t % 3] - EV[0] for t in (0, 1, 2, 3, 5, 6, 7, 9)]
+    assert [round(f.ev - gauge, 6) for f in m.frames if f.ev is not None] == [
+        EV[t % 3] - EV[0] for t in (0, 1, 2, 3, 5, 6, 7, 9)
+    ]
     assert [f.time for f in m.frames] == [0, 1, 2, 3, 5, 6, 7, 9]
     truth = Truth.open(config.out.with_name("scene_truth"))
     assert [v.time for v in truth.views] == [4, 8]
     evs = [truth.bracket_ev[v.bracket] for v in truth.views]
-    assert [ev - gauge for ev in evs if ev is not None] == pytest.approx([EV[1] - EV[0], EV[2] - EV[0]])
+    assert [ev - gauge for ev in evs if ev is not None] == pytest.approx(
+        [EV[1] - EV[0], EV[2] - EV[0]]
+    )
 
 
 def test_fractional_times_count_frames(tmp_path: Path) -> None:
@@ -244,13 +310,18 @@ def test_fractional_times_count_frames(tmp_path: Path) -> None:
 
 def test_transparent_pixels_are_white(tmp_path: Path) -> None:
     prepare(still(tmp_path, 8, mini.blender(tmp_path / "set")))
-    seen, shown = np.float32(mini.see(mini.blender_pose(0), EV[0])), read_image(tmp_path / "scene/images/00000.png")
+    seen, shown = (
+        np.float32(mini.see(mini.blender_pose(0), EV[0])),
+        read_image(tmp_path / "scene/images/00000.png"),
+    )
     quarter = 64 / 255
     assert np.allclose(shown[:-2], seen[:-2], atol=1e-6)
     assert np.allclose(shown[-2:], quarter * seen[-2:] + 1 - quarter, atol=2e-5)
     view = Truth.open(tmp_path / "scene_truth").views[0]
     held_out = read_image(tmp_path / "scene_truth" / view.recorded[view.bracket])
-    assert np.allclose(held_out[-2:], quarter * mini.see(mini.blender_pose(4), EV[1])[-2:] + 1 - quarter, atol=2e-5)
+    assert np.allclose(
+        held_out[-2:], quarter * mini.see(mini.blender_pose(4), EV[1])[-2:] + 1 - quarter, atol=2e-5
+    )
 
 
 def test_exact_radiance_of_held_out_views_is_kept(tmp_path: Path) -> None:
@@ -258,11 +329,16 @@ def test_exact_radiance_of_held_out_views_is_kept(tmp_path: Path) -> None:
     truth = Truth.open(tmp_path / "scene_truth")
     for view, t in zip(truth.views, (4, 8), strict=True):
         assert view.radiance is not None
-        assert (read_exr(tmp_path / "scene_truth" / view.radiance)["RGB"] == mini.radiance(mini.blender_pose(t))).all()
+        assert (
+            read_exr(tmp_path / "scene_truth" / view.radiance)["RGB"]
+            == mini.radiance(mini.blender_pose(t))
+        ).all()
     assert not list((tmp_path / "scene").rglob("*.exr"))  # nor that of training pictures
 
 
-def test_a_time_outside_the_training_pictures_cannot_be_compared(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_time_outside_the_training_pictures_cannot_be_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     root = mini.blender(tmp_path / "set")
     path = root / "transforms_test.json"
     path.write_text(path.read_text().replace('"time": 8', '"time": 12'))
@@ -278,17 +354,32 @@ def test_several_pictures_of_one_time_become_cameras(tmp_path: Path) -> None:
     for k, frame in enumerate(document["frames"]):
         frame["time"] = (k // 2) / 3
     path.write_text(json.dumps(document))
-    m = Manifest.load(prepare(replace(still(tmp_path, 8, root), masks=None, depth=None, max_size=32)))
-    assert [(f.camera_id, f.time) for f in m.frames] == [(0, 0), (0, 1), (0, 2), (0, 3), (1, 0), (1, 1), (1, 2), (1, 3)]
+    m = Manifest.load(
+        prepare(replace(still(tmp_path, 8, root), masks=None, depth=None, max_size=32))
+    )
+    assert [(f.camera_id, f.time) for f in m.frames] == [
+        (0, 0),
+        (0, 1),
+        (0, 2),
+        (0, 3),
+        (1, 0),
+        (1, 1),
+        (1, 2),
+        (1, 3),
+    ]
 
 
 # HDR-NeRF and nerfstudio
 
 
 def reference_of_rounds(m: Manifest) -> float:
-    """The EV of the first picture of a still scene whose first, third and fifth exposures, all given, come in turn."""
+    """The EV of the first picture of a still scene whose first, third and fifth
+    exposures, all given, come in turn.
+    """
     gauge = m.frames[0].ev
-    assert gauge is not None and [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
+    assert gauge is not None and [
+        f.ev - gauge for f in m.frames if f.ev is not None
+    ] == pytest.approx([0, 4, 8, 0, 4, 8])
     assert m.steps["masks"].provenance == "given" and m.exposure_given
     return gauge
 
@@ -307,7 +398,9 @@ def test_all_five_exposures_of_a_held_out_view_are_kept(tmp_path: Path) -> None:
     truth = Truth.open(tmp_path / "scene_truth")
     view = truth.views[0]
     assert len(view.recorded) == 5 and view.radiance is not None
-    assert sum(f is None for f in truth.bracket_frame or []) == 2  # two exposures that nothing was trained on
+    assert (
+        sum(f is None for f in truth.bracket_frame or []) == 2
+    )  # two exposures that nothing was trained on
     zero = m.frames[0].ev
     assert zero is not None
     for bracket, name in view.recorded.items():
@@ -320,9 +413,13 @@ def test_all_five_exposures_of_a_held_out_view_are_kept(tmp_path: Path) -> None:
 def test_every_second_pose_of_a_real_hdr_nerf_scene_is_held_out(tmp_path: Path) -> None:
     config = replace(still(tmp_path, 6, mini.hdr_nerf_real(tmp_path / "set")), masks=None)
     m = Manifest.load(prepare(config))
-    assert [f.source for f in m.frames] == [f"input_images/{2 * k:03d}_{(0, 2, 4)[k % 3]}.png" for k in range(6)]
+    assert [f.source for f in m.frames] == [
+        f"input_images/{2 * k:03d}_{(0, 2, 4)[k % 3]}.png" for k in range(6)
+    ]
     gauge = reference_of_rounds(m)
-    assert all(np.allclose(f.c2w, mini.pose(0.2 * k)) for k, f in enumerate(m.frames) if f.c2w is not None)
+    assert all(
+        np.allclose(f.c2w, mini.pose(0.2 * k)) for k, f in enumerate(m.frames) if f.c2w is not None
+    )
     folder = tmp_path / "scene_truth"
     truth = Truth.open(folder)
     assert len(truth.views) == 6 and sum(f is None for f in truth.bracket_frame or []) == 2
@@ -335,15 +432,21 @@ def test_every_second_pose_of_a_real_hdr_nerf_scene_is_held_out(tmp_path: Path) 
             assert (read_image(folder / name) == np.float32(expected)).all()
 
 
-def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimeters(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimeters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     config = PrepareConfig(mini.nerfstudio(tmp_path / "set"), tmp_path / "scene", max_size=W)
     m = Manifest.load(prepare(config))
-    assert [f.source for f in m.frames] == [f"images/frame_{n:05d}.png" for n in (0, 1, 2, 3, 5, 6, 7)]
+    assert [f.source for f in m.frames] == [
+        f"images/frame_{n:05d}.png" for n in (0, 1, 2, 3, 5, 6, 7)
+    ]
     assert [f.time for f in m.frames] == [0, 1, 2, 3, 5, 6, 7]
-    assert float(1 / Scene.open(config.out).train[0].disparity[0, 0]) == pytest.approx(mini.WALL, rel=1e-3)
-    assert provenance(config.out)["masks"] == "estimated" and "not what moves: not used" in " ".join(
-        capsys.readouterr().err.split()
+    assert float(1 / Scene.open(config.out).train[0].disparity[0, 0]) == pytest.approx(
+        mini.WALL, rel=1e-3
     )
+    assert provenance(config.out)[
+        "masks"
+    ] == "estimated" and "not what moves: not used" in " ".join(capsys.readouterr().err.split())
     view = Truth.open(tmp_path / "scene_truth").views[0]
     assert (view.name, view.time) == ("images_frame_00004", 4.0)
 

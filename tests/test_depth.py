@@ -1,4 +1,6 @@
-"""Depth from known poses: planes with closed forms, parts worked by hand, and what must not be believed."""
+"""Depth from known poses: planes with closed forms, parts worked by hand, and what must
+not be believed.
+"""
 
 import cv2
 import numpy as np
@@ -13,7 +15,15 @@ from hdr_nsff.priors.depth.fuse import carry_over, clean, vote
 from hdr_nsff.priors.depth.geometric import geometric_depth
 from hdr_nsff.priors.depth.parallax import choose_views, triangulate
 from hdr_nsff.priors.depth.plane_sweep import aggregate, best_share, box
-from hdr_nsff.priors.movers.distance import differences, link, mover_depth, regions, smoothest_path, split, steps_in_time
+from hdr_nsff.priors.movers.distance import (
+    differences,
+    link,
+    mover_depth,
+    regions,
+    smoothest_path,
+    split,
+    steps_in_time,
+)
 from hdr_nsff.scene.posed_video import PosedVideo
 
 H, W, F = 48, 64, 60.0
@@ -33,26 +43,37 @@ SWEEPING = at(*[(0.16 * (t - 3), 0.06 * np.sin(t), 0) for t in range(7)])
 
 def texture(seed: int = 0) -> np.ndarray:
     """Smooth noise in [0.1, 0.9], 512 x 512."""
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).random((512, 512, 3)).astype(np.float32), (0, 0), 2)
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(seed).random((512, 512, 3)).astype(np.float32), (0, 0), 2
+    )
     return 0.1 + 0.8 * (noise - noise.min()) / np.ptp(noise)
 
 
 def plane(c2w: np.ndarray, z0: float, slope: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The plane z = z0 + slope x seen by untilted cameras: video (T, H, W, 3) and true z-depth (T, H, W)."""
+    """The plane z = z0 + slope x seen by untilted cameras: video (T, H, W, 3) and true
+    z-depth (T, H, W).
+    """
     video, depth = [], []
     for ex, ey, ez in c2w[:, :, 3]:
         z = (z0 + slope * ex - ez) / (1 - slope * RAYS[..., 0])
         u, v = ((RAYS[..., k] * z + e) * 60 + 256 for k, e in ((0, ex), (1, ey)))
-        video.append(cv2.remap(texture(seed), u.astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC))
+        video.append(
+            cv2.remap(texture(seed), u.astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC)
+        )
         depth.append(z)
     return np.stack(video), np.stack(depth)
 
 
 def exact_flow(c2w: np.ndarray, depth: np.ndarray, pairs: np.ndarray) -> np.ndarray:
     """Flow (P, H, W, 2) px of a static scene seen by untilted cameras."""
-    point = [np.concatenate([RAYS * z[..., None], z[..., None]], -1) + c2w[i, :, 3] for i, z in enumerate(depth)]
+    point = [
+        np.concatenate([RAYS * z[..., None], z[..., None]], -1) + c2w[i, :, 3]
+        for i, z in enumerate(depth)
+    ]
     moved = [point[i] - c2w[j, :, 3] for i, j in pairs]
-    return np.stack([m[..., :2] / m[..., 2:] * F + [W / 2, H / 2] - np.stack([X, Y], -1) for m in moved]).astype(np.float32)
+    return np.stack(
+        [m[..., :2] / m[..., 2:] * F + [W / 2, H / 2] - np.stack([X, Y], -1) for m in moved]
+    ).astype(np.float32)
 
 
 def neighbors(count: int) -> np.ndarray:
@@ -67,7 +88,9 @@ def solve(c2w, video, depth, moving=None, clipped=None, **given):
     pairs = neighbors(len(c2w))
     flow = exact_flow(c2w, depth, pairs)
     valid = ~clipped[pairs[:, 0]] & ~clipped[pairs[:, 1]]
-    return geometric_depth(K, c2w, flow, valid, pairs, moving, given.pop("points", NO_POINTS), video, clipped, **given)
+    return geometric_depth(
+        K, c2w, flow, valid, pairs, moving, given.pop("points", NO_POINTS), video, clipped, **given
+    )
 
 
 def clip(c2w, moving=None, video=None) -> PosedVideo:
@@ -76,7 +99,12 @@ def clip(c2w, moving=None, video=None) -> PosedVideo:
     video = np.full((*size, 3), 0.5, np.float32) if video is None else video
     moving = np.zeros(size, bool) if moving is None else moving
     return PosedVideo(
-        np.broadcast_to(K, (len(c2w), 3, 3)), c2w, np.arange(len(c2w), dtype=float), video, np.zeros(size, bool), moving
+        np.broadcast_to(K, (len(c2w), 3, 3)),
+        c2w,
+        np.arange(len(c2w), dtype=float),
+        video,
+        np.zeros(size, bool),
+        moving,
     )
 
 
@@ -121,7 +149,9 @@ def test_a_moving_region_is_believed_little_and_never_behind_the_scene():
     moving = np.zeros(video.shape[:3], bool)
     moving[:, 16:32, 24:40] = True
     drifting = SWEEPING.copy()
-    drifting[:, 1, 3] += 0.3 * np.arange(7) ** 1.5  # as if its camera went elsewhere: no one depth explains it
+    drifting[:, 1, 3] += (
+        0.3 * np.arange(7) ** 1.5
+    )  # as if its camera went elsewhere: no one depth explains it
     video[moving] = plane(drifting, 3.0, 0.0, seed=5)[0][moving]
     disparity, confidence, *_ = solve(SWEEPING, video, depth, moving=moving)
     assert confidence[moving].max() <= 0.5 < np.median(confidence[~moving])
@@ -150,12 +180,21 @@ def test_without_parallax_everything_is_at_distance_one_and_it_is_said(monkeypat
 
 
 def test_frames_without_anything_to_match_do_not_crash():
-    """All is clipped: only structure from motion's points are left; nothing is believed."""
+    """All is clipped: only structure from motion's points are left; nothing is
+    believed.
+    """
     video, depth = plane(SWEEPING, 4.0, 0.0)
-    points = np.stack([RAYS[::4, ::4, 0] * 4, RAYS[::4, ::4, 1] * 4, np.full((12, 16), 4.0)], -1).reshape(-1, 3)
+    points = np.stack(
+        [RAYS[::4, ::4, 0] * 4, RAYS[::4, ::4, 1] * 4, np.full((12, 16), 4.0)], -1
+    ).reshape(-1, 3)
     clipped = np.ones(video.shape[:3], bool)
     disparity, confidence, near, far = solve(SWEEPING, video, depth, points=points, clipped=clipped)
-    assert np.isfinite(disparity).all() and (disparity > 0).all() and confidence.max() < 0.5 and 0 < near < far
+    assert (
+        np.isfinite(disparity).all()
+        and (disparity > 0).all()
+        and confidence.max() < 0.5
+        and 0 < near < far
+    )
 
 
 def test_points_triangulated_from_exact_flow_are_exact():
@@ -178,9 +217,15 @@ def test_transfer_is_projection_of_the_unprojected_pixel():
 
 
 def test_views_with_good_parallax_are_chosen_first():
-    """Points at z = 4, focal 60: baselines of 0.01, 0.2 and 2 move them by 0.15, 3 and 30 px; 5 % of 64 px is 3.2 px."""
-    points = np.stack([RAYS[..., 0] * 4, RAYS[..., 1] * 4, np.full((H, W), 4.0)], -1)[::8, ::8].reshape(-1, 3)
-    views, largest = choose_views(clip(at((0, 0, 0), (0.01, 0, 0), (0.2, 0, 0), (2, 0, 0))), points, 12)
+    """Points at z = 4, focal 60: baselines of 0.01, 0.2 and 2 move them by 0.15, 3 and
+    30 px; 5 % of 64 px is 3.2 px.
+    """
+    points = np.stack([RAYS[..., 0] * 4, RAYS[..., 1] * 4, np.full((H, W), 4.0)], -1)[
+        ::8, ::8
+    ].reshape(-1, 3)
+    views, largest = choose_views(
+        clip(at((0, 0, 0), (0.01, 0, 0), (0.2, 0, 0), (2, 0, 0))), points, 12
+    )
     assert views[0][0] == 2
     assert np.isclose(largest, 30, rtol=0.02)
 
@@ -205,7 +250,9 @@ def test_matching_is_smooth_where_costs_say_nothing():
 
 
 def test_a_map_carried_over_shifts_by_its_parallax_and_the_nearer_surface_wins():
-    """Baseline 1, focal 60: disparity 0.05 moves by 3 px, 0.1 by 6 px; both land on column 20, the nearer stays."""
+    """Baseline 1, focal 60: disparity 0.05 moves by 3 px, 0.1 by 6 px; both land on
+    column 20, the nearer stays.
+    """
     s = clip(at((0, 0, 0), (-1, 0, 0)))
     disparity, weight = np.zeros((H, W), np.float32), np.zeros((H, W), np.float32)
     disparity[10, 17], disparity[10, 14] = 0.05, 0.1
@@ -217,14 +264,20 @@ def test_a_map_carried_over_shifts_by_its_parallax_and_the_nearer_surface_wins()
 
 
 def test_the_vote_is_the_mean_of_those_near_the_weighted_median():
-    """Weights 1, 1, 1, 2.5: the total is 5.5, the median is the third value; the outlier at 9 has no say."""
+    """Weights 1, 1, 1, 2.5: the total is 5.5, the median is the third value; the
+    outlier at 9 has no say.
+    """
     disparities = np.array([1.0, 1.02, 1.01, 9.0], np.float32).reshape(4, 1, 1)
-    fused, agreeing, everything = vote(disparities, np.array([1, 1, 1, 2.5], np.float32).reshape(4, 1, 1))
+    fused, agreeing, everything = vote(
+        disparities, np.array([1, 1, 1, 2.5], np.float32).reshape(4, 1, 1)
+    )
     assert np.isclose(fused[0, 0], 1.01) and agreeing[0, 0] == 3 and everything[0, 0] == 5.5
 
 
 def test_cleaning_moves_a_depth_edge_onto_the_image_edge():
-    """The image changes at column 16, the map at column 18: columns 16 and 17 are given back to the far side."""
+    """The image changes at column 16, the map at column 18: columns 16 and 17 are given
+    back to the far side.
+    """
     rgb, disparity = np.full((32, 32, 3), 0.2, np.float32), np.full((32, 32), 0.2, np.float32)
     rgb[:, :16], disparity[:, :18] = 0.8, 0.5
     cleaned = clean(disparity, np.ones((32, 32), np.float32), rgb)
@@ -244,36 +297,48 @@ def test_third_differences_vanish_on_parabolas_whatever_the_spacing():
     assert D.shape == (3, 6)
     assert np.allclose(D @ (2 - t + 0.3 * t**2), 0, atol=1e-9)
     assert np.allclose(differences(np.arange(4.0), np.ones(3, bool)), [[-1, 3, -3, 1]])
-    assert len(differences(t, np.array([1, 1, 0, 1, 1], bool))) == 0  # a step is unknown in every run of four
+    assert (
+        len(differences(t, np.array([1, 1, 0, 1, 1], bool))) == 0
+    )  # a step is unknown in every run of four
 
 
 FORWARD = np.tile([0.0, 0, 1], (24, 1))
 
 
 def path(shake: float, count: int = 24) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A point on a straight line at z = 2 to 2.5, the eyes of a shaking camera, and the rays of z-depth 1 between them."""
+    """A point on a straight line at z = 2 to 2.5, the eyes of a shaking camera, and the
+    rays of z-depth 1 between them.
+    """
     t = np.arange(count, dtype=float)
     point = np.stack([0.03 * t - 0.3, 0.01 * t, 2 + 0.02 * t], -1)
-    eyes = shake * np.random.default_rng(0).standard_normal((count, 3)) + np.stack([0.02 * t, 0 * t, 0 * t], -1)
+    eyes = shake * np.random.default_rng(0).standard_normal((count, 3)) + np.stack(
+        [0.02 * t, 0 * t, 0 * t], -1
+    )
     local = point - eyes
     return point[:, 2] - eyes[:, 2], eyes, local / local[:, 2:]
 
 
 def test_a_shaking_camera_tells_how_far_a_moving_point_is():
     z, eyes, rays = path(shake=0.02)
-    found, sigma = smoothest_path(eyes, FORWARD, rays, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5))
+    found, sigma = smoothest_path(
+        eyes, FORWARD, rays, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
+    )
     assert np.abs(found / z - 1).mean() < 0.03 and np.median(sigma) < 0.03
 
 
 def test_a_smooth_camera_leaves_the_prior():
     _, eyes, rays = path(shake=0.0)
     noisy = rays + 0.003 * np.random.default_rng(1).standard_normal(rays.shape) * [1, 1, 0]
-    found, sigma = smoothest_path(eyes, FORWARD, noisy, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5))
+    found, sigma = smoothest_path(
+        eyes, FORWARD, noisy, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
+    )
     assert np.allclose(found, 3.5, rtol=0.02) and np.median(sigma) > 0.15
 
 
 def crossing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A large square drifts right in front of a small still one; they touch from frame 3. Masks (6, H, W), flow, pairs."""
+    """A large square drifts right in front of a small still one; they touch from frame
+    3. Masks (6, H, W), flow, pairs.
+    """
     moving, owner = np.zeros((6, H, W), bool), np.zeros((6, H, W), int)
     for t in range(6):
         owner[t, 20:28, 34:44] = 2
@@ -289,7 +354,10 @@ def crossing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def test_regions_are_followed_and_touching_ones_stay_two():
     moving, flow, pairs = crossing()
-    labels, steps = regions(moving), steps_in_time(np.arange(6.0), flow, np.ones(flow.shape[:3], bool), pairs)
+    labels, steps = (
+        regions(moving),
+        steps_in_time(np.arange(6.0), flow, np.ones(flow.shape[:3], bool), pairs),
+    )
     assert labels[2].max() == 2 and labels[3].max() == 1
     split(labels, steps)
     assert labels[3].max() == 2
@@ -306,7 +374,9 @@ def test_a_region_that_does_not_flow_back_is_another_object():
 
 
 def test_a_mask_over_the_static_scene_is_seen_through():
-    """A region that was called moving but obeys the plane's depth in all frames gets the plane's disparity and its confidence."""
+    """A region that was called moving but obeys the plane's depth in all frames gets
+    the plane's disparity and its confidence.
+    """
     video, depth = plane(SWEEPING, 4.0, 0.0)
     moving = np.zeros(video.shape[:3], bool)
     moving[3, 16:32, 24:40] = True
@@ -319,12 +389,19 @@ def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth():
     """A square at z = 2 before a wall at z = 4, moving by 0.03 per frame."""
     rng = np.random.default_rng(3)
     eyes = np.concatenate([0.03 * rng.standard_normal((20, 2)), np.zeros((20, 1))], 1)
-    center = (np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1) - eyes[:, :2]) / 2 * F + [W / 2, H / 2]  # (20, 2) px
+    center = (np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1) - eyes[:, :2]) / 2 * F + [
+        W / 2,
+        H / 2,
+    ]  # (20, 2) px
     moving = np.stack([(np.abs(X - x) < 7) & (np.abs(Y - y) < 7) for x, y in center])
     pairs = neighbors(20)
-    flow = np.stack([np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]).astype(np.float32)
+    flow = np.stack([np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]).astype(
+        np.float32
+    )
     wall = np.full((20, H, W), 0.25, np.float32)
-    disparity, confidence = mover_depth(clip(at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall)
+    disparity, confidence = mover_depth(
+        clip(at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall
+    )
     assert np.abs(disparity[moving] * 2 - 1).mean() < 0.03
     assert (disparity[~moving] == 0.25).all()
     assert confidence[~moving].max() == 0 and 0.4 < confidence[moving].mean() <= 0.5

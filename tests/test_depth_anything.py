@@ -1,4 +1,6 @@
-"""Depth Anything's answers are laid onto static points: known scales and shifts come back, outliers and gaps are borne; a tiny network runs."""
+"""Depth Anything's answers are laid onto static points: known scales and shifts come
+back, outliers and gaps are borne; a tiny network runs.
+"""
 
 import numpy as np
 import pytest
@@ -15,15 +17,21 @@ K = np.array([[F, 0, W / 2], [0, F, H / 2], [0, 0, 1.0]])
 NONE = (np.zeros((0, H, W, 2), np.float32), np.zeros((0, H, W), bool), np.zeros((0, 2), int))
 
 
-def frames_of(lines: np.ndarray, number: int = 200, outliers: float = 0.0, noise: float = 0.0) -> list[np.ndarray]:
-    """Answers and the disparities that the lines (T, 2) make of them, some of them anything."""
+def frames_of(
+    lines: np.ndarray, number: int = 200, outliers: float = 0.0, noise: float = 0.0
+) -> list[np.ndarray]:
+    """Answers and the disparities that the lines (T, 2) make of them, some of them
+    anything.
+    """
     rng = np.random.default_rng(3)
     seen = []
     for scale, shift in lines:
         answers = rng.uniform(1, 9, number)
         disparity = scale * answers + shift + noise * rng.normal(size=number)
         wrong = rng.random(number) < outliers
-        seen.append(np.stack([answers, np.where(wrong, rng.uniform(0.05, 3, number), disparity)], 1))
+        seen.append(
+            np.stack([answers, np.where(wrong, rng.uniform(0.05, 3, number), disparity)], 1)
+        )
     return seen
 
 
@@ -77,7 +85,9 @@ def test_many_points_are_not_bent_towards_the_neighbors():
 
 
 def slanted(count: int = 3) -> tuple[PosedVideo, np.ndarray, np.ndarray]:
-    """Cameras beside each other that see a slanted wall, its disparity (T, H, W), and points on it."""
+    """Cameras beside each other that see a slanted wall, its disparity (T, H, W), and
+    points on it.
+    """
     c2w = np.stack([np.concatenate([np.eye(3), [[0.1 * t], [0], [0]]], 1) for t in range(count)])
     _, x = np.indices((H, W)) + 0.5
     rays = (x - W / 2) / F
@@ -86,7 +96,12 @@ def slanted(count: int = 3) -> tuple[PosedVideo, np.ndarray, np.ndarray]:
     points = np.stack([wall[:, 0], wall[:, 1], 2 + 0.5 * wall[:, 0]], 1)
     empty = np.zeros((count, H, W), bool)
     clip = PosedVideo(
-        np.tile(K, (count, 1, 1)), c2w, np.arange(count, dtype=float), np.zeros((count, H, W, 3), np.float32), empty, empty.copy()
+        np.tile(K, (count, 1, 1)),
+        c2w,
+        np.arange(count, dtype=float),
+        np.zeros((count, H, W, 3), np.float32),
+        empty,
+        empty.copy(),
     )
     return clip, disparity.astype(np.float32), points
 
@@ -103,7 +118,9 @@ def test_answers_of_a_wall_become_its_disparity_in_scene_units(kind):
 def test_points_behind_a_mover_have_no_say():
     clip, true, points = slanted()
     clip.moving[:, :, : W // 2] = True
-    answered = np.where(clip.moving, 40, 7 * true + 3).astype(np.float32)  # something near in front of that half
+    answered = np.where(clip.moving, 40, 7 * true + 3).astype(
+        np.float32
+    )  # something near in front of that half
     disparity, _, _, _ = anchored_depth(answered, "relative", clip, points, *NONE)
     np.testing.assert_allclose(disparity[~clip.moving], true[~clip.moving], rtol=2e-3)
     assert disparity[clip.moving].min() > 1.5 * true.max()
@@ -147,6 +164,11 @@ def test_a_tiny_network_answers_every_frame_at_its_size_and_its_kind_is_read(tin
 def test_the_network_sees_its_own_size_with_the_shape_of_the_frame_kept(tiny):
     network = pretrained("DepthAnythingForDepthEstimation", str(tiny[1]))
     shown = picture(network, np.full((90, 160, 3), 0.5, np.float32))
-    assert shown.shape == (1, 3, 28, 56)  # shorter side 28, the longer 49.8 to the nearest multiple of 14
+    assert shown.shape == (
+        1,
+        3,
+        28,
+        56,
+    )  # shorter side 28, the longer 49.8 to the nearest multiple of 14
     expected = (0.5 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor([0.229, 0.224, 0.225])
     torch.testing.assert_close(shown[0, :, 3, 5], expected)

@@ -1,4 +1,6 @@
-"""Grids: the numba kernels against their plain-torch twin, hand-worked interpolation, the touched-only optimizer."""
+"""Grids: the numba kernels against their plain-torch twin, hand-worked interpolation,
+the touched-only optimizer.
+"""
 
 import numpy as np
 import torch
@@ -15,7 +17,9 @@ def grid(max_rows: int = 2**10) -> AdditiveGrid:
 
 
 def coords(n: int = 500) -> torch.Tensor:
-    return torch.rand(n, 3, generator=torch.Generator().manual_seed(2)) * 1.2 - 0.1  # a tenth outside on every side
+    return (
+        torch.rand(n, 3, generator=torch.Generator().manual_seed(2)) * 1.2 - 0.1
+    )  # a tenth outside on every side
 
 
 def test_kernels_equal_plain_torch_in_values_and_gradients_dense_and_hashed() -> None:
@@ -35,7 +39,9 @@ def test_kernels_equal_plain_torch_in_values_and_gradients_dense_and_hashed() ->
 
 def test_twin_gradient_agrees_with_finite_differences() -> None:
     g = grid().double()
-    x = torch.tensor([[0.31, 0.42, 0.53], [0.11, 0.77, 0.64]], dtype=torch.float64, requires_grad=True)
+    x = torch.tensor(
+        [[0.31, 0.42, 0.53], [0.11, 0.77, 0.64]], dtype=torch.float64, requires_grad=True
+    )
     assert torch.autograd.gradcheck(lambda p: g.reference(p, *g.at(1.3)), (x,), eps=1e-7, atol=1e-4)
 
 
@@ -70,7 +76,11 @@ def marked(rows: int) -> torch.Tensor:
 
 
 def test_touched_adam_is_adam_where_every_row_has_a_gradient() -> None:
-    a, b, marks = torch.ones(3, 4, requires_grad=True), torch.ones(3, 4, requires_grad=True), marked(3)
+    a, b, marks = (
+        torch.ones(3, 4, requires_grad=True),
+        torch.ones(3, 4, requires_grad=True),
+        marked(3),
+    )
     ours, theirs = (
         TouchedAdam([{"params": [a], "touched": [marks]}], lr=0.1, eps=1e-8),
         torch.optim.Adam([b], lr=0.1, betas=(0.9, 0.99), eps=1e-8),
@@ -108,7 +118,20 @@ def test_frequencies_hold_identity_sines_and_cosines() -> None:
     x = torch.tensor([[0.5, -1.0]])
     out = frequencies(x, 2)
     expected = torch.tensor(
-        [[0.5, -1.0, np.sin(0.5), np.sin(-1.0), np.cos(0.5), np.cos(-1.0), np.sin(1.0), np.sin(-2.0), np.cos(1.0), np.cos(-2.0)]]
+        [
+            [
+                0.5,
+                -1.0,
+                np.sin(0.5),
+                np.sin(-1.0),
+                np.cos(0.5),
+                np.cos(-1.0),
+                np.sin(1.0),
+                np.sin(-2.0),
+                np.cos(1.0),
+                np.cos(-2.0),
+            ]
+        ]
     )
     torch.testing.assert_close(out, expected.float())
 

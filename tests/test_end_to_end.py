@@ -1,5 +1,6 @@
-"""The one job, from frames to report, on the CPU: `run` once on a small clip whose radiance is known in closed form, then every other verb on
-what it made."""
+"""The one job, from frames to report, on the CPU: `run` once on a small clip whose
+radiance is known in closed form, then every other verb on what it made.
+"""
 
 import json
 from pathlib import Path
@@ -19,7 +20,9 @@ EXPOSURES = (0.0, -1.5, -3.0)  # EV; the brightest clips a little
 
 
 def made_scene() -> ToyScene:
-    """The wall and the card with softer textures, so that neighboring frames can be matched."""
+    """The wall and the card with softer textures, so that neighboring frames can be
+    matched.
+    """
     scene = ToyScene(WIDTH, HEIGHT, FRAMES)
     soft = [cv2.GaussianBlur(t, (0, 0), 3.0) for t in scene.textures]
     scene.textures = [np.clip((t - t.mean()) * 3 + 0.5, 0.02, 1).astype(np.float32) for t in soft]
@@ -27,16 +30,30 @@ def made_scene() -> ToyScene:
 
 
 def write_clip(folder: Path) -> list[str]:
-    """Frames in alternating exposures, their cameras in the LLFF layout (two planes are too little for structure from motion); the command."""
+    """Frames in alternating exposures, their cameras in the LLFF layout (two planes are
+    too little for structure from motion); the command.
+    """
     scene, rows = made_scene(), []
     for t in range(FRAMES):
         radiance, _, _ = scene.see(t)
-        io.write_png(folder / f"frames/{t:05d}.png", np.clip(radiance * 2.0 ** EXPOSURES[t % 3], 0, 1) ** (1 / 2.2))
+        io.write_png(
+            folder / f"frames/{t:05d}.png",
+            np.clip(radiance * 2.0 ** EXPOSURES[t % 3], 0, 1) ** (1 / 2.2),
+        )
         x, y, z = camera_center(t)
-        pose = np.array([[0, 1, 0, x, HEIGHT], [1, 0, 0, y, WIDTH], [0, 0, -1, z, scene.f]])  # columns: down, right, back
+        pose = np.array(
+            [[0, 1, 0, x, HEIGHT], [1, 0, 0, y, WIDTH], [0, 0, -1, z, scene.f]]
+        )  # columns: down, right, back
         rows.append([*pose.ravel(), 1.8, 5.0])
     io.write_npy(folder / "poses_bounds.npy", np.array(rows))
-    options = ["--ev", ",".join(f"{e:g}" for e in EXPOSURES), "--preset", "tiny", "--poses", str(folder / "poses_bounds.npy")]
+    options = [
+        "--ev",
+        ",".join(f"{e:g}" for e in EXPOSURES),
+        "--preset",
+        "tiny",
+        "--poses",
+        str(folder / "poses_bounds.npy"),
+    ]
     return ["run", str(folder / "frames"), str(folder / "out"), *options, "--device", "cpu"]
 
 
@@ -55,13 +72,19 @@ def out(command: list[str]) -> Path:
 
 
 def stamps(folder: Path) -> dict[str, int]:
-    return {p.relative_to(folder).as_posix(): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): p.stat().st_mtime_ns
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
 
 
 def test_the_scene_is_what_was_filmed(out: Path) -> None:
     m = Manifest.load(out / "scene")
     assert len(m.frames) == FRAMES and m.cycle == 3 and m.parallax == "full" and m.exposure_given
-    assert [f.bracket for f in m.frames[:4]] == [0, 1, 2, 0] and sum(f.split == "test" for f in m.frames) == 2
+    assert [f.bracket for f in m.frames[:4]] == [0, 1, 2, 0] and sum(
+        f.split == "test" for f in m.frames
+    ) == 2
     assert np.allclose(np.diff([e for e in m.bracket_ev if e is not None]), -1.5)
     scene = made_scene()
     for f in m.frames[4:8]:
@@ -75,7 +98,9 @@ def test_radiance_comes_out_linear_unclipped_and_at_the_right_scale(out: Path) -
     run, scene = Run.open(out / "run"), made_scene()
     files = sorted((out / "render/training").glob("*.exr"))
     assert len(files) == len(run.scene.train) == 12
-    unit = 2.0 ** EXPOSURES[run.scene.manifest.reference_bracket]  # radiance 1 saturates the reference exposure
+    unit = (
+        2.0 ** EXPOSURES[run.scene.manifest.reference_bracket]
+    )  # radiance 1 saturates the reference exposure
     for path, frame in list(zip(files, run.scene.train, strict=True))[2:10]:
         channels = io.read_exr(path)
         assert channels["RGB"].shape == (HEIGHT, WIDTH, 3) and float(channels["RGB"].min()) >= 0
@@ -97,7 +122,8 @@ def test_videos_play(out: Path) -> None:
 
 def test_ldr_views_depth_and_scene_flow_are_there_for_every_frame(out: Path) -> None:
     brightness = [
-        np.mean([io.read_image(p).mean() for p in folder.glob("*.png")]) for folder in sorted((out / "render/ldr").iterdir())
+        np.mean([io.read_image(p).mean() for p in folder.glob("*.png")])
+        for folder in sorted((out / "render/ldr").iterdir())
     ]
     assert len(brightness) == 3 and max(brightness) > 1.5 * min(brightness)
     for name in ("depth", "scene_flow"):
@@ -116,7 +142,9 @@ def test_the_report_is_one_page_that_needs_nothing_else(out: Path) -> None:
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/") >= 5 and "PSNR" in page
     assert not any(
-        f'{attribute}="{scheme}' in page for attribute in ("src", "href") for scheme in ("http:", "https:", "file:", "/")
+        f'{attribute}="{scheme}' in page
+        for attribute in ("src", "href")
+        for scheme in ("http:", "https:", "file:", "/")
     )
 
 
@@ -129,13 +157,36 @@ def test_the_same_command_again_redoes_nothing(command: list[str], out: Path) ->
     assert not {p for p in redone if p.endswith((".exr", ".mp4", ".npy", ".safetensors"))}, redone
 
 
-def test_the_other_verbs_work_on_what_run_made(out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_other_verbs_work_on_what_run_made(
+    out: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     run = str(out / "run")
-    cli.main(["train", "tiny", "--scene", str(out / "scene"), "--out", run, "--device", "cpu"])  # finished already
-    cli.main(["render", run, "--path", "fixed", "--out", str(tmp_path / "fixed"), "--scale", "0.5", "--device", "cpu"])
-    assert io.read_exr(next((tmp_path / "fixed").rglob("*.exr")))["RGB"].shape == (HEIGHT // 2, WIDTH // 2, 3)
+    cli.main(
+        ["train", "tiny", "--scene", str(out / "scene"), "--out", run, "--device", "cpu"]
+    )  # finished already
+    cli.main(
+        [
+            "render",
+            run,
+            "--path",
+            "fixed",
+            "--out",
+            str(tmp_path / "fixed"),
+            "--scale",
+            "0.5",
+            "--device",
+            "cpu",
+        ]
+    )
+    assert io.read_exr(next((tmp_path / "fixed").rglob("*.exr")))["RGB"].shape == (
+        HEIGHT // 2,
+        WIDTH // 2,
+        3,
+    )
     cli.main(["evaluate", run, "--device", "cpu"])
-    cli.main(["report", run, "--out", str(tmp_path / "again.html"), "--renders", str(out / "render")])
+    cli.main(
+        ["report", run, "--out", str(tmp_path / "again.html"), "--renders", str(out / "render")]
+    )
     assert (tmp_path / "again.html").stat().st_size > 50_000
     cli.main(["reexpose", str(out / "render/slowmo.mp4"), str(tmp_path / "problem")])
     assert len(list((tmp_path / "problem/clip").glob("*.png"))) >= 20 and list(
@@ -143,13 +194,34 @@ def test_the_other_verbs_work_on_what_run_made(out: Path, tmp_path: Path, capsys
     )
 
 
-def test_gaussians_trained_on_the_same_scene_come_closer_and_move_between_frames(out: Path, tmp_path: Path) -> None:
+def test_gaussians_trained_on_the_same_scene_come_closer_and_move_between_frames(
+    out: Path, tmp_path: Path
+) -> None:
     run = tmp_path / "run"
-    cli.main(["train", "splat", "--scene", str(out / "scene"), "--out", str(run), "--steps", "250", "--device", "cpu"])
+    cli.main(
+        [
+            "train",
+            "splat",
+            "--scene",
+            str(out / "scene"),
+            "--out",
+            str(run),
+            "--steps",
+            "250",
+            "--device",
+            "cpu",
+        ]
+    )
     cli.main(["evaluate", str(run), "--device", "cpu"])
-    psnr = [json.loads((r / "metrics.json").read_text())["headline"]["psnr"] for r in (out / "run", run)]
+    psnr = [
+        json.loads((r / "metrics.json").read_text())["headline"]["psnr"] for r in (out / "run", run)
+    ]
     assert psnr[1] > psnr[0] + 1, psnr
-    cli.main(["render", str(run), "--path", "slowmo", "--factor", "2", "--no-video", "--device", "cpu"])
+    cli.main(
+        ["render", str(run), "--path", "slowmo", "--factor", "2", "--no-video", "--device", "cpu"]
+    )
     moving = [io.read_exr(p)["motion"] for p in sorted((run / "render/slowmo").glob("*.exr"))[4:9]]
     columns = [float((m * np.arange(m.shape[1])).sum() / m.sum()) for m in moving]
-    assert all(m.max() > 0.5 for m in moving) and columns == sorted(columns), "the card moves to the right, half frames between"
+    assert all(m.max() > 0.5 for m in moving) and columns == sorted(columns), (
+        "the card moves to the right, half frames between"
+    )

@@ -1,4 +1,6 @@
-"""Gaussians as PLY files: what is written is what the field draws, at any time; refusals are sentences; restarts keep what is there."""
+"""Gaussians as PLY files: what is written is what the field draws, at any time;
+refusals are sentences; restarts keep what is there.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,13 @@ from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths import color
 from hdr_nsff.rendering import export, ply
-from hdr_nsff.rendering.export import Coloring, ExportConfig, GaussianField, export_one, export_sequence
+from hdr_nsff.rendering.export import (
+    Coloring,
+    ExportConfig,
+    GaussianField,
+    export_one,
+    export_sequence,
+)
 from hdr_nsff.rendering.shots import develop
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
@@ -31,7 +39,9 @@ LINEAR = Coloring(linear=True)
 def make_run(toy: Scene, folder: Path, preset: str = "splat") -> Run:
     """An untrained run with something in every part of its field."""
     tonemapper = ToneMapper.for_scene(ToneMapConfig(), toy)
-    return Run(folder, small(preset), toy, random_field(preset, toy), tonemapper, step=7, seconds=1.0)
+    return Run(
+        folder, small(preset), toy, random_field(preset, toy), tonemapper, step=7, seconds=1.0
+    )
 
 
 @pytest.fixture
@@ -55,23 +65,45 @@ def raw(path: Path) -> tuple[list[str], np.ndarray]:
 def test_the_file_follows_the_common_layout(run: Run, tmp_path: Path) -> None:
     lines, v = raw(export_one(run, tmp_path / "a.ply", 2.5, LINEAR))
     cloud = splat(run).gaussians(2.5)
-    assert lines[:3] == ["ply", "format binary_little_endian 1.0", f"element vertex {len(cloud.means)}"]
+    assert lines[:3] == [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(cloud.means)}",
+    ]
     names = "x y z nx ny nz f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3"
-    assert " ".join(line.removeprefix("property float ") for line in lines if line.startswith("property")) == names
-    assert "comment time 2.5 frames" in lines and "comment axes OpenCV: +x right, +y down, +z forward" in lines
+    assert (
+        " ".join(
+            line.removeprefix("property float ") for line in lines if line.startswith("property")
+        )
+        == names
+    )
+    assert (
+        "comment time 2.5 frames" in lines
+        and "comment axes OpenCV: +x right, +y down, +z forward" in lines
+    )
     np.testing.assert_array_equal(v[:, :3], cloud.means)
     assert not v[:, 3:6].any()
-    np.testing.assert_allclose(v[:, 6:9], (cloud.radiance - 0.5) / 0.28209479177387814, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        v[:, 6:9], (cloud.radiance - 0.5) / 0.28209479177387814, rtol=1e-6, atol=1e-6
+    )
     np.testing.assert_allclose(1 / (1 + np.exp(-v[:, 9])), cloud.opacities, rtol=1e-5)
     np.testing.assert_allclose(np.exp(v[:, 10:13]), cloud.scales, rtol=1e-5)
-    np.testing.assert_allclose(v[:, 13:], torch.nn.functional.normalize(cloud.quaternions, dim=1), atol=1e-6)
+    np.testing.assert_allclose(
+        v[:, 13:], torch.nn.functional.normalize(cloud.quaternions, dim=1), atol=1e-6
+    )
 
 
 def test_what_is_written_is_read_back(tmp_path: Path) -> None:
     g = np.random.default_rng(0)
     quaternions = g.normal(size=(9, 4)).astype(np.float32)
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
-    given = ply.Splats(g.normal(size=(9, 3)), quaternions, g.random((9, 3)) + 0.01, g.random(9), 100 * g.random((9, 3)))
+    given = ply.Splats(
+        g.normal(size=(9, 3)),
+        quaternions,
+        g.random((9, 3)) + 0.01,
+        g.random(9),
+        100 * g.random((9, 3)),
+    )
     ply.write(tmp_path / "a.ply", given, ["a remark"])
     found = ply.read(tmp_path / "a.ply")
     for name in ("means", "quaternions", "scales", "opacities", "colors"):
@@ -79,7 +111,9 @@ def test_what_is_written_is_read_back(tmp_path: Path) -> None:
 
 
 def test_extremes_stay_finite(tmp_path: Path) -> None:
-    given = ply.Splats(np.zeros((2, 3)), np.eye(4)[:2], np.zeros((2, 3)), np.array([0.0, 1.0]), np.zeros((2, 3)))
+    given = ply.Splats(
+        np.zeros((2, 3)), np.eye(4)[:2], np.zeros((2, 3)), np.array([0.0, 1.0]), np.zeros((2, 3))
+    )
     ply.write(tmp_path / "a.ply", given)
     assert np.isfinite(raw(tmp_path / "a.ply")[1]).all()
     np.testing.assert_allclose(ply.read(tmp_path / "a.ply").opacities, [0, 1], atol=2e-6)
@@ -95,7 +129,9 @@ def test_the_file_renders_the_fields_own_picture(run: Run, tmp_path: Path, time:
     picture = (seen.features + behind).reshape(-1, 3)
     expected = run.field.render(camera, time).radiance
     torch.testing.assert_close(picture, expected, atol=1e-3 * float(expected.max()), rtol=0)
-    assert float((expected - run.field.render(camera, 5.0).radiance).abs().max()) > 0.05 * float(expected.max())  # time matters
+    assert float((expected - run.field.render(camera, 5.0).radiance).abs().max()) > 0.05 * float(
+        expected.max()
+    )  # time matters
 
 
 def test_invisible_and_broken_gaussians_are_left_out(run: Run, tmp_path: Path) -> None:
@@ -127,7 +163,9 @@ def test_colors_are_developed_by_the_learned_camera(run: Run, tmp_path: Path) ->
 def test_without_an_ev_colors_are_tone_mapped_for_a_display(run: Run, tmp_path: Path) -> None:
     radiance = ply.read(export_one(run, tmp_path / "linear.ply", 1.0, LINEAR)).colors
     shown = ply.read(export_one(run, tmp_path / "shown.ply", 1.0, Coloring())).colors
-    np.testing.assert_allclose(shown, color.display(radiance, export.exposure_of(run, Coloring())), atol=1e-4)
+    np.testing.assert_allclose(
+        shown, color.display(radiance, export.exposure_of(run, Coloring())), atol=1e-4
+    )
     assert shown.min() >= -1e-6 and shown.max() <= 1 + 1e-6 and 0.1 < np.median(shown) < 0.9
 
 
@@ -166,8 +204,13 @@ def test_a_field_without_gaussians_is_refused_in_one_sentence(toy: Scene, tmp_pa
     assert not (tmp_path / "a.ply").exists()
 
 
-@pytest.mark.parametrize(("time", "word"), [(-1.0, "outside the clip"), (99.0, "outside the clip"), (float("nan"), "outside")])
-def test_times_outside_the_clip_are_refused(run: Run, tmp_path: Path, time: float, word: str) -> None:
+@pytest.mark.parametrize(
+    ("time", "word"),
+    [(-1.0, "outside the clip"), (99.0, "outside the clip"), (float("nan"), "outside")],
+)
+def test_times_outside_the_clip_are_refused(
+    run: Run, tmp_path: Path, time: float, word: str
+) -> None:
     with pytest.raises(InputError, match=word):
         export_one(run, tmp_path / "a.ply", time, LINEAR)
 
@@ -206,7 +249,9 @@ def test_the_verb_exports_from_a_run_folder(run: Run, toy_folder: Path, tmp_path
     folder = tmp_path / "run"
     write_config(folder, replace(run.config, scene=toy_folder, out=folder))
     save_checkpoint(folder, 7, 1.0, pack({"field": splat(run), "tonemapper": run.tonemapper}, {}))
-    cli.main(["export", str(folder), str(tmp_path / "one.ply"), "--ply", "--time", "1.5", "--linear"])
+    cli.main(
+        ["export", str(folder), str(tmp_path / "one.ply"), "--ply", "--time", "1.5", "--linear"]
+    )
     cli.main(["export", str(folder), str(tmp_path / "all"), "--ply-sequence", "--ev", "-1"])
     expected = splat(run).gaussians(1.5)
     np.testing.assert_array_equal(ply.read(tmp_path / "one.ply").means, expected.means)

@@ -1,4 +1,6 @@
-"""Exposures from brightness alone, on clips made here: textures that pan, flicker, light up; recorded with a gamma of 2.2."""
+"""Exposures from brightness alone, on clips made here: textures that pan, flicker,
+light up; recorded with a gamma of 2.2.
+"""
 
 import numpy as np
 import pytest
@@ -28,19 +30,30 @@ def texture(width: int, seed: int = 0) -> np.ndarray:
 
 
 def clip(
-    evs: list[float], frames: int = 24, pan: int = 0, flicker: float = 0.0, light_at: int | None = None, seed: int = 0
+    evs: list[float],
+    frames: int = 24,
+    pan: int = 0,
+    flicker: float = 0.0,
+    light_at: int | None = None,
+    seed: int = 0,
 ) -> np.ndarray:
     """A recorded clip (T, 48, 64, 3) whose frame t has exposure `evs[t % n]`."""
     world, rng = texture(64 + pan * frames, seed), np.random.default_rng(seed + 1)
     shots = []
     for t in range(frames):
-        ev = evs[t % len(evs)] + flicker * rng.normal() + (1.5 if light_at is not None and t >= light_at else 0)
+        ev = (
+            evs[t % len(evs)]
+            + flicker * rng.normal()
+            + (1.5 if light_at is not None and t >= light_at else 0)
+        )
         exposure = world[:, pan * t : pan * t + 64] * 2.0**ev + rng.normal(size=(48, 64, 3)) * 1e-3
         shots.append(np.rint(np.clip(exposure, 0, 1) ** (1 / 2.2) * 255) / 255)
     return np.stack(shots).astype(np.float32)
 
 
-@pytest.mark.parametrize("evs", [[-2, 0, 2], [2, 0, -2], [0, -3], [-2, 2, 0], [-1, 0, 1, 2], [-3, 0, -1.5, 1.5, 3]])
+@pytest.mark.parametrize(
+    "evs", [[-2, 0, 2], [2, 0, -2], [0, -3], [-2, 2, 0], [-1, 0, 1, 2], [-3, 0, -1.5, 1.5, 3]]
+)
 def test_cycle_and_order_are_found_from_brightness(evs):
     cycle = detect_cycle(clip(evs))
     assert cycle.length == len(evs)
@@ -66,7 +79,9 @@ def test_ordinary_clips_have_no_cycle():
 
 
 def test_a_cycle_is_never_a_multiple_of_itself():
-    assert [detect_cycle(clip([-2, 0, 2], frames=n, seed=n)).length for n in (7, 9, 12, 13, 40)] == [3] * 5
+    assert [
+        detect_cycle(clip([-2, 0, 2], frames=n, seed=n)).length for n in (7, 9, 12, 13, 40)
+    ] == [3] * 5
 
 
 def test_too_few_frames_for_a_cycle_find_none():

@@ -1,4 +1,6 @@
-"""Dense features: XFeat with weights made up here, DINOv2 as a tiny network in a folder; the published weights where they are found."""
+"""Dense features: XFeat with weights made up here, DINOv2 as a tiny network in a
+folder; the published weights where they are found.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +29,9 @@ def random_state(seed: int = 0) -> dict[str, torch.Tensor]:
     for block, layers in BLOCKS.items():
         for i, (inside, outside, kernel, _) in enumerate(layers):
             name = f"{block}.{i}.layer"
-            state[f"{name}.0.weight"] = torch.randn(outside, inside, kernel, kernel, generator=rng) / (inside**0.5 * kernel)
+            state[f"{name}.0.weight"] = torch.randn(
+                outside, inside, kernel, kernel, generator=rng
+            ) / (inside**0.5 * kernel)
             state[f"{name}.1.running_mean"] = 0.1 * torch.randn(outside, generator=rng)
             state[f"{name}.1.running_var"] = 0.5 + torch.rand(outside, generator=rng)
     for name, (inside, outside) in LINEAR.items():
@@ -43,11 +47,18 @@ def noise(*shape: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def dino(tmp_path_factory):
-    """A folder with a tiny DINOv2: 4 layers of 16 channels, patches of 14 pixels, 4 x 4 positions."""
+    """A folder with a tiny DINOv2: 4 layers of 16 channels, patches of 14 pixels, 4 x 4
+    positions.
+    """
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     config = transformers.Dinov2Config(
-        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, mlp_ratio=2, image_size=56, patch_size=14
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        mlp_ratio=2,
+        image_size=56,
+        patch_size=14,
     )
     folder = tmp_path_factory.mktemp("dino")
     transformers.Dinov2Model(config).save_pretrained(folder)
@@ -77,12 +88,18 @@ def test_small_frames_are_doubled_so_cells_are_four_pixels():
 
 
 def test_features_move_with_the_picture():
-    """A shift by 32 pixels is one by 8 cells of 4 pixels (32 doubled is 64, a whole number of the coarsest cells)."""
+    """A shift by 32 pixels is one by 8 cells of 4 pixels (32 doubled is 64, a whole
+    number of the coarsest cells).
+    """
     wide = noise(1, 160, 320, 3)
     network = XFeat(random_state())
-    a, b = (xfeat_features(network, x).maps[0, :, 16:24] for x in (wide[:, :, 32:288], wide[:, :, :256]))
+    a, b = (
+        xfeat_features(network, x).maps[0, :, 16:24] for x in (wide[:, :, 32:288], wide[:, :, :256])
+    )
     a, b = (torch.nn.functional.normalize(x, dim=0) for x in (a, b))
-    assert (a[:, :, 24:32] - b[:, :, 32:40]).abs().max() < 0.01  # edges and the pictures' different means are all there is
+    assert (
+        a[:, :, 24:32] - b[:, :, 32:40]
+    ).abs().max() < 0.01  # edges and the pictures' different means are all there is
     assert (a[:, :, 24:32] - b[:, :, 24:32]).abs().max() > 0.05
 
 
@@ -108,7 +125,9 @@ def test_dinov2_tokens_are_those_of_transformers_where_patches_do_not_overlap(di
 
 
 def test_a_smaller_stride_gives_more_dinov2_tokens(dino):
-    """56 pixels, patches of 14: 4 side by side, (56 - 14) / 7 + 1 = 7 with a stride of 7."""
+    """56 pixels, patches of 14: 4 side by side, (56 - 14) / 7 + 1 = 7 with a stride of
+    7.
+    """
     source = feature_source("dinov2-small", dino, layer=2, stride=7)
     found = source.func(*source.args, noise(2, 28, 28, 3), **source.keywords, side=56)
     assert found.maps.shape == (2, 16, 7, 7) and not found.maps.requires_grad
@@ -120,12 +139,16 @@ def test_a_smaller_stride_gives_more_dinov2_tokens(dino):
 def test_the_layer_is_the_papers_share_of_the_depth(dino):
     network = feature_source("dinov2-small", dino).args[0]
     video = noise(1, 28, 28, 3)
-    named = dinov2_features(network, video, round(DINO_DEPTH * 4), 7, 56).maps  # round(15 / 24 * 4) = 2
+    named = dinov2_features(
+        network, video, round(DINO_DEPTH * 4), 7, 56
+    ).maps  # round(15 / 24 * 4) = 2
     assert torch.equal(dinov2_features(network, video, side=56).maps, named)
     assert not torch.equal(dinov2_features(network, video, 3, 7, 56).maps, named)
 
 
-@pytest.mark.parametrize(("layer", "stride", "said"), [(9, None, "has 4 layers"), (None, 15, "14 pixels wide")])
+@pytest.mark.parametrize(
+    ("layer", "stride", "said"), [(9, None, "has 4 layers"), (None, 15, "14 pixels wide")]
+)
 def test_a_layer_or_stride_that_is_not_there_is_refused(dino, layer, stride, said):
     source = feature_source("dinov2-small", dino, layer, stride)
     with pytest.raises(InputError, match=said):
@@ -138,7 +161,9 @@ def test_xfeat_has_no_layer_to_choose():
 
 
 def test_published_weights_match_across_four_ev():
-    """The same textured picture, 16 times darker and clipped: most cells are still nearest to themselves."""
+    """The same textured picture, 16 times darker and clipped: most cells are still
+    nearest to themselves.
+    """
     from hdr_nsff.priors.flow.correlation import costs
 
     try:

@@ -1,4 +1,6 @@
-"""`finetune-flow` with a tiny network: it learns, goes on after a kill as if there had been none, and keeps what it measures on apart."""
+"""`finetune-flow` with a tiny network: it learns, goes on after a kill as if there had
+been none, and keeps what it measures on apart.
+"""
 
 import json
 from dataclasses import replace
@@ -12,7 +14,14 @@ from test_flow_sets import synth
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.flow_training import finetune_flow as verb
-from hdr_nsff.flow_training.finetune_flow import FinetuneConfig, finetune_flow, mean, rate, sequence_loss, split
+from hdr_nsff.flow_training.finetune_flow import (
+    FinetuneConfig,
+    finetune_flow,
+    mean,
+    rate,
+    sequence_loss,
+    split,
+)
 from hdr_nsff.flow_training.flow_sets import FlowPair, flow_pairs
 from hdr_nsff.priors.flow import networks as flow_networks
 from hdr_nsff.priors.flow.gmflow import GMFlow
@@ -26,7 +35,14 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FinetuneConfig:
     torch.save(GMFlow(8, 1).state_dict(), tmp_path / "start.pkl")
     data = synth(tmp_path / "data", frames=6, size=(48, 64))
     return FinetuneConfig(
-        tmp_path / "out", (data,), weights=tmp_path / "start.pkl", steps=4, batch=1, size="128x128", measure=1, checkpoint_steps=2
+        tmp_path / "out",
+        (data,),
+        weights=tmp_path / "start.pkl",
+        steps=4,
+        batch=1,
+        size="128x128",
+        measure=1,
+        checkpoint_steps=2,
     )
 
 
@@ -34,9 +50,17 @@ def test_weights_are_adapted_measured_and_loadable(config: FinetuneConfig):
     path = finetune_flow(config)
     note = json.loads(path.with_suffix(".json").read_text())
     assert note["network"] == "gmflow" and note["steps"] == 4 and note["training_pairs"] == 3
-    assert set(note["before"]) == set(note["after"]) == {"0", "2", "4"} and note["before"] != note["after"]
-    start, end = torch.load(config.weights, weights_only=True), flow_networks.load(None, config.out).state_dict()
-    assert set(start) == set(end) and not torch.equal(start["backbone.conv1.weight"], end["backbone.conv1.weight"])
+    assert (
+        set(note["before"]) == set(note["after"]) == {"0", "2", "4"}
+        and note["before"] != note["after"]
+    )
+    start, end = (
+        torch.load(config.weights, weights_only=True),
+        flow_networks.load(None, config.out).state_dict(),
+    )
+    assert set(start) == set(end) and not torch.equal(
+        start["backbone.conv1.weight"], end["backbone.conv1.weight"]
+    )
 
 
 def trained(config: FinetuneConfig) -> dict[str, torch.Tensor]:
@@ -47,7 +71,9 @@ def trained(config: FinetuneConfig) -> dict[str, torch.Tensor]:
     return network.state_dict()
 
 
-def test_a_killed_run_ends_as_one_that_was_not(config: FinetuneConfig, monkeypatch: pytest.MonkeyPatch):
+def test_a_killed_run_ends_as_one_that_was_not(
+    config: FinetuneConfig, monkeypatch: pytest.MonkeyPatch
+):
     whole, draw = trained(config), verb.drawn
     again = replace(config, out=config.out.with_name("again"))
 
@@ -108,16 +134,23 @@ def pair(scene: str, k: int) -> FlowPair:
 def test_scenes_are_held_out_whole_and_one_scene_at_its_end():
     scenes = [pair(s, k) for s in "abcdefghij" for k in range(2)]
     training, held_out = split(scenes, 0.2)
-    assert {p.scene for p in held_out} == {"i", "j"} and not {p.scene for p in training} & {"i", "j"}
+    assert {p.scene for p in held_out} == {"i", "j"} and not {p.scene for p in training} & {
+        "i",
+        "j",
+    }
     training, held_out = split([pair("a", k) for k in range(10)], 0.2)
-    assert [p.first.name for p in held_out] == ["a8", "a9"] and training[-1].second.name == "a7"  # no frame in both
+    assert [p.first.name for p in held_out] == ["a8", "a9"] and training[
+        -1
+    ].second.name == "a7"  # no frame in both
     with pytest.raises(InputError, match="too few"):
         split([pair("a", 0), pair("a", 1)], 0.5)
 
 
 def test_the_rate_rises_and_falls():
     shares = [rate(p) for p in np.linspace(0, 1, 21)]
-    assert shares[0] < 0.05 and max(shares) > 0.99 and shares[-1] == 0 and all(np.diff(shares[2:]) < 0)
+    assert (
+        shares[0] < 0.05 and max(shares) > 0.99 and shares[-1] == 0 and all(np.diff(shares[2:]) < 0)
+    )
 
 
 def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneConfig):
@@ -138,16 +171,24 @@ def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneCon
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"by_stops": {}}', '{"by_stops": {"0": 3}}'])
-def test_damaged_measurements_are_made_again(text: str, config: FinetuneConfig, capsys: pytest.CaptureFixture[str]):
+def test_damaged_measurements_are_made_again(
+    text: str, config: FinetuneConfig, capsys: pytest.CaptureFixture[str]
+):
     network, pairs, kept = (
         flow_networks.load("gmflow", config.weights),
         flow_pairs(config.data[0])[:1],
         config.out / "before.json",
     )
     before = verb.measured(network, pairs, kept)
-    assert verb.measured(network, pairs, kept) == before and "taken for missing" not in capsys.readouterr().err
+    assert (
+        verb.measured(network, pairs, kept) == before
+        and "taken for missing" not in capsys.readouterr().err
+    )
     kept.write_text(text)
-    assert verb.measured(network, pairs, kept) == before and "taken for missing" in capsys.readouterr().err
+    assert (
+        verb.measured(network, pairs, kept) == before
+        and "taken for missing" in capsys.readouterr().err
+    )
     assert verb.measured(network, [], kept) == before  # from the file
 
 

@@ -1,4 +1,6 @@
-"""Optical flow: exact on a plane that slides, invalid where it cannot be known, and a folder of maps as another source."""
+"""Optical flow: exact on a plane that slides, invalid where it cannot be known, and a
+folder of maps as another source.
+"""
 
 import cv2
 import numpy as np
@@ -17,7 +19,9 @@ NOTHING = np.zeros((H, W), bool)
 
 def texture(seed: int = 0, size: tuple[int, int] = (H + 40, W + 40)) -> np.ndarray:
     """Smooth noise (H, W, 3) in [0.1, 0.9]."""
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).random((*size, 3)).astype(np.float32), (0, 0), 1.5)
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(seed).random((*size, 3)).astype(np.float32), (0, 0), 1.5
+    )
     return 0.1 + 0.8 * (noise - noise.min()) / np.ptp(noise)
 
 
@@ -56,7 +60,9 @@ def test_order_of_pairs_does_not_change_the_answer():
     clipped = np.zeros(frames.shape[:3], bool)
     pairs = np.array([[0, 1], [1, 3], [3, 0]])
     forward, reverse = flow(frames, clipped, pairs), flow(frames, clipped, pairs[::-1])
-    assert np.array_equal(forward[0], reverse[0][::-1]) and np.array_equal(forward[1], reverse[1][::-1])
+    assert np.array_equal(forward[0], reverse[0][::-1]) and np.array_equal(
+        forward[1], reverse[1][::-1]
+    )
 
 
 def test_pixels_clipped_at_either_end_are_invalid():
@@ -83,14 +89,18 @@ def test_both_ways_meet_halfway_where_they_agree_and_nowhere_else():
     there, back = np.full(shape, 2.0, np.float32), np.full(shape, -1.8, np.float32)
     assert np.allclose(halfway(there, back), 1.9) and np.allclose(halfway(back, there), -1.9)
     assert np.array_equal(halfway(there, -there), there)
-    assert np.array_equal(halfway(there, -there + 1), there)  # one of them is wrong, nobody knows which
+    assert np.array_equal(
+        halfway(there, -there + 1), there
+    )  # one of them is wrong, nobody knows which
     rng = np.random.default_rng(0)
     noisy = [flow + rng.normal(0, 0.05, shape).astype(np.float32) for flow in (there, -there)]
     assert np.std(halfway(*noisy) - there) < 0.85 * np.std(noisy[0] - there)
 
 
 def test_what_an_occluder_hides_fails_the_check():
-    """A patch slides 6 px to the right over a still background; 6 columns right of it are hidden next."""
+    """A patch slides 6 px to the right over a still background; 6 columns right of it
+    are hidden next.
+    """
     background, patch = texture(1)[:H, :W], texture(2)[:32, :32]
     frames = np.stack([background, background])
     frames[0, 16:48, 30:62], frames[1, 16:48, 36:68] = patch, patch
@@ -101,7 +111,9 @@ def test_what_an_occluder_hides_fails_the_check():
 
 
 def test_both_frames_are_cut_to_what_both_recorded():
-    """Frame 0 holds grays 0.2 to 1, frame 1 only up to 0.5: white is 0.5 in both, black 0.2."""
+    """Frame 0 holds grays 0.2 to 1, frame 1 only up to 0.5: white is 0.5 in both, black
+    0.2.
+    """
     ramp = np.repeat(np.linspace(0.2, 1, W, dtype=np.float32)[None, :, None], H, 0).repeat(3, -1)
     video = np.stack([ramp, np.minimum(ramp, 0.5)])
     clipped = np.stack([NOTHING, video[1, ..., 0] >= 0.5])
@@ -124,10 +136,15 @@ def test_following_a_flow_reads_between_pixels():
 
 def test_a_folder_of_maps_is_checked_against_its_reverse(tmp_path):
     write_npy(tmp_path / "00004_00005.npy", constant(2, 0))
-    write_npy(tmp_path / "00005_00004.npy", np.where(np.arange(W)[:, None] < 40, constant(-2, 0), constant(0, 0)))
+    write_npy(
+        tmp_path / "00005_00004.npy",
+        np.where(np.arange(W)[:, None] < 40, constant(-2, 0), constant(0, 0)),
+    )
     found, valid = read_flow(tmp_path, [(4, 5)], (H, W))
     assert np.allclose(found[0], [2, 0])
-    assert valid[0, :, :37].all() and not valid[0, :, 39:].any()  # column 38 lands on column 40, where the reverse disagrees
+    assert (
+        valid[0, :, :37].all() and not valid[0, :, 39:].any()
+    )  # column 38 lands on column 40, where the reverse disagrees
 
 
 def test_a_folder_in_the_public_layout_is_read(tmp_path):

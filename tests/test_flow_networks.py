@@ -1,4 +1,6 @@
-"""Flow by a network: frames at the size it wants, weights of every kind, RAFT without torchvision, and a sentence for what is wrong."""
+"""Flow by a network: frames at the size it wants, weights of every kind, RAFT without
+torchvision, and a sentence for what is wrong.
+"""
 
 import sys
 from pathlib import Path
@@ -13,7 +15,15 @@ from safetensors.torch import save_file
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.flow import networks as flow_networks
 from hdr_nsff.priors.flow.gmflow import GMFlow
-from hdr_nsff.priors.flow.networks import both_ways, load, matched_flow, mended, read_weights, resized_flow, working_size
+from hdr_nsff.priors.flow.networks import (
+    both_ways,
+    load,
+    matched_flow,
+    mended,
+    read_weights,
+    resized_flow,
+    working_size,
+)
 from hdr_nsff.priors.flow.raft import Raft
 
 
@@ -45,7 +55,9 @@ def test_flow_comes_back_in_pixels_of_the_frame():
     network = Constant()
     there, back = both_ways(network, *np.zeros((2, 60, 90, 3), np.float32))
     assert network.saw.shape == (2, 3, 192, 256)
-    assert there.shape == (60, 90, 2) and np.allclose(there, [4 * 90 / 256, -2 * 60 / 192], atol=1e-5)
+    assert there.shape == (60, 90, 2) and np.allclose(
+        there, [4 * 90 / 256, -2 * 60 / 192], atol=1e-5
+    )
     assert np.allclose(back, -there)
 
 
@@ -55,16 +67,25 @@ def test_a_constant_flow_survives_any_size():
 
 
 def test_a_network_is_a_flow_prior_that_checks_itself():
-    video, clipped = np.full((3, 60, 90, 3), 0.5, np.float32), np.zeros((3, 60, 90), bool)  # flat: nothing to mend
+    video, clipped = (
+        np.full((3, 60, 90, 3), 0.5, np.float32),
+        np.zeros((3, 60, 90), bool),
+    )  # flat: nothing to mend
     clipped[2, 30, 40] = True
     found, valid = matched_flow(Constant(), video, clipped, np.array([[0, 2], [2, 0]]))
     assert np.allclose(found[0], -found[1]) and np.abs(found[0] - [1.40625, -0.625]).max() < 1e-4
-    assert not valid[1, 30, 40] and valid[1, 30, 45] and not valid[0, :, -1].any()  # clipped; believed; leaves the frame
+    assert (
+        not valid[1, 30, 40] and valid[1, 30, 45] and not valid[0, :, -1].any()
+    )  # clipped; believed; leaves the frame
 
 
 def test_the_search_mends_what_is_nearly_right_and_leaves_the_rest():
-    """Noise that slides by (3, 0): from (3.4, 0) it is found; from (9, 6), whatever the search says is no more than half a pixel away."""
-    noise = cv2.GaussianBlur(np.random.default_rng(0).random((64, 110)).astype(np.float32), (0, 0), 2)
+    """Noise that slides by (3, 0): from (3.4, 0) it is found; from (9, 6), whatever the
+    search says is no more than half a pixel away.
+    """
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(0).random((64, 110)).astype(np.float32), (0, 0), 2
+    )
     gray = np.rint(255 * (noise - noise.min()) / np.ptp(noise)).astype(np.uint8)
     a, b = gray[:, 5:-9].copy(), gray[:, 2:-12].copy()
     near, far = (np.broadcast_to(np.float32(f), (*a.shape, 2)).copy() for f in ((3.4, 0), (9, 6)))
@@ -93,7 +114,11 @@ def test_weights_that_do_not_fit_are_refused_in_one_sentence(tmp_path: Path):
     torch.save([1, 2], tmp_path / "list.pkl")
     (tmp_path / "broken.pkl").write_bytes(b"PK nothing")
     (tmp_path / "broken.safetensors").write_bytes(b"nothing")
-    for name, said in (("other.pkl", "do not fit gmflow"), ("list.pkl", "something else"), ("broken.pkl", "no readable weights")):
+    for name, said in (
+        ("other.pkl", "do not fit gmflow"),
+        ("list.pkl", "something else"),
+        ("broken.pkl", "no readable weights"),
+    ):
         with pytest.raises(InputError, match=said):
             load("gmflow", tmp_path / name)
     with pytest.raises(InputError, match="no readable weights"):
@@ -108,12 +133,16 @@ def test_weights_with_code_in_them_are_not_run(tmp_path: Path):
 
 def test_raft_without_torchvision_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "torchvision", None)
-    with pytest.raises(InputError, match=r"--flow raft: torchvision cannot be imported .* use --flow gmflow or dis"):
+    with pytest.raises(
+        InputError, match=r"--flow raft: torchvision cannot be imported .* use --flow gmflow or dis"
+    ):
         Raft()
 
 
 def test_raft_sees_signed_images_and_their_partners(monkeypatch: pytest.MonkeyPatch):
-    """A stand-in for torchvision's network says the first two channels of the difference of what it was shown."""
+    """A stand-in for torchvision's network says the first two channels of the
+    difference of what it was shown.
+    """
 
     class Shown(torch.nn.Module):
         def forward(self, first: torch.Tensor, second: torch.Tensor) -> list[torch.Tensor]:
@@ -127,5 +156,7 @@ def test_raft_sees_signed_images_and_their_partners(monkeypatch: pytest.MonkeyPa
     images = torch.rand(4, 3, 128, 160)
     flow = Raft()(images)
     assert flow.shape == (4, 2, 128, 160)
-    assert torch.allclose(flow[1], 2 * (images[3] - images[1])[:2], atol=1e-6)  # [0, 1] became [-1, 1]
+    assert torch.allclose(
+        flow[1], 2 * (images[3] - images[1])[:2], atol=1e-6
+    )  # [0, 1] became [-1, 1]
     assert torch.allclose(flow[3], -flow[1])

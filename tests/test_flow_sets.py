@@ -1,4 +1,6 @@
-"""Readers of sets with known flow, on miniature trees written by the formats' own descriptions; and pairs recorded across exposures."""
+"""Readers of sets with known flow, on miniature trees written by the formats' own
+descriptions; and pairs recorded across exposures.
+"""
 
 import struct
 from pathlib import Path
@@ -12,12 +14,16 @@ from hdr_nsff.flow_training.flow_exposures import cropped, example, random_curve
 from hdr_nsff.flow_training.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
 
 H, W = 12, 16
-FLOW = np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1).astype(np.float32)  # (x, y) at (x, y): no two pixels alike
+FLOW = np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1).astype(
+    np.float32
+)  # (x, y) at (x, y): no two pixels alike
 
 
 def write_flo(path: Path, flow: np.ndarray) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(b"PIEH" + struct.pack("<ii", flow.shape[1], flow.shape[0]) + flow.astype("<f4").tobytes())
+    path.write_bytes(
+        b"PIEH" + struct.pack("<ii", flow.shape[1], flow.shape[0]) + flow.astype("<f4").tobytes()
+    )
 
 
 def write_pfm(path: Path, flow: np.ndarray) -> None:
@@ -48,7 +54,9 @@ def things(root: Path) -> Path:
             picture(root / f"frames_finalpass/TRAIN/A/0007/{eye}/{k:04d}.png", k / 10)
         write_pfm(scene / f"into_future/{eye}/OpticalFlowIntoFuture_0006_{side}.pfm", FLOW)
         write_pfm(scene / f"into_past/{eye}/OpticalFlowIntoPast_0007_{side}.pfm", -FLOW)
-        write_pfm(scene / f"into_future/{eye}/OpticalFlowIntoFuture_0007_{side}.pfm", FLOW)  # its next frame is not there
+        write_pfm(
+            scene / f"into_future/{eye}/OpticalFlowIntoFuture_0007_{side}.pfm", FLOW
+        )  # its next frame is not there
     return root
 
 
@@ -58,9 +66,15 @@ def synth(root: Path, frames: int = 3, size: tuple[int, int] = (H, W)) -> Path:
     still = np.broadcast_to(np.float32([1, 0]), (*size, 2))
     for k in range(frames):
         channels = {
-            f"{name}.{axis}": s * still[..., c] for name, s in (("forward", 1), ("backward", -1)) for c, axis in enumerate("uv")
+            f"{name}.{axis}": s * still[..., c]
+            for name, s in (("forward", 1), ("backward", -1))
+            for c, axis in enumerate("uv")
         }
-        write_exr(root / f"exact/clip_{k:05d}.exr", {"RGB": rng.random((*size, 3)).astype(np.float32), **channels}, half=False)
+        write_exr(
+            root / f"exact/clip_{k:05d}.exr",
+            {"RGB": rng.random((*size, 3)).astype(np.float32), **channels},
+            half=False,
+        )
     return root
 
 
@@ -73,15 +87,23 @@ def test_sintel_has_flow_one_way_and_says_where_it_does_not_know(tmp_path: Path)
     sample = read_sample(pairs[0])
     assert np.array_equal(sample.flow[0][5, 7], [7, 5]) and not sample.known[1].any()
     assert not sample.known[0][2, 3] and sample.known[0].sum() == H * W - 1
-    assert sample.radiance[0, 0, 0] == pytest.approx([0.0331] * 3, abs=1e-3)  # sRGB 0.2: ((0.2 + 0.055) / 1.055)^2.4
+    assert sample.radiance[0, 0, 0] == pytest.approx(
+        [0.0331] * 3, abs=1e-3
+    )  # sRGB 0.2: ((0.2 + 0.055) / 1.055)^2.4
     assert flow_pairs(tmp_path / "training") == pairs
 
 
 def test_flyingthings_has_both_eyes_and_both_ways(tmp_path: Path):
     pairs = flow_pairs(things(tmp_path))
-    assert [p.first.parent.name for p in pairs] == ["left", "right"] and len({p.scene for p in pairs}) == 1
+    assert [p.first.parent.name for p in pairs] == ["left", "right"] and len(
+        {p.scene for p in pairs}
+    ) == 1
     sample = read_sample(pairs[1])
-    assert np.array_equal(sample.flow[0], FLOW) and np.array_equal(sample.flow[1], -FLOW) and sample.known.all()
+    assert (
+        np.array_equal(sample.flow[0], FLOW)
+        and np.array_equal(sample.flow[1], -FLOW)
+        and sample.known.all()
+    )
 
 
 def test_rendered_scenes_are_pairs_of_neighbors(tmp_path: Path):
@@ -102,7 +124,10 @@ def test_unknown_flow_is_not_known(tmp_path: Path):
 
 def test_big_endian_and_gray_float_maps(tmp_path: Path):
     (tmp_path / "a.pfm").write_bytes(b"Pf\n2 2\n1.0\n" + np.array([3, 4, 1, 2], ">f4").tobytes())
-    assert read_pfm(tmp_path / "a.pfm")[..., 0].tolist() == [[1, 2], [3, 4]]  # from the bottom to the top
+    assert read_pfm(tmp_path / "a.pfm")[..., 0].tolist() == [
+        [1, 2],
+        [3, 4],
+    ]  # from the bottom to the top
 
 
 def test_files_cut_short_or_of_another_kind_are_refused(tmp_path: Path):
@@ -123,15 +148,21 @@ def test_files_cut_short_or_of_another_kind_are_refused(tmp_path: Path):
 
 def sample(height: int = 60, width: int = 80) -> Sample:
     """A pair of a bright and dark ramp, flow (2, -1)."""
-    ramp = np.broadcast_to(2.0 ** np.linspace(-8, 3, width)[None, :, None], (height, width, 3)).astype(np.float32)
+    ramp = np.broadcast_to(
+        2.0 ** np.linspace(-8, 3, width)[None, :, None], (height, width, 3)
+    ).astype(np.float32)
     flow = np.stack([np.broadcast_to(s * np.float32([2, -1]), (height, width, 2)) for s in (1, -1)])
     return Sample(np.stack([ramp, ramp]), flow.copy(), np.ones((2, height, width), bool))
 
 
 def test_exposures_are_as_far_apart_as_asked():
-    """Around the median 2^-2.5 recorded at 0.18 in the middle, 4 EV apart: the halves of one ramp clip at different ends."""
+    """Around the median 2^-2.5 recorded at 0.18 in the middle, 4 EV apart: the halves
+    of one ramp clip at different ends.
+    """
     dark, bright = recorded_pair(sample().radiance, 4, equal=False)
-    assert (bright >= 0.999).all(-1).mean() > (dark >= 0.999).all(-1).mean() + 0.3  # 4 EV of 11 saturate more: 36 %
+    assert (bright >= 0.999).all(-1).mean() > (dark >= 0.999).all(
+        -1
+    ).mean() + 0.3  # 4 EV of 11 saturate more: 36 %
     same = recorded_pair(sample().radiance, 0, equal=False)
     assert np.abs(same[0] - same[1]).mean() < 0.02
 
@@ -142,10 +173,14 @@ def test_equalized_pairs_look_alike():
 
 
 def test_crops_scale_and_mirror_flow_with_the_pixels():
-    """80 px are matched at 240 (three times), times 0.8 to 1.25: flow (2, -1) grows as much, its signs follow the mirrors."""
+    """80 px are matched at 240 (three times), times 0.8 to 1.25: flow (2, -1) grows as
+    much, its signs follow the mirrors.
+    """
     s = sample()
     for seed in range(8):
-        one = cropped(np.zeros((2, 60, 80, 3), np.float32), s, (96, 128), np.random.default_rng(seed))
+        one = cropped(
+            np.zeros((2, 60, 80, 3), np.float32), s, (96, 128), np.random.default_rng(seed)
+        )
         assert one.images.shape == (2, 3, 96, 128) and one.known.all()
         u, v = one.flow[0, :, 50, 50].abs().tolist()
         assert 2 * 2.3 < u < 2 * 3.9 and abs(u / v - 2) < 0.1

@@ -1,4 +1,6 @@
-"""What `--flow` names: a matcher, or a folder; bad names and weights nobody asked for are refused before anything is done."""
+"""What `--flow` names: a matcher, or a folder; bad names and weights nobody asked for
+are refused before anything is done.
+"""
 
 from pathlib import Path
 
@@ -11,7 +13,13 @@ from hdr_nsff.prepare.steps.priors import learning_pairs
 from hdr_nsff.priors import weights
 from hdr_nsff.priors.flow.dense import flow
 from hdr_nsff.priors.flow.semantic import SemanticConfig
-from hdr_nsff.priors.flow.sources import check_flow, fallback_note, flow_source, flow_weights, resolved
+from hdr_nsff.priors.flow.sources import (
+    check_flow,
+    fallback_note,
+    flow_source,
+    flow_weights,
+    resolved,
+)
 from hdr_nsff.priors.weights import find
 from hdr_nsff.scene.scene import FrameEntry
 
@@ -28,20 +36,28 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "weights"
 
 
-def test_without_weights_the_default_is_dense_inverse_search_over_the_whole_clip_and_says_so(bare: Path):
-    assert resolved(None, "xfeat") == "dis" and "hdr-nsff weights xfeat" in fallback_note(None, "xfeat")
+def test_without_weights_the_default_is_dense_inverse_search_over_the_whole_clip_and_says_so(
+    bare: Path,
+):
+    assert resolved(None, "xfeat") == "dis" and "hdr-nsff weights xfeat" in fallback_note(
+        None, "xfeat"
+    )
     assert fallback_note("dis", "xfeat") == "" and flow_weights(None, None, SemanticConfig()) == []
     for chosen in (None, "dis"):
         found = flow_source(chosen)(FRAMES, CLIPPED, PAIRS)
         assert np.array_equal(found[0], flow(FRAMES, CLIPPED, PAIRS, None)[0])
-    assert np.array_equal(found[0], flow(FRAMES[1:], CLIPPED[1:], PAIRS - 1, None)[0])  # frames of no pair change nothing
+    assert np.array_equal(
+        found[0], flow(FRAMES[1:], CLIPPED[1:], PAIRS - 1, None)[0]
+    )  # frames of no pair change nothing
 
 
 def test_with_the_weights_of_its_features_the_default_is_semantic(bare: Path):
     write_text(bare / "xfeat" / "xfeat.pt", "something else")
     assert resolved(None, "xfeat") == "semantic" and fallback_note(None, "xfeat") == ""
     assert resolved("dis", "xfeat") == "dis" and resolved(None, "dinov2-small") == "dis"
-    with pytest.raises(InputError, match=r"xfeat.pt"):  # broken weights are no reason to fall back silently
+    with pytest.raises(
+        InputError, match=r"xfeat.pt"
+    ):  # broken weights are no reason to fall back silently
         flow_weights(None, None, SemanticConfig())
 
 
@@ -83,7 +99,13 @@ def test_features_learn_from_training_frames_of_one_camera_at_a_time():
     """Two cameras of 5 and 2 frames, exposures 0, 1, 0, ..., frame 1 held out."""
     frames = [
         FrameEntry(
-            index=k, image="", source="", time=float(k), bracket=k % 2, camera_id=int(k > 4), split="test" if k == 1 else "train"
+            index=k,
+            image="",
+            source="",
+            time=float(k),
+            bracket=k % 2,
+            camera_id=int(k > 4),
+            split="test" if k == 1 else "train",
         )
         for k in range(7)
     ]
@@ -92,7 +114,9 @@ def test_features_learn_from_training_frames_of_one_camera_at_a_time():
     assert equal == [(0, 2), (2, 4)]
 
 
-def test_missing_weights_are_said_before_anything_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_missing_weights_are_said_before_anything_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     monkeypatch.setattr("hdr_nsff.priors.weights.package_folder", lambda weights: None)

@@ -1,4 +1,6 @@
-"""GMFlow: its parts against plain loops and closed forms, both directions at once, and the published weights where they are found."""
+"""GMFlow: its parts against plain loops and closed forms, both directions at once, and
+the published weights where they are found.
+"""
 
 from pathlib import Path
 
@@ -42,7 +44,9 @@ def test_pairs_of_a_batch_do_not_see_each_other():
 
 
 def test_the_match_is_where_the_likeness_is():
-    """Features that occur once each, twenty times over: the softmax picks the place itself."""
+    """Features that occur once each, twenty times over: the softmax picks the place
+    itself.
+    """
     marks = torch.eye(24).view(1, 24, 4, 6) * 20
     moved = marks.roll((1, 2), (2, 3))  # row y goes to y + 1, column x to x + 2, around the edge
     flow = gmflow.match_everywhere(torch.cat([marks, moved]))
@@ -68,7 +72,9 @@ def test_windows_come_apart_and_together():
 
 
 def test_moved_windows_join_no_opposite_edges():
-    """Four tokens in two windows, moved by one: 1 2 | 3 0, where 3 and 0 are the two ends of the image."""
+    """Four tokens in two windows, moved by one: 1 2 | 3 0, where 3 and 0 are the two
+    ends of the image.
+    """
     allowed = gmflow.together((2, 4), (0, 1), 2, torch.device("cpu"))  # windows of 1 x 2
     assert allowed[0].all() and torch.equal(allowed[1], torch.eye(2, dtype=torch.bool))
 
@@ -76,7 +82,9 @@ def test_moved_windows_join_no_opposite_edges():
 def test_position_repeats_in_every_window():
     field = gmflow.position(torch.zeros(1, 16, 8, 12), 2)
     assert torch.equal(field[:, :4, :6], field[:, 4:, 6:])
-    assert field[0, 3, 0].item() == pytest.approx(0, abs=1e-6)  # the last row of a window: sin(2 pi)
+    assert field[0, 3, 0].item() == pytest.approx(
+        0, abs=1e-6
+    )  # the last row of a window: sin(2 pi)
     assert torch.equal(field[:8, :, 0], field[:8, :, 5])  # the first half is of y alone
 
 
@@ -86,7 +94,9 @@ def test_a_convex_mixture_of_one_flow_is_that_flow():
     flow = torch.full((1, 2, 6, 8), 1.5)
     large = network.enlarged_convex(flow, torch.rand(1, 16, 6, 8, generator=rng))
     assert large.shape == (1, 2, 24, 32)
-    assert torch.allclose(large[..., 4:-4, 4:-4], torch.full((1, 2, 16, 24), 6.0), atol=1e-5)  # four times the pixels
+    assert torch.allclose(
+        large[..., 4:-4, 4:-4], torch.full((1, 2, 16, 24), 6.0), atol=1e-5
+    )  # four times the pixels
 
 
 def test_reading_features_through_a_flow_shifts_them():
@@ -98,11 +108,15 @@ def test_reading_features_through_a_flow_shifts_them():
 
 
 def test_every_prediction_trains_the_part_that_made_it():
-    """The first prediction moves the encoder but not the enlargement; the last one moves both."""
+    """The first prediction moves the encoder but not the enlargement; the last one
+    moves both.
+    """
     network = small()
     first, *_, last = network.predictions(images())
     first.sum().backward(retain_graph=True)
-    assert network.backbone.conv1.weight.grad is not None and network.upsampler[0].weight.grad is None
+    assert (
+        network.backbone.conv1.weight.grad is not None and network.upsampler[0].weight.grad is None
+    )
     last.square().sum().backward()
     assert network.upsampler[0].weight.grad is not None
 
@@ -117,9 +131,14 @@ def published() -> Path:
 
 def test_published_weights_follow_a_sliding_texture_when_it_darkens():
     network = load("gmflow", published())
-    noise = cv2.GaussianBlur(np.random.default_rng(0).random((168, 232, 3)).astype(np.float32), (0, 0), 2)
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(0).random((168, 232, 3)).astype(np.float32), (0, 0), 2
+    )
     texture = (noise - noise.min()) / np.ptp(noise)
-    a, b = texture[20:-20, 20:-20], texture[23:-17, 15:-25]  # what was at (x, y) is at (x + 5, y - 3)
+    a, b = (
+        texture[20:-20, 20:-20],
+        texture[23:-17, 15:-25],
+    )  # what was at (x, y) is at (x + 5, y - 3)
     there, back = both_ways(network, a, (b / 4) ** 2)  # darker by two stops, and another curve
     assert np.median(np.abs(there[8:-8, 8:-8] - [5, -3])) < 0.3
     assert np.median(np.abs(back[8:-8, 8:-8] - [-5, 3])) < 0.3
@@ -132,4 +151,6 @@ def test_sizes_that_do_not_fall_into_windows_are_our_own_mistake():
 
 def test_normalization_is_that_of_the_encoder():
     gray = gmflow.normalized(torch.full((1, 3, 1, 1), 0.485))
-    assert gray[0, 0].item() == pytest.approx(0) and gray[0, 1].item() == pytest.approx((0.485 - 0.456) / 0.224)
+    assert gray[0, 0].item() == pytest.approx(0) and gray[0, 1].item() == pytest.approx(
+        (0.485 - 0.456) / 0.224
+    )

@@ -1,4 +1,6 @@
-"""Given poses in every convention: a known point in front of a known camera must land on its known pixel."""
+"""Given poses in every convention: a known point in front of a known camera must land
+on its known pixel.
+"""
 
 import json
 import struct
@@ -16,7 +18,9 @@ W, H, FOCAL = 64, 48, 50.0
 POINT = np.array([0.3, -0.2, 5.0])
 # cameras 0.5 apart, each turned by 0, 10, 20 degrees about the vertical
 TURNS = Rotation.from_euler("y", [[0], [10], [20]], degrees=True).as_matrix().reshape(3, 3, 3)
-C2W = np.concatenate([TURNS, np.array([[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]])[:, :, None]], 2)  # OpenCV: right, down, forward
+C2W = np.concatenate(
+    [TURNS, np.array([[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]])[:, :, None]], 2
+)  # OpenCV: right, down, forward
 # camera 0 is the world: x = 32 + 50 * 0.3 / 5 = 35, y = 24 - 50 * 0.2 / 5 = 22
 PIXEL_0 = np.array([35.0, 22.0])
 NAMES = ["a_0.png", "a_1.png", "a_2.png"]
@@ -30,13 +34,17 @@ def pixels(poses, point=POINT) -> np.ndarray:
 def expected() -> np.ndarray:
     """The same, by hand: rotate into each camera, divide, scale."""
     local = np.stack([c[:, :3].T @ (POINT - c[:, 3]) for c in C2W])
-    return np.stack([W / 2 + FOCAL * local[:, 0] / local[:, 2], H / 2 + FOCAL * local[:, 1] / local[:, 2]], 1)
+    return np.stack(
+        [W / 2 + FOCAL * local[:, 0] / local[:, 2], H / 2 + FOCAL * local[:, 1] / local[:, 2]], 1
+    )
 
 
 def opengl(c2w: np.ndarray) -> list:
     """A 4x4 with columns right, up, back."""
     right, down, forward, center = c2w.T
-    return np.stack([np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(center, 1)], 1).tolist()
+    return np.stack(
+        [np.append(right, 0), np.append(-down, 0), np.append(-forward, 0), np.append(center, 1)], 1
+    ).tolist()
 
 
 def llff_table() -> np.ndarray:
@@ -78,8 +86,20 @@ def colmap_binary(folder) -> None:
 
 def transforms(**extra) -> dict:
     """transforms.json with intrinsics for all frames."""
-    frames = [{"file_path": f"images/{n}", "transform_matrix": opengl(c)} for n, c in zip(NAMES, C2W, strict=True)]
-    return {"fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames, **extra}
+    frames = [
+        {"file_path": f"images/{n}", "transform_matrix": opengl(c)}
+        for n, c in zip(NAMES, C2W, strict=True)
+    ]
+    return {
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": W / 2,
+        "cy": H / 2,
+        "w": W,
+        "h": H,
+        "frames": frames,
+        **extra,
+    }
 
 
 def write(path, document) -> None:
@@ -104,9 +124,14 @@ def test_nerfstudio_axes(tmp_path):
 
 
 def test_blender_angle_gives_the_focal_length(tmp_path):
-    frames = [{"file_path": f"./train/a_{k}", "transform_matrix": opengl(c)} for k, c in enumerate(C2W)]
+    frames = [
+        {"file_path": f"./train/a_{k}", "transform_matrix": opengl(c)} for k, c in enumerate(C2W)
+    ]
     angle = 2 * np.arctan(W / 2 / FOCAL)
-    write(tmp_path / "transforms_train.json", {"camera_angle_x": angle, "near": 2.0, "far": 6.0, "frames": frames})
+    write(
+        tmp_path / "transforms_train.json",
+        {"camera_angle_x": angle, "near": 2.0, "far": 6.0, "frames": frames},
+    )
     poses = import_poses(tmp_path, NAMES, (H, W))
     assert np.allclose(pixels(poses), expected())
     assert (poses.near, poses.far) == (2.0, 6.0)
@@ -154,7 +179,9 @@ def test_frames_of_a_video_are_matched_in_order(tmp_path):
 def test_a_frame_that_colmap_left_out_lies_between_its_neighbors(tmp_path):
     colmap_text(tmp_path)
     text = (tmp_path / "images.txt").read_text().splitlines()
-    (tmp_path / "images.txt").write_text("\n".join(text[:3] + text[5:]) + "\n")  # without the second image
+    (tmp_path / "images.txt").write_text(
+        "\n".join(text[:3] + text[5:]) + "\n"
+    )  # without the second image
     poses = import_poses(tmp_path, NAMES, (H, W))
     assert poses.registered.tolist() == [True, False, True]
     assert np.allclose(poses.c2w[1], C2W[1])  # midway in place and angle

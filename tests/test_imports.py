@@ -1,5 +1,7 @@
-"""The house's laws about imports, read from the source: one order (that of the README's tree), verbs apart, the truth out of
-training's sight, heavy libraries behind one door each."""
+"""The house's laws about imports, read from the source: one order (that of the README's
+tree), verbs apart, the truth out of training's sight, heavy libraries behind one door
+each.
+"""
 
 import ast
 from pathlib import Path
@@ -20,7 +22,9 @@ VERBS = {
     "flow_training.finetune_flow",
     "prepare.weights",
 }
-TRUTH = {  # who reads it, for `evaluate` and for `export --truth`, and the last three, which write it
+# who reads it, for `evaluate` and for `export --truth`, and the last three, which write
+# it
+TRUTH = {
     "evaluation.targets",
     "evaluation.scores.geometry",
     "evaluation.scores.camera",
@@ -75,18 +79,30 @@ def imports(tree: ast.AST) -> set[str]:
     return {name for child in ast.iter_child_nodes(tree) for name in imports(child)}
 
 
-SOURCES = {module_of(p.relative_to(PACKAGE)): ast.parse(p.read_text(encoding="utf-8")) for p in PACKAGE.rglob("*.py")}
+SOURCES = {
+    module_of(p.relative_to(PACKAGE)): ast.parse(p.read_text(encoding="utf-8"))
+    for p in PACKAGE.rglob("*.py")
+}
 ORDER = documented_order()
 
 
 def own_imports(module: str) -> set[str]:
     """The modules of this package that a module imports."""
-    inner = [n.removeprefix("hdr_nsff").removeprefix(".") for n in imports(SOURCES[module]) if n.split(".")[0] == "hdr_nsff"]
-    return {next((m for m in (name, name.rpartition(".")[0]) if m in SOURCES), "__init__") for name in inner}
+    inner = [
+        n.removeprefix("hdr_nsff").removeprefix(".")
+        for n in imports(SOURCES[module])
+        if n.split(".")[0] == "hdr_nsff"
+    ]
+    return {
+        next((m for m in (name, name.rpartition(".")[0]) if m in SOURCES), "__init__")
+        for name in inner
+    }
 
 
 def test_every_file_has_one_line_in_the_tree():
-    bare = {m for m, tree in SOURCES.items() if all(isinstance(node, ast.Expr) for node in tree.body)}  # a docstring at most
+    bare = {
+        m for m, tree in SOURCES.items() if all(isinstance(node, ast.Expr) for node in tree.body)
+    }  # a docstring at most
     assert sorted(ORDER) == sorted(set(ORDER))
     assert set(ORDER) - bare == set(SOURCES) - bare
 
@@ -107,7 +123,9 @@ def test_the_truth_is_read_for_evaluate_and_export_alone():
 
 
 def reached(module: str, without: frozenset[str] = frozenset()) -> set[str]:
-    """Every module of this package that a module imports, by itself or through others, but for ways through those `without`."""
+    """Every module of this package that a module imports, by itself or through others,
+    but for ways through those `without`.
+    """
     found: set[str] = set()
     waiting = [module]
     while waiting:
@@ -119,7 +137,9 @@ def reached(module: str, without: frozenset[str] = frozenset()) -> set[str]:
 
 def knows_the_truth(modules: set[str]) -> set[str]:
     """Which of these can open a truth folder, or what data sets keep back."""
-    return {m for m in modules if m in TRUTH | {"scene.truth"} or m.startswith("evaluation.scores.")}
+    return {
+        m for m in modules if m in TRUTH | {"scene.truth"} or m.startswith("evaluation.scores.")
+    }
 
 
 LEARNERS = [
@@ -139,13 +159,19 @@ LEARNERS = [
 def test_nothing_that_learns_or_prepares_can_reach_held_out_truth(module: str):
     assert not knows_the_truth(reached(module))
     assert (
-        knows_the_truth(reached("evaluation.evaluate")) >= {"scene.truth", "evaluation.targets"} and len(SOURCES) > 50
+        knows_the_truth(reached("evaluation.evaluate")) >= {"scene.truth", "evaluation.targets"}
+        and len(SOURCES) > 50
     )  # the search finds what is there
 
 
 def test_prepare_reaches_the_truth_through_its_writer_alone():
-    assert knows_the_truth(reached("prepare.prepare")) == {"footage.datasets.held_out", "scene.truth"}
-    assert not knows_the_truth(reached("prepare.prepare", without=frozenset({"footage.datasets.held_out"})))
+    assert knows_the_truth(reached("prepare.prepare")) == {
+        "footage.datasets.held_out",
+        "scene.truth",
+    }
+    assert not knows_the_truth(
+        reached("prepare.prepare", without=frozenset({"footage.datasets.held_out"}))
+    )
 
 
 def test_export_reaches_the_truth_through_what_it_writes_it_with():
@@ -157,12 +183,23 @@ def test_export_reaches_the_truth_through_what_it_writes_it_with():
 
 
 def test_only_prepare_writes_what_data_sets_keep_back():
-    assert {m for m in SOURCES if "footage.datasets.held_out" in own_imports(m)} == {"prepare.prepare"}
+    assert {m for m in SOURCES if "footage.datasets.held_out" in own_imports(m)} == {
+        "prepare.prepare"
+    }
 
 
 @pytest.mark.parametrize("library", sorted(HEAVY))
 def test_a_heavy_library_has_one_door_inside_a_function(library: str):
-    users = [m for m, tree in SOURCES.items() if library in {n.split(".")[0] for n in imports(tree)}]
+    users = [
+        m for m, tree in SOURCES.items() if library in {n.split(".")[0] for n in imports(tree)}
+    ]
     assert len(users) == 1, f"{library} is imported by {users}"
-    top = [n for node in SOURCES[users[0]].body if isinstance(node, ast.Import | ast.ImportFrom) for n in imports(node)]
-    assert not any(n.startswith(library) for n in top), f"{users[0]} imports {library} before anyone needs it"
+    top = [
+        n
+        for node in SOURCES[users[0]].body
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for n in imports(node)
+    ]
+    assert not any(n.startswith(library) for n in top), (
+        f"{users[0]} imports {library} before anyone needs it"
+    )

@@ -1,4 +1,6 @@
-"""Reading footage: what counts as footage, in which order, and where its exposures are written down."""
+"""Reading footage: what counts as footage, in which order, and where its exposures are
+written down.
+"""
 
 import math
 from pathlib import Path
@@ -27,7 +29,9 @@ from hdr_nsff.footage.ingest import (
 
 def picture(value: float, height: int = 24, width: int = 32) -> np.ndarray:
     """A ramp of brightness around `value` (H, W, 3)."""
-    return np.clip(np.linspace(0.5, 1.5, width)[None, :, None] * np.full((height, 1, 3), value), 0, 1).astype(np.float32)
+    return np.clip(
+        np.linspace(0.5, 1.5, width)[None, :, None] * np.full((height, 1, 3), value), 0, 1
+    ).astype(np.float32)
 
 
 def folder_of(path: Path, values: list[float], suffix: str = ".png") -> Path:
@@ -39,7 +43,11 @@ def folder_of(path: Path, values: list[float], suffix: str = ".png") -> Path:
 
 def all_frames(path: Path, **choice) -> list:
     """What `read_frames` gives, with everything chosen by default."""
-    return list(read_frames(open_footage(path), **{"start": 0, "end": None, "stride": 1, "max_size": 640, **choice}))
+    return list(
+        read_frames(
+            open_footage(path), **{"start": 0, "end": None, "stride": 1, "max_size": 640, **choice}
+        )
+    )
 
 
 def test_frames_come_in_the_order_of_their_numbers(tmp_path):
@@ -119,14 +127,22 @@ def test_shrinking_averages_and_keeps_the_shape():
 
 
 def test_exposure_times_become_log2_seconds():
-    assert np.allclose(parse_exposures("1/1000, 1/250,0.25", None), [-math.log2(1000), -math.log2(250), -2])
+    assert np.allclose(
+        parse_exposures("1/1000, 1/250,0.25", None), [-math.log2(1000), -math.log2(250), -2]
+    )
     assert parse_exposures(None, "-4,-2,0") == [-4, -2, 0]
     assert parse_exposures("auto", None) is None and parse_exposures(None, None) is None
 
 
 @pytest.mark.parametrize(
     ("text", "what"),
-    [("1/0", "divides by zero"), ("-1/60", "cannot be"), ("abc", "not a number"), ("inf", "not finite"), ("", "not a number")],
+    [
+        ("1/0", "divides by zero"),
+        ("-1/60", "cannot be"),
+        ("abc", "not a number"),
+        ("inf", "not finite"),
+        ("", "not a number"),
+    ],
 )
 def test_an_impossible_exposure_is_named(text, what):
     with pytest.raises(InputError, match=what):
@@ -155,7 +171,12 @@ def test_a_csv_beside_a_video_names_frames_by_number(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "what"), [("file,ev\nf1.png,1/0\n", "line 2"), ("name,value\n", "columns"), ("file,ev\nf1.png\n", "line 2")]
+    ("text", "what"),
+    [
+        ("file,ev\nf1.png,1/0\n", "line 2"),
+        ("name,value\n", "columns"),
+        ("file,ev\nf1.png\n", "line 2"),
+    ],
 )
 def test_a_csv_that_makes_no_sense_is_named(tmp_path, text, what):
     folder_of(tmp_path, [0.5])
@@ -183,11 +204,23 @@ def test_held_out_frames_go_through_all_exposures():
 
 
 def write_dng(path: Path, level: float) -> None:
-    """A small raw photograph of a gray card, its upper half at half `level` of the sensor's range."""
+    """A small raw photograph of a gray card, its upper half at half `level` of the
+    sensor's range.
+    """
     tifffile = pytest.importorskip("tifffile")
     raw = np.full((64, 96), int(level * 65535), np.uint16)
     raw[:32] //= 2
-    matrix = (3.1339, -1.6169, -0.4906, -0.9785, 1.9160, 0.0333, 0.0720, -0.2290, 1.4057)  # XYZ to the camera's own colors
+    matrix = (
+        3.1339,
+        -1.6169,
+        -0.4906,
+        -0.9785,
+        1.9160,
+        0.0333,
+        0.0720,
+        -0.2290,
+        1.4057,
+    )  # XYZ to the camera's own colors
 
     def ratios(values: tuple[float, ...]) -> tuple[int, ...]:
         return tuple(n for v in values for n in (round(v * 10000), 10000))

@@ -1,4 +1,6 @@
-"""Time between frames: splatted samples land where the closed form says, energy is kept, nothing tears open."""
+"""Time between frames: splatted samples land where the closed form says, energy is
+kept, nothing tears open.
+"""
 
 from __future__ import annotations
 
@@ -24,26 +26,36 @@ def red_center(radiance: Tensor) -> Tensor:
 
 @pytest.mark.parametrize("fraction", [0.25, 0.5, 0.8])
 @pytest.mark.parametrize("empty_moves", [False, True])
-def test_a_disc_at_constant_velocity_lands_at_the_closed_form_place(fraction: float, empty_moves: bool) -> None:
+def test_a_disc_at_constant_velocity_lands_at_the_closed_form_place(
+    fraction: float, empty_moves: bool
+) -> None:
     field = DiscBeforeWall(empty_moves=empty_moves)
     start, step = red_center(field.render(CAMERA, 0.0).radiance), torch.tensor([8.0, 2.0])
     seen = render_at(field, CAMERA, fraction, [0.0, 1.0])
     assert torch.allclose(red_center(seen.radiance), start + fraction * step, atol=0.2)
     truth = field.render(CAMERA, fraction)
-    assert (seen.radiance - truth.radiance).abs().mean() < 2.0  # 100 x half of the disc's edge (31 of 1536 pixels)
+    assert (
+        seen.radiance - truth.radiance
+    ).abs().mean() < 2.0  # 100 x half of the disc's edge (31 of 1536 pixels)
     assert abs(seen.motion.sum() - truth.motion.sum()) < 9  # the disc keeps its 79 pixels
 
 
 def test_unmoved_wall_is_exact_and_nothing_tears_open() -> None:
     seen = render_at(DiscBeforeWall(), CAMERA, 0.5, [0.0, 1.0])
     wall = DiscBeforeWall().layers(CAMERA, 0.0).radiance[:, 1]
-    far = (CAMERA.pixel_grid() - torch.tensor([20.0, 13.0])).norm(dim=-1) > 16  # away from both places of the disc
-    assert torch.allclose(seen.radiance[far], wall[far], atol=1e-5) and torch.allclose(seen.depth[far], torch.tensor(WALL))
+    far = (CAMERA.pixel_grid() - torch.tensor([20.0, 13.0])).norm(
+        dim=-1
+    ) > 16  # away from both places of the disc
+    assert torch.allclose(seen.radiance[far], wall[far], atol=1e-5) and torch.allclose(
+        seen.depth[far], torch.tensor(WALL)
+    )
     assert torch.allclose(seen.opacity, torch.ones(W * H), atol=1e-5)
 
 
 def one_layer(alpha: Tensor, value: Tensor, shift: Tensor) -> Picture:
-    """A single layer at z = 2 of `alpha` (S,) and gray radiance `value` (S,) after its samples moved by `shift` (S, 2) pixels."""
+    """A single layer at z = 2 of `alpha` (S,) and gray radiance `value` (S,) after its
+    samples moved by `shift` (S, 2) pixels.
+    """
     rays = CAMERA.rays(CAMERA.pixel_grid())
     flow = torch.cat([shift * 2 / FOCAL, torch.zeros(W * H, 1)], -1)[:, None]
     radiance = value[:, None, None].expand(-1, 1, 3)
@@ -54,35 +66,51 @@ def one_layer(alpha: Tensor, value: Tensor, shift: Tensor) -> Picture:
 
 def test_whole_pixels_of_flow_shift_the_picture_and_zero_flow_leaves_it() -> None:
     generator = torch.Generator().manual_seed(0)
-    alpha, value = 0.1 + 0.9 * torch.rand(W * H, generator=generator), torch.rand(W * H, generator=generator)
+    alpha, value = (
+        0.1 + 0.9 * torch.rand(W * H, generator=generator),
+        torch.rand(W * H, generator=generator),
+    )
     for dx, dy in ((0, 0), (3, -2)):
         moved = one_layer(alpha, value, torch.tensor([float(dx), float(dy)]).expand(W * H, 2))
         inside = slice(2, H - 2), slice(3, W)  # what came in from beyond the border is not known
-        expected = alpha.view(H, W).roll((dy, dx), (0, 1)), (alpha * value).view(H, W).roll((dy, dx), (0, 1))
+        expected = (
+            alpha.view(H, W).roll((dy, dx), (0, 1)),
+            (alpha * value).view(H, W).roll((dy, dx), (0, 1)),
+        )
         assert torch.allclose(moved.opacity.view(H, W)[inside], expected[0][inside], atol=1e-4)
         assert torch.allclose(moved.color[:, 0].view(H, W)[inside], expected[1][inside], atol=1e-4)
 
 
 def test_splatting_keeps_the_energy_of_what_moves() -> None:
     alpha = torch.zeros(H, W)
-    alpha[10:14, 10:14] = 0.5  # 16 pixels, over empty samples; they move by a quarter and three quarters of a pixel
-    moved = one_layer(alpha.view(-1), torch.full((W * H,), 3.0), torch.tensor([0.25, 0.75]).expand(W * H, 2))
-    assert moved.opacity.sum().item() == pytest.approx(8.0, rel=0.06) and moved.color[:, 0].sum().item() == pytest.approx(
-        24.0, rel=0.06
+    # 16 pixels, over empty samples; they move by a quarter and three quarters of a
+    # pixel
+    alpha[10:14, 10:14] = 0.5
+    moved = one_layer(
+        alpha.view(-1), torch.full((W * H,), 3.0), torch.tensor([0.25, 0.75]).expand(W * H, 2)
     )
+    assert moved.opacity.sum().item() == pytest.approx(8.0, rel=0.06) and moved.color[
+        :, 0
+    ].sum().item() == pytest.approx(24.0, rel=0.06)
 
 
 def test_spreading_samples_leave_no_cracks() -> None:
     center = torch.tensor([W / 2, H / 2])
     moved = one_layer(torch.ones(W * H), torch.ones(W * H), (CAMERA.pixel_grid() - center) * 0.1)
-    assert moved.opacity.min() > 0.95 and torch.allclose(moved.color[:, 0], moved.opacity[:, 0], atol=1e-5)
+    assert moved.opacity.min() > 0.95 and torch.allclose(
+        moved.color[:, 0], moved.opacity[:, 0], atol=1e-5
+    )
 
 
 def test_a_mover_over_empty_samples_stays_opaque_and_leaves_nothing_behind() -> None:
     inside = torch.zeros(H, W)
     inside[8:16, 8:16] = 1
-    alpha = one_layer(inside.view(-1), torch.ones(W * H), inside.view(-1, 1) * torch.tensor([4.0, 0.0])).opacity.view(H, W)
-    assert torch.allclose(alpha[8:16, 12:20], torch.ones(8, 8), atol=1e-4) and alpha.sum().item() == pytest.approx(64, abs=0.01)
+    alpha = one_layer(
+        inside.view(-1), torch.ones(W * H), inside.view(-1, 1) * torch.tensor([4.0, 0.0])
+    ).opacity.view(H, W)
+    assert torch.allclose(
+        alpha[8:16, 12:20], torch.ones(8, 8), atol=1e-4
+    ) and alpha.sum().item() == pytest.approx(64, abs=0.01)
 
 
 def test_where_neither_time_shows_anything_the_nearer_one_stands() -> None:
@@ -94,7 +122,12 @@ def test_where_neither_time_shows_anything_the_nearer_one_stands() -> None:
             right = (camera.pixel_grid()[:, 0] > W / 2).float()[:, None, None]
             flow = right * torch.tensor([[1000.0, 0, 0]] * 2)
             radiance = torch.full_like(layers.radiance, 1.0 + time)
-            return replace(layers, alpha=torch.ones_like(layers.alpha), scene_flow={1: flow, -1: flow}, radiance=radiance)
+            return replace(
+                layers,
+                alpha=torch.ones_like(layers.alpha),
+                scene_flow={1: flow, -1: flow},
+                radiance=radiance,
+            )
 
     seen = render_at(Fleeing(), CAMERA, 0.75, [0.0, 1.0]).radiance.reshape(H, W, 3)
     assert torch.allclose(seen[:, W // 2 + 1 :], torch.tensor(2.0))  # time 1 is nearer
@@ -110,4 +143,7 @@ def test_neighbors_of_uneven_times() -> None:
 def test_direct_query_and_training_times_ask_the_field_itself() -> None:
     field = DiscBeforeWall()
     for mode, time in (("direct", 0.3), ("splat", 1.0)):
-        assert torch.equal(render_at(field, CAMERA, time, [0.0, 1.0], mode).radiance, field.render(CAMERA, time).radiance)
+        assert torch.equal(
+            render_at(field, CAMERA, time, [0.0, 1.0], mode).radiance,
+            field.render(CAMERA, time).radiance,
+        )

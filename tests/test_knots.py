@@ -1,4 +1,6 @@
-"""Time as knots: where a time lies among the training times, and the curves through what is kept there."""
+"""Time as knots: where a time lies among the training times, and the curves through
+what is kept there.
+"""
 
 from collections.abc import Callable
 
@@ -57,7 +59,9 @@ def test_linear_is_the_mean_half_way() -> None:
 def test_a_parabola_is_reproduced_by_the_cubic_away_from_the_ends() -> None:
     v = torch.arange(6, dtype=torch.float64)[:, None] ** 2
     for position in (1.2, 2.5, 3.9):
-        torch.testing.assert_close(catmull_rom(v, position), torch.tensor([position**2], dtype=torch.float64))
+        torch.testing.assert_close(
+            catmull_rom(v, position), torch.tensor([position**2], dtype=torch.float64)
+        )
 
 
 def test_the_cubics_velocity_is_continuous_and_that_of_the_neighbors() -> None:

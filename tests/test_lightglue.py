@@ -1,4 +1,6 @@
-"""Learned matches: their way into structure from motion with exact ones, the networks with random weights, and with real ones where they are."""
+"""Learned matches: their way into structure from motion with exact ones, the networks
+with random weights, and with real ones where they are.
+"""
 
 import hashlib
 import re
@@ -27,12 +29,16 @@ def test_given_matches_are_what_poses_come_from(tmp_path, monkeypatch):
     asked = {}
 
     def exact(pictures, usable, pairs, matcher):
-        """Projections of 300 points into pictures of twice the size, each point the same row everywhere."""
+        """Projections of 300 points into pictures of twice the size, each point the
+        same row everywhere.
+        """
         asked.update(matcher=matcher, size=pictures[0].shape, count=len(pictures), pairs=len(pairs))
         local = np.einsum("tji,tnj->tni", turns, points[None] - PLACES[:, None])
         pixels = 2 * (local[..., :2] / local[..., 2:] * FOCAL + [W / 2, H / 2])
         inside = ((pixels > 0) & (pixels < [2 * W, 2 * H])).all(-1)
-        return list(pixels), [np.repeat(np.flatnonzero(inside[a] & inside[b])[:, None], 2, 1) for a, b in pairs]
+        return list(pixels), [
+            np.repeat(np.flatnonzero(inside[a] & inside[b])[:, None], 2, 1) for a, b in pairs
+        ]
 
     monkeypatch.setattr(poses, "match_pictures", exact)
     found = poses.estimate_poses(sliding(PLACES), None, tmp_path, matcher="aliked")
@@ -60,13 +66,18 @@ def test_missing_weights_and_a_missing_library_are_one_sentence(tmp_path, monkey
 
 @pytest.fixture(params=["aliked", "disk"])
 def random_weights(request, tmp_path, monkeypatch):
-    """Random weights of both networks where the real ones would be, LightGlue's under its authors' first names."""
+    """Random weights of both networks where the real ones would be, LightGlue's under
+    its authors' first names.
+    """
     kf = pytest.importorskip("kornia.feature")
     torch.manual_seed(0)
     extractor = kf.ALIKED("aliked-n16") if request.param == "aliked" else kf.DISK()
     state = extractor.state_dict()
     glue = kf.LightGlue(None, input_dim=128).state_dict()
-    old = {re.sub(r"transformers\.(\d+)\.(self_attn|cross_attn)\.", r"\2.\1.", k): v for k, v in glue.items()}
+    old = {
+        re.sub(r"transformers\.(\d+)\.(self_attn|cross_attn)\.", r"\2.\1.", k): v
+        for k, v in glue.items()
+    }
     for name, content in (
         (request.param, state if request.param == "aliked" else {"extractor": state}),
         (f"{request.param}-lightglue", old),
@@ -74,7 +85,9 @@ def random_weights(request, tmp_path, monkeypatch):
         path = tmp_path / name / str(KNOWN[name].file)
         path.parent.mkdir()
         torch.save(content, path)
-        monkeypatch.setitem(KNOWN, name, replace(KNOWN[name], sha256=hashlib.sha256(path.read_bytes()).hexdigest()))
+        monkeypatch.setitem(
+            KNOWN, name, replace(KNOWN[name], sha256=hashlib.sha256(path.read_bytes()).hexdigest())
+        )
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
     return request.param, tmp_path, glue
 
@@ -90,7 +103,12 @@ def test_keypoints_lie_where_they_may_and_matches_name_their_rows(random_weights
     right = np.tile(np.arange(96) >= 48, (64, 1))
     points, matches = match_pictures(list(pictures), [right, right], [(0, 1)], random_weights[0])
     for xy in points:
-        assert len(xy) > 5 and (xy[:, 0] >= 47.9).all() and (xy[:, 0] <= 96).all() and (xy[:, 1] <= 64).all()
+        assert (
+            len(xy) > 5
+            and (xy[:, 0] >= 47.9).all()
+            and (xy[:, 0] <= 96).all()
+            and (xy[:, 1] <= 64).all()
+        )
     assert matches[0].shape[1:] == (2,) and (matches[0] < [len(p) for p in points]).all()
 
 

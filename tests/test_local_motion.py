@@ -1,4 +1,6 @@
-"""Flow told by what is around: only where it is not sure, as the model says, sharp at outlines, by what can be trusted."""
+"""Flow told by what is around: only where it is not sure, as the model says, sharp at
+outlines, by what can be trusted.
+"""
 
 import numpy as np
 import pytest
@@ -24,7 +26,9 @@ def affine() -> np.ndarray:
 
 def halves() -> np.ndarray:
     """Two motions (H, W, 2) side by side."""
-    return np.where(X[..., None] < W / 2, np.float32([4, 0]), np.float32([-1, 1])).astype(np.float32)
+    return np.where(X[..., None] < W / 2, np.float32([4, 0]), np.float32([-1, 1])).astype(
+        np.float32
+    )
 
 
 def error(a: np.ndarray, b: np.ndarray, margin: int = 0) -> np.ndarray:
@@ -43,7 +47,10 @@ def test_a_uniform_motion_stays_as_it_is() -> None:
 
 def test_motion_that_turns_and_grows_stays_and_its_noise_goes() -> None:
     assert error(smoothed(affine(), ALL), affine(), 6).max() < 1e-4
-    assert error(smoothed(noisy(affine(), 0.1), ALL), affine()).mean() < 0.5 * error(noisy(affine(), 0.1), affine()).mean()
+    assert (
+        error(smoothed(noisy(affine(), 0.1), ALL), affine()).mean()
+        < 0.5 * error(noisy(affine(), 0.1), affine()).mean()
+    )
 
 
 def test_an_outline_between_two_motions_stays_sharp() -> None:
@@ -58,7 +65,9 @@ def test_a_patch_that_shows_nothing_moves_as_what_is_around_it() -> None:
     assert np.array_equal(found[~hole], lost[~hole])
 
 
-def test_what_stands_still_tells_nothing_of_what_moves_and_what_is_unknown_is_told_by_both() -> None:
+def test_what_stands_still_tells_nothing_of_what_moves_and_what_is_unknown_is_told_by_both() -> (
+    None
+):
     side = np.where(X < W / 2, 1, -1)
     alike = 0.05 * halves()  # nearer to each other than what counts as unlike
     assert error(smoothed(alike, ALL), alike).max() > 0.05
@@ -69,7 +78,9 @@ def test_what_stands_still_tells_nothing_of_what_moves_and_what_is_unknown_is_to
     assert error(blurred, alike)[middle].min() > 0.01
 
 
-def test_movers_and_the_rest_are_told_apart_but_where_nothing_shows(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_movers_and_the_rest_are_told_apart_but_where_nothing_shows(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     still = np.zeros((H, W, 2), np.float32)
     side = asked(monkeypatch, still, still, picture(), picture(), X < 20, NOTHING, moving=Y < 10)[2]
     assert np.array_equal(side, np.where(X < 20, 0, np.where(Y < 10, 1, -1)))
@@ -85,7 +96,12 @@ def test_larger_pictures_have_larger_windows() -> None:
     original, local_motion.fit = fit, lambda *given: steps.append(given[5])
     try:
         for width in (60, 128, 129, 320, 1920):
-            filled(np.zeros((4, width, 2), np.float32), np.ones((4, width)), np.ones((4, width), bool), np.zeros((4, width)))
+            filled(
+                np.zeros((4, width, 2), np.float32),
+                np.ones((4, width)),
+                np.ones((4, width), bool),
+                np.zeros((4, width)),
+            )
     finally:
         local_motion.fit = original
     assert steps == [1, 1, 2, 3, 15]
@@ -94,8 +110,14 @@ def test_larger_pictures_have_larger_windows() -> None:
 @pytest.mark.parametrize("place", [(0, 0), (20, 30), (47, 71), (3, 60)])
 def test_the_kernel_is_the_weighted_least_squares_it_says(place: tuple[int, int]) -> None:
     """A slow twin of one pixel, by `lstsq`."""
-    flow, trusted, step = noisy(halves()), np.random.default_rng(1).random((H, W)).astype(np.float32), 2
-    sides_of = np.where(np.random.default_rng(4).random((H, W)) < 0.3, 0, np.where(X + Y < 60, 1, -1)).astype(np.int8)
+    flow, trusted, step = (
+        noisy(halves()),
+        np.random.default_rng(1).random((H, W)).astype(np.float32),
+        2,
+    )
+    sides_of = np.where(
+        np.random.default_rng(4).random((H, W)) < 0.3, 0, np.where(X + Y < 60, 1, -1)
+    ).astype(np.int8)
     rows, sides, weights = [], [], []
     for row in range(-SAMPLES, SAMPLES + 1):
         for column in range(-SAMPLES, SAMPLES + 1):
@@ -113,9 +135,16 @@ def test_the_kernel_is_the_weighted_least_squares_it_says(place: tuple[int, int]
                 rows.append([1, dx, dy, dx * dx, dx * dy, dy * dy])
                 sides.append(other)
     root = np.sqrt(np.array(weights))[:, None]
-    ridge = np.diag(np.sqrt(sum(weights) * np.array([0, LINEAR, LINEAR, QUADRATIC, QUADRATIC, QUADRATIC])))
+    ridge = np.diag(
+        np.sqrt(sum(weights) * np.array([0, LINEAR, LINEAR, QUADRATIC, QUADRATIC, QUADRATIC]))
+    )
     system = np.concatenate([root * np.array(rows), ridge])
-    expected = flow[place] + np.linalg.lstsq(system, np.concatenate([root * np.array(sides), np.zeros((6, 2))]), rcond=None)[0][0]
+    expected = (
+        flow[place]
+        + np.linalg.lstsq(
+            system, np.concatenate([root * np.array(sides), np.zeros((6, 2))]), rcond=None
+        )[0][0]
+    )
     offsets = np.arange(-SAMPLES, SAMPLES + 1)
     window = np.exp(-0.5 * (offsets[:, None] ** 2 + offsets**2) / local_motion.WIDTH**2)
     result = flow.copy()
@@ -140,30 +169,44 @@ def picture(seed: int = 3) -> np.ndarray:
 def asked(
     monkeypatch: pytest.MonkeyPatch, *given: np.ndarray, moving: np.ndarray = NOTHING
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What `told` says of these: trust (H, W), where flow is not sure, and which side pixels are on."""
+    """What `told` says of these: trust (H, W), where flow is not sure, and which side
+    pixels are on.
+    """
     seen: list[np.ndarray] = []
-    monkeypatch.setattr("hdr_nsff.priors.flow.dense.filled", lambda flow, *rest: seen.extend(rest) or flow)
+    monkeypatch.setattr(
+        "hdr_nsff.priors.flow.dense.filled", lambda flow, *rest: seen.extend(rest) or flow
+    )
     told(*given, moving)
     return seen[0], seen[1], seen[2]
 
 
-def test_flow_is_trusted_where_it_agrees_with_its_reverse_and_something_shows_in_both(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flow_is_trusted_where_it_agrees_with_its_reverse_and_something_shows_in_both(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     still = np.zeros((H, W, 2), np.float32)
     sure, unsure, _ = asked(monkeypatch, still, still, picture(), picture(), NOTHING, NOTHING)
     assert sure[4:-4, 4:-4].min() > 0.3 and np.median(sure) > 0.7 and not unsure.any()
     plain = np.where(X < 20, 100, picture()).astype(np.uint8)
     for one, other in ((plain, picture()), (picture(), plain)):
-        assert asked(monkeypatch, still, still, one, other, NOTHING, NOTHING)[0][:, :14].max() < 1e-6
-    lost, unsure, _ = asked(monkeypatch, still, still + 3 * MISSED, picture(), picture(), NOTHING, NOTHING)
+        assert (
+            asked(monkeypatch, still, still, one, other, NOTHING, NOTHING)[0][:, :14].max() < 1e-6
+        )
+    lost, unsure, _ = asked(
+        monkeypatch, still, still + 3 * MISSED, picture(), picture(), NOTHING, NOTHING
+    )
     assert lost.max() < 0.02 and unsure.all()
 
 
-def test_what_is_clipped_at_either_end_is_not_sure_and_hardly_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_clipped_at_either_end_is_not_sure_and_hardly_trusted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     still = np.zeros((H, W, 2), np.float32)
     sure, *_ = asked(monkeypatch, still, still, picture(), picture(), NOTHING, NOTHING)
     for one, other in ((X < 20, NOTHING), (NOTHING, X < 20)):
         trusted, unsure, _ = asked(monkeypatch, still, still, picture(), picture(), one, other)
-        assert np.allclose(trusted, np.where(X < 20, 0.1 * sure, sure)) and np.array_equal(unsure, X < 20)
+        assert np.allclose(trusted, np.where(X < 20, 0.1 * sure, sure)) and np.array_equal(
+            unsure, X < 20
+        )
 
 
 def test_detail_of_stripes_is_nothing_for_they_show_one_direction() -> None:

@@ -10,7 +10,9 @@ from hdr_nsff.maths import losses
 def test_photometric_is_the_mean_absolute_or_squared_difference() -> None:
     a, b = torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([[0.3, 0.5, 0.9]])
     assert math.isclose(float(losses.photometric(a, b)), 0.6 / 3, rel_tol=1e-5)
-    assert math.isclose(float(losses.photometric(a, b, squared=True)), (0.04 + 0.16) / 3, rel_tol=1e-5)
+    assert math.isclose(
+        float(losses.photometric(a, b, squared=True)), (0.04 + 0.16) / 3, rel_tol=1e-5
+    )
 
 
 def test_photometric_ignores_pixels_of_weight_zero() -> None:
@@ -31,7 +33,9 @@ def test_opposite_flows_close_the_cycle_and_cost_no_kinetic_energy() -> None:
 
 
 def test_kinetic_energy_of_a_bend() -> None:
-    assert math.isclose(float(losses.kinetic(torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 1.0, 0]]))), 0.5 * 2)
+    assert math.isclose(
+        float(losses.kinetic(torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 1.0, 0]]))), 0.5 * 2
+    )
 
 
 def test_flow_magnitude_does_not_cancel_between_axes() -> None:
@@ -51,7 +55,11 @@ def test_relative_depth_ignores_scale_and_shift_of_the_prior() -> None:
 
 def test_scene_depth_trusts_the_confidence() -> None:
     depth, prior = torch.tensor([1.0, 1.0]), torch.tensor([0.5, 0.9])
-    assert math.isclose(float(losses.depth_scene(depth, prior, torch.tensor([0.0, 1.0]), 2.0)), 0.1 / 2 * 2, rel_tol=1e-5)
+    assert math.isclose(
+        float(losses.depth_scene(depth, prior, torch.tensor([0.0, 1.0]), 2.0)),
+        0.1 / 2 * 2,
+        rel_tol=1e-5,
+    )
 
 
 def test_optical_flow_counts_valid_pixels_only_and_caps_outliers() -> None:

@@ -1,16 +1,28 @@
-"""Moving masks of painted clips whose flow is known: a textured wall, a textured square before it, a camera that slides sideways."""
+"""Moving masks of painted clips whose flow is known: a textured wall, a textured square
+before it, a camera that slides sideways.
+"""
 
 import cv2
 import numpy as np
 import pytest
 
 from hdr_nsff.priors.masks import geometric as mask
-from hdr_nsff.priors.masks.geometric import epipolar_miss, geometric_mask, grid, rough_mask, static_miss, steps_from
+from hdr_nsff.priors.masks.geometric import (
+    epipolar_miss,
+    geometric_mask,
+    grid,
+    rough_mask,
+    static_miss,
+    steps_from,
+)
 
 T, H, W, FOCAL = 8, 72, 96, 80.0
 SIZE = 20  # of the square, pixels
 K = np.array([[FOCAL, 0, W / 2], [0, FOCAL, H / 2], [0, 0, 1.0]])
-BASE, WALL = 0.1, 4.0  # the camera's step and the wall's depth: the wall moves by 80 * 0.1 / 4 = 2 px per frame to the left
+BASE, WALL = (
+    0.1,
+    4.0,
+)  # the camera's step and the wall's depth: the wall moves by 80 * 0.1 / 4 = 2 px per frame to the left
 SPEED = FOCAL * BASE / WALL
 
 
@@ -28,8 +40,10 @@ def texture(seed: int, height: int = H, width: int = 3 * W) -> np.ndarray:
 
 
 def corners(kind: str) -> np.ndarray:
-    """Where the square's upper left corner is in each frame (T, 2) px: rising, on a path along the epipolar lines that no depth has,
-    or standing still in space at half the wall's depth."""
+    """Where the square's upper left corner is in each frame (T, 2) px: rising, on a
+    path along the epipolar lines that no depth has, or standing still in space at half
+    the wall's depth.
+    """
     t = np.arange(T)
     x = {"rising": 60 - 2.0 * t, "along": 30 + 4.0 * t, "near": 60 - 2 * SPEED * t}[kind]
     return np.stack([x, 40 - 3.0 * t if kind == "rising" else np.full(T, 26.0)], 1).round()
@@ -43,7 +57,9 @@ def clip(kind: str, speed: float = SPEED) -> tuple[np.ndarray, ...]:
         shift = np.array([[1, 0, -speed * t], [0, 1, 0]], np.float32)
         video[t] = cv2.warpAffine(wall, shift, (W, H), borderMode=cv2.BORDER_REFLECT)[..., None]
         (x, y), (x0, y0) = at[t], np.maximum(at[t], 0)
-        video[t, y0 : y + SIZE, x0 : x + SIZE] = square[y0 - y : y0 - y + H - y0, x0 - x : x0 - x + W - x0][..., None]
+        video[t, y0 : y + SIZE, x0 : x + SIZE] = square[
+            y0 - y : y0 - y + H - y0, x0 - x : x0 - x + W - x0
+        ][..., None]
         truth[t, y0 : y + SIZE, x0 : x + SIZE] = True
     pairs = np.array([(i, j) for i in range(T) for j in (i - 1, i + 1) if 0 <= j < T])
     flow, valid = np.zeros((len(pairs), H, W, 2), np.float32), np.zeros((len(pairs), H, W), bool)
@@ -53,7 +69,9 @@ def clip(kind: str, speed: float = SPEED) -> tuple[np.ndarray, ...]:
         end = np.floor(grid((H, W)) + flow[p]).astype(int)
         inside = ((end >= 0) & (end < (W, H))).all(-1)
         valid[p] = inside
-        valid[p][inside] &= truth[i][inside] == truth[j][end[inside][:, 1], end[inside][:, 0]]  # what gets covered is not valid
+        valid[p][inside] &= (
+            truth[i][inside] == truth[j][end[inside][:, 1], end[inside][:, 0]]
+        )  # what gets covered is not valid
     return flow, valid, pairs, video, truth
 
 
@@ -111,7 +129,8 @@ def test_static_miss_is_zero_for_static_points_and_the_motion_for_others():
     steps = [s for s in steps_from(mask.prepared(flow, valid, pairs, video), 0) if s.frame == 1]
     miss = static_miss(0, steps, np.tile(K, (T, 1, 1)), cameras())[0]
     assert np.allclose(miss[~truth[0] & valid[1]], 0, atol=1e-3)
-    # the square moves by +4 px against parallax: the best depth >= 0 is infinity, which does not move at all
+    # the square moves by +4 px against parallax: the best depth >= 0 is infinity, which
+    # does not move at all
     assert np.allclose(miss[truth[0]].mean(0), (-4, 0), atol=1e-3)
 
 
@@ -129,7 +148,9 @@ def test_epipolar_miss_is_the_distance_from_the_line():
 def test_a_mask_of_most_of_the_frame_is_doubted_aloud(monkeypatch):
     said = []
     monkeypatch.setattr(mask, "say", said.append)
-    monkeypatch.setattr(mask, "score", lambda footage, frame, steps, misses: np.full((H, W), 4.0, np.float32))
+    monkeypatch.setattr(
+        mask, "score", lambda footage, frame, steps, misses: np.full((H, W), 4.0, np.float32)
+    )
     *given, _ = clip("rising")
     assert rough_mask(*given).all()
     assert "8 of 8 frames" in said[0] and "--masks" in said[0]

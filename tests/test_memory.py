@@ -25,7 +25,11 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 
 def faults(first: str) -> int:
     """Page faults of a new process that makes the same pictures 20 times."""
-    return int(subprocess.run([sys.executable, "-c", first + PICTURES], capture_output=True, check=True, text=True).stdout)
+    return int(
+        subprocess.run(
+            [sys.executable, "-c", first + PICTURES], capture_output=True, check=True, text=True
+        ).stdout
+    )
 
 
 @pytest.mark.skipif(not keep_memory(), reason="not glibc's allocator")

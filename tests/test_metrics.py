@@ -1,4 +1,6 @@
-"""Metrics against closed forms and slow oracles (scikit-image, flip's own defaults, a plain-numpy AlexNet)."""
+"""Metrics against closed forms and slow oracles (scikit-image, flip's own defaults, a
+plain-numpy AlexNet).
+"""
 
 import importlib.util
 import math
@@ -40,9 +42,19 @@ def test_psnr_on_a_mask_sees_only_the_mask():
 def test_psnr_and_ssim_agree_with_scikit_image():
     measure = pytest.importorskip("skimage.metrics")
     a, b = pictures()
-    assert metrics.psnr(a, b) == pytest.approx(measure.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1))
-    published = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "data_range": 1, "channel_axis": 2}
-    assert metrics.ssim(a, b) == pytest.approx(measure.structural_similarity(a.numpy(), b.numpy(), **published), abs=1e-9)
+    assert metrics.psnr(a, b) == pytest.approx(
+        measure.peak_signal_noise_ratio(b.numpy(), a.numpy(), data_range=1)
+    )
+    published = {
+        "gaussian_weights": True,
+        "sigma": 1.5,
+        "use_sample_covariance": False,
+        "data_range": 1,
+        "channel_axis": 2,
+    }
+    assert metrics.ssim(a, b) == pytest.approx(
+        measure.structural_similarity(a.numpy(), b.numpy(), **published), abs=1e-9
+    )
 
 
 def test_ssim_of_equal_pictures_is_one_and_a_mask_averages_the_map():
@@ -52,7 +64,9 @@ def test_ssim_of_equal_pictures_is_one_and_a_mask_averages_the_map():
     mixed[:, 30:] = a[:, 30:]
     left = torch.zeros(40, 50, dtype=torch.bool)
     left[:, :24] = True  # six columns away from what differs
-    assert metrics.ssim(mixed, b, left) == pytest.approx(1.0) and metrics.ssim(mixed, b, ~left) < 0.9
+    assert (
+        metrics.ssim(mixed, b, left) == pytest.approx(1.0) and metrics.ssim(mixed, b, ~left) < 0.9
+    )
 
 
 def test_alignment_is_not_led_by_what_no_exposure_records():
@@ -61,44 +75,71 @@ def test_alignment_is_not_led_by_what_no_exposure_records():
     radiance = truth / torch.tensor([2.0, 4.0, 8.0])
     truth[:100] *= 500.0  # a lamp, predicted far too dark
     recordable = torch.arange(1000) >= 100
-    torch.testing.assert_close(metrics.align(radiance, truth, recordable, per_channel=True), torch.tensor([2.0, 4.0, 8.0]))
+    torch.testing.assert_close(
+        metrics.align(radiance, truth, recordable, per_channel=True), torch.tensor([2.0, 4.0, 8.0])
+    )
     assert metrics.align(radiance, truth, recordable).item() == pytest.approx(4.0)
     least_squares = float((radiance * truth).sum() / radiance.square().sum())
     assert least_squares > 20  # what the lamp would do
 
 
 def test_alignment_without_common_pixels_is_one():
-    assert metrics.align(torch.zeros(5, 3), torch.ones(5, 3), torch.ones(5, dtype=torch.bool)).item() == 1.0
+    assert (
+        metrics.align(torch.zeros(5, 3), torch.ones(5, 3), torch.ones(5, dtype=torch.bool)).item()
+        == 1.0
+    )
 
 
 def test_mu_law_psnr_worked_by_hand():
     truth = torch.full((2, 2, 3), 8.0)  # at the peak: 1 after the mu-law
     radiance = torch.full((2, 2, 3), 8.0 / 50)  # log(2) / log(51)
     expected = -20 * math.log10(1 - math.log(2) / math.log(51))
-    assert metrics.mu_law_psnr(radiance, truth, peak=8.0, mu=50.0) == pytest.approx(expected, rel=1e-6)
-    assert metrics.mu_law_psnr(truth * 3, truth, peak=8.0) == pytest.approx(100.0)  # beyond the peak nothing is told apart
+    assert metrics.mu_law_psnr(radiance, truth, peak=8.0, mu=50.0) == pytest.approx(
+        expected, rel=1e-6
+    )
+    assert metrics.mu_law_psnr(truth * 3, truth, peak=8.0) == pytest.approx(
+        100.0
+    )  # beyond the peak nothing is told apart
 
 
 def pu21_code(nits):
     """Mantiuk and Azimi 2021, banding + glare, as printed."""
-    p = (0.353487901, 0.3734658629, 8.277049286e-05, 0.9062562627, 0.09150303166, 0.9099517204, 596.3148142)
+    p = (
+        0.353487901,
+        0.3734658629,
+        8.277049286e-05,
+        0.9062562627,
+        0.09150303166,
+        0.9099517204,
+        596.3148142,
+    )
     return p[6] * (((p[0] + p[1] * nits ** p[3]) / (1 + p[2] * nits ** p[3])) ** p[4] - p[5])
 
 
 def test_pu21_psnr_worked_by_hand():
-    """White is 1000 cd/m^2: half of it is 500, and the codes of the two are compared with a peak of 256, that of 100 cd/m^2."""
+    """White is 1000 cd/m^2: half of it is 500, and the codes of the two are compared
+    with a peak of 256, that of 100 cd/m^2.
+    """
     truth = torch.full((2, 2, 3), 8.0)
-    assert pu21_code(100) == pytest.approx(256, abs=0.5) and 300 < pu21_code(500) < pu21_code(1000) < 500
+    assert (
+        pu21_code(100) == pytest.approx(256, abs=0.5)
+        and 300 < pu21_code(500) < pu21_code(1000) < 500
+    )
     expected = 20 * math.log10(256 / (pu21_code(1000) - pu21_code(500)))
     assert metrics.pu21_psnr(truth / 2, truth, white=8.0) == pytest.approx(expected, abs=1e-6)
-    assert metrics.pu21_psnr(truth * 20, truth * 10, white=8.0) == pytest.approx(100)  # 10,000 cd/m^2 is as bright as it tells
+    assert metrics.pu21_psnr(truth * 20, truth * 10, white=8.0) == pytest.approx(
+        100
+    )  # 10,000 cd/m^2 is as bright as it tells
 
 
 def test_pu21_psnr_on_a_mask_sees_only_the_mask():
     truth, mask = torch.full((4, 4, 3), 1.0), torch.zeros(4, 4, dtype=torch.bool)
     radiance = truth.clone()
     radiance[1, 2], mask[1, 2] = 0.5, True
-    whole, part = metrics.pu21_psnr(radiance, truth, 1.0), metrics.pu21_psnr(radiance, truth, 1.0, mask)
+    whole, part = (
+        metrics.pu21_psnr(radiance, truth, 1.0),
+        metrics.pu21_psnr(radiance, truth, 1.0, mask),
+    )
     assert whole - part == pytest.approx(10 * math.log10(16))
 
 
@@ -108,7 +149,9 @@ def test_pu21_white_is_not_that_of_a_lamp_of_few_pixels():
     assert metrics.pu21_white([truth]) == pytest.approx(2.0)
     truth[:10, :10] = 700.0  # 1 %
     assert metrics.pu21_white([truth]) == pytest.approx(700.0)
-    assert metrics.pu21_white([truth, torch.full((100, 200, 3), 2.0)]) == pytest.approx(2.0)  # one white for all views
+    assert metrics.pu21_white([truth, torch.full((100, 200, 3), 2.0)]) == pytest.approx(
+        2.0
+    )  # one white for all views
 
 
 def hdr():
@@ -121,10 +164,14 @@ def hdr():
 def test_the_flip_range_of_one_picture_is_flips_own():
     flip = pytest.importorskip("flip_evaluator")
     radiance, truth = hdr()
-    _, mean, used = flip.evaluate(truth.float().numpy(), radiance.float().numpy(), "HDR", applyMagma=False)
+    _, mean, used = flip.evaluate(
+        truth.float().numpy(), radiance.float().numpy(), "HDR", applyMagma=False
+    )
     start, stop = metrics.flip_exposures([truth])
     assert (start, stop) == pytest.approx((used["startExposure"], used["stopExposure"]), abs=1e-3)
-    assert float(metrics.hdr_flip_map(radiance, truth, (start, stop)).mean()) == pytest.approx(mean, abs=2e-4)
+    assert float(metrics.hdr_flip_map(radiance, truth, (start, stop)).mean()) == pytest.approx(
+        mean, abs=2e-4
+    )
 
 
 def test_flip_of_equal_pictures_is_zero_and_differences_stay_where_they_are():
@@ -132,9 +179,13 @@ def test_flip_of_equal_pictures_is_zero_and_differences_stay_where_they_are():
     radiance, truth = hdr()
     mask = torch.zeros(48, 64, dtype=torch.bool)
     mask[20:30] = True
-    assert float(metrics.hdr_flip_map(truth, truth, (-5.0, 2.0)).max()) == pytest.approx(0.0, abs=1e-6)
+    assert float(metrics.hdr_flip_map(truth, truth, (-5.0, 2.0)).max()) == pytest.approx(
+        0.0, abs=1e-6
+    )
     seen = metrics.hdr_flip_map(torch.where(mask[..., None], radiance, truth), truth, (-5.0, 2.0))
-    assert seen.shape == mask.shape and seen[mask].mean() > 2 * seen.mean() and float(seen.max()) <= 1
+    assert (
+        seen.shape == mask.shape and seen[mask].mean() > 2 * seen.mean() and float(seen.max()) <= 1
+    )
 
 
 def test_flip_is_none_where_it_is_not_installed(monkeypatch):
@@ -158,16 +209,26 @@ def test_hdr_tae_of_two_constants_worked_by_hand():
     assert metrics.hdr_tae(one, 3 * one, rest, everywhere(one)) == (pytest.approx(2 / 4), 20)
     assert metrics.hdr_tae(one, one, rest, everywhere(one)) == (0, 20)
     assert metrics.hdr_tae(0 * one, 0 * one, rest, everywhere(one)) == (0, 20)  # black stays black
-    assert metrics.hdr_tae(one, 0 * one, rest, everywhere(one)) == (pytest.approx(1), 20)  # the most there is
+    assert metrics.hdr_tae(one, 0 * one, rest, everywhere(one)) == (
+        pytest.approx(1),
+        20,
+    )  # the most there is
     colored = one * torch.tensor([1.0, 3.0, 9.0])
-    assert metrics.hdr_tae(one, colored, rest, everywhere(one))[0] == pytest.approx((0 + 2 / 4 + 8 / 10) / 3)
+    assert metrics.hdr_tae(one, colored, rest, everywhere(one))[0] == pytest.approx(
+        (0 + 2 / 4 + 8 / 10) / 3
+    )
 
 
 def test_hdr_tae_follows_the_flow_between_pixels_and_leaves_out_what_leaves_the_picture():
-    """What is at column x + 1.5, row y + 1 has 1.5 + 10 more; the last two columns and the last row of 6 x 9 flow out."""
+    """What is at column x + 1.5, row y + 1 has 1.5 + 10 more; the last two columns and
+    the last row of 6 x 9 flow out.
+    """
     here, there = ramp() + 11.5, ramp()
     flow = torch.tensor([1.5, 1.0]).expand(6, 9, 2)
-    assert metrics.hdr_tae(here, there, flow, everywhere(here)) == (pytest.approx(0, abs=1e-12), 5 * 7)
+    assert metrics.hdr_tae(here, there, flow, everywhere(here)) == (
+        pytest.approx(0, abs=1e-12),
+        5 * 7,
+    )
     wrong, _ = metrics.hdr_tae(here, there, torch.zeros(6, 9, 2), everywhere(here))
     assert wrong > 0.1
 
@@ -209,7 +270,13 @@ def test_end_point_error_is_the_mean_distance(step, length):
 def alexnet_weights(seed=0):
     """Random weights under torchvision's and the LPIPS authors' names."""
     rng = torch.Generator().manual_seed(seed)
-    shapes = {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)}
+    shapes = {
+        0: (64, 3, 11),
+        3: (192, 64, 5),
+        6: (384, 192, 3),
+        8: (256, 384, 3),
+        10: (256, 256, 3),
+    }
     net, linear = {}, {}
     for k, (at, (o, i, s)) in enumerate(shapes.items()):
         net[f"features.{at}.weight"] = torch.randn(o, i, s, s, generator=rng) / math.sqrt(i * s * s)
@@ -240,11 +307,15 @@ def test_lpips_agrees_with_a_network_written_out(tmp_path):
         c(3, 64, 11, 4, 2), r(), p(3, 2), c(64, 192, 5, padding=2), r(), p(3, 2), c(192, 384, 3, padding=1), r(),
         c(384, 256, 3, padding=1), r(), c(256, 256, 3, padding=1), r(),
     )  # fmt: skip
-    layers.load_state_dict({k.removeprefix("features."): v for k, v in net.items() if k.startswith("features")})
+    layers.load_state_dict(
+        {k.removeprefix("features."): v for k, v in net.items() if k.startswith("features")}
+    )
     a, b = (p.float() for p in pictures(80, 96))
     seen = []
     for x in (a, b):
-        x = (2 * x - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450])
+        x = (2 * x - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor(
+            [0.458, 0.448, 0.450]
+        )
         x, taps = x.permute(2, 0, 1)[None], []
         for i, layer in enumerate(layers):
             x = layer(x)
@@ -252,7 +323,8 @@ def test_lpips_agrees_with_a_network_written_out(tmp_path):
                 taps.append(x / x.square().sum(1, keepdim=True).sqrt())
         seen.append(taps)
     slow = sum(
-        ((x - y) ** 2 * linear[f"lin{k}.model.1.weight"]).sum(1).mean() for k, (x, y) in enumerate(zip(*seen, strict=True))
+        ((x - y) ** 2 * linear[f"lin{k}.model.1.weight"]).sum(1).mean()
+        for k, (x, y) in enumerate(zip(*seen, strict=True))
     )
     assert metrics.Lpips(tmp_path / "w.pth")(a, b) == pytest.approx(slow.item(), rel=1e-5)
 
@@ -271,13 +343,24 @@ def test_weights_as_flax_lays_them_out_give_the_same_distance(tmp_path):
     torch.save(net | linear, tmp_path / "theirs.pth")
     params = {"AlexNet_0": {}}
     for i, at in enumerate(metrics.Lpips.LAYERS):
-        kernel = net[f"features.{at}.weight"].permute(2, 3, 1, 0).numpy()  # out, in, h, w -> h, w, in, out
-        params["AlexNet_0"][f"Conv_{i}"] = {"kernel": kernel, "bias": net[f"features.{at}.bias"].numpy()}
-        params[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": linear[f"lin{i}.model.1.weight"].permute(2, 3, 1, 0).numpy()}}
+        kernel = (
+            net[f"features.{at}.weight"].permute(2, 3, 1, 0).numpy()
+        )  # out, in, h, w -> h, w, in, out
+        params["AlexNet_0"][f"Conv_{i}"] = {
+            "kernel": kernel,
+            "bias": net[f"features.{at}.bias"].numpy(),
+        }
+        params[f"NetLinLayer_{i}"] = {
+            "Conv_0": {"kernel": linear[f"lin{i}.model.1.weight"].permute(2, 3, 1, 0).numpy()}
+        }
     (tmp_path / "flax.ckpt").write_bytes(pickle.dumps(params))
     lpips_weights().main(str(tmp_path / "flax.ckpt"), str(tmp_path / "ours.pth"))
     a, b = (p.float() for p in pictures(80, 96))
-    assert metrics.Lpips(tmp_path / "ours.pth")(a, b) == metrics.Lpips(tmp_path / "theirs.pth")(a, b) > 0
+    assert (
+        metrics.Lpips(tmp_path / "ours.pth")(a, b)
+        == metrics.Lpips(tmp_path / "theirs.pth")(a, b)
+        > 0
+    )
 
 
 def test_nothing_but_arrays_is_unpickled(tmp_path):
@@ -287,7 +370,9 @@ def test_nothing_but_arrays_is_unpickled(tmp_path):
 
 
 def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):
-    """Bilinear by hand: pixel center (i + 0.5) of n lies at (i + 0.5) m / n - 0.5 of m samples, ends repeated."""
+    """Bilinear by hand: pixel center (i + 0.5) of n lies at (i + 0.5) m / n - 0.5 of m
+    samples, ends repeated.
+    """
     net, linear = alexnet_weights()
     torch.save(net | linear, tmp_path / "w.pth")
     model, (a, b) = metrics.Lpips(tmp_path / "w.pth"), (p.float() for p in pictures(80, 96))
@@ -302,9 +387,14 @@ def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):
         matrix[np.arange(n), np.minimum(low + 1, m - 1)] += place - low
         return matrix
 
-    slow = sum(weights(80, d.shape[0]) @ d.numpy() @ weights(96, d.shape[1]).T for d in model.distances(a, b))
+    slow = sum(
+        weights(80, d.shape[0]) @ d.numpy() @ weights(96, d.shape[1]).T
+        for d in model.distances(a, b)
+    )
     assert model.on_mask(a, b, mask) == pytest.approx(slow[mask.numpy()].mean(), rel=1e-4)
-    assert model.on_mask(a, a, mask) == 0 and model.on_mask(a, b, mask) != pytest.approx(model(a, b), rel=1e-3)
+    assert model.on_mask(a, a, mask) == 0 and model.on_mask(a, b, mask) != pytest.approx(
+        model(a, b), rel=1e-3
+    )
 
 
 def test_lpips_without_its_linear_layers_is_refused_in_a_sentence(tmp_path):

@@ -28,7 +28,9 @@ def test_a_code_changes_colors_and_nothing_else(field: NerfWT, toy: Scene) -> No
     camera = toy.train[2].camera
     a, b = (field.render(camera, 2.0, recorder=recorder(i)) for i in (0, 4))
     assert float((a.radiance - b.radiance).abs().max()) > 1e-3
-    assert all(torch.equal(getattr(a, name), getattr(b, name)) for name in ("depth", "opacity", "motion"))
+    assert all(
+        torch.equal(getattr(a, name), getattr(b, name)) for name in ("depth", "opacity", "motion")
+    )
 
 
 def test_movers_do_not_know_the_code(field: NerfWT, toy: Scene) -> None:
@@ -47,13 +49,18 @@ def test_another_view_borrows_the_mean_code_of_its_exposure(field: NerfWT, toy: 
     torch.testing.assert_close(field.render(camera, 2.0, recorder=recorder(0)).radiance, mean)
 
 
-def test_radiance_without_a_look_is_that_of_the_reference_exposure(field: NerfWT, toy: Scene) -> None:
+def test_radiance_without_a_look_is_that_of_the_reference_exposure(
+    field: NerfWT, toy: Scene
+) -> None:
     camera = toy.train[2].camera
-    reference = tuple(i for i, f in enumerate(toy.train) if f.bracket == toy.manifest.reference_bracket)
+    reference = tuple(
+        i for i, f in enumerate(toy.train) if f.bracket == toy.manifest.reference_bracket
+    )
     assert reference == (1, 4)
     field.render(camera, 2.0, recorder=recorder(3))  # leaves nothing behind
     torch.testing.assert_close(
-        field.render(camera, 2.0).radiance, field.render(camera, 2.0, recorder=recorder(*reference)).radiance
+        field.render(camera, 2.0).radiance,
+        field.render(camera, 2.0, recorder=recorder(*reference)).radiance,
     )
 
 
@@ -63,7 +70,9 @@ def touched(table: Tensor) -> list[int]:
 
 
 def test_a_recording_teaches_the_code_of_its_image_alone(field: NerfWT, toy: Scene) -> None:
-    batch = replace(draw_pixels(toy, 3, 60, 0, torch.Generator().manual_seed(0)), recorder=recorder(3))
+    batch = replace(
+        draw_pixels(toy, 3, 60, 0, torch.Generator().manual_seed(0)), recorder=recorder(3)
+    )
     render, own = field(batch)
     (render.radiance - batch.rgb).square().mean().backward()
     assert touched(field.codes.table) == [3] and render.warps == () and render.scene_flow == {}

@@ -21,7 +21,10 @@ COUNT, H, W, FOCAL, SIDE = 9, 64, 96, 80.0, 20
 
 
 def textured(seed: int, height: int, width: int) -> np.ndarray:
-    return np.kron(np.random.default_rng(seed).uniform(0.1, 0.9, (height // 2, width // 2, 3)), np.ones((2, 2, 1)))
+    return np.kron(
+        np.random.default_rng(seed).uniform(0.1, 0.9, (height // 2, width // 2, 3)),
+        np.ones((2, 2, 1)),
+    )
 
 
 def square(t: int) -> tuple[slice, slice]:
@@ -31,7 +34,9 @@ def square(t: int) -> tuple[slice, slice]:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory) -> PrepareConfig:
-    """A wall at z = 2 that moves by -2 pixels a frame (the camera slides), a square before it, exact poses, flow and depth."""
+    """A wall at z = 2 that moves by -2 pixels a frame (the camera slides), a square
+    before it, exact poses, flow and depth.
+    """
     root = tmp_path_factory.mktemp("clip")
     wall, mover, rows = textured(0, H, W + 2 * COUNT), textured(1, SIDE, SIDE), []
     for t in range(COUNT):
@@ -39,7 +44,13 @@ def clip(tmp_path_factory) -> PrepareConfig:
         rgb[square(t)] = mover
         write_png(root / f"clip/{t:03d}.png", rgb)
         write_npy(root / f"depth/{t:05d}.npy", np.full((H, W), 2, np.float32))
-        rows.append([*np.array([[0, 1, 0, 0.05 * t, H], [1, 0, 0, 0, W], [0, 0, -1, 0, FOCAL]]).ravel(), 1.0, 4.0])
+        rows.append(
+            [
+                *np.array([[0, 1, 0, 0.05 * t, H], [1, 0, 0, 0, W], [0, 0, -1, 0, FOCAL]]).ravel(),
+                1.0,
+                4.0,
+            ]
+        )
         for other in range(max(t - 2, 0), min(t + 3, COUNT)):
             flow = np.full((H, W, 2), [2.0 * (t - other), 0], np.float32)
             flow[square(t)] = [3.0 * (other - t), 0]
@@ -71,7 +82,9 @@ def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it
     scene = shutil.copytree(motion, tmp_path / "scene")
     prepare(replace(clip, out=scene, masks="sam2", mask_weights=str(tiny_sam2(tmp_path / "sam2"))))
     m = Manifest.load(scene)
-    assert m.steps["masks"].provenance == "estimated" and m.steps["masks"].details["source"] == "sam2"
+    assert (
+        m.steps["masks"].provenance == "estimated" and m.steps["masks"].details["source"] == "sam2"
+    )
     assert m.steps["poses"].details["attempt"] == 1  # whoever outlines the masks, the poses stay
     prompts = json.loads((scene / "masks/prompts.json").read_text())
     train = {f.index for f in m.frames if f.split == "train"}
@@ -99,7 +112,15 @@ def test_points_in_held_out_frames_are_refused(clip, motion, tmp_path):
     (tmp_path / "points.json").write_text(json.dumps({"points": [point]}))
     weights = str(tiny_sam2(tmp_path / "sam2"))
     with pytest.raises(InputError, match=f"frame {held_out} is held out"):
-        prepare(replace(clip, out=scene, masks="sam2", mask_weights=weights, mask_points=tmp_path / "points.json"))
+        prepare(
+            replace(
+                clip,
+                out=scene,
+                masks="sam2",
+                mask_weights=weights,
+                mask_points=tmp_path / "points.json",
+            )
+        )
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
@@ -109,17 +130,26 @@ def test_depth_anything_is_laid_onto_points_and_its_kind_is_recorded(kind, clip,
     prepare(replace(clip, out=scene, depth="depth-anything", depth_weights=weights))
     m = Manifest.load(scene)
     step = m.steps["depth"]
-    assert (step.details["source"], step.details["kind"], step.details["weights"]) == ("depth-anything", kind, weights)
+    assert (step.details["source"], step.details["kind"], step.details["weights"]) == (
+        "depth-anything",
+        kind,
+        weights,
+    )
     assert m.depth_kind == "scene" and step.provenance == "estimated"
     for f in (f for f in m.frames if f.split == "train"):
         wall = ~read_mask(scene / str(f.mask))
-        assert np.median(read_npy(scene / str(f.disparity))[wall]) == pytest.approx(0.5, rel=0.1)  # z = 2, whatever was answered
+        assert np.median(read_npy(scene / str(f.disparity))[wall]) == pytest.approx(
+            0.5, rel=0.1
+        )  # z = 2, whatever was answered
 
 
 def test_weights_that_are_not_there_stop_it_at_the_door(clip, tmp_path, monkeypatch):
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
-    for chosen, words in (({"masks": "sam2"}, "sam2.1-hiera-tiny"), ({"depth": "depth-anything"}, "Depth-Anything-V2-Small")):
+    for chosen, words in (
+        ({"masks": "sam2"}, "sam2.1-hiera-tiny"),
+        ({"depth": "depth-anything"}, "Depth-Anything-V2-Small"),
+    ):
         with pytest.raises(InputError, match=words):
             prepare(replace(clip, out=tmp_path / "scene", **chosen))
     assert not (tmp_path / "scene").exists()
@@ -134,7 +164,9 @@ def changed(weights: Path) -> None:
     save_file(tensors | {name: tensors[name] + 1}, weights, metadata={"format": "pt"})
 
 
-def test_a_step_is_done_again_where_its_weights_changed_under_their_name(clip, motion, tmp_path, monkeypatch):
+def test_a_step_is_done_again_where_its_weights_changed_under_their_name(
+    clip, motion, tmp_path, monkeypatch
+):
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
     network = tiny_depth_anything(tmp_path / "cache/depth-anything", "relative")
     config = replace(clip, out=shutil.copytree(motion, tmp_path / "scene"), depth="depth-anything")
@@ -172,7 +204,10 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         write_text(file, "something else")
         assert found and weights_of(config, step) != found, name
         assert not any(weights_of(config, other) for other in ("frames", "exposure", "sheet"))
-    assert not any(weights_of(replace(clip, flow="dis", depth=None, poses=None), s) for s in ("flow", "poses", "masks", "depth"))
+    assert not any(
+        weights_of(replace(clip, flow="dis", depth=None, poses=None), s)
+        for s in ("flow", "poses", "masks", "depth")
+    )
 
 
 def test_a_known_file_that_changed_is_refused(clip, tmp_path, monkeypatch):

@@ -1,4 +1,6 @@
-"""NSFF on contents known in closed form: a wall and a blob that moves at constant scene flow; warps, flows, gradients, culling."""
+"""NSFF on contents known in closed form: a wall and a blob that moves at constant scene
+flow; warps, flows, gradients, culling.
+"""
 
 import math
 from dataclasses import replace
@@ -24,23 +26,53 @@ EMPTY, SOLID = -30.0, 9.0  # raw densities
 
 
 class Blob(nn.Module):
-    """Branches in closed form, instead of grids: a wall that stands, and a blob (or none) with constant scene flow both ways."""
+    """Branches in closed form, instead of grids: a wall that stands, and a blob (or
+    none) with constant scene flow both ways.
+    """
 
-    def __init__(self, velocity: Tensor = VELOCITY, wall: bool = True, blob: bool = True, disocclusion: float = -30.0) -> None:
+    def __init__(
+        self,
+        velocity: Tensor = VELOCITY,
+        wall: bool = True,
+        blob: bool = True,
+        disocclusion: float = -30.0,
+    ) -> None:
         super().__init__()
         self.velocity, self.wall, self.blob, self.disocclusion = velocity, wall, blob, disocclusion
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         inside = (coords[:, 2] < WALL) & self.wall
-        return torch.cat([2 * coords[:, :1], 1 - coords[:, 1:2], coords[:, :1] * 0, self.density(inside), coords[:, :1] * 0], -1)
+        return torch.cat(
+            [
+                2 * coords[:, :1],
+                1 - coords[:, 1:2],
+                coords[:, :1] * 0,
+                self.density(inside),
+                coords[:, :1] * 0,
+            ],
+            -1,
+        )
 
-    def dynamic(self, coords: Tensor, knot: float, directions: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
+    def dynamic(
+        self, coords: Tensor, knot: float, directions: Tensor, motion: bool
+    ) -> tuple[Tensor, Tensor | None]:
         local = coords - START - knot * self.velocity
         inside = (local.norm(dim=-1) < RADIUS) & self.blob
         brightness_drift = torch.cat([3 * local[:, :1], 2 + local[:, 1:2], 0 * local[:, :1]], -1)
-        raw = torch.cat([brightness_drift, self.density(inside), torch.where(inside, 30.0, -30.0)[:, None]], -1)
-        both = torch.cat([self.velocity, torch.tensor([self.disocclusion]), -self.velocity, torch.tensor([self.disocclusion])])
-        scale = torch.tensor([20.0, 20, 20, 1, 20, 20, 20, 1])  # raw flow is in units of `flow_scale`, 0.05
+        raw = torch.cat(
+            [brightness_drift, self.density(inside), torch.where(inside, 30.0, -30.0)[:, None]], -1
+        )
+        both = torch.cat(
+            [
+                self.velocity,
+                torch.tensor([self.disocclusion]),
+                -self.velocity,
+                torch.tensor([self.disocclusion]),
+            ]
+        )
+        scale = torch.tensor(
+            [20.0, 20, 20, 1, 20, 20, 20, 1]
+        )  # raw flow is in units of `flow_scale`, 0.05
         return raw, (both * scale).expand(len(coords), 8) if motion else None
 
     @staticmethod
@@ -56,7 +88,9 @@ def camera(x: float = 0.0) -> Camera:
     return Camera(K, torch.cat([torch.eye(3), torch.tensor([[x], [0.0], [0.0]])], 1), W, H)
 
 
-def blob_field(branches: Blob, compositing: Any = "add", times: tuple[float, ...] = (0.0, 1.0, 2.0)) -> NSFF:
+def blob_field(
+    branches: Blob, compositing: Any = "add", times: tuple[float, ...] = (0.0, 1.0, 2.0)
+) -> NSFF:
     cameras = [camera(0.1 * t) for t in times]
     config = NSFFConfig(samples=160, render_samples=160, compositing=compositing, cull=False)
     field = NSFF(config, build_space(cameras, NEAR, FAR), torch.tensor(times), NEAR, FAR, W, H)
@@ -64,13 +98,19 @@ def blob_field(branches: Blob, compositing: Any = "add", times: tuple[float, ...
     return field
 
 
-def batch(time: float = 1.0, x: float = 0.1, neighbors: tuple[float, float] = (0.0, 0.2)) -> PixelBatch:
-    """Every pixel of the camera at `x`; the previous and the next camera are at `neighbors`."""
+def batch(
+    time: float = 1.0, x: float = 0.1, neighbors: tuple[float, float] = (0.0, 0.2)
+) -> PixelBatch:
+    """Every pixel of the camera at `x`; the previous and the next camera are at
+    `neighbors`.
+    """
     c = camera(x)
     pixels = c.pixel_grid()
     n = len(pixels)
     around = {-1: camera(neighbors[0]), 1: camera(neighbors[1])}
-    return PixelBatch(0, time, c, 0, 0, around, pixels, torch.zeros(n, 3), torch.ones(n, dtype=torch.bool))
+    return PixelBatch(
+        0, time, c, 0, 0, around, pixels, torch.zeros(n, 3), torch.ones(n, dtype=torch.bool)
+    )
 
 
 def centroid(motion: Tensor) -> Tensor:
@@ -80,7 +120,16 @@ def centroid(motion: Tensor) -> Tensor:
 
 def test_knots_count_training_times_however_uneven() -> None:
     field = blob_field(Blob(), times=(0.0, 1.0, 3.0, 4.0))
-    for time, knot in ((-1.0, 0.0), (0.0, 0.0), (0.5, 0.5), (1.0, 1.0), (2.0, 1.5), (3.5, 2.5), (4.0, 3.0), (9.0, 3.0)):
+    for time, knot in (
+        (-1.0, 0.0),
+        (0.0, 0.0),
+        (0.5, 0.5),
+        (1.0, 1.0),
+        (2.0, 1.5),
+        (3.5, 2.5),
+        (4.0, 3.0),
+        (9.0, 3.0),
+    ):
         assert math.isclose(field.knot(time), knot)
     assert blob_field(Blob(), times=(5.0,)).knot(7.0) == 0.0
 
@@ -96,7 +145,9 @@ def test_wall_and_blob_are_rendered_where_they_are(compositing: str) -> None:
     torch.testing.assert_close(centroid(r.motion), camera().project(middle)[0], atol=0.5, rtol=0)
     assert float(r.depth[blob].mean()) == pytest.approx(float(camera().project(middle)[1]), rel=0.2)
     face = float(space.decode(torch.tensor([0.5, 0.5, WALL]))[2])
-    torch.testing.assert_close(r.depth[wall], torch.full_like(r.depth[wall], face), rtol=0.05, atol=0)
+    torch.testing.assert_close(
+        r.depth[wall], torch.full_like(r.depth[wall], face), rtol=0.05, atol=0
+    )
     assert float(r.opacity.min()) > 0.99
     assert float(r.radiance[blob].mean(0)[1]) == pytest.approx(math.exp(2), rel=0.1)
 
@@ -119,8 +170,13 @@ def test_a_static_scene_flows_as_the_camera_moves() -> None:
     render, _ = field(b)
     forward, backward = render.warps
     assert (forward.offset, backward.offset) == (1, -1)
-    for warp, shift in ((forward, 0.1), (backward, -0.1)):  # the camera goes right by `shift`, the wall goes left
-        torch.testing.assert_close(warp.flow[:, 0], -FOCAL * shift / render.depth, atol=1e-3, rtol=1e-3)
+    for warp, shift in (
+        (forward, 0.1),
+        (backward, -0.1),
+    ):  # the camera goes right by `shift`, the wall goes left
+        torch.testing.assert_close(
+            warp.flow[:, 0], -FOCAL * shift / render.depth, atol=1e-3, rtol=1e-3
+        )
         assert float(warp.flow[:, 1].abs().max()) < 1e-3
     assert float(render.motion.max()) < 1e-3
 
@@ -130,12 +186,16 @@ def test_flow_into_the_neighbors_camera_adds_motion_and_parallax() -> None:
     render, _ = field(batch(neighbors=(0.1, 0.1)))  # nobody moves but the blob
     blob = render.motion > 0.99
     ends = [camera(0.1).project(field.space.decode(START + k * VELOCITY))[0] for k in (1, 2)]
-    torch.testing.assert_close(render.warps[0].flow[blob].mean(0), ends[1] - ends[0], atol=0.3, rtol=0)
+    torch.testing.assert_close(
+        render.warps[0].flow[blob].mean(0), ends[1] - ends[0], atol=0.3, rtol=0
+    )
     assert float(render.warps[0].flow[render.motion < 1e-3].abs().max()) < 1e-2
 
 
 @pytest.mark.parametrize("compositing", ["add", "blend"])
-def test_content_that_follows_its_flow_looks_the_same_through_both_neighbors(compositing: str) -> None:
+def test_content_that_follows_its_flow_looks_the_same_through_both_neighbors(
+    compositing: str,
+) -> None:
     field = blob_field(Blob(), compositing)
     render, own = field(replace(batch(time=1.0), chain=0))
     blob = render.motion > 0.99
@@ -150,13 +210,18 @@ def test_two_steps_along_the_flow_see_the_same_too() -> None:
     render, _ = blob_field(Blob())(replace(batch(time=0.0), chain=1))
     chained = [w for w in render.warps if w.offset == 2]
     blob = render.motion > 0.99
-    torch.testing.assert_close(chained[0].radiance[blob], render.radiance[blob], atol=0.02, rtol=0.02)
+    torch.testing.assert_close(
+        chained[0].radiance[blob], render.radiance[blob], atol=0.02, rtol=0.02
+    )
 
 
 def test_content_that_ignores_its_flow_looks_different() -> None:
     lying = Blob()
     dynamic = lying.dynamic
-    lying.dynamic = lambda c, k, d, motion: (dynamic(c, 1.0, d, False)[0], dynamic(c, k, d, motion)[1])  # type: ignore[method-assign]
+    lying.dynamic = lambda c, k, d, motion: (
+        dynamic(c, 1.0, d, False)[0],
+        dynamic(c, k, d, motion)[1],
+    )  # type: ignore[method-assign]
     render, _ = blob_field(lying)(batch())  # stands still, but says it moves
     blob = render.motion > 0.99
     assert float((render.warps[0].radiance[blob] - render.radiance[blob]).abs().mean()) > 0.1
@@ -164,7 +229,9 @@ def test_content_that_ignores_its_flow_looks_different() -> None:
 
 def test_confidence_is_one_minus_the_rendered_disocclusion() -> None:
     render, own = blob_field(Blob(disocclusion=0.0))(batch())  # sigmoid(0) = a half
-    torch.testing.assert_close(render.warps[0].confidence, 1 - 0.5 * render.motion, atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        render.warps[0].confidence, 1 - 0.5 * render.motion, atol=1e-4, rtol=0
+    )
     assert float(own["disocclusion"]) == 0.5
 
 
@@ -199,7 +266,9 @@ def test_the_picture_teaches_both_branches_but_not_the_flow(toy: Scene) -> None:
     field = random_field("grid", toy)
     render, _, b = pass_of(field, toy)
     (render.radiance - b.rgb).abs().mean().backward()
-    assert size(field.branches.static_grid.table) > 0 and size(field.branches.dynamic_grid.table) > 0
+    assert (
+        size(field.branches.static_grid.table) > 0 and size(field.branches.dynamic_grid.table) > 0
+    )
     assert all(size(g.table) == 0 for g in field.branches.motion_grids)
 
 
@@ -208,10 +277,14 @@ def test_the_warped_picture_teaches_scene_flow_and_the_neighbors_content(toy: Sc
     render, _, b = pass_of(field, toy)
     (render.warps[0].radiance - b.rgb).abs().mean().backward()
     forward = field.branches.motion_grids[0].table.grad.abs().sum(0)
-    assert bool((forward[:3] > 0).all()) and float(forward[3]) == 0  # the flow itself, not the disocclusion
+    assert (
+        bool((forward[:3] > 0).all()) and float(forward[3]) == 0
+    )  # the flow itself, not the disocclusion
     assert size(field.branches.motion_grids[1].table) == 0  # the way back has no part in it
     grid = field.branches.dynamic_grid
-    per_slice = grid.table.grad[: int(grid.size[0])].abs().sum(-1).view(6, -1).sum(1)  # the coarsest level, frame by frame
+    per_slice = (
+        grid.table.grad[: int(grid.size[0])].abs().sum(-1).view(6, -1).sum(1)
+    )  # the coarsest level, frame by frame
     assert float(per_slice[4]) > 0 and float(per_slice[[0, 1, 2, 3, 5]].sum()) == 0
 
 
@@ -219,7 +292,10 @@ def test_rendered_flow_teaches_scene_flow_and_depth(toy: Scene) -> None:
     field = random_field("grid", toy)
     render, _, b = pass_of(field, toy)
     (render.warps[0].flow - b.flow[1]).abs().mean().backward()
-    assert size(field.branches.motion_grids[0].table) > 0 and size(field.branches.static_grid.table) > 0
+    assert (
+        size(field.branches.motion_grids[0].table) > 0
+        and size(field.branches.static_grid.table) > 0
+    )
 
 
 def test_disocclusion_is_taught_by_the_confidence_only(toy: Scene) -> None:
@@ -238,7 +314,9 @@ def test_a_field_learns_the_way_things_went_from_warped_pictures_alone() -> None
     content = branches.dynamic
 
     def dynamic(c: Tensor, k: float, d: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
-        both = torch.cat([learned * 20, torch.tensor([-30.0]), -learned * 20, torch.tensor([-30.0])])
+        both = torch.cat(
+            [learned * 20, torch.tensor([-30.0]), -learned * 20, torch.tensor([-30.0])]
+        )
         return content(c, k, d, False)[0], both.expand(len(c), 8) if motion else None
 
     branches.dynamic = dynamic  # type: ignore[method-assign]
@@ -267,7 +345,10 @@ def test_culled_samples_get_no_gradient_and_nothing_is_seen_there(toy: Scene) ->
     columns = grid.table.grad[int(grid.offset[-1]) :].abs().sum(-1).view(nz, ny, nx).sum((0, 1))
     assert float(columns[: nx // 2].sum()) > 0 and float(columns[nx // 2 + 1 :].sum()) == 0
     right = b.pixels[:, 0] > 45
-    assert float(render.opacity.detach()[right].max()) == 0 and float(render.depth.detach()[right].min()) > 4.9  # far
+    assert (
+        float(render.opacity.detach()[right].max()) == 0
+        and float(render.depth.detach()[right].min()) > 4.9
+    )  # far
 
 
 def test_masks_say_where_motion_may_be(toy: Scene) -> None:
@@ -276,7 +357,9 @@ def test_masks_say_where_motion_may_be(toy: Scene) -> None:
     motion = field.render(f.camera, f.time).motion.view(f.moving.shape)
     rows, columns = f.moving.nonzero().unbind(1)
     far = torch.ones_like(f.moving)
-    far[max(rows.min() - 18, 0) : rows.max() + 18, max(columns.min() - 22, 0) : columns.max() + 22] = False
+    far[
+        max(rows.min() - 18, 0) : rows.max() + 18, max(columns.min() - 22, 0) : columns.max() + 22
+    ] = False
     assert float(motion[f.moving].mean()) > 0.02 and float(motion[far].max()) == 0
 
 
@@ -298,6 +381,11 @@ def test_one_frame_alone_trains(toy: Scene) -> None:
 def test_radiance_is_unbounded_above_and_extreme_numbers_stay_finite(toy: Scene) -> None:
     field = random_field("grid", toy)
     raw = torch.tensor([[-1e4, 0.0, 1e4]])
-    assert float(field.to_radiance(raw)[0, 2]) > 1e6 and bool(torch.isfinite(field.to_radiance(raw)).all())
-    assert bool(torch.isfinite(field.to_density(raw, 0.0)).all()) and float(field.to_density(raw, 0.0).min()) >= 0
+    assert float(field.to_radiance(raw)[0, 2]) > 1e6 and bool(
+        torch.isfinite(field.to_radiance(raw)).all()
+    )
+    assert (
+        bool(torch.isfinite(field.to_density(raw, 0.0)).all())
+        and float(field.to_density(raw, 0.0).min()) >= 0
+    )
     assert float(random_field("paper", toy).to_radiance(raw).max()) == 1.0

@@ -31,7 +31,12 @@ def test_everything_is_asked_until_refreshed_then_only_around_what_was_seen() ->
 def test_the_largest_weight_is_remembered_and_fades() -> None:
     grid = Occupancy((10, 10, 10))
     grid.observe(CENTER.expand(2, 3), torch.tensor([0.8, 0.2]))
-    for count, kept in ((1, 27), (2, 27), (3, 27), (4, 0)):  # 0.8, 0.4, 0.2, 0.1: the fourth is not above the threshold
+    for count, kept in (
+        (1, 27),
+        (2, 27),
+        (3, 27),
+        (4, 0),
+    ):  # 0.8, 0.4, 0.2, 0.1: the fourth is not above the threshold
         grid.refresh(threshold=0.1001, decay=0.5)
         assert int(grid.mask.sum()) == kept, count
 
@@ -40,7 +45,10 @@ def test_exploration_asks_its_share_of_the_others_but_never_where_it_is_not_allo
     grid = Occupancy((40, 40, 40))
     grid.mask.zero_()
     grid.allowed[:, :20] = False  # the near half
-    coords, generator = torch.rand(20000, 3, generator=torch.Generator().manual_seed(0)), torch.Generator().manual_seed(1)
+    coords, generator = (
+        torch.rand(20000, 3, generator=torch.Generator().manual_seed(0)),
+        torch.Generator().manual_seed(1),
+    )
     asked = grid.asks(coords, 0.0, 0.1, generator)
     assert not bool(asked[coords[:, 2] < 0.5].any())
     share = float(asked[coords[:, 2] >= 0.5].float().mean())

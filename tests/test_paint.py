@@ -24,7 +24,9 @@ FINE = GridConfig(finest=1.0, depth_cells=48, levels=4, max_rows=2**20)
 def painted(toy: Scene, toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Trainer:
     """Before its first step."""
     config = small("grid", toy_folder, tmp_path_factory.mktemp("paint") / "run")
-    return trainer(replace(config, field=replace(config.field, encoding=FINE, render_samples=48)), toy)
+    return trainer(
+        replace(config, field=replace(config.field, encoding=FINE, render_samples=48)), toy
+    )
 
 
 def psnr(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -35,7 +37,11 @@ def test_a_painted_field_renders_the_recordings_and_the_depth(painted: Trainer, 
     for i in (1, 2, 4):
         f = toy.train[i]
         render = painted.field.render(f.camera, f.time)
-        rgb = painted.tonemapper(render.radiance, f.bracket, f.camera_id, i, leaky=False).detach().view_as(f.image)
+        rgb = (
+            painted.tonemapper(render.radiance, f.bracket, f.camera_id, i, leaky=False)
+            .detach()
+            .view_as(f.image)
+        )
         flat = f.image.mean((0, 1)).expand_as(f.image)
         assert psnr(rgb, f.image) > psnr(flat, f.image) + 4  # dB
         assert float((1 / render.depth - f.disparity.reshape(-1)).abs().median()) < 0.03
@@ -46,7 +52,11 @@ def test_a_painted_field_renders_the_recordings_and_the_depth(painted: Trainer, 
 def flat(scene: Scene, rgb: float, moving: float) -> Scene:
     """The scene with one color for what stands and one for what moves."""
     frames = [
-        replace(f, image=torch.where(f.moving[..., None], moving, rgb).expand(*f.moving.shape, 3).clone()) for f in scene.train
+        replace(
+            f,
+            image=torch.where(f.moving[..., None], moving, rgb).expand(*f.moving.shape, 3).clone(),
+        )
+        for f in scene.train
     ]
     return replace(scene, train=frames)
 
@@ -91,12 +101,18 @@ def test_without_depth_or_without_grids_nothing_is_painted(toy: Scene) -> None:
 
 def test_every_frame_is_inverted_by_its_own_recording(toy: Scene) -> None:
     asked = []
-    paint(build_field(small("grid").field, toy), toy.train, lambda rgb, i: (asked.append((i, len(rgb))), rgb)[1])
+    paint(
+        build_field(small("grid").field, toy),
+        toy.train,
+        lambda rgb, i: (asked.append((i, len(rgb))), rgb)[1],
+    )
     assert asked == [(i, 60 * 34) for i in range(6)]
 
 
 def test_clipped_recordings_are_hardly_trusted() -> None:
-    trust = exposure_trust(torch.tensor([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [0.0, 0.0, 0.0], [0.2, 0.2, 0.2]]))
+    trust = exposure_trust(
+        torch.tensor([[0.5, 0.5, 0.5], [1.0, 0.5, 0.5], [0.0, 0.0, 0.0], [0.2, 0.2, 0.2]])
+    )
     torch.testing.assert_close(trust, torch.tensor([0.5, 1e-3, 1e-3, 0.2]))
 
 
@@ -108,7 +124,15 @@ def left_over(sweeps: int, monkeypatch: pytest.MonkeyPatch) -> float:
     coords = torch.stack([x, y, torch.full_like(x, 0.5)], -1).reshape(-1, 3)
     squares = ((coords[:, 0] * 64 // 3 + coords[:, 1] * 64 // 3) % 2)[:, None].expand(-1, 3)
     n = len(coords)
-    wall = Splash(coords, squares, torch.ones(n), torch.zeros(n, dtype=torch.bool), torch.zeros(n, 1, 3), torch.zeros(n), 0.0)
+    wall = Splash(
+        coords,
+        squares,
+        torch.ones(n),
+        torch.zeros(n, dtype=torch.bool),
+        torch.zeros(n, 1, 3),
+        torch.zeros(n),
+        0.0,
+    )
     grid = AdditiveGrid([(16, 16, 4, 1), (32, 32, 4, 1), (64, 64, 4, 1)])
     paint_radiance(grid, [wall], moving=False)
     return float((grid(coords).detach()[:, :3] - squares).square().mean().sqrt())

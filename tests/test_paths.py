@@ -1,4 +1,6 @@
-"""Camera paths: they begin where they should, look where they should, and path files are read or refused in a sentence."""
+"""Camera paths: they begin where they should, look where they should, and path files
+are read or refused in a sentence.
+"""
 
 from __future__ import annotations
 
@@ -45,21 +47,32 @@ def test_bullet_time_stays_within_its_radius_and_uses_it() -> None:
 
 
 def test_reach_is_half_the_range_in_the_axes_of_the_camera() -> None:
-    cameras = [camera(0.0, x, 0.0, 0.0) for x in torch.linspace(0, 1, 11).tolist()]  # 10th to 90th percentile: 0.1 to 0.9
+    cameras = [
+        camera(0.0, x, 0.0, 0.0) for x in torch.linspace(0, 1, 11).tolist()
+    ]  # 10th to 90th percentile: 0.1 to 0.9
     assert torch.allclose(paths.reach(cameras, camera()), torch.tensor([0.4, 0, 0]), atol=1e-6)
-    assert torch.allclose(paths.reach(cameras, camera(90.0)), torch.tensor([0, 0, 0.4]), atol=1e-6)  # now it looks along x
+    assert torch.allclose(
+        paths.reach(cameras, camera(90.0)), torch.tensor([0, 0, 0.4]), atol=1e-6
+    )  # now it looks along x
 
 
 def test_slow_motion_divides_uneven_intervals_and_glides_the_camera() -> None:
-    views = paths.slow_motion([camera(), camera(30.0, 1.0), camera(30.0, 1.0)], [0.0, 1.0, 3.0], factor=2)
+    views = paths.slow_motion(
+        [camera(), camera(30.0, 1.0), camera(30.0, 1.0)], [0.0, 1.0, 3.0], factor=2
+    )
     assert [v.time for v in views] == [0.0, 0.5, 1.0, 2.0, 3.0]
-    assert torch.allclose(views[1].camera.c2w, pose(15.0, 0.5), atol=1e-6)  # half the angle, half the way
+    assert torch.allclose(
+        views[1].camera.c2w, pose(15.0, 0.5), atol=1e-6
+    )  # half the angle, half the way
 
 
 def test_training_path_and_fixed_camera_pair_cameras_with_times() -> None:
     a, b = camera(), camera(5.0)
     assert [(v.camera, v.time) for v in paths.training_path([a, b], [0, 2])] == [(a, 0.0), (b, 2.0)]
-    assert [(v.camera, v.time, v.ev) for v in paths.fixed(b, [0, 2])] == [(b, 0.0, None), (b, 2.0, None)]
+    assert [(v.camera, v.time, v.ev) for v in paths.fixed(b, [0, 2])] == [
+        (b, 0.0, None),
+        (b, 2.0, None),
+    ]
 
 
 def test_resizing_a_view_keeps_what_it_sees() -> None:
@@ -71,13 +84,20 @@ def test_resizing_a_view_keeps_what_it_sees() -> None:
 
 def test_path_file_is_read_back(tmp_path) -> None:
     other = [[60.0, 0, 10], [0, 60, 9], [0, 0, 1]]
-    entries = [{"time": 0.5, "c2w": pose(10.0, 1.0).tolist()}, {"time": 2, "c2w": pose().tolist(), "K": other, "ev": -2}]
+    entries = [
+        {"time": 0.5, "c2w": pose(10.0, 1.0).tolist()},
+        {"time": 2, "c2w": pose().tolist(), "K": other, "ev": -2},
+    ]
     file = tmp_path / "weg übers Feld.json"
     file.write_text(json.dumps(entries))
     first, second = paths.from_json(file, camera())
     assert first.time == 0.5 and first.ev is None and torch.equal(first.camera.K, K)
     assert torch.allclose(first.camera.c2w, pose(10.0, 1.0))
-    assert second.ev == -2.0 and torch.equal(second.camera.K, torch.tensor(other)) and second.camera.width == 32
+    assert (
+        second.ev == -2.0
+        and torch.equal(second.camera.K, torch.tensor(other))
+        and second.camera.width == 32
+    )
 
 
 GOOD = {"time": 0.0, "c2w": pose().tolist()}

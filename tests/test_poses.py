@@ -21,7 +21,15 @@ from hdr_nsff.geometry.poses import Poses, interpolate, project, ranges, trusted
 from hdr_nsff.priors.poses import estimate as module
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.estimate import estimate_poses, plausible, worth
-from hdr_nsff.priors.poses.matching import PairMatches, keypoints, match_all, picture, spread_pairs, usable, view_pairs
+from hdr_nsff.priors.poses.matching import (
+    PairMatches,
+    keypoints,
+    match_all,
+    picture,
+    spread_pairs,
+    usable,
+    view_pairs,
+)
 from hdr_nsff.priors.poses.rotation import derivatives, panorama, turned
 
 W, H, FOCAL = 160, 96, 150.0
@@ -38,21 +46,33 @@ def texture(seed: int, width: int, height: int) -> np.ndarray:
 
 
 def seen(texture: np.ndarray, to_pixels: np.ndarray) -> np.ndarray:
-    """A frame (H, W, 3) from a texture whose index coordinates map to pixels by a homography; NaN outside."""
+    """A frame (H, W, 3) from a texture whose index coordinates map to pixels by a
+    homography; NaN outside.
+    """
     matrix = np.linalg.inv(HALF) @ to_pixels @ HALF
-    return cv2.warpPerspective(texture, matrix, (W, H), flags=cv2.INTER_AREA, borderValue=(np.nan,) * 3)
+    return cv2.warpPerspective(
+        texture, matrix, (W, H), flags=cv2.INTER_AREA, borderValue=(np.nan,) * 3
+    )
 
 
 def panning(angles: np.ndarray) -> np.ndarray:
-    """A clip (T, H, W, 3) of a camera that turns by `angles` (T) degrees about the vertical, before a far wall."""
+    """A clip (T, H, W, 3) of a camera that turns by `angles` (T) degrees about the
+    vertical, before a far wall.
+    """
     wall = texture(0, 400, 240)
-    place = K @ np.array([[1, 0, -200], [0, 1, -120], [0, 0, FOCAL]])  # a pixel of the wall per pixel straight ahead
+    place = K @ np.array(
+        [[1, 0, -200], [0, 1, -120], [0, 0, FOCAL]]
+    )  # a pixel of the wall per pixel straight ahead
     turns = Rotation.from_euler("y", angles[:, None], degrees=True).as_matrix().reshape(-1, 3, 3)
-    return np.stack([np.nan_to_num(seen(wall, K @ turn.T @ np.linalg.inv(K) @ place)) for turn in turns])
+    return np.stack(
+        [np.nan_to_num(seen(wall, K @ turn.T @ np.linalg.inv(K) @ place)) for turn in turns]
+    )
 
 
 def sliding(places: np.ndarray) -> np.ndarray:
-    """A clip (T, H, W, 3) of a camera at `places` (T, 3) looking along +z at a wall and three boards before it."""
+    """A clip (T, H, W, 3) of a camera at `places` (T, 3) looking along +z at a wall and
+    three boards before it.
+    """
     clip = []
     boards = [
         (6.0, (-5, -3, 10, 6), 0),
@@ -65,14 +85,22 @@ def sliding(places: np.ndarray) -> np.ndarray:
         for depth, (x, y, width, height), seed in sorted(boards, reverse=True):
             scale = 60.0  # texture pixels per scene unit
             image = texture(seed, int(width * scale), int(height * scale))
-            plane = np.array([[1 / scale, 0, x - place[0]], [0, 1 / scale, y - place[1]], [0, 0, depth - place[2]]])
+            plane = np.array(
+                [
+                    [1 / scale, 0, x - place[0]],
+                    [0, 1 / scale, y - place[1]],
+                    [0, 0, depth - place[2]],
+                ]
+            )
             layer = seen(image, K @ plane)
             frame = np.where(np.isnan(layer), frame, layer)
         clip.append(frame)
     return np.stack(clip)
 
 
-PLACES = np.stack([np.linspace(-0.5, 0.5, 8), 0.15 * np.sin(np.arange(8)), 0.1 * np.cos(np.arange(8))], 1)
+PLACES = np.stack(
+    [np.linspace(-0.5, 0.5, 8), 0.15 * np.sin(np.arange(8)), 0.1 * np.cos(np.arange(8))], 1
+)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +155,9 @@ def test_a_pan_gives_its_angles_and_focal_length(tmp_path):
 
 
 def test_a_tripod_stands_still(tmp_path):
-    video = np.repeat(panning(np.zeros(1)), 9, 0) + 0.01 * np.random.default_rng(0).normal(size=(9, H, W, 3))
+    video = np.repeat(panning(np.zeros(1)), 9, 0) + 0.01 * np.random.default_rng(0).normal(
+        size=(9, H, W, 3)
+    )
     for t in range(9):
         video[t, 30:60, 10 * t : 10 * t + 30] = texture(9, 30, 30)  # someone walks by
     poses = estimate_poses(video.astype(np.float32), None, tmp_path)
@@ -144,7 +174,9 @@ def test_parallax_is_told_from_a_turn():
 
 def test_a_slide_past_a_flat_wall_is_no_turn():
     wall = texture(0, 400, 240)
-    slide = np.stack([seen(wall, np.array([[1, 0, -200 + 8.0 * t], [0, 1, -70], [0, 0, 1]])) for t in range(8)])
+    slide = np.stack(
+        [seen(wall, np.array([[1, 0, -200 + 8.0 * t], [0, 1, -70], [0, 0, 1]])) for t in range(8)]
+    )
     matches = match_all(keypoints(slide, np.zeros((8, H, W), bool)), view_pairs([list(range(8))]))
     assert panorama(matches, 8, W, H).slides
 
@@ -163,9 +195,13 @@ def test_two_frames_are_too_few(tmp_path):
 def test_cameras_of_a_rig_that_stand_still_share_one_view():
     rng = np.random.default_rng(0)
     left, right = panning(np.zeros(1))[0], panning(np.array([20.0]))[0]
-    video = np.stack([f + 0.005 * rng.normal(size=f.shape) for f in [left, right] * 6]).astype(np.float32)
+    video = np.stack([f + 0.005 * rng.normal(size=f.shape) for f in [left, right] * 6]).astype(
+        np.float32
+    )
     video[4, 20:50, 20:50] = 0  # something passes the left camera once
-    views = module.collapse(video, np.zeros(video.shape[:3], bool), [list(range(0, 12, 2)), list(range(1, 12, 2))])
+    views = module.collapse(
+        video, np.zeros(video.shape[:3], bool), [list(range(0, 12, 2)), list(range(1, 12, 2))]
+    )
     assert len(views.pictures) == 2 and views.of_frame.tolist() == [0, 1] * 6
     assert np.abs(views.pictures[0] - left).max() < 0.03  # the median does not know the passer-by
 
@@ -174,11 +210,16 @@ def test_missing_poses_lie_between_their_neighbors():
     c2w = np.tile(np.eye(4)[:3], (4, 1, 1))
     c2w[2, :, :3] = Rotation.from_euler("y", 90, degrees=True).as_matrix()
     c2w[2, 0, 3] = 2.0
-    filled = interpolate(Poses(np.tile(K, (4, 1, 1)), c2w, np.array([True, False, True, False]), "full"), [[0, 1, 2, 3]])
+    filled = interpolate(
+        Poses(np.tile(K, (4, 1, 1)), c2w, np.array([True, False, True, False]), "full"),
+        [[0, 1, 2, 3]],
+    )
     assert np.allclose(filled.c2w[1, :, 3], (1, 0, 0))
     assert np.degrees(Rotation.from_matrix(filled.c2w[1, :, :3]).magnitude()) == pytest.approx(45)
     assert np.allclose(filled.c2w[3], c2w[2])  # held beyond the last
-    assert filled.notes == ("2 of 4 frames did not register; their poses are interpolated (frames 1, 3)",)
+    assert filled.notes == (
+        "2 of 4 frames did not register; their poses are interpolated (frames 1, 3)",
+    )
 
 
 def test_points_seen_twice_or_badly_are_not_trusted():
@@ -201,7 +242,14 @@ def test_points_seen_twice_or_badly_are_not_trusted():
 def model(focal: float, images: int) -> ColmapModel:
     """A reconstruction of `images` images, 240 pixels wide."""
     camera = ColmapCamera("SIMPLE_PINHOLE", 240, 136, np.diag([focal, focal, 1.0]), np.zeros(0))
-    return ColmapModel({1: camera}, dict.fromkeys(range(images)), np.zeros(0), np.zeros((0, 3)), np.zeros(0), np.zeros(0))
+    return ColmapModel(
+        {1: camera},
+        dict.fromkeys(range(images)),
+        np.zeros(0),
+        np.zeros((0, 3)),
+        np.zeros(0),
+        np.zeros(0),
+    )
 
 
 def test_a_plausible_lens_counts_more_than_images():
@@ -212,12 +260,22 @@ def test_a_plausible_lens_counts_more_than_images():
 
 def views_of(count: int) -> module.Views:
     """`count` black frames of one camera, 240x136."""
-    return module.Views(np.zeros((count, 136, 240, 3)), np.zeros((count, 136, 240), bool), [list(range(count))], np.arange(count))
+    return module.Views(
+        np.zeros((count, 136, 240, 3)),
+        np.zeros((count, 136, 240), bool),
+        [list(range(count))],
+        np.arange(count),
+    )
 
 
 def test_failure_names_the_lens_or_the_frames():
-    images = {k: ColmapImage(f"{k:05d}.png", 1, np.eye(4)[:3], np.zeros((0, 2)), np.zeros(0)) for k in (0, 1, 2, 6)}
-    assert "impossible 45 px" in module.sentence(replace(model(90, 0), images=images), views_of(5), [])  # doubled frames: 90 / 2
+    images = {
+        k: ColmapImage(f"{k:05d}.png", 1, np.eye(4)[:3], np.zeros((0, 2)), np.zeros(0))
+        for k in (0, 1, 2, 6)
+    }
+    assert "impossible 45 px" in module.sentence(
+        replace(model(90, 0), images=images), views_of(5), []
+    )  # doubled frames: 90 / 2
     assert "6 of 10 frames could not be placed (frames 3-5, 7-9)" in module.sentence(
         replace(model(500, 0), images=images), views_of(10), []
     )
@@ -237,7 +295,9 @@ def test_turning_derivatives_agree_with_differences():
     for k in range(7):
         moved, focal = rotations.copy(), FOCAL
         if k < 6:
-            moved[k // 3] = moved[k // 3] @ Rotation.from_rotvec(step * np.eye(3)[k % 3]).as_matrix()
+            moved[k // 3] = (
+                moved[k // 3] @ Rotation.from_rotvec(step * np.eye(3)[k % 3]).as_matrix()
+            )
         else:
             focal = FOCAL * np.exp(step)
         slope = (turned(moved, focal, ends, p)[0] - turned(rotations, FOCAL, ends, p)[0]) / step
@@ -254,7 +314,9 @@ def test_keypoints_keep_away_from_what_is_ignored():
 def test_keypoints_know_pixel_centers():
     dot = np.zeros((1, H, W, 3), np.float32)
     y, x = np.mgrid[:H, :W] + 0.5
-    dot[0] = np.exp(-((x - 60.5) ** 2 + (y - 40.5) ** 2) / 2 / 3**2)[..., None]  # a blob whose middle is pixel (60, 40)
+    dot[0] = np.exp(-((x - 60.5) ** 2 + (y - 40.5) ** 2) / 2 / 3**2)[
+        ..., None
+    ]  # a blob whose middle is pixel (60, 40)
     xy = keypoints(dot, np.zeros((1, H, W), bool))[0].xy
     assert np.linalg.norm(xy - (60.5, 40.5), axis=1).min() < 0.15
 
@@ -268,7 +330,9 @@ def test_small_frames_are_doubled_with_their_masks():
 
 def test_every_frame_meets_its_own_exposure():
     pairs = spread_pairs(20)
-    assert {(0, 1), (0, 2), (0, 3), (0, 4), (0, 6), (0, 8), (0, 12), (0, 16)} == {p for p in pairs if p[0] == 0}
+    assert {(0, 1), (0, 2), (0, 3), (0, 4), (0, 6), (0, 8), (0, 12), (0, 16)} == {
+        p for p in pairs if p[0] == 0
+    }
     assert all(i < j < 20 for i, j in pairs)
 
 
@@ -328,7 +392,9 @@ pathlib.Path.write_text = write_text
 def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap")
     (tmp_path / "inject").mkdir()
-    (tmp_path / "inject/sitecustomize.py").write_text(FULL_DISK)  # what Python imports first: in the worker only
+    (tmp_path / "inject/sitecustomize.py").write_text(
+        FULL_DISK
+    )  # what Python imports first: in the worker only
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "inject"), *sys.path]))
     for t, frame in enumerate(sliding(PLACES)):
         io.write_png(tmp_path / f"clip/{t:03d}.png", frame)
@@ -341,7 +407,10 @@ def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, mon
 
 def test_a_disk_without_room_is_full_whatever_the_worker_said(tmp_path):
     sfm.need_room(tmp_path, "all went well")
-    before, handler = resource.getrlimit(resource.RLIMIT_FSIZE), signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    before, handler = (
+        resource.getrlimit(resource.RLIMIT_FSIZE),
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
+    )
     resource.setrlimit(resource.RLIMIT_FSIZE, (sfm.ROOM // 2, before[1]))
     try:
         with pytest.raises(OSError) as full:

@@ -1,4 +1,6 @@
-"""The step engine and the way from footage to a scene: skipped, redone, killed, continued. Priors are given, so that it is quick."""
+"""The step engine and the way from footage to a scene: skipped, redone, killed,
+continued. Priors are given, so that it is quick.
+"""
 
 import json
 import multiprocessing
@@ -24,7 +26,9 @@ EVS = (-2.0, 0.0, 2.0)
 
 
 def footage(folder: Path, count: int = COUNT, blur: float = 0.0) -> Path:
-    """A textured wall at z = 2, seen by a camera that slides along x by 0.1 per frame: the picture moves by -2 pixels."""
+    """A textured wall at z = 2, seen by a camera that slides along x by 0.1 per frame:
+    the picture moves by -2 pixels.
+    """
     pattern = np.random.default_rng(0).normal(size=(H, W + 2 * count, 3))
     if blur:
         pattern = cv2.GaussianBlur(pattern, (0, 0), blur)
@@ -40,20 +44,32 @@ def given(root: Path, count: int = COUNT) -> dict[str, Path]:
     """Exact poses, flow, masks and depth of `footage`."""
     rows = []
     for t in range(count):
-        pose = np.array([[0, 1, 0, 0.1 * t, H], [1, 0, 0, 0, W], [0, 0, -1, 0, FOCAL]])  # LLFF: down, right, back
+        pose = np.array(
+            [[0, 1, 0, 0.1 * t, H], [1, 0, 0, 0, W], [0, 0, -1, 0, FOCAL]]
+        )  # LLFF: down, right, back
         rows.append([*pose.ravel(), 1.0, 4.0])
         write_png(root / f"masks/{t:03d}.png", np.arange(W)[None, :].repeat(H, 0) < 4)
         write_npy(root / f"depth/{t:03d}.npy", np.full((H, W), 2.0, np.float32))
         for other in range(max(t - 2, 0), min(t + 3, count)):
-            write_npy(root / f"flow/{t:05d}_{other:05d}.npy", np.full((H, W, 2), [2.0 * (t - other), 0], np.float32))
+            write_npy(
+                root / f"flow/{t:05d}_{other:05d}.npy",
+                np.full((H, W, 2), [2.0 * (t - other), 0], np.float32),
+            )
     write_npy(root / "poses_bounds.npy", np.array(rows))
-    return {"poses": root / "poses_bounds.npy", "flow": root / "flow", "masks": root / "masks", "depth": root / "depth"}
+    return {
+        "poses": root / "poses_bounds.npy",
+        "flow": root / "flow",
+        "masks": root / "masks",
+        "depth": root / "depth",
+    }
 
 
 @pytest.fixture
 def config(tmp_path: Path) -> PrepareConfig:
     """Everything given, nothing held out."""
-    return PrepareConfig(footage(tmp_path / "clip"), tmp_path / "scene", hold_out=0, **given(tmp_path / "given"))
+    return PrepareConfig(
+        footage(tmp_path / "clip"), tmp_path / "scene", hold_out=0, **given(tmp_path / "given")
+    )
 
 
 def attempts(folder: Path) -> dict[str, int]:
@@ -63,7 +79,11 @@ def attempts(folder: Path) -> dict[str, int]:
 
 def stamps(folder: Path) -> dict[str, int]:
     """When each file was written."""
-    return {p.relative_to(folder).as_posix(): p.stat().st_mtime_ns for p in folder.rglob("*") if p.is_file()}
+    return {
+        p.relative_to(folder).as_posix(): p.stat().st_mtime_ns
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
 
 
 def test_footage_becomes_a_scene_that_opens(config):
@@ -73,7 +93,9 @@ def test_footage_becomes_a_scene_that_opens(config):
     middle = scene.train[5]
     assert (middle.camera.K[0, 0], middle.camera.c2w[0, 3]) == (FOCAL, pytest.approx(0.5))
     assert middle.neighbors == {-1: 4, 1: 6}
-    assert (middle.flow[1] == -2 * np.array([1, 0])).all() and (middle.flow[-1] == 2 * np.array([1, 0])).all()
+    assert (middle.flow[1] == -2 * np.array([1, 0])).all() and (
+        middle.flow[-1] == 2 * np.array([1, 0])
+    ).all()
     assert middle.flow_valid[1][:, 8:-8].all()
     assert middle.moving.sum() == 4 * H
     assert (middle.disparity == 0.5).all()
@@ -85,7 +107,9 @@ def test_the_manifest_says_where_everything_came_from(config):
         "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "masks": "given", "refined_flow": "given",
         "depth": "given", "sheet": "estimated",
     }  # fmt: skip
-    assert m.inputs.keys() == {f"{t:03d}.png" for t in range(COUNT)} and all(len(h) == 64 for h in m.inputs.values())
+    assert m.inputs.keys() == {f"{t:03d}.png" for t in range(COUNT)} and all(
+        len(h) == 64 for h in m.inputs.values()
+    )
     assert (m.cycle, m.exposure_given, m.bracket_ev) == (3, False, [None] * 3)
     assert m.frames[7].source == "007.png"
     assert read_image(config.out / "contact_sheet.png").shape[0] > 5 * H
@@ -94,7 +118,9 @@ def test_the_manifest_says_where_everything_came_from(config):
 def test_frames_are_kept_exactly(config):
     prepare(config)
     for t in (0, 5, 11):
-        assert np.array_equal(read_image(config.out / f"images/{t:05d}.png"), read_image(config.clip / f"{t:03d}.png"))
+        assert np.array_equal(
+            read_image(config.out / f"images/{t:05d}.png"), read_image(config.clip / f"{t:03d}.png")
+        )
 
 
 def test_a_second_run_does_nothing(config):
@@ -118,13 +144,21 @@ def test_frames_are_matched_again_through_the_response_that_flow_tells(config):
     work = begin(replace(config, flow="dis"))
     for name in STEPS:
         do(work, name)
-    assert "at one exposure through the response that flow tells (misfit 0." in work.manifest.steps["refined_flow"].note
+    assert (
+        "at one exposure through the response that flow tells (misfit 0."
+        in work.manifest.steps["refined_flow"].note
+    )
     level, _ = through_response(work, np.zeros((COUNT, H, W), bool))
     dark, bright = level[0, :, 8:-8], level[1, :, 6:-10]  # the wall has gone two pixels to the left
     recorded = [work.video[0, :, 8:-8], work.video[1, :, 6:-10]]
     both = ((recorded[0] > 0.1) & (recorded[1] < 0.9)).all(-1)
     assert both.sum() > 100
-    assert np.abs(dark - bright)[both].mean() < 0.02 < 0.1 < np.abs(recorded[0] - recorded[1])[both].mean()
+    assert (
+        np.abs(dark - bright)[both].mean()
+        < 0.02
+        < 0.1
+        < np.abs(recorded[0] - recorded[1])[both].mean()
+    )
 
     first, moving = COUNT - 3, np.zeros((COUNT, H, W), bool)
     moving[first:] = True  # nothing at rest to ask
@@ -141,16 +175,28 @@ def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(confi
     estimated = replace(config, flow="dis")
     m = Manifest.load(prepare(estimated))
     f = m.frames[4]
-    assert (f.flow[5].flow, f.flow[5].valid) == ("refined_flow/00004_00005.npy", "refined_flow/00004_00005_valid.png")
-    assert (f.raw_flow[5].flow, f.raw_flow[5].valid) == ("raw_flow/00004_00005.npy", "raw_flow/00004_00005_valid.png")
+    assert (f.flow[5].flow, f.flow[5].valid) == (
+        "refined_flow/00004_00005.npy",
+        "refined_flow/00004_00005_valid.png",
+    )
+    assert (f.raw_flow[5].flow, f.raw_flow[5].valid) == (
+        "raw_flow/00004_00005.npy",
+        "raw_flow/00004_00005_valid.png",
+    )
     assert m.steps["refined_flow"].provenance == "estimated"
-    before, after = (np.load(config.out / files[5].flow).astype(np.float32) for files in (f.raw_flow, f.flow))
+    before, after = (
+        np.load(config.out / files[5].flow).astype(np.float32) for files in (f.raw_flow, f.flow)
+    )
     back = np.load(config.out / m.frames[5].raw_flow[4].flow).astype(np.float32)
     sure = read_mask(config.out / f.raw_flow[5].valid) & (round_trip(before, back) < MISSED - 0.02)
     changed = np.abs(halfway(before, back) - after).max(-1)
-    assert changed[:, :4].max() > 0.05 and sure[:, 7:].mean() > 0.5  # 4 columns move, and others go there
+    assert (
+        changed[:, :4].max() > 0.05 and sure[:, 7:].mean() > 0.5
+    )  # 4 columns move, and others go there
     assert np.quantile(changed[:, 7:][sure[:, 7:]], 0.95) < 0.01  # the way back meets it halfway
-    assert m.steps["refined_flow"].note.endswith("equalized by brightness: too few pixels at rest in several exposures")
+    assert m.steps["refined_flow"].note.endswith(
+        "equalized by brightness: too few pixels at rest in several exposures"
+    )
 
     (config.out / "refined_flow/00004_00005.npy").unlink()
     prepare(estimated)
@@ -164,13 +210,19 @@ def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(confi
 
 def test_a_changed_setting_redoes_what_depends_on_it(config):
     prepare(config)
-    write_npy(config.depth / "003.npy", np.full((H, W), 3.0, np.float32))  # the contents of a given folder count
+    write_npy(
+        config.depth / "003.npy", np.full((H, W), 3.0, np.float32)
+    )  # the contents of a given folder count
     prepare(config)
     assert attempts(config.out) == {
         "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "masks": 1, "refined_flow": 1, "depth": 2, "sheet": 2,
     }  # fmt: skip
     prepare(replace(config, ev="-2,0,2"))
-    assert attempts(config.out)["frames"] == 1 and attempts(config.out)["exposure"] == 2 and attempts(config.out)["flow"] == 2
+    assert (
+        attempts(config.out)["frames"] == 1
+        and attempts(config.out)["exposure"] == 2
+        and attempts(config.out)["flow"] == 2
+    )
 
 
 def test_a_lost_file_is_made_again_and_the_others_stay(config):
@@ -254,7 +306,10 @@ def test_held_out_frames_feed_nothing_of_training(config):
     scene = Scene.open(prepare(replace(config, hold_out=4)))
     assert [f.index for f in scene.test] == [2, 6, 10]
     assert [f.time for f in scene.train] == [0, 1, 3, 4, 5, 7, 8, 9, 11]
-    assert scene.train[1].neighbors == {-1: 0, 1: 2} and (scene.train[1].flow[1] == -4 * np.array([1, 0])).all()  # over the gap
+    assert (
+        scene.train[1].neighbors == {-1: 0, 1: 2}
+        and (scene.train[1].flow[1] == -4 * np.array([1, 0])).all()
+    )  # over the gap
     assert all(f.disparity is None and f.moving is not None for f in scene.test)
 
 
@@ -279,7 +334,9 @@ def test_a_rig_has_one_camera_per_folder(tmp_path):
     scene = Scene.open(prepare(config))
     assert [f.camera_id for f in scene.train] == [0] * 6 + [1] * 6
     assert [f.time for f in scene.train] == [*range(6)] * 2
-    assert scene.train[5].neighbors == {-1: 4} and scene.train[6].neighbors == {1: 7}  # never across cameras
+    assert scene.train[5].neighbors == {-1: 4} and scene.train[6].neighbors == {
+        1: 7
+    }  # never across cameras
     assert abs(float(scene.train[2].flow[1][8:-8, 8:-8, 0].median()) + 2) < 0.5
 
 
@@ -287,7 +344,9 @@ def test_a_clip_from_a_tripod_needs_nothing_but_itself(tmp_path):
     wall = np.kron(np.random.default_rng(0).random((12, 16, 3)), np.ones((6, 6, 1))) * 0.2 + 0.05
     for t in range(9):
         world = wall.copy()
-        world[24:44, 6 * t + 4 : 6 * t + 24] = np.kron(np.random.default_rng(1).random((5, 5, 3)), np.ones((4, 4, 1)))
+        world[24:44, 6 * t + 4 : 6 * t + 24] = np.kron(
+            np.random.default_rng(1).random((5, 5, 3)), np.ones((4, 4, 1))
+        )
         write_png(tmp_path / f"clip/{t}.png", np.clip(world * 2.0 ** (t % 2), 0, 1) ** (1 / 2.2))
     scene = Scene.open(prepare(PrepareConfig(tmp_path / "clip", tmp_path / "scene", hold_out=0)))
     assert scene.manifest.parallax == "none" and scene.manifest.cycle == 2

@@ -1,5 +1,7 @@
-"""The protocols split the clip as the published tables do, and what is held out stays out: `prepare` and `train` beside a truth folder that is
-poisoned. (What they import is in test_imports.py.)"""
+"""The protocols split the clip as the published tables do, and what is held out stays
+out: `prepare` and `train` beside a truth folder that is poisoned. (What they import is
+in test_imports.py.)
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,23 @@ def kept(count: int, cycle: int) -> list[int]:
 
 
 def test_every_second_frame_is_trained_on_and_so_is_the_last() -> None:
-    assert kept(9, 3) == [0, 2, 4, 6, 8] and kept(10, 3) == [0, 2, 4, 6, 8, 9] and kept(5, 1) == [0, 2, 4]
+    assert (
+        kept(9, 3) == [0, 2, 4, 6, 8]
+        and kept(10, 3) == [0, 2, 4, 6, 8, 9]
+        and kept(5, 1) == [0, 2, 4]
+    )
 
 
 @pytest.mark.parametrize("cycle", [1, 2, 3, 4, 5, 6])
 def test_half_of_the_frames_show_all_exposures(cycle: int) -> None:
     frames = kept(36, cycle)
     assert {k % cycle for k in frames} == set(range(cycle))
-    assert len(frames) in (18, 19) and frames[0] == 0 and frames[-1] == 35 and max(np.diff(frames)) <= 3
+    assert (
+        len(frames) in (18, 19)
+        and frames[0] == 0
+        and frames[-1] == 35
+        and max(np.diff(frames)) <= 3
+    )
 
 
 def test_of_a_cycle_of_two_each_cycle_begins_with_the_other_half() -> None:
@@ -43,22 +54,38 @@ def test_of_a_cycle_of_two_each_cycle_begins_with_the_other_half() -> None:
 
 def test_novel_view_time_trains_on_every_second_frame_and_links_those(tmp_path: Path) -> None:
     config = PrepareConfig(
-        footage(tmp_path / "clip"), tmp_path / "scene", protocol="novel-view-time", **given(tmp_path / "given")
+        footage(tmp_path / "clip"),
+        tmp_path / "scene",
+        protocol="novel-view-time",
+        **given(tmp_path / "given"),
     )
     scene = Scene.open(prepare(config))
     assert scene.manifest.protocol == "novel-view-time"
-    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8, 10, 11] and [f.time for f in scene.test] == [1, 3, 5, 7, 9]
+    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8, 10, 11] and [
+        f.time for f in scene.test
+    ] == [1, 3, 5, 7, 9]
     middle = scene.train[2]
-    assert middle.neighbors == {-1: 1, 1: 3} and (middle.flow[1] == -4 * np.array([1, 0])).all()  # two frames of -2 pixels
+    assert (
+        middle.neighbors == {-1: 1, 1: 3} and (middle.flow[1] == -4 * np.array([1, 0])).all()
+    )  # two frames of -2 pixels
     assert all(f.disparity is None and not f.flow for f in scene.test)
 
 
 def test_novel_view_trains_on_all_frames(tmp_path: Path) -> None:
-    config = PrepareConfig(footage(tmp_path / "clip"), tmp_path / "scene", protocol="novel-view", **given(tmp_path / "given"))
+    config = PrepareConfig(
+        footage(tmp_path / "clip"),
+        tmp_path / "scene",
+        protocol="novel-view",
+        **given(tmp_path / "given"),
+    )
     scene = Scene.open(prepare(config))
     assert scene.manifest.protocol == "novel-view" and len(scene.train) == COUNT and not scene.test
     changed = Scene.open(prepare(replace(config, protocol=None, hold_out=4)))
-    assert changed.manifest.protocol is None and len(changed.test) == 3 and all(f.disparity is None for f in changed.test)
+    assert (
+        changed.manifest.protocol is None
+        and len(changed.test) == 3
+        and all(f.disparity is None for f in changed.test)
+    )
 
 
 def test_protocols_that_cannot_be_followed_are_refused_in_a_sentence(tmp_path: Path) -> None:
@@ -78,8 +105,15 @@ WATCHED: list[str] = []
 
 
 def watch(event: str, arguments: tuple[object, ...]) -> None:
-    """Notes every file below a watched folder that Python opens, and every such folder that it lists."""
-    if WATCHED and event in ("open", "os.listdir", "os.scandir") and arguments and isinstance(arguments[0], str | bytes):
+    """Notes every file below a watched folder that Python opens, and every such folder
+    that it lists.
+    """
+    if (
+        WATCHED
+        and event in ("open", "os.listdir", "os.scandir")
+        and arguments
+        and isinstance(arguments[0], str | bytes)
+    ):
         name = arguments[0].decode() if isinstance(arguments[0], bytes) else arguments[0]
         OPENED.extend(name for folder in WATCHED if name.startswith(folder))
 
@@ -93,9 +127,15 @@ def made(root: Path) -> Path:
     wall = np.ones((32, 48, 3), np.float32)
     io.write_exr(root / "truth/radiance/a.exr", {"RGB": wall})
     io.write_png(root / "truth/masks/a.png", wall[..., 0] > 2)
-    view = TruthView(name="a", time=2.5, bracket=0, anchor=2, radiance="radiance/a.exr", mask="masks/a.png")
+    view = TruthView(
+        name="a", time=2.5, bracket=0, anchor=2, radiance="radiance/a.exr", mask="masks/a.png"
+    )
     truth = Truth(
-        bracket_ev=[-2.0, 0.0, 2.0], reference_bracket=1, response_x=[0.0, 1.0], response_y=[[0.0, 1.0]] * 3, views=[view]
+        bracket_ev=[-2.0, 0.0, 2.0],
+        reference_bracket=1,
+        response_x=[0.0, 1.0],
+        response_y=[[0.0, 1.0]] * 3,
+        views=[view],
     )
     io.write_json(root / "truth/truth.json", truth.model_dump())
     return root
@@ -108,11 +148,20 @@ def poison(truth: Path) -> None:
 
 
 def trained(root: Path, maps: dict[str, Path]) -> dict[str, np.ndarray | dict[str, object]]:
-    """What `prepare` and `train` make of the clip in `root`: the scene without times, every file's bytes, every tensor."""
-    scene = prepare(PrepareConfig(root / "clip", root / "scene", protocol="novel-view-time", **maps))
-    run = train(replace(PRESETS["tiny"], scene=scene, out=root / "run", steps=6, minutes=None, device="cpu"))
+    """What `prepare` and `train` make of the clip in `root`: the scene without times,
+    every file's bytes, every tensor.
+    """
+    scene = prepare(
+        PrepareConfig(root / "clip", root / "scene", protocol="novel-view-time", **maps)
+    )
+    run = train(
+        replace(PRESETS["tiny"], scene=scene, out=root / "run", steps=6, minutes=None, device="cpu")
+    )
     manifest = Manifest.load(scene).model_dump(exclude={"source"})
-    steps = {name: {k: v for k, v in step.items() if k not in ("seconds", "key")} for name, step in manifest["steps"].items()}
+    steps = {
+        name: {k: v for k, v in step.items() if k not in ("seconds", "key")}
+        for name, step in manifest["steps"].items()
+    }
     found: dict[str, np.ndarray | dict[str, object]] = {"manifest": {**manifest, "steps": steps}}
     found |= {
         p.relative_to(scene).as_posix(): np.frombuffer(p.read_bytes(), np.uint8)

@@ -1,5 +1,7 @@
-"""The rasterizer: numba kernels against the plain-torch twin in float64, that one against finite differences, closed forms, and what
-no scene should hold but some day one does."""
+"""The rasterizer: numba kernels against the plain-torch twin in float64, that one
+against finite differences, closed forms, and what no scene should hold but some day one
+does.
+"""
 
 import hashlib
 import os
@@ -16,7 +18,14 @@ from torch import Tensor
 
 from hdr_nsff.fields.kernels import compositing, projection
 from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
-from hdr_nsff.fields.splat.rasterize import Maps, dense, front_to_back, project, rasterize, rotation_matrices
+from hdr_nsff.fields.splat.rasterize import (
+    Maps,
+    dense,
+    front_to_back,
+    project,
+    rasterize,
+    rotation_matrices,
+)
 from hdr_nsff.geometry.cameras import Camera
 
 FOCAL = 40.0
@@ -24,10 +33,14 @@ NAMES = ("means", "quaternions", "scales", "opacities", "features", "c2w", "foca
 
 
 def camera(width: int = 41, height: int = 27) -> Camera:
-    """A camera that stands aside and looks askew, its center off the middle of the picture."""
+    """A camera that stands aside and looks askew, its center off the middle of the
+    picture.
+    """
     turn = rotation_matrices(torch.tensor([[1.0, 0.05, -0.1, 0.2]], dtype=torch.float64))[0]
     c2w = torch.cat([turn, torch.tensor([[0.1], [-0.2], [0.3]], dtype=torch.float64)], 1)
-    K = torch.tensor([[FOCAL, 0, 0.45 * width], [0, 1.1 * FOCAL, 0.6 * height], [0, 0, 1]], dtype=torch.float64)
+    K = torch.tensor(
+        [[FOCAL, 0, 0.45 * width], [0, 1.1 * FOCAL, 0.6 * height], [0, 0, 1]], dtype=torch.float64
+    )
     return Camera(K, c2w, width, height)
 
 
@@ -37,8 +50,10 @@ def ahead(view: Camera, local: Tensor) -> Tensor:
 
 
 def scene(seed: int, view: Camera, count: int = 60, channels: int = 4) -> list[Tensor]:
-    """Random Gaussians in front of a camera, some beyond its frame: means, quaternions, scales, opacities, features. Float32 numbers
-    in float64, so that both twins see the same ones."""
+    """Random Gaussians in front of a camera, some beyond its frame: means, quaternions,
+    scales, opacities, features. Float32 numbers in float64, so that both twins see the
+    same ones.
+    """
     g = torch.Generator().manual_seed(seed)
     z = 1.5 + 3 * torch.rand(count, 1, generator=g)
     size = torch.tensor([view.width, view.height])
@@ -61,24 +76,39 @@ def everything(maps: Maps) -> Tensor:
 
 def lens(view: Camera, focal: Tensor) -> Camera:
     """The camera with other focal lengths (2,), differentiable in them."""
-    return replace(view, K=torch.diag(torch.cat([focal, focal.new_ones(1)])) + view.K - torch.diag(view.K.diagonal()))
+    return replace(
+        view,
+        K=torch.diag(torch.cat([focal, focal.new_ones(1)]))
+        + view.K
+        - torch.diag(view.K.diagonal()),
+    )
 
 
-def drawn(twin: Callable[..., Maps], gaussians: list[Tensor], view: Camera, weight: Tensor) -> tuple[Tensor, list[Tensor]]:
-    """Maps (H, W, D + 2) and the gradients of their sum with `weight`, of everything in NAMES."""
+def drawn(
+    twin: Callable[..., Maps], gaussians: list[Tensor], view: Camera, weight: Tensor
+) -> tuple[Tensor, list[Tensor]]:
+    """Maps (H, W, D + 2) and the gradients of their sum with `weight`, of everything in
+    NAMES.
+    """
     kind = torch.float32 if twin is rasterize else torch.float64
     leaves = [t.to(kind, copy=True).requires_grad_() for t in gaussians]
     pose, focal = view.c2w.clone().requires_grad_(), view.K[[0, 1], [0, 1]].clone().requires_grad_()
     seen = everything(twin(*leaves, lens(view, focal).moved(pose)))
     (seen * weight).sum().backward()
-    return seen.detach(), [torch.zeros_like(t) if t.grad is None else t.grad.double() for t in (*leaves, pose, focal)]
+    return seen.detach(), [
+        torch.zeros_like(t) if t.grad is None else t.grad.double() for t in (*leaves, pose, focal)
+    ]
 
 
 def sure(gaussians: list[Tensor], view: Camera) -> Tensor:
-    """(H, W) pixels where no alpha is so close to the cut or to the largest one that rounding decides."""
+    """(H, W) pixels where no alpha is so close to the cut or to the largest one that
+    rounding decides.
+    """
     centers, covariance, z = project(*gaussians[:3], view)
     d = view.pixel_grid()[:, None] - centers
-    alpha = gaussians[3] * torch.exp(-0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0])
+    alpha = gaussians[3] * torch.exp(
+        -0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0]
+    )
     unsure = ((alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01) | (
         (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
     )
@@ -86,35 +116,52 @@ def sure(gaussians: list[Tensor], view: Camera) -> Tensor:
 
 
 def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> Tensor:
-    """Both twins show the same, and have the same gradients up to a share of the largest ones. What they show, (H, W, D + 2)."""
+    """Both twins show the same, and have the same gradients up to a share of the
+    largest ones. What they show, (H, W, D + 2).
+    """
     clear = sure(gaussians, view)
     assert clear.double().mean() > 0.8
     shape = (view.height, view.width, gaussians[4].shape[1] + 2)
-    weight = torch.randn(shape, generator=torch.Generator().manual_seed(99), dtype=torch.float64) * clear[..., None]
+    weight = (
+        torch.randn(shape, generator=torch.Generator().manual_seed(99), dtype=torch.float64)
+        * clear[..., None]
+    )
     ours, theirs = (drawn(twin, gaussians, view, weight) for twin in (rasterize, dense))
     top = theirs[0].abs().amax((0, 1)).clamp_min(1.0)
     assert float(((ours[0] - theirs[0]).abs() / top)[clear].max()) < 2e-4
     for name, a, b in zip(NAMES, ours[1], theirs[1], strict=True):
         if b.numel():
             off, largest = float((a - b).abs().max()), float(b.abs().max())
-            assert off <= gradients * largest + 1e-9, f"gradient of {name} is off by {off:.3g}, the largest is {largest:.3g}"
+            assert off <= gradients * largest + 1e-9, (
+                f"gradient of {name} is off by {off:.3g}, the largest is {largest:.3g}"
+            )
     return theirs[0]
 
 
 @pytest.mark.parametrize(
-    ("seed", "channels", "size"), [(0, 4, (41, 27)), (1, 1, (16, 8)), (2, 17, (33, 50)), (3, 4, (1, 1)), (4, 4, (48, 32))]
+    ("seed", "channels", "size"),
+    [(0, 4, (41, 27)), (1, 1, (16, 8)), (2, 17, (33, 50)), (3, 4, (1, 1)), (4, 4, (48, 32))],
 )
-def test_kernels_equal_plain_torch_in_values_and_gradients(seed: int, channels: int, size: tuple[int, int]) -> None:
+def test_kernels_equal_plain_torch_in_values_and_gradients(
+    seed: int, channels: int, size: tuple[int, int]
+) -> None:
     view = camera(*size)
     assert float(compare(scene(seed, view, channels=channels), view)[..., -1].max()) > 0.5
 
 
 def placed(view: Camera, z: tuple[float, float], wide: float, size: float = 1.0) -> list[Tensor]:
-    """Random Gaussians whose z-depths lie in a range, within `wide` of the optical axis at z = 1, sizes multiplied."""
+    """Random Gaussians whose z-depths lie in a range, within `wide` of the optical axis
+    at z = 1, sizes multiplied.
+    """
     gaussians, g = scene(5, view), torch.Generator().manual_seed(7)
     depth = z[0] + (z[1] - z[0]) * torch.rand(60, 1, generator=g)
     local = torch.cat([wide * (torch.rand(60, 2, generator=g) - 0.5) * depth, depth], 1)
-    return [ahead(view, local).float().double(), gaussians[1], (gaussians[2] * size).float().double(), *gaussians[3:]]
+    return [
+        ahead(view, local).float().double(),
+        gaussians[1],
+        (gaussians[2] * size).float().double(),
+        *gaussians[3:],
+    ]
 
 
 def test_nothing_behind_the_camera_is_seen_or_has_a_gradient() -> None:
@@ -135,7 +182,9 @@ def test_kernels_equal_plain_torch_at_the_frames_edge_and_beyond_it() -> None:
     gaussians = placed(view, (1.0, 2.0), 3.0)
     centers = project(*gaussians[:3], view)[0]
     outside = ((centers < -0.3 * 0.5 * 41) | (centers > 1.3 * 41)).any(1)
-    assert 10 < int(outside.sum()) < 50  # there the projection is linearized at the edge, not at the mean
+    assert (
+        10 < int(outside.sum()) < 50
+    )  # there the projection is linearized at the edge, not at the mean
     gradients = drawn(dense, gaussians, view, torch.ones(27, 41, 6, dtype=torch.float64))[1]
     assert int((gradients[0][outside] != 0).any(1).sum()) > 5
     compare(gaussians, view)
@@ -150,14 +199,21 @@ def test_kernels_equal_plain_torch_on_needles(length: float) -> None:
 
 
 def test_kernels_show_needles_whose_center_is_far_outside_as_plain_torch_does() -> None:
-    view, g = camera().moved(torch.eye(4, dtype=torch.float64)[:3]), torch.Generator().manual_seed(7)
+    view, g = (
+        camera().moved(torch.eye(4, dtype=torch.float64)[:3]),
+        torch.Generator().manual_seed(7),
+    )
     angle, z = 6.28 * torch.rand(60, generator=g), 2 + torch.rand(60, 1, generator=g)
-    through = (torch.rand(60, 2, generator=g) - 0.5) * z  # a point in the frame that the needle passes, 30 units from its center
+    through = (
+        torch.rand(60, 2, generator=g) - 0.5
+    ) * z  # a point in the frame that the needle passes, 30 units from its center
     gaussians = scene(5, view)
     gaussians[0] = torch.cat([through + 30 * torch.stack([angle.cos(), angle.sin()], 1), z], 1)
     gaussians[1] = torch.stack([(angle / 2).cos(), 0 * angle, 0 * angle, (angle / 2).sin()], 1)
     gaussians[2] = torch.tensor([30, 1e-3, 1e-3]).expand(60, 3)
-    seen = compare([t.float().double() for t in gaussians], view, gradients=0.1)  # moments of gradients still cancel
+    seen = compare(
+        [t.float().double() for t in gaussians], view, gradients=0.1
+    )  # moments of gradients still cancel
     assert float(seen[..., -1].mean()) > 0.2
 
 
@@ -173,8 +229,13 @@ def test_kernels_equal_plain_torch_at_opacities_0_and_1() -> None:
     view = camera()
     gaussians = scene(5, view)
     gaussians[3] = (gaussians[3] > 0.5).double()
-    for size in (1.0, 1e5):  # alphas above the largest one, whose gradients stop there, fill the picture
-        seen = compare([*gaussians[:2], (gaussians[2] * size).float().double(), *gaussians[3:]], view)
+    for size in (
+        1.0,
+        1e5,
+    ):  # alphas above the largest one, whose gradients stop there, fill the picture
+        seen = compare(
+            [*gaussians[:2], (gaussians[2] * size).float().double(), *gaussians[3:]], view
+        )
         assert float(seen[..., -1].max()) > 0.9
 
 
@@ -195,7 +256,9 @@ def test_plain_torch_agrees_with_finite_differences_pose_and_focal_lengths_inclu
 
 
 def facing(*opacities: float, z: tuple[float, ...]) -> tuple[list[Tensor], Camera]:
-    """Small round Gaussians behind each other, on the middle of pixel (4, 3) of a camera at the origin; features 1, 2, ..."""
+    """Small round Gaussians behind each other, on the middle of pixel (4, 3) of a
+    camera at the origin; features 1, 2, ...
+    """
     view = Camera(torch.tensor([[20.0, 0, 4.5], [0, 20, 3.5], [0, 0, 1]]), torch.eye(4)[:3], 9, 7)
     count = len(z)
     means = torch.tensor([[0.0, 0.0, depth] for depth in z])
@@ -213,8 +276,12 @@ def test_alpha_at_the_center_is_the_opacity_and_depth_is_z(twin: Callable[..., M
     seen = twin(*gaussians, view)
     assert float(seen.alpha.max()) == float(seen.alpha[3, 4]) == pytest.approx(0.7)
     assert float(seen.depth[3, 4] / seen.alpha[3, 4]) == pytest.approx(2.5)
-    variance = (20 / 2.5 * 0.05) ** 2 + 0.3  # pixels^2: one pixel aside it is exp(-1 / 2 variance) of that
-    assert float(seen.alpha[3, 5]) == pytest.approx(0.7 * torch.tensor(-0.5 / variance).exp().item(), rel=1e-4)
+    variance = (
+        20 / 2.5 * 0.05
+    ) ** 2 + 0.3  # pixels^2: one pixel aside it is exp(-1 / 2 variance) of that
+    assert float(seen.alpha[3, 5]) == pytest.approx(
+        0.7 * torch.tensor(-0.5 / variance).exp().item(), rel=1e-4
+    )
 
 
 @both
@@ -237,7 +304,14 @@ def test_of_coincident_gaussians_the_first_is_in_front(twin: Callable[..., Maps]
 
 def test_the_depth_order_is_a_stable_sort_of_all_that_is_drawn() -> None:
     g = np.random.default_rng(0)
-    depths = np.concatenate([g.random(500), g.integers(1, 9, 500), 10.0 ** g.uniform(-2, 30, 200), [-1.0, 0.0, np.nan, np.inf]])
+    depths = np.concatenate(
+        [
+            g.random(500),
+            g.integers(1, 9, 500),
+            10.0 ** g.uniform(-2, 30, 200),
+            [-1.0, 0.0, np.nan, np.inf],
+        ]
+    )
     depths = g.permutation(depths).astype(np.float32)
     order = front_to_back(depths)
     assert sorted(order.tolist()) == list(range(len(depths)))
@@ -257,15 +331,27 @@ def test_opacity_never_exceeds_1_however_many_there_are() -> None:
 @both
 @pytest.mark.parametrize(
     ("part", "bad"),
-    [(0, float("nan")), (1, float("nan")), (2, float("nan")), (3, float("nan")), (0, float("inf")), (2, float("inf"))],
+    [
+        (0, float("nan")),
+        (1, float("nan")),
+        (2, float("nan")),
+        (3, float("nan")),
+        (0, float("inf")),
+        (2, float("inf")),
+    ],
 )
-def test_a_gaussian_that_is_no_number_is_not_drawn_and_harms_no_other(twin: Callable[..., Maps], part: int, bad: float) -> None:
+def test_a_gaussian_that_is_no_number_is_not_drawn_and_harms_no_other(
+    twin: Callable[..., Maps], part: int, bad: float
+) -> None:
     view = camera()
     gaussians = scene(0, view)
     rest = [torch.cat([t[:7], t[8:]]) for t in gaussians]
     gaussians[part].view(60, -1)[7, -1] = bad
     weight = torch.ones(27, 41, 6, dtype=torch.float64)
-    (seen, gradients), (expected, theirs) = drawn(twin, gaussians, view, weight), drawn(twin, rest, view, weight)
+    (seen, gradients), (expected, theirs) = (
+        drawn(twin, gaussians, view, weight),
+        drawn(twin, rest, view, weight),
+    )
     assert torch.equal(seen, expected)
     for a, b in zip(gradients[:5], theirs[:5], strict=True):
         assert float(a[7].abs().max()) == 0
@@ -294,7 +380,9 @@ def fingerprints() -> None:
 def test_the_result_is_the_same_to_the_bit_for_any_number_of_threads() -> None:
     environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
     code = "import test_rasterize; test_rasterize.fingerprints()"
-    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
     hashes = said.stdout.split()
     assert len(hashes) == 4 and len(set(hashes)) == 1
 
@@ -312,14 +400,17 @@ def test_a_missing_gsplat_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("channels", [1, 4, 17, 40])
 @pytest.mark.parametrize("installed", [True, False])
-def test_cuda_equals_plain_torch(channels: int, installed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cuda_equals_plain_torch(
+    channels: int, installed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     if installed:
         pytest.importorskip("gsplat")
     monkeypatch.setattr(rasterize_cuda, "available", lambda: installed)
     view = camera()
     gaussians = scene(0, view, channels=channels)
     weight = (
-        torch.randn(27, 41, channels + 2, generator=torch.Generator().manual_seed(99)).double() * sure(gaussians, view)[..., None]
+        torch.randn(27, 41, channels + 2, generator=torch.Generator().manual_seed(99)).double()
+        * sure(gaussians, view)[..., None]
     )
     leaves = [t.float().cuda().requires_grad_() for t in gaussians]
     pose, focal = (t.float().cuda().requires_grad_() for t in (view.c2w, view.K[[0, 1], [0, 1]]))

@@ -26,7 +26,9 @@ def test_response_and_its_inverse_cancel(name: str) -> None:
 
 
 def test_film_is_no_gamma_curve_and_differs_between_channels() -> None:
-    """The local exponent d log y / d log x of a gamma curve is one number; film's changes by more than half of it."""
+    """The local exponent d log y / d log x of a gamma curve is one number; film's
+    changes by more than half of it.
+    """
     curve = response_curve("film")
     slope = np.gradient(np.log(curve.y[:, 8:]), axis=1) / np.gradient(np.log(curve.x[8:]))
     assert (slope.max(1) / slope.min(1) > 1.5).all()
@@ -44,7 +46,8 @@ def test_white_balance_is_a_gain_per_channel_before_the_response() -> None:
     radiance = np.full((1, 1, 3), 0.25)
     curve = response_curve("gamma")
     rgb = record(radiance, 0.0, (1.0, 2.0, 4.0), curve, None, np.random.default_rng(0))
-    # 0.25^(1/2.2) = 0.5325 -> 136/255; 0.5^(1/2.2) = 0.7297 -> 186/255; the third channel saturates
+    # 0.25^(1/2.2) = 0.5325 -> 136/255; 0.5^(1/2.2) = 0.7297 -> 186/255; the third
+    # channel saturates
     np.testing.assert_allclose(rgb[0, 0] * 255, [136, 186, 255], atol=1e-4)
 
 
@@ -67,14 +70,22 @@ def test_noise_has_the_stated_variance_and_the_seed_repeats_it() -> None:
 def test_a_short_exposure_is_relatively_noisier() -> None:
     radiance = np.full((100, 100, 3), 0.5)
     curve, rng = response_curve("film"), np.random.default_rng(0)
-    long, short = (curve.invert(record(radiance, ev, GRAY, curve, Noise(), rng)) for ev in (0.0, -4.0))
-    assert short.std() / short.mean() > 3 * long.std() / long.mean()  # shot noise alone: sqrt(16) = 4
+    long, short = (
+        curve.invert(record(radiance, ev, GRAY, curve, Noise(), rng)) for ev in (0.0, -4.0)
+    )
+    assert (
+        short.std() / short.mean() > 3 * long.std() / long.mean()
+    )  # shot noise alone: sqrt(16) = 4
 
 
 def test_light_falls_off_by_the_fourth_power_of_the_cosine() -> None:
-    """At 45 degrees from the axis cos^4 is 1/4; half the strength takes half as much away. On the axis all light passes."""
+    """At 45 degrees from the axis cos^4 is 1/4; half the strength takes half as much
+    away. On the axis all light passes.
+    """
     K = np.array([[2.0, 0, 2.5], [0, 2.0, 0.5], [0, 0, 1]])
-    assert vignette(1, 5, K, 1.0)[0, :, 0] == pytest.approx([0.25, 0.64, 1.0, 0.64, 0.25])  # tangents -1, -1/2, 0, 1/2, 1
+    assert vignette(1, 5, K, 1.0)[0, :, 0] == pytest.approx(
+        [0.25, 0.64, 1.0, 0.64, 0.25]
+    )  # tangents -1, -1/2, 0, 1/2, 1
     assert vignette(1, 5, K, 0.5)[0, 0, 0] == pytest.approx(0.625)
     assert (vignette(4, 4, K, 0.0) == 1).all()
 

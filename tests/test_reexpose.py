@@ -1,4 +1,6 @@
-"""Re-exposed clips: what is recorded, what is kept aside, and what each says about the other."""
+"""Re-exposed clips: what is recorded, what is kept aside, and what each says about the
+other.
+"""
 
 import json
 from pathlib import Path
@@ -24,9 +26,14 @@ def ordinary_clip(folder: Path, count: int = 20, width: int = 40) -> Path:
 
 
 def llff(count: int, width: int = 40, height: int = 24) -> np.ndarray:
-    """poses_bounds rows (count, 17): axes of the world (columns down, right, back of an OpenCV identity), center (t, 0, 0), focal 50."""
+    """poses_bounds rows (count, 17): axes of the world (columns down, right, back of an
+    OpenCV identity), center (t, 0, 0), focal 50.
+    """
     pose = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
-    rows = [np.concatenate([pose, [[t], [0], [0]], [[height], [width], [50]]], 1).ravel() for t in range(count)]
+    rows = [
+        np.concatenate([pose, [[t], [0], [0]], [[height], [width], [50]]], 1).ravel()
+        for t in range(count)
+    ]
     return np.concatenate([np.array(rows), np.full((count, 1), 1.0), np.full((count, 1), 9.0)], 1)
 
 
@@ -34,19 +41,31 @@ def test_without_poses_truth_frames_stay_in_the_clip(tmp_path):
     out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out"))
     truth = Truth.open(out / "truth")
     assert len(list((out / "clip").glob("*.png"))) == 20
-    assert [(v.time, v.anchor, v.bracket, v.c2w) for v in truth.views] == [(4, 4, 1, None), (12, 12, 0, None)]
+    assert [(v.time, v.anchor, v.bracket, v.c2w) for v in truth.views] == [
+        (4, 4, 1, None),
+        (12, 12, 0, None),
+    ]
 
 
 def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbors(tmp_path):
     write_npy(tmp_path / "poses_bounds.npy", llff(20))
-    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"))
+    out = reexpose(
+        ReexposeConfig(
+            ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"
+        )
+    )
     truth = Truth.open(out / "truth")
     assert len(list((out / "clip").glob("*.png"))) == 18
-    assert [(v.name, v.time, v.anchor) for v in truth.views] == [("00004", 3.5, 3), ("00012", 10.5, 10)]
+    assert [(v.name, v.time, v.anchor) for v in truth.views] == [
+        ("00004", 3.5, 3),
+        ("00012", 10.5, 10),
+    ]
     assert truth.views[0].c2w == [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert [pose[0][3] for pose in truth.clip_c2w] == [t for t in range(20) if t not in (4, 12)]
     assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
-    again = import_poses(out / "poses_bounds.npy", [f"{k}.png" for k in range(18)], (24, 40))  # what `prepare --poses` will read
+    again = import_poses(
+        out / "poses_bounds.npy", [f"{k}.png" for k in range(18)], (24, 40)
+    )  # what `prepare --poses` will read
     assert np.allclose(again.c2w, truth.clip_c2w) and np.allclose(again.K, truth.K)
 
 
@@ -54,7 +73,9 @@ def test_recordings_follow_the_response_and_truth_is_the_clip(tmp_path):
     out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", noise=0))
     radiance = read_exr(out / "truth/radiance/00004.exr")["RGB"]
     assert np.allclose(radiance, read_image(tmp_path / "in/004.png") ** 2.2, rtol=2e-3)
-    expected = response_curve("film").apply(np.clip(radiance * 2.0**0, 0, 1))  # frame 4 is in bracket 1: EV 0
+    expected = response_curve("film").apply(
+        np.clip(radiance * 2.0**0, 0, 1)
+    )  # frame 4 is in bracket 1: EV 0
     assert np.abs(read_image(out / "clip/00004.png") - expected).max() < 1.5 / 255
 
 
@@ -83,7 +104,9 @@ def test_noise_repeats_with_its_seed(tmp_path):
 def test_masks_of_the_clip_become_masks_of_the_truth(tmp_path):
     for t in range(20):
         write_png(tmp_path / f"masks/{t:03d}.png", np.full((24, 40), t == 12))
-    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", masks=tmp_path / "masks"))
+    out = reexpose(
+        ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", masks=tmp_path / "masks")
+    )
     views = Truth.open(out / "truth").views
     assert [read_image(out / "truth" / v.mask).mean() for v in views] == [0, 1]
 
@@ -91,7 +114,12 @@ def test_masks_of_the_clip_become_masks_of_the_truth(tmp_path):
 def test_poses_shrink_with_the_frames(tmp_path):
     write_npy(tmp_path / "poses_bounds.npy", llff(20))
     out = reexpose(
-        ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy", max_size=20)
+        ReexposeConfig(
+            ordinary_clip(tmp_path / "in"),
+            tmp_path / "out",
+            poses=tmp_path / "poses_bounds.npy",
+            max_size=20,
+        )
     )
     assert Truth.open(out / "truth").K == [[25, 0, 10], [0, 25, 6], [0, 0, 1]]
 
@@ -116,7 +144,9 @@ def test_output_of_another_clip_is_not_touched(tmp_path):
         reexpose(ReexposeConfig(ordinary_clip(tmp_path / "b", 19), tmp_path / "out"))
     with pytest.raises(InputError, match="not made by reexpose"):
         reexpose(ReexposeConfig(tmp_path / "a", tmp_path / "b"))
-    assert (tmp_path / "out/reexpose.json").read_text() == told and json.loads(told)["ev"] == "-2,0,2"
+    assert (tmp_path / "out/reexpose.json").read_text() == told and json.loads(told)[
+        "ev"
+    ] == "-2,0,2"
 
 
 @pytest.mark.parametrize(
@@ -138,4 +168,10 @@ def test_bad_settings_are_named(tmp_path, change, what):
 def test_too_few_poses_are_named(tmp_path):
     write_npy(tmp_path / "poses_bounds.npy", llff(7))
     with pytest.raises(InputError, match="7 poses for 20 frames"):
-        reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", poses=tmp_path / "poses_bounds.npy"))
+        reexpose(
+            ReexposeConfig(
+                ordinary_clip(tmp_path / "in"),
+                tmp_path / "out",
+                poses=tmp_path / "poses_bounds.npy",
+            )
+        )

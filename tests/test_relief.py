@@ -1,4 +1,6 @@
-"""Relief of a turning ellipsoid in front of a wall, in closed form: exact flow, and depth that knows one distance per time only."""
+"""Relief of a turning ellipsoid in front of a wall, in closed form: exact flow, and
+depth that knows one distance per time only.
+"""
 
 from dataclasses import replace
 
@@ -24,7 +26,9 @@ RAYS = np.stack([(X - W / 2) / FOCAL, (Y - H / 2) / FOCAL, np.ones((H, W))], -1)
 
 
 def body(t: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the ellipsoid is seen at a time (H, W) and its z-depth there: the nearer root of |diag(1 / axes) R^T (x - place)| = 1."""
+    """Where the ellipsoid is seen at a time (H, W) and its z-depth there: the nearer
+    root of |diag(1 / axes) R^T (x - place)| = 1.
+    """
     ray, eye = RAYS @ ROTATIONS[t] / AXES, (EYES[t] - PLACES[t]) @ ROTATIONS[t] / AXES
     a, b, c = (ray**2).sum(-1), (ray * eye).sum(-1), (eye**2).sum() - 1
     inside = b**2 - a * c > 0
@@ -32,7 +36,9 @@ def body(t: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flow(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Exact flow (H, W, 2) from time i to j, and where the content is still seen (H, W): the ellipsoid's side that faces the camera."""
+    """Exact flow (H, W, 2) from time i to j, and where the content is still seen (H,
+    W): the ellipsoid's side that faces the camera.
+    """
     inside, z = body(i)
     points = EYES[i] + RAYS * np.where(inside, z, WALL)[..., None]
     local = (points - PLACES[i]) @ ROTATIONS[i]
@@ -54,24 +60,44 @@ class Clip:
         self.valid = np.array([v for _, v in flows], bool).reshape(-1, H, W)
         seen = [body(t) for t in range(times)]
         self.moving = np.array([m for m, _ in seen])
-        self.true = np.array([np.where(m, 1 / np.where(m, z, 1), 1 / WALL) for m, z in seen], np.float32)
-        flat = [np.where(m, d[m].mean(), 1 / WALL) for d, m in zip(self.true, self.moving, strict=True)]
+        self.true = np.array(
+            [np.where(m, 1 / np.where(m, z, 1), 1 / WALL) for m, z in seen], np.float32
+        )
+        flat = [
+            np.where(m, d[m].mean(), 1 / WALL) for d, m in zip(self.true, self.moving, strict=True)
+        ]
         self.flat = np.array(flat, np.float32)
         self.confidence = np.where(self.moving, np.float32(0.3), np.float32(0.9))
         c2w = np.concatenate([np.tile(np.eye(3), (times, 1, 1)), EYES[:times, :, None]], 2)
         video = np.full((times, H, W, 3), 0.5, np.float32)
         self.clip = PosedVideo(
-            np.tile(K, (times, 1, 1)), c2w, np.arange(times) * 1.0, video, np.zeros((times, H, W), bool), self.moving
+            np.tile(K, (times, 1, 1)),
+            c2w,
+            np.arange(times) * 1.0,
+            video,
+            np.zeros((times, H, W), bool),
+            self.moving,
         )
 
     def relief(self, **other) -> tuple[np.ndarray, np.ndarray]:
         """With some of the arguments replaced."""
-        given = {"clip": self.clip, "flow": self.flow, "valid": self.valid, "pairs": self.pairs, "disparity": self.flat} | other
+        given = {
+            "clip": self.clip,
+            "flow": self.flow,
+            "valid": self.valid,
+            "pairs": self.pairs,
+            "disparity": self.flat,
+        } | other
         return relief(**given, confidence=self.confidence)
 
     def wrong(self, disparity: np.ndarray) -> np.ndarray:
         """Mean absolute error (T,) of disparity inside the masks."""
-        return np.array([abs(d - t)[m].mean() for d, t, m in zip(disparity, self.true, self.moving, strict=True)])
+        return np.array(
+            [
+                abs(d - t)[m].mean()
+                for d, t, m in zip(disparity, self.true, self.moving, strict=True)
+            ]
+        )
 
 
 @pytest.fixture(scope="module")
@@ -101,23 +127,35 @@ def test_the_clip_is_what_it_says(clip: Clip) -> None:
     assert 1 / clip.true[3][tuple(there.astype(int)[::-1])] == pytest.approx(moved[2], abs=0.02)
 
 
-def test_relief_is_found_where_depth_knew_one_distance(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
+def test_relief_is_found_where_depth_knew_one_distance(
+    clip: Clip, found: tuple[np.ndarray, np.ndarray]
+) -> None:
     before, after = clip.wrong(clip.flat), clip.wrong(found[0])
-    assert before.min() > 0.009 and (after < 0.7 * before).all() and after.mean() < 0.55 * before.mean()
-    distance = np.median((found[0] / clip.true)[clip.moving])  # found from the camera's shake, not given by depth
+    assert (
+        before.min() > 0.009
+        and (after < 0.7 * before).all()
+        and after.mean() < 0.55 * before.mean()
+    )
+    distance = np.median(
+        (found[0] / clip.true)[clip.moving]
+    )  # found from the camera's shake, not given by depth
     assert distance == pytest.approx(1, abs=0.02)
     relief_alone = clip.wrong(found[0] / distance)
     assert (relief_alone < 0.3 * before).all() and relief_alone.mean() < 0.2 * before.mean()
 
 
-def test_nothing_changes_outside_the_masks(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
+def test_nothing_changes_outside_the_masks(
+    clip: Clip, found: tuple[np.ndarray, np.ndarray]
+) -> None:
     disparity, confidence = found
     assert np.array_equal(disparity[~clip.moving], clip.flat[~clip.moving])
     assert np.array_equal(confidence[~clip.moving], clip.confidence[~clip.moving])
     assert disparity.dtype == confidence.dtype == np.float32
 
 
-def test_confidence_grows_at_tracks_and_never_falls(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
+def test_confidence_grows_at_tracks_and_never_falls(
+    clip: Clip, found: tuple[np.ndarray, np.ndarray]
+) -> None:
     confidence = found[1]
     assert (confidence >= clip.confidence).all()
     assert 0.46 < np.median(confidence[clip.moving]) <= confidence[clip.moving].max() <= 0.5
@@ -125,12 +163,16 @@ def test_confidence_grows_at_tracks_and_never_falls(clip: Clip, found: tuple[np.
 
 def test_what_was_given_stays_as_it_was(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
     fresh = Clip()
-    assert np.array_equal(clip.flat, fresh.flat) and np.array_equal(clip.confidence, fresh.confidence)
+    assert np.array_equal(clip.flat, fresh.flat) and np.array_equal(
+        clip.confidence, fresh.confidence
+    )
 
 
 def untouched(short: Clip, **other) -> bool:
     disparity, confidence = short.relief(**other)
-    return np.array_equal(disparity, other.get("disparity", short.flat)) and np.array_equal(confidence, short.confidence)
+    return np.array_equal(disparity, other.get("disparity", short.flat)) and np.array_equal(
+        confidence, short.confidence
+    )
 
 
 def test_without_movers_nothing_changes(short: Clip) -> None:
@@ -161,11 +203,15 @@ def test_a_mover_in_one_frame_alone_changes_nothing(short: Clip) -> None:
 def test_of_several_frames_of_one_time_the_first_speaks(short: Clip) -> None:
     again = [0, 1, 2, 3, 4, 5, 3]  # one more frame of time 3
     s = short.clip
-    clip = PosedVideo(s.K[again], s.c2w[again], s.times[again], s.video[again], s.clipped[again], s.moving[again])
+    clip = PosedVideo(
+        s.K[again], s.c2w[again], s.times[again], s.video[again], s.clipped[again], s.moving[again]
+    )
     twice = Clip(6)
     twice.confidence = short.confidence[again]
     disparity, _ = twice.relief(clip=clip, disparity=short.flat[again])
-    assert np.array_equal(disparity[:6], short.relief()[0]) and np.array_equal(disparity[6], short.flat[3])
+    assert np.array_equal(disparity[:6], short.relief()[0]) and np.array_equal(
+        disparity[6], short.flat[3]
+    )
 
 
 def test_a_pixel_takes_the_depth_of_the_tracks_near_it_unless_it_differs_much(short: Clip) -> None:
@@ -173,10 +219,22 @@ def test_a_pixel_takes_the_depth_of_the_tracks_near_it_unless_it_differs_much(sh
     disparity[32, 50], disparity[32, 51], confidence[32, 49] = 0, 0.2, 0.9
     points = EYES[:1] + RAYS[32, 48] * 2.2  # a track whose disparity is 1 / 2.2 = 0.455
     place = np.array([[[48.5, 32.5]]])
-    tracks = Tracks(place, points[None], np.ones((1, 1)), np.ones((1, 1), int), np.zeros((1, 1), int))
+    tracks = Tracks(
+        place, points[None], np.ones((1, 1)), np.ones((1, 1), int), np.zeros((1, 1), int)
+    )
     group = Group(np.eye(3)[None], np.zeros((1, 3)), np.zeros(3), np.array([0]), np.array([True]))
-    apply(short.clip.moving[0], short.clip.c2w[0], 0, tracks, [Shape(group, points, 0.1)], disparity, confidence)
-    assert disparity[32, [48, 49, 50, 51, 57]] == pytest.approx([1 / 2.2, 1 / 2.2, 0, 0.2, 0.4])  # 57 is out of reach
+    apply(
+        short.clip.moving[0],
+        short.clip.c2w[0],
+        0,
+        tracks,
+        [Shape(group, points, 0.1)],
+        disparity,
+        confidence,
+    )
+    assert disparity[32, [48, 49, 50, 51, 57]] == pytest.approx(
+        [1 / 2.2, 1 / 2.2, 0, 0.2, 0.4]
+    )  # 57 is out of reach
     assert confidence[32, [48, 49, 50, 57]] == pytest.approx([0.5, 0.9, 0, 0])
 
 

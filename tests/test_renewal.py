@@ -17,7 +17,9 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 
 
-def misfit(error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA) -> FrameError:
+def misfit(
+    error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA
+) -> FrameError:
     wrong = torch.ones(camera.height, camera.width) if error is None else error
     return FrameError(camera, time, lambda radiance: wrong.flatten())
 
@@ -30,12 +32,17 @@ def corner() -> torch.Tensor:
 
 
 def test_blame_is_the_weights_of_the_slow_twin_times_the_error() -> None:
-    field, error = scattered(), torch.rand(CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(1))
+    field, error = (
+        scattered(),
+        torch.rand(CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(1)),
+    )
     cloud = field.cloud(field.knot(3.0))
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
     own = dense(*(p.detach() for p in parts), torch.eye(len(cloud.means)), CAMERA)  # weights
     told = field.error_scores(misfit(error))
-    torch.testing.assert_close(told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(
+        told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3
+    )
     torch.testing.assert_close(told[:, 1], own.features.sum((0, 1)), atol=1e-3, rtol=1e-3)
 
 
@@ -53,7 +60,9 @@ def test_unseen_gaussians_go_where_the_error_is() -> None:
     there = in_corner(field)
     count = field.relocate([misfit(corner())], torch.Generator().manual_seed(0))
     assert count == int(MOST * len(field.static))  # more are unseen
-    assert there + 0.6 * count < in_corner(field) <= there + count  # some were faint ones of that quarter
+    assert (
+        there + 0.6 * count < in_corner(field) <= there + count
+    )  # some were faint ones of that quarter
 
 
 def test_floaters_that_no_view_sees_are_put_to_use() -> None:
@@ -71,26 +80,42 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
     seen = field.error_scores(misfit())[: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
-    assert int((~kept & seen).sum()) <= 2 * MOST * len(field.static)  # the halves and what they were cut from
+    assert int((~kept & seen).sum()) <= 2 * MOST * len(
+        field.static
+    )  # the halves and what they were cut from
 
 
 def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
     field = scattered()
     g, told = field.moving, torch.zeros(30, 2)
-    told[:, 1], told[4, 0], told[7, 1] = 1.0, 3.0, 0.0  # all seen but the eighth; only the fifth is to error_scores
-    g.quaternions.data[4], g.log_scales.data[4] = torch.tensor([1.0, 0, 0, 0]), torch.tensor([-2.0, -1.0, -3.0])
+    told[:, 1], told[4, 0], told[7, 1] = (
+        1.0,
+        3.0,
+        0.0,
+    )  # all seen but the eighth; only the fifth is to error_scores
+    g.quaternions.data[4], g.log_scales.data[4] = (
+        torch.tensor([1.0, 0, 0, 0]),
+        torch.tensor([-2.0, -1.0, -3.0]),
+    )
     mean, mixture, opacity_offsets = (
         g.means[4].detach().clone(),
         field.mixture_logits[:, 4].clone(),
         field.opacity_offsets[:, 4].clone(),
     )
     others = g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]].clone()
-    assert relocate(g, told, [field.opacity_offsets, field.mixture_logits], torch.Generator().manual_seed(0)) == 1
+    assert (
+        relocate(
+            g, told, [field.opacity_offsets, field.mixture_logits], torch.Generator().manual_seed(0)
+        )
+        == 1
+    )
     along = torch.tensor([0.0, PARTED * math.exp(-1.0), 0.0])
     torch.testing.assert_close(g.means[4].detach(), mean - along)
     torch.testing.assert_close(g.means[7].detach(), mean + along)
     for i in (4, 7):
-        torch.testing.assert_close(g.log_scales[i].detach(), torch.tensor([-2.0, -1.0 + math.log(NARROWER), -3.0]))
+        torch.testing.assert_close(
+            g.log_scales[i].detach(), torch.tensor([-2.0, -1.0 + math.log(NARROWER), -3.0])
+        )
         torch.testing.assert_close(field.mixture_logits[:, i], mixture)
         torch.testing.assert_close(field.opacity_offsets[:, i], opacity_offsets)
     torch.testing.assert_close(g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]], others)
@@ -99,12 +124,19 @@ def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
 def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]
-    assert field.relocate([misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)) == 0
+    assert (
+        field.relocate(
+            [misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)
+        )
+        == 0
+    )
     assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("shiny", [False, True])
-def test_training_renews_until_late_in_the_run(toy: Scene, toy_folder: Path, tmp_path: Path, shiny: bool) -> None:
+def test_training_renews_until_late_in_the_run(
+    toy: Scene, toy_folder: Path, tmp_path: Path, shiny: bool
+) -> None:
     config = small("splat", toy_folder, tmp_path / "run", steps=10)
     config = replace(config, field=replace(config.field, relocate_every=1, view_dependence=shiny))
     t = trainer(config, toy)

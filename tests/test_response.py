@@ -1,4 +1,6 @@
-"""Debevec's initialization against simulated cameras: response and exposures come back, outliers and misplaced points do not matter."""
+"""Debevec's initialization against simulated cameras: response and exposures come back,
+outliers and misplaced points do not matter.
+"""
 
 import math
 from pathlib import Path
@@ -30,13 +32,17 @@ U = np.linspace(0, 1, 2001)
 X = U**2.2
 GAMMA22 = np.stack([U] * 3)
 SRGB = np.stack([np.where(X <= 0.0031308, 12.92 * X, 1.055 * X ** (1 / 2.4) - 0.055)] * 3)
-S_CURVE = np.stack([U - k * np.sin(2 * np.pi * U) / (2 * np.pi) for k in (0.2, 0.3, 0.4)])  # other per channel
+S_CURVE = np.stack(
+    [U - k * np.sin(2 * np.pi * U) / (2 * np.pi) for k in (0.2, 0.3, 0.4)]
+)  # other per channel
 EV = [-4.0, -2.0, 0.0]
 
 
 def record(exposure, curve, rng):
     """8 bits of a noisy sensor: (..., 3)."""
-    noisy = exposure + rng.standard_normal(exposure.shape) * np.sqrt(1e-6 + np.clip(exposure, 0, 1) / 6000)
+    noisy = exposure + rng.standard_normal(exposure.shape) * np.sqrt(
+        1e-6 + np.clip(exposure, 0, 1) / 6000
+    )
     z = np.stack([np.interp(np.clip(noisy[..., c], 0, 1), X, curve[c]) for c in range(3)], -1)
     return np.rint(z * 255) / 255
 
@@ -46,7 +52,9 @@ def points(curve, ev, num=700, outliers=0.0, seed=0):
     radiance = 2 ** rng.uniform(-7, 3, (num, 1, 1)) * 2 ** rng.normal(0, 0.5, (num, 1, 3))
     exposure = radiance * 2.0 ** np.array(ev)[:, None]
     wrong = rng.random((num, len(ev), 1)) < outliers
-    z = record(np.where(wrong, exposure * 2 ** rng.normal(0, 1, exposure.shape), exposure), curve, rng)
+    z = record(
+        np.where(wrong, exposure * 2 ** rng.normal(0, 1, exposure.shape), exposure), curve, rng
+    )
     return Samples(z, (z >= LOW) & (z <= HIGH), z >= SATURATED)
 
 
@@ -76,7 +84,9 @@ def test_unknown_exposures_of_a_typical_camera_come_back():
 
 
 @pytest.mark.parametrize("curve", [GAMMA22, SRGB, S_CURVE], ids=["gamma", "srgb", "s-curve"])
-@pytest.mark.parametrize("ev", [EV, [-3.0, 0.0], [0.0, 1.0, 2.0]], ids=["2 stops", "3 stops", "1 stop"])
+@pytest.mark.parametrize(
+    "ev", [EV, [-3.0, 0.0], [0.0, 1.0, 2.0]], ids=["2 stops", "3 stops", "1 stop"]
+)
 def test_unknown_exposures_in_whole_stops_come_back_whatever_the_curve(curve, ev):
     fit = debevec(points(curve, ev), [None] * len(ev), reference=len(ev) - 1)
     np.testing.assert_allclose(fit.ev, np.array(ev) - ev[-1], atol=0.08)
@@ -104,7 +114,9 @@ def test_the_typical_factor_undoes_any_power_of_srgb():
 
 
 def test_saturation_is_where_recordings_begin_to_saturate():
-    """Linear camera, one channel: exposures 0.1 ... 0.4 read in the dark frame; two stops brighter, those above 0.25 saturate."""
+    """Linear camera, one channel: exposures 0.1 ... 0.4 read in the dark frame; two
+    stops brighter, those above 0.25 saturate.
+    """
     dark = np.linspace(0.1, 0.4, 301)[:, None]
     light = np.minimum(4 * dark, 1)
     rgb = np.stack([dark, light], 1).repeat(3, -1)  # (P, 2, 3)
@@ -115,8 +127,12 @@ def test_saturation_is_where_recordings_begin_to_saturate():
 
 
 def test_shadows_do_not_move_saturation():
-    """As above, but points that fell into shadow before the brighter frame outnumber those that are just bright enough to saturate."""
-    dark = np.concatenate([np.linspace(0.05, 0.225, 300), np.linspace(0.23, 0.4, 30), np.linspace(0.278, 0.6, 40)])[:, None]
+    """As above, but points that fell into shadow before the brighter frame outnumber
+    those that are just bright enough to saturate.
+    """
+    dark = np.concatenate(
+        [np.linspace(0.05, 0.225, 300), np.linspace(0.23, 0.4, 30), np.linspace(0.278, 0.6, 40)]
+    )[:, None]
     light = np.minimum(4 * dark, 1)
     light[300:330] = 0.3
     rgb = np.stack([dark, light], 1).repeat(3, -1)
@@ -146,7 +162,9 @@ def test_brightness_alone_gives_gamma_exposures():
     rng = np.random.default_rng(0)
     radiance = 2 ** rng.uniform(-5, 1, (40, 50, 3))
     images = [record(radiance * 2.0**ev, GAMMA22, rng) for ev in EV]
-    assert brightness_ev(images, [0, 1, 2], reference=2, num_brackets=3) == pytest.approx(EV, abs=0.15)
+    assert brightness_ev(images, [0, 1, 2], reference=2, num_brackets=3) == pytest.approx(
+        EV, abs=0.15
+    )
 
 
 K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
@@ -160,7 +178,9 @@ def wall(x, y):
 
 
 def wall_view(index, curve, rng, depth_noise=0.0, shift=0.06):
-    """Camera `index` beside the others, before the wall; a square that moves is marked as moving."""
+    """Camera `index` beside the others, before the wall; a square that moves is marked
+    as moving.
+    """
     column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
     x = (column - K[0, 2]) / K[0, 0] * 4 + shift * index
     y = (row - K[1, 2]) / K[1, 1] * 4
@@ -170,7 +190,16 @@ def wall_view(index, curve, rng, depth_noise=0.0, shift=0.06):
     c2w = np.concatenate([np.eye(3), [[shift * index], [0], [0]]], 1)
     disparity = 0.25 * (1 + depth_noise * rng.standard_normal((HEIGHT, WIDTH)))
     bracket = index % 3
-    return View(record(radiance * 2.0 ** EV[bracket], curve, rng), bracket, float(index), K, c2w, disparity, None, moving)
+    return View(
+        record(radiance * 2.0 ** EV[bracket], curve, rng),
+        bracket,
+        float(index),
+        K,
+        c2w,
+        disparity,
+        None,
+        moving,
+    )
 
 
 def test_static_points_are_the_same_points_in_every_bracket():
@@ -179,7 +208,10 @@ def test_static_points_are_the_same_points_in_every_bracket():
     both = samples.valid[:, 1] & samples.valid[:, 2]
     ratio = 2.2 * np.log2(samples.rgb[:, 2][both] / samples.rgb[:, 1][both])
     assert both.sum() > 300
-    assert np.median(ratio) == pytest.approx(2.0, abs=0.03) and np.percentile(np.abs(ratio - 2), 90) < 0.4
+    assert (
+        np.median(ratio) == pytest.approx(2.0, abs=0.03)
+        and np.percentile(np.abs(ratio - 2), 90) < 0.4
+    )
 
 
 def test_points_hidden_behind_something_are_not_read():
@@ -206,7 +238,14 @@ def scene_of(views, bracket_ev):
         )
         for i, v in enumerate(views)
     ]
-    manifest = Manifest(source="wall", width=WIDTH, height=HEIGHT, cycle=3, reference_bracket=2, bracket_ev=bracket_ev)
+    manifest = Manifest(
+        source="wall",
+        width=WIDTH,
+        height=HEIGHT,
+        cycle=3,
+        reference_bracket=2,
+        bracket_ev=bracket_ev,
+    )
     return Scene(Path("."), frames, [], 1.0, 10.0, torch.zeros(0, 3), manifest)
 
 
@@ -239,6 +278,8 @@ def test_initialize_falls_back_on_brightness_and_says_so():
 def test_the_papers_tone_mapper_is_left_as_published():
     rng = np.random.default_rng(0)
     scene = scene_of([wall_view(i, S_CURVE, rng) for i in range(3)], [None, None, None])
-    tonemapper = ToneMapper.for_scene(ToneMapConfig(kind="per_image", knots="even", from_recordings=False), scene)
+    tonemapper = ToneMapper.for_scene(
+        ToneMapConfig(kind="per_image", knots="even", from_recordings=False), scene
+    )
     assert "published" in initialize(tonemapper, scene)
     assert (tonemapper.gains() == 0).all()

@@ -1,4 +1,6 @@
-"""Flow of what moves, told by what moves alone: a disc that slides over a wall that slides another way."""
+"""Flow of what moves, told by what moves alone: a disc that slides over a wall that
+slides another way.
+"""
 
 import cv2
 import numpy as np
@@ -12,13 +14,17 @@ DISC, WALL = np.float32([2.4, 0.6]), np.float32([-0.8, 0.3])
 
 def texture(seed: int) -> np.ndarray:
     """Smooth noise (H + 40, W + 40, 3) in [0.1, 0.9]."""
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).random((H + 40, W + 40, 3)).astype(np.float32), (0, 0), 1.5)
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(seed).random((H + 40, W + 40, 3)).astype(np.float32), (0, 0), 1.5
+    )
     return 0.1 + 0.8 * (noise - noise.min()) / np.ptp(noise)
 
 
 def slid(picture: np.ndarray, by: np.ndarray) -> np.ndarray:
     """The middle of a picture after it slid by so many pixels."""
-    return cv2.warpAffine(picture, np.float32([[1, 0, by[0] - 20], [0, 1, by[1] - 20]]), (W, H), flags=cv2.INTER_CUBIC)
+    return cv2.warpAffine(
+        picture, np.float32([[1, 0, by[0] - 20], [0, 1, by[1] - 20]]), (W, H), flags=cv2.INTER_CUBIC
+    )
 
 
 def disc(at: np.ndarray, radius: float = 14.0) -> np.ndarray:
@@ -29,7 +35,10 @@ def disc(at: np.ndarray, radius: float = 14.0) -> np.ndarray:
 
 def frames() -> tuple[np.ndarray, np.ndarray]:
     """The disc over the wall, and both a time later."""
-    shots = [np.where(disc(k * DISC)[..., None], slid(texture(1), k * DISC), slid(texture(2), k * WALL)) for k in (0, 1)]
+    shots = [
+        np.where(disc(k * DISC)[..., None], slid(texture(1), k * DISC), slid(texture(2), k * WALL))
+        for k in (0, 1)
+    ]
     return shots[0], shots[1]
 
 
@@ -62,7 +71,9 @@ def test_masks_that_are_a_little_too_wide_do() -> None:
 @pytest.mark.parametrize("change", [lambda p: p * 0.9 + 0.05, lambda p: p + 0.05])
 def test_what_is_left_of_another_exposure_does_no_harm(change) -> None:
     here, there = frames()
-    assert error(mended(here, change(there).astype(np.float32), blurred(), disc(0 * DISC))) < 0.65 * error(blurred())
+    assert error(
+        mended(here, change(there).astype(np.float32), blurred(), disc(0 * DISC))
+    ) < 0.65 * error(blurred())
 
 
 def test_what_does_not_move_is_left_alone() -> None:

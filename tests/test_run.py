@@ -1,4 +1,6 @@
-"""Run folders: what is written, what is kept, and what is said where something is damaged or from another version."""
+"""Run folders: what is written, what is kept, and what is said where something is
+damaged or from another version.
+"""
 
 import json
 import shutil
@@ -36,7 +38,9 @@ def newest(folder: Path) -> Path:
     return max((folder / "checkpoints").glob("step_*.safetensors"))
 
 
-def test_a_run_opens_to_the_field_that_was_trained(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+def test_a_run_opens_to_the_field_that_was_trained(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
     t = trainer(small("tiny", toy_folder, tmp_path / "run", 3), toy)
     t.loop()
     opened, camera = Run.open(tmp_path / "run"), toy.train[1].camera
@@ -61,10 +65,16 @@ def test_the_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
         "step_00000100.safetensors",
     ]
     found = latest_checkpoint(tmp_path)
-    assert found is not None and (found.step, found.seconds, found.tensors["a"].tolist()) == (100, 50.0, [100.0, 100.0])
+    assert found is not None and (found.step, found.seconds, found.tensors["a"].tolist()) == (
+        100,
+        50.0,
+        [100.0, 100.0],
+    )
 
 
-def test_a_failed_write_leaves_the_checkpoints_as_they_were(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_write_leaves_the_checkpoints_as_they_were(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     save_checkpoint(tmp_path, 1, 0.0, {"a": torch.ones(2)})
 
     def full(tensors: object, path: Path, metadata: object) -> None:
@@ -82,7 +92,11 @@ def cut(path: Path) -> None:
 
 
 def other_version(path: Path) -> None:
-    save_file({"a": torch.ones(1)}, path, metadata={"format": "hdr-nsff checkpoint 99", "step": "2", "seconds": "0"})
+    save_file(
+        {"a": torch.ones(1)},
+        path,
+        metadata={"format": "hdr-nsff checkpoint 99", "step": "2", "seconds": "0"},
+    )
 
 
 def empty(path: Path) -> None:
@@ -99,15 +113,24 @@ def test_a_bad_checkpoint_gives_way_to_the_one_before_and_that_is_said(
     DAMAGE[what](newest(run))
     opened = Run.open(run)
     said = " ".join(capsys.readouterr().err.split())
-    assert opened.step == 0 and what in said and "going on from the one before, step 0" in said and newest(run).name in said
+    assert (
+        opened.step == 0
+        and what in said
+        and "going on from the one before, step 0" in said
+        and newest(run).name in said
+    )
 
 
 @pytest.mark.parametrize("what", DAMAGE)
-def test_training_goes_on_from_the_one_before_too(what: str, run: Path, toy_folder: Path, finished: Path) -> None:
+def test_training_goes_on_from_the_one_before_too(
+    what: str, run: Path, toy_folder: Path, finished: Path
+) -> None:
     DAMAGE[what](newest(run))
     train(replace(small("tiny", toy_folder, run)))
     ours, theirs = read_checkpoint(newest(run)), read_checkpoint(newest(finished))
-    assert ours.step == 2 and all(torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items())
+    assert ours.step == 2 and all(
+        torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items()
+    )
 
 
 def test_no_readable_checkpoint_is_an_error(run: Path) -> None:
@@ -199,7 +222,9 @@ def test_without_a_log_there_are_no_lines(tmp_path: Path) -> None:
 
 def test_config_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     write_config(tmp_path, PRESETS["tiny"])
-    assert read_config(tmp_path) == PRESETS["tiny"] and [p.name for p in tmp_path.iterdir()] == ["config.json"]
+    assert read_config(tmp_path) == PRESETS["tiny"] and [p.name for p in tmp_path.iterdir()] == [
+        "config.json"
+    ]
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

@@ -23,7 +23,9 @@ COUNT = 21
 
 
 def problem(root: Path, hold_out: int) -> Path:
-    """A textured wall at z = 2, seen by a camera that slides along x by 0.1 per frame, re-exposed; its true views are frames of the clip."""
+    """A textured wall at z = 2, seen by a camera that slides along x by 0.1 per frame,
+    re-exposed; its true views are frames of the clip.
+    """
     world = np.exp(np.random.default_rng(0).normal(size=(H, W + 2 * COUNT, 3)) * 0.5 - 1.5)
     for t in range(COUNT):
         io.write_png(root / f"ordinary/{t:03d}.png", np.clip(world[:, 2 * t : 2 * t + W], 0, 1))
@@ -33,9 +35,16 @@ def problem(root: Path, hold_out: int) -> Path:
 def truth_of(folder: Path, *views: tuple[float, int]) -> Path:
     """A truth whose views are of a (time, anchor) each."""
     entries = [
-        TruthView(name=f"{t}_{a}", time=t, bracket=0, anchor=a, radiance=f"radiance/{k}.exr") for k, (t, a) in enumerate(views)
+        TruthView(name=f"{t}_{a}", time=t, bracket=0, anchor=a, radiance=f"radiance/{k}.exr")
+        for k, (t, a) in enumerate(views)
     ]
-    truth = Truth(bracket_ev=[0.0], reference_bracket=0, response_x=[0, 1], response_y=[[0, 1]] * 3, views=entries)
+    truth = Truth(
+        bracket_ev=[0.0],
+        reference_bracket=0,
+        response_x=[0, 1],
+        response_y=[[0, 1]] * 3,
+        views=entries,
+    )
     io.write_json(folder / "truth.json", truth.model_dump())
     return folder
 
@@ -44,21 +53,33 @@ def truth_of(folder: Path, *views: tuple[float, int]) -> Path:
 def test_frames_that_the_truth_is_of_are_kept_out_of_training(
     hold_out: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Scored on exact radiance of the frames that were kept out, and of none that was trained on."""
+    """Scored on exact radiance of the frames that were kept out, and of none that was
+    trained on.
+    """
     monkeypatch.setitem(PRESETS, "tiny", replace(PRESETS["tiny"], steps=20, minutes=None))
     monkeypatch.setattr(run_all, "render_all", lambda run, out: {})
     made, poses = problem(tmp_path, hold_out), given(tmp_path / "given", COUNT)["poses"]
     run_all.run_all(
-        RunConfig(made / "clip", tmp_path / "out", ev="-2,0,2", preset="tiny", poses=poses, truth=made / "truth", device="cpu")
+        RunConfig(
+            made / "clip",
+            tmp_path / "out",
+            ev="-2,0,2",
+            preset="tiny",
+            poses=poses,
+            truth=made / "truth",
+            device="cpu",
+        )
     )
     scene = Scene.open(tmp_path / "out/scene")
     views = [v.anchor for v in Truth.open(made / "truth").views]
     assert views == ([2, 7, 12, 17] if hold_out == 5 else [4, 12]) == [f.index for f in scene.test]
     metrics = json.loads((tmp_path / "out/run/metrics.json").read_text())
-    assert metrics["kind"] == "held-out views with exact radiance" and metrics["headline"]["views"] == len(views)
-    assert {v["group"] for v in metrics["views"]} == {"view+time"} and {v["protocol"] for v in metrics["views"]} == {
-        "novel-view-time"
-    }
+    assert metrics["kind"] == "held-out views with exact radiance" and metrics["headline"][
+        "views"
+    ] == len(views)
+    assert {v["group"] for v in metrics["views"]} == {"view+time"} and {
+        v["protocol"] for v in metrics["views"]
+    } == {"novel-view-time"}
     assert not any("trained on" in note for note in metrics["notes"])
 
 
@@ -72,11 +93,16 @@ def test_beside_a_truth_of_other_places_or_times_all_frames_are_trained_on(tmp_p
 def test_what_the_user_asks_for_counts_before_the_truth(tmp_path: Path) -> None:
     config = RunConfig(tmp_path, tmp_path, truth=truth_of(tmp_path / "truth", (4.0, 4), (12.0, 12)))
     assert held_out_every(config) == 8
-    assert held_out_every(replace(config, hold_out=3)) == 3 and held_out_every(replace(config, hold_out=0)) == 0
+    assert (
+        held_out_every(replace(config, hold_out=3)) == 3
+        and held_out_every(replace(config, hold_out=0)) == 0
+    )
     assert held_out_every(replace(config, protocol="novel-view-time")) is None
 
 
 def test_frames_that_are_not_every_so_many_are_refused_in_a_sentence(tmp_path: Path) -> None:
-    config = RunConfig(tmp_path, tmp_path, truth=truth_of(tmp_path / "truth", (4.0, 4), (5.0, 5), (9.0, 9)))
+    config = RunConfig(
+        tmp_path, tmp_path, truth=truth_of(tmp_path / "truth", (4.0, 4), (5.0, 5), (9.0, 9))
+    )
     with pytest.raises(InputError, match=r"frames 4, 5, 9 of the clip.* --hold-out"):
         held_out_every(config)

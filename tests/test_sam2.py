@@ -1,4 +1,6 @@
-"""Prompts come from motion masks by laws; a tiny SAM 2 with random weights runs on them; points of a file correct them."""
+"""Prompts come from motion masks by laws; a tiny SAM 2 with random weights runs on
+them; points of a file correct them.
+"""
 
 import json
 from dataclasses import replace
@@ -10,7 +12,15 @@ from tiny_networks import tiny_sam2
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.masks import sam2
-from hdr_nsff.priors.masks.prompts import Mover, PointsFile, Prompt, as_file, corrected, movers, read_points
+from hdr_nsff.priors.masks.prompts import (
+    Mover,
+    PointsFile,
+    Prompt,
+    as_file,
+    corrected,
+    movers,
+    read_points,
+)
 from hdr_nsff.priors.pretrained import pretrained
 
 HEIGHT, WIDTH = 80, 120
@@ -22,8 +32,12 @@ def disc(x: float, y: float, radius: float) -> np.ndarray:
 
 
 def clip_of_two(count: int = 9) -> np.ndarray:
-    """A disc that grows until frame 6 while it moves right, and a smaller one that moves left below it."""
-    return np.stack([disc(30 + 4 * t, 25, 10 + min(t, 12 - t)) | disc(90 - 5 * t, 65, 8) for t in range(count)])
+    """A disc that grows until frame 6 while it moves right, and a smaller one that
+    moves left below it.
+    """
+    return np.stack(
+        [disc(30 + 4 * t, 25, 10 + min(t, 12 - t)) | disc(90 - 5 * t, 65, 8) for t in range(count)]
+    )
 
 
 def test_two_discs_are_two_things_the_larger_first_each_in_its_best_frame():
@@ -44,7 +58,12 @@ def test_points_on_a_thing_lie_on_it_and_points_beside_lie_on_nothing_that_moves
         assert not moving[prompt.frame, at[prompt.labels == 0, 1], at[prompt.labels == 0, 0]].any()
         rows, columns = np.nonzero(mask)
         left, top, right, bottom = prompt.box
-        assert left <= columns.min() and right >= columns.max() + 1 and top <= rows.min() and bottom >= rows.max() + 1
+        assert (
+            left <= columns.min()
+            and right >= columns.max() + 1
+            and top <= rows.min()
+            and bottom >= rows.max() + 1
+        )
         assert (right - left) * (bottom - top) < 1.3 * (np.ptp(rows) + 1) * (np.ptp(columns) + 1)
 
 
@@ -56,7 +75,9 @@ def test_the_first_point_is_the_middle_of_a_disc():
 
 def test_a_frame_whose_outline_fits_its_neighbors_is_preferred_over_a_larger_ragged_one():
     moving = np.stack([disc(40 + 2 * t, 40, 12) for t in range(7)])
-    moving[3] |= (np.abs(X - 46) < 2) & (Y < 76)  # a spike: larger, but nothing like the frames around it
+    moving[3] |= (np.abs(X - 46) < 2) & (
+        Y < 76
+    )  # a spike: larger, but nothing like the frames around it
     assert movers(moving)[0].prompts[0].frame not in (2, 3, 4)
 
 
@@ -85,7 +106,9 @@ def test_points_of_a_file_are_added_to_their_object_and_new_numbers_are_new_obje
     (tmp_path / "points.json").write_text(json.dumps(text))
     given = read_points(tmp_path / "points.json", 19, (HEIGHT, WIDTH))
     first, second, new = corrected(found, given, range(10, 19))  # a clip that starts at frame 10
-    assert [p.frame for p in first.prompts] == [4, 6] and first.prompts[0].points.tolist() == [[50, 26]]
+    assert [p.frame for p in first.prompts] == [4, 6] and first.prompts[0].points.tolist() == [
+        [50, 26]
+    ]
     assert second == found[1]
     assert new.number == 7 and new.prompts[0].frame == 0 and not new.seen
     assert corrected(found, given, range(20, 29)) == found  # another camera's frames
@@ -109,7 +132,10 @@ def test_what_is_written_of_the_prompts_reads_back_the_same(tmp_path):
         ('{"points": [{"frame": 1, "object": 1, "x": 1.0, "y": 1.0, "label": 2}]}', "label"),
         ('{"points": [{"frame": 1, "object": 1, "x": 500.0, "y": 1.0, "label": 1}]}', "120x80"),
         ('{"points": [{"frame": 9, "object": 1, "x": 5.0, "y": 1.0, "label": 1}]}', "9 frames"),
-        ('{"boxes": [{"frame": 1, "object": 1, "left": 5.0, "top": 1.0, "right": 4.0, "bottom": 3.0}]}', "empty"),
+        (
+            '{"boxes": [{"frame": 1, "object": 1, "left": 5.0, "top": 1.0, "right": 4.0, "bottom": 3.0}]}',
+            "empty",
+        ),
     ],
 )
 def test_a_points_file_with_a_mistake_is_one_sentence(text: str, words: str, tmp_path):
@@ -124,14 +150,28 @@ def test_a_missing_points_file_is_named(tmp_path):
 
 
 def test_coordinates_scale_with_pixel_centers_kept():
-    inputs = sam2.coordinates(np.array([[0.5, 0.5], [60, 40]]), np.array([1, 0]), np.array([0, 0, 120, 80]), (HEIGHT, WIDTH), 240)
-    # a network that adds 0.5 sees 2 x the first in x and 3 x in y, the middle in the middle, the box's corners at the corners
-    assert (inputs["point_coords"][0, 0] + 0.5).tolist() == [[0, 0], [240, 240], [1, 1.5], [120, 120]]
+    inputs = sam2.coordinates(
+        np.array([[0.5, 0.5], [60, 40]]),
+        np.array([1, 0]),
+        np.array([0, 0, 120, 80]),
+        (HEIGHT, WIDTH),
+        240,
+    )
+    # a network that adds 0.5 sees 2 x the first in x and 3 x in y, the middle in the
+    # middle, the box's corners at the corners
+    assert (inputs["point_coords"][0, 0] + 0.5).tolist() == [
+        [0, 0],
+        [240, 240],
+        [1, 1.5],
+        [120, 120],
+    ]
     assert inputs["point_labels"].tolist() == [[[2, 3, 1, 0]]]
 
 
 class Oracle:
-    """Stands for the network where only the combining of objects is looked at: outlines by object number."""
+    """Stands for the network where only the combining of objects is looked at: outlines
+    by object number.
+    """
 
     def __init__(self, outlines: dict[int, np.ndarray]) -> None:
         self.outlines = outlines
@@ -173,8 +213,12 @@ def test_a_tiny_network_answers_in_every_frame_both_ways_and_hears_the_prompts(t
     network = pretrained("Sam2VideoModel", str(tiny))
     video = np.random.default_rng(0).random((5, HEIGHT, WIDTH, 3)).astype(np.float32)
     seen: list[tuple[int, torch.Tensor]] = []
-    network.register_forward_hook(lambda module, args, out: seen.append((out.frame_idx, out.pred_masks)))
-    mover = Mover(1, (Prompt(2, np.array([[40.0, 40.0]]), np.array([1]), np.array([20.0, 20, 60, 60])),))
+    network.register_forward_hook(
+        lambda module, args, out: seen.append((out.frame_idx, out.pred_masks))
+    )
+    mover = Mover(
+        1, (Prompt(2, np.array([[40.0, 40.0]]), np.array([1]), np.array([20.0, 20, 60, 60])),)
+    )
     outlined = sam2.follow(network, video, mover)
     assert outlined.shape == (5, HEIGHT, WIDTH) and outlined.dtype == bool
     assert [frame for frame, _ in seen] == [2, 2, 3, 4, 2, 1, 0]

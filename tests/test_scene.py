@@ -17,11 +17,19 @@ def entry(index: int, time: float, camera: int = 0) -> FrameEntry:
 
 
 def test_neighbors_are_the_frames_before_and_after_in_time_whatever_the_order() -> None:
-    assert neighbors([entry(0, 2.0), entry(1, 0.0), entry(2, 1.0)]) == [{-1: 2}, {1: 2}, {-1: 1, 1: 0}]
+    assert neighbors([entry(0, 2.0), entry(1, 0.0), entry(2, 1.0)]) == [
+        {-1: 2},
+        {1: 2},
+        {-1: 1, 1: 0},
+    ]
 
 
 def test_neighbors_span_a_frame_that_is_held_out() -> None:
-    assert neighbors([entry(0, 0.0), entry(2, 2.0), entry(3, 3.0)]) == [{1: 1}, {-1: 0, 1: 2}, {-1: 1}]
+    assert neighbors([entry(0, 0.0), entry(2, 2.0), entry(3, 3.0)]) == [
+        {1: 1},
+        {-1: 0, 1: 2},
+        {-1: 1},
+    ]
 
 
 def test_neighbors_stay_within_a_physical_camera() -> None:
@@ -30,7 +38,13 @@ def test_neighbors_stay_within_a_physical_camera() -> None:
 
 
 def test_a_camera_that_missed_a_training_time_has_no_neighbor_across_it() -> None:
-    entries = [entry(0, 0.0, 0), entry(1, 1.0, 0), entry(2, 2.0, 0), entry(3, 0.0, 1), entry(4, 2.0, 1)]
+    entries = [
+        entry(0, 0.0, 0),
+        entry(1, 1.0, 0),
+        entry(2, 2.0, 0),
+        entry(3, 0.0, 1),
+        entry(4, 2.0, 1),
+    ]
     assert neighbors(entries) == [{1: 1}, {-1: 0, 1: 2}, {-1: 1}, {}, {}]
 
 
@@ -43,19 +57,25 @@ def test_a_scene_holds_what_was_written(toy: Scene) -> None:
         recorded = np.clip(radiance * 2.0**f.exposure, 0, 1) ** (1 / 2.2)
         assert float(np.abs(f.image.numpy() - recorded).max()) <= 0.5 / 255 + 1e-6
         assert torch.equal(f.moving, torch.from_numpy(moving))
-        assert sorted({round(1 / v, 2) for v in f.disparity.unique().tolist()}) == pytest.approx([CARD, WALL], rel=1e-3)
+        assert sorted({round(1 / v, 2) for v in f.disparity.unique().tolist()}) == pytest.approx(
+            [CARD, WALL], rel=1e-3
+        )
         assert set(f.flow) == set(f.neighbors) == {o for o in (-1, 1) if 0 <= f.index + o < 6}
 
 
 def test_the_outline_of_a_mask_is_two_pixels_on_either_side() -> None:
     mask = torch.zeros(12, 12, dtype=torch.bool)
     mask[:, 6:] = True
-    assert outline(mask).any(0).nonzero()[:, 0].tolist() == [4, 5, 6, 7] and torch.equal(outline(mask), outline(~mask))
+    assert outline(mask).any(0).nonzero()[:, 0].tolist() == [4, 5, 6, 7] and torch.equal(
+        outline(mask), outline(~mask)
+    )
     assert not outline(torch.ones(8, 8, dtype=torch.bool)).any()  # the picture's edge is no outline
 
 
 @pytest.mark.parametrize("provenance", ["estimated", "given"])
-def test_only_an_estimated_mask_has_a_doubtful_outline(toy_folder: Path, tmp_path: Path, provenance: str) -> None:
+def test_only_an_estimated_mask_has_a_doubtful_outline(
+    toy_folder: Path, tmp_path: Path, provenance: str
+) -> None:
     folder = shutil.copytree(toy_folder, tmp_path / "scene")
     manifest = Manifest.load(folder)
     manifest.steps["masks"] = Step(done=True, provenance=provenance)
@@ -71,7 +91,11 @@ def test_held_out_frames_lend_no_map_to_training(toy_folder: Path, tmp_path: Pat
     data["frames"][2]["split"] = "test"
     (folder / "scene.json").write_text(json.dumps(data))
     scene = Scene.open(folder)
-    assert [f.index for f in scene.train] == [0, 1, 3, 4, 5] and [f.index for f in scene.test] == [2]
+    assert [f.index for f in scene.train] == [0, 1, 3, 4, 5] and [f.index for f in scene.test] == [
+        2
+    ]
     assert scene.test[0].flow == {} and scene.test[0].neighbors == {}
-    assert scene.train[1].neighbors == {-1: 0, 1: 2} and set(scene.train[1].flow) == {-1}  # no flow from 1 to 3 was made
+    assert scene.train[1].neighbors == {-1: 0, 1: 2} and set(scene.train[1].flow) == {
+        -1
+    }  # no flow from 1 to 3 was made
     assert scene.times.tolist() == [0, 1, 3, 4, 5]

@@ -1,5 +1,7 @@
-"""Depth, motion, stability and the learned camera against closed forms; which views belong to which protocol. The truth's world is turned,
-shifted and three times as large as the scene's."""
+"""Depth, motion, stability and the learned camera against closed forms; which views
+belong to which protocol. The truth's world is turned, shifted and three times as large
+as the scene's.
+"""
 
 from __future__ import annotations
 
@@ -33,15 +35,22 @@ PIXELS = FOCAL / DISC * float(MOTION.norm())  # the same in its picture
 
 
 class Wrong(DiscBeforeWall):
-    """The scene with depth times a factor, scene flow times another, radiance that flickers from frame to frame."""
+    """The scene with depth times a factor, scene flow times another, radiance that
+    flickers from frame to frame.
+    """
 
     deeper, faster, flicker = 1.0, 1.0, 0.0
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
+    def render(
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
+    ) -> Render:
         seen = super().render(camera, time, pixels)
         flow = {o: f * self.faster for o, f in seen.scene_flow.items()}
         return replace(
-            seen, depth=seen.depth * self.deeper, scene_flow=flow, radiance=seen.radiance * (1 + self.flicker * (time % 2))
+            seen,
+            depth=seen.depth * self.deeper,
+            scene_flow=flow,
+            radiance=seen.radiance * (1 + self.flicker * (time % 2)),
         )
 
 
@@ -50,8 +59,13 @@ class Still(DiscBeforeWall):
 
     layers = None  # type: ignore[assignment]
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
-        return replace(DiscBeforeWall(speed=self.speed, red=self.red).render(camera, time, pixels), scene_flow={})
+    def render(
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
+    ) -> Render:
+        return replace(
+            DiscBeforeWall(speed=self.speed, red=self.red).render(camera, time, pixels),
+            scene_flow={},
+        )
 
 
 def truth_of(folder: Path, run: Run) -> Path:
@@ -67,11 +81,18 @@ def truth_of(folder: Path, run: Run) -> Path:
         maps = {"Z": 3 * seen.depth}
         for side, name in io.SIDES.items():
             flow = seen.scene_flow[side]
-            world, pixels = 3 * flow @ TURN.T, camera.project(points + flow)[0] - camera.pixel_grid()
+            world, pixels = (
+                3 * flow @ TURN.T,
+                camera.project(points + flow)[0] - camera.pixel_grid(),
+            )
             maps |= {f"{name}.{a}": world[:, k] for k, a in enumerate("xyz")} | {
                 f"{name}.{a}": pixels[:, k] for k, a in enumerate("uv")
             }
-        io.write_exr(folder / f"geometry/{view.name}.exr", {n: m.reshape(H, W).numpy() for n, m in maps.items()}, half=False)
+        io.write_exr(
+            folder / f"geometry/{view.name}.exr",
+            {n: m.reshape(H, W).numpy() for n, m in maps.items()},
+            half=False,
+        )
     views = [v.model_copy(update={"geometry": f"geometry/{v.name}.exr"}) for v in truth.views]
     io.write_json(folder / "truth.json", truth.model_copy(update={"views": views}).model_dump())
     return folder
@@ -94,9 +115,14 @@ def views_of(result: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def test_the_true_field_has_no_error_of_depth_or_motion(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     result = evaluate_run(run, truth_of(tmp_path / "truth", run))
-    assert result["depth_scale"] == pytest.approx(3, rel=1e-4) and result["world_scale"] == pytest.approx(3, rel=1e-4)
+    assert result["depth_scale"] == pytest.approx(3, rel=1e-4) and result[
+        "world_scale"
+    ] == pytest.approx(3, rel=1e-4)
     note = notes.read(run.folder / "metrics.json", notes.Metrics)  # which the report reads
-    assert note is not None and {"geometry_scores", "pu21", "stability", "protocols"} <= note.model_fields_set
+    assert (
+        note is not None
+        and {"geometry_scores", "pu21", "stability", "protocols"} <= note.model_fields_set
+    )
     for key, value in json.loads(note.model_dump_json(exclude_unset=True)).items():
         assert value == result[key], key
     for name in ("a", "c"):  # b is splatted between two frames
@@ -104,31 +130,45 @@ def test_the_true_field_has_no_error_of_depth_or_motion(tmp_path: Path) -> None:
         for score in ("depth_abs_rel", "depth_rmse", "scene_flow_epe", "flow_epe"):
             assert view[score] < 1e-3 and view[f"{score}_moving"] < 1e-3, score
         assert view["flow_epe_of_rest_moving"] == pytest.approx(PIXELS, rel=1e-4)
-        assert view["pu21"] > 55 and view["pu21_moving"] > 55 and view["mu50_per_channel_moving"] > 55
+        assert (
+            view["pu21"] > 55 and view["pu21_moving"] > 55 and view["mu50_per_channel_moving"] > 55
+        )
     assert not any("depth" in note or "motion" in note for note in result["notes"])
 
 
 def test_depth_takes_one_scale_for_all_views_and_motion_that_of_the_cameras(tmp_path: Path) -> None:
-    """Depth that is 1.5 times too large everywhere is aligned away; the scale of the flow is that of the camera path and stays."""
+    """Depth that is 1.5 times too large everywhere is aligned away; the scale of the
+    flow is that of the camera path and stays.
+    """
     run = wrong_run(tmp_path / "run", deeper=1.5)
     result = evaluate_run(run, truth_of(tmp_path / "truth", run))
     view = views_of(result)["a"]
-    assert result["depth_scale"] == pytest.approx(2, rel=1e-4) and result["world_scale"] == pytest.approx(3, rel=1e-4)
+    assert result["depth_scale"] == pytest.approx(2, rel=1e-4) and result[
+        "world_scale"
+    ] == pytest.approx(3, rel=1e-4)
     assert view["depth_abs_rel"] < 1e-3 and view["scene_flow_epe"] < 1e-3
-    assert view["flow_epe_moving"] == pytest.approx(PIXELS / 3, rel=1e-3)  # seen at 1.5 times the depth, it moves 2/3 as far
+    assert view["flow_epe_moving"] == pytest.approx(
+        PIXELS / 3, rel=1e-3
+    )  # seen at 1.5 times the depth, it moves 2/3 as far
 
 
-def test_wrong_scene_flow_is_wrong_by_what_it_lacks_in_true_units_and_in_pixels(tmp_path: Path) -> None:
+def test_wrong_scene_flow_is_wrong_by_what_it_lacks_in_true_units_and_in_pixels(
+    tmp_path: Path,
+) -> None:
     run = wrong_run(tmp_path / "run", faster=0.25)
     view = views_of(evaluate_run(run, truth_of(tmp_path / "truth", run)))["a"]
     assert view["scene_flow_epe_moving"] == pytest.approx(0.75 * 3 * float(MOTION.norm()), rel=1e-4)
     assert view["flow_epe_moving"] == pytest.approx(0.75 * PIXELS, rel=1e-4)
     moving = io.read_mask(tmp_path / "truth/masks/a.png").mean()
-    assert view["flow_epe"] == pytest.approx(moving * view["flow_epe_moving"], rel=1e-4)  # the wall rests in both
+    assert view["flow_epe"] == pytest.approx(
+        moving * view["flow_epe_moving"], rel=1e-4
+    )  # the wall rests in both
 
 
 def test_depth_errors_are_in_true_units_after_the_scale(tmp_path: Path) -> None:
-    """The wall, most of the picture, sets the scale; the disc is then 12 % too far away, of true z-depth 3 * DISC."""
+    """The wall, most of the picture, sets the scale; the disc is then 12 % too far
+    away, of true z-depth 3 * DISC.
+    """
     run = fake_run(tmp_path / "run", field=DiscTooFar(speed=MOTION, red=3.0))
     view = views_of(evaluate_run(run, truth_of(tmp_path / "truth", run)))["a"]
     assert view["depth_abs_rel_moving"] == pytest.approx(0.12, rel=1e-3)
@@ -138,7 +178,9 @@ def test_depth_errors_are_in_true_units_after_the_scale(tmp_path: Path) -> None:
 
 
 class DiscTooFar(DiscBeforeWall):
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
+    def render(
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
+    ) -> Render:
         seen = super().render(camera, time, pixels)
         return replace(seen, depth=seen.depth * (1 + 0.12 * seen.motion))
 
@@ -146,14 +188,20 @@ class DiscTooFar(DiscBeforeWall):
 def test_scene_flow_reaches_from_one_training_time_to_the_next() -> None:
     assert intervals(1.0, [0.0, 1.0, 2.0]) == {1: 1, -1: 1}
     assert intervals(2.0, [0.0, 2.0, 4.0]) == {1: 2, -1: 2}
-    assert intervals(0.0, [0.0, 2.0, 4.0]) == {1: 2}  # nothing was learned about the time before the clip
+    assert intervals(0.0, [0.0, 2.0, 4.0]) == {
+        1: 2
+    }  # nothing was learned about the time before the clip
     assert intervals(3.0, [0.0, 2.0, 4.0]) == {-1: 2}
     assert intervals(2.0, [0.0, 2.0, 3.0]) == {1: 1, -1: 2}
-    assert intervals(1.0, [0.0, 2.0, 3.0]) == {1: pytest.approx(1.5)}  # half-way from 0-2 is carried to half-way from 2-3
+    assert intervals(1.0, [0.0, 2.0, 3.0]) == {
+        1: pytest.approx(1.5)
+    }  # half-way from 0-2 is carried to half-way from 2-3
 
 
 def test_flow_over_two_frames_is_compared_per_frame(tmp_path: Path) -> None:
-    """Every second frame held out: the field's flow is twice as long, and what is measured is the same."""
+    """Every second frame held out: the field's flow is twice as long, and what is
+    measured is the same.
+    """
     run = wrong_run(tmp_path / "run", faster=2.0)
     truth = truth_of(tmp_path / "truth", run)
     frames = [f for f in run.scene.train if f.index % 2 == 0 or f.index == 5]
@@ -165,21 +213,31 @@ def test_flow_over_two_frames_is_compared_per_frame(tmp_path: Path) -> None:
 def test_a_truth_without_depth_and_a_field_without_flow_are_named(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     result = evaluate_run(run, write_truth(tmp_path / "old", run, field_of(run)))
-    assert any("this truth folder holds none" in note for note in result["notes"]) and "depth_scale" not in result
+    assert (
+        any("this truth folder holds none" in note for note in result["notes"])
+        and "depth_scale" not in result
+    )
     still = fake_run(tmp_path / "still", field=Still(speed=MOTION, red=3.0))
     result = evaluate_run(still, truth_of(tmp_path / "truth", still))
     assert any("this field tells no scene flow" in note for note in result["notes"])
     assert result["headline"]["depth_abs_rel"] < 1e-3 and "flow_epe" not in result["headline"]
     tripod = fake_run(tmp_path / "tripod", parallax="none")
     result = evaluate_run(tripod, truth_of(tmp_path / "truth", fake_run(tmp_path / "moves")))
-    assert any("fix no scale" in note for note in result["notes"]) and "scene_flow_epe" not in result["headline"]
+    assert (
+        any("fix no scale" in note for note in result["notes"])
+        and "scene_flow_epe" not in result["headline"]
+    )
 
 
 def test_depth_and_motion_that_fit_nothing_are_refused_in_a_sentence(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     folder = truth_of(tmp_path / "truth", run)
     channels = io.read_exr(folder / "geometry/a.exr")
-    io.write_exr(folder / "geometry/a.exr", {k: v for k, v in channels.items() if k != "backward.v"}, half=False)
+    io.write_exr(
+        folder / "geometry/a.exr",
+        {k: v for k, v in channels.items() if k != "backward.v"},
+        half=False,
+    )
     with pytest.raises(InputError, match=r"no channel backward\.v"):
         evaluate_run(run, folder)
     io.write_exr(folder / "geometry/a.exr", {k: v[:5] for k, v in channels.items()}, half=False)
@@ -195,7 +253,9 @@ def test_depth_and_motion_that_fit_nothing_are_refused_in_a_sentence(tmp_path: P
 
 
 def with_flow(run: Run) -> Run:
-    """The run with the exact flow of its clip, believed everywhere but at the disc's edge and where the other frame hides it."""
+    """The run with the exact flow of its clip, believed everywhere but at the disc's
+    edge and where the other frame hides it.
+    """
     field, frames = DiscBeforeWall(speed=MOTION, red=3.0), []
     for k, frame in enumerate(run.scene.train):
         neighbors = {o: k + o for o in (-1, 1) if 0 <= k + o < len(run.scene.train)}
@@ -216,22 +276,26 @@ def with_flow(run: Run) -> Run:
 
 
 def test_a_steady_field_is_steady_and_flicker_is_measured(tmp_path: Path) -> None:
-    """Radiance that changes by a tenth between even and odd frames: 0.1 / 2.1, whichever of the two is brighter. Of the disc, which is red
-    alone, two channels stay black."""
+    """Radiance that changes by a tenth between even and odd frames: 0.1 / 2.1,
+    whichever of the two is brighter. Of the disc, which is red alone, two channels stay
+    black.
+    """
     run = with_flow(fake_run(tmp_path / "run"))
     steady = stability(run, tmp_path / "steady")
     assert steady["pairs"] == 5 and steady["hdr_tae"] < 2e-4 and steady["hdr_tae_moving"] < 2e-4
     field = Wrong(speed=MOTION, red=3.0)
     field.flicker = 0.1
     found = stability(replace(run, field=field), tmp_path / "flickers")
-    assert found["hdr_tae"] == pytest.approx(0.1 / 2.1, rel=0.04) and found["hdr_tae_moving"] == pytest.approx(
-        0.1 / 2.1 / 3, abs=2e-4
-    )
+    assert found["hdr_tae"] == pytest.approx(0.1 / 2.1, rel=0.04) and found[
+        "hdr_tae_moving"
+    ] == pytest.approx(0.1 / 2.1 / 3, abs=2e-4)
 
 
 def test_a_mover_that_stands_still_in_the_field_is_not_steady(tmp_path: Path) -> None:
     run = with_flow(fake_run(tmp_path / "run"))
-    found = stability(replace(run, field=DiscBeforeWall(speed=torch.zeros(3), red=3.0)), tmp_path / "rests")
+    found = stability(
+        replace(run, field=DiscBeforeWall(speed=torch.zeros(3), red=3.0)), tmp_path / "rests"
+    )
     assert found["hdr_tae_moving"] > 0.02
 
 
@@ -248,36 +312,59 @@ def test_long_clips_are_sampled_and_clips_without_flow_have_no_stability(tmp_pat
 
 def learned(run: Run, ev: list[float], gamma: float) -> Run:
     """The run with learned exposures and the response x^(1 / gamma)."""
-    tonemapper = ToneMapper(ToneMapConfig(residual=False), [i % 3 for i in range(6)], [0] * 6, [None, None, 0.0], 2)
+    tonemapper = ToneMapper(
+        ToneMapConfig(residual=False), [i % 3 for i in range(6)], [0] * 6, [None, None, 0.0], 2
+    )
     tonemapper.set_exposures(ev)
     knots = knot_positions("gamma")
     tonemapper.set_curve(knots, (knots ** (1 / gamma)).expand(3, -1))
-    manifest = run.scene.manifest.model_copy(update={"exposure_given": False, "bracket_ev": [None, None, 0.0]})
+    manifest = run.scene.manifest.model_copy(
+        update={"exposure_given": False, "bracket_ev": [None, None, 0.0]}
+    )
     return replace(run, tonemapper=tonemapper, scene=replace(run.scene, manifest=manifest))
 
 
 def test_the_power_that_no_recording_tells_is_taken_out_of_curve_and_steps(tmp_path: Path) -> None:
-    """E^1.25 through x^(1 / (2.2 * 1.25)) with steps of 2.5 EV records what E through x^(1 / 2.2) with steps of 2 EV does."""
+    """E^1.25 through x^(1 / (2.2 * 1.25)) with steps of 2.5 EV records what E through
+    x^(1 / 2.2) with steps of 2 EV does.
+    """
     run = fake_run(tmp_path / "run")
     truth = Truth.open(write_truth(tmp_path / "truth", run, field_of(run)))
     errors = camera_errors(learned(run, [-5.0, -2.5, 0.0], 2.2 * 1.25), truth)
-    assert errors["true_ev_steps"] == [2, 2] and errors["learned_ev_steps"] == pytest.approx([2.5, 2.5])
+    assert errors["true_ev_steps"] == [2, 2] and errors["learned_ev_steps"] == pytest.approx(
+        [2.5, 2.5]
+    )
     assert errors["largest_step_error"] == pytest.approx(0.5) and errors["response_rmse"] > 0.05
-    assert errors["power"] == pytest.approx(1.25) and errors["power_of_response"] == pytest.approx(1.25, rel=0.005)
-    assert errors["response_rmse_after_power"] < 2e-3 and errors["largest_step_error_after_power"] < 0.02
+    assert errors["power"] == pytest.approx(1.25) and errors["power_of_response"] == pytest.approx(
+        1.25, rel=0.005
+    )
+    assert (
+        errors["response_rmse_after_power"] < 2e-3
+        and errors["largest_step_error_after_power"] < 0.02
+    )
 
 
 def test_neither_curve_nor_steps_are_measured_against_themselves(tmp_path: Path) -> None:
-    """The true curve with steps that are 25 % too long is no gauge: the error stays in both."""
+    """The true curve with steps that are 25 % too long is no gauge: the error stays in
+    both.
+    """
     run = fake_run(tmp_path / "run")
     truth = Truth.open(write_truth(tmp_path / "truth", run, field_of(run)))
     errors = camera_errors(learned(run, [-5.0, -2.5, 0.0], 2.2), truth)
-    assert errors["power_of_response"] == pytest.approx(1, rel=0.005) and errors["response_rmse"] < 2e-3
-    assert errors["largest_step_error_after_power"] == pytest.approx(0.5, abs=0.02) and errors["response_rmse_after_power"] > 0.05
+    assert (
+        errors["power_of_response"] == pytest.approx(1, rel=0.005)
+        and errors["response_rmse"] < 2e-3
+    )
+    assert (
+        errors["largest_step_error_after_power"] == pytest.approx(0.5, abs=0.02)
+        and errors["response_rmse_after_power"] > 0.05
+    )
 
 
 def test_the_error_of_a_response_worked_by_hand(tmp_path: Path) -> None:
-    """The identity against x^(1 / 2.2), over u in [0, 1] with x = u^2.2: the root of the integral of (u^2.2 - u)^2."""
+    """The identity against x^(1 / 2.2), over u in [0, 1] with x = u^2.2: the root of
+    the integral of (u^2.2 - u)^2.
+    """
     run = fake_run(tmp_path / "run")
     truth = Truth.open(write_truth(tmp_path / "truth", run, field_of(run)))
     errors = camera_errors(learned(run, [-4.0, -2.0, 0.0], 1.0), truth)
@@ -291,19 +378,32 @@ def test_the_error_of_a_response_worked_by_hand(tmp_path: Path) -> None:
 def test_views_at_and_between_training_times_are_told_apart(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     result = evaluate_run(run, truth_of(tmp_path / "truth", run))
-    assert {v["name"]: v["protocol"] for v in result["views"]} == {"a": "novel-view", "b": "novel-view-time", "c": "novel-view"}
+    assert {v["name"]: v["protocol"] for v in result["views"]} == {
+        "a": "novel-view",
+        "b": "novel-view-time",
+        "c": "novel-view",
+    }
     assert result["protocol"] is None and result["headline"]["views"] == 3
-    assert {p: m["views"] for p, m in result["protocols"].items()} == {"novel-view": 2, "novel-view-time": 1}
+    assert {p: m["views"] for p, m in result["protocols"].items()} == {
+        "novel-view": 2,
+        "novel-view-time": 1,
+    }
 
 
-@pytest.mark.parametrize("protocol, names", [("novel-view", ["a", "c"]), ("novel-view-time", ["b"])])
-def test_the_headline_is_that_of_the_scenes_protocol(tmp_path: Path, protocol: str, names: list[str]) -> None:
+@pytest.mark.parametrize(
+    "protocol, names", [("novel-view", ["a", "c"]), ("novel-view-time", ["b"])]
+)
+def test_the_headline_is_that_of_the_scenes_protocol(
+    tmp_path: Path, protocol: str, names: list[str]
+) -> None:
     run = fake_run(tmp_path / "run")
     truth = truth_of(tmp_path / "truth", run)
     manifest = run.scene.manifest.model_copy(update={"protocol": protocol})
     result = evaluate_run(replace(run, scene=replace(run.scene, manifest=manifest)), truth)
     assert result["headline"] == result["protocols"][protocol]
-    assert result["headline"]["psnr"] == pytest.approx(np.mean([views_of(result)[n]["psnr"] for n in names]))
+    assert result["headline"]["psnr"] == pytest.approx(
+        np.mean([views_of(result)[n]["psnr"] for n in names])
+    )
 
 
 def test_with_every_second_frame_held_out_its_time_is_a_new_one(tmp_path: Path) -> None:
@@ -322,16 +422,27 @@ def test_a_frame_that_was_trained_on_is_no_held_out_view(tmp_path: Path) -> None
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, field_of(run))
     truth = Truth.open(folder)
-    own = TruthView(name="own", time=4.0, bracket=1, anchor=4, radiance="radiance/a.exr", mask="masks/a.png")
-    io.write_json(folder / "truth.json", truth.model_copy(update={"views": [*truth.views, own]}).model_dump())
+    own = TruthView(
+        name="own", time=4.0, bracket=1, anchor=4, radiance="radiance/a.exr", mask="masks/a.png"
+    )
+    io.write_json(
+        folder / "truth.json", truth.model_copy(update={"views": [*truth.views, own]}).model_dump()
+    )
     result = evaluate_run(run, folder)
-    assert views_of(result)["own"]["group"] == "training view" and views_of(result)["own"]["protocol"] is None
-    assert result["headline"]["views"] == 3 and any("trained on" in note for note in result["notes"])
+    assert (
+        views_of(result)["own"]["group"] == "training view"
+        and views_of(result)["own"]["protocol"] is None
+    )
+    assert result["headline"]["views"] == 3 and any(
+        "trained on" in note for note in result["notes"]
+    )
     assert result["kind"] == "held-out views with exact radiance"
     io.write_json(folder / "truth.json", truth.model_copy(update={"views": [own]}).model_dump())
     result = evaluate_run(run, folder)
     assert (
-        result["kind"] == "training views with exact radiance" and result["headline"]["views"] == 1 and result["protocols"] == {}
+        result["kind"] == "training views with exact radiance"
+        and result["headline"]["views"] == 1
+        and result["protocols"] == {}
     )
 
 
@@ -339,6 +450,10 @@ def test_a_scene_whose_protocol_no_view_belongs_to_says_so(tmp_path: Path) -> No
     run = fake_run(tmp_path / "run", num_frames=8, held_out=2)
     manifest = run.scene.manifest.model_copy(update={"protocol": "novel-view"})
     held = replace(run.scene.test[0], time=4.5)
-    result = evaluate_run(replace(run, scene=replace(run.scene, test=[held], manifest=manifest)), None)
-    assert any("novel-view" in note for note in result["notes"]) and result["headline"]["views"] == 1
+    result = evaluate_run(
+        replace(run, scene=replace(run.scene, test=[held], manifest=manifest)), None
+    )
+    assert (
+        any("novel-view" in note for note in result["notes"]) and result["headline"]["views"] == 1
+    )
     assert result["views"][0]["protocol"] == "novel-view-time"

@@ -1,4 +1,6 @@
-"""Gaussians before training, on the scene in closed form: static ones on its wall, moving ones on its card at every time."""
+"""Gaussians before training, on the scene in closed form: static ones on its wall,
+moving ones on its card at every time.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -30,11 +32,15 @@ CONFIG = SplatConfig(static=400, moving=150, bases=3)
 
 
 def recorded(rgb: Tensor, frame: int) -> Tensor:
-    """Radiance of what the toy's frames recorded: their exposures repeat, their response is a gamma of 2.2."""
+    """Radiance of what the toy's frames recorded: their exposures repeat, their
+    response is a gamma of 2.2.
+    """
     return rgb**2.2 / 2.0 ** EV[frame % len(EV)]
 
 
-def seeded(scene: Scene, config: SplatConfig = CONFIG, from_priors: bool = True) -> tuple[Splat, str]:
+def seeded(
+    scene: Scene, config: SplatConfig = CONFIG, from_priors: bool = True
+) -> tuple[Splat, str]:
     """A field started from a scene, none of whose numbers is NaN; and what was said."""
     field = Splat(config, scene.times, scene.near, scene.far, 60 * 34)
     told = seed(field, scene, recorded, -1.0, from_priors)
@@ -67,7 +73,9 @@ def field(toy: Scene) -> Splat:
 def test_static_gaussians_lie_on_the_wall(field: Splat) -> None:
     on = seen(field.static)
     assert 0.6 * 400 < int(on.sum()) <= 0.95 * 400
-    assert float((field.static.means.detach()[on, 2] - WALL).abs().max()) < 0.01  # half-precision disparity
+    assert (
+        float((field.static.means.detach()[on, 2] - WALL).abs().max()) < 0.01
+    )  # half-precision disparity
 
 
 def test_static_gaussians_have_the_walls_radiance(toy: Scene) -> None:
@@ -78,7 +86,9 @@ def test_static_gaussians_have_the_walls_radiance(toy: Scene) -> None:
     xy = toy.train[2].camera.project(at)[0].long()
     inside = (xy[:, 0] >= 0) & (xy[:, 0] < 60) & (xy[:, 1] >= 0) & (xy[:, 1] < 34)
     x, y = xy[inside].T.numpy()
-    log = field.static.log_radiance.detach()[seen(field.static)][inside][~torch.from_numpy(mask[y, x])]
+    log = field.static.log_radiance.detach()[seen(field.static)][inside][
+        ~torch.from_numpy(mask[y, x])
+    ]
     true = torch.from_numpy(np.log(radiance[y, x]))[~torch.from_numpy(mask[y, x])]
     assert float(true.std()) > 0.5 and float((log - true).abs().median()) < 0.2
 
@@ -87,9 +97,13 @@ def test_static_gaussians_have_the_walls_radiance(toy: Scene) -> None:
 def test_moving_gaussians_follow_the_card(field: Splat, time: float) -> None:
     at = moving_at(field, time)
     assert len(at) > 50 and float((at[:, 2] - CARD).abs().max()) < 0.05
-    assert at[:, :2].mean(0).numpy() == pytest.approx(card_offset(time), abs=0.05)  # the card is 0.7 x 0.6
+    assert at[:, :2].mean(0).numpy() == pytest.approx(
+        card_offset(time), abs=0.05
+    )  # the card is 0.7 x 0.6
     corner = (at[:, :2] - torch.from_numpy(card_offset(time)).float()).abs().amax(0)
-    assert 0.2 < float(corner[0]) < 0.42 and 0.15 < float(corner[1]) < 0.37  # its outline is left out
+    assert (
+        0.2 < float(corner[0]) < 0.42 and 0.15 < float(corner[1]) < 0.37
+    )  # its outline is left out
 
 
 def test_the_rest_is_invisible_and_the_background_typical(field: Splat) -> None:
@@ -100,7 +114,9 @@ def test_the_rest_is_invisible_and_the_background_typical(field: Splat) -> None:
 def test_a_start_is_told_in_a_sentence_and_is_the_same_again(field: Splat, toy: Scene) -> None:
     again, told = seeded(toy)
     still, moving = int(seen(field.static).sum()), int(seen(field.moving).sum())
-    assert told == f"{still} static Gaussians from the depth prior; {moving} moving ones in 1 groups"
+    assert (
+        told == f"{still} static Gaussians from the depth prior; {moving} moving ones in 1 groups"
+    )
     assert all(torch.equal(v, field.state_dict()[k]) for k, v in again.state_dict().items())
 
 
@@ -110,20 +126,28 @@ def test_groups_are_never_more_than_bases(toy: Scene, bases: int) -> None:
     assert 1 <= int(told.split(" in ")[1].split()[0]) <= bases
     mixture = started.mixture_logits.detach()[:, : int(seen(started.moving).sum())].softmax(0)
     assert float(mixture.amax(0).min()) > 1 / bases - 1e-6  # everyone has a basis of its own
-    assert moving_at(started, 4.0)[:, :2].mean(0).numpy() == pytest.approx(card_offset(4.0), abs=0.05)
+    assert moving_at(started, 4.0)[:, :2].mean(0).numpy() == pytest.approx(
+        card_offset(4.0), abs=0.05
+    )
 
 
 @pytest.mark.parametrize("none", [None, torch.zeros(34, 60, dtype=torch.bool)])
 def test_without_movers_all_is_static(toy: Scene, none: Tensor | None) -> None:
     started, told = seeded(changed(toy, lambda f: replace(f, moving=none)))
     assert told.endswith("0 moving ones in 0 groups") and not seen(started.moving).any()
-    assert float(started.static.means.detach()[seen(started.static), 2].min()) < 2.6  # the card as well
+    assert (
+        float(started.static.means.detach()[seen(started.static), 2].min()) < 2.6
+    )  # the card as well
 
 
 def test_where_everything_moves_nothing_is_static(toy: Scene) -> None:
     every = torch.ones(34, 60, dtype=torch.bool)
     started, told = seeded(changed(toy, lambda f: replace(f, moving=every)))
-    assert told.startswith("0 static Gaussians") and not seen(started.static).any() and seen(started.moving).any()
+    assert (
+        told.startswith("0 static Gaussians")
+        and not seen(started.static).any()
+        and seen(started.moving).any()
+    )
 
 
 def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Scene) -> None:
@@ -133,21 +157,29 @@ def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Sc
     assert torch.equal(surely_moving(replace(toy.train[0], moving=mask, outline=None)), mask)
     sure = surely_moving(replace(toy.train[0], moving=mask, outline=outline(mask)))
     inner = sure[:, :20].nonzero()
-    assert inner.amin(0).tolist() == [6, 6] and inner.amax(0).tolist() == [13, 13] and sure[:, 25].sum() == 12
+    assert (
+        inner.amin(0).tolist() == [6, 6]
+        and inner.amax(0).tolist() == [13, 13]
+        and sure[:, 25].sum() == 12
+    )
 
 
 def test_without_flow_movers_drift_with_their_middle(toy: Scene) -> None:
     started, told = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))
     assert told.endswith("in 1 groups")
     for t in (1.0, 2.0, 3.0, 4.0):  # smoothing shortens the ends
-        assert moving_at(started, t)[:, :2].mean(0).numpy() == pytest.approx(card_offset(t), abs=0.12)
+        assert moving_at(started, t)[:, :2].mean(0).numpy() == pytest.approx(
+            card_offset(t), abs=0.12
+        )
 
 
 def test_flow_that_is_never_believed_is_no_flow(toy: Scene) -> None:
     doubted = {o: torch.zeros(34, 60, dtype=torch.bool) for o in (-1, 1)}
     one = seeded(changed(toy, lambda f: replace(f, flow_valid={o: doubted[o] for o in f.flow})))[0]
     none = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))[0]
-    assert torch.equal(one.moving.means, none.moving.means) and torch.equal(one.trajectories.shifts, none.trajectories.shifts)
+    assert torch.equal(one.moving.means, none.moving.means) and torch.equal(
+        one.trajectories.shifts, none.trajectories.shifts
+    )
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -157,7 +189,9 @@ def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given
     assert "random places" in told and "depth prior" in told
     at = started.static.means.detach()[seen(started.static)]
     assert len(at) >= 390 and not seen(started.moving).any()
-    assert toy.near * 0.99 < float(at[:, 2].min()) < 2.2 and 4 < float(at[:, 2].max()) < toy.far * 1.01
+    assert (
+        toy.near * 0.99 < float(at[:, 2].min()) < 2.2 and 4 < float(at[:, 2].max()) < toy.far * 1.01
+    )
     assert float(started.static.log_radiance.detach()[seen(started.static)].unique()) == -1.0
 
 
@@ -165,20 +199,28 @@ def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given
 def test_few_training_frames(toy: Scene, frames: int) -> None:
     started, told = seeded(changed(toy, lambda f: f, frames))
     assert started.trajectories.num_knots == frames and " 0 groups" not in told
-    assert moving_at(started, 0.0)[:, :2].mean(0).numpy() == pytest.approx(card_offset(0.0), abs=0.05)
+    assert moving_at(started, 0.0)[:, :2].mean(0).numpy() == pytest.approx(
+        card_offset(0.0), abs=0.05
+    )
 
 
 def test_two_exposures(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("toy_scene.EV", [1.0, 0.0, 1.0])  # frames alternate, but for two long ones on end
+    monkeypatch.setattr(
+        "toy_scene.EV", [1.0, 0.0, 1.0]
+    )  # frames alternate, but for two long ones on end
     monkeypatch.setitem(globals(), "EV", [1.0, 0.0, 1.0])
     started, _ = seeded(Scene.open(ToyScene().write(tmp_path)))
-    assert moving_at(started, 3.0)[:, :2].mean(0).numpy() == pytest.approx(card_offset(3.0), abs=0.05)
+    assert moving_at(started, 3.0)[:, :2].mean(0).numpy() == pytest.approx(
+        card_offset(3.0), abs=0.05
+    )
 
 
 def test_a_single_moving_pixel(toy: Scene) -> None:
     lone = torch.zeros(34, 60, dtype=torch.bool)
     lone[17, 30] = True
-    started, _ = seeded(changed(toy, lambda f: replace(f, moving=lone if f.time == 2 else ~lone & lone)))
+    started, _ = seeded(
+        changed(toy, lambda f: replace(f, moving=lone if f.time == 2 else ~lone & lone))
+    )
     assert int(seen(started.moving).sum()) == 1
 
 
@@ -188,7 +230,11 @@ def test_frozen_footage(toy: Scene) -> None:
     scene = changed(
         toy,
         lambda f: replace(
-            first, time=f.time, neighbors=f.neighbors, flow=same, flow_valid={o: ~first.moving | True for o in same}
+            first,
+            time=f.time,
+            neighbors=f.neighbors,
+            flow=same,
+            flow_valid={o: ~first.moving | True for o in same},
         ),
     )
     started, _ = seeded(scene)
@@ -198,15 +244,21 @@ def test_frozen_footage(toy: Scene) -> None:
 def test_a_second_camera_speaks_where_the_first_has_no_frame(toy: Scene) -> None:
     f = toy.train[2]
     twin = replace(f, camera_id=1, neighbors={}, flow={}, flow_valid={})
-    views, chosen = views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=[*toy.train, twin]))
+    views, chosen = views_of(
+        Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=[*toy.train, twin])
+    )
     assert chosen == [0, 1, 2, 3, 4, 5] and len(views) == 6
 
 
 def test_flow_to_a_frame_that_does_not_speak_is_left_out(toy: Scene) -> None:
     train = [*toy.train]
     train[2] = replace(train[2], camera_id=1)
-    train.append(replace(toy.train[2]))  # what frames 1 and 3 know the flow to; its time is spoken for
-    train[1], train[3] = (replace(train[i], neighbors=train[i].neighbors | {o: 6}) for i, o in ((1, 1), (3, -1)))
+    train.append(
+        replace(toy.train[2])
+    )  # what frames 1 and 3 know the flow to; its time is spoken for
+    train[1], train[3] = (
+        replace(train[i], neighbors=train[i].neighbors | {o: 6}) for i, o in ((1, 1), (3, -1))
+    )
     views, chosen = views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=train))
     assert chosen == [0, 1, 2, 3, 4, 5]
     assert [sorted(v.flow) for v in views] == [[1], [-1], [-1, 1], [1], [-1, 1], [-1]]
@@ -216,7 +268,10 @@ def test_drift_fills_times_at_which_nothing_is_seen(toy: Scene) -> None:
     hidden = torch.zeros(34, 60, dtype=torch.bool)
     scene = changed(toy, lambda f: replace(f, moving=hidden) if f.time in (0, 3, 5) else f)
     group = drift(views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), scene)[0])
-    assert group.known.tolist() == [False, True, True, False, True, False] and np.isfinite(group.shifts).all()
+    assert (
+        group.known.tolist() == [False, True, True, False, True, False]
+        and np.isfinite(group.shifts).all()
+    )
     steps = np.diff(group.shifts[:, 0])
     assert (steps[1:4] > 0.03).all()  # 0.1 from one time to the next, smoothed
 
@@ -224,7 +279,10 @@ def test_drift_fills_times_at_which_nothing_is_seen(toy: Scene) -> None:
 def test_movers_are_hidden_while_nothing_of_them_is_seen(toy: Scene) -> None:
     hidden = torch.zeros(34, 60, dtype=torch.bool)
     started, _ = seeded(changed(toy, lambda f: replace(f, moving=hidden) if f.time < 3 else f))
-    share = [float(started.opacities(t / 5).detach()[len(started.static) :].max()) for t in (0.0, 1.0, 2.0, 3.0, 5.0)]
+    share = [
+        float(started.opacities(t / 5).detach()[len(started.static) :].max())
+        for t in (0.0, 1.0, 2.0, 3.0, 5.0)
+    ]
     assert max(share[:3]) < 0.01 and share[3:] == pytest.approx([0.7, 0.7])
 
 
@@ -235,7 +293,9 @@ def test_a_gaussian_is_as_wide_as_its_neighbors_are_away() -> None:
     grid = torch.tensor([[x, y, 0.0] for x in range(6) for y in range(6)])
     gaussians = Gaussians(40, 1, 1)
     with torch.no_grad():
-        assert place(gaussians, Points(grid, torch.zeros(36, 3), torch.ones(36), torch.ones(36))) == 36
+        assert (
+            place(gaussians, Points(grid, torch.zeros(36, 3), torch.ones(36), torch.ones(36))) == 36
+        )
     inner = (grid[:, :2] > 0).all(1) & (grid[:, :2] < 5).all(1)
     torch.testing.assert_close(gaussians.log_scales[:36][inner].exp(), torch.full((16, 3), 0.6))
     assert int(seen(gaussians).sum()) == 36
@@ -246,7 +306,12 @@ def test_few_points_are_placed_with_finite_sizes(count: int) -> None:
     gaussians = Gaussians(10, 1, 1)
     at = torch.zeros(count, 3)  # all in one place
     with torch.no_grad():
-        assert place(gaussians, Points(at, torch.zeros(count, 3), torch.ones(count), torch.ones(count))) == count
+        assert (
+            place(
+                gaussians, Points(at, torch.zeros(count, 3), torch.ones(count), torch.ones(count))
+            )
+            == count
+        )
     assert torch.isfinite(gaussians.log_scales).all() and int(seen(gaussians).sum()) == count
     assert len(neighbor_distance(at.numpy())) == count
 
@@ -254,7 +319,9 @@ def test_few_points_are_placed_with_finite_sizes(count: int) -> None:
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_bases_spread_over_separate_heaps(count: int) -> None:
     heaps = torch.tensor([[0.0, 0, 0], [9, 0, 0], [0, 9, 0], [0, 0, 9]])
-    points = heaps[:count].repeat_interleave(20, 0) + 0.1 * torch.randn(20 * count, 3, generator=torch.Generator().manual_seed(0))
+    points = heaps[:count].repeat_interleave(20, 0) + 0.1 * torch.randn(
+        20 * count, 3, generator=torch.Generator().manual_seed(0)
+    )
     places = spread(points, count, torch.zeros(3))
     assert float(torch.cdist(places, heaps[:count]).amin(0).max()) < 0.2
 

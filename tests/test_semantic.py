@@ -1,4 +1,6 @@
-"""Flow by features: right across exposures and beyond the reach of plain matching, clean at edges; features here are colors."""
+"""Flow by features: right across exposures and beyond the reach of plain matching,
+clean at edges; features here are colors.
+"""
 
 import cv2
 import numpy as np
@@ -14,19 +16,27 @@ H, W = 64, 96
 
 def texture(seed: int, size: tuple[int, int], blur: float) -> np.ndarray:
     """Smooth noise (H, W, 3) in [0, 1]."""
-    noise = cv2.GaussianBlur(np.random.default_rng(seed).random((*size, 3)).astype(np.float32), (0, 0), blur)
+    noise = cv2.GaussianBlur(
+        np.random.default_rng(seed).random((*size, 3)).astype(np.float32), (0, 0), blur
+    )
     return (noise - noise.min()) / np.ptp(noise)
 
 
 def source(video: np.ndarray) -> Features:
-    """What each cell of 4 pixels shows, its mean over the cells around taken off: alike under any gain and offset."""
+    """What each cell of 4 pixels shows, its mean over the cells around taken off: alike
+    under any gain and offset.
+    """
     bare = Features(torch.zeros(1, 1, H // 4, W // 4), 4.0, 2.0)
     seen = colors(video, bare, 2)
-    return Features(seen - torch.nn.functional.avg_pool2d(seen, 5, 1, 2, count_include_pad=False), 4.0, 2.0)
+    return Features(
+        seen - torch.nn.functional.avg_pool2d(seen, 5, 1, 2, count_include_pad=False), 4.0, 2.0
+    )
 
 
 def passing(step: int = 14) -> tuple[np.ndarray, np.ndarray]:
-    """Frames (3, H, W, 3) in which a patch of 20 pixels leaps by `step` to the right before a background at rest, and where it is."""
+    """Frames (3, H, W, 3) in which a patch of 20 pixels leaps by `step` to the right
+    before a background at rest, and where it is.
+    """
     background, patch = texture(0, (H, W), 1.5), texture(1, (20, 20), 1.5)
     video, where = np.stack([background] * 3), np.zeros((3, H, W), bool)
     for t in range(3):
@@ -36,7 +46,9 @@ def passing(step: int = 14) -> tuple[np.ndarray, np.ndarray]:
 
 
 def translated() -> np.ndarray:
-    """Two frames (2, H, W, 3) of a texture that moves by 6 pixels to the right, the second one of another exposure."""
+    """Two frames (2, H, W, 3) of a texture that moves by 6 pixels to the right, the
+    second one of another exposure.
+    """
     wide = texture(0, (H, W + 20), 1.5)
     return np.stack([wide[:, 10 : 10 + W], 0.5 * wide[:, 4 : 4 + W] ** 0.8 + 0.1])
 
@@ -67,14 +79,22 @@ def test_a_small_thing_that_leaps_is_followed_where_plain_matching_loses_it():
 
 def test_flow_is_not_rounded_to_cells_or_pixels():
     wide = cv2.resize(texture(0, (H, W + 20), 1.5), None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-    video = np.stack([cv2.resize(wide[:, x : x + 4 * W], (W, H), interpolation=cv2.INTER_AREA) for x in (40, 30)])  # 2.5 px
+    video = np.stack(
+        [cv2.resize(wide[:, x : x + 4 * W], (W, H), interpolation=cv2.INTER_AREA) for x in (40, 30)]
+    )  # 2.5 px
     found = SemanticFlow(source)(video, nothing(video), np.array([[0, 1]]))[0][0]
     assert abs(np.median(found[8:-8, 12:-12, 0]) - 2.5) < 0.1
 
 
 def test_what_lies_beyond_an_edge_is_not_mixed_in():
-    """Unsure cells hold nonsense, cells of another color another motion: neither shows within the edge."""
-    values, sure, rgb = np.zeros((6, 8, 2), np.float32), np.ones((6, 8), bool), np.zeros((6, 8, 3), np.float32)
+    """Unsure cells hold nonsense, cells of another color another motion: neither shows
+    within the edge.
+    """
+    values, sure, rgb = (
+        np.zeros((6, 8, 2), np.float32),
+        np.ones((6, 8), bool),
+        np.zeros((6, 8, 3), np.float32),
+    )
     values[:, :4], values[:, 4:], rgb[:, 4:] = 3, -50, 1
     values[2, 2], sure[2, 2] = np.nan, False
     assert np.allclose(fill(values, sure, rgb)[:, :4], 3, atol=1e-3)
@@ -97,7 +117,9 @@ def test_nothing_sure_leaves_the_motion_as_it_was():
 def test_points_of_equal_exposure_are_followed_over_two_cycles():
     """A patch that goes 6 pixels per cycle goes 3 cells of 4 pixels in two."""
     video, where = passing(6)
-    tracks = {t.frames: t for t in equal_tracks(source(video), video, nothing(video), [(0, 1), (1, 2)])}
+    tracks = {
+        t.frames: t for t in equal_tracks(source(video), video, nothing(video), [(0, 1), (1, 2)])
+    }
     assert set(tracks) == {(0, 1), (1, 0), (1, 2), (2, 1), (0, 2), (2, 0)}
     track = tracks[0, 2]
     pixel = (track.start * 4 + 2 - 0.5).round().int().numpy()
@@ -109,7 +131,9 @@ def test_fitting_to_the_clip_repeats_itself_and_keeps_flow_right():
     video, where = passing()
     prior = SemanticFlow(source, [(0, 1), (1, 2)], [(0, 2)], steps=20)
     found, valid = prior(video, nothing(video), np.array([[0, 1]]))
-    again = SemanticFlow(source, [(0, 1), (1, 2)], [(0, 2)], steps=20)(video, nothing(video), np.array([[0, 1]]))
+    again = SemanticFlow(source, [(0, 1), (1, 2)], [(0, 2)], steps=20)(
+        video, nothing(video), np.array([[0, 1]])
+    )
     assert np.array_equal(found, again[0]) and np.array_equal(valid, again[1])
     assert np.median(np.linalg.norm(found[0] - [14, 0], axis=-1)[where[0]]) < 0.2
     assert not torch.equal(prior.features.maps, source(video).maps)
@@ -120,7 +144,10 @@ def test_only_frames_to_learn_from_shape_the_features():
     video, _ = passing()
     other = video.copy()
     other[2] = texture(9, (H, W), 1.5)
-    one, two = (SemanticFlow(source, [(0, 1)], steps=5)(v, nothing(v), np.array([[0, 1]]))[0] for v in (video, other))
+    one, two = (
+        SemanticFlow(source, [(0, 1)], steps=5)(v, nothing(v), np.array([[0, 1]]))[0]
+        for v in (video, other)
+    )
     assert np.array_equal(one, two)
 
 

@@ -5,7 +5,13 @@ import math
 import pytest
 import torch
 
-from hdr_nsff.fields.space import ContractedSpace, FrustumSpace, build_space, frustum_corners, mean_pose
+from hdr_nsff.fields.space import (
+    ContractedSpace,
+    FrustumSpace,
+    build_space,
+    frustum_corners,
+    mean_pose,
+)
 from hdr_nsff.geometry.cameras import Camera
 
 K = torch.tensor([[50.0, 0, 32], [0, 50.0, 18], [0, 0, 1]])
@@ -42,8 +48,12 @@ def test_decode_inverts_encode_for_everything_the_cameras_see(cameras: list[Came
 
 def test_frustum_cells_are_even_in_pixels_and_in_disparity() -> None:
     space = build_space([camera()], 1.0, 20.0)
-    near, far = (space.encode(torch.tensor([[z * 0.1, 0.0, z], [z * 0.2, 0.0, z]])) for z in (1.5, 15.0))
-    torch.testing.assert_close(near[1, 0] - near[0, 0], far[1, 0] - far[0, 0])  # 5 pixels are 5 pixels at every depth
+    near, far = (
+        space.encode(torch.tensor([[z * 0.1, 0.0, z], [z * 0.2, 0.0, z]])) for z in (1.5, 15.0)
+    )
+    torch.testing.assert_close(
+        near[1, 0] - near[0, 0], far[1, 0] - far[0, 0]
+    )  # 5 pixels are 5 pixels at every depth
     z = 1 / torch.tensor([0.2, 0.4, 0.6])
     third = space.encode(torch.stack([0 * z, 0 * z, z], -1))[:, 2]
     torch.testing.assert_close(third[2] - third[1], third[1] - third[0])
@@ -57,7 +67,9 @@ def test_frustum_of_one_camera_spans_its_picture_with_a_small_margin() -> None:
 
 def test_contraction_is_linear_inside_and_bounded_outside() -> None:
     space = ContractedSpace(torch.tensor([1.0, 0, 0]), torch.tensor(2.0))
-    torch.testing.assert_close(space.encode(torch.tensor([[2.0, 0, 0]])), torch.tensor([[0.5 + 0.5 / 4, 0.5, 0.5]]))
+    torch.testing.assert_close(
+        space.encode(torch.tensor([[2.0, 0, 0]])), torch.tensor([[0.5 + 0.5 / 4, 0.5, 0.5]])
+    )
     torch.testing.assert_close(
         space.encode(torch.tensor([[1.0, 4.0, 0]])), torch.tensor([[0.5, 0.5 + 1.5 / 4, 0.5]])
     )  # (2 - 1/2)
@@ -74,7 +86,9 @@ def test_mean_pose_is_a_rotation_at_the_mean_center() -> None:
 
 def test_gradients_pass_through_both_maps() -> None:
     for space in (build_space(forward_facing(), 1.0, 20.0), build_space(all_round(), 1.0, 20.0)):
-        x = torch.tensor([[0.4, 0.6, 0.3], [0.55, 0.5, 0.7]], dtype=torch.float64, requires_grad=True)
+        x = torch.tensor(
+            [[0.4, 0.6, 0.3], [0.55, 0.5, 0.7]], dtype=torch.float64, requires_grad=True
+        )
         assert torch.autograd.gradcheck(space.double().decode, (x,), atol=1e-4)
         points = space.decode(x).detach().requires_grad_()
         assert torch.autograd.gradcheck(space.encode, (points,), atol=1e-4)

@@ -1,4 +1,6 @@
-"""A field of Gaussians: exact flows of what moves, gradients and their reach, and what is drawn where nothing is."""
+"""A field of Gaussians: exact flows of what moves, gradients and their reach, and what
+is drawn where nothing is.
+"""
 
 import math
 from dataclasses import replace
@@ -27,12 +29,23 @@ BESIDE = CAMERA.moved(torch.tensor([[1.0, 0, 0, 0.2], [0, 1, 0, -0.1], [0, 0, 1,
 
 
 def card_field(bases: int = 2) -> Splat:
-    """A card of opaque Gaussians at z = 2 that moves by `STEP`, in front of a wall at z = 4 that fills the view."""
-    field = Splat(SplatConfig(static=33 * 25, moving=121, bases=bases), torch.arange(TIMES), 1.0, 6.0, 1200)
+    """A card of opaque Gaussians at z = 2 that moves by `STEP`, in front of a wall at z
+    = 4 that fills the view.
+    """
+    field = Splat(
+        SplatConfig(static=33 * 25, moving=121, bases=bases), torch.arange(TIMES), 1.0, 6.0, 1200
+    )
     with torch.no_grad():
-        for gaussians, wide, high, z, space in ((field.static, 33, 25, 4.0, 0.1), (field.moving, 11, 11, 2.0, 0.04)):
-            y, x = torch.meshgrid(torch.arange(high) - high // 2, torch.arange(wide) - wide // 2, indexing="ij")
-            gaussians.means[:] = torch.stack([x * space, y * space, torch.full_like(x, 0) + z], -1).reshape(-1, 3)
+        for gaussians, wide, high, z, space in (
+            (field.static, 33, 25, 4.0, 0.1),
+            (field.moving, 11, 11, 2.0, 0.04),
+        ):
+            y, x = torch.meshgrid(
+                torch.arange(high) - high // 2, torch.arange(wide) - wide // 2, indexing="ij"
+            )
+            gaussians.means[:] = torch.stack(
+                [x * space, y * space, torch.full_like(x, 0) + z], -1
+            ).reshape(-1, 3)
             gaussians.log_scales[:] = math.log(space)
             gaussians.log_scales[:, 2] = math.log(1e-3)  # flat
             gaussians.logits[:] = 6.0
@@ -44,11 +57,15 @@ def card_field(bases: int = 2) -> Splat:
 
 
 def batch_of(knot: int, offset: int, seed: int = 0) -> PixelBatch:
-    """The whole picture at a time; flow is asked for towards one neighbor, seen from `BESIDE`."""
+    """The whole picture at a time; flow is asked for towards one neighbor, seen from
+    `BESIDE`.
+    """
     pixels = CAMERA.pixel_grid()
     gray, flow = torch.full((len(pixels), 3), 0.5), {offset: torch.zeros(len(pixels), 2)}
     every = torch.ones(len(pixels), dtype=torch.bool)
-    return PixelBatch(knot, float(knot), CAMERA, 0, 0, {offset: BESIDE}, pixels, gray, every, seed=seed, flow=flow)
+    return PixelBatch(
+        knot, float(knot), CAMERA, 0, 0, {offset: BESIDE}, pixels, gray, every, seed=seed, flow=flow
+    )
 
 
 def pixel_of(point: Tensor) -> int:
@@ -57,7 +74,9 @@ def pixel_of(point: Tensor) -> int:
     return y * CAMERA.width + x
 
 
-def scattered(seed: int = 0, static: int = 40, moving: int = 30, view_dependence: bool = False) -> Splat:
+def scattered(
+    seed: int = 0, static: int = 40, moving: int = 30, view_dependence: bool = False
+) -> Splat:
     """Anything anywhere in view, with something in every parameter."""
     config = SplatConfig(static=static, moving=moving, bases=3, view_dependence=view_dependence)
     field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
@@ -96,10 +115,14 @@ def test_flow_to_the_neighbor_is_the_projected_displacement(offset: int) -> None
     (warp,) = render.warps
     z = 2 + 4 * 0.03
     at = pixel_of(torch.tensor([0.0, 0, 2]) + 4 * STEP)
-    card, wall = (CAMERA.rays(CAMERA.pixel_grid()[k]).directions * depth for k, depth in ((at, z), (0, 4.0)))
+    card, wall = (
+        CAMERA.rays(CAMERA.pixel_grid()[k]).directions * depth for k, depth in ((at, z), (0, 4.0))
+    )
     card_flow = BESIDE.project(card + offset * STEP)[0] - CAMERA.pixel_grid()[at]
     wall_flow = BESIDE.project(wall)[0] - CAMERA.pixel_grid()[0]
-    assert warp.offset == offset and warp.radiance is None and warp.confidence.tolist() == [1.0] * 1200
+    assert (
+        warp.offset == offset and warp.radiance is None and warp.confidence.tolist() == [1.0] * 1200
+    )
     torch.testing.assert_close(
         warp.flow.detach()[at], card_flow, atol=0.1, rtol=0
     )  # Gaussians up to two pixels off shine through
@@ -121,7 +144,9 @@ def test_flow_through_a_faint_card_is_the_same() -> None:
 
 def test_flow_to_one_side_and_rigidity_take_turns_as_the_seed_says() -> None:
     batch = batch_of(4, 1)
-    both = replace(batch, neighbors={1: BESIDE, -1: BESIDE}, flow={o: batch.flow[1] for o in (1, -1)})
+    both = replace(
+        batch, neighbors={1: BESIDE, -1: BESIDE}, flow={o: batch.flow[1] for o in (1, -1)}
+    )
     seen = [card_field()(replace(both, seed=s)) for s in range(5)]
     assert [[w.offset for w in render.warps] for render, _ in seen] == [[1], [], [-1], [], [1]]
     assert ["rigidity" in own for _, own in seen] == [False, True, False, True, False]
@@ -135,7 +160,10 @@ def test_fractional_times_lie_between() -> None:
         low, high = (field.positions(k).detach() for k in (3.0, 4.0))
         torch.testing.assert_close(at, torch.lerp(low, high, time - 3))
     columns = torch.arange(1200) % 40
-    middles = [float((r.motion * columns).sum() / r.motion.sum()) for r in (field.render(CAMERA, t) for t in (3.0, 3.5, 4.0))]
+    middles = [
+        float((r.motion * columns).sum() / r.motion.sum())
+        for r in (field.render(CAMERA, t) for t in (3.0, 3.5, 4.0))
+    ]
     assert middles[0] < middles[1] < middles[2]
     assert middles[1] == pytest.approx((middles[0] + middles[2]) / 2, abs=0.05)
 
@@ -143,7 +171,10 @@ def test_fractional_times_lie_between() -> None:
 def test_times_may_be_uneven() -> None:
     field = card_field()
     field.times[:] = torch.tensor([0.0, 1, 2, 3, 7, 8, 9, 10, 11, 12])
-    torch.testing.assert_close(field.positions(field.knot(5.0)), torch.lerp(field.positions(3.0), field.positions(4.0), 0.5))
+    torch.testing.assert_close(
+        field.positions(field.knot(5.0)),
+        torch.lerp(field.positions(3.0), field.positions(4.0), 0.5),
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -152,21 +183,34 @@ def test_shares_stay_between_0_and_1(seed: int) -> None:
     for gaussians in (field.static, field.moving):
         gaussians.logits.data.fill_(9.0)
     r = field.render(CAMERA, 2.3)
-    assert float(r.motion.min()) >= 0 and float(r.motion.max()) <= float(r.opacity.max()) <= 1 + 1e-5
+    assert (
+        float(r.motion.min()) >= 0 and float(r.motion.max()) <= float(r.opacity.max()) <= 1 + 1e-5
+    )
     assert bool((r.motion <= r.opacity + 1e-5).all()) and float(r.motion.max()) > 0.5
 
 
 def test_gradients_reach_every_parameter() -> None:
     field = scattered(view_dependence=True)
     render, own = field(batch_of(4, 1))
-    total = render.radiance.square().sum() + render.depth.sum() + render.motion.sum() + render.warps[0].flow.square().sum()
+    total = (
+        render.radiance.square().sum()
+        + render.depth.sum()
+        + render.motion.sum()
+        + render.warps[0].flow.square().sum()
+    )
     (total + sum(own.values())).backward()
     for name, p in field.named_parameters():
-        assert p.grad is not None and torch.isfinite(p.grad).all() and float(p.grad.abs().max()) > 0, name
+        assert (
+            p.grad is not None and torch.isfinite(p.grad).all() and float(p.grad.abs().max()) > 0
+        ), name
 
 
-def test_a_step_moves_only_the_poses_near_the_drawn_frame(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
-    long = replace(toy, train=[replace(toy.train[i % 6], time=float(i), neighbors={}) for i in range(12)])
+def test_a_step_moves_only_the_poses_near_the_drawn_frame(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    long = replace(
+        toy, train=[replace(toy.train[i % 6], time=float(i), neighbors={}) for i in range(12)]
+    )
     t = trainer(small("splat", toy_folder, tmp_path / "run"), long)
     field = t.field
     assert isinstance(field, Splat)
@@ -196,15 +240,27 @@ def test_the_regularizers_of_a_plain_field_by_hand() -> None:
     field = card_field()
     own = {k: float(v.detach()) for k, v in field.regularizers(field.cloud(3.0), 3.0).items()}
     assert own["opacity"] == pytest.approx(1 / (1 + math.exp(-6)))
-    assert own["scale"] == pytest.approx((825 * (0.2 + 1e-3) + 121 * (0.08 + 1e-3)) / 3 / 946, rel=1e-5)  # near is 1
-    assert own["trajectory"] < 1e-12 and own["brightness_drift"] == own["color_change"] == 0  # even steps, constant colors
-    field.moving.offsets.data[3] = 2.0  # up and down between 7 times: 2 of 6 differences; 1 of 7 times
-    assert float(field.regularizers(field.cloud(3.0), 3.0)["color_change"].detach()) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
+    assert own["scale"] == pytest.approx(
+        (825 * (0.2 + 1e-3) + 121 * (0.08 + 1e-3)) / 3 / 946, rel=1e-5
+    )  # near is 1
+    assert (
+        own["trajectory"] < 1e-12 and own["brightness_drift"] == own["color_change"] == 0
+    )  # even steps, constant colors
+    # up and down between 7 times: 2 of 6 differences; 1 of 7 times
+    field.moving.offsets.data[3] = 2.0
+    assert float(
+        field.regularizers(field.cloud(3.0), 3.0)["color_change"].detach()
+    ) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
 
 
-@pytest.mark.parametrize("config", [{"moving": 0}, {"static": 0}, {"color_knots": 1, "opacity_knots": 1, "brightness_knots": 1}])
+@pytest.mark.parametrize(
+    "config",
+    [{"moving": 0}, {"static": 0}, {"color_knots": 1, "opacity_knots": 1, "brightness_knots": 1}],
+)
 def test_a_field_may_lack_a_kind_of_gaussian_or_all_change(config: dict[str, int]) -> None:
-    field = Splat(replace(SplatConfig(static=20, moving=20), **config), torch.arange(TIMES), 1.0, 6.0, 1200)
+    field = Splat(
+        replace(SplatConfig(static=20, moving=20), **config), torch.arange(TIMES), 1.0, 6.0, 1200
+    )
     render, own = field(batch_of(4, 1))
     (render.radiance.sum() + sum(own.values())).backward()
     assert all(torch.isfinite(v) for v in own.values())
@@ -243,13 +299,20 @@ def test_the_background_shows_where_nothing_is() -> None:
     field.background.data = torch.tensor([0.3, 1.0, 20.0]).log()
     render = field.render(CAMERA, 2.0)
     torch.testing.assert_close(render.radiance, torch.tensor([0.3, 1.0, 20.0]).expand(1200, 3))
-    assert float(render.opacity.max()) == float(render.motion.max()) == 0 and render.depth.unique().tolist() == [6.0]
+    assert float(render.opacity.max()) == float(
+        render.motion.max()
+    ) == 0 and render.depth.unique().tolist() == [6.0]
     assert len(field.gaussians(2.0).means) == 0
 
 
 def test_huge_log_radiance_stays_finite() -> None:
     field = card_field()
-    for p in (field.background, field.static.log_radiance, field.moving.log_radiance, field.moving.offsets):
+    for p in (
+        field.background,
+        field.static.log_radiance,
+        field.moving.log_radiance,
+        field.moving.offsets,
+    ):
         p.data += 1e4
     render, own = field(batch_of(4, 1))
     assert float(render.radiance.detach().max()) == pytest.approx(math.exp(BRIGHTEST), rel=0.01)
@@ -283,12 +346,16 @@ def test_one_training_time_has_no_flow() -> None:
     assert isinstance(field, RadianceField)
     render = field.render(CAMERA, 0.7)
     assert float(render.scene_flow[1].abs().max()) == float(render.scene_flow[-1].abs().max()) == 0
-    assert float(render.motion.max()) > 0.1 and torch.isfinite(field(replace(batch_of(0, 1), flow={}))[1]["trajectory"])
+    assert float(render.motion.max()) > 0.1 and torch.isfinite(
+        field(replace(batch_of(0, 1), flow={}))[1]["trajectory"]
+    )
 
 
 def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> None:
     field = card_field()
-    field.moving.offsets.data = torch.linspace(0, 1, 7)[:, None, None] * torch.tensor([1.0, 0.0, -1.0]).expand(121, 3)
+    field.moving.offsets.data = torch.linspace(0, 1, 7)[:, None, None] * torch.tensor(
+        [1.0, 0.0, -1.0]
+    ).expand(121, 3)
     field.static.offsets.data = torch.linspace(0, 2, 5)[:, None, None].expand(5, 825, 1).clone()
     early, late = field.gaussians(0.0).radiance.log(), field.gaussians(9.0).radiance.log()
     torch.testing.assert_close((late - early)[-1], torch.tensor([1.0, 0.0, -1.0]))
@@ -298,7 +365,9 @@ def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> Non
 
 
 def test_a_trained_start_knows_the_cards_flow(toy: Scene) -> None:
-    field = Splat(SplatConfig(static=1500, moving=400, bases=2), toy.times, toy.near, toy.far, 60 * 34)
+    field = Splat(
+        SplatConfig(static=1500, moving=400, bases=2), toy.times, toy.near, toy.far, 60 * 34
+    )
     start_field(field, toy, lambda rgb, i: rgb + 0.1, 0.0, True)
     f = toy.train[2]
     offset = card_offset(2.0)
@@ -319,10 +388,14 @@ def test_a_picture_without_scene_flow_is_the_same_picture() -> None:
 def test_flow_with_a_camera_that_learns_reaches_its_pose() -> None:
     field, batch = card_field(), batch_of(4, 1)
     pose = BESIDE.c2w.clone().requires_grad_()
-    moved = field.displacements(replace(batch, neighbors={1: BESIDE.moved(pose)}), field.cloud(4.0).means, 4.0, 1)
+    moved = field.displacements(
+        replace(batch, neighbors={1: BESIDE.moved(pose)}), field.cloud(4.0).means, 4.0, 1
+    )
     torch.testing.assert_close(moved, field.displacements(batch, field.cloud(4.0).means, 4.0, 1))
     moved[:, 0].sum().backward()
-    assert pose.grad is not None and float(pose.grad[0, 3]) < 0  # a camera that goes right sees everything go left
+    assert (
+        pose.grad is not None and float(pose.grad[0, 3]) < 0
+    )  # a camera that goes right sees everything go left
 
 
 def test_neighbors_that_mix_alike_are_rigid_and_others_pay() -> None:
@@ -330,23 +403,39 @@ def test_neighbors_that_mix_alike_are_rigid_and_others_pay() -> None:
     field.find_neighbors()
     assert set(field.neighbors[60].tolist()) == {49, 59, 61, 71}  # the middle one's four
     assert float(field.rigidity().detach()) == 0
-    field.mixture_logits.data[:, 60] = torch.tensor([1.0, -1.0])  # 0.8808 and 0.1192 instead of halves
-    pairs = int((field.neighbors == 60).sum()) + 4  # it looks at its four neighbors, and some look at it
-    assert float(field.rigidity().detach()) == pytest.approx(pairs * 2 * 0.3808**2 / (121 * 4 * 2), rel=1e-3)
+    field.mixture_logits.data[:, 60] = torch.tensor(
+        [1.0, -1.0]
+    )  # 0.8808 and 0.1192 instead of halves
+    pairs = (
+        int((field.neighbors == 60).sum()) + 4
+    )  # it looks at its four neighbors, and some look at it
+    assert float(field.rigidity().detach()) == pytest.approx(
+        pairs * 2 * 0.3808**2 / (121 * 4 * 2), rel=1e-3
+    )
     field.rigidity().backward()
     assert field.mixture_logits.grad is not None and float(field.mixture_logits.grad[0, 60]) > 0
 
 
 def test_colors_depend_on_the_direction_of_view_only_where_wanted() -> None:
-    plain, shiny = (Splat(SplatConfig(1, 0, view_dependence=v), torch.arange(2), 1.0, 6.0, 1200) for v in (False, True))
+    plain, shiny = (
+        Splat(SplatConfig(1, 0, view_dependence=v), torch.arange(2), 1.0, 6.0, 1200)
+        for v in (False, True)
+    )
     assert plain.static.sh1.numel() == 0
     with torch.no_grad():
         for field in (plain, shiny):
             field.static.means[:] = torch.tensor([0.0, 0.0, 2.0])
             field.static.log_scales[:], field.static.logits[:] = 0.0, 9.0
         shiny.static.sh1[0, 1, 0] = 1.0  # green grows to the right
-        beside = CAMERA.moved(torch.tensor([[0.8, 0, 0.6, -1.5], [0, 1, 0, 0], [-0.6, 0, 0.8, 0]]))  # sees it along (0.6, 0, 0.8)
+        beside = CAMERA.moved(
+            torch.tensor([[0.8, 0, 0.6, -1.5], [0, 1, 0, 0], [-0.6, 0, 0.8, 0]])
+        )  # sees it along (0.6, 0, 0.8)
         middle = torch.tensor([[20.0, 15.0]])
         for camera, direction in ((CAMERA, 0.0), (beside, 0.6)):
-            ratio = shiny.render(camera, 0.0, middle).radiance / plain.render(camera, 0.0, middle).radiance
-            torch.testing.assert_close(ratio[0], torch.tensor([1.0, math.exp(direction), 1.0]), atol=2e-3, rtol=2e-3)
+            ratio = (
+                shiny.render(camera, 0.0, middle).radiance
+                / plain.render(camera, 0.0, middle).radiance
+            )
+            torch.testing.assert_close(
+                ratio[0], torch.tensor([1.0, math.exp(direction), 1.0]), atol=2e-3, rtol=2e-3
+            )

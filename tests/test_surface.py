@@ -6,19 +6,35 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.surface import CELLS, Points, cells_for, exposure_trust, joined, lift, thinned, thinned_to
+from hdr_nsff.fields.surface import (
+    CELLS,
+    Points,
+    cells_for,
+    exposure_trust,
+    joined,
+    lift,
+    thinned,
+    thinned_to,
+)
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Frame
 
 CAMERA = Camera(
-    torch.tensor([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]]), torch.tensor([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]), 4, 2
+    torch.tensor([[10.0, 0, 2], [0, 10, 1], [0, 0, 1]]),
+    torch.tensor([[1.0, 0, 0, 5], [0, 1, 0, 0], [0, 0, 1, 0]]),
+    4,
+    2,
 )
 
 
-def frame(disparity: Tensor, image: Tensor | None = None, confidence: Tensor | None = None) -> Frame:
+def frame(
+    disparity: Tensor, image: Tensor | None = None, confidence: Tensor | None = None
+) -> Frame:
     """A frame of 4 x 2 pixels, gray unless given."""
     image = torch.full((2, 4, 3), 0.5) if image is None else image
-    return Frame(0, 0.0, CAMERA, 0, 0, None, image, disparity=disparity, disparity_confidence=confidence)
+    return Frame(
+        0, 0.0, CAMERA, 0, 0, None, image, disparity=disparity, disparity_confidence=confidence
+    )
 
 
 def double(rgb: Tensor, frame: int) -> Tensor:
@@ -40,7 +56,9 @@ EVERY = torch.ones(8, dtype=torch.bool)
 
 
 def test_a_pixel_is_lifted_to_its_depth_on_its_ray() -> None:
-    chosen = torch.arange(8) == 7  # column 3, row 1: center (3.5, 1.5), so x / z = 0.15 and y / z = 0.05
+    chosen = (
+        torch.arange(8) == 7
+    )  # column 3, row 1: center (3.5, 1.5), so x / z = 0.15 and y / z = 0.05
     p = lift(frame(torch.full((2, 4), 0.25)), 0, chosen, 1.0, 100.0, double)
     torch.testing.assert_close(p.positions, torch.tensor([[5 + 0.15 * 4, 0.05 * 4, 4.0]]))
     torch.testing.assert_close(p.footprint, torch.tensor([4.0 / 10]))
@@ -48,13 +66,17 @@ def test_a_pixel_is_lifted_to_its_depth_on_its_ray() -> None:
 
 def test_depth_is_held_between_near_and_far() -> None:
     disparity = torch.tensor([[0.0, 0.01, 0.25, 9.0], [0.0, 0.01, 0.25, 9.0]])
-    assert lift(frame(disparity), 0, EVERY, 2.0, 50.0, double).positions[:4, 2].tolist() == pytest.approx([50, 50, 4, 2])
+    assert lift(frame(disparity), 0, EVERY, 2.0, 50.0, double).positions[
+        :4, 2
+    ].tolist() == pytest.approx([50, 50, 4, 2])
 
 
 def test_radiance_is_recovered_frame_by_frame() -> None:
     f = frame(torch.ones(2, 4))
     for i, radiance in ((0, 1.0), (1, 1.5)):
-        torch.testing.assert_close(lift(f, i, EVERY, 0.5, 9.0, double).log_radiance, torch.full((8, 3), math.log(radiance)))
+        torch.testing.assert_close(
+            lift(f, i, EVERY, 0.5, 9.0, double).log_radiance, torch.full((8, 3), math.log(radiance))
+        )
 
 
 def test_black_has_a_finite_log_radiance() -> None:
@@ -66,10 +88,14 @@ def test_black_has_a_finite_log_radiance() -> None:
 def test_confidence_is_part_of_trust() -> None:
     confidence = torch.tensor([[0.0, 0.5, 1.0, 1.0], [0.0, 0.5, 1.0, 1.0]])
     p = lift(frame(torch.ones(2, 4), confidence=confidence), 0, EVERY, 0.5, 9.0, double)
-    torch.testing.assert_close(p.trust[:3], torch.tensor([0.02, 0.52, 1.02]) * 0.5)  # gray, mean 0.5, is well exposed
+    torch.testing.assert_close(
+        p.trust[:3], torch.tensor([0.02, 0.52, 1.02]) * 0.5
+    )  # gray, mean 0.5, is well exposed
 
 
-@pytest.mark.parametrize("rgb", [[0.98, 0.5, 0.5], [0.5, 0.5, 1.0], [0.005, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]])
+@pytest.mark.parametrize(
+    "rgb", [[0.98, 0.5, 0.5], [0.5, 0.5, 1.0], [0.005, 0.5, 0.5], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
+)
 def test_one_clipped_channel_takes_all_trust(rgb: list[float]) -> None:
     clipped, gray = exposure_trust(torch.tensor([rgb, [0.5, 0.5, 0.5]])).tolist()
     assert 0 < clipped < 0.01 * gray
@@ -78,11 +104,14 @@ def test_one_clipped_channel_takes_all_trust(rgb: list[float]) -> None:
 def test_darks_are_trusted_less() -> None:
     trust = exposure_trust(torch.tensor([[0.02] * 3, [0.1] * 3, [0.3] * 3, [0.6] * 3]))
     assert trust.tolist() == sorted(trust.tolist())
-    assert float(trust[3]) == pytest.approx(0.6)  # within the trusted range only the brightness counts
+    assert float(trust[3]) == pytest.approx(
+        0.6
+    )  # within the trusted range only the brightness counts
 
 
 def test_thinning_takes_trust_weighted_means() -> None:
-    # cell 7: positions 1 and 4 with trusts 3 and 1: (3 * 1 + 1 * 4) / 4 = 1.75; cell 2: alone
+    # cell 7: positions 1 and 4 with trusts 3 and 1: (3 * 1 + 1 * 4) / 4 = 1.75; cell 2:
+    # alone
     p = points(torch.tensor([[1.0, 0, 0], [9.0, 2, 1], [4.0, 4, 8]]), torch.tensor([3.0, 0.5, 1.0]))
     kept = thinned(p, torch.tensor([7, 2, 7]))
     torch.testing.assert_close(kept.positions, torch.tensor([[9.0, 2, 1], [1.75, 1, 2]]))
@@ -137,7 +166,10 @@ def test_one_point_or_none(count: int, limit: int) -> None:
 
 
 def test_points_of_different_kinds_never_share_a_cell() -> None:
-    coords, kind = cloud(30).repeat(3, 1), torch.arange(3).repeat_interleave(30)  # three kinds at the same places
+    coords, kind = (
+        cloud(30).repeat(3, 1),
+        torch.arange(3).repeat_interleave(30),
+    )  # three kinds at the same places
     for limit in (1, 3, 20, 80, 90):
         cell = cells_for(coords, kind, limit)
         assert torch.equal(cell // CELLS, kind) and 3 <= len(torch.unique(cell)) <= max(limit, 3)

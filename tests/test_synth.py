@@ -1,4 +1,6 @@
-"""The synthetic room: exact geometry, what is held out, resuming; one tiny picture where Mitsuba is installed."""
+"""The synthetic room: exact geometry, what is held out, resuming; one tiny picture
+where Mitsuba is installed.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +23,16 @@ from hdr_nsff.synth.oracle import visible
 from hdr_nsff.synth.pathtracer import PASS, Surface, Tracer, smooth
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics, look_at, project
-from hdr_nsff.synth.scenes.interior import BACK, CORD, FLOOR, INTERIOR, PIVOT, ball_pose, box_pose, camera_pose
+from hdr_nsff.synth.scenes.interior import (
+    BACK,
+    CORD,
+    FLOOR,
+    INTERIOR,
+    PIVOT,
+    ball_pose,
+    box_pose,
+    camera_pose,
+)
 from hdr_nsff.synth.synth import SynthConfig, clip_shots, parse_ev, parse_size, synth, truth_shots
 
 ROOM, BOX, BALL = 0, 1, 2
@@ -47,9 +58,15 @@ def test_camera_looks_at_its_target_level() -> None:
 
 
 def test_projection_agrees_with_the_camera_of_the_package() -> None:
-    points, c2w, K = np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (9, 3)), camera_pose(5.5), intrinsics(240, 136)
+    points, c2w, K = (
+        np.random.default_rng(0).uniform([-1, -1, 2], [1, 1, 4], (9, 3)),
+        camera_pose(5.5),
+        intrinsics(240, 136),
+    )
     pixels, depth = project(points, K, c2w)
-    expected, expected_depth = Camera(torch.tensor(K), torch.tensor(c2w), 240, 136).project(torch.tensor(points))
+    expected, expected_depth = Camera(torch.tensor(K), torch.tensor(c2w), 240, 136).project(
+        torch.tensor(points)
+    )
     np.testing.assert_allclose(pixels, expected.numpy(), atol=1e-9)
     np.testing.assert_allclose(depth, expected_depth.numpy(), atol=1e-12)
 
@@ -74,7 +91,9 @@ def test_moved_carries_movers_rigidly_and_leaves_the_room() -> None:
 
 
 def test_flow_of_a_known_point_is_exact() -> None:
-    """A pixel that shows the ball's center flows to where the next camera projects the next position of that center."""
+    """A pixel that shows the ball's center flows to where the next camera projects the
+    next position of that center.
+    """
     K, center = intrinsics(240, 136), [0, CORD, 0, 1]
     pixel, _ = project((ball_pose(7) @ center)[:3], K, camera_pose(7))
     after, _ = project((ball_pose(8) @ center)[:3], K, camera_pose(8))
@@ -89,7 +108,9 @@ def test_motion_between_frames_stays_within_ten_pixels() -> None:
     K = intrinsics(240, 136)
     for t in range(36):
         for pose, point in ((box_pose, [0.1, 0.1, 0.1, 1]), (ball_pose, [0, CORD, 0, 1])):
-            (a, depth), (b, _) = (project((pose(s) @ point)[:3], K, camera_pose(s)) for s in (t, t + 1))
+            (a, depth), (b, _) = (
+                project((pose(s) @ point)[:3], K, camera_pose(s)) for s in (t, t + 1)
+            )
             assert np.linalg.norm(b - a) < 10 and depth > 1
             assert (a > 0).all() and (a < [240, 136]).all()  # always in the picture
 
@@ -113,13 +134,21 @@ def test_the_rig_is_two_rows_of_cameras_that_look_at_one_place() -> None:
     assert beside.max() < 0.35  # whoever records next stands beside, also after the last
     for k in range(9):
         np.testing.assert_allclose(
-            project(np.array(INTERIOR.rig_target), intrinsics(240, 136), INTERIOR.pose("rig", k))[0], [120, 68], atol=1e-9
+            project(np.array(INTERIOR.rig_target), intrinsics(240, 136), INTERIOR.pose("rig", k))[
+                0
+            ],
+            [120, 68],
+            atol=1e-9,
         )
 
 
 def test_every_camera_of_the_rig_always_sees_both_movers() -> None:
     K = intrinsics(240, 136)
-    centers = [(b(t) @ p)[:3] for t in range(36) for b, p in ((box_pose, [0, 0, 0, 1]), (ball_pose, [0, CORD, 0, 1]))]
+    centers = [
+        (b(t) @ p)[:3]
+        for t in range(36)
+        for b, p in ((box_pose, [0, 0, 0, 1]), (ball_pose, [0, CORD, 0, 1]))
+    ]
     for k in range(9):
         pixels, depth = project(np.array(centers), K, INTERIOR.pose("rig", k))
         assert (pixels > 20).all() and (pixels < [220, 116]).all() and (depth > 1.5).all()
@@ -133,14 +162,19 @@ def test_frame_i_of_a_rig_is_what_camera_i_modulo_nine_records() -> None:
 
 @pytest.mark.parametrize("frames", [12, 36])
 def test_a_rig_holds_out_other_cameras_than_the_one_that_records_then(frames: int) -> None:
-    clip, views = clip_shots(INTERIOR, frames, 1, 0, "rig"), truth_shots(INTERIOR, frames, 1, 0, "rig")
+    clip, views = (
+        clip_shots(INTERIOR, frames, 1, 0, "rig"),
+        truth_shots(INTERIOR, frames, 1, 0, "rig"),
+    )
     assert len({v.name for v in views}) == 16 and sum(v.time % 1 == 0.5 for v in views) == 6
     for view in views:
         recording = clip[int(view.time)]
         apart = np.linalg.norm(view.c2w[:, 3] - recording.c2w[:, 3])
         assert (0.02 < apart < 0.1) if view.off_path else apart > 0.3
         assert view.off_path or np.array_equal(view.c2w, clip[view.anchor].c2w)
-    assert frames < 36 or len({v.anchor % 9 for v in views}) == 9  # every camera is asked for something
+    assert (
+        frames < 36 or len({v.anchor % 9 for v in views}) == 9
+    )  # every camera is asked for something
 
 
 def test_textures_are_physical_albedos_and_the_seed_repeats_them() -> None:
@@ -162,14 +196,21 @@ def plane(height: int = 12, width: int = 16, depth: float = 2.0, bodies: int = R
     y, x = np.mgrid[:height, :width] * 0.01
     points = np.stack([x, y, np.full_like(x, depth)], -1)
     normals = np.broadcast_to([0.0, 0, -1], points.shape)
-    return Surface(points, normals, np.full((height, width), depth), np.full((height, width), bodies), points[..., :2])
+    return Surface(
+        points,
+        normals,
+        np.full((height, width), depth),
+        np.full((height, width), bodies),
+        points[..., :2],
+    )
 
 
 def test_smoothing_keeps_even_light_and_lowers_noise() -> None:
     surface = plane(40, 40)
     np.testing.assert_allclose(smooth(np.full((40, 40, 3), 0.7), surface, 0.05), 0.7, rtol=1e-5)
     noisy = np.random.default_rng(0).normal(1, 0.2, (40, 40, 3))
-    # a Gaussian of 5 pixels averages 4 pi 25 = 314 independent values: 0.2 / 17.7 = 0.011; the cut at 9 pixels costs a little
+    # a Gaussian of 5 pixels averages 4 pi 25 = 314 independent values: 0.2 / 17.7 =
+    # 0.011; the cut at 9 pixels costs a little
     assert 0.009 < smooth(noisy, surface, 0.05)[15:25, 15:25].std() < 0.02
 
 
@@ -179,14 +220,18 @@ def test_smoothing_does_not_cross_a_mover_or_a_corner() -> None:
     half = np.arange(16) >= 8
     surface = plane()
     other_body = replace(surface, bodies=np.where(half, BOX, ROOM) * np.ones((12, 1), int))
-    corner = replace(surface, normals=np.where(half[:, None], [1.0, 0, 0], [0, 0, -1.0]) * np.ones((12, 1, 1)))
+    corner = replace(
+        surface, normals=np.where(half[:, None], [1.0, 0, 0], [0, 0, -1.0]) * np.ones((12, 1, 1))
+    )
     for parted in (other_body, corner):
         np.testing.assert_allclose(smooth(light, parted, 0.05), light, atol=1e-6)
     assert 0.2 < smooth(light, surface, 0.05)[6, 7, 0] < 0.8
 
 
 def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
-    """Everything moves two pixels to the right, where a pole now stands in columns 4 and 5 of eight."""
+    """Everything moves two pixels to the right, where a pole now stands in columns 4
+    and 5 of eight.
+    """
     flow = np.zeros((6, 8, 2))
     flow[..., 0] = 2.0
     there = np.full((6, 8), 3.0)
@@ -205,9 +250,13 @@ class Flat:
 
     def surface(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]) -> Surface:
         surface = plane(size[1], size[0], 3.0)
-        return replace(surface, bodies=np.where(np.arange(size[0]) < 4, BOX, ROOM) * np.ones((size[1], 1), int))
+        return replace(
+            surface, bodies=np.where(np.arange(size[0]) < 4, BOX, ROOM) * np.ones((size[1], 1), int)
+        )
 
-    def radiance(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int) -> np.ndarray:
+    def radiance(
+        self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int
+    ) -> np.ndarray:
         Flat.rendered += spp > PASS  # what is traced for the estimate of time does not count
         return np.full((size[1], size[0], 3), 0.25, np.float32)
 
@@ -220,7 +269,9 @@ def flat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SynthConfig:
 
 
 def test_exposures_alternate_about_the_middle_bracket(flat: SynthConfig) -> None:
-    """EV -4, -2, 0: relative to the middle -2, 0, 2; green, radiance 0.25: exposures 1/16, 1/4, 1 (recorded 1)."""
+    """EV -4, -2, 0: relative to the middle -2, 0, 2; green, radiance 0.25: exposures
+    1/16, 1/4, 1 (recorded 1).
+    """
     synth(flat)
     truth = Truth.open(flat.out / "truth")
     assert truth.bracket_ev == [-2, 0, 2] and truth.reference_bracket == 1
@@ -235,7 +286,9 @@ def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
     truth = Truth.open(flat.out / "truth")
     assert len(truth.views) == 16 and len(truth.clip_c2w or []) == 12
     view = truth.views[0]
-    np.testing.assert_array_equal(io.read_exr(flat.out / "truth" / view.radiance)["RGB"], np.full((16, 16, 3), 0.25))
+    np.testing.assert_array_equal(
+        io.read_exr(flat.out / "truth" / view.radiance)["RGB"], np.full((16, 16, 3), 0.25)
+    )
     assert io.read_mask(flat.out / "truth" / str(view.mask)).sum() == 4 * 16
     assert sum(1 for _ in io.read_video(flat.out / "clip.mp4")) == 12
 
@@ -251,10 +304,15 @@ def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig, views: Views)
     still = pixels[:, 4:]
     points = plane(16, 16, 3.0).points
     for side in (-1, 1):
-        exact = project(points, intrinsics(16, 16), INTERIOR.pose(views, k + side))[0][:, 4:] - still
+        exact = (
+            project(points, intrinsics(16, 16), INTERIOR.pose(views, k + side))[0][:, 4:] - still
+        )
         error = frame.flow[side].numpy()[:, 4:] - exact
         assert 0.2 < error.std() < 0.4 and abs(error.mean()) < 0.1  # 0.3 px of noise, no bias
-    assert frame.disparity is not None and abs(float(frame.disparity.log().mean() - np.log(1 / 3))) < 0.03
+    assert (
+        frame.disparity is not None
+        and abs(float(frame.disparity.log().mean() - np.log(1 / 3))) < 0.03
+    )
 
 
 def test_a_run_that_was_killed_renders_only_what_is_missing(flat: SynthConfig) -> None:
@@ -270,16 +328,28 @@ def test_other_settings_do_not_mix_into_a_folder(flat: SynthConfig) -> None:
     synth(flat)
     with pytest.raises(InputError, match="other settings"):
         synth(replace(flat, seed=1))
-    synth(replace(flat, ev="0,-3", response="srgb"))  # recording the same room otherwise renders nothing
+    synth(
+        replace(flat, ev="0,-3", response="srgb")
+    )  # recording the same room otherwise renders nothing
     assert Flat.rendered == 12 + 16
 
 
 def test_the_cameras_settings_are_in_the_truth_and_in_the_recording(flat: SynthConfig) -> None:
-    """Without noise, a clip's frame is what the truth makes of the same radiance at the same bracket: gains, fall-off, curve and all."""
+    """Without noise, a clip's frame is what the truth makes of the same radiance at the
+    same bracket: gains, fall-off, curve and all.
+    """
     synth(replace(flat, ev="0,-3", response="log", white_balance="2,1,0.5", vignetting=0.8))
     truth = Truth.open(flat.out / "truth")
-    assert truth.bracket_ev == [0, -3] and truth.white_balance == [2, 1, 0.5] and truth.vignetting == 0.8
-    assert truth.settings is not None and truth.settings["name"] == "interior" and truth.settings["response"] == "log"
+    assert (
+        truth.bracket_ev == [0, -3]
+        and truth.white_balance == [2, 1, 0.5]
+        and truth.vignetting == 0.8
+    )
+    assert (
+        truth.settings is not None
+        and truth.settings["name"] == "interior"
+        and truth.settings["response"] == "log"
+    )
     _, pictures = true_pictures(truth, truth.views[0], flat.out / "truth")
     for bracket in (0, 1):
         recorded = io.read_image(flat.out / "clip" / f"{bracket:05d}.png")
@@ -295,18 +365,30 @@ def test_scenes_do_not_mix_in_a_folder_and_are_exposed_as_suits_them(flat: Synth
     assert Truth.open(flat.out.parent / "night" / "truth").bracket_ev == [-3, 0, 3]
 
 
-def test_the_estimate_of_time_is_exact_where_a_path_costs_the_same_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_estimate_of_time_is_exact_where_a_path_costs_the_same_every_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Two seconds per picture and a tenth per path: 2 + 25.6 and 2 + 76.8."""
     now = [0.0]
 
     class Steady(Flat):
-        def radiance(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int) -> np.ndarray:
+        def radiance(
+            self,
+            t: float,
+            K: np.ndarray,
+            c2w: np.ndarray,
+            size: tuple[int, int],
+            spp: int,
+            seed: int,
+        ) -> np.ndarray:
             now[0] += 2 + 0.1 * spp
             return super().radiance(t, K, c2w, size, spp, seed)
 
     monkeypatch.setattr(verb.clock, "monotonic", lambda: now[0])
     shots = [clip_shots(INTERIOR, 12, 256, 0)[0], truth_shots(INTERIOR, 12, 768, 0)[0]]
-    assert verb.estimate(Steady(), shots, intrinsics(16, 16), (16, 16)) == pytest.approx(27.6 + 78.8)
+    assert verb.estimate(Steady(), shots, intrinsics(16, 16), (16, 16)) == pytest.approx(
+        27.6 + 78.8
+    )
 
 
 @pytest.mark.parametrize("text", ["1,1", "a,b,c", "0,1,1", "nan,1,1", "1,1,1,1"])
@@ -326,7 +408,9 @@ def test_the_poses_of_a_rig_are_in_its_truth_and_its_oracle(flat: SynthConfig) -
     synth(replace(flat, views="rig"))
     poses = np.array([INTERIOR.pose("rig", t) for t in range(12)])
     np.testing.assert_allclose(np.array(Truth.open(flat.out / "truth").clip_c2w), poses)
-    np.testing.assert_allclose([e.c2w for e in Scene.open(flat.out / "oracle").manifest.frames], poses)
+    np.testing.assert_allclose(
+        [e.c2w for e in Scene.open(flat.out / "oracle").manifest.frames], poses
+    )
 
 
 def test_a_rig_goes_on_after_a_kill_and_does_not_mix_with_one_camera(flat: SynthConfig) -> None:
@@ -336,7 +420,9 @@ def test_a_rig_goes_on_after_a_kill_and_does_not_mix_with_one_camera(flat: Synth
     (rig.out / "exact" / "clip_00003.exr").unlink()
     synth(rig)
     assert Flat.rendered == 12 + 16 + 1
-    np.testing.assert_array_equal(io.read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy"), before)
+    np.testing.assert_array_equal(
+        io.read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy"), before
+    )
     with pytest.raises(InputError, match="other settings"):
         synth(flat)
 
@@ -356,12 +442,21 @@ def test_bad_exposures_are_refused_in_a_sentence(text: str) -> None:
 @pytest.mark.parametrize(
     "change",
     [
-        *({"frames": 3}, {"seed": -1}, {"spp": 0}, {"noise": -1.0}, {"noise": float("nan")}, {"response": "kodak"}),
+        *(
+            {"frames": 3},
+            {"seed": -1},
+            {"spp": 0},
+            {"noise": -1.0},
+            {"noise": float("nan")},
+            {"response": "kodak"},
+        ),
         *({"vignetting": 1.1}, {"vignetting": float("nan")}, {"white_balance": "1"}),
         *({"depth_noise": 1.0}, {"depth_grain": -0.1}, {"flow_noise": float("nan")}),
     ],
 )
-def test_bad_numbers_are_refused_before_anything_is_rendered(flat: SynthConfig, change: dict) -> None:
+def test_bad_numbers_are_refused_before_anything_is_rendered(
+    flat: SynthConfig, change: dict
+) -> None:
     with pytest.raises(InputError):
         synth(replace(flat, **change))
     assert Flat.rendered == 0 and not flat.out.exists()
@@ -403,17 +498,25 @@ def test_surfaces_lie_on_the_rays_through_pixel_centers(tracer: Tracer) -> None:
     K = intrinsics(*size)
     surface = tracer.surface(3.0, K, c2w, size)
     pixels, depth = project(surface.points, K, c2w)
-    np.testing.assert_allclose(pixels, np.stack(np.meshgrid(np.arange(32) + 0.5, np.arange(18) + 0.5), -1), atol=1e-6)
+    np.testing.assert_allclose(
+        pixels, np.stack(np.meshgrid(np.arange(32) + 0.5, np.arange(18) + 0.5), -1), atol=1e-6
+    )
     np.testing.assert_allclose(depth, surface.depth, rtol=1e-6)
-    assert surface.points[..., 2].max() < BACK + 0.25 and surface.points[..., 1].max() < FLOOR + 1e-3
+    assert (
+        surface.points[..., 2].max() < BACK + 0.25 and surface.points[..., 1].max() < FLOOR + 1e-3
+    )
     assert set(np.unique(surface.bodies)) == {ROOM, BOX, BALL}
     ball = surface.points[surface.bodies == BALL] - (ball_pose(3.0) @ [0, CORD, 0, 1])[:3]
-    assert np.abs(np.linalg.norm(ball, axis=1) - 0.165).min() < 0.003  # on the sphere, where it is no cord
+    assert (
+        np.abs(np.linalg.norm(ball, axis=1) - 0.165).min() < 0.003
+    )  # on the sphere, where it is no cord
 
 
 def test_the_demo_is_whole_and_small_enough_for_git() -> None:
     demo = Path(__file__).parents[1] / "demo"
-    kept = [f for f in demo.rglob("*") if f.is_file() and demo / "out" not in f.parents]  # `make demo` writes its results there
+    kept = [
+        f for f in demo.rglob("*") if f.is_file() and demo / "out" not in f.parents
+    ]  # `make demo` writes its results there
     assert sum(f.stat().st_size for f in kept) < 4_000_000
     frames = np.stack([rgb for rgb, _ in io.read_video(demo / "clip.mp4")])
     assert frames.shape == (36, 136, 240, 3)

@@ -1,4 +1,6 @@
-"""The exact motion of the synthetic room, pixel by pixel, and that every held-out view comes with it."""
+"""The exact motion of the synthetic room, pixel by pixel, and that every held-out view
+comes with it.
+"""
 
 import numpy as np
 from test_synth import BALL, BOX, ROOM, flat, tracer  # noqa: F401  (fixtures)
@@ -15,7 +17,9 @@ POSES = {0: lambda t: np.eye(4), 1: box_pose, 2: ball_pose}
 
 
 def test_every_pixel_moves_as_its_body_does() -> None:
-    """One pixel at a time: out along the ray, from world to body, body to world a frame later and earlier, into the picture again."""
+    """One pixel at a time: out along the ray, from world to body, body to world a frame
+    later and earlier, into the picture again.
+    """
     K, c2w, time = intrinsics(12, 9), camera_pose(3.0), 7.5
     rng = np.random.default_rng(0)
     depth, bodies = rng.uniform(1.5, 3, (9, 12)), rng.integers(0, 3, (9, 12))
@@ -28,15 +32,23 @@ def test_every_pixel_moves_as_its_body_does() -> None:
             pose = POSES[bodies[y, x]]
             there = (pose(time + side) @ np.linalg.inv(pose(time)) @ [*point, 1])[:3]
             seen = K @ c2w[:, :3].T @ (there - c2w[:, 3])
-            np.testing.assert_allclose([channels[f"{name}.{a}"][y, x] for a in "xyz"], there - point, atol=1e-9)
             np.testing.assert_allclose(
-                [channels[f"{name}.{a}"][y, x] for a in "uv"], seen[:2] / seen[2] - [x + 0.5, y + 0.5], atol=1e-7
+                [channels[f"{name}.{a}"][y, x] for a in "xyz"], there - point, atol=1e-9
+            )
+            np.testing.assert_allclose(
+                [channels[f"{name}.{a}"][y, x] for a in "uv"],
+                seen[:2] / seen[2] - [x + 0.5, y + 0.5],
+                atol=1e-7,
             )
 
 
 def test_the_room_rests_exactly() -> None:
     channels = view_geometry(
-        INTERIOR, {"Z": np.full((6, 8), 2.5, np.float32), "body": np.full((6, 8), ROOM)}, 4.0, intrinsics(8, 6), camera_pose(9)
+        INTERIOR,
+        {"Z": np.full((6, 8), 2.5, np.float32), "body": np.full((6, 8), ROOM)},
+        4.0,
+        intrinsics(8, 6),
+        camera_pose(9),
     )
     assert all((m == 0).all() for n, m in channels.items() if n != "Z")
 
@@ -48,14 +60,20 @@ def test_every_held_out_view_and_half_time_has_depth_and_motion(flat: SynthConfi
     for view in truth.views:
         channels = io.read_exr(flat.out / "truth" / str(view.geometry))
         assert sorted(channels) == sorted(GEOMETRY) and (channels["Z"] == 3).all()
-        assert (np.abs(channels["forward.x"][:, :4]) > 0).all() and (channels["forward.x"][:, 4:] == 0).all()  # a box, a wall
+        assert (np.abs(channels["forward.x"][:, :4]) > 0).all() and (
+            channels["forward.x"][:, 4:] == 0
+        ).all()  # a box, a wall
 
 
 def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:  # noqa: F811
-    """What the ray through a pixel hits of the ball is carried to the ball of the next frame, and back to that of the one before."""
+    """What the ray through a pixel hits of the ball is carried to the ball of the next
+    frame, and back to that of the one before.
+    """
     size, c2w, time = (96, 54), camera_pose(3), 9.5
     surface = tracer.surface(time, intrinsics(*size), c2w, size)
-    channels = view_geometry(INTERIOR, {"Z": surface.depth, "body": surface.bodies}, time, intrinsics(*size), c2w)
+    channels = view_geometry(
+        INTERIOR, {"Z": surface.depth, "body": surface.bodies}, time, intrinsics(*size), c2w
+    )
     center = {s: (ball_pose(time + s) @ [0, CORD, 0, 1])[:3] for s in (0, 1, -1)}
     distance = np.linalg.norm(surface.points - center[0], axis=-1)
     ball = (surface.bodies == BALL) & (distance < 0.17)  # and not its cord
@@ -63,5 +81,7 @@ def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:  # noqa: F
     for side, name in io.SIDES.items():
         moved = surface.points + np.stack([channels[f"{name}.{a}"] for a in "xyz"], -1)
         assert np.linalg.norm(center[side] - center[0]) > 0.02
-        np.testing.assert_allclose(np.linalg.norm(moved - center[side], axis=-1)[ball], distance[ball], atol=1e-5)
+        np.testing.assert_allclose(
+            np.linalg.norm(moved - center[side], axis=-1)[ball], distance[ball], atol=1e-5
+        )
         np.testing.assert_allclose(distance[ball], 0.165, atol=1e-3)

@@ -1,4 +1,6 @@
-"""The oracle scene: what it gives fits together, is as noisy as asked, and links the cameras of a rig that take turns."""
+"""The oracle scene: what it gives fits together, is as noisy as asked, and links the
+cameras of a rig that take turns.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,14 +21,18 @@ EXACT = OracleNoise(depth=0.0, grain=0.0, flow=0.0)
 
 
 def wall(t: int) -> dict[str, np.ndarray]:
-    """What frame `t` of a rig renders of a wall at z = 3, of which the left quarter of the picture moves as the box does."""
+    """What frame `t` of a rig renders of a wall at z = 3, of which the left quarter of
+    the picture moves as the box does.
+    """
     height, width = SIZE[::-1]
     rays = back_project(np.ones((height, width)), K, POSES[t]) - POSES[t][:, 3]
     depth = (3 - POSES[t][2, 3]) / rays[..., 2]
     bodies = np.where(np.arange(width) < width // 4, 1, 0) * np.ones((height, 1), int)
     channels = {"Z": depth.astype(np.float32), "body": bodies.astype(np.float32)}
     for side, name in ((1, "forward"), (-1, "backward")):
-        there = INTERIOR.moved(back_project(depth, K, POSES[t]), bodies, np.zeros((height, width, 2)), t, t + side)
+        there = INTERIOR.moved(
+            back_project(depth, K, POSES[t]), bodies, np.zeros((height, width, 2)), t, t + side
+        )
         flow = exact_flow(there, K, INTERIOR.pose("rig", t + side))
         channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
     return channels
@@ -35,7 +41,9 @@ def wall(t: int) -> dict[str, np.ndarray]:
 def oracle(out: Path, noise: OracleNoise) -> list[Frame]:
     """The frames of an oracle scene of `wall`."""
     video = np.zeros((FRAMES, *SIZE[::-1], 3), np.float32)
-    write_oracle(out, INTERIOR, [wall(t) for t in range(FRAMES)], video, K, POSES, [-2.0, 0.0, 2.0], 1, noise)
+    write_oracle(
+        out, INTERIOR, [wall(t) for t in range(FRAMES)], video, K, POSES, [-2.0, 0.0, 2.0], 1, noise
+    )
     return Scene.open(out / "oracle").train
 
 
@@ -47,48 +55,80 @@ def test_a_still_pixel_carried_by_its_depth_lands_where_the_flow_says(tmp_path: 
             points = back_project(1 / frame.disparity.double().numpy(), K, POSES[k])
             landed, _ = project(points, K, POSES[j])
             error = np.linalg.norm(landed - pixels - frame.flow[side].numpy(), axis=-1)
-            still, inside = ~frame.moving.numpy(), ((landed > 1) & (landed < np.array(SIZE) - 1)).all(-1)
+            still, inside = (
+                ~frame.moving.numpy(),
+                ((landed > 1) & (landed < np.array(SIZE) - 1)).all(-1),
+            )
             assert error[still].max() < 0.05  # half precision
             assert error[~still].mean() > 0.3  # a mover has gone elsewhere
-            assert frame.flow_valid[side].numpy()[still & inside].all() and (still & inside).sum() > 500
+            assert (
+                frame.flow_valid[side].numpy()[still & inside].all()
+                and (still & inside).sum() > 500
+            )
 
 
 def test_cameras_of_a_rig_are_neighbors_in_time_and_share_one_response(tmp_path: Path) -> None:
     frames = oracle(tmp_path, EXACT)
     assert [f.neighbors for f in frames] == [{1: 1}, {-1: 0, 1: 2}, {-1: 1, 1: 3}, {-1: 2}]
-    assert {f.camera_id for f in frames} == {0} and all(set(f.flow) == set(f.neighbors) for f in frames)
+    assert {f.camera_id for f in frames} == {0} and all(
+        set(f.flow) == set(f.neighbors) for f in frames
+    )
     eyes = np.array([f.camera.c2w[:, 3].tolist() for f in frames])
-    assert (np.linalg.norm(np.diff(eyes, axis=0), axis=1) > 0.25).all()  # and are not the same camera
+    assert (
+        np.linalg.norm(np.diff(eyes, axis=0), axis=1) > 0.25
+    ).all()  # and are not the same camera
 
 
-@pytest.mark.parametrize("noise", [OracleNoise(), OracleNoise(0.0, 0.05, 0.5), OracleNoise(0.03, 0.03, 0.5)])
+@pytest.mark.parametrize(
+    "noise", [OracleNoise(), OracleNoise(0.0, 0.05, 0.5), OracleNoise(0.03, 0.03, 0.5)]
+)
 def test_depth_and_flow_are_as_noisy_as_asked(tmp_path: Path, noise: OracleNoise) -> None:
     exact, noisy = oracle(tmp_path / "exact", EXACT), oracle(tmp_path / "noisy", noise)
     error = np.stack([np.log(n.disparity / e.disparity) for n, e in zip(noisy, exact, strict=True)])
-    # the smooth part is interpolated between 8 x 8 values, which costs it up to a third of its spread, and hardly differs next door
-    assert np.hypot(0.6 * noise.depth, 0.95 * noise.grain) < error.std() < np.hypot(1.15 * noise.depth, 1.05 * noise.grain)
-    assert 0.95 * noise.grain < np.diff(error, axis=2).std() / np.sqrt(2) < np.hypot(0.3 * noise.depth, 1.05 * noise.grain)
-    flow = np.stack([(n.flow[s] - e.flow[s]).numpy() for n, e in zip(noisy, exact, strict=True) for s in n.flow])
+    # the smooth part is interpolated between 8 x 8 values, which costs it up to a third
+    # of its spread, and hardly differs next door
+    assert (
+        np.hypot(0.6 * noise.depth, 0.95 * noise.grain)
+        < error.std()
+        < np.hypot(1.15 * noise.depth, 1.05 * noise.grain)
+    )
+    assert (
+        0.95 * noise.grain
+        < np.diff(error, axis=2).std() / np.sqrt(2)
+        < np.hypot(0.3 * noise.depth, 1.05 * noise.grain)
+    )
+    flow = np.stack(
+        [(n.flow[s] - e.flow[s]).numpy() for n, e in zip(noisy, exact, strict=True) for s in n.flow]
+    )
     assert flow.std() == pytest.approx(noise.flow, rel=0.03)
 
 
 def test_the_seed_decides_the_noise(tmp_path: Path) -> None:
     noise = OracleNoise(0.03, 0.03, 0.5, seed=4)
-    a, b, c = (oracle(tmp_path / str(i), n)[1] for i, n in enumerate((noise, noise, replace(noise, seed=5))))
+    a, b, c = (
+        oracle(tmp_path / str(i), n)[1]
+        for i, n in enumerate((noise, noise, replace(noise, seed=5)))
+    )
     assert a.disparity.equal(b.disparity) and a.flow[1].equal(b.flow[1])
     assert not a.disparity.isclose(c.disparity, rtol=1e-3).all() and not a.flow[1].equal(c.flow[1])
 
 
 def test_a_mover_has_the_depth_of_where_it_goes() -> None:
-    """Two cameras that look straight at the box, ten frames apart: the middle of three pixels shows its center."""
+    """Two cameras that look straight at the box, ten frames apart: the middle of three
+    pixels shows its center.
+    """
     eye, (before, after) = np.array([0.4, -0.1, 0.2]), (box_pose(t)[:3, 3] for t in (0, 10))
     channels = {"Z": np.full((3, 3), np.linalg.norm(before - eye)), "body": np.ones((3, 3))}
     poses = [look_at(eye, before)] * 10 + [look_at(eye, after)]
-    assert depth_there(INTERIOR, channels, intrinsics(3, 3), poses, 0, 10)[1, 1] == pytest.approx(np.linalg.norm(after - eye))
+    assert depth_there(INTERIOR, channels, intrinsics(3, 3), poses, 0, 10)[1, 1] == pytest.approx(
+        np.linalg.norm(after - eye)
+    )
 
 
 def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
-    """A camera two thirds of a meter nearer sees the wall a quarter nearer: other depth, same surface. A pole hides it."""
+    """A camera two thirds of a meter nearer sees the wall a quarter nearer: other
+    depth, same surface. A pole hides it.
+    """
     near = camera_pose(0).copy()
     near[:, 3] += 0.7 * near[:, 2]
     channels = {"Z": np.full(SIZE[::-1], 3.0), "body": np.zeros(SIZE[::-1])}

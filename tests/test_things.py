@@ -1,21 +1,34 @@
-"""Tracks of two rigid bodies shared out by what their motions explain, in closed form: bodies that cross, and one that comes back."""
+"""Tracks of two rigid bodies shared out by what their motions explain, in closed form:
+bodies that cross, and one that comes back.
+"""
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.priors.movers.bundle import Cameras, adjust
-from hdr_nsff.priors.movers.motion_segmentation import groups_by_motion, may_be_one, members_of, same, share_out, things
+from hdr_nsff.priors.movers.motion_segmentation import (
+    groups_by_motion,
+    may_be_one,
+    members_of,
+    same,
+    share_out,
+    things,
+)
 from hdr_nsff.priors.movers.rigid_groups import Tracks, fit
 
 TIMES, COUNT, FOCAL = 20, 140, 200.0
 T = np.arange(TIMES)
 K = np.tile([[FOCAL, 0, 120], [0, FOCAL, 70], [0, 0, 1.0]], (TIMES, 1, 1))
-EYES = np.stack([0.05 * np.sin(2.1 * T), 0.04 * np.sin(2.9 * T + 1), 0.02 * np.sin(1.7 * T)], -1)  # a hand that shakes
+EYES = np.stack(
+    [0.05 * np.sin(2.1 * T), 0.04 * np.sin(2.9 * T + 1), 0.02 * np.sin(1.7 * T)], -1
+)  # a hand that shakes
 CAMERAS = Cameras(K, np.concatenate([np.tile(np.eye(3), (TIMES, 1, 1)), EYES[..., None]], 2))
 
 
-def body(seed: int, size: float, start: list[float], velocity: list[float], spin: float) -> np.ndarray:
+def body(
+    seed: int, size: float, start: list[float], velocity: list[float], spin: float
+) -> np.ndarray:
     """Points (COUNT, TIMES, 3) of a turning body on a straight path."""
     local = np.random.default_rng(seed).uniform(-size, size, (COUNT, 3))
     rotations = Rotation.from_rotvec(np.outer(T * spin, [0.3, 1.0, 0.2])).as_matrix()
@@ -27,11 +40,23 @@ TWO = body(1, 0.15, [0.5, 0.05, 2.6], [-0.05, 0.01, 0.01], -0.1)
 
 
 def tracked(points: np.ndarray, seen: np.ndarray, far: np.ndarray) -> Tracks:
-    """Tracks of points (N, TIMES, 3) at the times `seen` (N, TIMES), all in one patch, put at `far` (N, TIMES) times their depth."""
+    """Tracks of points (N, TIMES, 3) at the times `seen` (N, TIMES), all in one patch,
+    put at `far` (N, TIMES) times their depth.
+    """
     local = points - EYES
-    pixels = local[..., :2] / local[..., 2:] * FOCAL + [120, 70] + np.random.default_rng(9).normal(0, 0.05, (*seen.shape, 2))
+    pixels = (
+        local[..., :2] / local[..., 2:] * FOCAL
+        + [120, 70]
+        + np.random.default_rng(9).normal(0, 0.05, (*seen.shape, 2))
+    )
     hide = np.where(seen, 1.0, np.nan)[..., None]
-    return Tracks(pixels * hide, (EYES + local * far[..., None]) * hide, seen * 0.3, seen.astype(int), np.zeros(seen.shape, int))
+    return Tracks(
+        pixels * hide,
+        (EYES + local * far[..., None]) * hide,
+        seen * 0.3,
+        seen.astype(int),
+        np.zeros(seen.shape, int),
+    )
 
 
 def spans(first: np.ndarray, lasting: int, end: int = TIMES) -> np.ndarray:
@@ -47,10 +72,16 @@ def crossing() -> Tracks:
 
 
 def hidden() -> tuple[Tracks, np.ndarray]:
-    """The second body, out of sight for three times, comes back where depth puts it a third too near; which of its tracks are late."""
+    """The second body, out of sight for three times, comes back where depth puts it a
+    third too near; which of its tracks are late.
+    """
     late = np.arange(COUNT) >= COUNT // 2
     first = np.where(late, 14, np.random.default_rng(4).integers(0, 4, COUNT))
-    return tracked(TWO, spans(first, 8) & ((T < 11) | late[:, None]), np.where(late[:, None], 0.7, 1.0) * np.ones(TIMES)), late
+    return tracked(
+        TWO,
+        spans(first, 8) & ((T < 11) | late[:, None]),
+        np.where(late[:, None], 0.7, 1.0) * np.ones(TIMES),
+    ), late
 
 
 def test_two_bodies_that_cross_in_one_patch_are_two_things_and_none_is_mixed() -> None:
@@ -62,10 +93,16 @@ def test_two_bodies_that_cross_in_one_patch_are_two_things_and_none_is_mixed() -
 
 def test_tracks_put_into_the_wrong_group_find_back() -> None:
     tracks = crossing()
-    one, two = np.arange(COUNT + 20), np.arange(COUNT + 20, 2 * COUNT)  # the first has 20 of the second
+    one, two = (
+        np.arange(COUNT + 20),
+        np.arange(COUNT + 20, 2 * COUNT),
+    )  # the first has 20 of the second
     found = groups_by_motion(tracks, [one, two], CAMERAS)
     assert len(found) == 2
-    assert {frozenset((g.members >= COUNT).tolist()) for g, _ in found} == {frozenset({False}), frozenset({True})}
+    assert {frozenset((g.members >= COUNT).tolist()) for g, _ in found} == {
+        frozenset({False}),
+        frozenset({True}),
+    }
 
 
 def test_what_comes_back_after_it_was_hidden_is_one_thing_at_its_distance() -> None:
@@ -85,21 +122,37 @@ def test_things_far_apart_or_seen_apart_are_not_tried_as_one() -> None:
     a, b = fit(tracks, np.nonzero(~late)[0]), fit(tracks, np.nonzero(late)[0])
     assert may_be_one(tracks, a, b)
     away = Tracks(
-        tracks.pixels + np.where(late, 200.0, 0.0)[:, None, None], tracks.points, tracks.trust, tracks.patch, tracks.age
+        tracks.pixels + np.where(late, 200.0, 0.0)[:, None, None],
+        tracks.points,
+        tracks.trust,
+        tracks.patch,
+        tracks.age,
     )
     assert not may_be_one(away, a, b)
 
 
 def test_the_larger_group_gets_what_both_explain_and_nobody_what_none_explains() -> None:
     before = [np.array([0, 1, 2]), np.array([3, 4])]
-    cost = np.array([[0.1, 0.2], [3.0, 0.1], [9.0, 8.0], [0.3, 0.2], [np.inf, np.inf], [np.inf, 1.0], [5.0, 5.0]])
+    cost = np.array(
+        [
+            [0.1, 0.2],
+            [3.0, 0.1],
+            [9.0, 8.0],
+            [0.3, 0.2],
+            [np.inf, np.inf],
+            [np.inf, 1.0],
+            [5.0, 5.0],
+        ]
+    )
     assert share_out(before, cost).tolist() == [0, 1, 0, 0, 1, 1, -1]
 
 
 def test_groups_of_few_tracks_are_left_out_but_for_the_largest() -> None:
     owner = np.repeat([0, 1, -1], [90, 1, 9])
     assert [len(m) for m in members_of(owner)] == [90]
-    assert [len(m) for m in members_of(np.array([0] + [-1] * 99))] == [1] and members_of(np.full(5, -1)) == []
+    assert [len(m) for m in members_of(np.array([0] + [-1] * 99))] == [1] and members_of(
+        np.full(5, -1)
+    ) == []
 
 
 def test_a_hundredth_of_the_tracks_makes_no_other_group() -> None:

@@ -1,4 +1,6 @@
-"""Laws of the tone mapper: gauge, monotony, invertibility, the ends of eq. 11, and which gradients flow."""
+"""Laws of the tone mapper: gauge, monotony, invertibility, the ends of eq. 11, and
+which gradients flow.
+"""
 
 import math
 
@@ -7,13 +9,22 @@ import pytest
 import torch
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.tonemap.tonemapper import GAMMA, ToneMapConfig, ToneMapper, informative, leaky_ends, piecewise_linear
+from hdr_nsff.tonemap.tonemapper import (
+    GAMMA,
+    ToneMapConfig,
+    ToneMapper,
+    informative,
+    leaky_ends,
+    piecewise_linear,
+)
 
 EV = [-4.0, -2.0, 0.0]
 
 
 def mapper(ev=EV, cameras=(0, 0, 0, 0, 0, 0), **config):
-    return ToneMapper(ToneMapConfig(**config), [0, 1, 2, 0, 1, 2], list(cameras), ev, reference_bracket=2)
+    return ToneMapper(
+        ToneMapConfig(**config), [0, 1, 2, 0, 1, 2], list(cameras), ev, reference_bracket=2
+    )
 
 
 def disturb(tonemapper, seed=0, scale=1.0):
@@ -32,12 +43,17 @@ def grid(n=1001, top=1.0):
 @pytest.mark.parametrize("knots", ["gamma", "even"])
 def test_a_new_response_is_gamma(kind, knots):
     rgb = mapper(kind=kind, knots=knots)(grid(), bracket=2, frame=2, leaky=False)
-    assert (rgb - grid() ** (1 / GAMMA)).abs().max() < (1e-4 if knots == "gamma" else 0.03)  # even knots starve the darks
+    assert (rgb - grid() ** (1 / GAMMA)).abs().max() < (
+        1e-4 if knots == "gamma" else 0.03
+    )  # even knots starve the darks
 
 
 def test_gain_is_two_to_the_ev():
     t = mapper()
-    dark, reference = t(grid() * 4, bracket=1), t(grid(), bracket=2)  # bracket 1 is two stops darker: a quarter of the light
+    dark, reference = (
+        t(grid() * 4, bracket=1),
+        t(grid(), bracket=2),
+    )  # bracket 1 is two stops darker: a quarter of the light
     torch.testing.assert_close(dark, reference, atol=1e-5, rtol=0)
 
 
@@ -50,7 +66,9 @@ def test_reference_gain_stays_fixed():
 
 def test_residuals_cannot_carry_scale():
     t = disturb(mapper())
-    residual = torch.stack([t.log_gain(b, 0, i) - t.log_gain(b, 0, None) for i, b in enumerate(t.frame_brackets)])
+    residual = torch.stack(
+        [t.log_gain(b, 0, i) - t.log_gain(b, 0, None) for i, b in enumerate(t.frame_brackets)]
+    )
     assert residual.abs().max() > 0.1
     torch.testing.assert_close(residual.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
 
@@ -92,7 +110,9 @@ def test_inverse_undoes_the_recording(kind):
 def test_ends_are_eq_11_and_continuous():
     x = torch.tensor([-2.0, -1e-7, 0.0, 1.0, 1 + 1e-6, 4.0, math.inf])
     y = leaky_ends(x, x.clamp(0, 1), leak=0.01)
-    expected = torch.tensor([-0.02, 0.0, 0.0, 1.0, 1.0, 1 + 0.01 - 0.01 / 2, 1.01])  # -a / sqrt(4) + a + 1
+    expected = torch.tensor(
+        [-0.02, 0.0, 0.0, 1.0, 1.0, 1 + 0.01 - 0.01 / 2, 1.01]
+    )  # -a / sqrt(4) + a + 1
     torch.testing.assert_close(y, expected, atol=1e-6, rtol=0)
 
 
@@ -111,7 +131,9 @@ def test_lookup_and_its_gradients_agree_with_numpy_interpolation(power):
     values = torch.rand(3, 9, generator=generator, dtype=torch.float64, requires_grad=True)
     x = torch.rand(40, 3, generator=generator, dtype=torch.float64, requires_grad=True)
     y = piecewise_linear(x, values, knots, power)
-    slow = [torch.from_numpy(np.interp(x[:, c].detach(), knots, values[c].detach())) for c in range(3)]
+    slow = [
+        torch.from_numpy(np.interp(x[:, c].detach(), knots, values[c].detach())) for c in range(3)
+    ]
     torch.testing.assert_close(y, torch.stack(slow, -1))
     assert torch.autograd.gradcheck(lambda a, b: piecewise_linear(a, b, knots, power), (x, values))
 
@@ -130,7 +152,9 @@ def test_a_set_curve_is_reproduced(knots):
     t = mapper(knots=knots)
     t.set_curve(x, y)
     at = x[:, None].expand(-1, 3)[100:]  # above even knots' blind first cells
-    assert (t(at, bracket=2, leaky=False).T - y[:, 100:]).abs().max() < (2e-3 if knots == "gamma" else 5e-3)
+    assert (t(at, bracket=2, leaky=False).T - y[:, 100:]).abs().max() < (
+        2e-3 if knots == "gamma" else 5e-3
+    )
 
 
 def test_a_set_curve_that_falls_is_made_monotone():
@@ -147,13 +171,17 @@ def test_cameras_have_curves_of_their_own():
     x = torch.linspace(0, 1, 100)
     t.set_curve(x, x.expand(3, -1), camera_id=1)
     torch.testing.assert_close(t(grid(), 2, camera_id=1, leaky=False), grid(), atol=2e-3, rtol=0)
-    torch.testing.assert_close(t(grid(), 2, camera_id=0, leaky=False), grid() ** (1 / GAMMA), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        t(grid(), 2, camera_id=0, leaky=False), grid() ** (1 / GAMMA), atol=1e-4, rtol=0
+    )
 
 
 def test_smoothness_is_the_sum_of_squared_second_differences():
     t = disturb(mapper(kind="per_image", knots="even"), scale=0.1)
     y = t.response.values(slice(None)).detach()
-    slow = sum((y[:, :, k + 1] - 2 * y[:, :, k] + y[:, :, k - 1]) ** 2 for k in range(1, 255)).mean()
+    slow = sum(
+        (y[:, :, k + 1] - 2 * y[:, :, k] + y[:, :, k - 1]) ** 2 for k in range(1, 255)
+    ).mean()
     torch.testing.assert_close(t.smoothness().detach(), slow)
 
 
@@ -193,7 +221,9 @@ def test_param_groups_hold_every_parameter_once():
 
 def test_develop_is_the_recording_of_a_bracket_at_its_ev():
     t = disturb(mapper(residual=False))
-    torch.testing.assert_close(t.develop(grid(top=20), ev=-4.0), t(grid(top=20), bracket=0, leaky=False))
+    torch.testing.assert_close(
+        t.develop(grid(top=20), ev=-4.0), t(grid(top=20), bracket=0, leaky=False)
+    )
     picture = t.develop(torch.rand(4, 5, 3), ev=1.5)
     assert picture.shape == (4, 5, 3) and picture.min() >= 0 and picture.max() <= 1
 
@@ -201,15 +231,21 @@ def test_develop_is_the_recording_of_a_bracket_at_its_ev():
 def test_a_network_response_is_undone_through_its_curve():
     t = mapper(kind="mlp", residual=False)
     radiance = torch.rand(50, 3) * 0.6 + 0.1
-    torch.testing.assert_close(t.inverse(t(radiance, bracket=2), bracket=2), radiance, atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        t.inverse(t(radiance, bracket=2), bracket=2), radiance, atol=2e-3, rtol=0
+    )
 
 
 def test_the_papers_gain_is_free_but_for_the_reference_image():
     t = disturb(mapper(kind="per_image", knots="even"), scale=0.3)
-    assert torch.equal(t.gains()[2], torch.zeros(3))  # frame 2 is the first of the reference bracket
+    assert torch.equal(
+        t.gains()[2], torch.zeros(3)
+    )  # frame 2 is the first of the reference bracket
     assert (t.gains()[[0, 1, 3, 4, 5]].abs() > 0).all()
     borrowed = t.log_gain(0, 0, None)
-    torch.testing.assert_close(borrowed, (t.log_gain(0, 0, 0) + t.log_gain(0, 0, 3)) / 2)  # frames 0 and 3 have bracket 0
+    torch.testing.assert_close(
+        borrowed, (t.log_gain(0, 0, 0) + t.log_gain(0, 0, 3)) / 2
+    )  # frames 0 and 3 have bracket 0
 
 
 def test_none_takes_radiance_for_rgb():
@@ -235,11 +271,22 @@ def test_the_sigmoid_records_x_over_one_plus_x_with_one_exposure_per_image():
     with torch.no_grad():
         t.image_gain.copy_(torch.log(torch.tensor([[0.25], [1.0], [9.0], [4.0], [2.0], [1.0]])))
     radiance = torch.full((1, 3), 3.0)
-    for frame, gain in ((0, 0.25), (1, 1.0), (2, 1.0), (3, 4.0)):  # frame 2 is the reference image: gain 1 whatever it says
+    for frame, gain in (
+        (0, 0.25),
+        (1, 1.0),
+        (2, 1.0),
+        (3, 4.0),
+    ):  # frame 2 is the reference image: gain 1 whatever it says
         x = 3.0 * gain
-        torch.testing.assert_close(t(radiance, t.frame_brackets[frame], frame=frame), torch.full((1, 3), x / (1 + x)))
-    torch.testing.assert_close(t(radiance, bracket=0), torch.full((1, 3), 0.75))  # borrowed: geometric mean of 1/4 and 4 is 1
-    torch.testing.assert_close(t.inverse(t(radiance, bracket=1, frame=4), bracket=1, frame=4), radiance)
+        torch.testing.assert_close(
+            t(radiance, t.frame_brackets[frame], frame=frame), torch.full((1, 3), x / (1 + x))
+        )
+    torch.testing.assert_close(
+        t(radiance, bracket=0), torch.full((1, 3), 0.75)
+    )  # borrowed: geometric mean of 1/4 and 4 is 1
+    torch.testing.assert_close(
+        t.inverse(t(radiance, bracket=1, frame=4), bracket=1, frame=4), radiance
+    )
     torch.testing.assert_close(t.develop(radiance, ev=1.0), torch.full((1, 3), 6 / 7))
     torch.testing.assert_close(t.curve()[1], (t.knots / (1 + t.knots)).expand(3, -1))
 
@@ -254,7 +301,9 @@ def test_a_network_response_starts_at_the_curve_it_is_given_and_is_not_kept_mono
     t = mapper(kind="mlp", residual=False)
     above = grid()[20:650]
     assert (t(above, bracket=2) - above ** (1 / GAMMA)).abs().max() < 0.01
-    assert (t(grid(), bracket=2) - grid() ** (1 / GAMMA)).abs().max() < 0.08  # a sigmoid never gets to 1
+    assert (
+        t(grid(), bracket=2) - grid() ** (1 / GAMMA)
+    ).abs().max() < 0.08  # a sigmoid never gets to 1
     x = torch.linspace(0, 1, 64) ** 2
     t.set_curve(x, (x**0.3).expand(3, -1))
     assert (t(above, bracket=2) - above**0.3).abs().max() < 0.02
@@ -281,7 +330,9 @@ def test_a_network_response_teaches_gains_and_radiance_beyond_saturation():
 def test_a_look_is_the_recording_and_names_the_images_it_resembles():
     t = disturb(mapper())
     assert t.recorder(1, 0).images == (1, 4) and t.recorder(1, 0, 4).images == (4,)
-    torch.testing.assert_close(t.recorder(1, 0, 4, leaky=True).rgb(grid()), t(grid(), bracket=1, frame=4))
+    torch.testing.assert_close(
+        t.recorder(1, 0, 4, leaky=True).rgb(grid()), t(grid(), bracket=1, frame=4)
+    )
     assert t.recorder_at(-3.9).images == (0, 3)  # the exposures are -4, -2, 0
     torch.testing.assert_close(t.recorder_at(-3.9).rgb(grid()), t.develop(grid(), -3.9))
 
@@ -292,7 +343,8 @@ def test_black_and_saturated_pixels_tell_nothing():
 
 
 @pytest.mark.parametrize(
-    ("ev", "reference", "word"), [([0.0, 1.0], 2, "reference"), ([0.0], 0, "lists only"), ([-2.0, 1.0], 1, "must be 0")]
+    ("ev", "reference", "word"),
+    [([0.0, 1.0], 2, "reference"), ([0.0], 0, "lists only"), ([-2.0, 1.0], 1, "must be 0")],
 )
 def test_brackets_that_make_no_sense_are_refused(ev, reference, word):
     with pytest.raises(InputError, match=word):
@@ -300,7 +352,9 @@ def test_brackets_that_make_no_sense_are_refused(ev, reference, word):
 
 
 def test_a_response_is_learned_from_known_exposures():
-    """Recordings of known radiance through an S-curve: the curve comes back to within 0.02 where it was seen."""
+    """Recordings of known radiance through an S-curve: the curve comes back to within
+    0.02 where it was seen.
+    """
     generator = torch.Generator().manual_seed(1)
     truth = lambda x: (x**0.6 * (1.4 - 0.4 * x)).clamp(0, 1)  # noqa: E731
     t = mapper(residual=False)
@@ -308,7 +362,9 @@ def test_a_response_is_learned_from_known_exposures():
     for _ in range(250):
         radiance = 2.0 ** (torch.rand(512, 3, generator=generator) * 10 - 6)
         bracket = int(torch.randint(3, (1,), generator=generator))
-        loss = (t(radiance, bracket) - truth((radiance * 2 ** EV[bracket]).clamp(0, 1))).abs().mean()
+        loss = (
+            (t(radiance, bracket) - truth((radiance * 2 ** EV[bracket]).clamp(0, 1))).abs().mean()
+        )
         optimizer.zero_grad()
         (loss + 1e-3 * t.smoothness()).backward()
         optimizer.step()

@@ -1,4 +1,6 @@
-"""The loop: same seed same parameters, killed and resumed like unbroken, two processes like one; clocks and schedules."""
+"""The loop: same seed same parameters, killed and resumed like unbroken, two processes
+like one; clocks and schedules.
+"""
 
 import contextlib
 import math
@@ -50,10 +52,15 @@ def unbroken(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     return train(config(toy_folder, tmp_path_factory.mktemp("unbroken") / "run"))
 
 
-def test_the_same_seed_gives_the_same_parameters_bit_for_bit(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_parameters_bit_for_bit(
+    unbroken: Path, toy_folder: Path, tmp_path: Path
+) -> None:
     again = final(train(config(toy_folder, tmp_path / "run")))
     assert_same(final(unbroken), again)
-    assert any(k.startswith("optimizer.touched.") for k in again) and "field.static_cells.weight" in again
+    assert (
+        any(k.startswith("optimizer.touched.") for k in again)
+        and "field.static_cells.weight" in again
+    )
 
 
 def test_another_seed_gives_others(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
@@ -68,12 +75,17 @@ def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
 ) -> None:
     settings = replace(config(toy_folder, tmp_path / "run", preset), checkpoint_seconds=0.0)
     straight = final(
-        unbroken if preset == "grid" else train(replace(settings, out=tmp_path / "straight", checkpoint_seconds=1e9))
+        unbroken
+        if preset == "grid"
+        else train(replace(settings, out=tmp_path / "straight", checkpoint_seconds=1e9))
     )
     monkeypatch.setattr(Trainer, "preview", lambda self: None)
     for stop in (3, 17):  # before and after culling starts and the tone mapper is anchored
         interrupted_at(stop, settings, monkeypatch)
-        assert max(p.name for p in (settings.out / "checkpoints").iterdir()) == f"step_{stop:08d}.safetensors"
+        assert (
+            max(p.name for p in (settings.out / "checkpoints").iterdir())
+            == f"step_{stop:08d}.safetensors"
+        )
     assert_same(final(train(settings)), straight)
 
 
@@ -89,15 +101,21 @@ def command(settings: TrainConfig, *launcher: str) -> subprocess.Popen[bytes]:
     write_json(given, settings.to_json())
     environment = os.environ | {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
     arguments = [sys.executable, *launcher, str(script), str(given)]
-    return subprocess.Popen(arguments, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    return subprocess.Popen(
+        arguments, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
 
 
-def test_a_run_killed_outright_resumes_to_the_same_parameters(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+def test_a_run_killed_outright_resumes_to_the_same_parameters(
+    unbroken: Path, toy_folder: Path, tmp_path: Path
+) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), checkpoint_seconds=0.0)
     process = command(settings)
     deadline = time.monotonic() + 120
     while len(list(tmp_path.glob("run/checkpoints/step_0000000[2-9]*"))) == 0:
-        assert process.poll() is None and time.monotonic() < deadline, process.stderr and process.stderr.read().decode()
+        assert process.poll() is None and time.monotonic() < deadline, (
+            process.stderr and process.stderr.read().decode()
+        )
         time.sleep(0.02)
     process.send_signal(signal.SIGKILL)
     assert process.wait() == -signal.SIGKILL
@@ -106,7 +124,9 @@ def test_a_run_killed_outright_resumes_to_the_same_parameters(unbroken: Path, to
     assert_same(final(train(settings)), final(unbroken))
 
 
-def test_two_processes_do_what_one_does_and_resume_too(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+def test_two_processes_do_what_one_does_and_resume_too(
+    unbroken: Path, toy_folder: Path, tmp_path: Path
+) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), checkpoint_seconds=0.0)
     launcher = ("-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2")
     one = final(unbroken)
@@ -118,12 +138,20 @@ def test_two_processes_do_what_one_does_and_resume_too(unbroken: Path, toy_folde
         assert two.keys() == one.keys()
         for name in one:
             if name.startswith(("field.", "tonemapper.")):
-                torch.testing.assert_close(two[name], one[name], atol=2e-6, rtol=2e-5, msg=lambda m, n=name: f"{n}: {m}")
-        max((settings.out / "checkpoints").glob("step_*")).unlink()  # the second round goes on from the step before
+                torch.testing.assert_close(
+                    two[name], one[name], atol=2e-6, rtol=2e-5, msg=lambda m, n=name: f"{n}: {m}"
+                )
+        max(
+            (settings.out / "checkpoints").glob("step_*")
+        ).unlink()  # the second round goes on from the step before
 
 
-def test_more_processes_than_batches_is_said(toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(distributed, "group", lambda: contextlib.nullcontext(distributed.Ranks(0, 4)))
+def test_more_processes_than_batches_is_said(
+    toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        distributed, "group", lambda: contextlib.nullcontext(distributed.Ranks(0, 4))
+    )
     with pytest.raises(InputError, match="4 processes share 2 batches"):
         train(config(toy_folder, tmp_path / "run"))
 
@@ -134,7 +162,9 @@ def test_training_lowers_the_error(toy_folder: Path, tmp_path: Path) -> None:
     log = run.log()
     assert [line.step for line in log] == [25, 50, 75] and run.step == 75
     assert log[-1].psnr > log[0].psnr + 1
-    assert {"photometric", "dynamic", "temporal", "cycle", "response_smoothness"} <= set(log[-1].losses)
+    assert {"photometric", "dynamic", "temporal", "cycle", "response_smoothness"} <= set(
+        log[-1].losses
+    )
     assert list((settings.out / "previews").glob("*.png"))
 
 
@@ -160,7 +190,9 @@ def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:
     assert run.step > 3 and 1.5 <= run.seconds < 10
 
 
-def test_snapshots_are_kept_on_the_way_and_change_nothing(unbroken: Path, toy_folder: Path, tmp_path: Path) -> None:
+def test_snapshots_are_kept_on_the_way_and_change_nothing(
+    unbroken: Path, toy_folder: Path, tmp_path: Path
+) -> None:
     run = train(config(toy_folder, tmp_path / "run"), keep_at=(0.5, 0.125), previews=False)
     assert_same(final(unbroken), final(run))
     assert not (run / "previews").exists() and list(snapshots(run)) == [0.125, 0.5]
@@ -187,7 +219,10 @@ def test_a_resumed_run_keeps_the_snapshots_that_are_still_to_come(
         train(settings, keep_at=(0.25, 0.5))
     first = snapshots(settings.out)[0.25].stat().st_mtime_ns
     train(settings, keep_at=(0.25, 0.5))
-    assert list(snapshots(settings.out)) == [0.25, 0.5] and snapshots(settings.out)[0.25].stat().st_mtime_ns == first
+    assert (
+        list(snapshots(settings.out)) == [0.25, 0.5]
+        and snapshots(settings.out)[0.25].stat().st_mtime_ns == first
+    )
 
 
 def test_the_clock_stands_still_while_something_is_written(
@@ -200,7 +235,9 @@ def test_the_clock_stands_still_while_something_is_written(
     assert run.seconds < 2 and time.monotonic() - start > 3
 
 
-def test_draws_depend_on_seed_step_and_slot_alone(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+def test_draws_depend_on_seed_step_and_slot_alone(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
     t = trainer(config(toy_folder, tmp_path / "run"), toy)
     first, same, slot = t.draw(0), t.draw(0), t.draw(1)
     assert torch.equal(first.pixels, same.pixels) and first.seed == same.seed
@@ -213,7 +250,9 @@ def test_draws_depend_on_seed_step_and_slot_alone(toy: Scene, toy_folder: Path, 
 def test_nan_names_the_step_and_the_term(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
     t = trainer(config(toy_folder, tmp_path / "run"), toy)
     t.field.branches.static_grid.table.data.fill_(math.nan)
-    with pytest.raises(FloatingPointError, match=r"step 0: the terms \['photometric'.* are not finite; pixel \["):
+    with pytest.raises(
+        FloatingPointError, match=r"step 0: the terms \['photometric'.* are not finite; pixel \["
+    ):
         t.step()
 
 

@@ -1,4 +1,6 @@
-"""Structure from motion past what stays in place and moves all the same: a waving cloth bends no camera."""
+"""Structure from motion past what stays in place and moves all the same: a waving cloth
+bends no camera.
+"""
 
 import numpy as np
 import pytest
@@ -16,8 +18,12 @@ STATIC, WAVING = 220, 130
 
 
 def world(rng: np.random.Generator, time: int) -> np.ndarray:
-    """Points (N, 3) in front of the cameras: a room that stands still, and a cloth before it."""
-    room = np.stack([rng.uniform(-2, 2, STATIC), rng.uniform(-1.1, 1.1, STATIC), rng.uniform(3, 7, STATIC)], 1)
+    """Points (N, 3) in front of the cameras: a room that stands still, and a cloth
+    before it.
+    """
+    room = np.stack(
+        [rng.uniform(-2, 2, STATIC), rng.uniform(-1.1, 1.1, STATIC), rng.uniform(3, 7, STATIC)], 1
+    )
     u, v = rng.uniform(-0.8, 0.8, (2, WAVING))
     wave = 0.06 * np.sin(5 * u + 2 * np.pi * time / 9)
     return np.concatenate([room, np.stack([u + 0.3 * wave, v, 2.6 + wave], 1)])
@@ -29,7 +35,9 @@ def filmed() -> list[np.ndarray]:
     for t in range(FRAMES):
         a = 2 * np.pi * t / FRAMES
         eye = np.array([0.45 * np.sin(a), 0.18 * np.cos(2 * a), 0.15 * np.cos(a)])
-        points = (world(np.random.default_rng(0), t) - eye) @ look_at(eye, np.array([0.0, 0.0, 4.0]))[:, :3]
+        points = (world(np.random.default_rng(0), t) - eye) @ look_at(
+            eye, np.array([0.0, 0.0, 4.0])
+        )[:, :3]
         seen = FOCAL * points[:, :2] / points[:, 2:] + [WIDTH / 2, HEIGHT / 2]
         clip.append(seen + 0.2 * noise.standard_normal(seen.shape))
     return clip
@@ -43,9 +51,23 @@ def test_a_waving_cloth_bends_no_camera(tmp_path):
     inside = [((p > 0) & (p < [WIDTH, HEIGHT])).all(1) for p in clip]
     pairs = [(i, j) for i in range(FRAMES) for j in range(i + 1, FRAMES)]
     both = [np.flatnonzero(inside[i] & inside[j]) for i, j in pairs]
-    sfm.write_matches(tmp_path, names, clip, [(names[i], names[j]) for i, j in pairs], [np.stack([b, b], 1) for b in both])
+    sfm.write_matches(
+        tmp_path,
+        names,
+        clip,
+        [(names[i], names[j]) for i, j in pairs],
+        [np.stack([b, b], 1) for b in both],
+    )
     wanted = [(names[i], names[j]) for i, j in pairs]
-    job = sfm.Job(str(tmp_path), [names], wanted, focal=1.2 * FOCAL, mapping="incremental", threads=1, given=True)
+    job = sfm.Job(
+        str(tmp_path),
+        [names],
+        wanted,
+        focal=1.2 * FOCAL,
+        mapping="incremental",
+        threads=1,
+        given=True,
+    )
 
     model = read_model(sfm.run(job)[0])
 

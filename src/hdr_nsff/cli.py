@@ -1,4 +1,6 @@
-"""The command line: one verb, one function, one config. Bad input is one sentence and exit code 2."""
+"""The command line: one verb, one function, one config. Bad input is one sentence and
+exit code 2.
+"""
 
 from __future__ import annotations
 
@@ -41,26 +43,54 @@ class Verb:
 
 
 VERBS = {
-    "run": Verb(run_all, RunConfig, "Footage to HDR in one go: prepare, train, render, evaluate, report."),
-    "prepare": Verb(prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."),
+    "run": Verb(
+        run_all, RunConfig, "Footage to HDR in one go: prepare, train, render, evaluate, report."
+    ),
+    "prepare": Verb(
+        prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."
+    ),
     "train": Verb(
         train,
         PRESETS,
         "Train a radiance field from a scene folder: `train splat`, `train grid`, ...; `train --help` lists the presets.",
     ),
-    "render": Verb(render, RenderConfig, "Views of a trained run: EXR, PNG, video; any path, time and exposure."),
+    "render": Verb(
+        render,
+        RenderConfig,
+        "Views of a trained run: EXR, PNG, video; any path, time and exposure.",
+    ),
     "export": Verb(
-        export, ExportConfig, "For other programs: a splat run's Gaussians as PLY, or a scene in a public data layout."
+        export,
+        ExportConfig,
+        "For other programs: a splat run's Gaussians as PLY, or a scene in a public data layout.",
     ),
     "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
-    "report": Verb(report, ReportConfig, "One HTML page about a run: pictures, curves, losses, metrics, what was given."),
-    "bench": Verb(bench, BenchConfig, "Methods x scenes in one table: trained, measured, side by side."),
-    "synth": Verb(synth, SynthConfig, "Path-trace a scene with exact truth, recorded in alternating exposures."),
-    "finetune-flow": Verb(
-        finetune_flow, FinetuneConfig, "Adapt a flow network to pairs of different exposure, for `prepare --flow raft-finetuned`."
+    "report": Verb(
+        report,
+        ReportConfig,
+        "One HTML page about a run: pictures, curves, losses, metrics, what was given.",
     ),
-    "reexpose": Verb(reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."),
-    "weights": Verb(weights, WeightsConfig, "List the networks that can help, whether their weights are here, how to get them."),
+    "bench": Verb(
+        bench, BenchConfig, "Methods x scenes in one table: trained, measured, side by side."
+    ),
+    "synth": Verb(
+        synth,
+        SynthConfig,
+        "Path-trace a scene with exact truth, recorded in alternating exposures.",
+    ),
+    "finetune-flow": Verb(
+        finetune_flow,
+        FinetuneConfig,
+        "Adapt a flow network to pairs of different exposure, for `prepare --flow raft-finetuned`.",
+    ),
+    "reexpose": Verb(
+        reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."
+    ),
+    "weights": Verb(
+        weights,
+        WeightsConfig,
+        "List the networks that can help, whether their weights are here, how to get them.",
+    ),
 }
 PRESET_HELP = {
     "splat": "4D Gaussians, minutes on a CPU, tens of small frames a second; the default of `run`.",
@@ -98,20 +128,35 @@ def usage() -> str:
 
 
 def parse(verb: Verb, name: str, arguments: Sequence[str]) -> Any:
-    """The config of a verb from its arguments; tyro prints help and typos itself and exits."""
+    """The config of a verb from its arguments; tyro prints help and typos itself and
+    exits.
+    """
     if isinstance(verb.config, dict):
         asked = arguments[0] if arguments else ""
-        shown = {asked: f"Ablation: `{asked}`."} if asked in verb.config and asked not in PRESET_HELP else PRESET_HELP
+        shown = (
+            {asked: f"Ablation: `{asked}`."}
+            if asked in verb.config and asked not in PRESET_HELP
+            else PRESET_HELP
+        )
         presets = {k: (words, verb.config[k]) for k, words in shown.items()}
         about = f"{TrainConfig.__doc__} {MORE_PRESETS}"
-        config = tyro.extras.overridable_config_cli(presets, prog=f"hdr-nsff {name}", description=about, args=arguments)
+        config = tyro.extras.overridable_config_cli(
+            presets, prog=f"hdr-nsff {name}", description=about, args=arguments
+        )
         assert isinstance(config, TrainConfig)
         return config
-    return tyro.cli(verb.config, prog=f"hdr-nsff {name}", args=arguments, config=(tyro.conf.OmitSubcommandPrefixes,))
+    return tyro.cli(
+        verb.config,
+        prog=f"hdr-nsff {name}",
+        args=arguments,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one verb; exits with 0, 1 (a run of `bench` failed), 2 (bad input) or 130 (Ctrl-C)."""
+    """Run one verb; exits with 0, 1 (a run of `bench` failed), 2 (bad input) or 130
+    (Ctrl-C).
+    """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
     if arguments[:1] == ["--version"]:
         print(f"hdr-nsff {__version__}")

@@ -1,4 +1,6 @@
-"""Methods x scenes -> one table: every pair is trained and measured in a process of its own, what is done is kept, what fails is shown."""
+"""Methods x scenes -> one table: every pair is trained and measured in a process of its
+own, what is done is kept, what fails is shown.
+"""
 
 from __future__ import annotations
 
@@ -58,12 +60,16 @@ def do_one(plan: Plan, only: str) -> None:
             return get_ready(scene)
     cell = next((c for c in plan.cells if c.name == only), None)
     if cell is None:
-        raise InputError(f"--only {only!r:.100}: no such run; there are {', '.join(c.name for c in plan.cells)}")
+        raise InputError(
+            f"--only {only!r:.100}: no such run; there are {', '.join(c.name for c in plan.cells)}"
+        )
     run_cell(cell, plan.config.views, plan.config.lpips)
 
 
 def prepare_scenes(plan: Plan) -> None:
-    """Prepare the scenes that are not there yet, side by side; where one cannot be, its runs fail with the reason."""
+    """Prepare the scenes that are not there yet, side by side; where one cannot be, its
+    runs fail with the reason.
+    """
     waiting = [s for s in plan.scenes if not s.ready]
     jobs = [job(plan, s.name, plan.config.out / "logs" / f"{s.name}.log") for s in waiting]
 
@@ -75,7 +81,10 @@ def prepare_scenes(plan: Plan) -> None:
         say(f"{done.name}: could not be prepared: {reason} (log: {done.log})")
         for cell in plan.cells:
             if cell.scene.name == done.name:
-                notes.write(cell.folder / "failure.json", notes.Failure(reason=f"preparing: {reason}", log=str(done.log)))
+                notes.write(
+                    cell.folder / "failure.json",
+                    notes.Failure(reason=f"preparing: {reason}", log=str(done.log)),
+                )
 
     places = slots(plan.config.jobs, plan.config.devices)
     if jobs:
@@ -89,7 +98,9 @@ def job(plan: Plan, only: str, log: Path) -> Job:
 
 
 def do_all(plan: Plan) -> None:
-    """All runs that are not done and whose scenes are there, as many at once as asked for."""
+    """All runs that are not done and whose scenes are there, as many at once as asked
+    for.
+    """
     config = plan.config
     todo = [c for c in plan.cells if c.scene.ready and not complete(c, config.views, config.lpips)]
     jobs = [job(plan, c.name, c.log) for c in todo]
@@ -102,7 +113,11 @@ def do_all(plan: Plan) -> None:
         ended = partial(state.ended)
 
         def look(running: set[str]) -> None:
-            progress.update(task, completed=state.done + state.on_the_way(running), note=", ".join(sorted(running)))
+            progress.update(
+                task,
+                completed=state.done + state.on_the_way(running),
+                note=", ".join(sorted(running)),
+            )
 
         run_jobs(jobs, slots(config.jobs, config.devices), ended, look)
 
@@ -121,17 +136,26 @@ class Standing:
         self.done += 1
         cell = self.cells[which.name]
         if code != 0 and not (cell.folder / "failure.json").is_file():
-            notes.write(cell.folder / "failure.json", notes.Failure(reason=last_words(which.log, code), log=str(which.log)))
+            notes.write(
+                cell.folder / "failure.json",
+                notes.Failure(reason=last_words(which.log, code), log=str(which.log)),
+            )
         row = row_of(cell, self.plan)
         values = row.values
-        numbers = [f"{values[k]:.2f} dB{word}" for k, word in (("psnr", ""), ("psnr_moving", " moving")) if k in values]
+        numbers = [
+            f"{values[k]:.2f} dB{word}"
+            for k, word in (("psnr", ""), ("psnr_moving", " moving"))
+            if k in values
+        ]
         told = (
             f"{', '.join(numbers)}; {values['steps']:,} steps in {values['train_seconds']:.0f} s"
             if values
             else f"{row.status}: {row.reason}"
         )
         left = (time.monotonic() - self.start) / self.done * (len(self.cells) - self.done)
-        say(f"{cell.name}: {told}  ({self.done} of {len(self.cells)}{f', about {left / 60:.0f} min left' if left > 90 else ''})")
+        say(
+            f"{cell.name}: {told}  ({self.done} of {len(self.cells)}{f', about {left / 60:.0f} min left' if left > 90 else ''})"
+        )
 
     def on_the_way(self, running: set[str]) -> float:
         """What part of the runs at work is done, together."""
@@ -140,7 +164,11 @@ class Standing:
             config = self.cells[name].config
             line = last_logged(config.out)
             if line is not None:
-                share = line.step / config.steps if config.steps else line.seconds / 60 / (config.minutes or 1)
+                share = (
+                    line.step / config.steps
+                    if config.steps
+                    else line.seconds / 60 / (config.minutes or 1)
+                )
                 total += (1 - MEASURING) * min(share, 1.0)
         return total
 

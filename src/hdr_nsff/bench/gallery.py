@@ -1,5 +1,6 @@
-"""index.html of a benchmark: the tables, quality over training time, and crops of the same views side by side with their errors. One
-file that opens offline."""
+"""index.html of a benchmark: the tables, quality over training time, and crops of the
+same views side by side with their errors. One file that opens offline.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +30,11 @@ from hdr_nsff.core import io
 from hdr_nsff.core.notes import ShownView
 from hdr_nsff.core.page import details, document, figure, legend, missing, plot, svg, table
 
-CURVES = (("psnr", "PSNR, dB"), ("psnr_moving", "PSNR moving, dB"), ("mu5000", "μ-law 5000 PSNR, dB"))
+CURVES = (
+    ("psnr", "PSNR, dB"),
+    ("psnr_moving", "PSNR moving, dB"),
+    ("mu5000", "μ-law 5000 PSNR, dB"),
+)
 NOTES = {
     SCORES: "Means over the held-out views of each run's headline; “moving”: over moving pixels of what stands left of it. PSNR, μ-law and PU21 in dB. "
     "Bold: the best on its scene. Every score is defined in docs/metrics.md.",
@@ -44,22 +49,35 @@ CROP_WIDTH = 300  # pixels of a crop on the page
 def write_page(plan: Plan, rows: Sequence[Row]) -> None:
     """index.html."""
     scenes = list(dict.fromkeys(r.cell.scene.name for r in rows))
-    sections = [("Quality", runs_table(rows, SCORES)), *mean_sections(rows), ("Cost", runs_table(rows, COSTS))]
+    sections = [
+        ("Quality", runs_table(rows, SCORES)),
+        *mean_sections(rows),
+        ("Cost", runs_table(rows, COSTS)),
+    ]
     if failed := [r for r in rows if r.status != "done"]:
         lines = [[r.cell.name, r.status, r.reason] for r in failed]
         sections.append(("Without a result", table(("run", "", "reason"), lines, numeric=False)))
-    sections += [(name, of_scene([r for r in rows if r.cell.scene.name == name])) for name in scenes]
+    sections += [
+        (name, of_scene([r for r in rows if r.cell.scene.name == name])) for name in scenes
+    ]
     said = "".join(f"<p>{escape(s)}</p>" for s in told_of_scenes(rows))
     sections.append(
         (
             "What the numbers are of",
-            said + f'<p class="note">{escape(machine(rows))}.</p>' + details("command", f"<pre>{escape(command(plan))}</pre>"),
+            said
+            + f'<p class="note">{escape(machine(rows))}.</p>'
+            + details("command", f"<pre>{escape(command(plan))}</pre>"),
         )
     )
-    body = "\n".join(f"<section><h2>{escape(title)}</h2>\n{content}</section>" for title, content in sections)
+    body = "\n".join(
+        f"<section><h2>{escape(title)}</h2>\n{content}</section>" for title, content in sections
+    )
     methods = len(dict.fromkeys(r.cell.method for r in rows))
     facts = f"{plural(len(scenes), 'scene')}, {plural(methods, 'method')}, {sum(r.status == 'done' for r in rows)} of {len(rows)} runs done"
-    io.write_text(plan.config.out / "index.html", document(f"Benchmark {plan.config.out.resolve().name}", facts, body))
+    io.write_text(
+        plan.config.out / "index.html",
+        document(f"Benchmark {plan.config.out.resolve().name}", facts, body),
+    )
 
 
 def runs_table(rows: Sequence[Row], wanted: tuple[Column, ...]) -> str:
@@ -81,7 +99,9 @@ def plural(count: int, word: str) -> str:
 def mean_sections(rows: Sequence[Row]) -> list[tuple[str, str]]:
     """Means over scenes, oracle runs apart."""
     found = [(oracle, means(rows, oracle)) for oracle in (False, True)]
-    return [(mean_title(m, oracle), table(*mean_table(m, rows), words=3)) for oracle, m in found if m]
+    return [
+        (mean_title(m, oracle), table(*mean_table(m, rows), words=3)) for oracle, m in found if m
+    ]
 
 
 def of_scene(rows: Sequence[Row]) -> str:
@@ -92,7 +112,9 @@ def of_scene(rows: Sequence[Row]) -> str:
     assert done[0].trial is not None
     count = len(done[0].trial.shown)
     note = f'<p class="note">Over {count} of the held-out views, the same for all methods; the last point is the end of the training. Time is training alone, on a log axis.</p>'
-    return f'<div class="plots">{"".join(curves(done))}</div>{note}' + "".join(crops(done, view) for view in chosen_views(done))
+    return f'<div class="plots">{"".join(curves(done))}</div>{note}' + "".join(
+        crops(done, view) for view in chosen_views(done)
+    )
 
 
 def curves(rows: Sequence[Row]) -> list[str]:
@@ -101,10 +123,22 @@ def curves(rows: Sequence[Row]) -> list[str]:
     for key, label in CURVES:
         drawing, axes = plot(3.7, 3.0)
         for i, row in enumerate(rows):
-            points = [p for p in (row.trial.curve if row.trial else []) if key in p.scores and p.seconds > 0]
+            points = [
+                p
+                for p in (row.trial.curve if row.trial else [])
+                if key in p.scores and p.seconds > 0
+            ]
             style = "-" if i < 10 else "--"
             xy = [p.seconds / 60 for p in points], [p.scores[key] for p in points]
-            axes.plot(*xy, style, color=f"C{i % 10}", marker="o", markersize=3.5, linewidth=1.4, label=row.cell.method)
+            axes.plot(
+                *xy,
+                style,
+                color=f"C{i % 10}",
+                marker="o",
+                markersize=3.5,
+                linewidth=1.4,
+                label=row.cell.method,
+            )
         if not any(len(line.get_xdata()) for line in axes.lines):
             continue
         axes.set(xlabel="minutes of training", title=label, xscale="log")
@@ -117,36 +151,62 @@ def curves(rows: Sequence[Row]) -> list[str]:
 
 
 def chosen_views(rows: Sequence[Row]) -> list[ShownView]:
-    """Of the views that all runs show, the one that the methods meet best on average and the one that they meet worst (moving pixels where there are)."""
+    """Of the views that all runs show, the one that the methods meet best on average
+    and the one that they meet worst (moving pixels where there are).
+    """
     views = [{v.name: v for v in r.trial.shown} for r in rows if r.trial is not None]
     names = [n for n in views[0] if all(n in of_run for of_run in views)]
 
     def quality(name: str) -> float:
-        return float(np.mean([of_run[name].scores.get("psnr_moving", of_run[name].scores["psnr"]) for of_run in views]))
+        return float(
+            np.mean(
+                [
+                    of_run[name].scores.get("psnr_moving", of_run[name].scores["psnr"])
+                    for of_run in views
+                ]
+            )
+        )
 
     ranked = sorted(names, key=quality, reverse=True)
     return [views[0][n] for n in dict.fromkeys([*ranked[:1], *ranked[-1:]])]
 
 
 def crops(rows: Sequence[Row], view: ShownView) -> str:
-    """The moving region of a view: the truth and what every method makes of it, and below the errors."""
+    """The moving region of a view: the truth and what every method makes of it, and
+    below the errors.
+    """
     folder = rows[0].cell.folder / "shown"
     truth = io.read_image(folder / f"{view.name}_truth.png")
     box = region(folder / f"{view.name}_moving.png", truth.shape[:2])
     pictures, errors = (
         [figure(enlarged(truth, box), "truth")],
-        [figure(scale_bar(), f"absolute error, mean of the channels: 0 to {ERROR_TOP:g} and above")],
+        [
+            figure(
+                scale_bar(), f"absolute error, mean of the channels: 0 to {ERROR_TOP:g} and above"
+            )
+        ],
     )
     for row in rows:
         predicted = io.read_image(row.cell.folder / "shown" / f"{view.name}_run.png")
         own = next(v for v in (row.trial.shown if row.trial else []) if v.name == view.name)
         moving = f", moving {own.scores['psnr_moving']:.2f}" if "psnr_moving" in own.scores else ""
-        pictures.append(figure(enlarged(predicted, box), f"{row.cell.method}: {own.scores['psnr']:.2f} dB{moving}"))
+        pictures.append(
+            figure(
+                enlarged(predicted, box), f"{row.cell.method}: {own.scores['psnr']:.2f} dB{moving}"
+            )
+        )
         error = np.abs(predicted - truth).mean(-1)
-        errors.append(figure(enlarged(io.colorize(error, 0.0, ERROR_TOP), box), f"{row.cell.method}, error"))
+        errors.append(
+            figure(enlarged(io.colorize(error, 0.0, ERROR_TOP), box), f"{row.cell.method}, error")
+        )
     style = f'style="display:grid;gap:10px;margin-bottom:14px;grid-template-columns:repeat({len(pictures)},minmax(150px,{CROP_WIDTH}px))"'
-    lines = "".join(f'<div class="wide"><div {style}>{"".join(cells)}</div></div>' for cells in (pictures, errors))
-    return f"<h3>{escape(view.name)}, time {view.time:g}: around what moves, as recorded</h3>{lines}"
+    lines = "".join(
+        f'<div class="wide"><div {style}>{"".join(cells)}</div></div>'
+        for cells in (pictures, errors)
+    )
+    return (
+        f"<h3>{escape(view.name)}, time {view.time:g}: around what moves, as recorded</h3>{lines}"
+    )
 
 
 def region(mask: io.Path, size: tuple[int, int]) -> tuple[slice, slice]:

@@ -1,10 +1,11 @@
-"""The settings of `bench`, and what they ask for: scenes x methods, each pair a run in a folder of its own.
+"""The settings of `bench`, and what they ask for: scenes x methods, each pair a run in
+a folder of its own.
 
-OUT/bench.json              what all runs have in common
-OUT/scenes/NAME/            footage, prepared once for all methods
-OUT/runs/SCENE/METHOD/      a run folder, with its measurements
-OUT/logs/SCENE/METHOD.log   what its process said
-OUT/results.*, index.html   the tables"""
+OUT/bench.json              what all runs have in common OUT/scenes/NAME/
+footage, prepared once for all methods OUT/runs/SCENE/METHOD/      a run folder, with
+its measurements OUT/logs/SCENE/METHOD.log   what its process said OUT/results.*,
+index.html   the tables
+"""
 
 from __future__ import annotations
 
@@ -36,26 +37,40 @@ from hdr_nsff.training.train import open_folder
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """Train and measure methods on scenes, every pair a run of its own; tables, curves and pictures side by side.
+    """Train and measure methods on scenes, every pair a run of its own; tables, curves
+    and pictures side by side.
 
-    Killed, the same command goes on where it was; with more scenes or methods it adds theirs. A run that fails is shown with its reason,
-    the others go on, and the exit code is 1."""
+    Killed, the same command goes on where it was; with more scenes or methods it adds
+    theirs. A run that fails is shown with its reason, the others go on, and the exit
+    code is 1.
+    """
 
     out: Positional[Path]
-    """Folder for everything; the results are OUT/index.html, results.md, results.csv, results.json."""
+    """Folder for everything; the results are OUT/index.html, results.md, results.csv,
+    results.json.
+    """
     scenes: str
-    """Scenes with commas between them: scene folders, folders that `synth` or `reexpose` wrote, or public data sets. NAME=FOLDER gives one
-    another name, FOLDER:TRUTH a truth folder; else truth/ in the scene folder or beside it is used, else its held-out frames."""
+    """Scenes with commas between them: scene folders, folders that `synth` or
+    `reexpose` wrote, or public data sets. NAME=FOLDER gives one another name,
+    FOLDER:TRUTH a truth folder; else truth/ in the scene folder or beside it is used,
+    else its held-out frames.
+    """
     methods: str
-    """Presets with commas between them. NAME=PRESET OPTIONS changes settings as `train` does: "splat,no-flow=splat --loss.flow 0"."""
+    """Presets with commas between them. NAME=PRESET OPTIONS changes settings as `train`
+    does: "splat,no-flow=splat --loss.flow 0".
+    """
     budget: str | None = None
     """Training time of each run: 5min, 90s, 0.5h. Default: the presets' own."""
     steps: int | None = None
     """Steps of each run, instead."""
     protocol: Protocol | None = None
-    """How `prepare` splits footage, and which held-out views count, see `prepare --help`."""
+    """How `prepare` splits footage, and which held-out views count, see `prepare
+    --help`.
+    """
     oracle: bool = False
-    """Of `synth` folders take the oracle scene: exact poses and masks, given depth and flow. The results are named so."""
+    """Of `synth` folders take the oracle scene: exact poses and masks, given depth and
+    flow. The results are named so.
+    """
     jobs: int = 1
     """Runs at once on this machine, which share its threads."""
     devices: str | None = None
@@ -65,7 +80,9 @@ class BenchConfig:
     lpips: str | None = None
     """LPIPS: a file with AlexNet weights, or `hub` to download them."""
     views: int = 4
-    """Held-out views that are also measured after 1/8, 1/4 and 1/2 of the training, and of which pictures are shown; 0: none."""
+    """Held-out views that are also measured after 1/8, 1/4 and 1/2 of the training, and
+    of which pictures are shown; 0: none.
+    """
     max_size: int = 640
     """Longest side in pixels of footage; larger frames are shrunk."""
     seed: int = 0
@@ -78,7 +95,15 @@ class BenchConfig:
 
 
 OF_THE_WHOLE = ("jobs", "devices", "only", "list", "collect")  # settings that a single run has not
-COMMON = ("budget", "steps", "protocol", "oracle", "views", "max_size", "seed")  # settings that all runs in a folder share
+COMMON = (
+    "budget",
+    "steps",
+    "protocol",
+    "oracle",
+    "views",
+    "max_size",
+    "seed",
+)  # settings that all runs in a folder share
 
 
 @dataclass(frozen=True)
@@ -158,15 +183,28 @@ class Plan:
 
 
 def make_plan(config: BenchConfig) -> Plan:
-    """What is asked for; InputError where it makes no sense or is not there. Writes nothing."""
+    """What is asked for; InputError where it makes no sense or is not there. Writes
+    nothing.
+    """
     if config.jobs < 1 or config.views < 0:
-        raise InputError(f"--jobs {config.jobs} --views {config.views}: choose at least one job, and no fewer than 0 views")
-    if config.devices is not None and (config.jobs != 1 or not all(d.strip() for d in config.devices.split(","))):
-        raise InputError(f"--devices {config.devices}: name devices such as 0,1; each takes one run at once, so leave --jobs out")
+        raise InputError(
+            f"--jobs {config.jobs} --views {config.views}: choose at least one job, and no fewer than 0 views"
+        )
+    if config.devices is not None and (
+        config.jobs != 1 or not all(d.strip() for d in config.devices.split(","))
+    ):
+        raise InputError(
+            f"--devices {config.devices}: name devices such as 0,1; each takes one run at once, so leave --jobs out"
+        )
     if config.budget is not None and config.steps is not None:
-        raise InputError("--budget and --steps both given, and each says how long to train; leave one out")
+        raise InputError(
+            "--budget and --steps both given, and each says how long to train; leave one out"
+        )
     methods = distinct([method(text, config) for text in config.methods.split(",")], "--methods")
-    scenes = distinct([(s.name, s) for s in (scene(text, config) for text in config.scenes.split(","))], "--scenes")
+    scenes = distinct(
+        [(s.name, s) for s in (scene(text, config) for text in config.scenes.split(","))],
+        "--scenes",
+    )
     return Plan(config, tuple(scenes.values()), methods)
 
 
@@ -174,7 +212,9 @@ def distinct(named: list[tuple[str, Any]], option: str) -> dict[str, Any]:
     """{name: value}; InputError where two have one name."""
     names = [name for name, _ in named]
     if twice := next((n for n in names if names.count(n) > 1), None):
-        raise InputError(f"{option}: two are called {twice!r}; give one another name, {twice}-2=...")
+        raise InputError(
+            f"{option}: two are called {twice!r}; give one another name, {twice}-2=..."
+        )
     return dict(named)
 
 
@@ -188,16 +228,27 @@ def minutes_of(budget: str) -> float:
 
 
 def safe_name(text: str, what: str) -> str:
-    """`text` as the name of a folder: letters, digits, `_`, `-` and dots inside; others become `_`."""
+    """`text` as the name of a folder: letters, digits, `_`, `-` and dots inside; others
+    become `_`.
+    """
     name = re.sub(r"[^\w.\-]", "_", text).strip("._")[:60]
     if not name:
-        raise InputError(f"{what} {text!r:.60}: cannot be a name; give it one of letters and digits, NAME=...")
+        raise InputError(
+            f"{what} {text!r:.60}: cannot be a name; give it one of letters and digits, NAME=..."
+        )
     return name
 
 
 # Methods
 
-OURS = ("scene", "out", "steps", "minutes", "seed", "device")  # settings of `train` that are the same for all methods
+OURS = (
+    "scene",
+    "out",
+    "steps",
+    "minutes",
+    "seed",
+    "device",
+)  # settings of `train` that are the same for all methods
 
 
 def method(text: str, config: BenchConfig) -> tuple[str, TrainConfig]:
@@ -209,12 +260,20 @@ def method(text: str, config: BenchConfig) -> tuple[str, TrainConfig]:
     except ValueError as error:
         raise InputError(f"--methods {text!r:.60}: {error}; mend the quotes") from error
     if not words or words[0] not in PRESETS:
-        raise InputError(f"--methods: no preset {' '.join(words[:1])!r:.60}; there are {', '.join(PRESETS)}")
+        raise InputError(
+            f"--methods: no preset {' '.join(words[:1])!r:.60}; there are {', '.join(PRESETS)}"
+        )
     if len(words) > 1 and found[1] is None:
-        raise InputError(f"--methods {text!r:.60}: a method with options needs a name of its own, NAME={text.strip()[:60]}")
+        raise InputError(
+            f"--methods {text!r:.60}: a method with options needs a name of its own, NAME={text.strip()[:60]}"
+        )
     if taken := [o for o in OURS if any(w.split("=")[0] == f"--{o}" for w in words)]:
-        raise InputError(f"--methods {text!r:.60}: --{taken[0]} is the same for all runs of a bench; leave it out there")
-    settings = tyro.extras.overridable_config_cli({k: ("", v) for k, v in PRESETS.items()}, prog="--methods", args=words)
+        raise InputError(
+            f"--methods {text!r:.60}: --{taken[0]} is the same for all runs of a bench; leave it out there"
+        )
+    settings = tyro.extras.overridable_config_cli(
+        {k: ("", v) for k, v in PRESETS.items()}, prog="--methods", args=words
+    )
     settings = replace(settings, seed=config.seed, device=config.device)
     if config.budget is not None:
         settings = replace(settings, minutes=minutes_of(config.budget), steps=None)
@@ -232,13 +291,19 @@ def scene(text: str, config: BenchConfig) -> BenchScene:
     label, folder, given = split_scene(text.strip())
     name = safe_name(label or Path(os.path.abspath(folder)).name, "--scenes")
     if given is not None and not (given / "truth.json").is_file():
-        raise InputError(f"--scenes {text.strip()!r:.200}: no truth.json in {given}; mend the path, or leave it out")
+        raise InputError(
+            f"--scenes {text.strip()!r:.200}: no truth.json in {given}; mend the path, or leave it out"
+        )
     if (folder / "scene.json").is_file():
         return prepared(name, folder, given, config)
     footage = next((p for p in (folder / "clip.mp4", folder / "clip") if p.exists()), None)
     if footage is not None and (given or (folder / "truth" / "truth.json").is_file()):
         truth_folder = given or folder / "truth"
-        return of_oracle(name, folder, truth_folder) if config.oracle else of_footage(name, footage, truth_folder, config)
+        return (
+            of_oracle(name, folder, truth_folder)
+            if config.oracle
+            else of_footage(name, footage, truth_folder, config)
+        )
     if layout_of(folder) is not None and not config.oracle:
         return of_footage(name, folder, given, config)
     raise InputError(
@@ -248,7 +313,9 @@ def scene(text: str, config: BenchConfig) -> BenchScene:
 
 
 def split_scene(text: str) -> tuple[str | None, Path, Path | None]:
-    """Name, folder and truth folder of "[NAME=]FOLDER[:TRUTH]". What is a folder as it stands is taken for one."""
+    """Name, folder and truth folder of "[NAME=]FOLDER[:TRUTH]". What is a folder as it
+    stands is taken for one.
+    """
     label, equals, rest = text.partition("=")
     for name, place in ((None, text), (label if equals else None, rest if equals else text)):
         folder, colon, truth = place.rpartition(":")
@@ -256,7 +323,9 @@ def split_scene(text: str) -> tuple[str | None, Path, Path | None]:
             return name, Path(place), None
         if colon and folder and Path(folder).is_dir():
             return name, Path(folder), Path(truth)
-    raise InputError(f"--scenes {text!r:.200}: no such folder; mend the path (one with a comma in it cannot be given)")
+    raise InputError(
+        f"--scenes {text!r:.200}: no such folder; mend the path (one with a comma in it cannot be given)"
+    )
 
 
 def prepared(name: str, folder: Path, given: Path | None, config: BenchConfig) -> BenchScene:
@@ -264,7 +333,9 @@ def prepared(name: str, folder: Path, given: Path | None, config: BenchConfig) -
     manifest = Manifest.load(folder)
     oracle = any(ORACLE in step.note for step in manifest.steps.values())
     if config.oracle and not oracle:
-        raise InputError(f"--oracle: {folder} is a scene made from footage; give a folder that `hdr-nsff synth --oracle` wrote")
+        raise InputError(
+            f"--oracle: {folder} is a scene made from footage; give a folder that `hdr-nsff synth --oracle` wrote"
+        )
     if config.protocol is not None and manifest.protocol != config.protocol:
         raise InputError(
             f"--protocol {config.protocol}: {folder} is prepared already, for {manifest.protocol or 'none'}; give its footage, or leave the option out"
@@ -288,7 +359,9 @@ def oracle_name(name: str) -> str:
 def of_oracle(name: str, folder: Path, truth: Path) -> BenchScene:
     """The oracle scene that `synth --oracle` wrote."""
     if not (folder / "oracle" / "scene.json").is_file():
-        raise InputError(f"--oracle: {folder} holds no oracle/; run `hdr-nsff synth` with `--oracle` on it again")
+        raise InputError(
+            f"--oracle: {folder} holds no oracle/; run `hdr-nsff synth` with `--oracle` on it again"
+        )
     views_of_clip(truth)
     return BenchScene(oracle_name(name), folder / "oracle", truth, None, True)
 
@@ -299,7 +372,9 @@ def of_footage(name: str, clip: Path, truth: Path | None, config: BenchConfig) -
     every = held_out_every(RunConfig(clip, out, truth=truth, protocol=config.protocol))
     poses = clip.parent / "poses_bounds.npy"
     known = poses if truth is not None and poses.is_file() else None
-    footage = PrepareConfig(clip, out, max_size=config.max_size, hold_out=every, protocol=config.protocol, poses=known)
+    footage = PrepareConfig(
+        clip, out, max_size=config.max_size, hold_out=every, protocol=config.protocol, poses=known
+    )
     return BenchScene(name, out, truth, footage, False)
 
 
@@ -307,13 +382,17 @@ def of_footage(name: str, clip: Path, truth: Path | None, config: BenchConfig) -
 
 
 def claim(plan: Plan) -> None:
-    """Make the folder this benchmark's; InputError where it holds something else, or runs with other settings."""
+    """Make the folder this benchmark's; InputError where it holds something else, or
+    runs with other settings.
+    """
     config = plan.config
     path, out = config.out / "bench.json", config.out
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; choose a folder")
     settings = {name: getattr(config, name) for name in COMMON}
-    places = {s.name: str((s.footage.clip if s.footage else s.folder).resolve()) for s in plan.scenes}
+    places = {
+        s.name: str((s.footage.clip if s.footage else s.folder).resolve()) for s in plan.scenes
+    }
     if not path.is_file() and out.is_dir() and any(out.iterdir()):
         raise InputError(f"{out}: holds other files and no bench; choose an empty or new folder")
     check_place(out / "index.html")
@@ -323,9 +402,15 @@ def claim(plan: Plan) -> None:
             if before.settings.get(name) != value:
                 option = f"--{name.replace('_', '-')}"
                 was = before.settings.get(name)
-                raise InputError(f"{out}: holds runs with {option} {was}, not {value}; choose another folder, or delete it")
-        if moved := next((n for n, place in places.items() if before.scenes.get(n, place) != place), None):
-            raise InputError(f"{out}: there {moved} is the scene {before.scenes[moved]}; give this one another name, NAME=FOLDER")
+                raise InputError(
+                    f"{out}: holds runs with {option} {was}, not {value}; choose another folder, or delete it"
+                )
+        if moved := next(
+            (n for n, place in places.items() if before.scenes.get(n, place) != place), None
+        ):
+            raise InputError(
+                f"{out}: there {moved} is the scene {before.scenes[moved]}; give this one another name, NAME=FOLDER"
+            )
         places = before.scenes | places
     for cell in plan.cells:
         check_cell(cell)
@@ -333,7 +418,9 @@ def claim(plan: Plan) -> None:
 
 
 def check_cell(cell: BenchRun) -> None:
-    """InputError where the folder of a run holds one with other settings, or of another state of the scene."""
+    """InputError where the folder of a run holds one with other settings, or of another
+    state of the scene.
+    """
     if (cell.folder / "config.json").is_file():
         open_folder(cell.config)
     trial = notes.read(cell.folder / "trial.json", notes.RunRecord)
@@ -346,12 +433,20 @@ def check_cell(cell: BenchRun) -> None:
 def introduce(plan: Plan) -> None:
     """Say what will be measured on what."""
     for s in plan.scenes:
-        against = f"measured on {s.truth}" if s.truth else "measured on what its data set or `prepare` holds out"
-        say(f"{s.name}: {s.footage.clip if s.footage else s.folder}, {against}{', an oracle run' if s.oracle else ''}")
+        against = (
+            f"measured on {s.truth}"
+            if s.truth
+            else "measured on what its data set or `prepare` holds out"
+        )
+        say(
+            f"{s.name}: {s.footage.clip if s.footage else s.folder}, {against}{', an oracle run' if s.oracle else ''}"
+        )
 
 
 def arguments(config: BenchConfig, only: str) -> list[str]:
-    """What follows `hdr-nsff` in the command that does one run, or prepares one scene, of a benchmark."""
+    """What follows `hdr-nsff` in the command that does one run, or prepares one scene,
+    of a benchmark.
+    """
     words = ["bench", str(config.out)]
     for field in fields(config):
         value = getattr(config, field.name)

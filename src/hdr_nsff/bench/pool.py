@@ -1,4 +1,6 @@
-"""Processes: so many at once, each with its share of the threads or a device of its own, each with its own log."""
+"""Processes: so many at once, each with its share of the threads or a device of its
+own, each with its own log.
+"""
 
 from __future__ import annotations
 
@@ -38,19 +40,30 @@ def shell_line(arguments: Sequence[str]) -> str:
 
 
 def slots(jobs: int, devices: str | None) -> list[dict[str, str]]:
-    """Per process at once, what its environment has of its own: a share of the threads (unless the user's environment says how many), a device."""
+    """Per process at once, what its environment has of its own: a share of the threads
+    (unless the user's environment says how many), a device.
+    """
     names = [d.strip() for d in devices.split(",")] if devices else []
     count = len(names) or jobs
-    share = str(max(1, len(os.sched_getaffinity(0)) // count) if hasattr(os, "sched_getaffinity") else 1)
-    threads = {name: os.environ.get(name) or os.environ.get("OMP_NUM_THREADS") or share for name in THREADS}
+    share = str(
+        max(1, len(os.sched_getaffinity(0)) // count) if hasattr(os, "sched_getaffinity") else 1
+    )
+    threads = {
+        name: os.environ.get(name) or os.environ.get("OMP_NUM_THREADS") or share for name in THREADS
+    }
     return [threads | ({"CUDA_VISIBLE_DEVICES": names[i]} if names else {}) for i in range(count)]
 
 
 def run_jobs(
-    jobs: Sequence[Job], places: Sequence[dict[str, str]], ended: Callable[[Job, int], None], look: Callable[[set[str]], None]
+    jobs: Sequence[Job],
+    places: Sequence[dict[str, str]],
+    ended: Callable[[Job, int], None],
+    look: Callable[[set[str]], None],
 ) -> None:
-    """Run all jobs, as many at once as there are `places`. `ended` gets each with its exit code; `look` now and then the names of those
-    that run. Whatever ends this function ends them."""
+    """Run all jobs, as many at once as there are `places`. `ended` gets each with its
+    exit code; `look` now and then the names of those that run. Whatever ends this
+    function ends them.
+    """
     waiting, free, looked = list(jobs), list(places), 0.0
     running: list[tuple[Job, subprocess.Popen[bytes], dict[str, str]]] = []
     try:
@@ -103,7 +116,9 @@ def stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
 
 
 def end_with_parent() -> None:
-    """In a process that `run_jobs` started: end it where the one that waits for it was killed."""
+    """In a process that `run_jobs` started: end it where the one that waits for it was
+    killed.
+    """
     parent = int(os.environ.get(PARENT) or 0)
     if not parent:
         return
@@ -121,5 +136,9 @@ def last_words(log: Path, code: int) -> str:
     if code < 0:
         name = signal.Signals(-code).name
         return f"killed by {name}{', as where memory runs out' if name == 'SIGKILL' else ''}"
-    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    lines = [
+        line
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()
+        if line.strip()
+    ]
     return lines[-1].removeprefix("hdr-nsff: ").strip() if lines else f"exit code {code}"

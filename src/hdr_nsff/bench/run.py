@@ -1,6 +1,9 @@
-"""One run of a benchmark: its scene prepared, trained, measured. Each part keeps what it has done, so a killed run goes on.
+"""One run of a benchmark: its scene prepared, trained, measured. Each part keeps what
+it has done, so a killed run goes on.
 
-The clock of the training stands still while snapshots are written, and measuring comes after it."""
+The clock of the training stands still while snapshots are written, and measuring comes
+after it.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,9 @@ ENOUGH = 10.0  # seconds after which no further one is
 
 @contextmanager
 def alone(place: Path, wait: bool) -> Iterator[None]:
-    """No other process is in here with the same `place`. Where one is: wait for it, or InputError."""
+    """No other process is in here with the same `place`. Where one is: wait for it, or
+    InputError.
+    """
     import fcntl  # not on every system, and needed nowhere else
 
     place.parent.mkdir(parents=True, exist_ok=True)
@@ -46,7 +51,9 @@ def alone(place: Path, wait: bool) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
-            raise InputError(f"{place.parent}: another process is at work on this run; wait for it, or end it") from error
+            raise InputError(
+                f"{place.parent}: another process is at work on this run; wait for it, or end it"
+            ) from error
         yield
 
 
@@ -59,7 +66,9 @@ def get_ready(scene: BenchScene) -> None:
 
 
 def run_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
-    """All of a run that is not done yet. What makes it fail is kept in `failure.json`, and raised."""
+    """All of a run that is not done yet. What makes it fail is kept in `failure.json`,
+    and raised.
+    """
     with alone(cell.folder / ".lock", wait=False):
         (cell.folder / "failure.json").unlink(missing_ok=True)
         try:
@@ -68,8 +77,12 @@ def run_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
             measure_cell(cell, views, lpips)
         except Exception as error:
             told = str(error).strip().splitlines()[-1:] or [""]
-            reason = told[0] if isinstance(error, InputError) else f"{type(error).__name__}: {told[0]}"
-            notes.write(cell.folder / "failure.json", notes.Failure(reason=reason, log=os.environ.get(LOG)))
+            reason = (
+                told[0] if isinstance(error, InputError) else f"{type(error).__name__}: {told[0]}"
+            )
+            notes.write(
+                cell.folder / "failure.json", notes.Failure(reason=reason, log=os.environ.get(LOG))
+            )
             raise
 
 
@@ -105,7 +118,9 @@ def train_cell(cell: BenchRun, views: int) -> None:
     found = latest_checkpoint(cell.folder)
     train(cell.config, keep_at=SHARES if views else (), previews=False)
     wall = time.monotonic() - start
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+        1 if sys.platform == "darwin" else 1024
+    )
     run = Run.open(cell.folder, cell.config.device)
     device = device_of(run)
     cuda = device.type == "cuda"
@@ -137,11 +152,19 @@ def measure_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
 
 @torch.no_grad()
 def frame_seconds(run: Run) -> float:
-    """Median seconds to render a frame of the scene: radiance, depth and motion, nothing written."""
+    """Median seconds to render a frame of the scene: radiance, depth and motion,
+    nothing written.
+    """
     frames = run.scene.train[:: max(1, len(run.scene.train) // FRAMES)][:FRAMES]
-    small = replace(frames[0], camera=frames[0].camera.resized(frames[0].camera.width // 4, frames[0].camera.height // 4))
+    small = replace(
+        frames[0],
+        camera=frames[0].camera.resized(frames[0].camera.width // 4, frames[0].camera.height // 4),
+    )
     taken: list[float] = []
-    for warm, frame in ((True, small), *((False, f) for f in frames)):  # the first compiles the kernels
+    for warm, frame in (
+        (True, small),
+        *((False, f) for f in frames),
+    ):  # the first compiles the kernels
         camera, start = to_device(frame.camera, device_of(run)), time.perf_counter()
         seen = run.field.render(camera, frame.time)
         float(seen.radiance[0, 0])  # a GPU has finished by then

@@ -1,5 +1,7 @@
-"""The results of a benchmark as numbers: rows of runs, means, best and worst scenes; CSV, JSON, Markdown. Every score is that of the run's
-own metrics.json, from its `headline`."""
+"""The results of a benchmark as numbers: rows of runs, means, best and worst scenes;
+CSV, JSON, Markdown. Every score is that of the run's own metrics.json, from its
+`headline`.
+"""
 
 from __future__ import annotations
 
@@ -62,11 +64,27 @@ class Row:
         if self.metrics is None or self.trial is None or self.trial.trained is None:
             return {}
         t = self.trial.trained
-        costs = {"train_seconds": t.seconds, "steps": t.steps, "start_seconds": t.start_seconds, "frame_seconds": t.frame_seconds}
+        costs = {
+            "train_seconds": t.seconds,
+            "steps": t.steps,
+            "start_seconds": t.start_seconds,
+            "frame_seconds": t.frame_seconds,
+        }
         costs |= {"measure_seconds": self.trial.seconds}
-        costs |= {"memory_gb": t.memory / 1e9} | ({} if t.gpu_memory is None else {"gpu_memory_gb": t.gpu_memory / 1e9})
-        parts = {"": self.metrics["headline"], "camera.": self.metrics.get("camera", {}), "poses.": self.metrics.get("poses", {})}
-        found = {p + k: v for p, part in parts.items() for k, v in part.items() if isinstance(v, int | float)}
+        costs |= {"memory_gb": t.memory / 1e9} | (
+            {} if t.gpu_memory is None else {"gpu_memory_gb": t.gpu_memory / 1e9}
+        )
+        parts = {
+            "": self.metrics["headline"],
+            "camera.": self.metrics.get("camera", {}),
+            "poses.": self.metrics.get("poses", {}),
+        }
+        found = {
+            p + k: v
+            for p, part in parts.items()
+            for k, v in part.items()
+            if isinstance(v, int | float)
+        }
         return found | costs
 
 
@@ -78,7 +96,13 @@ def row_of(cell: BenchRun, plan: Plan) -> Row:
             return Row(cell, "done", "", notes.plain(found), read_trial(cell))
     failure = notes.read(cell.folder / "failure.json", notes.Failure)
     if failure is not None:
-        return Row(cell, "failed", failure.reason + (f" (log: {failure.log})" if failure.log else ""), None, None)
+        return Row(
+            cell,
+            "failed",
+            failure.reason + (f" (log: {failure.log})" if failure.log else ""),
+            None,
+            None,
+        )
     return Row(cell, "not finished", "the same command goes on with it", None, None)
 
 
@@ -96,11 +120,19 @@ def shown(row: Row, columns: Sequence[Column]) -> list[str]:
 
 def text(value: float | None, column: Column) -> str:
     """A number for people."""
-    return "–" if value is None else f"{value:,.{column.digits}f}" if column.key == "steps" else f"{value:.{column.digits}f}"
+    return (
+        "–"
+        if value is None
+        else f"{value:,.{column.digits}f}"
+        if column.key == "steps"
+        else f"{value:.{column.digits}f}"
+    )
 
 
 def best_cells(rows: Sequence[Row], columns: Sequence[Column]) -> set[tuple[int, int]]:
-    """(row, column) of the best value, as shown, of each column on each scene, where at least two runs have one."""
+    """(row, column) of the best value, as shown, of each column on each scene, where at
+    least two runs have one.
+    """
     found = set()
     for j, column in enumerate(columns):
         for name in dict.fromkeys(r.cell.scene.name for r in rows):
@@ -126,7 +158,9 @@ class Mean:
 
 
 def means(rows: Sequence[Row], oracle: bool) -> list[Mean]:
-    """The mean of each method over the scenes that all of them have finished (but those that have finished none), of oracle runs or of others."""
+    """The mean of each method over the scenes that all of them have finished (but those
+    that have finished none), of oracle runs or of others.
+    """
     done = [r for r in rows if r.status == "done" and r.cell.scene.oracle == oracle]
     methods = list(dict.fromkeys(r.cell.method for r in done))
     finished = {m: [r for r in done if r.cell.method == m] for m in methods}
@@ -135,10 +169,14 @@ def means(rows: Sequence[Row], oracle: bool) -> list[Mean]:
     result = []
     for name, runs in finished.items():
         common = [r.values for r in runs if r.cell.scene.name in scenes]
-        keys = [k for k in dict.fromkeys(k for v in common for k in v) if all(k in v for v in common)]
+        keys = [
+            k for k in dict.fromkeys(k for v in common for k in v) if all(k in v for v in common)
+        ]
         ranked = sorted(runs, key=lambda r: r.values["psnr"])
         values = {k: sum(v[k] for v in common) / len(common) for k in keys if k != "views"}
-        result.append(Mean(name, tuple(scenes), values, ranked[-1].cell.scene.name, ranked[0].cell.scene.name))
+        result.append(
+            Mean(name, tuple(scenes), values, ranked[-1].cell.scene.name, ranked[0].cell.scene.name)
+        )
     return result
 
 
@@ -146,7 +184,10 @@ def machine(rows: Sequence[Row]) -> str:
     """What it ran on, in a sentence."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
-    cpu = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+    cpu = next(
+        (line.partition(":")[2].strip() for line in lines if line.startswith("model name")),
+        platform.machine(),
+    )
     trained = [r.trial.trained for r in rows if r.trial is not None and r.trial.trained is not None]
     devices = ", ".join(dict.fromkeys(t.device for t in trained)) or "nothing yet"
     threads = ", ".join(dict.fromkeys(str(t.threads) for t in trained)) or "-"
@@ -208,8 +249,18 @@ def told_of_scenes(rows: Sequence[Row]) -> list[str]:
     found = []
     for name in dict.fromkeys(r.cell.scene.name for r in rows):
         own = [r for r in rows if r.cell.scene.name == name]
-        oracle = " An oracle run: its poses, masks, depth and flow were made from the truth." if own[0].cell.scene.oracle else ""
-        kinds = list(dict.fromkeys(f"{r.metrics['headline']['views']} {r.metrics['kind']}" for r in own if r.metrics is not None))
+        oracle = (
+            " An oracle run: its poses, masks, depth and flow were made from the truth."
+            if own[0].cell.scene.oracle
+            else ""
+        )
+        kinds = list(
+            dict.fromkeys(
+                f"{r.metrics['headline']['views']} {r.metrics['kind']}"
+                for r in own
+                if r.metrics is not None
+            )
+        )
         said = dict.fromkeys(note for r in own for note in (r.metrics or {}).get("notes", []))
         found.append(
             f"{name}: {', '.join(kinds) or 'nothing measured yet'}.{oracle}{''.join(f' {s[:1].upper()}{s[1:]}.' for s in said)}"
@@ -219,12 +270,20 @@ def told_of_scenes(rows: Sequence[Row]) -> list[str]:
 
 def markdown(plan: Plan, rows: Sequence[Row]) -> str:
     """results.md."""
-    parts = ["# Results", f"```sh\n{command(plan)}\n```", f"{machine(rows)}.", markdown_table(rows, SCORES)]
+    parts = [
+        "# Results",
+        f"```sh\n{command(plan)}\n```",
+        f"{machine(rows)}.",
+        markdown_table(rows, SCORES),
+    ]
     for oracle in (False, True):
         if found := means(rows, oracle):
             parts += [f"## {mean_title(found, oracle)}", grid(*mean_table(found, rows))]
     if failed := [r for r in rows if r.status != "done"]:
-        parts += ["## Without a result", "\n".join(f"- {r.cell.name}: {r.status}: {r.reason}" for r in failed)]
+        parts += [
+            "## Without a result",
+            "\n".join(f"- {r.cell.name}: {r.status}: {r.reason}" for r in failed),
+        ]
     parts += ["## Cost", markdown_table(rows, COSTS)]
     parts += ["## What the numbers are of", "\n".join(f"- {s}" for s in told_of_scenes(rows))]
     return "\n\n".join(parts) + "\n"
@@ -234,9 +293,15 @@ def markdown_table(rows: Sequence[Row], wanted: Sequence[Column]) -> str:
     """A line per run, the best of each scene bold."""
     columns = used(rows, wanted)
     bold = best_cells(rows, columns)
-    lines = [[f"**{t}**" if (i, j) in bold else t for j, t in enumerate(shown(r, columns))] for i, r in enumerate(rows)]
+    lines = [
+        [f"**{t}**" if (i, j) in bold else t for j, t in enumerate(shown(r, columns))]
+        for i, r in enumerate(rows)
+    ]
     names = [[r.cell.scene.name, r.cell.method] for r in rows]
-    return grid(["scene", "method", *(c.label for c in columns)], [n + line for n, line in zip(names, lines, strict=True)])
+    return grid(
+        ["scene", "method", *(c.label for c in columns)],
+        [n + line for n, line in zip(names, lines, strict=True)],
+    )
 
 
 def mean_title(found: Sequence[Mean], oracle: bool) -> str:
@@ -253,11 +318,15 @@ def mean_title(found: Sequence[Mean], oracle: bool) -> str:
 def mean_table(found: Sequence[Mean], rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     """Header and lines of the means, with the best and the worst scene of every method."""
     columns = used(rows, SCORES)
-    lines = [[m.method, m.best, m.worst, *(text(m.values.get(c.key), c) for c in columns)] for m in found]
+    lines = [
+        [m.method, m.best, m.worst, *(text(m.values.get(c.key), c) for c in columns)] for m in found
+    ]
     return ["method", "best scene (PSNR)", "worst scene", *(c.label for c in columns)], lines
 
 
 def grid(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
     """A Markdown table."""
     safe = [[c.replace("|", "\\|").replace("\n", " ") for c in line] for line in lines]
-    return "\n".join(f"| {' | '.join(line)} |" for line in [list(header), ["---"] * len(header), *safe])
+    return "\n".join(
+        f"| {' | '.join(line)} |" for line in [list(header), ["---"] * len(header), *safe]
+    )

@@ -1,6 +1,9 @@
-"""Data parallelism under `torchrun`: every process holds the whole model and its share of a step's batches; gradients are summed.
+"""Data parallelism under `torchrun`: every process holds the whole model and its share
+of a step's batches; gradients are summed.
 
-Nothing here when there is one process. Sums instead of `DistributedDataParallel`'s hooks, because the grids add to their gradients in place."""
+Nothing here when there is one process. Sums instead of `DistributedDataParallel`'s
+hooks, because the grids add to their gradients in place.
+"""
 
 from __future__ import annotations
 
@@ -53,7 +56,9 @@ class Ranks:
 
 @contextmanager
 def group() -> Iterator[Ranks]:
-    """Join the other processes where `torchrun` started several; leave in order at the end."""
+    """Join the other processes where `torchrun` started several; leave in order at the
+    end.
+    """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         yield Ranks()

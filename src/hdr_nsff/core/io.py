@@ -1,5 +1,7 @@
-"""Files: PNG and TIFF images, OpenEXR, video, npy, json. Reading checks and says what is wrong in one sentence
-(`InputError`); writing is atomic: a temporary file beside the target, fsync, rename."""
+"""Files: PNG and TIFF images, OpenEXR, video, npy, json. Reading checks and says what
+is wrong in one sentence (`InputError`); writing is atomic: a temporary file beside the
+target, fsync, rename.
+"""
 
 from __future__ import annotations
 
@@ -21,13 +23,18 @@ import OpenEXR
 
 from hdr_nsff.core.errors import InputError
 
-SIDES = {1: "forward", -1: "backward"}  # what channels of motion are called: to what is next, to what was before
+SIDES = {
+    1: "forward",
+    -1: "backward",
+}  # what channels of motion are called: to what is next, to what was before
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # chromaticities of R, G, B and white
 
 
 @contextmanager
 def atomic(path: Path | str) -> Iterator[Path]:
-    """A temporary path beside `path` with the same suffix; renamed onto `path` once the block ends without an error."""
+    """A temporary path beside `path` with the same suffix; renamed onto `path` once the
+    block ends without an error.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, name = tempfile.mkstemp(prefix=".partial-", suffix=path.suffix, dir=path.parent)
@@ -50,14 +57,17 @@ IMPOSSIBLE = (errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, err
 
 @contextmanager
 def writing_to(place: Path | str) -> Iterator[None]:
-    """Turns a full disk, and a place that cannot or may not be read or written, into an InputError. What was complete stays;
-    nothing is half-written."""
+    """Turns a full disk, and a place that cannot or may not be read or written, into an
+    InputError. What was complete stays; nothing is half-written.
+    """
     try:
         yield
     except InputError:
         raise
     except UnicodeEncodeError as error:
-        raise InputError(f"{place}: a file name that is no UTF-8 text ({error.object[:80]!r}); rename the file") from error
+        raise InputError(
+            f"{place}: a file name that is no UTF-8 text ({error.object[:80]!r}); rename the file"
+        ) from error
     except Exception as error:  # OpenEXR, FFmpeg and safetensors have types of their own for it
         if (sentence := about_the_disk(error, place)) is None:
             raise
@@ -65,8 +75,13 @@ def writing_to(place: Path | str) -> Iterator[None]:
 
 
 def about_the_disk(error: Exception, place: Path | str) -> str | None:
-    """What to say where the disk, not this program, is the cause of `error`; None for any other error."""
-    code, text = getattr(error, "errno", None), getattr(error, "strerror", None) or str(error).partition("\n")[0]
+    """What to say where the disk, not this program, is the cause of `error`; None for
+    any other error.
+    """
+    code, text = (
+        getattr(error, "errno", None),
+        getattr(error, "strerror", None) or str(error).partition("\n")[0],
+    )
     named = Path(getattr(error, "filename", None) or place)
     named = named.parent if named.name.startswith(".partial-") else named
     if code in FULL or any(m in str(error) for m in ("No space left", "File too large")):
@@ -114,7 +129,9 @@ def read_npy(path: Path | str) -> np.ndarray:
     except FileNotFoundError as error:
         raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it") from error
     except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"{path}: not a readable .npy array ({error}); run `hdr-nsff prepare` with `--redo`") from error
+        raise InputError(
+            f"{path}: not a readable .npy array ({error}); run `hdr-nsff prepare` with `--redo`"
+        ) from error
 
 
 def encode(path: Path | str, image: np.ndarray) -> None:
@@ -127,7 +144,9 @@ def encode(path: Path | str, image: np.ndarray) -> None:
 
 
 def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
-    """Write `rgb` (H, W, 3) or (H, W) in [0, 1] (clipped here: a PNG is for looking at or a recorded image), or a bool mask."""
+    """Write `rgb` (H, W, 3) or (H, W) in [0, 1] (clipped here: a PNG is for looking at
+    or a recorded image), or a bool mask.
+    """
     if rgb.dtype == bool:
         encode(path, rgb.astype(np.uint8) * 255)
         return
@@ -136,13 +155,17 @@ def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
 
 
 def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
-    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]; `over` is the gray in [0, 1] that shows through
-    transparent pixels (None: transparency is not looked at)."""
+    """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1]; `over` is
+    the gray in [0, 1] that shows through transparent pixels (None: transparency is not
+    looked at).
+    """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such image; put it back or mend the name")
     raw = np.frombuffer(path.read_bytes(), np.uint8)
-    if path.suffix.lower() == ".png" and not raw.tobytes().rstrip(b"\0").endswith(b"IEND\xaeB`\x82"):
+    if path.suffix.lower() == ".png" and not raw.tobytes().rstrip(b"\0").endswith(
+        b"IEND\xaeB`\x82"
+    ):
         raise InputError(f"{path}: the PNG is cut short; copy it again")
     if path.suffix.lower() in {".jpg", ".jpeg"} and b"\xff\xd9" not in raw[-64:].tobytes():
         raise InputError(f"{path}: the JPEG is cut short; copy it again")
@@ -154,7 +177,9 @@ def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
     if image is None:
         raise InputError(f"{path}: not a readable image (PNG, JPEG or TIFF); copy it again")
     if image.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: {image.dtype} pixels; convert to 8 or 16 bits, or to EXR for linear data")
+        raise InputError(
+            f"{path}: {image.dtype} pixels; convert to 8 or 16 bits, or to EXR for linear data"
+        )
     top = 255 if image.dtype == np.uint8 else 65535
     if image.ndim == 2:
         image = np.repeat(image[..., None], 3, -1)
@@ -170,27 +195,46 @@ def read_mask(path: Path | str) -> np.ndarray:
     return read_image(path).mean(-1) > 0.5
 
 
-def write_exr(path: Path | str, channels: dict[str, np.ndarray], header: dict[str, Any] | None = None, half: bool = True) -> None:
-    """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped; depth `Z` stays 32-bit. NaN is an error.
+def write_exr(
+    path: Path | str,
+    channels: dict[str, np.ndarray],
+    header: dict[str, Any] | None = None,
+    half: bool = True,
+) -> None:
+    """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped; depth `Z`
+    stays 32-bit. NaN is an error.
 
-    Header defaults: ZIP compression, Rec. 709 chromaticities. Extra keys (str, float) become attributes."""
+    Header defaults: ZIP compression, Rec. 709 chromaticities. Extra keys (str, float)
+    become attributes.
+    """
     arrays = {}
     for name, array in channels.items():
         assert np.isfinite(array).all(), f"{path}: channel {name} holds NaN or Inf"
         kind = np.float16 if half and name != "Z" else np.float32
         with np.errstate(over="ignore"):
-            data = np.ascontiguousarray(array, dtype=kind)  # OpenEXR writes wrong pixels for anything not contiguous
+            data = np.ascontiguousarray(
+                array, dtype=kind
+            )  # OpenEXR writes wrong pixels for anything not contiguous
         if kind == np.float16 and np.isinf(data).any():
-            data = np.ascontiguousarray(array, dtype=np.float32)  # beyond 65504: keep the radiance, not the size
+            data = np.ascontiguousarray(
+                array, dtype=np.float32
+            )  # beyond 65504: keep the radiance, not the size
         arrays[name] = data
-    full = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "chromaticities": REC709, **(header or {})}
+    full = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": REC709,
+        **(header or {}),
+    }
     with atomic(path) as temporary, OpenEXR.File(full, arrays) as file:
         file.write(str(temporary))
 
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Keeps what C libraries print of their own to stderr away from the terminal: the error that is raised says it."""
+    """Keeps what C libraries print of their own to stderr away from the terminal: the
+    error that is raised says it.
+    """
     with open(os.devnull, "wb") as nowhere:
         stderr = os.dup(2)
         os.dup2(nowhere.fileno(), 2)
@@ -202,7 +246,9 @@ def silent() -> Iterator[None]:
 
 
 def read_exr(path: Path | str) -> dict[str, np.ndarray]:
-    """Channels of an EXR as float32: {"RGB": (H, W, 3)} and {name: (H, W)} for the others. InputError for a file cut short, NaN or Inf."""
+    """Channels of an EXR as float32: {"RGB": (H, W, 3)} and {name: (H, W)} for the
+    others. InputError for a file cut short, NaN or Inf.
+    """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -221,32 +267,48 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
         channels["RGB"] = np.ascontiguousarray(channels["RGBA"][..., :3])
     for name, array in channels.items():
         if not np.isfinite(array).all():
-            raise InputError(f"{path}: channel {name} holds NaN or Inf; mend it in the program that wrote it")
+            raise InputError(
+                f"{path}: channel {name} holds NaN or Inf; mend it in the program that wrote it"
+            )
     return channels
 
 
-def write_video(path: Path | str, frames: Iterable[np.ndarray], fps: float = 24.0, crf: int = 16, footage: bool = False) -> int:
-    """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4 (8 bits, Rec. 709 tags, fast start), atomically; the number of frames written.
+def write_video(
+    path: Path | str,
+    frames: Iterable[np.ndarray],
+    fps: float = 24.0,
+    crf: int = 16,
+    footage: bool = False,
+) -> int:
+    """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4 (8 bits, Rec. 709 tags, fast
+    start), atomically; the number of frames written.
 
-    `footage` keeps the color of every pixel (4:4:4) and the grain: for video to be measured, browsers do not play it.
-    Odd sizes lose their last row or column (4:2:0 needs even ones)."""
+    `footage` keeps the color of every pixel (4:4:4) and the grain: for video to be
+    measured, browsers do not play it. Odd sizes lose their last row or column (4:2:0
+    needs even ones).
+    """
     import av
 
     count = 0
     pixels = "yuv444p" if footage else "yuv420p"
     options = {"crf": str(crf)} | ({"tune": "grain", "preset": "slow"} if footage else {})
-    with atomic(path) as temporary, av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container:
+    with (
+        atomic(path) as temporary,
+        av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container,
+    ):
         stream: Any = None
         for frame in frames:
             h, w = frame.shape[0] // 2 * 2, frame.shape[1] // 2 * 2
             if stream is None:
-                stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1001), options=options)
+                stream = container.add_stream(
+                    "libx264", rate=Fraction(fps).limit_denominator(1001), options=options
+                )
                 stream.width, stream.height, stream.pix_fmt = w, h, pixels
                 tag(stream.codec_context)
             data = np.rint(np.clip(frame[:h, :w], 0, 1) * 255).astype(np.uint8)
-            picture = av.VideoFrame.from_ndarray(np.ascontiguousarray(data), format="rgb24").reformat(
-                format=pixels, dst_colorspace="ITU709", dst_color_range="MPEG"
-            )
+            picture = av.VideoFrame.from_ndarray(
+                np.ascontiguousarray(data), format="rgb24"
+            ).reformat(format=pixels, dst_colorspace="ITU709", dst_color_range="MPEG")
             tag(picture)
             container.mux(stream.encode(picture))
             count += 1
@@ -262,7 +324,9 @@ def tag(target: Any) -> None:
 
 
 def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
-    """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds. InputError where nothing can be decoded."""
+    """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
+    InputError where nothing can be decoded.
+    """
     import av
 
     path = Path(path)
@@ -272,8 +336,14 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
                 raise InputError(f"{path}: no video stream in this file")
             for frame in container.decode(video=0):
                 deep = frame.format.components[0].bits > 8
-                array = np.rot90(frame.to_ndarray(format="rgb48le" if deep else "rgb24"), round(frame.rotation / 90))
-                yield array.astype(np.float32) / np.float32(65535 if deep else 255), float(frame.time or 0.0)
+                array = np.rot90(
+                    frame.to_ndarray(format="rgb48le" if deep else "rgb24"),
+                    round(frame.rotation / 90),
+                )
+                yield (
+                    array.astype(np.float32) / np.float32(65535 if deep else 255),
+                    float(frame.time or 0.0),
+                )
     except (av.FFmpegError, OSError) as error:
         raise InputError(
             f"{path}: not a readable video, or cut short ({error.strerror or type(error).__name__}); check that it plays, or copy it again"
@@ -303,7 +373,11 @@ def video_info(path: Path | str) -> VideoInfo:
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")
             alone = len(container.streams) == 1  # else the sound may be what lasts longest
-            seconds = float(stream.duration * stream.time_base) if stream.duration and stream.time_base else 0.0
+            seconds = (
+                float(stream.duration * stream.time_base)
+                if stream.duration and stream.time_base
+                else 0.0
+            )
             if not seconds and alone and container.duration:
                 seconds = container.duration / 1e6
             return VideoInfo(stream.frames, float(stream.average_rate or 24), seconds)
@@ -313,13 +387,19 @@ def video_info(path: Path | str) -> VideoInfo:
         ) from error
 
 
-def contact_sheet(rows: list[list[np.ndarray]], gap: int = 4, background: float = 0.12) -> np.ndarray:
-    """One picture (H, W, 3) of a table of pictures; gray (H, W) ones become rgb, all cells take the size of the largest."""
+def contact_sheet(
+    rows: list[list[np.ndarray]], gap: int = 4, background: float = 0.12
+) -> np.ndarray:
+    """One picture (H, W, 3) of a table of pictures; gray (H, W) ones become rgb, all
+    cells take the size of the largest.
+    """
     cells = [[c if c.ndim == 3 else np.repeat(c[..., None], 3, -1) for c in row] for row in rows]
     h = max(c.shape[0] for row in cells for c in row)
     w = max(c.shape[1] for row in cells for c in row)
     columns = max(len(row) for row in cells)
-    sheet = np.full((len(cells) * (h + gap) + gap, columns * (w + gap) + gap, 3), background, np.float32)
+    sheet = np.full(
+        (len(cells) * (h + gap) + gap, columns * (w + gap) + gap, 3), background, np.float32
+    )
     for i, row in enumerate(cells):
         for j, cell in enumerate(row):
             y, x = gap + i * (h + gap), gap + j * (w + gap)
@@ -328,20 +408,29 @@ def contact_sheet(rows: list[list[np.ndarray]], gap: int = 4, background: float 
 
 
 def colorize(
-    values: np.ndarray, low: float | None = None, high: float | None = None, valid: np.ndarray | None = None
+    values: np.ndarray,
+    low: float | None = None,
+    high: float | None = None,
+    valid: np.ndarray | None = None,
 ) -> np.ndarray:
-    """A scalar map (H, W) as rgb (H, W, 3) in [0, 1] through matplotlib's turbo, from percentiles 2 to 98 unless `low`, `high` are given."""
+    """A scalar map (H, W) as rgb (H, W, 3) in [0, 1] through matplotlib's turbo, from
+    percentiles 2 to 98 unless `low`, `high` are given.
+    """
     import matplotlib
 
     known = values[valid] if valid is not None and valid.any() else values.reshape(-1)
     low = float(np.percentile(known, 2)) if low is None else low
     high = float(np.percentile(known, 98)) if high is None else high
-    rgb = matplotlib.colormaps["turbo"](np.clip((values - low) / max(high - low, 1e-12), 0, 1))[..., :3].astype(np.float32)
+    rgb = matplotlib.colormaps["turbo"](np.clip((values - low) / max(high - low, 1e-12), 0, 1))[
+        ..., :3
+    ].astype(np.float32)
     return rgb if valid is None else rgb * valid[..., None]
 
 
 def colorize_flow(flow: np.ndarray, maximum: float | None = None) -> np.ndarray:
-    """Optical flow (H, W, 2) px as rgb (H, W, 3): hue is direction, saturation is length up to `maximum` (98th percentile)."""
+    """Optical flow (H, W, 2) px as rgb (H, W, 3): hue is direction, saturation is
+    length up to `maximum` (98th percentile).
+    """
     length = np.linalg.norm(flow, axis=-1)
     maximum = maximum or max(float(np.percentile(length, 98)), 1e-6)
     hue = (np.degrees(np.arctan2(flow[..., 1], flow[..., 0])) % 360).astype(np.float32)

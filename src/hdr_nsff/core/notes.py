@@ -1,7 +1,10 @@
-"""Notes: JSON files of fixed shape that verbs leave beside what they make, so that a restart goes on and `report` can tell.
+"""Notes: JSON files of fixed shape that verbs leave beside what they make, so that a
+restart goes on and `report` can tell.
 
-A note that was cut short, or edited into another shape, counts as missing, and that is said: whoever needs it makes it again. A JSON
-file of the same name that no verb has written is somebody else's, and is left alone."""
+A note that was cut short, or edited into another shape, counts as missing, and that is
+said: whoever needs it makes it again. A JSON file of the same name that no verb has
+written is somebody else's, and is left alone.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +25,9 @@ class Note(BaseModel):
     """What all notes have in common."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    marks: ClassVar[tuple[str, ...]] = ()  # keys that tell a note of this kind from other people's files
+    marks: ClassVar[
+        tuple[str, ...]
+    ] = ()  # keys that tell a note of this kind from other people's files
 
 
 N = TypeVar("N", bound=Note)
@@ -110,7 +115,9 @@ class FlowError(Note):
 
 
 class FlowErrors(Note):
-    """`before.json` of `finetune-flow`: what the network it starts from does to the pairs kept out of training."""
+    """`before.json` of `finetune-flow`: what the network it starts from does to the
+    pairs kept out of training.
+    """
 
     by_stops: dict[str, FlowError] = Field(min_length=1)  # EV between the two pictures -> error
 
@@ -138,7 +145,9 @@ class Trained(Note):
 
     steps: Count
     seconds: float  # of training
-    start_seconds: float  # from reading the scene to the first step, and writing; in the process that finished the training
+    # from reading the scene to the first step, and writing; in the process that
+    # finished the training
+    start_seconds: float
     memory: Count  # bytes, the most that process held
     gpu_memory: Count | None = None
     device: str
@@ -224,7 +233,9 @@ class Pu21(Note):
     nits: float
 
 
-Names = dict[str, tuple[str, Annotated[int, Field(ge=0, le=9)]]]  # of scores: what they are called, and digits to show
+Names = dict[
+    str, tuple[str, Annotated[int, Field(ge=0, le=9)]]
+]  # of scores: what they are called, and digits to show
 
 
 class Metrics(Note):
@@ -256,7 +267,12 @@ class Metrics(Note):
     def fits(self) -> Self:
         if empty := set(self.groups) - {v.group for v in self.views}:
             raise ValueError(f"no view is of the group {min(empty)}")
-        if self.hdr_scores is not None and None in (self.peak, self.recordable_peak, self.scale, self.scale_per_channel):
+        if self.hdr_scores is not None and None in (
+            self.peak,
+            self.recordable_peak,
+            self.scale,
+            self.scale_per_channel,
+        ):
             raise ValueError("hdr_scores without their scale")
         if self.geometry_scores is not None and self.depth_scale is None:
             raise ValueError("geometry_scores without their scale")
@@ -266,13 +282,17 @@ class Metrics(Note):
 
 
 def read(path: Path, kind: type[N]) -> N | None:
-    """The note at `path`; None where there is none, or, which is said, none that makes sense. InputError where it is no note of ours."""
+    """The note at `path`; None where there is none, or, which is said, none that makes
+    sense. InputError where it is no note of ours.
+    """
     if not path.is_file():
         return None
     try:
         data = read_json(path)
         if kind.marks and not (isinstance(data, dict) and set(kind.marks) <= data.keys()):
-            raise InputError(f"{path}: is there already and was not made by hdr-nsff; move it away, or choose another place")
+            raise InputError(
+                f"{path}: is there already and was not made by hdr-nsff; move it away, or choose another place"
+            )
         return kind.model_validate(data)
     except InputError:
         raise

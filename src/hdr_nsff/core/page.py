@@ -1,4 +1,6 @@
-"""Pieces of one self-contained HTML page, readable on light and dark: the frame, tables, embedded pictures and videos, plots."""
+"""Pieces of one self-contained HTML page, readable on light and dark: the frame,
+tables, embedded pictures and videos, plots.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +68,9 @@ def table(
     words: int = 1,
     bold: Collection[tuple[int, int]] = (),
 ) -> str:
-    """An HTML table of plain texts; all columns but the first `words` are numbers if `numeric`. `bold`: cells as (row, column)."""
+    """An HTML table of plain texts; all columns but the first `words` are numbers if
+    `numeric`. `bold`: cells as (row, column).
+    """
 
     def cell(text: str, tag: str, row: int, column: int) -> str:
         inner = f"<b>{escape(text)}</b>" if (row, column) in bold else escape(text)
@@ -82,7 +86,9 @@ def table(
 def figure(rgb: np.ndarray, caption: str, widest: int = 640) -> str:
     """An embedded JPEG of rgb (H, W, 3) in [0, 1], no wider than `widest` pixels."""
     if rgb.shape[1] > widest:
-        rgb = cv2.resize(rgb, (widest, round(rgb.shape[0] * widest / rgb.shape[1])), interpolation=cv2.INTER_AREA)
+        rgb = cv2.resize(
+            rgb, (widest, round(rgb.shape[0] * widest / rgb.shape[1])), interpolation=cv2.INTER_AREA
+        )
     data = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
     ok, buffer = cv2.imencode(".jpg", np.ascontiguousarray(data), [cv2.IMWRITE_JPEG_QUALITY, 92])
     assert ok
@@ -103,7 +109,9 @@ def number(value: Any, digits: int = 2, unit: str = "") -> str:
 
 
 def plot(width: float, height: float) -> tuple[Any, Any]:
-    """An empty matplotlib figure in inches, transparent, in grays that can be read on light and dark."""
+    """An empty matplotlib figure in inches, transparent, in grays that can be read on
+    light and dark.
+    """
     from matplotlib.figure import Figure
 
     drawing = Figure(figsize=(width, height), layout="constrained")

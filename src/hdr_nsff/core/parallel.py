@@ -11,7 +11,9 @@ from hdr_nsff.core.progress import track
 
 
 def in_threads(work: Callable, items: list, report: str | None, threads: int = 2) -> list:
-    """`work` of every item, in order, on a few threads with OpenCV's own threads off (its results depend on their number)."""
+    """`work` of every item, in order, on a few threads with OpenCV's own threads off
+    (its results depend on their number).
+    """
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     pool = ThreadPoolExecutor(threads)
@@ -19,5 +21,7 @@ def in_threads(work: Callable, items: list, report: str | None, threads: int = 2
         results = pool.map(work, items)
         return list(results if report is None else track(results, report, total=len(items)))
     finally:
-        pool.shutdown(cancel_futures=True)  # Ctrl-C waits for what is under way, not for what is to come
+        pool.shutdown(
+            cancel_futures=True
+        )  # Ctrl-C waits for what is under way, not for what is to come
         cv2.setNumThreads(before)

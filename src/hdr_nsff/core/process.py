@@ -10,10 +10,12 @@ AHEAD = 64 << 20  # bytes asked for beyond what is needed
 
 
 def keep_memory() -> bool:
-    """Let freed memory stay with the process, as every step and picture asks for the same pieces again; whether the allocator can be told.
+    """Let freed memory stay with the process, as every step and picture asks for the
+    same pieces again; whether the allocator can be told.
 
-    glibc gives pieces of a picture's size back to the system and gets them anew, a page fault for every 4 KB: up to 10 ms of a picture of
-    720x480 that takes 11."""
+    glibc gives pieces of a picture's size back to the system and gets them anew, a page
+    fault for every 4 KB: up to 10 ms of a picture of 720x480 that takes 11.
+    """
     if not sys.platform.startswith("linux"):
         return False
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)  # musl has none

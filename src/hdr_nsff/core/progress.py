@@ -1,4 +1,6 @@
-"""Progress bars with time left, for anything that takes more than two seconds; plain lines where no one watches a terminal."""
+"""Progress bars with time left, for anything that takes more than two seconds; plain
+lines where no one watches a terminal.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,23 @@ from collections.abc import Iterable, Iterator, Sized
 from typing import TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 T = TypeVar("T")
 console = Console(stderr=True, highlight=False)
 
 
 def bar() -> Progress:
-    """A progress display: `with bar() as p: task = p.add_task("poses", total=3); p.advance(task)`."""
+    """A progress display: `with bar() as p: task = p.add_task("poses", total=3);
+    p.advance(task)`.
+    """
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -40,8 +51,16 @@ def track(items: Iterable[T], description: str, total: int | None = None) -> Ite
             now = time.monotonic()
             if progress.disable and now - last > 10:
                 last = now
-                left = f", {(now - start) / (done + 1) * (total - done - 1):.0f} s left" if total else ""
-                print(f"{description}: {done + 1}{f' of {total}' if total else ''}{left}", file=sys.stderr, flush=True)
+                left = (
+                    f", {(now - start) / (done + 1) * (total - done - 1):.0f} s left"
+                    if total
+                    else ""
+                )
+                print(
+                    f"{description}: {done + 1}{f' of {total}' if total else ''}{left}",
+                    file=sys.stderr,
+                    flush=True,
+                )
 
 
 def say(message: str) -> None:

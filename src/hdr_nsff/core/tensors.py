@@ -1,4 +1,6 @@
-"""Map a function over the tensors of a frozen dataclass, so that moving or slicing one is a single call."""
+"""Map a function over the tensors of a frozen dataclass, so that moving or slicing one
+is a single call.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,17 @@ T = TypeVar("T")
 
 
 def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
-    """`value` with `function` applied to every tensor in it: dataclasses, dicts, lists and tuples are entered."""
+    """`value` with `function` applied to every tensor in it: dataclasses, dicts, lists
+    and tuples are entered.
+    """
 
     def walk(v: Any) -> Any:
         if isinstance(v, Tensor):
             return function(v)
         if dataclasses.is_dataclass(v) and not isinstance(v, type):
-            return dataclasses.replace(v, **{f.name: walk(getattr(v, f.name)) for f in dataclasses.fields(v)})
+            return dataclasses.replace(
+                v, **{f.name: walk(getattr(v, f.name)) for f in dataclasses.fields(v)}
+            )
         if isinstance(v, dict):
             return {k: walk(x) for k, x in v.items()}
         if isinstance(v, (list, tuple)):
@@ -37,8 +43,9 @@ def to_device(value: T, device: torch.device | str) -> T:
 
 
 def hold_threads(count: int) -> None:
-    """Let torch use `count` threads (0: as it is). Before every step or frame: numba's kernels set the count of the OpenMP library that
-    both share."""
+    """Let torch use `count` threads (0: as it is). Before every step or frame: numba's
+    kernels set the count of the OpenMP library that both share.
+    """
     if count:
         torch.set_num_threads(count)
 
@@ -48,7 +55,9 @@ def pick_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise InputError("--device cuda: this torch sees no CUDA device; leave the flag out to use the CPU")
+        raise InputError(
+            "--device cuda: this torch sees no CUDA device; leave the flag out to use the CPU"
+        )
     try:
         return torch.device(name)
     except RuntimeError as error:

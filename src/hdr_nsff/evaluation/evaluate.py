@@ -1,9 +1,12 @@
-"""A run against what it has never seen: held-out views with exact radiance or as recorded (a truth folder), else held-out frames of
-the clip, else, named as such, its own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
+"""A run against what it has never seen: held-out views with exact radiance or as
+recorded (a truth folder), else held-out frames of the clip, else, named as such, its
+own training frames. Writes `metrics.json` and pictures of prediction | truth | error.
 
-Recorded rgb is compared at the view's own exposure (the headline) and at all exposures of the clip; radiance after one scale
-for all views: LDR recordings alone leave it free. Moving-only numbers average over the moving mask. Every score has its definition,
-range and source in docs/metrics.md and at the function that computes it."""
+Recorded rgb is compared at the view's own exposure (the headline) and at all exposures
+of the clip; radiance after one scale for all views: LDR recordings alone leave it free.
+Moving-only numbers average over the moving mask. Every score has its definition, range
+and source in docs/metrics.md and at the function that computes it.
+"""
 
 from __future__ import annotations
 
@@ -41,9 +44,13 @@ class EvaluateConfig:
     run: tyro.conf.Positional[Path]
     """Run folder."""
     truth: Path | None = None
-    """Truth folder, as `synth`, `reexpose`, and `prepare` of a public data set write it; default: the frames that `prepare` held out."""
+    """Truth folder, as `synth`, `reexpose`, and `prepare` of a public data set write
+    it; default: the frames that `prepare` held out.
+    """
     lpips: str | None = None
-    """LPIPS: a file with AlexNet weights, or `hub` for those that `hdr-nsff weights` lists, downloaded where they are not here yet."""
+    """LPIPS: a file with AlexNet weights, or `hub` for those that `hdr-nsff weights`
+    lists, downloaded where they are not here yet.
+    """
     device: str = "auto"
     """auto, cpu or cuda."""
 
@@ -55,17 +62,25 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
 
 
 def views_of_clip(folder: Path) -> list[int]:
-    """Which frames of the clip the views of a truth folder are, for those who keep them out of training; none where any view is of another
-    place or time. InputError where `folder` is no truth folder."""
+    """Which frames of the clip the views of a truth folder are, for those who keep them
+    out of training; none where any view is of another place or time. InputError where
+    `folder` is no truth folder.
+    """
     views = Truth.open(folder).views
     own = all(v.c2w is None and v.time == v.anchor for v in views)
     return sorted({v.anchor for v in views}) if own else []
 
 
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:
-    """Measure, write `metrics.json` and `evaluation/*.png` into the run folder, and give back what was written."""
+    """Measure, write `metrics.json` and `evaluation/*.png` into the run folder, and
+    give back what was written.
+    """
     start = time.monotonic()
-    perceptual = metrics.Lpips([find("alexnet"), find("lpips")] if lpips == "hub" else lpips) if lpips else None
+    perceptual = (
+        metrics.Lpips([find("alexnet"), find("lpips")] if lpips == "hub" else lpips)
+        if lpips
+        else None
+    )
     truth = Truth.open(truth_folder) if truth_folder else None
     kind, targets, notes = choose_targets(run, truth, truth_folder)
     say(f"evaluating on {len(targets)} {kind}")
@@ -83,10 +98,15 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
         of_view |= score_radiance(target, predicted, gauge) if gauge else {}
         scores.append(of_view | (score_geometry(target, file, units) if units else {}))
         write_picture(target, predicted, at[target.bracket], gauge, exposure, folder)
-    result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes} | summary(run, scores, notes)
+    result: dict[str, Any] = {"step": run.step, "kind": kind, "notes": notes} | summary(
+        run, scores, notes
+    )
     result |= told_of_radiance(gauge) | told_of_geometry(units)
     if truth is not None:
-        result |= {"camera": camera_errors(run, truth), "poses": trajectory_errors(run, truth, targets)}
+        result |= {
+            "camera": camera_errors(run, truth),
+            "poses": trajectory_errors(run, truth, targets),
+        }
         notes += absences(result["headline"], gauge, units)
     result |= {"stability": stability(run, folder / "path"), "lpips": lpips_note(lpips, scores)}
     if not result["stability"]:
@@ -100,15 +120,23 @@ def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) 
 def describe(run: Run, target: Target) -> dict[str, Any]:
     """What a view is."""
     protocol = target.protocol(run.scene.times.tolist())
-    return {"name": target.name, "group": target.group, "protocol": protocol, "time": target.view.time, "bracket": target.bracket}
+    return {
+        "name": target.name,
+        "group": target.group,
+        "protocol": protocol,
+        "time": target.view.time,
+        "bracket": target.bracket,
+    }
 
 
 NOT_SCORES = ("name", "group", "protocol", "time", "bracket")
 
 
 def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict[str, Any]:
-    """Means of the views: `headline`, `groups`, `protocols`. The headline is that of the protocol the scene was prepared for, else of all views
-    the run was not trained on, else of all."""
+    """Means of the views: `headline`, `groups`, `protocols`. The headline is that of
+    the protocol the scene was prepared for, else of all views the run was not trained
+    on, else of all.
+    """
     protocol = run.scene.manifest.protocol
     if protocol is not None and not any(v["protocol"] == protocol for v in views):
         notes.append(
@@ -117,7 +145,10 @@ def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict
     return {
         "protocol": protocol,
         "headline": mean_of(headline_views(run, views)),
-        "groups": {g: mean_of([v for v in views if v["group"] == g]) for g in dict.fromkeys(v["group"] for v in views)},
+        "groups": {
+            g: mean_of([v for v in views if v["group"] == g])
+            for g in dict.fromkeys(v["group"] for v in views)
+        },
         "protocols": {
             p: mean_of([v for v in views if v["protocol"] == p])
             for p in get_args(Protocol)
@@ -129,12 +160,18 @@ def summary(run: Run, views: Sequence[dict[str, Any]], notes: list[str]) -> dict
 def headline_views(run: Run, views: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """Those of the described views that the headline is of."""
     protocol = run.scene.manifest.protocol
-    wanted = [v for v in views if v["protocol"] is not None and v["protocol"] == (protocol or v["protocol"])]
+    wanted = [
+        v
+        for v in views
+        if v["protocol"] is not None and v["protocol"] == (protocol or v["protocol"])
+    ]
     return wanted or [v for v in views if v["protocol"] is not None] or list(views)
 
 
 def headline_targets(run: Run, truth_folder: Path | None) -> list[Target]:
-    """The views that the headline is of: the same, in the same order, for every run on a scene."""
+    """The views that the headline is of: the same, in the same order, for every run on
+    a scene.
+    """
     truth = Truth.open(truth_folder) if truth_folder else None
     targets = choose_targets(run, truth, truth_folder)[1]
     names = {v["name"] for v in headline_views(run, [describe(run, t) for t in targets])}
@@ -160,16 +197,24 @@ def told_of_geometry(units: Units | None) -> dict[str, Any]:
     """What belongs beside the scores of depth and motion."""
     if units is None:
         return {}
-    return {"geometry_scores": GEOMETRY_SCORES, "depth_scale": units.depth, "world_scale": units.world}
+    return {
+        "geometry_scores": GEOMETRY_SCORES,
+        "depth_scale": units.depth,
+        "world_scale": units.world,
+    }
 
 
 def absences(headline: dict[str, Any], gauge: Gauge | None, units: Units | None) -> list[str]:
-    """Sentences about scores that a truth folder could have, and this one or this run has not."""
+    """Sentences about scores that a truth folder could have, and this one or this run
+    has not.
+    """
     notes = []
     if gauge is None:
         notes.append("radiance: absent, this truth folder holds what a camera recorded alone")
     elif "hdr_flip" not in headline:
-        notes.append("HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)")
+        notes.append(
+            "HDR-FLIP: absent, flip-evaluator is not installed (`pip install flip-evaluator`)"
+        )
     if units is None:
         notes.append("depth and motion: absent, this truth folder holds none (`synth` writes them)")
     elif "flow_epe" not in headline:
@@ -183,7 +228,11 @@ def lpips_note(weights: str | None, views: Sequence[dict[str, Any]]) -> str:
     """What there is to say about LPIPS."""
     if weights is None:
         return "absent; give --lpips FILE (AlexNet weights) or --lpips hub"
-    return f"AlexNet v0.1, {weights}" if "lpips" in views[0] else f"absent; the pictures are smaller than {SMALLEST_LPIPS} pixels"
+    return (
+        f"AlexNet v0.1, {weights}"
+        if "lpips" in views[0]
+        else f"absent; the pictures are smaller than {SMALLEST_LPIPS} pixels"
+    )
 
 
 def tell(result: dict[str, Any]) -> None:
@@ -195,7 +244,13 @@ def tell(result: dict[str, Any]) -> None:
         ("ssim", "SSIM", ""),
         ("mu5000", "HDR mu-law(5000)", "dB"),
     )
-    say("; ".join(f"{label} {h[key]:.{3 if key == 'ssim' else 2}f} {unit}".rstrip() for key, label, unit in names if key in h))
+    say(
+        "; ".join(
+            f"{label} {h[key]:.{3 if key == 'ssim' else 2}f} {unit}".rstrip()
+            for key, label, unit in names
+            if key in h
+        )
+    )
 
 
 def mean_of(views: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -205,10 +260,24 @@ def mean_of(views: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return {"views": len(views)} | {k: float(np.mean(x)) for k, x in means.items() if x}
 
 
-def write_picture(target: Target, predicted: Tensor, own: Tensor, gauge: Gauge | None, exposure: float, folder: Path) -> None:
-    """Prediction | truth | 4 x error, as recorded (`own`) and, where the radiance is known, tone-mapped for a display at `exposure`."""
+def write_picture(
+    target: Target,
+    predicted: Tensor,
+    own: Tensor,
+    gauge: Gauge | None,
+    exposure: float,
+    folder: Path,
+) -> None:
+    """Prediction | truth | 4 x error, as recorded (`own`) and, where the radiance is
+    known, tone-mapped for a display at `exposure`.
+    """
     pairs = [(own, target.rgb[target.bracket])]
     if gauge is not None and target.radiance is not None:
-        pairs.append((color.display(predicted * gauge.scale, exposure), color.display(target.radiance, exposure)))
+        pairs.append(
+            (
+                color.display(predicted * gauge.scale, exposure),
+                color.display(target.radiance, exposure),
+            )
+        )
     rows = [[p.numpy(), t.numpy(), (4 * (p - t).abs()).clip(0, 1).numpy()] for p, t in pairs]
     io.write_png(folder / f"{target.name}.png", io.contact_sheet(rows))

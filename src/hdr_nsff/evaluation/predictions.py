@@ -34,9 +34,13 @@ class Geometry:
     scene_flow: dict[int, Tensor]  # {+-1: (H, W, 3)} units per frame, axes of the scene
 
 
-def predict(run: Run, views: Mapping[str, View], folder: Path, description: str, motion: bool) -> list[Path]:
-    """An EXR per named view, `folder`/NAME.exr: radiance, depth and, with `motion`, scene flow per frame in channels like `forward.x`. What
-    is there of the same run is kept, so that a killed evaluation goes on where it was."""
+def predict(
+    run: Run, views: Mapping[str, View], folder: Path, description: str, motion: bool
+) -> list[Path]:
+    """An EXR per named view, `folder`/NAME.exr: radiance, depth and, with `motion`,
+    scene flow per frame in channels like `forward.x`. What is there of the same run is
+    kept, so that a killed evaluation goes on where it was.
+    """
     key = json.dumps(fingerprint(run, motion, list(views.items())))
     note = folder / "predictions.json"
     if not note.is_file() or note.read_text(encoding="utf-8", errors="replace") != key:
@@ -50,7 +54,9 @@ def predict(run: Run, views: Mapping[str, View], folder: Path, description: str,
 
 
 def maps_of(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
-    """The channels of one view. Where a time between frames is splatted, the field itself is asked for its scene flow there."""
+    """The channels of one view. Where a time between frames is splatted, the field
+    itself is asked for its scene flow there.
+    """
     camera, times = to_device(view.camera, device_of(run)), run.scene.times.tolist()
     with torch.no_grad():
         seen = render_at(run.field, camera, view.time, times, scene_flow=motion)
@@ -69,11 +75,18 @@ def maps_of(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
 
 
 def intervals(time: float, times: Sequence[float]) -> dict[int, float]:
-    """How many frames a field's scene flow at `time` reaches forward and backward: it is told from one of the training `times` to the
-    next; between two of them what it reaches is interpolated as well. Without a side where the clip ends: nothing was learned there."""
+    """How many frames a field's scene flow at `time` reaches forward and backward: it
+    is told from one of the training `times` to the next; between two of them what it
+    reaches is interpolated as well. Without a side where the clip ends: nothing was
+    learned there.
+    """
     places = np.arange(len(times))
     knot = float(np.interp(time, times, places))
-    reached = {side: float(np.interp(knot + side, places, times)) for side in io.SIDES if 0 <= knot + side <= len(times) - 1}
+    reached = {
+        side: float(np.interp(knot + side, places, times))
+        for side in io.SIDES
+        if 0 <= knot + side <= len(times) - 1
+    }
     return {side: abs(end - time) for side, end in reached.items()}
 
 
@@ -86,16 +99,24 @@ def geometry_of(path: Path, view: View) -> Geometry:
     """Depth and motion of a prediction, in scene units."""
     channels = {name: torch.from_numpy(array) for name, array in io.read_exr(path).items()}
     depth, pixels = channels["Z"], view.camera.pixel_grid()
-    scene_flow = {s: torch.stack([channels[f"{n}.{a}"] for a in "xyz"], -1) for s, n in io.SIDES.items() if f"{n}.x" in channels}
+    scene_flow = {
+        s: torch.stack([channels[f"{n}.{a}"] for a in "xyz"], -1)
+        for s, n in io.SIDES.items()
+        if f"{n}.x" in channels
+    }
     rays = view.camera.rays(pixels)
     points = rays.origins + depth.reshape(-1, 1) * rays.directions
-    flow = {s: (view.camera.project(points + f.reshape(-1, 3))[0] - pixels).view(*depth.shape, 2) for s, f in scene_flow.items()}
+    flow = {
+        s: (view.camera.project(points + f.reshape(-1, 3))[0] - pixels).view(*depth.shape, 2)
+        for s, f in scene_flow.items()
+    }
     return Geometry(depth, flow, scene_flow)
 
 
 def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
-    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run rendered of the target, at every bracket at which
-    the target is known."""
+    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run
+    rendered of the target, at every bracket at which the target is known.
+    """
     brackets = list(target.rgb)
     recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]
     return dict(zip(brackets, seen_by(run, target, radiance, recorders), strict=True))
@@ -103,10 +124,18 @@ def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
 
 def developed(run: Run, target: Target, radiance: Tensor, evs: Sequence[float]) -> list[Tensor]:
     """The same at any exposures, `evs` relative to the reference bracket."""
-    return seen_by(run, target, radiance, [run.tonemapper.recorder_at(ev, target.camera_id) for ev in evs]) if evs else []
+    return (
+        seen_by(
+            run, target, radiance, [run.tonemapper.recorder_at(ev, target.camera_id) for ev in evs]
+        )
+        if evs
+        else []
+    )
 
 
-def seen_by(run: Run, target: Target, radiance: Tensor, recorders: Sequence[Recorder]) -> list[Tensor]:
+def seen_by(
+    run: Run, target: Target, radiance: Tensor, recorders: Sequence[Recorder]
+) -> list[Tensor]:
     """The same as given recordings look."""
     device = device_of(run)
     with torch.no_grad():

@@ -1,4 +1,6 @@
-"""The views that a run is held against: those of a truth folder, carried over to the estimated poses, or recorded frames."""
+"""The views that a run is held against: those of a truth folder, carried over to the
+estimated poses, or recorded frames.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ class GeometryFile:
 
     path: Path
     size: tuple[int, int]  # (H, W)
-    turn: np.ndarray  # (3, 3): axes of the truth to those of the scene, as the view's two poses have it
+    turn: (
+        np.ndarray
+    )  # (3, 3): axes of the truth to those of the scene, as the view's two poses have it
 
 
 @dataclass(frozen=True)
@@ -43,16 +47,25 @@ class Target:
     bracket: int
     camera_id: int
     rgb: dict[int, Tensor]  # {bracket: (H, W, 3)} what the camera would record (or did) in [0, 1]
-    radiance: Tensor | None  # (H, W, 3) exact, where known, in the camera's white balance: the unit of a run's radiance
+    radiance: (
+        Tensor | None
+    )  # (H, W, 3) exact, where known, in the camera's white balance: the unit of a run's radiance
     moving: Tensor | None  # (H, W) bool
     geometry: GeometryFile | None = None  # where known
-    novel: dict[float, Tensor] = field(default_factory=dict)  # {EV: (H, W, 3)} recorded, at exposures of no frame of the clip
+    # {EV: (H, W, 3)} recorded, at exposures of no frame of the clip
+    novel: dict[float, Tensor] = field(default_factory=dict)
 
     def protocol(self, times: Sequence[float]) -> Protocol | None:
-        """Which of the published comparisons the view belongs to, of a run trained at `times`; None where it was trained on."""
+        """Which of the published comparisons the view belongs to, of a run trained at
+        `times`; None where it was trained on.
+        """
         if self.group == SEEN:
             return None
-        return "novel-view" if min(abs(self.view.time - t) for t in times) < 1e-6 else "novel-view-time"
+        return (
+            "novel-view"
+            if min(abs(self.view.time - t) for t in times) < 1e-6
+            else "novel-view-time"
+        )
 
 
 def moving_of(target: Target) -> Tensor | None:
@@ -67,7 +80,9 @@ def exact_of(target: Target) -> Tensor:
 
 
 def recordable(target: Target) -> Tensor:
-    """True (H, W) where at least one exposure of the clip, of those at which the view is known, records all channels unclipped."""
+    """True (H, W) where at least one exposure of the clip, of those at which the view
+    is known, records all channels unclipped.
+    """
     return (
         torch.stack([informative(rgb.reshape(-1, 3)) for rgb in target.rgb.values()])
         .any(0)
@@ -75,8 +90,12 @@ def recordable(target: Target) -> Tensor:
     )
 
 
-def choose_targets(run: Run, truth: Truth | None, folder: Path | None) -> tuple[str, list[Target], list[str]]:
-    """What the targets are, in words; the targets; sentences about what had to be left out."""
+def choose_targets(
+    run: Run, truth: Truth | None, folder: Path | None
+) -> tuple[str, list[Target], list[str]]:
+    """What the targets are, in words; the targets; sentences about what had to be left
+    out.
+    """
     if truth is not None and folder is not None:
         targets, notes = truth_targets(run, truth, folder)
         held_out = any(t.group != SEEN for t in targets)
@@ -96,7 +115,14 @@ def frame_targets(run: Run, test: bool) -> list[Target]:
     group = "held-out frame" if test else SEEN
     return [
         Target(
-            f"{f.index:05d}", group, View(f.camera, f.time), f.bracket, f.camera_id, {f.bracket: f.image.cpu()}, None, f.moving
+            f"{f.index:05d}",
+            group,
+            View(f.camera, f.time),
+            f.bracket,
+            f.camera_id,
+            {f.bracket: f.image.cpu()},
+            None,
+            f.moving,
         )
         for f in frames
     ]
@@ -114,13 +140,19 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
     targets, notes = [], []
     for view in truth.views:
         if view.c2w is not None and scale is None:
-            notes.append(f"{view.name}: left out, its pose is off the clip's path and the estimated cameras fix no scale")
+            notes.append(
+                f"{view.name}: left out, its pose is off the clip's path and the estimated cameras fix no scale"
+            )
         elif not times[0] <= view.time <= times[-1]:
-            notes.append(f"{view.name}: left out, its time {view.time:g} is outside the training frames")
+            notes.append(
+                f"{view.name}: left out, its time {view.time:g} is outside the training frames"
+            )
         else:
             targets.append(truth_target(run, truth, view, folder, scale or 1.0))
     if seen := [t.name for t in targets if t.group == SEEN]:
-        notes.append(f"{len(seen)} views, {seen[0]} first, are frames that the run was trained on; they are no held-out views")
+        notes.append(
+            f"{len(seen)} views, {seen[0]} first, are frames that the run was trained on; they are no held-out views"
+        )
     for note in notes:
         say(note)
     if not targets:
@@ -146,11 +178,15 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     pose = np.array(anchor.c2w)
     if view.c2w is not None:
         assert truth.clip_c2w is not None, "world_scale refuses this"
-        pose = alignment.carry(pose, np.array(truth.clip_c2w[view.anchor]), np.array(view.c2w), scale)
+        pose = alignment.carry(
+            pose, np.array(truth.clip_c2w[view.anchor]), np.array(view.c2w), scale
+        )
     height, width = pictures[view.bracket].shape[:2]
     match = scene_brackets(truth, run.scene.manifest.frames, run.tonemapper.exposures().tolist())
     if view.bracket not in match:
-        raise InputError(f"{folder}: view {view.name} is of an exposure that the scene does not have; prepare it again")
+        raise InputError(
+            f"{folder}: view {view.name} is of an exposure that the scene does not have; prepare it again"
+        )
     return Target(
         view.name, group_of(run, view), View(camera_of(run, view, anchor, pose, (height, width)), view.time),
         match[view.bracket], anchor.camera_id,
@@ -162,8 +198,12 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     )  # fmt: skip
 
 
-def camera_of(run: Run, view: TruthView, anchor: FrameEntry, pose: np.ndarray, size: tuple[int, int]) -> Camera:
-    """The camera of a truth view at `pose` (3, 4) for pictures of `size` (H, W): with a K of its own, else with that of its anchor."""
+def camera_of(
+    run: Run, view: TruthView, anchor: FrameEntry, pose: np.ndarray, size: tuple[int, int]
+) -> Camera:
+    """The camera of a truth view at `pose` (3, 4) for pictures of `size` (H, W): with a
+    K of its own, else with that of its anchor.
+    """
     m, (height, width) = run.scene.manifest, size
     c2w = torch.from_numpy(pose).float()
     if view.K is not None:
@@ -177,11 +217,17 @@ def group_of(run: Run, view: TruthView) -> str:
         return "off-path"
     if any(f.index == view.anchor and abs(f.time - view.time) < 1e-6 for f in run.scene.train):
         return SEEN
-    return "view" if min(abs(view.time - t) for t in run.scene.times.tolist()) < 1e-6 else "view+time"
+    return (
+        "view" if min(abs(view.time - t) for t in run.scene.times.tolist()) < 1e-6 else "view+time"
+    )
 
 
-def geometry_file(truth: Truth, view: TruthView, folder: Path, size: tuple[int, int], pose: np.ndarray) -> GeometryFile | None:
-    """Where depth and motion of a truth view are, whose `pose` (3, 4) in the scene is known."""
+def geometry_file(
+    truth: Truth, view: TruthView, folder: Path, size: tuple[int, int], pose: np.ndarray
+) -> GeometryFile | None:
+    """Where depth and motion of a truth view are, whose `pose` (3, 4) in the scene is
+    known.
+    """
     if view.geometry is None:
         return None
     assert truth.clip_c2w is not None, "Truth.problem refuses this"
@@ -190,22 +236,34 @@ def geometry_file(truth: Truth, view: TruthView, folder: Path, size: tuple[int, 
 
 
 def moving_mask(run: Run, view: TruthView, folder: Path, size: tuple[int, int]) -> Tensor | None:
-    """The moving mask (H, W) of a truth view; without one, that of the scene where the view is a frame of the clip."""
+    """The moving mask (H, W) of a truth view; without one, that of the scene where the
+    view is a frame of the clip.
+    """
     if view.mask is not None:
         mask = io.read_mask(inside(folder, view.mask))
         if mask.shape != size:
-            raise InputError(f"{folder / view.mask}: a mask of {mask.shape}, but the pictures of {view.name} are {size}")
+            raise InputError(
+                f"{folder / view.mask}: a mask of {mask.shape}, but the pictures of {view.name} are {size}"
+            )
         return torch.from_numpy(mask)
-    frames = [f for f in run.scene.train + run.scene.test if f.index == view.anchor and f.time == view.time and view.c2w is None]
+    frames = [
+        f
+        for f in run.scene.train + run.scene.test
+        if f.index == view.anchor and f.time == view.time and view.c2w is None
+    ]
     own = frames[0].moving if frames else None
     return own if own is not None and own.shape == size else None
 
 
 def trajectories(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray] | None:
-    """True and estimated poses (T, 3, 4) of the clip's frames; None where the truth has none."""
+    """True and estimated poses (T, 3, 4) of the clip's frames; None where the truth has
+    none.
+    """
     if truth.clip_c2w is None:
         return None
-    return np.array(truth.clip_c2w), np.array([e.c2w for e in run.scene.manifest.frames], dtype=np.float64)
+    return np.array(truth.clip_c2w), np.array(
+        [e.c2w for e in run.scene.manifest.frames], dtype=np.float64
+    )
 
 
 def world_scale(run: Run, truth: Truth) -> float | None:
@@ -213,6 +271,8 @@ def world_scale(run: Run, truth: Truth) -> float | None:
     paths = trajectories(run, truth)
     if paths is None:
         if any(v.c2w is not None for v in truth.views):
-            raise InputError("truth.json: views have poses of their own, but clip_c2w is missing; they cannot be carried over")
+            raise InputError(
+                "truth.json: views have poses of their own, but clip_c2w is missing; they cannot be carried over"
+            )
         return None
     return alignment.scale_between(*paths)

@@ -1,4 +1,6 @@
-"""Radiance fields behind one interface (`base.RadianceField`); here is the one place that knows which there are."""
+"""Radiance fields behind one interface (`base.RadianceField`); here is the one place
+that knows which there are.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +30,14 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
         case NSFFConfig():
             field: NSFF | NerfWT = NSFF(config, space, scene.times, near, far, m.width, m.height)
         case NerfWTConfig():
-            reference = tuple(i for i, f in enumerate(scene.train) if f.bracket == m.reference_bracket)
+            reference = tuple(
+                i for i, f in enumerate(scene.train) if f.bracket == m.reference_bracket
+            )
             everyone = tuple(range(len(scene.train)))
             size = (m.width, m.height)
-            field = NerfWT(config, space, scene.times, near, far, size, len(everyone), reference or everyone)
+            field = NerfWT(
+                config, space, scene.times, near, far, size, len(everyone), reference or everyone
+            )
         case HexPlaneConfig():
             return HexPlane(config, space, scene.times, near, far)
         case _:
@@ -40,9 +46,14 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     return field
 
 
-def start_field(field: AnyField, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool) -> str | None:
-    """Give an untrained field what the scene tells before training: `typical` log radiance and, if `from_priors`, the surfaces of
-    the depth prior in the colors that `to_radiance(rgb (P, 3), i)` recovers from training frame i. A sentence about it, if any."""
+def start_field(
+    field: AnyField, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool
+) -> str | None:
+    """Give an untrained field what the scene tells before training: `typical` log
+    radiance and, if `from_priors`, the surfaces of the depth prior in the colors that
+    `to_radiance(rgb (P, 3), i)` recovers from training frame i. A sentence about it, if
+    any.
+    """
     match field:
         case NSFF() | NerfWT():
             field.bias.fill_(typical)

@@ -1,9 +1,12 @@
-"""What every radiance field answers: what does this camera see, at this time, at these pixels, in linear HDR radiance.
+"""What every radiance field answers: what does this camera see, at this time, at these
+pixels, in linear HDR radiance.
 
-Fields know nothing of exposure, white balance or response curves: tone mapping happens outside. `S` is the number of
-pixels asked for. Camera, time and pixels are the currency, not rays: an NSFF casts rays through the pixels, a splat
-field rasterizes the frame and reads them off. Two published baselines cannot be told without what was recorded (`RecordingField`):
-they are handed a `Recorder` from outside."""
+Fields know nothing of exposure, white balance or response curves: tone mapping happens
+outside. `S` is the number of pixels asked for. Camera, time and pixels are the
+currency, not rays: an NSFF casts rays through the pixels, a splat field rasterizes the
+frame and reads them off. Two published baselines cannot be told without what was
+recorded (`RecordingField`): they are handed a `Recorder` from outside.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,9 @@ class Warp:
     """The same pixels rendered through the content of a neighboring frame (eq. 2-3)."""
 
     offset: int  # which neighbor: -1, +1, and -2, +2 for the two-step chain
-    flow: Tensor  # (S, 2) pixels: where the content goes in the neighbor's camera, minus where it is here
+    # (S, 2) pixels: where the content goes in the neighbor's camera, minus where it is
+    # here
+    flow: Tensor
     confidence: Tensor  # (S,) in [0, 1]: 1 - rendered disocclusion
     radiance: Tensor | None  # (S, 3) linear HDR, None where the field offers no warped render
 
@@ -37,24 +42,31 @@ class Render:
     depth: Tensor  # (S,) z-depth, scene units
     opacity: Tensor  # (S,) in [0, 1]
     motion: Tensor  # (S,) in [0, 1]: share of dynamic content
-    scene_flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (S, 3)} scene units to the next / previous training time
+    # {+-1: (S, 3)} scene units to the next / previous training time
+    scene_flow: dict[int, Tensor] = field(default_factory=dict)
     warps: tuple[Warp, ...] = ()  # while training
     dynamic_radiance: Tensor | None = None  # (S, 3) the dynamic branch alone, while training
     dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch alone, while training
     rgb: Tensor | None = (
-        None  # (S, 3) recorded, of a field that composites recordings; None: tone mapping makes it from `radiance`
+        # (S, 3) recorded, of a field that composites recordings; None: tone mapping
+        # makes it from `radiance`
+        None
     )
 
 
 @dataclass(frozen=True)
 class Layers:
-    """A view as L translucent layers, front to back. A layer holds one kind of content: a field with two branches interleaves
-    them (static, dynamic, static, ...), so that the static share stays where it is."""
+    """A view as L translucent layers, front to back. A layer holds one kind of content:
+    a field with two branches interleaves them (static, dynamic, static, ...), so that
+    the static share stays where it is.
+    """
 
     positions: Tensor  # (S, L, 3) scene units; S = height * width, row by row
     alpha: Tensor  # (S, L) in [0, 1]
     radiance: Tensor  # (S, L, 3) linear HDR
-    scene_flow: dict[int, Tensor]  # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
+    scene_flow: dict[
+        int, Tensor
+    ]  # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
     motion: Tensor  # (S, L) in [0, 1]: share of dynamic content
 
 
@@ -64,7 +76,9 @@ class FrameError:
 
     camera: Camera
     time: float  # in frames
-    error: Callable[[Tensor], Tensor]  # of its radiance (S, 3): (S,) mean absolute difference of recorded values
+    error: Callable[
+        [Tensor], Tensor
+    ]  # of its radiance (S, 3): (S,) mean absolute difference of recorded values
 
 
 @dataclass(frozen=True)
@@ -81,15 +95,23 @@ class GaussianCloud:
 
 @runtime_checkable
 class RadianceField(Protocol):
-    """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses by type."""
+    """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses
+    by type.
+    """
 
-    def render(self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True) -> Render:
-        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks itself. `time` in frames, may be fractional.
-        Whoever does not need the scene flow has the picture sooner."""
+    def render(
+        self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
+    ) -> Render:
+        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients;
+        chunks itself. `time` in frames, may be fractional. Whoever does not need the
+        scene flow has the picture sooner.
+        """
         ...
 
     def __call__(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A training render with warps, and the field's own per-sample regularizers by their `LossWeights` name."""
+        """A training render with warps, and the field's own per-sample regularizers by
+        their `LossWeights` name.
+        """
         ...
 
     def param_groups(self) -> list[dict[str, Any]]:
@@ -97,25 +119,36 @@ class RadianceField(Protocol):
         ...
 
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
-        """Housekeeping between optimizer steps (culling grids, schedules). `frame_errors(n)` says of n training frames how wrong their pictures
-        are; None late in a run, when nothing is to be rearranged any more."""
+        """Housekeeping between optimizer steps (culling grids, schedules).
+        `frame_errors(n)` says of n training frames how wrong their pictures are; None
+        late in a run, when nothing is to be rearranged any more.
+        """
         ...
 
 
 @runtime_checkable
 class RecordingField(RadianceField, Protocol):
-    """A field whose recordings do not follow from its composited radiance, because the camera acts on samples (HDR-HexPlane) or inside
-    the network (NeRF-W)."""
+    """A field whose recordings do not follow from its composited radiance, because the
+    camera acts on samples (HDR-HexPlane) or inside the network (NeRF-W).
+    """
 
     def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
-        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row, without gradients; chunks itself."""
+        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by
+        row, without gradients; chunks itself.
+        """
         ...
 
 
 def recorded(
-    field: RadianceField, camera: Camera, time: float, recorders: Sequence[Recorder], radiance: Tensor | None = None
+    field: RadianceField,
+    camera: Camera,
+    time: float,
+    recorders: Sequence[Recorder],
+    radiance: Tensor | None = None,
 ) -> list[Tensor]:
-    """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row; `radiance` (S, 3) is what the field rendered, if it was."""
+    """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row;
+    `radiance` (S, 3) is what the field rendered, if it was.
+    """
     if isinstance(field, RecordingField):
         return field.record(camera, time, recorders)
     seen = field.render(camera, time, scene_flow=False).radiance if radiance is None else radiance

@@ -1,4 +1,6 @@
-"""Time as knots: a knot is a position on the sorted list of training times; what varies in time lives on it and is interpolated."""
+"""Time as knots: a knot is a position on the sorted list of training times; what varies
+in time lives on it and is interpolated.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +9,16 @@ from torch import Tensor
 
 
 def knot_of(times: Tensor, time: float) -> float:
-    """Position of a time (in frames) on the sorted training times (T,), clamped to their range."""
+    """Position of a time (in frames) on the sorted training times (T,), clamped to
+    their range.
+    """
     if len(times) == 1:
         return 0.0
-    i = int(torch.searchsorted(times, torch.tensor(time, dtype=times.dtype, device=times.device)).clamp(1, len(times) - 1))
+    i = int(
+        torch.searchsorted(times, torch.tensor(time, dtype=times.dtype, device=times.device)).clamp(
+            1, len(times) - 1
+        )
+    )
     return float(i - 1 + ((time - times[i - 1]) / (times[i] - times[i - 1])).clamp(0, 1))
 
 
@@ -24,7 +32,9 @@ def linear(values: Tensor, position: float) -> Tensor:
 
 
 def catmull_rom(values: Tensor, position: float) -> Tensor:
-    """`values` (K, ...) by the cubic through them with continuous velocity (Catmull & Rom 1974); ends are extended straight on."""
+    """`values` (K, ...) by the cubic through them with continuous velocity (Catmull &
+    Rom 1974); ends are extended straight on.
+    """
     last = len(values) - 1
     if last == 0:
         return values[0]
@@ -45,5 +55,7 @@ def catmull_rom(values: Tensor, position: float) -> Tensor:
 
 
 def weighted(values: Tensor, weights: list[float]) -> Tensor:
-    """The sum of `values` (K, ...) times `weights` (K): one product, where gradients of single rows would each fill the whole of them."""
+    """The sum of `values` (K, ...) times `weights` (K): one product, where gradients of
+    single rows would each fill the whole of them.
+    """
     return (values.new_tensor(weights) @ values.flatten(1)).view(values.shape[1:])

@@ -1,7 +1,10 @@
-"""Where a field lives: an invertible map from the world onto the unit cube in which it is sampled and stored.
+"""Where a field lives: an invertible map from the world onto the unit cube in which it
+is sampled and stored.
 
-`FrustumSpace` is NDC generalized to any bounds: (x / z, y / z, 1 / z) in a reference camera, so that cells are pixel-sized at
-every distance. `ContractedSpace` squeezes all of space into a ball (mip-NeRF 360, eq. 10) for cameras that look every way."""
+`FrustumSpace` is NDC generalized to any bounds: (x / z, y / z, 1 / z) in a reference
+camera, so that cells are pixel-sized at every distance. `ContractedSpace` squeezes all
+of space into a ball (mip-NeRF 360, eq. 10) for cameras that look every way.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,9 @@ MARGIN = 0.02  # of the cube, left free on every side
 
 
 class FrustumSpace(nn.Module):
-    """The union of the cameras' frusta, seen from their average pose: x / z, y / z and 1 / z scaled to [0, 1]."""
+    """The union of the cameras' frusta, seen from their average pose: x / z, y / z and
+    1 / z scaled to [0, 1].
+    """
 
     w2c: Tensor
     low: Tensor
@@ -30,7 +35,9 @@ class FrustumSpace(nn.Module):
         """World points (..., 3) to cube coordinates (..., 3)."""
         local = points @ self.w2c[:, :3].T + self.w2c[:, 3]
         disparity = 1.0 / local[..., 2:].clamp_min(1e-6)
-        return (torch.cat([local[..., :2] * disparity, disparity], -1) - self.low) / (self.high - self.low)
+        return (torch.cat([local[..., :2] * disparity, disparity], -1) - self.low) / (
+            self.high - self.low
+        )
 
     def decode(self, coords: Tensor) -> Tensor:
         """Cube coordinates (..., 3) to world points (..., 3)."""
@@ -41,7 +48,9 @@ class FrustumSpace(nn.Module):
 
 
 class ContractedSpace(nn.Module):
-    """All of space: linear within `radius` of `center`, squeezed beyond, scaled to [0, 1]."""
+    """All of space: linear within `radius` of `center`, squeezed beyond, scaled to [0,
+    1].
+    """
 
     center: Tensor
     radius: Tensor
@@ -70,15 +79,23 @@ Space = FrustumSpace | ContractedSpace
 
 
 def mean_pose(cameras: list[Camera]) -> Tensor:
-    """The cameras' average pose (3, 4), camera to world: mean center, mean viewing and down directions made orthogonal."""
+    """The cameras' average pose (3, 4), camera to world: mean center, mean viewing and
+    down directions made orthogonal.
+    """
     poses = torch.stack([c.c2w for c in cameras]).double()
     forward = torch.nn.functional.normalize(poses[:, :, 2].mean(0), dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(poses[:, :, 1].mean(0), forward), dim=0)
-    return torch.stack([right, torch.linalg.cross(forward, right), forward, poses[:, :, 3].mean(0)], -1).float()
+    right = torch.nn.functional.normalize(
+        torch.linalg.cross(poses[:, :, 1].mean(0), forward), dim=0
+    )
+    return torch.stack(
+        [right, torch.linalg.cross(forward, right), forward, poses[:, :, 3].mean(0)], -1
+    ).float()
 
 
 def frustum_corners(cameras: list[Camera], near: float, far: float) -> Tensor:
-    """The eight corners of every camera's viewing frustum between z-depths `near` and `far`: (T * 8, 3)."""
+    """The eight corners of every camera's viewing frustum between z-depths `near` and
+    `far`: (T * 8, 3).
+    """
     corners = []
     for c in cameras:
         pixels = torch.tensor([[0.0, 0.0], [c.width, 0.0], [0.0, c.height], [c.width, c.height]])
@@ -88,7 +105,9 @@ def frustum_corners(cameras: list[Camera], near: float, far: float) -> Tensor:
 
 
 def build_space(cameras: list[Camera], near: float, far: float) -> Space:
-    """`FrustumSpace` where all frusta lie well in front of the average camera, else `ContractedSpace`."""
+    """`FrustumSpace` where all frusta lie well in front of the average camera, else
+    `ContractedSpace`.
+    """
     pose = mean_pose(cameras)
     corners = frustum_corners(cameras, near, far)
     local = (corners - pose[:, 3]) @ pose[:, :3]

@@ -1,11 +1,16 @@
-"""`hdr-nsff finetune-flow`: a flow network learns to look across exposures, on pairs whose flow is known, recorded anew for every step with
-random EV pairs, clipping, noise and response curves (as the paper does for its ablation, with FlyingThings3D).
+"""`hdr-nsff finetune-flow`: a flow network learns to look across exposures, on pairs
+whose flow is known, recorded anew for every step with random EV pairs, clipping, noise
+and response curves (as the paper does for its ablation, with FlyingThings3D).
 
 Writes into the output folder:
-    weights.safetensors   the adapted network, for `prepare --flow raft-finetuned --flow-weights`
-    weights.json          what it was made of, and its error on pairs kept out of training, before and after
+    weights.safetensors   the adapted network, for `prepare --flow raft-finetuned
+    --flow-weights`
+    weights.json          what it was made of, and its error on pairs kept out of
+    training, before and after
     config.json, checkpoints/   to go on after a kill
-Every step draws from a generator of its own, so a run that was killed ends as one that was not."""
+Every step draws from a generator of its own, so a run that was killed ends as one that
+was not.
+"""
 
 from __future__ import annotations
 
@@ -38,14 +43,18 @@ WARM_UP = 0.05  # share of the steps
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """Adapt a flow network to pairs of different exposure, on pairs whose flow is known.
+    """Adapt a flow network to pairs of different exposure, on pairs whose flow is
+    known.
 
-    Killed? The same command goes on where it was."""
+    Killed? The same command goes on where it was.
+    """
 
     out: Positional[Path]
     """Folder to write."""
     data: tuple[Path, ...] = field(default=())
-    """Folders of pairs with known flow: FlyingThings3D, MPI Sintel, or scenes of `synth`."""
+    """Folders of pairs with known flow: FlyingThings3D, MPI Sintel, or scenes of
+    `synth`.
+    """
     network: Literal["gmflow", "raft"] = "gmflow"
     """The network to start from."""
     weights: Path | None = None
@@ -54,13 +63,17 @@ class FinetuneConfig:
     batch: int = 2
     """Pairs per step."""
     size: str = "320x224"
-    """Width x height of the crops in pixels, as matched (frames whose longer side is below 640 pixels are enlarged up to three times)."""
+    """Width x height of the crops in pixels, as matched (frames whose longer side is
+    below 640 pixels are enlarged up to three times).
+    """
     stops: float = 5.0
     """The farthest that the exposures of a pair are apart, in EV."""
     lr: float = 5e-5
     keep: float = 0.5
-    """Share of the network as it was in the result, which is the mean of the weights before and after (Wortsman et al. 2022): it keeps what
-    the data do not show. 0 takes the trained network alone."""
+    """Share of the network as it was in the result, which is the mean of the weights
+    before and after (Wortsman et al. 2022): it keeps what the data do not show. 0 takes
+    the trained network alone.
+    """
     held_out: float = 0.1
     """Share of the scenes (of a single scene: of its last pairs) kept for measuring."""
     measure: int = 6
@@ -73,17 +86,24 @@ class FinetuneConfig:
 
 
 def finetune_flow(config: FinetuneConfig) -> Path:
-    """Adapt, measure, save; the file of weights. InputError where the data or a setting is at fault."""
+    """Adapt, measure, save; the file of weights. InputError where the data or a setting
+    is at fault.
+    """
     size = check(config)
     device = pick_device(config.device)
     pairs = [pair for folder in config.data for pair in flow_pairs(folder)]
     training, held_out = split(pairs, config.held_out)
-    held_out = [held_out[k] for k in np.unique(np.linspace(0, len(held_out) - 1, config.measure).astype(int))]
+    held_out = [
+        held_out[k]
+        for k in np.unique(np.linspace(0, len(held_out) - 1, config.measure).astype(int))
+    ]
     network = load(config.network, config.weights, device)
     start = {k: v.clone() for k, v in network.state_dict().items()}
     with writing_to(config.out):
         claim(config)
-        say(f"finetune-flow: {len(training)} pairs to train on, {len(held_out)} others to measure on")
+        say(
+            f"finetune-flow: {len(training)} pairs to train on, {len(held_out)} others to measure on"
+        )
         before = measured(network, held_out, config.out / "before.json")
         seconds = train(network, training, size, config)
         network.load_state_dict(mean(start, network.state_dict(), config.keep))
@@ -100,26 +120,45 @@ def finetune_flow(config: FinetuneConfig) -> Path:
             },
         )
     for stops in before:
-        say(f"  {stops} EV apart: {before[stops]['mean']:.3f} px mean error before, {after[stops]['mean']:.3f} px after")
+        say(
+            f"  {stops} EV apart: {before[stops]['mean']:.3f} px mean error before, {after[stops]['mean']:.3f} px after"
+        )
     return weights
 
 
 def check(config: FinetuneConfig) -> tuple[int, int]:
     """The size (h, w) of crops; InputError for settings that make no sense."""
     if not config.data:
-        raise InputError("finetune-flow: no data; name folders of pairs with known flow with --data")
+        raise InputError(
+            "finetune-flow: no data; name folders of pairs with known flow with --data"
+        )
     width, _, height = config.size.lower().partition("x")
-    if not (width.isdecimal() and height.isdecimal() and all(int(s) >= 128 and int(s) % MULTIPLE == 0 for s in (width, height))):
-        raise InputError(f"--size {config.size!r}: write it as WIDTHxHEIGHT, both multiples of {MULTIPLE} and at least 128")
+    if not (
+        width.isdecimal()
+        and height.isdecimal()
+        and all(int(s) >= 128 and int(s) % MULTIPLE == 0 for s in (width, height))
+    ):
+        raise InputError(
+            f"--size {config.size!r}: write it as WIDTHxHEIGHT, both multiples of {MULTIPLE} and at least 128"
+        )
     if min(config.steps, config.batch, config.measure, config.checkpoint_steps) < 1:
         raise InputError("--steps, --batch, --measure and --checkpoint-steps must be at least 1")
-    if not (0 < config.held_out < 1 and 0 <= config.keep < 1 and 0 <= config.stops <= 12 and 0 < config.lr < 1):
-        raise InputError("--held-out, --keep and --lr must be between 0 and 1, --stops from 0 to 12")
+    if not (
+        0 < config.held_out < 1
+        and 0 <= config.keep < 1
+        and 0 <= config.stops <= 12
+        and 0 < config.lr < 1
+    ):
+        raise InputError(
+            "--held-out, --keep and --lr must be between 0 and 1, --stops from 0 to 12"
+        )
     return int(height), int(width)
 
 
 def split(pairs: list[FlowPair], share: float) -> tuple[list[FlowPair], list[FlowPair]]:
-    """Pairs to train on and pairs to measure on: whole scenes apart; of a single scene its end, and no frame in both."""
+    """Pairs to train on and pairs to measure on: whole scenes apart; of a single scene
+    its end, and no frame in both.
+    """
     scenes = list(dict.fromkeys(p.scene for p in pairs))
     if len(scenes) > 1:
         kept = set(scenes[-max(1, round(share * len(scenes))) :])
@@ -127,12 +166,16 @@ def split(pairs: list[FlowPair], share: float) -> tuple[list[FlowPair], list[Flo
     count = max(1, round(share * len(pairs)))
     training, held_out = pairs[: -count - 1], pairs[-count:]
     if not training:
-        raise InputError(f"{scenes[0]}: {len(pairs)} pairs are too few to train on some and measure on others; name more data")
+        raise InputError(
+            f"{scenes[0]}: {len(pairs)} pairs are too few to train on some and measure on others; name more data"
+        )
     return training, held_out
 
 
 def claim(config: FinetuneConfig) -> None:
-    """Note the settings; InputError where the folder holds a run with other ones, or something else."""
+    """Note the settings; InputError where the folder holds a run with other ones, or
+    something else.
+    """
     path = config.out / "config.json"
     settings = {
         k: [str(p) for p in v] if k == "data" else str(v) if isinstance(v, Path) else v
@@ -140,7 +183,9 @@ def claim(config: FinetuneConfig) -> None:
         if k not in ("out", "device")
     }
     if path.is_file() and settings_in(path) != settings:
-        raise InputError(f"{config.out}: holds a run with other settings; choose a new folder, or repeat its command")
+        raise InputError(
+            f"{config.out}: holds a run with other settings; choose a new folder, or repeat its command"
+        )
     if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
         raise InputError(f"{config.out}: holds other files; choose an empty or new folder")
     write_json(path, settings)
@@ -151,11 +196,17 @@ def settings_in(path: Path) -> Any:
     try:
         return read_json(path)
     except ValueError as error:
-        raise InputError(f"{path}: not readable JSON ({error}); restore it, or choose a new folder") from error
+        raise InputError(
+            f"{path}: not readable JSON ({error}); restore it, or choose a new folder"
+        ) from error
 
 
-def train(network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig) -> float:
-    """Train to the last step from where the folder's checkpoints are; the seconds it took."""
+def train(
+    network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig
+) -> float:
+    """Train to the last step from where the folder's checkpoints are; the seconds it
+    took.
+    """
     network.requires_grad_(True)
     optimizer = torch.optim.AdamW(network.parameters(), config.lr, weight_decay=1e-4)
     found = latest_checkpoint(config.out) if (config.out / "checkpoints").is_dir() else None
@@ -180,46 +231,67 @@ def train(network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], co
         optimizer.step()
         if (step + 1) % config.checkpoint_steps == 0 or step + 1 == config.steps:
             save_checkpoint(
-                config.out, step + 1, before + time.monotonic() - started, pack({"network": network}, {"adam": optimizer})
+                config.out,
+                step + 1,
+                before + time.monotonic() - started,
+                pack({"network": network}, {"adam": optimizer}),
             )
     network.requires_grad_(False)
     return before + time.monotonic() - started
 
 
 def mean(one: dict[str, Tensor], other: dict[str, Tensor], share: float) -> dict[str, Tensor]:
-    """Weights that are `share` of `one` and the rest of the `other`; numbers that are no weights are the other's."""
-    return {k: torch.lerp(v, one[k], share) if v.is_floating_point() else v for k, v in other.items()}
+    """Weights that are `share` of `one` and the rest of the `other`; numbers that are
+    no weights are the other's.
+    """
+    return {
+        k: torch.lerp(v, one[k], share) if v.is_floating_point() else v for k, v in other.items()
+    }
 
 
 def rate(progress: float) -> float:
-    """The learning rate's share at a share of the steps: up in a line, then down in a line."""
+    """The learning rate's share at a share of the steps: up in a line, then down in a
+    line.
+    """
     return min((progress + 1e-3) / WARM_UP, (1 - progress) / (1 - WARM_UP))
 
 
-def drawn(pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig, step: int, slot: int) -> Example:
+def drawn(
+    pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig, step: int, slot: int
+) -> Example:
     """The example of a slot of a step."""
     rng = np.random.default_rng([config.seed, step, slot])
     return example(read_sample(pairs[rng.integers(len(pairs))]), config.stops, size, rng)
 
 
 def stacked(examples: list[Example], name: str) -> Tensor:
-    """One part of some examples as a pair batch (2B, ...): first all firsts, then all seconds."""
+    """One part of some examples as a pair batch (2B, ...): first all firsts, then all
+    seconds.
+    """
     parts = torch.stack([getattr(e, name) for e in examples], 1)  # (2, B, ...)
     return parts.flatten(0, 1)
 
 
 def sequence_loss(predictions: list[Tensor], flow: Tensor, known: Tensor) -> Tensor:
-    """The mean absolute error (pixels, per axis) of every prediction (2B, 2, H, W) where flow is `known` (2B, H, W), later ones weighing more."""
+    """The mean absolute error (pixels, per axis) of every prediction (2B, 2, H, W)
+    where flow is `known` (2B, H, W), later ones weighing more.
+    """
     counted = known & (flow.norm(dim=1) < FASTEST)
     weights = [DECAY ** (len(predictions) - 1 - k) for k in range(len(predictions))]
-    errors = [((p - flow).abs().mean(1) * counted).sum() / counted.sum().clamp_min(1) for p in predictions]
+    errors = [
+        ((p - flow).abs().mean(1) * counted).sum() / counted.sum().clamp_min(1) for p in predictions
+    ]
     return torch.stack([w * e for w, e in zip(weights, errors, strict=True)]).sum()
 
 
-def measured(network: FlowNetwork, pairs: list[FlowPair], kept: Path | None) -> dict[str, dict[str, float]]:
-    """End-point error of `pairs` per EV difference, mean and median in pixels of the frames, as `prepare` matches them.
+def measured(
+    network: FlowNetwork, pairs: list[FlowPair], kept: Path | None
+) -> dict[str, dict[str, float]]:
+    """End-point error of `pairs` per EV difference, mean and median in pixels of the
+    frames, as `prepare` matches them.
 
-    `kept`: a file with the answer, if it is there; where it is not, it is written."""
+    `kept`: a file with the answer, if it is there; where it is not, it is written.
+    """
     if kept is not None and (found := notes.read(kept, notes.FlowErrors)) is not None:
         return {k: e.model_dump() for k, e in found.by_stops.items()}
     errors: dict[str, list[np.ndarray]] = {f"{stops:g}": [] for stops in MEASURED}
@@ -229,7 +301,8 @@ def measured(network: FlowNetwork, pairs: list[FlowPair], kept: Path | None) -> 
             flow = np.stack(both_ways(network, *recorded_pair(sample.radiance, stops, equal=True)))
             errors[f"{stops:g}"].append(np.linalg.norm(flow - sample.flow, axis=-1)[sample.known])
     result = {
-        k: {"mean": float(np.concatenate(e).mean()), "median": float(np.median(np.concatenate(e)))} for k, e in errors.items()
+        k: {"mean": float(np.concatenate(e).mean()), "median": float(np.median(np.concatenate(e)))}
+        for k, e in errors.items()
     }
     if kept is not None:
         notes.write(kept, notes.FlowErrors.model_validate({"by_stops": result}))
@@ -242,6 +315,8 @@ def write_weights(network: FlowNetwork, config: FinetuneConfig, record: dict) ->
     tensors = {k: v.detach().cpu().contiguous() for k, v in network.state_dict().items()}
     with atomic(path) as partial:
         partial.write_bytes(save(tensors, {"network": config.network}))
-    write_json(path.with_suffix(".json"), {"network": config.network, "steps": config.steps, **record})
+    write_json(
+        path.with_suffix(".json"), {"network": config.network, "steps": config.steps, **record}
+    )
     say(f"finetune-flow: {path}; use it with `prepare --flow raft-finetuned --flow-weights {path}`")
     return path

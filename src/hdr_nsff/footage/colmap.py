@@ -1,6 +1,9 @@
-"""A COLMAP model on disk: cameras, images and points3D, binary or text, as COLMAP's documentation describes the format.
+"""A COLMAP model on disk: cameras, images and points3D, binary or text, as COLMAP's
+documentation describes the format.
 
-Poses in these files are world to camera, quaternions (w, x, y, z), OpenCV axes; pixel centers at +0.5, like ours."""
+Poses in these files are world to camera, quaternions (w, x, y, z), OpenCV axes; pixel
+centers at +0.5, like ours.
+"""
 
 from __future__ import annotations
 
@@ -66,7 +69,9 @@ class ColmapModel:
 
 
 def read_model(folder: Path | str) -> ColmapModel:
-    """The COLMAP model in `folder` (cameras, images, points3D; .bin before .txt). InputError where a file is missing or cut short."""
+    """The COLMAP model in `folder` (cameras, images, points3D; .bin before .txt).
+    InputError where a file is missing or cut short.
+    """
     folder = Path(folder)
     parts: list[Any] = []
     for name, readers in {
@@ -74,23 +79,41 @@ def read_model(folder: Path | str) -> ColmapModel:
         "images": (images_bin, images_txt),
         "points3D": (points_bin, points_txt),
     }.items():
-        path = next((p for p in (folder / f"{name}.bin", folder / f"{name}.txt") if p.is_file()), None)
+        path = next(
+            (p for p in (folder / f"{name}.bin", folder / f"{name}.txt") if p.is_file()), None
+        )
         if path is None:
-            raise InputError(f"{folder}: no {name}.bin or {name}.txt here; name the folder that COLMAP wrote (often sparse/0)")
+            raise InputError(
+                f"{folder}: no {name}.bin or {name}.txt here; name the folder that COLMAP wrote (often sparse/0)"
+            )
         try:
             with open(path, "rb") as file:
                 parts.append(readers[path.suffix == ".txt"](file))
-        except (struct.error, ValueError, IndexError, KeyError, UnicodeDecodeError, MemoryError, OverflowError) as error:
-            raise InputError(f"{path}: not a readable COLMAP file, or cut short ({error}); export the model again") from error
+        except (
+            struct.error,
+            ValueError,
+            IndexError,
+            KeyError,
+            UnicodeDecodeError,
+            MemoryError,
+            OverflowError,
+        ) as error:
+            raise InputError(
+                f"{path}: not a readable COLMAP file, or cut short ({error}); export the model again"
+            ) from error
     cameras, images, (ids, points, errors, lengths) = parts
     lost = next((i for i in images.values() if i.camera_id not in cameras), None)
     if lost is not None:
-        raise InputError(f"{folder}: image {lost.name} names camera {lost.camera_id}, which the model has not; export it again")
+        raise InputError(
+            f"{folder}: image {lost.name} names camera {lost.camera_id}, which the model has not; export it again"
+        )
     return ColmapModel(cameras, images, ids, points, errors, lengths)
 
 
 def camera(model: str, width: int, height: int, params: np.ndarray) -> ColmapCamera:
-    """A camera from its parameters in COLMAP's order: focal length(s), principal point, distortion."""
+    """A camera from its parameters in COLMAP's order: focal length(s), principal point,
+    distortion.
+    """
     count, single = MODELS[NUMBERS[model]][1:]
     if len(params) != count:
         raise ValueError(f"{model} has {count} parameters, found {len(params)}")
@@ -139,7 +162,9 @@ def images_bin(file: BinaryIO) -> dict[int, ColmapImage]:
             name += byte
         seen = block(file, take(file, "Q")[0], keypoint)
         c2w = pose(np.array(values[:4]), np.array(values[4:]))
-        images[key] = ColmapImage(name.decode(), camera_id, c2w, seen["xy"].copy(), seen["point"].copy())
+        images[key] = ColmapImage(
+            name.decode(), camera_id, c2w, seen["xy"].copy(), seen["point"].copy()
+        )
     return images
 
 
@@ -160,14 +185,20 @@ def columns(rows: list[tuple]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 
 
 def lines(file: BinaryIO) -> list[list[str]]:
-    """The words of every line that is not a comment; empty lines (an image without keypoints) stay, but not at the end."""
+    """The words of every line that is not a comment; empty lines (an image without
+    keypoints) stay, but not at the end.
+    """
     text = file.read().decode()
     return [line.split() for line in text.rstrip("\n").split("\n") if not line.startswith("#")]
 
 
 def cameras_txt(file: BinaryIO) -> dict[int, ColmapCamera]:
     """cameras.txt."""
-    return {int(w[0]): camera(w[1], int(w[2]), int(w[3]), np.array(w[4:], np.float64)) for w in lines(file) if w}
+    return {
+        int(w[0]): camera(w[1], int(w[2]), int(w[3]), np.array(w[4:], np.float64))
+        for w in lines(file)
+        if w
+    }
 
 
 def images_txt(file: BinaryIO) -> dict[int, ColmapImage]:
@@ -182,11 +213,17 @@ def images_txt(file: BinaryIO) -> dict[int, ColmapImage]:
         table = np.array(seen, np.float64).reshape(-1, 3)
         name = " ".join(head[9:])
         images[int(head[0])] = ColmapImage(
-            name, int(head[8]), pose(values[:4], values[4:]), table[:, :2], table[:, 2].astype(np.int64)
+            name,
+            int(head[8]),
+            pose(values[:4], values[4:]),
+            table[:, :2],
+            table[:, 2].astype(np.int64),
         )
     return images
 
 
 def points_txt(file: BinaryIO) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """points3D.txt."""
-    return columns([(int(w[0]), *map(float, w[1:4]), float(w[7]), (len(w) - 8) // 2) for w in lines(file) if w])
+    return columns(
+        [(int(w[0]), *map(float, w[1:4]), float(w[7]), (len(w) - 8) // 2) for w in lines(file) if w]
+    )

@@ -14,23 +14,36 @@ from hdr_nsff.geometry.fill import fill
 DepthKind = Literal["metric", "disparity", "relative"]
 
 
-def read_depth(files: list[Path], kind: DepthKind, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Disparity and confidence (T, H, W) of depth maps made elsewhere, one file per frame (.npy, EXR, 16-bit PNG).
+def read_depth(
+    files: list[Path], kind: DepthKind, size: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Disparity and confidence (T, H, W) of depth maps made elsewhere, one file per
+    frame (.npy, EXR, 16-bit PNG).
 
-    `kind` says what they hold: "metric" z-depth in scene units, "disparity" 1 / z-depth, "relative" disparity up to scale and shift.
-    Confidence is 1, and 0 where a metric map holds 0 or less (no measurement). InputError for another size, NaN, or an empty map."""
+    `kind` says what they hold: "metric" z-depth in scene units, "disparity" 1 /
+    z-depth, "relative" disparity up to scale and shift. Confidence is 1, and 0 where a
+    metric map holds 0 or less (no measurement). InputError for another size, NaN, or an
+    empty map.
+    """
     maps = [read_map(path) for path in files]
-    disparity, confidence = np.zeros((len(maps), *size), np.float32), np.ones((len(maps), *size), np.float32)
+    disparity, confidence = (
+        np.zeros((len(maps), *size), np.float32),
+        np.ones((len(maps), *size), np.float32),
+    )
     for k, (path, values) in enumerate(zip(files, maps, strict=True)):
         if values.shape != size:
             raise InputError(
                 f"{path}: a depth map of shape {values.shape}, the frames need {size}; make it at the size of the frames"
             )
         if not np.isfinite(values).all():
-            raise InputError(f"{path}: the depth map holds NaN or Inf; write 0 where depth is unknown")
+            raise InputError(
+                f"{path}: the depth map holds NaN or Inf; write 0 where depth is unknown"
+            )
         known = values > 0
         if kind != "relative" and not known.any():
-            raise InputError(f"{path}: no depth above 0 in this map; check that its kind is {kind!r}")
+            raise InputError(
+                f"{path}: no depth above 0 in this map; check that its kind is {kind!r}"
+            )
         if kind == "metric":
             disparity[k] = fill(1 / np.where(known, values, 1), known)
             confidence[k] = known
@@ -40,7 +53,9 @@ def read_depth(files: list[Path], kind: DepthKind, size: tuple[int, int]) -> tup
 
 
 def read_map(path: Path) -> np.ndarray:
-    """One depth or disparity map (H, W) float32: .npy, EXR channel Z (or the only one), or a PNG in [0, 1]."""
+    """One depth or disparity map (H, W) float32: .npy, EXR channel Z (or the only one),
+    or a PNG in [0, 1].
+    """
     suffix = path.suffix.lower()
     if suffix == ".npy":
         return np.squeeze(np.array(read_npy(path), np.float32))

@@ -1,7 +1,10 @@
-"""Footage: a video, a folder of frames, or a folder of such folders (one per synchronized camera), read frame by frame.
+"""Footage: a video, a folder of frames, or a folder of such folders (one per
+synchronized camera), read frame by frame.
 
-Frames come out as recorded rgb in [0, 1]. EXR and DNG are linear; they are scaled by one constant for the whole footage and
-encoded as x^(1/2.2), so that what follows sees one kind of recording. Exposures come from EXIF or from a CSV beside the frames."""
+Frames come out as recorded rgb in [0, 1]. EXR and DNG are linear; they are scaled by
+one constant for the whole footage and encoded as x^(1/2.2), so that what follows sees
+one kind of recording. Exposures come from EXIF or from a CSV beside the frames.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +39,8 @@ class Footage:
     count: int  # frames per camera; 0 where a video's header does not say
     fps: float
     linear: bool  # EXR or DNG
-    over: float | None = None  # gray that shows through transparent pixels; None: transparency is not looked at
+    # gray that shows through transparent pixels; None: transparency is not looked at
+    over: float | None = None
 
     @property
     def files(self) -> dict[str, Path]:
@@ -56,7 +60,9 @@ class FootageFrame:
 
 
 def open_footage(clip: Path) -> Footage:
-    """What there is to read at `clip`; InputError where it is missing, empty, mixed or not understood."""
+    """What there is to read at `clip`; InputError where it is missing, empty, mixed or
+    not understood.
+    """
     if clip.is_file():
         if clip.suffix.lower() in FRAMES:
             raise InputError(f"{clip}: one frame is no footage; give {ACCEPTED}")
@@ -66,7 +72,11 @@ def open_footage(clip: Path) -> Footage:
         return Footage(clip, [[clip]], True, info.frames, info.fps, False)
     if not clip.is_dir():
         raise InputError(f"{clip}: no such file or folder; give {ACCEPTED}")
-    cameras = [files] if (files := frame_files(clip)) else [f for d in sorted_folders(clip) if (f := frame_files(d))]
+    cameras = (
+        [files]
+        if (files := frame_files(clip))
+        else [f for d in sorted_folders(clip) if (f := frame_files(d))]
+    )
     if not cameras:
         raise InputError(f"{clip}: no frames in this folder; give {ACCEPTED}")
     for files in cameras[1:]:
@@ -85,18 +95,28 @@ def open_footage(clip: Path) -> Footage:
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
     """A key that sorts frame2 before frame10."""
-    return [(0, int(p), "") if p.isdigit() else (1, 0, p.lower()) for p in re.split(r"(\d+)", path.name) if p]
+    return [
+        (0, int(p), "") if p.isdigit() else (1, 0, p.lower())
+        for p in re.split(r"(\d+)", path.name)
+        if p
+    ]
 
 
 def frame_files(folder: Path) -> list[Path]:
     """The frames directly in `folder`, in order."""
-    found = [p for p in folder.iterdir() if p.suffix.lower() in FRAMES and not p.name.startswith(".") and p.is_file()]
+    found = [
+        p
+        for p in folder.iterdir()
+        if p.suffix.lower() in FRAMES and not p.name.startswith(".") and p.is_file()
+    ]
     return sorted(found, key=natural)
 
 
 def sorted_folders(folder: Path) -> list[Path]:
     """The folders directly in `folder`, in order."""
-    return sorted((p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")), key=natural)
+    return sorted(
+        (p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")), key=natural
+    )
 
 
 def hash_file(path: Path) -> str:
@@ -105,12 +125,21 @@ def hash_file(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-def read_frames(footage: Footage, start: int, end: int | None, stride: int, max_size: int) -> Iterator[FootageFrame]:
-    """The chosen frames, camera by camera, shrunk so that the longest side is at most `max_size` pixels.
+def read_frames(
+    footage: Footage, start: int, end: int | None, stride: int, max_size: int
+) -> Iterator[FootageFrame]:
+    """The chosen frames, camera by camera, shrunk so that the longest side is at most
+    `max_size` pixels.
 
-    InputError for unreadable or truncated files, frames of different sizes, and negative, NaN or infinite radiance."""
+    InputError for unreadable or truncated files, frames of different sizes, and
+    negative, NaN or infinite radiance.
+    """
     chosen = range(start, end if end is not None else (footage.count or 10**9), stride)
-    scale = linear_scale([f for files in footage.cameras for f in files[start:end:stride]]) if footage.linear else 1.0
+    scale = (
+        linear_scale([f for files in footage.cameras for f in files[start:end:stride]])
+        if footage.linear
+        else 1.0
+    )
     first: tuple[str, tuple[int, ...]] | None = None
     for camera_id, files in enumerate(footage.cameras):
         for number, source, image in decode(footage, files, chosen):
@@ -124,17 +153,25 @@ def read_frames(footage: Footage, start: int, end: int | None, stride: int, max_
             yield FootageFrame(camera_id, number, source, rgb)
 
 
-def decode(footage: Footage, files: list[Path], chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
+def decode(
+    footage: Footage, files: list[Path], chosen: range
+) -> Iterator[tuple[int, str, np.ndarray]]:
     """(number, source, image (H, W, 3)) of the chosen frames of one camera."""
     if footage.video:
         yield from decode_video(files[0], chosen)
         return
     for number in chosen[: len(files[chosen.start : chosen.stop : chosen.step])]:
-        yield number, files[number].relative_to(footage.path).as_posix(), read_frame(files[number], footage.over)
+        yield (
+            number,
+            files[number].relative_to(footage.path).as_posix(),
+            read_frame(files[number], footage.over),
+        )
 
 
 def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames; InputError where it ends before its header says."""
+    """(number, source, image (H, W, 3)) of the chosen frames; InputError where it ends
+    before its header says.
+    """
     info, last = video_info(path), 0.0
     for number, (image, seconds) in enumerate(read_video(path)):
         if number >= chosen.stop:
@@ -143,11 +180,15 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
         if number in chosen:
             yield number, f"{path.name}#{number}", image
     if last + 3 / info.fps < info.seconds:
-        raise InputError(f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); copy it again")
+        raise InputError(
+            f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); copy it again"
+        )
 
 
 def read_frame(path: Path, over: float | None = None) -> np.ndarray:
-    """One frame file as float32 (H, W, 3): recorded rgb (`over` the gray that shows through it), or linear radiance for EXR and DNG."""
+    """One frame file as float32 (H, W, 3): recorded rgb (`over` the gray that shows
+    through it), or linear radiance for EXR and DNG.
+    """
     suffix = path.suffix.lower()
     if suffix == ".dng":
         return read_dng(path)
@@ -156,23 +197,34 @@ def read_frame(path: Path, over: float | None = None) -> np.ndarray:
     channels = read_exr(path)
     if "RGB" not in channels:
         if "Y" not in channels:
-            raise InputError(f"{path}: no R, G, B channels (found {', '.join(channels)}); write the picture as RGB")
+            raise InputError(
+                f"{path}: no R, G, B channels (found {', '.join(channels)}); write the picture as RGB"
+            )
         return np.repeat(channels["Y"][..., None], 3, -1)
     if channels["RGB"].min() < 0:
-        raise InputError(f"{path}: negative radiance; clip at zero or subtract the black level before writing the EXR")
+        raise InputError(
+            f"{path}: negative radiance; clip at zero or subtract the black level before writing the EXR"
+        )
     return channels["RGB"]
 
 
 def read_dng(path: Path) -> np.ndarray:
-    """A raw photograph as linear rgb (H, W, 3), 1 where the sensor saturates; daylight white balance, the same for every frame."""
+    """A raw photograph as linear rgb (H, W, 3), 1 where the sensor saturates; daylight
+    white balance, the same for every frame.
+    """
     try:
         import rawpy
     except ImportError as error:
-        raise InputError(f"{path}: DNG frames need rawpy; install it with `pip install 'hdr-nsff[prepare]'`") from error
+        raise InputError(
+            f"{path}: DNG frames need rawpy; install it with `pip install 'hdr-nsff[prepare]'`"
+        ) from error
     try:
         with rawpy.imread(str(path)) as raw:
             image = raw.postprocess(
-                gamma=(1, 1), no_auto_bright=True, output_bps=16, user_wb=[float(v) or 1.0 for v in raw.daylight_whitebalance]
+                gamma=(1, 1),
+                no_auto_bright=True,
+                output_bps=16,
+                user_wb=[float(v) or 1.0 for v in raw.daylight_whitebalance],
             )
     except rawpy.LibRawError as error:
         raise InputError(f"{path}: not a readable DNG ({error!s}); copy it again") from error
@@ -180,13 +232,18 @@ def read_dng(path: Path) -> np.ndarray:
 
 
 def linear_scale(files: list[Path]) -> float:
-    """The constant that brings linear frames into [0, 1]: 1 where nothing is brighter than 1, else 1 / the 99.9th percentile.
+    """The constant that brings linear frames into [0, 1]: 1 where nothing is brighter
+    than 1, else 1 / the 99.9th percentile.
 
-    The same for all frames, so that their exposures keep their ratios; what is brighter is saturated, as on a sensor."""
+    The same for all frames, so that their exposures keep their ratios; what is brighter
+    is saturated, as on a sensor.
+    """
     images = [read_frame(f) for f in files]
     if not images or max(float(i.max()) for i in images) <= 1:
         return 1.0
-    return 1 / max(float(np.percentile(np.concatenate([i[::4, ::4].ravel() for i in images]), 99.9)), 1e-12)
+    return 1 / max(
+        float(np.percentile(np.concatenate([i[::4, ::4].ravel() for i in images]), 99.9)), 1e-12
+    )
 
 
 def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
@@ -203,9 +260,12 @@ HOLD_OUT = 8  # every this many frames are kept out of training, where nobody sa
 
 
 def held_out(count: int, every: int, cycle: int) -> list[int]:
-    """Which of `count` frames are kept out of training: every `every`-th, never the first or the last; none for 0.
+    """Which of `count` frames are kept out of training: every `every`-th, never the
+    first or the last; none for 0.
 
-    `every` grows until it has no common factor with the exposure cycle, so that all exposures are kept out in turn."""
+    `every` grows until it has no common factor with the exposure cycle, so that all
+    exposures are kept out in turn.
+    """
     if every <= 0:
         return []
     while math.gcd(every, cycle) > 1:
@@ -214,24 +274,37 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
 
 
 def every_of(frames: Sequence[int]) -> int | None:
-    """The smallest `every` for which `held_out` keeps out just these `frames` of a clip that ends soon after them; None where there is none."""
+    """The smallest `every` for which `held_out` keeps out just these `frames` of a clip
+    that ends soon after them; None where there is none.
+    """
     candidates = range(2, 2 * frames[0] + 2)
-    return next((every for every in candidates if held_out(frames[-1] + 2, every, 1) == list(frames)), None)
+    return next(
+        (every for every in candidates if held_out(frames[-1] + 2, every, 1) == list(frames)), None
+    )
 
 
 def between(count: int, cycle: int) -> list[int]:
-    """Which of `count` frames are kept out of training by the protocol novel-view-time: every second one, never the first or the last.
+    """Which of `count` frames are kept out of training by the protocol novel-view-time:
+    every second one, never the first or the last.
 
-    With an even exposure cycle every second frame would always show the same exposures: there, each cycle begins with the other half,
-    so that of a cycle of 2 the frames 0, 3, 4, 7, 8, ... are trained on."""
+    With an even exposure cycle every second frame would always show the same exposures:
+    there, each cycle begins with the other half, so that of a cycle of 2 the frames 0,
+    3, 4, 7, 8, ... are trained on.
+    """
     phase = [k // cycle if cycle % 2 == 0 else 0 for k in range(count)]
     return [k for k in range(1, count - 1) if (k + phase[k]) % 2]
 
 
 def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None:
-    """The EV (log2 exposure) of each frame of one cycle from `--exposures 1/1000,1/250` (seconds) or `--ev -4,-2`, None for neither."""
+    """The EV (log2 exposure) of each frame of one cycle from `--exposures 1/1000,1/250`
+    (seconds) or `--ev -4,-2`, None for neither.
+    """
     if exposures is None or exposures.strip() == "auto":
-        return None if ev is None or ev.strip() == "auto" else [number(v, "--ev") for v in ev.split(",")]
+        return (
+            None
+            if ev is None or ev.strip() == "auto"
+            else [number(v, "--ev") for v in ev.split(",")]
+        )
     if ev is not None:
         raise InputError("--exposures and --ev both given; leave one out")
     return [log2_seconds(v, "--exposures") for v in exposures.split(",")]
@@ -243,11 +316,17 @@ def number(text: str, where: str) -> float:
         above, _, below = text.partition("/")
         value = float(above) / (float(below) if "/" in text else 1.0)
     except ZeroDivisionError as error:
-        raise InputError(f"{where}: {text.strip()!r} divides by zero; write times like 1/250 and EV like -2") from error
+        raise InputError(
+            f"{where}: {text.strip()!r} divides by zero; write times like 1/250 and EV like -2"
+        ) from error
     except ValueError as error:
-        raise InputError(f"{where}: {text.strip()!r} is not a number; write times like 1/250 and EV like -2") from error
+        raise InputError(
+            f"{where}: {text.strip()!r} is not a number; write times like 1/250 and EV like -2"
+        ) from error
     if not math.isfinite(value):
-        raise InputError(f"{where}: {text.strip()!r} is not finite; write times like 1/250 and EV like -2")
+        raise InputError(
+            f"{where}: {text.strip()!r} is not finite; write times like 1/250 and EV like -2"
+        )
     return value
 
 
@@ -255,14 +334,18 @@ def log2_seconds(text: str, where: str) -> float:
     """The EV of an exposure time in seconds."""
     seconds = number(text, where)
     if seconds <= 0:
-        raise InputError(f"{where}: an exposure of {text.strip()} seconds cannot be; write times like 1/250")
+        raise InputError(
+            f"{where}: an exposure of {text.strip()} seconds cannot be; write times like 1/250"
+        )
     return math.log2(seconds)
 
 
 def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
-    """The CSV beside the frames and its EV by frame (`file name` or `#number`), None where there is none.
+    """The CSV beside the frames and its EV by frame (`file name` or `#number`), None
+    where there is none.
 
-    Columns: `file` (or `frame`, a number from 0), and `exposure` (seconds) or `ev`."""
+    Columns: `file` (or `frame`, a number from 0), and `exposure` (seconds) or `ev`.
+    """
     beside = footage.path.with_suffix(".csv") if footage.video else footage.path / "exposures.csv"
     if not beside.is_file():
         return None
@@ -272,17 +355,23 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
         name = next((c for c in ("file", "frame") if c in columns), None)
         value = next((c for c in ("exposure", "ev") if c in columns), None)
         if name is None or value is None:
-            raise InputError(f"{beside}: columns {sorted(columns)}; it needs `file` or `frame`, and `exposure` (seconds) or `ev`")
+            raise InputError(
+                f"{beside}: columns {sorted(columns)}; it needs `file` or `frame`, and `exposure` (seconds) or `ev`"
+            )
         read = log2_seconds if value == "exposure" else number
         rows = {}
         for line, row in enumerate(reader, start=2):
             key = row[name].strip()
-            rows[f"#{key}" if name == "frame" else key] = read(row[value] or "", f"{beside}, line {line}")
+            rows[f"#{key}" if name == "frame" else key] = read(
+                row[value] or "", f"{beside}, line {line}"
+            )
     return beside, rows
 
 
 def read_exif_ev(path: Path) -> float | None:
-    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF, None where it has no exposure time."""
+    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF, None where
+    it has no exposure time.
+    """
     import exifread
 
     logging.getLogger("exifread").setLevel(logging.ERROR)  # it warns of every picture without EXIF

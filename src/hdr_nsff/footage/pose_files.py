@@ -1,6 +1,8 @@
-"""Poses made elsewhere: a COLMAP model, `transforms.json` (nerfstudio, Blender), `poses_bounds.npy` (LLFF) or the JSON of LLFF poses that
-non-rigid NeRF publishes. Every convention becomes ours here: c2w OpenCV (+x right, +y down, +z forward), pixels of the working size
-with centers at +0.5. The world and its units stay the giver's."""
+"""Poses made elsewhere: a COLMAP model, `transforms.json` (nerfstudio, Blender),
+`poses_bounds.npy` (LLFF) or the JSON of LLFF poses that non-rigid NeRF publishes. Every
+convention becomes ours here: c2w OpenCV (+x right, +y down, +z forward), pixels of the
+working size with centers at +0.5. The world and its units stay the giver's.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,9 @@ from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel, read_model
 from hdr_nsff.geometry.poses import LEAST, Poses, interpolate, project, ranges, trusted_points
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0])  # columns right, up, back -> right, down, forward
-FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])  # columns down, right, back -> right, down, forward
+FROM_LLFF = np.array(
+    [[0, 1, 0], [1, 0, 0], [0, 0, -1.0]]
+)  # columns down, right, back -> right, down, forward
 ROUNDING = 1e-6  # off which a rotation is made one again
 BENT = 2.0  # pixels of lens distortion at a corner that a pinhole may stand in for
 Parallax = Literal["full", "rotation", "none"]
@@ -38,10 +42,13 @@ class Given:
 
 
 def import_poses(path: Path | str, sources: list[str], size: tuple[int, int]) -> Poses:
-    """Poses of the frames named `sources` (T) from `path`, for frames of `size` (height, width).
+    """Poses of the frames named `sources` (T) from `path`, for frames of `size`
+    (height, width).
 
-    Frames are matched by file name, or in order where no name fits and the numbers do. `path` is a file, or a folder that holds
-    one of the known ones. InputError where it cannot be read, does not fit, or has fewer poses than six frames in ten."""
+    Frames are matched by file name, or in order where no name fits and the numbers do.
+    `path` is a file, or a folder that holds one of the known ones. InputError where it
+    cannot be read, does not fit, or has fewer poses than six frames in ten.
+    """
     path = locate(Path(path))
     model = None
     if path.is_dir():
@@ -65,7 +72,9 @@ def locate(path: Path) -> Path:
     """The file, or the folder of a COLMAP model, that `path` means."""
     if path.is_file():
         if path.suffix not in (".json", ".npy"):
-            raise InputError(f"{path}: poses come as a COLMAP folder, transforms.json, poses_bounds.npy or precomputed.json")
+            raise InputError(
+                f"{path}: poses come as a COLMAP folder, transforms.json, poses_bounds.npy or precomputed.json"
+            )
         return path
     if not path.is_dir():
         raise InputError(f"{path}: no such file or folder of poses")
@@ -75,7 +84,9 @@ def locate(path: Path) -> Path:
     for name in NAMES:
         if (path / name).is_file():
             return path / name
-    raise InputError(f"{path}: no poses here; expected a COLMAP model (cameras, images, points3D) or one of {', '.join(NAMES)}")
+    raise InputError(
+        f"{path}: no poses here; expected a COLMAP model (cameras, images, points3D) or one of {', '.join(NAMES)}"
+    )
 
 
 def from_colmap(path: Path, model: ColmapModel) -> Given:
@@ -95,17 +106,29 @@ def from_colmap(path: Path, model: ColmapModel) -> Given:
 
 
 def colmap_distortion(path: Path, camera: ColmapCamera) -> np.ndarray:
-    """k1, k2, p1, p2 of OpenCV's model. InputError for models beyond it, unless nothing is distorted."""
+    """k1, k2, p1, p2 of OpenCV's model. InputError for models beyond it, unless nothing
+    is distorted.
+    """
     values = camera.distortion
-    if camera.model in ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV") or not np.any(values):
+    if camera.model in (
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+    ) or not np.any(values):
         return np.pad(values, (0, 4))[:4]
     raise InputError(
         f"{path}: camera model {camera.model} bends rays; undistort the frames (colmap image_undistorter) and export again"
     )
 
 
-def check_lens(path: Path, K: np.ndarray, width: float, height: float, distortion: np.ndarray) -> None:
-    """InputError where leaving out the `distortion` (k1, k2, p1, p2) would misplace a corner by more than `BENT` pixels."""
+def check_lens(
+    path: Path, K: np.ndarray, width: float, height: float, distortion: np.ndarray
+) -> None:
+    """InputError where leaving out the `distortion` (k1, k2, p1, p2) would misplace a
+    corner by more than `BENT` pixels.
+    """
     k1, k2, p1, p2 = (float(v) for v in distortion)
     worst = 0.0
     for u, v in ((0, 0), (width, 0), (0, height), (width, height)):
@@ -122,7 +145,9 @@ def check_lens(path: Path, K: np.ndarray, width: float, height: float, distortio
 
 
 def from_llff(path: Path) -> Given:
-    """`poses_bounds.npy` (N, 17): 3x5 row by row (columns down, right, back, center, (height, width, focal)), then near, far."""
+    """`poses_bounds.npy` (N, 17): 3x5 row by row (columns down, right, back, center,
+    (height, width, focal)), then near, far.
+    """
     return llff_rows(llff_table(path, 17))
 
 
@@ -131,48 +156,76 @@ def llff_table(path: Path, columns: int) -> np.ndarray:
     try:
         table = np.load(path, allow_pickle=False)
     except (ValueError, EOFError, OSError) as error:
-        raise InputError(f"{path}: not a readable .npy array ({error}); export the poses again") from error
+        raise InputError(
+            f"{path}: not a readable .npy array ({error}); export the poses again"
+        ) from error
     if table.ndim != 2 or table.shape[1] != columns or not len(table):
-        raise InputError(f"{path}: expected an array (frames, {columns}) as LLFF writes it, found {table.shape}")
+        raise InputError(
+            f"{path}: expected an array (frames, {columns}) as LLFF writes it, found {table.shape}"
+        )
     return np.asarray(table)
 
 
 def llff_rows(table: np.ndarray) -> Given:
     """The poses of rows (N, 17) of `poses_bounds.npy`."""
-    return llff(table[:, :15].reshape(-1, 3, 5).astype(np.float64), table[:, 15:].astype(np.float64), FROM_LLFF)
+    return llff(
+        table[:, :15].reshape(-1, 3, 5).astype(np.float64),
+        table[:, 15:].astype(np.float64),
+        FROM_LLFF,
+    )
 
 
 def llff(poses: np.ndarray, bounds: np.ndarray, columns: np.ndarray) -> Given:
-    """From (N, 3, 5) matrices and (N, 2) depth bounds; `columns` turns the first three columns into ours."""
+    """From (N, 3, 5) matrices and (N, 2) depth bounds; `columns` turns the first three
+    columns into ours.
+    """
     height, width, focal = poses[:, :, 4].T
     K = np.zeros((len(poses), 3, 3))
     K[:, 0, 0] = K[:, 1, 1] = focal
     K[:, 0, 2], K[:, 1, 2], K[:, 2, 2] = width / 2, height / 2, 1
     c2w = np.concatenate([poses[:, :, :3] @ columns, poses[:, :, 3:4]], 2)
-    # a single stray point makes a bound of one frame useless: not the minimum, as is usual, but what nine frames in ten agree on
+    # a single stray point makes a bound of one frame useless: not the minimum, as is
+    # usual, but what nine frames in ten agree on
     near, far = 0.8 * np.percentile(bounds[:, 0], 10), 1.25 * np.percentile(bounds[:, 1], 90)
     fits = bool(np.isfinite(bounds).all() and 0 < near < far)
-    return Given(None, K, c2w, np.stack([width, height], 1), float(near) if fits else None, float(far) if fits else None)
+    return Given(
+        None,
+        K,
+        c2w,
+        np.stack([width, height], 1),
+        float(near) if fits else None,
+        float(far) if fits else None,
+    )
 
 
 def from_json(path: Path) -> Given:
-    """`transforms.json`, or the JSON with `poses` and `bds` of non-rigid NeRF (LLFF's matrices with columns right, up, back)."""
+    """`transforms.json`, or the JSON with `poses` and `bds` of non-rigid NeRF (LLFF's
+    matrices with columns right, up, back).
+    """
     try:
         document = read_json(path)
         if isinstance(document, dict) and "frames" in document:
             return from_transforms(path, document)
         if isinstance(document, dict) and "poses" in document and "bds" in document:
             poses = np.array(document["poses"], np.float64).reshape(-1, 3, 5)
-            return llff(poses, np.array(document["bds"], np.float64).reshape(len(poses), 2), FROM_OPENGL)
+            return llff(
+                poses, np.array(document["bds"], np.float64).reshape(len(poses), 2), FROM_OPENGL
+            )
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: not readable as poses ({type(error).__name__}: {error}); export them again") from error
-    raise InputError(f"{path}: neither `frames` (transforms.json) nor `poses` and `bds` in it; export the poses again")
+        raise InputError(
+            f"{path}: not readable as poses ({type(error).__name__}: {error}); export them again"
+        ) from error
+    raise InputError(
+        f"{path}: neither `frames` (transforms.json) nor `poses` and `bds` in it; export the poses again"
+    )
 
 
 def from_transforms(path: Path, document: dict[str, Any]) -> Given:
-    """nerfstudio's and Blender's layout: `transform_matrix` c2w with OpenGL axes, intrinsics for all or per frame."""
+    """nerfstudio's and Blender's layout: `transform_matrix` c2w with OpenGL axes,
+    intrinsics for all or per frame.
+    """
     frames = document["frames"]
     if not frames:
         raise InputError(f"{path}: no frames in it; export the poses again")
@@ -191,32 +244,54 @@ def from_transforms(path: Path, document: dict[str, Any]) -> Given:
 
 
 def lens(path: Path, values: dict[str, Any]) -> tuple[np.ndarray, tuple[float, float]]:
-    """K (3, 3) and the size (width, height) it is for, from the keys of one frame. Without a size the unit is the frame's width."""
+    """K (3, 3) and the size (width, height) it is for, from the keys of one frame.
+    Without a size the unit is the frame's width.
+    """
     if "fl_x" in values:
         fx, fy = float(values["fl_x"]), float(values.get("fl_y", values["fl_x"]))
         width = float(values.get("w", 2 * float(values.get("cx", 0))))
         height = float(values.get("h", 2 * float(values.get("cy", 0))))
         if width <= 0 or height <= 0:
-            raise InputError(f"{path}: `fl_x` without `w` and `h`: the size that the focal length is for is missing; add it")
+            raise InputError(
+                f"{path}: `fl_x` without `w` and `h`: the size that the focal length is for is missing; add it"
+            )
     elif "camera_angle_x" in values:
         width, height = float(values.get("w", 1)), float(values.get("h", 0))
         fx = width / 2 / math.tan(float(values["camera_angle_x"]) / 2)
-        fy = height / 2 / math.tan(float(values["camera_angle_y"]) / 2) if height and "camera_angle_y" in values else fx
+        fy = (
+            height / 2 / math.tan(float(values["camera_angle_y"]) / 2)
+            if height and "camera_angle_y" in values
+            else fx
+        )
     else:
         raise InputError(f"{path}: neither `fl_x` nor `camera_angle_x`: no focal length; add one")
     cx, cy = float(values.get("cx", width / 2)), float(values.get("cy", height / 2))
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    check_lens(path, K, width, height, np.array([float(values.get(k, 0)) for k in ("k1", "k2", "p1", "p2")]))
+    check_lens(
+        path,
+        K,
+        width,
+        height,
+        np.array([float(values.get(k, 0)) for k in ("k1", "k2", "p1", "p2")]),
+    )
     return K, (width, height)
 
 
-def arrange(path: Path, names: list[str] | None, count: int, sources: list[str]) -> list[int | None]:
-    """Which given pose belongs to each of `sources`: by the longest ending of the path that tells them apart, else in order."""
+def arrange(
+    path: Path, names: list[str] | None, count: int, sources: list[str]
+) -> list[int | None]:
+    """Which given pose belongs to each of `sources`: by the longest ending of the path
+    that tells them apart, else in order.
+    """
     if names is not None:
         for key in (path_key(3), path_key(2), path_key(1)):
             have = {key(name): k for k, name in enumerate(names)}
             wanted = [key(source) for source in sources]
-            if len(have) == len(names) and len(set(wanted)) == len(wanted) and any(w in have for w in wanted):
+            if (
+                len(have) == len(names)
+                and len(set(wanted)) == len(wanted)
+                and any(w in have for w in wanted)
+            ):
                 chosen = [have.get(w) for w in wanted]
                 missing = [t for t, k in enumerate(chosen) if k is None]
                 if len(missing) > (1 - LEAST) * len(sources):
@@ -226,14 +301,18 @@ def arrange(path: Path, names: list[str] | None, count: int, sources: list[str])
                     )
                 return chosen
     if count != len(sources):
-        raise InputError(f"{path}: {count} poses for {len(sources)} frames, and no file name fits; give one pose per used frame")
+        raise InputError(
+            f"{path}: {count} poses for {len(sources)} frames, and no file name fits; give one pose per used frame"
+        )
     return list(range(count))
 
 
 def path_key(parts: int) -> Any:
     """A function from a file name to its last `parts` parts, without an image's ending."""
     return lambda name: tuple(
-        re.sub(r"\.(png|jpe?g|tiff?|exr|dng)$", "", name.replace("\\", "/"), flags=re.I).split("/")[-parts:]
+        re.sub(r"\.(png|jpe?g|tiff?|exr|dng)$", "", name.replace("\\", "/"), flags=re.I).split("/")[
+            -parts:
+        ]
     )
 
 
@@ -269,11 +348,21 @@ def placed(path: Path, given: Given, chosen: list[int | None], size: tuple[int, 
     turns = np.abs(c2w[registered, :, :3] - c2w[registered][:1, :, :3]).max()
     moves = np.linalg.norm(centers - centers[:1], axis=1).max() > 1e-6 * (given.near or 1.0)
     parallax: Parallax = "full" if moves else ("rotation" if turns > 1e-6 else "none")
-    return Poses(K, c2w, registered, parallax, near=given.near, far=given.far, notes=(f"poses given: {path.name}",))
+    return Poses(
+        K,
+        c2w,
+        registered,
+        parallax,
+        near=given.near,
+        far=given.far,
+        notes=(f"poses given: {path.name}",),
+    )
 
 
 def with_points(poses: Poses, model: ColmapModel, chosen: list[int | None]) -> Poses:
-    """With the model's static points and what the chosen images saw of them, near and far from those."""
+    """With the model's static points and what the chosen images saw of them, near and
+    far from those.
+    """
     images = sorted(model.images.values(), key=lambda i: i.name)
     row = {int(key): r for r, key in enumerate(model.point_ids)}
     seen = []
@@ -283,11 +372,20 @@ def with_points(poses: Poses, model: ColmapModel, chosen: list[int | None]) -> P
         camera = model.cameras[images[k].camera_id]
         scale = poses.K[t, (0, 1), (0, 1)] / camera.K[(0, 1), (0, 1)]
         has = [p >= 0 and int(p) in row for p in images[k].point_ids]
-        seen += [(t, row[int(p)], *(xy * scale)) for xy, p in zip(images[k].xy[has], images[k].point_ids[has], strict=True)]
+        seen += [
+            (t, row[int(p)], *(xy * scale))
+            for xy, p in zip(images[k].xy[has], images[k].point_ids[has], strict=True)
+        ]
     tracks = np.array(seen, np.float64).reshape(-1, 4)
     shrink = poses.K[0, 0, 0] / next(iter(model.cameras.values())).K[0, 0]
-    poses = trusted_points(replace(poses, points=model.points, point_errors=model.errors * shrink, tracks=tracks))
+    poses = trusted_points(
+        replace(poses, points=model.points, point_errors=model.errors * shrink, tracks=tracks)
+    )
     if len(poses.tracks) < 10:
         return poses
-    depth = project(poses, poses.tracks[:, 0].astype(int), poses.points[poses.tracks[:, 1].astype(int)])[1]
-    return replace(poses, near=float(0.7 * np.percentile(depth, 1)), far=float(1.3 * np.percentile(depth, 99)))
+    depth = project(
+        poses, poses.tracks[:, 0].astype(int), poses.points[poses.tracks[:, 1].astype(int)]
+    )[1]
+    return replace(
+        poses, near=float(0.7 * np.percentile(depth, 1)), far=float(1.3 * np.percentile(depth, 99))
+    )

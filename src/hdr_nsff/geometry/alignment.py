@@ -1,5 +1,7 @@
-"""Two trajectories of the same cameras, in two worlds: the similarity between them, how far they differ, and how a pose known
-in the one is carried over to the other. Poses are camera to world, OpenCV axes, (..., 3, 4) float64 numpy."""
+"""Two trajectories of the same cameras, in two worlds: the similarity between them, how
+far they differ, and how a pose known in the one is carried over to the other. Poses are
+camera to world, OpenCV axes, (..., 3, 4) float64 numpy.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FLAT = 1e-6  # centers that spread less than this share of their distance from the origin (or of 1) fix no scale
+# centers that spread less than this share of their distance from the origin (or of 1)
+# fix no scale
+FLAT = 1e-6
 
 
 @dataclass(frozen=True)
@@ -24,11 +28,16 @@ class Similarity:
 
 
 def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity | None:
-    """The similarity that carries points `source` (N, 3) onto `target` (N, 3) with least squares (Umeyama 1991); None where the
-    points of either do not spread, so that no scale can be told."""
+    """The similarity that carries points `source` (N, 3) onto `target` (N, 3) with
+    least squares (Umeyama 1991); None where the points of either do not spread, so that
+    no scale can be told.
+    """
     a, b = source - source.mean(0), target - target.mean(0)
     variance = (a**2).sum() / len(a)
-    spread = [np.sqrt((x**2).sum() / len(x)) / max(1.0, np.abs(y).max()) for x, y in ((a, source), (b, target))]
+    spread = [
+        np.sqrt((x**2).sum() / len(x)) / max(1.0, np.abs(y).max())
+        for x, y in ((a, source), (b, target))
+    ]
     if min(spread) < FLAT:
         return None
     u, d, vt = np.linalg.svd(b.T @ a / len(a))
@@ -47,9 +56,12 @@ def mean_rotation(rotations: np.ndarray) -> np.ndarray:
 def pose_errors(true: np.ndarray, estimated: np.ndarray) -> dict[str, float]:
     """How far `estimated` (N, 3, 4) is from `true` (N, 3, 4) once aligned.
 
-    `ate`: root mean square distance of the centers after the best similarity, in true units; `ate_share`: the same as a share of
-    the true path's extent (both absent where the cameras do not spread); `rotation_degrees`: mean angle left after the best
-    common rotation (from the rotations themselves: centers along a line would not tell it)."""
+    `ate`: root mean square distance of the centers after the best similarity, in true
+    units; `ate_share`: the same as a share of the true path's extent (both absent where
+    the cameras do not spread); `rotation_degrees`: mean angle left after the best
+    common rotation (from the rotations themselves: centers along a line would not tell
+    it).
+    """
     errors: dict[str, float] = {}
     fit = umeyama(true[:, :, 3], estimated[:, :, 3])
     if fit is not None:
@@ -64,15 +76,23 @@ def pose_errors(true: np.ndarray, estimated: np.ndarray) -> dict[str, float]:
 
 
 def scale_between(true: np.ndarray, estimated: np.ndarray) -> float | None:
-    """Units of the `estimated` poses (N, 3, 4) per unit of the `true` ones; 1 where both are the same, None where the cameras do not spread."""
+    """Units of the `estimated` poses (N, 3, 4) per unit of the `true` ones; 1 where
+    both are the same, None where the cameras do not spread.
+    """
     if np.allclose(true, estimated):
         return 1.0  # given poses: one world
     fit = umeyama(true[:, :, 3], estimated[:, :, 3])
     return None if fit is None else fit.scale
 
 
-def carry(anchor: np.ndarray, true_anchor: np.ndarray, true_view: np.ndarray, scale: float) -> np.ndarray:
-    """The pose (3, 4) that stands to the estimated `anchor` as `true_view` stands to `true_anchor`; lengths times `scale`."""
+def carry(
+    anchor: np.ndarray, true_anchor: np.ndarray, true_view: np.ndarray, scale: float
+) -> np.ndarray:
+    """The pose (3, 4) that stands to the estimated `anchor` as `true_view` stands to
+    `true_anchor`; lengths times `scale`.
+    """
     turn = true_anchor[:, :3].T @ true_view[:, :3]
     step = true_anchor[:, :3].T @ (true_view[:, 3] - true_anchor[:, 3])
-    return np.concatenate([anchor[:, :3] @ turn, (anchor[:, 3] + scale * anchor[:, :3] @ step)[:, None]], 1)
+    return np.concatenate(
+        [anchor[:, :3] @ turn, (anchor[:, 3] + scale * anchor[:, :3] @ step)[:, None]], 1
+    )

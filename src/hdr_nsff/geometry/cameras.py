@@ -1,5 +1,7 @@
-"""Cameras and rays. OpenCV axes everywhere (+x right, +y down, +z forward); pixels are (x, y) with centers at +0.5;
-depth is z-depth (distance along the optical axis, scene units), never distance along the ray."""
+"""Cameras and rays. OpenCV axes everywhere (+x right, +y down, +z forward); pixels are
+(x, y) with centers at +0.5; depth is z-depth (distance along the optical axis, scene
+units), never distance along the ray.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,9 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays whose direction advances one unit of z-depth: `origins + depth * directions` is the point at z-depth `depth`."""
+    """Rays whose direction advances one unit of z-depth: `origins + depth * directions`
+    is the point at z-depth `depth`.
+    """
 
     origins: Tensor  # (S, 3) scene units
     directions: Tensor  # (S, 3) z-depth 1 per unit
@@ -38,8 +42,10 @@ class Camera:
         return (points - self.c2w[:, 3]) @ self.c2w[:, :3]
 
     def project(self, points: Tensor, min_depth: float = 1e-6) -> tuple[Tensor, Tensor]:
-        """Pixels (..., 2) and z-depths (...) of world `points` (..., 3). Points behind the camera project through
-        `min_depth`; test the returned depth before using their pixels."""
+        """Pixels (..., 2) and z-depths (...) of world `points` (..., 3). Points behind
+        the camera project through `min_depth`; test the returned depth before using
+        their pixels.
+        """
         local = self.to_camera(points)
         depth = local[..., 2]
         scale = 1.0 / depth.clamp_min(min_depth)

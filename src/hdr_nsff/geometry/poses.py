@@ -19,12 +19,14 @@ class Poses:
     c2w: np.ndarray  # (T, 3, 4) OpenCV camera to world, scene units
     registered: np.ndarray  # (T,) bool; the others are interpolated
     parallax: Literal["full", "rotation", "none"]
-    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # (P, 3) static, scene units
-    point_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (P,) mean reprojection error, pixels
-    tracks: np.ndarray = field(
-        default_factory=lambda: np.zeros((0, 4))
-    )  # (O, 4) one view of a point: frame, point, x, y in pixels
-    frame_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (T,) median reprojection error in pixels, NaN = none
+    # (P, 3) static, scene units
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
+    # (P,) mean reprojection error, pixels
+    point_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    # (O, 4) one view of a point: frame, point, x, y in pixels
+    tracks: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
+    # (T,) median reprojection error in pixels, NaN = none
+    frame_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
     near: float | None = None  # z-depth, scene units
     far: float | None = None
     notes: tuple[str, ...] = ()  # sentences for people
@@ -48,14 +50,18 @@ def ranges(numbers: list[int]) -> str:
 
 
 def project(poses: Poses, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) and z-depths (N,) of world `points` (N, 3), each in its own one of `frames` (N,)."""
+    """Pixels (N, 2) and z-depths (N,) of world `points` (N, 3), each in its own one of
+    `frames` (N,).
+    """
     local = np.einsum("nji,nj->ni", poses.c2w[frames, :, :3], points - poses.c2w[frames, :, 3])
     pixels = np.einsum("nij,nj->ni", poses.K[frames], local)
     return pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-9), local[:, 2]
 
 
 def trusted_points(poses: Poses, views: int = 3, error: float = 2.0) -> Poses:
-    """Without points of fewer than `views` views, of a larger mean `error` (pixels) or behind a camera; with every frame's error."""
+    """Without points of fewer than `views` views, of a larger mean `error` (pixels) or
+    behind a camera; with every frame's error.
+    """
     frames, rows = poses.tracks[:, 0].astype(int), poses.tracks[:, 1].astype(int)
     pixels, depth = project(poses, frames, poses.points[rows])
     residual = np.linalg.norm(pixels - poses.tracks[:, 2:], axis=1)
@@ -68,11 +74,19 @@ def trusted_points(poses: Poses, views: int = 3, error: float = 2.0) -> Poses:
         errors[t] = np.median(residual[kept & (frames == t)])
     tracks = poses.tracks[kept]
     tracks[:, 1] = (np.cumsum(good) - 1)[rows[kept]]
-    return replace(poses, points=poses.points[good], point_errors=poses.point_errors[good], tracks=tracks, frame_errors=errors)
+    return replace(
+        poses,
+        points=poses.points[good],
+        point_errors=poses.point_errors[good],
+        tracks=tracks,
+        frame_errors=errors,
+    )
 
 
 def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
-    """Poses of frames that did not register, between their registered neighbors of the same camera (held at the ends of the clip)."""
+    """Poses of frames that did not register, between their registered neighbors of the
+    same camera (held at the ends of the clip).
+    """
     c2w, lost = poses.c2w.copy(), []
     for group in groups:
         known = [t for t in group if poses.registered[t]]
@@ -84,9 +98,13 @@ def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
                 f"poses failed: none of the frames of one camera could be placed (frames {ranges(missing)}); {ADVICE}"
             )
         when = np.clip(missing, known[0], known[-1])
-        c2w[missing, :, 3] = np.stack([np.interp(when, known, c2w[known, k, 3]) for k in range(3)], -1)
+        c2w[missing, :, 3] = np.stack(
+            [np.interp(when, known, c2w[known, k, 3]) for k in range(3)], -1
+        )
         turn = Rotation.from_matrix(c2w[known, :, :3])
-        c2w[missing, :, :3] = Slerp(known, turn)(when).as_matrix() if len(known) > 1 else c2w[known[0], :, :3]
+        c2w[missing, :, :3] = (
+            Slerp(known, turn)(when).as_matrix() if len(known) > 1 else c2w[known[0], :, :3]
+        )
         lost += missing
     if not lost:
         return poses

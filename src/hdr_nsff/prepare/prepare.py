@@ -1,11 +1,16 @@
-"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow, poses, masks, refined flow, depth, sheet.
+"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow,
+poses, masks, refined flow, depth, sheet.
 
-Every step writes its files and then its record into `scene.json`; its key is a hash of its settings, of the weights of the networks that it
-asks, and of the steps and inputs it builds on. A finished step with the same key is skipped, an unfinished one goes on with the files it has, one with another key
-starts over, and with it whatever builds on it. So killing `prepare` at any moment loses at most the file in the making.
+Every step writes its files and then its record into `scene.json`; its key is a hash of
+its settings, of the weights of the networks that it asks, and of the steps and inputs
+it builds on. A finished step with the same key is skipped, an unfinished one goes on
+with the files it has, one with another key starts over, and with it whatever builds on
+it. So killing `prepare` at any moment loses at most the file in the making.
 
-What a data set gives takes the place of an estimate. What it keeps back for testing no step sees: once the scene is whole, it goes
-into a truth folder outside of it, for `evaluate` alone."""
+What a data set gives takes the place of an estimate. What it keeps back for testing no
+step sees: once the scene is whole, it goes into a truth folder outside of it, for
+`evaluate` alone.
+"""
 
 from __future__ import annotations
 
@@ -37,25 +42,36 @@ __all__ = ["PrepareConfig", "prepare"]
 
 @dataclass(frozen=True)
 class StepKind:
-    """A step: what it builds on, which settings it follows, how it is done, and what of it lies in the folder."""
+    """A step: what it builds on, which settings it follows, how it is done, and what of
+    it lies in the folder.
+    """
 
     run: Callable[[Work], Step]
     needs: tuple[StepName, ...] = ()
-    settings: tuple[str, ...] = ()  # names of `PrepareConfig` fields; a path among them counts with its contents
+    settings: tuple[
+        str, ...
+    ] = ()  # names of `PrepareConfig` fields; a path among them counts with its contents
     outputs: tuple[str, ...] = ()  # folders and files it owns
-    complete: Callable[[Manifest], bool] = field(default=lambda m: True)  # whether the manifest names all it should
+    # whether the manifest names all it should
+    complete: Callable[[Manifest], bool] = field(default=lambda m: True)
 
 
 def prepare(config: PrepareConfig) -> Path:
-    """Do every step that is not done; the scene folder. InputError where the footage or a setting is at fault."""
+    """Do every step that is not done; the scene folder. InputError where the footage or
+    a setting is at fault.
+    """
     with writing_to(config.out):
         work = begin(config)
         introduce(work)
         for name in STEPS:
             do(work, name)
         if work.capture is not None and work.capture.withheld:
-            write_truth(work.capture, work.manifest, work.own_time, truth_place(config), config.max_size)
-    say(f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {config.out / 'contact_sheet.png'})")
+            write_truth(
+                work.capture, work.manifest, work.own_time, truth_place(config), config.max_size
+            )
+    say(
+        f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {config.out / 'contact_sheet.png'})"
+    )
     return config.out
 
 
@@ -65,12 +81,16 @@ def truth_place(config: PrepareConfig) -> Path:
 
 
 def held_out_truth(config: PrepareConfig) -> Path | None:
-    """The truth folder that `prepare` wrote, None where the footage brings no held-out views."""
+    """The truth folder that `prepare` wrote, None where the footage brings no held-out
+    views.
+    """
     return truth_folder(truth_place(config))
 
 
 def begin(config: PrepareConfig) -> Work:
-    """Look at the footage and at the scene folder; InputError where they do not belong together."""
+    """Look at the footage and at the scene folder; InputError where they do not belong
+    together.
+    """
     check_settings(config)
     capture = recognize(config.clip)
     footage = capture.footage() if capture else ingest.open_footage(config.clip)
@@ -79,17 +99,26 @@ def begin(config: PrepareConfig) -> Work:
     if found is not None and found.inputs != inputs and not found.frames:
         found = None  # nothing to lose
     if found is not None and found.inputs != inputs and found.source != str(config.clip):
-        raise InputError(f"{config.out}: holds the scene of other footage ({found.source}); choose another folder")
+        raise InputError(
+            f"{config.out}: holds the scene of other footage ({found.source}); choose another folder"
+        )
     for leftover in config.out.rglob(".partial-*"):  # of a killed run
         leftover.unlink()
     if found is not None:
         found.source, found.inputs = str(config.clip), inputs
         return Work(config, footage, found, capture)
-    first = next(ingest.read_frames(footage, config.start, config.start + 1, 1, config.max_size), None)
+    first = next(
+        ingest.read_frames(footage, config.start, config.start + 1, 1, config.max_size), None
+    )
     if first is None:
         raise InputError(f"{config.clip}: no frame {config.start}; choose a smaller `--start`")
     height, width = first.rgb.shape[:2]
-    work = Work(config, footage, Manifest(source=str(config.clip), inputs=inputs, width=width, height=height), capture)
+    work = Work(
+        config,
+        footage,
+        Manifest(source=str(config.clip), inputs=inputs, width=width, height=height),
+        capture,
+    )
     work.save()
     return work
 
@@ -103,20 +132,26 @@ def introduce(work: Work) -> None:
     parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
     given = [*stored, *(part for part in parts if work.gives(part))]
     kept = f", held-out views for {truth_place(work.config)}" if capture.withheld else ""
-    say(f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}")
+    say(
+        f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}"
+    )
     for note in capture.notes:
         say(f"{clip}: {note}")
 
 
 def found_manifest(config: PrepareConfig) -> Manifest | None:
-    """The manifest already in the output folder, None where there is none yet or a broken one is to be redone from the frames."""
+    """The manifest already in the output folder, None where there is none yet or a
+    broken one is to be redone from the frames.
+    """
     if not config.out.exists():
         return None
     if not config.out.is_dir():
         raise InputError(f"{config.out}: is a file; choose a folder to write the scene to")
     if not (config.out / "scene.json").exists():
         if any(not p.name.startswith(".partial-") for p in config.out.iterdir()):
-            raise InputError(f"{config.out}: holds other files and no scene; choose an empty or new folder")
+            raise InputError(
+                f"{config.out}: holds other files and no scene; choose an empty or new folder"
+            )
         return None
     try:
         found = Manifest.load(config.out)
@@ -133,19 +168,31 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
 
 def check_settings(config: PrepareConfig) -> None:
     """InputError for settings that make no sense whatever the footage is."""
-    if config.start < 0 or config.stride < 1 or (config.end is not None and config.end <= config.start):
+    if (
+        config.start < 0
+        or config.stride < 1
+        or (config.end is not None and config.end <= config.start)
+    ):
         raise InputError(
             f"frames {config.start} to {config.end} in steps of {config.stride}: nothing to read; mend --start, --end, --stride"
         )
     if config.max_size < 32:
-        raise InputError(f"--max-size {config.max_size}: too small to find anything in; use at least 32")
+        raise InputError(
+            f"--max-size {config.max_size}: too small to find anything in; use at least 32"
+        )
     if config.hold_out is not None and (config.hold_out < 0 or config.hold_out == 1):
-        raise InputError(f"--hold-out {config.hold_out}: leaves nothing to train on; use 0, or 2 and more")
+        raise InputError(
+            f"--hold-out {config.hold_out}: leaves nothing to train on; use 0, or 2 and more"
+        )
     if config.protocol is not None and config.hold_out is not None:
-        raise InputError("--protocol and --hold-out both given, and each says what is kept out of training; leave one out")
+        raise InputError(
+            "--protocol and --hold-out both given, and each says what is kept out of training; leave one out"
+        )
     ingest.parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
-        raise InputError(f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside")
+        raise InputError(
+            f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside"
+        )
     check_flow(config.flow, config.flow_weights)
     for option, path in (
         ("poses", config.poses),
@@ -154,7 +201,9 @@ def check_settings(config: PrepareConfig) -> None:
         ("mask-points", config.mask_points),
     ):
         if isinstance(path, Path) and not path.exists():
-            raise InputError(f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate")
+            raise InputError(
+                f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate"
+            )
     check_networks(config)
 
 
@@ -166,7 +215,9 @@ def do(work: Work, name: StepName) -> None:
     if record is None or record.key != key or name in work.config.redo:
         for output in kind.outputs:
             remove(work.folder / output)
-        record = Step(key=key, details={"attempt": record.details.get("attempt", 0) + 1 if record else 1})
+        record = Step(
+            key=key, details={"attempt": record.details.get("attempt", 0) + 1 if record else 1}
+        )
     elif record.done and kind.complete(work.manifest) and present(work, name):
         return
     steps[name] = record = record.model_copy(update={"done": False})
@@ -174,14 +225,17 @@ def do(work: Work, name: StepName) -> None:
     start = time.monotonic()
     result = kind.run(work)
     seconds, details = round(time.monotonic() - start, 2), {**record.details, **result.details}
-    steps[name] = result.model_copy(update={"done": True, "key": key, "seconds": seconds, "details": details})
+    steps[name] = result.model_copy(
+        update={"done": True, "key": key, "seconds": seconds, "details": details}
+    )
     work.save()
     say(f"{name}: {result.note}")
 
 
 def step_key(work: Work, name: StepName) -> str:
-    """The hash of everything a step depends on: its settings, the files they name, the weights of its networks, the steps before it and how
-    often those were redone."""
+    """The hash of everything a step depends on: its settings, the files they name, the
+    weights of its networks, the steps before it and how often those were redone.
+    """
     kind = STEPS[name]
     settings: dict[str, Any] = {}
     for s in kind.settings:
@@ -191,10 +245,15 @@ def step_key(work: Work, name: StepName) -> str:
         settings[s] = given_hash(value) if isinstance(value, Path) else value
         if is_dataclass(value) and not isinstance(value, type):
             settings[s] = asdict(value)
-    before = [(n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt")) for n in kind.needs]
+    before = [
+        (n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt"))
+        for n in kind.needs
+    ]
     inputs = work.manifest.inputs if name == "frames" else {}
     known = [capture_part(work, name)] if work.capture is not None else []
-    return hashlib.sha256(json.dumps([settings, before, inputs, *known, *weights_of(work.config, name)]).encode()).hexdigest()
+    return hashlib.sha256(
+        json.dumps([settings, before, inputs, *known, *weights_of(work.config, name)]).encode()
+    ).hexdigest()
 
 
 def capture_part(work: Work, name: StepName) -> Any:
@@ -210,16 +269,32 @@ def capture_part(work: Work, name: StepName) -> Any:
         case "frames":
             return [(p.source, p.time, p.camera_id) for p in ps]
         case "exposure":
-            return [capture.withheld, asdict(capture.exposures) if capture.exposures else None, [(p.ev, p.bracket) for p in ps]]
+            return [
+                capture.withheld,
+                asdict(capture.exposures) if capture.exposures else None,
+                [(p.ev, p.bracket) for p in ps],
+            ]
         case "flow" if work.gives("flow"):
             return [sorted((to, ingest.hash_file(path)) for to, path in p.flow.items()) for p in ps]
         case "poses" if work.gives("poses") and (given := capture.poses) is not None:
             points = None if capture.points is None else capture.points.tolist()
-            return [given.K.tolist(), given.c2w.tolist(), given.size.tolist(), given.near, given.far, points]
+            return [
+                given.K.tolist(),
+                given.c2w.tolist(),
+                given.size.tolist(),
+                given.near,
+                given.far,
+                points,
+            ]
         case "masks" if work.gives("masks"):
             return [capture.still, capture.white_moves, files(lambda p: p.mask)]
         case "depth" if work.gives("depth"):
-            return [capture.depth_kind, capture.depth_units, files(lambda p: p.depth), files(lambda p: p.confidence)]
+            return [
+                capture.depth_kind,
+                capture.depth_units,
+                files(lambda p: p.depth),
+                files(lambda p: p.confidence),
+            ]
     return None
 
 
@@ -252,12 +327,17 @@ def present(work: Work, name: StepName) -> bool:
 
 def all_have(field: str, split: Split | None = None) -> Callable[[Manifest], bool]:
     """Whether every frame (of `split`) has `field`."""
-    return lambda m: bool(m.frames) and all(getattr(f, field) for f in m.frames if split in (None, f.split))
+    return lambda m: (
+        bool(m.frames) and all(getattr(f, field) for f in m.frames if split in (None, f.split))
+    )
 
 
 STEPS: dict[StepName, StepKind] = {
     "frames": StepKind(
-        on_footage.frames_step, settings=("start", "end", "stride", "max_size"), outputs=("images",), complete=all_have("image")
+        on_footage.frames_step,
+        settings=("start", "end", "stride", "max_size"),
+        outputs=("images",),
+        complete=all_have("image"),
     ),
     "exposure": StepKind(
         on_footage.exposure_step,
@@ -286,7 +366,12 @@ STEPS: dict[StepName, StepKind] = {
         outputs=("masks",),
         complete=all_have("mask"),
     ),
-    "refined_flow": StepKind(on_priors.refined_flow_step, needs=("masks",), outputs=("refined_flow",), complete=all_have("flow")),
+    "refined_flow": StepKind(
+        on_priors.refined_flow_step,
+        needs=("masks",),
+        outputs=("refined_flow",),
+        complete=all_have("flow"),
+    ),
     "depth": StepKind(
         on_priors.depth_step,
         needs=("refined_flow",),

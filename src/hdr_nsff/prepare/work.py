@@ -22,25 +22,33 @@ from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest, Protocol
 MaskName = Literal["motion", "sam2"]
 DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
-# flow (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices (from, to)
+# flow (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices
+# (from, to)
 Flows = tuple[np.ndarray, np.ndarray, np.ndarray]
 StepName = Literal["frames", "exposure", "flow", "poses", "masks", "refined_flow", "depth", "sheet"]
 
 
 @dataclass(frozen=True)
 class PrepareConfig:
-    """Turn alternating-exposure footage into a scene folder: exposures, poses, optical flow, moving masks, depth.
+    """Turn alternating-exposure footage into a scene folder: exposures, poses, optical
+    flow, moving masks, depth.
 
-    Steps that are done are skipped, so the same command goes on where a killed one was."""
+    Steps that are done are skipped, so the same command goes on where a killed one was.
+    """
 
     clip: Positional[Path]
-    """Footage: a video, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders, one per synchronized camera.
-    Or a public data set: HDR-GoPro / NSFF (LLFF), D-NeRF, HDR-HexPlane, HDR-4D, HDR-NeRF, nerfstudio; what it gives is used."""
+    """Footage: a video, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of
+    such folders, one per synchronized camera. Or a public data set: HDR-GoPro / NSFF
+    (LLFF), D-NeRF, HDR-HexPlane, HDR-4D, HDR-NeRF, nerfstudio; what it gives is used.
+    """
     out: Positional[Path]
     """Scene folder to write."""
     exposures: str | None = None
-    """Exposure times of one cycle in seconds, in the order of the frames: 1/1000,1/250,1/60. Default: a CSV beside the frames
-    (`exposures.csv`, for a video `CLIP.csv`; columns file or frame, and exposure or ev), else EXIF, else found from brightness."""
+    """Exposure times of one cycle in seconds, in the order of the frames:
+    1/1000,1/250,1/60. Default: a CSV beside the frames (`exposures.csv`, for a video
+    `CLIP.csv`; columns file or frame, and exposure or ev), else EXIF, else found from
+    brightness.
+    """
     ev: str | None = None
     """The same as log2 exposures: -4,-2,0."""
     max_size: int = 640
@@ -52,42 +60,73 @@ class PrepareConfig:
     stride: int = 1
     """Use every this many frames."""
     hold_out: int | None = None
-    """Keep every this many frames out of training, for `evaluate`; 0 keeps all in. Default 8; 0 for a data set with held-out views."""
+    """Keep every this many frames out of training, for `evaluate`; 0 keeps all in.
+    Default 8; 0 for a data set with held-out views.
+    """
     protocol: Protocol | None = None
-    """Split the clip as the published tables do, instead of --hold-out. novel-view: train on all frames, to be evaluated from other cameras
-    at their times; novel-view-time: train on every second frame, to be evaluated at the times between. Either wants held-out views: a truth
-    folder in `evaluate`, or a data set that brings them."""
+    """Split the clip as the published tables do, instead of --hold-out. novel-view:
+    train on all frames, to be evaluated from other cameras at their times;
+    novel-view-time: train on every second frame, to be evaluated at the times between.
+    Either wants held-out views: a truth folder in `evaluate`, or a data set that brings
+    them.
+    """
     poses: Path | None = None
-    """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of structure from motion."""
+    """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of
+    structure from motion.
+    """
     matcher: Matcher = "sift"
-    """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk: learned, matched by LightGlue (extra `neural`), seconds
-    per pair of frames on a CPU, for footage in which SIFT finds too little in common."""
+    """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
+    learned, matched by LightGlue (extra `neural`), seconds per pair of frames on a CPU,
+    for footage in which SIFT finds too little in common.
+    """
     flow: FlowName | Path | None = None
-    """Where optical flow comes from. Default: semantic where the weights of its features are on this machine, else dis. semantic: by features
-    that change little with the exposure; dis: OpenCV's dense inverse search, without weights; gmflow, raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network `finetune-flow` adapted; or a
-    folder of maps made elsewhere: 00003_00004.npy (H, W, 2) pixels per pair of frames."""
+    """Where optical flow comes from. Default: semantic where the weights of its
+    features are on this machine, else dis. semantic: by features that change little
+    with the exposure; dis: OpenCV's dense inverse search, without weights; gmflow,
+    raft: networks, see `hdr-nsff weights`; raft-finetuned: whichever network
+    `finetune-flow` adapted; or a folder of maps made elsewhere: 00003_00004.npy (H, W,
+    2) pixels per pair of frames.
+    """
     flow_weights: Path | None = None
-    """Weights of the network that --flow names: a file, or the folder of `finetune-flow`. Default: where weights are kept."""
+    """Weights of the network that --flow names: a file, or the folder of
+    `finetune-flow`. Default: where weights are kept.
+    """
     semantic: SemanticConfig = field(default_factory=SemanticConfig)
     """Of --flow semantic, which is the default where its weights are there."""
     masks: Annotated[MaskName | Path | None, arg(name="mask", aliases=("--masks",))] = None
-    """Where moving masks come from. motion: what the camera's motion does not explain (default); sam2: the same outlined by a network (extra
-    `neural`); or a folder of masks made elsewhere: one PNG per frame in order, moving = white."""
+    """Where moving masks come from. motion: what the camera's motion does not explain
+    (default); sam2: the same outlined by a network (extra `neural`); or a folder of
+    masks made elsewhere: one PNG per frame in order, moving = white.
+    """
     mask_weights: str = "sam2"
-    """Weights of sam2: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face hub, or a model's folder."""
+    """Weights of sam2: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face
+    hub, or a model's folder.
+    """
     mask_points: Path | None = None
-    """Points that correct or add to what sam2 is asked: JSON as in `masks/prompts.json` of the scene folder, where its own are written."""
+    """Points that correct or add to what sam2 is asked: JSON as in `masks/prompts.json`
+    of the scene folder, where its own are written.
+    """
     depth: DepthName | Path | None = None
-    """Where depth comes from. geometric: parallax, and where movers can be (default); depth-anything: a network (extra `neural`), laid onto
-    static points; or a folder of maps made elsewhere, one .npy, EXR or PNG per frame in order."""
+    """Where depth comes from. geometric: parallax, and where movers can be (default);
+    depth-anything: a network (extra `neural`), laid onto static points; or a folder of
+    maps made elsewhere, one .npy, EXR or PNG per frame in order.
+    """
     depth_weights: str = "depth-anything"
-    """Weights of depth-anything, relative or metric: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face hub, or a model's folder."""
+    """Weights of depth-anything, relative or metric: a name of `hdr-nsff weights`,
+    OWNER/MODEL of the Hugging Face hub, or a model's folder.
+    """
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
-    """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth, or disparity up to scale and shift."""
+    """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth,
+    or disparity up to scale and shift.
+    """
     estimate: tuple[Part, ...] = ()
-    """Parts of a public data set to estimate although it gives them. Its depth is left too where its poses are."""
+    """Parts of a public data set to estimate although it gives them. Its depth is left
+    too where its poses are.
+    """
     truth_out: Path | None = None
-    """Where the held-out views of a public data set go, for `evaluate --truth`. Default: OUT_truth, beside the scene folder."""
+    """Where the held-out views of a public data set go, for `evaluate --truth`.
+    Default: OUT_truth, beside the scene folder.
+    """
     redo: tuple[StepName, ...] = ()
     """Steps to do again although they are done."""
 
@@ -111,10 +150,17 @@ class Work:
         self.manifest.save(self.folder)
 
     def gives(self, part: Part) -> Capture | None:
-        """The data set, where it gives that part and the settings neither replace it nor ask for an estimate."""
+        """The data set, where it gives that part and the settings neither replace it
+        nor ask for an estimate.
+        """
         c = self.config
         own_world = c.poses is not None or "poses" in c.estimate
-        if self.capture is None or part in c.estimate or getattr(c, part) is not None or (part == "depth" and own_world):
+        if (
+            self.capture is None
+            or part in c.estimate
+            or getattr(c, part) is not None
+            or (part == "depth" and own_world)
+        ):
             return None
         return self.capture if self.capture.parts()[part] else None
 
@@ -124,7 +170,9 @@ class Work:
         return self.capture.by_source[frame.source]
 
     def time_of(self, source: str, number: int) -> float:
-        """The time of a frame, in frames as used; `number` is its place in the footage of its camera."""
+        """The time of a frame, in frames as used; `number` is its place in the footage
+        of its camera.
+        """
         if self.capture is None:
             return (number - self.config.start) // self.config.stride
         return self.own_time(self.capture.by_source[source].time)
@@ -132,12 +180,20 @@ class Work:
     def own_time(self, time: float) -> float:
         """A time of the data set, in frames as used."""
         assert self.capture is not None
-        first = min(self.capture.by_source[s].time for s in (files[self.config.start] for files in self.sources()))
+        first = min(
+            self.capture.by_source[s].time
+            for s in (files[self.config.start] for files in self.sources())
+        )
         return round((time - first) / self.config.stride, 6)
 
     def sources(self) -> list[list[str]]:
-        """The names of the footage's files, camera by camera; cameras that are too short for the settings left out."""
-        names = [[f.relative_to(self.footage.path).as_posix() for f in files] for files in self.footage.cameras]
+        """The names of the footage's files, camera by camera; cameras that are too
+        short for the settings left out.
+        """
+        names = [
+            [f.relative_to(self.footage.path).as_posix() for f in files]
+            for files in self.footage.cameras
+        ]
         return [n for n in names if len(n) > self.config.start]
 
     @cached_property
@@ -147,7 +203,9 @@ class Work:
 
     @cached_property
     def equalized(self) -> tuple[np.ndarray, np.ndarray]:
-        """All frames at one brightness (T, H, W, 3) and where they say nothing (T, H, W); the histograms are those of training frames."""
+        """All frames at one brightness (T, H, W, 3) and where they say nothing (T, H,
+        W); the histograms are those of training frames.
+        """
         frames = self.manifest.frames
         groups = [f.camera_id * (1 + max(g.bracket for g in frames)) + f.bracket for f in frames]
         return exposure.equalize(self.video, groups, np.array([f.split == "train" for f in frames]))
@@ -165,15 +223,22 @@ class Work:
     def read_flows(self, named: list[tuple[int, dict[int, FlowFiles]]]) -> Flows:
         """Flow from files."""
         files = [(i, j, names) for i, to in named for j, names in to.items()]
-        found = np.stack([read_npy(self.folder / names.flow).astype(np.float32) for _, _, names in files])
+        found = np.stack(
+            [read_npy(self.folder / names.flow).astype(np.float32) for _, _, names in files]
+        )
         valid = np.stack([read_mask(self.folder / names.valid) for _, _, names in files])
         return found, valid, np.array([(i, j) for i, j, _ in files])
 
     def cameras(self) -> tuple[np.ndarray, np.ndarray]:
         """K (T, 3, 3) pixels and c2w (T, 3, 4) of all frames."""
-        return np.array([f.K for f in self.manifest.frames]), np.array([f.c2w for f in self.manifest.frames])
+        return np.array([f.K for f in self.manifest.frames]), np.array(
+            [f.c2w for f in self.manifest.frames]
+        )
 
     def camera_frames(self) -> list[list[int]]:
         """Per camera the indices of its frames in time."""
         frames = self.manifest.frames
-        return [[f.index for f in frames if f.camera_id == c] for c in sorted({f.camera_id for f in frames})]
+        return [
+            [f.index for f in frames if f.camera_id == c]
+            for c in sorted({f.camera_id for f in frames})
+        ]

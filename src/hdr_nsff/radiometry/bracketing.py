@@ -1,9 +1,13 @@
-"""How far apart exposures are put when they alternate: what settles the factor that recordings leave open.
+"""How far apart exposures are put when they alternate: what settles the factor that
+recordings leave open.
 
-Where no exposure is known, recordings tell how the steps between exposures compare, and their size only up to a common factor (Grossberg
-and Nayar 2003: E^p explains them as well as E). A typical curve gives a first guess of it (`response.typical_factor`), which is a few per
-cent off for most cameras and 20 % for contrasty ones. People and cameras bracket in whole stops, seldom in halves or thirds: the most
-likely factor by Bayes' rule."""
+Where no exposure is known, recordings tell how the steps between exposures compare, and
+their size only up to a common factor (Grossberg and Nayar 2003: E^p explains them as
+well as E). A typical curve gives a first guess of it (`response.typical_factor`), which
+is a few per cent off for most cameras and 20 % for contrasty ones. People and cameras
+bracket in whole stops, seldom in halves or thirds: the most likely factor by Bayes'
+rule.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +15,32 @@ from collections.abc import Sequence
 
 import numpy as np
 
-USUAL = {1: 0.2, 2: 0.36, 3: 0.22, 4: 0.04, 5: 0.01, 6: 0.01, 7: 0.005, 8: 0.005}  # whole stops and how often
+USUAL = {
+    1: 0.2,
+    2: 0.36,
+    3: 0.22,
+    4: 0.04,
+    5: 0.01,
+    6: 0.01,
+    7: 0.005,
+    8: 0.005,
+}  # whole stops and how often
 HALVES, THIRDS = 0.02, 0.005  # how often a step is 0.5, 1.5, .. 4.5, and 1/3, 2/3, 4/3, .. 14/3
-FACTOR = (-0.03, 0.1)  # mean and standard deviation of the log of the factor that a typical curve is wrong by
+FACTOR = (
+    -0.03,
+    0.1,
+)  # mean and standard deviation of the log of the factor that a typical curve is wrong by
 TOLERANCE = 0.07  # stops: by how much measured steps differ from proportional ones
 SMALLEST = 0.2  # stops: a smaller step is none
 
 
 def likely_factor(ev: Sequence[float] | np.ndarray) -> float:
-    """The factor that EVs (B,), measured with a typical curve, most likely have to be multiplied by; within [0.65, 1.5].
+    """The factor that EVs (B,), measured with a typical curve, most likely have to be
+    multiplied by; within [0.65, 1.5].
 
-    Steps of [2.36, 2.35] stops are likelier two of 2 than anything else: 0.85. 1 where there is no step."""
+    Steps of [2.36, 2.35] stops are likelier two of 2 than anything else: 0.85. 1 where
+    there is no step.
+    """
     steps = np.diff(np.sort(np.asarray(ev, np.float64)))
     steps = steps[steps > SMALLEST]
     if not len(steps):
@@ -40,4 +59,8 @@ def likely_factor(ev: Sequence[float] | np.ndarray) -> float:
 def usual_steps() -> dict[float, float]:
     """Stops between neighboring exposures and how often they are chosen."""
     odd = [k / 3 for k in range(1, 15) if k % 3]
-    return {float(k): p for k, p in USUAL.items()} | {k + 0.5: HALVES for k in range(5)} | dict.fromkeys(odd, THIRDS)
+    return (
+        {float(k): p for k, p in USUAL.items()}
+        | {k + 0.5: HALVES for k in range(5)}
+        | dict.fromkeys(odd, THIRDS)
+    )

@@ -1,7 +1,10 @@
-"""Exposures from brightness alone: which frames share an exposure, and all frames brought to one common brightness.
+"""Exposures from brightness alone: which frames share an exposure, and all frames
+brought to one common brightness.
 
-Nothing here knows the camera. "EV" in this file is `2.2 log2(recorded)`, the exposure under the guess that the response is
-a plain gamma: good enough to find a cycle and its order, and to doubt a user's list; the true values are learned later."""
+Nothing here knows the camera. "EV" in this file is `2.2 log2(recorded)`, the exposure
+under the guess that the response is a plain gamma: good enough to find a cycle and its
+order, and to doubt a user's list; the true values are learned later.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ import numpy as np
 
 MAX_CYCLE = 6
 LOW, HIGH = 0.012, 0.97  # a recorded value outside says only "darker than" or "brighter than"
-MIN_STEP = 0.3  # EV between the darkest and brightest bracket below which brightness merely flickers
+# EV between the darkest and brightest bracket below which brightness merely flickers
+MIN_STEP = 0.3
 MIN_EXPLAINED = 0.6  # share of the brightness changes a cycle must explain
 NOISE = 0.1  # EV: changes of brightness smaller than this are never evidence
 LEVELS = np.linspace(0.05, 0.95, 37)  # quantiles that stand for a frame's brightness
@@ -25,8 +29,12 @@ class Cycle:
     length: int  # 1: no alternation
     brackets: list[int]  # per frame: its position in the cycle
     order: list[int]  # the brackets from the darkest to the brightest
-    ev: list[float]  # per bracket: EV relative to the darkest, under a gamma of 2.2 (a rough measurement)
-    confidence: float  # in [0, 1]: the share of the brightness changes between frames that the cycle explains
+    ev: list[
+        float
+    ]  # per bracket: EV relative to the darkest, under a gamma of 2.2 (a rough measurement)
+    # in [0, 1]: the share of the brightness changes between frames that the cycle
+    # explains
+    confidence: float
 
 
 def extent(rgb: np.ndarray) -> tuple[float, float]:
@@ -36,7 +44,9 @@ def extent(rgb: np.ndarray) -> tuple[float, float]:
 
 
 def all_clipped(extents: list[tuple[float, float]]) -> str | None:
-    """ "black" or "white" where every frame is that and nothing else, else None; `extents` as of `extent`, one per frame."""
+    """ "black" or "white" where every frame is that and nothing else, else None;
+    `extents` as of `extent`, one per frame.
+    """
     if max(high for _, high in extents) < LOW:
         return "black"
     return "white" if min(low for low, _ in extents) > HIGH else None
@@ -45,8 +55,10 @@ def all_clipped(extents: list[tuple[float, float]]) -> str | None:
 def brightness_steps(video: np.ndarray) -> np.ndarray:
     """EV from each frame of `video` (T, H, W, 3) recorded to the next, (T-1,).
 
-    Compares the same quantiles of both histograms (motion moves pixels, not quantiles) and takes the median over those
-    that are neither black nor saturated in either frame, so one lamp or one passing car does not count."""
+    Compares the same quantiles of both histograms (motion moves pixels, not quantiles)
+    and takes the median over those that are neither black nor saturated in either
+    frame, so one lamp or one passing car does not count.
+    """
     stride = max(1, int(np.sqrt(video.shape[1] * video.shape[2] / 20000)))
     luminance = video[:, ::stride, ::stride].mean(-1).reshape(len(video), -1)
     q = np.quantile(luminance, LEVELS, axis=1).T  # (T, levels)
@@ -55,13 +67,18 @@ def brightness_steps(video: np.ndarray) -> np.ndarray:
     both = known[1:] & known[:-1]
     steps = np.diff(ev, axis=0)
     enough = both.sum(1) >= 3
-    return np.array([np.median(s[b] if e else s) for s, b, e in zip(steps, both, enough, strict=True)])
+    return np.array(
+        [np.median(s[b] if e else s) for s, b, e in zip(steps, both, enough, strict=True)]
+    )
 
 
 def fit_cycle(steps: np.ndarray, length: int) -> tuple[float, np.ndarray]:
-    """How badly a cycle of `length` explains the EV `steps` (mean absolute EV, at least `NOISE`), and its levels (length,) in EV.
+    """How badly a cycle of `length` explains the EV `steps` (mean absolute EV, at least
+    `NOISE`), and its levels (length,) in EV.
 
-    One median step per phase; what they sum to over a cycle is taken off, since a cycle comes back to where it began."""
+    One median step per phase; what they sum to over a cycle is taken off, since a cycle
+    comes back to where it began.
+    """
     phase = np.arange(len(steps)) % length
     fit = np.array([np.median(steps[phase == k]) for k in range(length)])
     fit -= fit.mean()
@@ -70,13 +87,19 @@ def fit_cycle(steps: np.ndarray, length: int) -> tuple[float, np.ndarray]:
 
 
 def detect_cycle(video: np.ndarray, max_cycle: int = MAX_CYCLE) -> Cycle:
-    """The exposure cycle of `video` (T, H, W, 3) recorded in [0, 1], or a cycle of length 1 where there is none.
+    """The exposure cycle of `video` (T, H, W, 3) recorded in [0, 1], or a cycle of
+    length 1 where there is none.
 
-    The steps of brightness between frames repeat with the cycle; of all lengths the one with the best Bayesian information
-    criterion under Laplace noise wins, so a multiple of the true length, which fits no better, loses."""
+    The steps of brightness between frames repeat with the cycle; of all lengths the one
+    with the best Bayesian information criterion under Laplace noise wins, so a multiple
+    of the true length, which fits no better, loses.
+    """
     steps = brightness_steps(video)
     n = len(steps)
-    candidates = [(length, *fit_cycle(steps, length)) for length in range(1, max(1, min(max_cycle, (n + 1) // 2)) + 1)]
+    candidates = [
+        (length, *fit_cycle(steps, length))
+        for length in range(1, max(1, min(max_cycle, (n + 1) // 2)) + 1)
+    ]
     still = candidates[0][1]
     length, cost, level = min(candidates, key=lambda c: 2 * n * np.log(c[1]) + c[0] * np.log(n))
     if level.max() < MIN_STEP or 1 - cost / still < MIN_EXPLAINED:
@@ -91,35 +114,57 @@ def detect_cycle(video: np.ndarray, max_cycle: int = MAX_CYCLE) -> Cycle:
 
 
 def period(brackets: list[int]) -> int:
-    """The smallest p with `brackets[t] == brackets[t + p]` throughout and seen at least twice, else the number of brackets."""
+    """The smallest p with `brackets[t] == brackets[t + p]` throughout and seen at least
+    twice, else the number of brackets.
+    """
     n = len(brackets)
-    return next((p for p in range(1, n // 2 + 1) if brackets[p:] == brackets[: n - p]), len(set(brackets)))
+    return next(
+        (p for p in range(1, n // 2 + 1) if brackets[p:] == brackets[: n - p]), len(set(brackets))
+    )
 
 
 def by_value(ev: list[float]) -> tuple[list[int], list[float]]:
-    """Frames with the same EV (to 0.01) share a bracket, numbered as they appear: (bracket per frame, EV per bracket)."""
+    """Frames with the same EV (to 0.01) share a bracket, numbered as they appear:
+    (bracket per frame, EV per bracket).
+    """
     keys = [round(v, 2) for v in ev]
     order = list(dict.fromkeys(keys))
     return [order.index(k) for k in keys], [ev[keys.index(k)] for k in order]
 
 
 def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
-    """Per synchronized camera the bracket of each frame, such that equal brackets are equally bright in every camera."""
+    """Per synchronized camera the bracket of each frame, such that equal brackets are
+    equally bright in every camera.
+    """
     length = max({c.length for c in cycles}, key=[c.length for c in cycles].count)
     lead = next(c for c in cycles if c.length == length)
-    same = [{p: lead.order[c.order.index(p)] for p in range(length)} if c.length == length else None for c in cycles]
-    return [[m[t % length] if m else t % length for t in range(len(c.brackets))] for c, m in zip(cycles, same, strict=True)]
+    same = [
+        {p: lead.order[c.order.index(p)] for p in range(length)} if c.length == length else None
+        for c in cycles
+    ]
+    return [
+        [m[t % length] if m else t % length for t in range(len(c.brackets))]
+        for c, m in zip(cycles, same, strict=True)
+    ]
 
 
 def doubts(video: np.ndarray, ev: list[float]) -> list[str]:
-    """What in `video` (T, H, W, 3), recorded, contradicts the given `ev` per frame: sentences, none where they agree."""
+    """What in `video` (T, H, W, 3), recorded, contradicts the given `ev` per frame:
+    sentences, none where they agree.
+    """
     steps, given = brightness_steps(video), np.diff(ev)
     alternates = np.abs(given) >= MIN_STEP
     if not alternates.any():
         cycle = detect_cycle(video)
-        return [] if cycle.length == 1 else [f"one exposure is given, but the brightness repeats every {cycle.length} frames"]
+        return (
+            []
+            if cycle.length == 1
+            else [f"one exposure is given, but the brightness repeats every {cycle.length} frames"]
+        )
     if np.abs(steps).mean() < MIN_STEP:
-        return [f"exposure steps of {np.abs(given).mean():.1f} EV are given, but all frames are about equally bright"]
+        return [
+            f"exposure steps of {np.abs(given).mean():.1f} EV are given, but all frames are about equally bright"
+        ]
     sign = np.mean(np.sign(steps[alternates]) == np.sign(given[alternates]))
     if sign < 0.8:
         cycle = detect_cycle(video)
@@ -131,25 +176,39 @@ def doubts(video: np.ndarray, ev: list[float]) -> list[str]:
         return [f"only {sign:.0%} of the exposure steps go the way the brightness goes{seen}"]
     ratio = float(np.median(steps[alternates] / given[alternates]))
     if not 0.5 < ratio < 2:
-        return [f"a step of 1 EV as given changes the brightness like {ratio:.1f} EV (measured with a gamma of 2.2)"]
+        return [
+            f"a step of 1 EV as given changes the brightness like {ratio:.1f} EV (measured with a gamma of 2.2)"
+        ]
     return []
 
 
 def reference_bracket(video: np.ndarray, brackets: list[int]) -> int:
-    """The bracket of `video` (T, H, W, 3) whose pixels are best exposed: the largest share between 0.05 and `HIGH` in recorded value."""
+    """The bracket of `video` (T, H, W, 3) whose pixels are best exposed: the largest
+    share between 0.05 and `HIGH` in recorded value.
+    """
     good = ((video > 0.05) & (video < HIGH)).mean((1, 2, 3))  # (T,)
     group = np.array(brackets)
-    return int(np.argmax([good[group == b].mean() if (group == b).any() else 0.0 for b in range(group.max() + 1)]))
+    return int(
+        np.argmax(
+            [good[group == b].mean() if (group == b).any() else 0.0 for b in range(group.max() + 1)]
+        )
+    )
 
 
-def equalize(video: np.ndarray, groups: list[int], pool: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """All frames at one common brightness, for matching only: (equalized (T, H, W, 3) in [0, 1], clipped (T, H, W) bool).
+def equalize(
+    video: np.ndarray, groups: list[int], pool: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """All frames at one common brightness, for matching only: (equalized (T, H, W, 3)
+    in [0, 1], clipped (T, H, W) bool).
 
-    `groups` says which frames of `video` (T, H, W, 3) share an exposure (and a camera); `pool` (T,) bool which frames the
-    histograms are taken from (all). Each group shows about the same content, so the value of rank r in one histogram is the
-    value of rank r in another: a monotone map per channel between any two exposures, with no response curve or exposure time
-    assumed. A pixel becomes the mean of its images in all groups, which keeps contrast wherever any exposure has some.
-    `clipped`: at least two channels say only "darker than" or "brighter than"."""
+    `groups` says which frames of `video` (T, H, W, 3) share an exposure (and a camera);
+    `pool` (T,) bool which frames the histograms are taken from (all). Each group shows
+    about the same content, so the value of rank r in one histogram is the value of rank
+    r in another: a monotone map per channel between any two exposures, with no response
+    curve or exposure time assumed. A pixel becomes the mean of its images in all
+    groups, which keeps contrast wherever any exposure has some. `clipped`: at least two
+    channels say only "darker than" or "brighter than".
+    """
     group = np.array(groups)
     pool = np.ones(len(group), bool) if pool is None else pool
     equalized, outside = np.empty(video.shape, np.float32), np.empty(video.shape, bool)
@@ -159,7 +218,9 @@ def equalize(video: np.ndarray, groups: list[int], pool: np.ndarray | None = Non
         for g in np.unique(group):
             frames = (group == g) & pool
             curves[g] = value_ranks(video[frames if frames.any() else group == g][..., channel])
-        common = np.mean([np.interp(ranks, rank, value) for value, rank in curves.values()], axis=0)  # (ranks,)
+        common = np.mean(
+            [np.interp(ranks, rank, value) for value, rank in curves.values()], axis=0
+        )  # (ranks,)
         for t, g in enumerate(group):
             value, rank = curves[g]
             recorded = video[t, ..., channel]
@@ -170,9 +231,12 @@ def equalize(video: np.ndarray, groups: list[int], pool: np.ndarray | None = Non
 
 
 def value_ranks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The values in [0, 1] that occur (in `BINS` steps, increasing) and the share of `values` below each, ties counted half.
+    """The values in [0, 1] that occur (in `BINS` steps, increasing) and the share of
+    `values` below each, ties counted half.
 
-    All that is saturated is one tie: codes 250 to 255 of a burnt sky are not worth half the contrast."""
+    All that is saturated is one tie: codes 250 to 255 of a burnt sky are not worth half
+    the contrast.
+    """
     count = np.bincount(np.rint(values.ravel() * (BINS - 1)).astype(np.int64), minlength=BINS)
     white = round(HIGH * (BINS - 1))
     count[white:] = [count[white:].sum(), *[0] * (BINS - 1 - white)]

@@ -1,4 +1,6 @@
-"""A batch of pixels of one frame with everything the objective compares them to, and how pixels are drawn."""
+"""A batch of pixels of one frame with everything the objective compares them to, and
+how pixels are drawn.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,9 @@ from hdr_nsff.scene.scene import Frame, Scene
 
 @dataclass(frozen=True)
 class Recorder:
-    """One recording, for the baselines' fields that must know of it before samples are composited; the others never ask."""
+    """One recording, for the baselines' fields that must know of it before samples are
+    composited; the others never ask.
+    """
 
     rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to what is recorded of it (M, 3)
     images: tuple[
@@ -31,11 +35,14 @@ class PixelBatch:
     camera: Camera
     camera_id: int
     bracket: int
-    neighbors: dict[int, Camera]  # {+-1: camera of the next / previous training frame}; a missing side is absent
+    neighbors: dict[
+        int, Camera
+    ]  # {+-1: camera of the next / previous training frame}; a missing side is absent
     pixels: Tensor  # (N, 2) xy, centers at +0.5
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
-    seed: int = 0  # for the field's own randomness (jitter, noise): the same seed gives the same pass
+    # for the field's own randomness (jitter, noise): the same seed gives the same pass
+    seed: int = 0
     recorder: Recorder | None = None  # the recording, while training
     chain: int = 0  # direction of the two-step warp: +1, -1, or 0 for none
     moving: Tensor | None = None  # (N,) bool
@@ -53,14 +60,24 @@ def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = No
 
 
 def whole_frame(scene: Scene, frame: int) -> PixelBatch:
-    """The batch of every pixel of training frame `frame`, row by row: views of its images, not copies."""
-    return read_off(scene, frame, scene.train[frame].camera.pixel_grid(), lambda image: image.flatten(0, 1))
+    """The batch of every pixel of training frame `frame`, row by row: views of its
+    images, not copies.
+    """
+    return read_off(
+        scene, frame, scene.train[frame].camera.pixel_grid(), lambda image: image.flatten(0, 1)
+    )
 
 
 def read_off(
-    scene: Scene, frame: int, pixels: Tensor, at: Callable[[Tensor], Tensor], uniform: Tensor | None = None
+    scene: Scene,
+    frame: int,
+    pixels: Tensor,
+    at: Callable[[Tensor], Tensor],
+    uniform: Tensor | None = None,
 ) -> PixelBatch:
-    """The batch of `pixels` (N, 2; centers at +0.5) of training frame `frame`; `at` takes an image (H, W, ...) to its values there."""
+    """The batch of `pixels` (N, 2; centers at +0.5) of training frame `frame`; `at`
+    takes an image (H, W, ...) to its values there.
+    """
     f: Frame = scene.train[frame]
 
     def maybe(image: Tensor | None) -> Tensor | None:
@@ -75,7 +92,9 @@ def read_off(
         neighbors={o: scene.train[j].camera for o, j in f.neighbors.items()},
         pixels=pixels.to(f.image),
         rgb=at(f.image),
-        uniform=torch.ones(len(pixels), dtype=torch.bool, device=f.image.device) if uniform is None else uniform,
+        uniform=torch.ones(len(pixels), dtype=torch.bool, device=f.image.device)
+        if uniform is None
+        else uniform,
         moving=maybe(f.moving),
         outline=maybe(f.outline),
         disparity=maybe(f.disparity),
@@ -85,8 +104,12 @@ def read_off(
     )
 
 
-def draw_pixels(scene: Scene, frame: int, num_uniform: int, num_moving: int, generator: torch.Generator) -> PixelBatch:
-    """`num_uniform` random pixels of training frame `frame`, and `num_moving` more from its moving mask (none where nothing moves)."""
+def draw_pixels(
+    scene: Scene, frame: int, num_uniform: int, num_moving: int, generator: torch.Generator
+) -> PixelBatch:
+    """`num_uniform` random pixels of training frame `frame`, and `num_moving` more from
+    its moving mask (none where nothing moves).
+    """
     f = scene.train[frame]
     h, w = f.image.shape[:2]
     flat = torch.randint(h * w, (num_uniform,), generator=generator).to(f.image.device)

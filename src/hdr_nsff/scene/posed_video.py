@@ -1,4 +1,6 @@
-"""Frames with known poses: pixels to world points and back, and from one frame to another."""
+"""Frames with known poses: pixels to world points and back, and from one frame to
+another.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,15 @@ class PosedVideo:
     @cached_property
     def ranges(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per frame the lowest and highest equalized rgb it recorded."""
-        return [recorded_range(frame, clip) for frame, clip in zip(self.video, self.clipped, strict=True)]
+        return [
+            recorded_range(frame, clip)
+            for frame, clip in zip(self.video, self.clipped, strict=True)
+        ]
 
     def project(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """World `points` (P, 3) in frame `i`: pixels (P, 2) with centers at +0.5, z-depth (P,), which are inside the frame (P,)."""
+        """World `points` (P, 3) in frame `i`: pixels (P, 2) with centers at +0.5,
+        z-depth (P,), which are inside the frame (P,).
+        """
         local = (points - self.c2w[i, :, 3]) @ self.c2w[i, :, :3]
         z = local[:, 2]
         homogeneous = local @ self.K[i].T
@@ -46,8 +53,12 @@ class PosedVideo:
         return local / disparity[:, None] @ self.c2w[i, :, :3].T + self.c2w[i, :, 3]
 
     def transfer(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-        """`A` (3, 3) and `b` (3,) float32: pixel (x, y) of frame `i` at disparity d falls on the homogeneous `A (x, y, 1) + d b` of
-        frame `j`, whose third entry is z-depth in `j` times d."""
+        """`A` (3, 3) and `b` (3,) float32: pixel (x, y) of frame `i` at disparity d
+        falls on the homogeneous `A (x, y, 1) + d b` of frame `j`, whose third entry is
+        z-depth in `j` times d.
+        """
         to_j = self.K[j] @ self.c2w[j, :, :3].T
         turn = to_j @ self.c2w[i, :, :3] @ np.linalg.inv(self.K[i])
-        return turn.astype(np.float32), (to_j @ (self.c2w[i, :, 3] - self.c2w[j, :, 3])).astype(np.float32)
+        return turn.astype(np.float32), (to_j @ (self.c2w[i, :, 3] - self.c2w[j, :, 3])).astype(
+            np.float32
+        )

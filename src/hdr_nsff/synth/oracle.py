@@ -1,8 +1,12 @@
-"""An oracle: a scene folder whose poses and masks are exact and whose depth and flow are exact up to a little noise.
+"""An oracle: a scene folder whose poses and masks are exact and whose depth and flow
+are exact up to a little noise.
 
-It measures a field and its training apart from the priors. It is made from the truth, says so in every step of its
-manifest, and is no input a user could have. Flow goes from a frame to the ones before and after, whichever cameras they are of:
-`scene.neighbors` links consecutive times of one `camera_id`, so the cameras of a rig that take turns share id 0."""
+It measures a field and its training apart from the priors. It is made from the truth,
+says so in every step of its manifest, and is no input a user could have. Flow goes from
+a frame to the ones before and after, whichever cameras they are of: `scene.neighbors`
+links consecutive times of one `camera_id`, so the cameras of a rig that take turns
+share id 0.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +47,9 @@ def write_oracle(
     reference: int,
     noise: OracleNoise,
 ) -> None:
-    """`out`/oracle from the rendered channels of every frame, the recorded `video` (T, H, W, 3), poses and bracket exposures."""
+    """`out`/oracle from the rendered channels of every frame, the recorded `video` (T,
+    H, W, 3), poses and bracket exposures.
+    """
     folder, rng = out / "oracle", np.random.default_rng(noise.seed)
     count, height, width = video.shape[:3]
     depths = np.stack([e["Z"] for e in exact])
@@ -52,12 +58,22 @@ def write_oracle(
         error = depth_error(noise, (height, width), rng, i)
         io.write_png(folder / entry.image, video[i])
         io.write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
-        io.write_npy(folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16))
-        io.write_npy(folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16))
+        io.write_npy(
+            folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16)
+        )
+        io.write_npy(
+            folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16)
+        )
         for j, files in entry.flow.items():
             flow = rendered_flow(channels, j - i)
-            io.write_png(folder / files.valid, visible(flow, depth_there(scene, channels, K, c2w, i, j), depths[j]))
-            io.write_npy(folder / files.flow, (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16))
+            io.write_png(
+                folder / files.valid,
+                visible(flow, depth_there(scene, channels, K, c2w, i, j), depths[j]),
+            )
+            io.write_npy(
+                folder / files.flow,
+                (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16),
+            )
     io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
     manifest = Manifest(
         source="clip",
@@ -101,10 +117,18 @@ def frame_entry(i: int, count: int, K: np.ndarray, c2w: np.ndarray, ev: list[flo
     )
 
 
-def depth_error(noise: OracleNoise, size: tuple[int, int], rng: np.random.Generator, frame: int) -> np.ndarray:
-    """The error (H, W) of a frame's log disparity: smooth, and grain from a generator of its own."""
-    smooth = cv2.resize(rng.normal(size=(8, 8)).astype(np.float32), size[::-1], interpolation=cv2.INTER_CUBIC)
-    return noise.depth * smooth + noise.grain * np.random.default_rng([noise.seed, frame, 1]).normal(size=size)
+def depth_error(
+    noise: OracleNoise, size: tuple[int, int], rng: np.random.Generator, frame: int
+) -> np.ndarray:
+    """The error (H, W) of a frame's log disparity: smooth, and grain from a generator
+    of its own.
+    """
+    smooth = cv2.resize(
+        rng.normal(size=(8, 8)).astype(np.float32), size[::-1], interpolation=cv2.INTER_CUBIC
+    )
+    return noise.depth * smooth + noise.grain * np.random.default_rng(
+        [noise.seed, frame, 1]
+    ).normal(size=size)
 
 
 def rendered_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
@@ -113,8 +137,10 @@ def rendered_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
 
 
 def visible(flow: np.ndarray, expected: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Where the surface is still in the frame and not hidden in the other one, (H, W) bool: the depth `expected` (H, W) of
-    it there agrees with the other frame's `depth` (H, W) at one of the four pixels around."""
+    """Where the surface is still in the frame and not hidden in the other one, (H, W)
+    bool: the depth `expected` (H, W) of it there agrees with the other frame's `depth`
+    (H, W) at one of the four pixels around.
+    """
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width), np.arange(height))
     left, top = np.floor(x + flow[..., 0]).astype(int), np.floor(y + flow[..., 1]).astype(int)
@@ -125,9 +151,14 @@ def visible(flow: np.ndarray, expected: np.ndarray, depth: np.ndarray) -> np.nda
 
 
 def static_points(
-    exact: list[dict[str, np.ndarray]], K: np.ndarray, c2w: list[np.ndarray], rng: np.random.Generator
+    exact: list[dict[str, np.ndarray]],
+    K: np.ndarray,
+    c2w: list[np.ndarray],
+    rng: np.random.Generator,
 ) -> np.ndarray:
-    """Points (P, 3) of what stands still, 200 from each frame, as structure from motion would give."""
+    """Points (P, 3) of what stands still, 200 from each frame, as structure from motion
+    would give.
+    """
     points = []
     for channels, pose in zip(exact, c2w, strict=True):
         y, x = np.nonzero(channels["body"] == 0)

@@ -1,16 +1,23 @@
-"""`hdr-nsff synth`: a path-traced scene as alternating-exposure footage, with held-out truth that only `evaluate` reads.
+"""`hdr-nsff synth`: a path-traced scene as alternating-exposure footage, with held-out
+truth that only `evaluate` reads.
 
 Writes, below the output folder:
-    clip.mp4, clip/*.png   what the camera recorded: the same frames as footage and without compression loss
+    clip.mp4, clip/*.png   what the camera recorded: the same frames as footage and
+    without compression loss
     clip.csv, clip/exposures.csv   of a rig: the exposure of every frame, for `prepare`
-    truth/                 views and times the clip does not show: linear radiance, moving masks, depth and motion (see truth.py)
-    exact/*.exr            every rendered frame: radiance, z-depth `Z`, `body` (0 stands still, k the scene's k-th mover), exact optical flow
-    oracle/                with `--oracle`: a scene folder made from the truth, for measuring a field without estimated priors
+    truth/                 views and times the clip does not show: linear radiance,
+    moving masks, depth and motion (see truth.py)
+    exact/*.exr            every rendered frame: radiance, z-depth `Z`, `body` (0 stands
+    still, k the scene's k-th mover), exact optical flow
+    oracle/                with `--oracle`: a scene folder made from the truth, for
+    measuring a field without estimated priors
 Every picture is cached in exact/: a run that was killed goes on where it was.
 
-`--views mono` is one moving camera. `--views rig` is nine synchronized ones that stand still, and the clip goes around them:
-frame i is what camera i modulo nine records at time i. They are of one make and share one response, so the clip is prepared
-and trained on as that of one camera (`camera_id` 0), whose neighbor in time stands beside it."""
+`--views mono` is one moving camera. `--views rig` is nine synchronized ones that stand
+still, and the clip goes around them: frame i is what camera i modulo nine records at
+time i. They are of one make and share one response, so the clip is prepared and trained
+on as that of one camera (`camera_id` 0), whose neighbor in time stands beside it.
+"""
 
 from __future__ import annotations
 
@@ -37,31 +44,49 @@ from hdr_nsff.synth.scenes.base import SynthScene, Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
-OFF_PATH = ((0.06, -0.03, 0.03), (-0.05, 0.05, -0.02))  # meters in the camera's axes from the frame's pose
+OFF_PATH = (
+    (0.06, -0.03, 0.03),
+    (-0.05, 0.05, -0.02),
+)  # meters in the camera's axes from the frame's pose
 
 
 @dataclass(frozen=True)
 class SynthConfig:
-    """A path-traced scene filmed by a moving camera or a rig. `interior`: a room with a bright window, a tumbling box and a swinging
-    ball. `lamp`: things that rush past a lamp. `night`: an alley at night, lights that move. `cloth`: cloth and a dancing tube in the wind."""
+    """A path-traced scene filmed by a moving camera or a rig. `interior`: a room with a
+    bright window, a tumbling box and a swinging ball. `lamp`: things that rush past a
+    lamp. `night`: an alley at night, lights that move. `cloth`: cloth and a dancing
+    tube in the wind.
+    """
 
-    name: Annotated[Literal["interior", "lamp", "night", "cloth"], tyro.conf.Positional]  # which scene
+    name: Annotated[
+        Literal["interior", "lamp", "night", "cloth"], tyro.conf.Positional
+    ]  # which scene
     out: Annotated[Path, tyro.conf.Positional]  # folder to write
-    views: Views = "mono"  # one moving camera, or nine synchronized ones that take the frames in turn
+    # one moving camera, or nine synchronized ones that take the frames in turn
+    views: Views = "mono"
     size: str = "240x136"  # width x height in pixels
     frames: int = 36
     ev: str | None = (
-        None  # stops of the exposures that alternate, in the order they are taken, such as -4,-2,0; by default the scene's
+        # stops of the exposures that alternate, in the order they are taken, such as
+        # -4,-2,0; by default the scene's
+        None
     )
     response: str = "film"  # the camera's response curve: film, log, gamma or srgb
     white_balance: str = "1.12,1,0.87"  # gains of red, green and blue before the response
-    vignetting: float = 0.0  # fall-off of light towards the corners: 1 is the cos^4 law of a simple lens
+    # fall-off of light towards the corners: 1 is the cos^4 law of a simple lens
+    vignetting: float = 0.0
     noise: float = 1.0  # times the noise of a small sensor; 0 is a perfect one
-    spp: int | None = None  # paths per pixel; above 64 rounded to a multiple of it; by default what suits the scene
+    spp: int | None = (
+        # paths per pixel; above 64 rounded to a multiple of it; by default what suits
+        # the scene
+        None
+    )
     truth_spp: int | None = None  # paths per pixel of the held-out views
     seed: int = 0  # of textures, paths and noise
     variant: str = "auto"  # Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb
-    oracle: bool = False  # also write a scene folder with exact poses and masks, depth and flow with a little noise
+    # also write a scene folder with exact poses and masks, depth and flow with a little
+    # noise
+    oracle: bool = False
     depth_noise: float = 0.03  # of the oracle's depth: relative, smooth over an eighth of the frame
     depth_grain: float = 0.0  # of the oracle's depth: relative, every pixel for itself
     flow_noise: float = 0.3  # of the oracle's flow, in pixels
@@ -81,10 +106,15 @@ class Shot:
 
 
 def synth(config: SynthConfig) -> None:
-    """Render, record and write everything; InputError where the settings or the output folder make no sense."""
+    """Render, record and write everything; InputError where the settings or the output
+    folder make no sense.
+    """
     scene = SCENES[config.name]
     ev = scene.ev if config.ev is None else config.ev
-    spp, truth_spp = (d if c is None else c for c, d in ((config.spp, scene.spp), (config.truth_spp, scene.truth_spp)))
+    spp, truth_spp = (
+        d if c is None else c
+        for c, d in ((config.spp, scene.spp), (config.truth_spp, scene.truth_spp))
+    )
     config = replace(config, ev=ev, spp=spp, truth_spp=truth_spp)
     size, evs = parse_size(config.size), parse_ev(ev)
     check(config, min(spp, truth_spp))
@@ -113,7 +143,9 @@ def check(config: SynthConfig, fewest_paths: int) -> None:
     response_curve(config.response)
     parse_white_balance(config.white_balance)
     if not 0 <= config.vignetting <= 1:
-        raise InputError(f"--vignetting {config.vignetting}: must be from 0 (none) to 1 (the cos^4 law)")
+        raise InputError(
+            f"--vignetting {config.vignetting}: must be from 0 (none) to 1 (the cos^4 law)"
+        )
     if not 12 <= config.frames <= 400:
         raise InputError(
             f"--frames {config.frames}: 12 to 400 can be made; fewer leave no views far from the frames of their time"
@@ -121,11 +153,15 @@ def check(config: SynthConfig, fewest_paths: int) -> None:
     if not 0 <= config.seed < 1000:
         raise InputError(f"--seed {config.seed}: must be from 0 to 999")
     if fewest_paths < 1:
-        raise InputError(f"--spp {config.spp} --truth-spp {config.truth_spp}: at least one path per pixel is needed")
+        raise InputError(
+            f"--spp {config.spp} --truth-spp {config.truth_spp}: at least one path per pixel is needed"
+        )
     if not 0 <= config.noise < 1000:
         raise InputError(f"--noise {config.noise}: must be from 0 (a perfect sensor) to 1000")
     if not (0 <= config.depth_noise < 1 and 0 <= config.depth_grain < 1):
-        raise InputError(f"--depth-noise {config.depth_noise} --depth-grain {config.depth_grain}: must be from 0 (exact) to 1")
+        raise InputError(
+            f"--depth-noise {config.depth_noise} --depth-grain {config.depth_grain}: must be from 0 (exact) to 1"
+        )
     if not 0 <= config.flow_noise < 100:
         raise InputError(f"--flow-noise {config.flow_noise}: must be from 0 (exact) to 100 pixels")
 
@@ -134,7 +170,9 @@ def parse_size(text: str) -> tuple[int, int]:
     """(width, height) of "WxH"."""
     width, _, height = text.lower().partition("x")
     if not (width.isdecimal() and height.isdecimal() and int(width) >= 16 and int(height) >= 16):
-        raise InputError(f"--size {text!r}: write it as WIDTHxHEIGHT, such as 240x136, at least 16x16")
+        raise InputError(
+            f"--size {text!r}: write it as WIDTHxHEIGHT, such as 240x136, at least 16x16"
+        )
     return int(width), int(height)
 
 
@@ -143,7 +181,9 @@ def parse_ev(text: str) -> list[float]:
     try:
         evs = [float(e) for e in text.split(",")]
     except ValueError as error:
-        raise InputError(f"--ev {text!r}: write stops with commas between them, such as -4,-2,0") from error
+        raise InputError(
+            f"--ev {text!r}: write stops with commas between them, such as -4,-2,0"
+        ) from error
     if not np.isfinite(evs).all():
         raise InputError(f"--ev {text!r}: the stops must be finite numbers")
     return evs
@@ -154,37 +194,58 @@ def parse_white_balance(text: str) -> tuple[float, float, float]:
     try:
         red, green, blue = (float(g) for g in text.split(","))
     except ValueError as error:
-        raise InputError(f"--white-balance {text!r}: write three gains with commas between them, such as 1.12,1,0.87") from error
+        raise InputError(
+            f"--white-balance {text!r}: write three gains with commas between them, such as 1.12,1,0.87"
+        ) from error
     if not all(0.01 <= g <= 100 for g in (red, green, blue)):
         raise InputError(f"--white-balance {text!r}: the gains must be from 0.01 to 100")
     return red, green, blue
 
 
-def clip_shots(scene: SynthScene, frames: int, spp: int, seed: int, views: Views = "mono") -> list[Shot]:
+def clip_shots(
+    scene: SynthScene, frames: int, spp: int, seed: int, views: Views = "mono"
+) -> list[Shot]:
     """The frames of the clip."""
-    return [Shot(f"clip_{t:05d}", float(t), scene.pose(views, t), spp, seed * 1000 + t, t) for t in range(frames)]
+    return [
+        Shot(f"clip_{t:05d}", float(t), scene.pose(views, t), spp, seed * 1000 + t, t)
+        for t in range(frames)
+    ]
 
 
-def truth_shots(scene: SynthScene, frames: int, spp: int, seed: int, views: Views = "mono") -> list[Shot]:
-    """Held-out views: eight at whole times from the pose of another frame (mono: far away in time; rig: of a camera three
-    to six further around than the one that records then), six at half times, two off the path."""
+def truth_shots(
+    scene: SynthScene, frames: int, spp: int, seed: int, views: Views = "mono"
+) -> list[Shot]:
+    """Held-out views: eight at whole times from the pose of another frame (mono: far
+    away in time; rig: of a camera three to six further around than the one that records
+    then), six at half times, two off the path.
+    """
     shots: list[Shot] = []
 
-    def hold_out(kind: str, time: float, anchor: int, offset: tuple[float, float, float] | None = None) -> None:
+    def hold_out(
+        kind: str, time: float, anchor: int, offset: tuple[float, float, float] | None = None
+    ) -> None:
         c2w = scene.pose(views, anchor)
         if offset is not None:
             c2w[:, 3] += c2w[:, :3] @ np.asarray(offset)
-        name = f"{kind}_t{time:04.1f}_" + (f"pose{anchor:02d}" if views == "mono" else f"camera{anchor % len(scene.rig)}")
-        shots.append(Shot(name, time, c2w, spp, seed * 1000 + 500 + len(shots), anchor, offset is not None))
+        name = f"{kind}_t{time:04.1f}_" + (
+            f"pose{anchor:02d}" if views == "mono" else f"camera{anchor % len(scene.rig)}"
+        )
+        shots.append(
+            Shot(name, time, c2w, spp, seed * 1000 + 500 + len(shots), anchor, offset is not None)
+        )
 
     def other(time: int, rank: float) -> int:
         if views == "mono":
             return far_anchor(scene, time, frames, rank)
         return rig_anchor(time, frames, len(scene.rig), 3 + len(shots) % 4)
 
-    for time, rank in zip(np.linspace(1, frames - 2, 8).round().astype(int), np.linspace(0.3, 0.9, 8), strict=True):
+    for time, rank in zip(
+        np.linspace(1, frames - 2, 8).round().astype(int), np.linspace(0.3, 0.9, 8), strict=True
+    ):
         hold_out("view", float(time), other(time, rank))
-    for time, rank in zip(np.linspace(2, frames - 4, 6).round().astype(int), np.linspace(0.8, 0.3, 6), strict=True):
+    for time, rank in zip(
+        np.linspace(2, frames - 4, 6).round().astype(int), np.linspace(0.8, 0.3, 6), strict=True
+    ):
         hold_out("time", time + 0.5, other(time, rank))
     for time, offset in zip((frames // 3, 2 * frames // 3), OFF_PATH, strict=True):
         hold_out("off", float(time), time, offset)
@@ -192,42 +253,66 @@ def truth_shots(scene: SynthScene, frames: int, spp: int, seed: int, views: View
 
 
 def far_anchor(scene: SynthScene, time: int, frames: int, rank: float) -> int:
-    """A frame at least a quarter of the clip away from `time`: of all such, the one at `rank` in [0, 1] by distance."""
+    """A frame at least a quarter of the clip away from `time`: of all such, the one at
+    `rank` in [0, 1] by distance.
+    """
     others = [k for k in range(frames) if abs(k - time) >= frames // 4]
-    others.sort(key=lambda k: float(np.linalg.norm(scene.camera_pose(k)[:, 3] - scene.camera_pose(time)[:, 3])))
+    others.sort(
+        key=lambda k: float(
+            np.linalg.norm(scene.camera_pose(k)[:, 3] - scene.camera_pose(time)[:, 3])
+        )
+    )
     return others[round(rank * (len(others) - 1))]
 
 
 def rig_anchor(time: int, frames: int, cameras: int, step: int) -> int:
-    """The frame nearest to `time` of the rig's camera `step` further around than the one that records then."""
+    """The frame nearest to `time` of the rig's camera `step` further around than the
+    one that records then.
+    """
     recorded = range((time + step) % cameras, frames, cameras)
     return min(recorded, key=lambda k: abs(k - time))
 
 
 def claim(config: SynthConfig) -> None:
-    """Mark the output folder with what it is rendered from; refuse one that holds something else."""
-    key = {k: v for k, v in asdict(config).items() if k in ("size", "frames", "spp", "truth_spp", "seed")}
-    key |= {k: v for k, v in (("views", config.views), ("name", config.name)) if v not in ("mono", "interior")}
+    """Mark the output folder with what it is rendered from; refuse one that holds
+    something else.
+    """
+    key = {
+        k: v
+        for k, v in asdict(config).items()
+        if k in ("size", "frames", "spp", "truth_spp", "seed")
+    }
+    key |= {
+        k: v
+        for k, v in (("views", config.views), ("name", config.name))
+        if v not in ("mono", "interior")
+    }
     digest = hashlib.sha256(json.dumps(key).encode()).hexdigest()[:16]
     path = config.out / "exact" / "key.json"
     if config.out.exists() and not config.out.is_dir():
         raise InputError(f"{config.out}: is a file; name a folder to write")
     if path.is_file() and digest not in path.read_text(encoding="utf-8", errors="replace"):
-        raise InputError(f"{config.out}: holds a scene rendered with other settings; choose another folder or remove it")
+        raise InputError(
+            f"{config.out}: holds a scene rendered with other settings; choose another folder or remove it"
+        )
     if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
         raise InputError(f"{config.out}: holds something else; choose a new or an empty folder")
     io.write_json(path, {"digest": digest, **key})
 
 
 def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: SynthConfig) -> None:
-    """Path-trace what is not in exact/ yet; says beforehand how long it will take, and in the end how long a picture took."""
+    """Path-trace what is not in exact/ yet; says beforehand how long it will take, and
+    in the end how long a picture took.
+    """
     missing = [s for s in shots if not (config.out / "exact" / f"{s.name}.exr").is_file()]
     if not missing:
         return
     scene = SCENES[config.name]
     tracer = Tracer(scene, config.seed, config.variant)
     seconds = estimate(tracer, missing, K, size)
-    say(f"{config.name}: {len(missing)} pictures of {size[0]}x{size[1]} to trace, about {seconds / 60:.1f} minutes")
+    say(
+        f"{config.name}: {len(missing)} pictures of {size[0]}x{size[1]} to trace, about {seconds / 60:.1f} minutes"
+    )
     spent: dict[int, list[float]] = {}
     for shot in track(missing, "path tracing"):
         began = clock.monotonic()
@@ -236,12 +321,16 @@ def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: Synt
         channels["RGB"] = tracer.radiance(shot.time, K, shot.c2w, size, shot.spp, shot.seed)
         io.write_exr(config.out / "exact" / f"{shot.name}.exr", channels, half=False)
         spent.setdefault(shot.spp, []).append(clock.monotonic() - began)
-    cost = ", ".join(f"{np.mean(s):.1f} s per picture at {spp} paths per pixel" for spp, s in spent.items())
+    cost = ", ".join(
+        f"{np.mean(s):.1f} s per picture at {spp} paths per pixel" for spp, s in spent.items()
+    )
     say(f"{config.name}: traced in {sum(map(sum, spent.values())) / 60:.1f} minutes; {cost}")
 
 
 def estimate(tracer: Tracer, shots: list[Shot], K: np.ndarray, size: tuple[int, int]) -> float:
-    """How many seconds the pictures will take, from the first of them with one path per pixel and with as many as are traced at once."""
+    """How many seconds the pictures will take, from the first of them with one path per
+    pixel and with as many as are traced at once.
+    """
     shot = shots[0]
     few = min(PASS, shot.spp)
     taken = []
@@ -253,14 +342,20 @@ def estimate(tracer: Tracer, shots: list[Shot], K: np.ndarray, size: tuple[int, 
     return sum(taken[1] + per_path * (s.spp - 1) for s in shots)
 
 
-def geometry_channels(scene: SynthScene, surface: Surface, shot: Shot, K: np.ndarray, views: Views) -> dict[str, np.ndarray]:
-    """What a picture shows: depth, bodies, where something deforms the place on it, and of a clip's frame the flow to the ones beside."""
+def geometry_channels(
+    scene: SynthScene, surface: Surface, shot: Shot, K: np.ndarray, views: Views
+) -> dict[str, np.ndarray]:
+    """What a picture shows: depth, bodies, where something deforms the place on it, and
+    of a clip's frame the flow to the ones beside.
+    """
     channels = {"Z": surface.depth, "body": surface.bodies.astype(np.float32)}
     if scene.deforms:
         channels |= {name: surface.uv[..., k] * (surface.bodies > 0) for k, name in enumerate(UV)}
     if shot.name.startswith("clip"):
         for side, name in io.SIDES.items():
-            there = scene.moved(surface.points, surface.bodies, surface.uv, shot.time, shot.time + side)
+            there = scene.moved(
+                surface.points, surface.bodies, surface.uv, shot.time, shot.time + side
+            )
             flow = exact_flow(there, K, scene.pose(views, shot.time + side))
             channels |= {f"{name}.u": flow[..., 0], f"{name}.v": flow[..., 1]}
     return channels
@@ -271,8 +366,12 @@ def exact(out: Path, shot: Shot) -> dict[str, np.ndarray]:
     return io.read_exr(out / "exact" / f"{shot.name}.exr")
 
 
-def record_clip(clip: list[Shot], relative: list[float], K: np.ndarray, config: SynthConfig) -> np.ndarray:
-    """Record every frame at its bracket's exposure; write clip/ and clip.mp4; the frames (T, H, W, 3)."""
+def record_clip(
+    clip: list[Shot], relative: list[float], K: np.ndarray, config: SynthConfig
+) -> np.ndarray:
+    """Record every frame at its bracket's exposure; write clip/ and clip.mp4; the
+    frames (T, H, W, 3).
+    """
     curve, gains = response_curve(config.response), parse_white_balance(config.white_balance)
     noise = Noise(1e-3 * config.noise, config.noise**2 / 6000) if config.noise > 0 else None
     video = []
@@ -280,23 +379,34 @@ def record_clip(clip: list[Shot], relative: list[float], K: np.ndarray, config: 
         rng = np.random.default_rng([config.seed, t])
         radiance = exact(config.out, shot)["RGB"]
         passed = vignette(radiance.shape[0], radiance.shape[1], K, config.vignetting)
-        video.append(record(radiance, relative[t % len(relative)], gains, curve, noise, rng, passed))
+        video.append(
+            record(radiance, relative[t % len(relative)], gains, curve, noise, rng, passed)
+        )
         io.write_png(config.out / "clip" / f"{t:05d}.png", video[-1])
     io.write_video(config.out / "clip.mp4", video, crf=VIDEO_CRF, footage=True)
     return np.stack(video)
 
 
 def list_exposures(evs: list[float], config: SynthConfig) -> None:
-    """The exposure of every frame beside the footage: from camera to camera brightness changes for other reasons too."""
+    """The exposure of every frame beside the footage: from camera to camera brightness
+    changes for other reasons too.
+    """
     rows = [f"{t},{evs[t % len(evs)]:g}" for t in range(config.frames)]
     for path in (config.out / "clip.csv", config.out / "clip" / "exposures.csv"):
         io.write_text(path, "\n".join(["frame,ev", *rows, ""]))
 
 
 def write_truth(
-    clip: list[Shot], views: list[Shot], K: np.ndarray, relative: list[float], reference: int, config: SynthConfig
+    clip: list[Shot],
+    views: list[Shot],
+    K: np.ndarray,
+    relative: list[float],
+    reference: int,
+    config: SynthConfig,
 ) -> None:
-    """truth/: truth.json, radiance as half EXR, moving masks, depth and motion as float EXR."""
+    """truth/: truth.json, radiance as half EXR, moving masks, depth and motion as float
+    EXR.
+    """
     folder, curve = config.out / "truth", response_curve(config.response)
     entries = []
     for k, shot in enumerate(views):

@@ -1,9 +1,13 @@
-"""Numba kernels of the recording on the CPU: gain, response curve and the ends of eq. 11 in one pass over the pixels, and back.
+"""Numba kernels of the recording on the CPU: gain, response curve and the ends of eq.
+11 in one pass over the pixels, and back.
 
-A value's bin comes without a power. Floats in [0, 1] that share their upper 16 bits make a cell; a table says in which bin a cell
-begins, and since no cell holds two knots, the bin is that one or the next. Pixels are taken in a fixed number of chunks that add up
-what they say of curve and gain each for itself: the same sums whatever the number of threads. The plain-torch twin is in `tonemap.py`;
-a test compares them. At a knot, where the slope jumps, either neighbor's is right and the twins may differ."""
+A value's bin comes without a power. Floats in [0, 1] that share their upper 16 bits
+make a cell; a table says in which bin a cell begins, and since no cell holds two knots,
+the bin is that one or the next. Pixels are taken in a fixed number of chunks that add
+up what they say of curve and gain each for itself: the same sums whatever the number of
+threads. The plain-torch twin is in `tonemap.py`; a test compares them. At a knot, where
+the slope jumps, either neighbor's is right and the twins may differ.
+"""
 
 from __future__ import annotations
 
@@ -22,10 +26,14 @@ NEXT, HALF_BITS, NO_SIGN = np.uint32(1), np.uint32(16), np.uint32(0x7FFF)
 
 
 def bin_table(knots: Tensor) -> Tensor:
-    """Bin (CELLS,) int16 in which each cell of [0, 1] begins, for rising float32 knots (K,) from 0 to 1."""
+    """Bin (CELLS,) int16 in which each cell of [0, 1] begins, for rising float32 knots
+    (K,) from 0 to 1.
+    """
     starts = (torch.arange(CELLS, dtype=torch.int32, device=knots.device) << 16).view(torch.float32)
     bins = (torch.searchsorted(knots, starts) - 1).clamp(0, len(knots) - 2)
-    assert int(bins.diff().max()) <= 1, "two knots in one cell: the curve has too many for this table"
+    assert int(bins.diff().max()) <= 1, (
+        "two knots in one cell: the curve has too many for this table"
+    )
     return bins.to(torch.int16)
 
 
@@ -39,9 +47,12 @@ def bin_of(x, knots, table):
 
 @numba.njit(parallel=True, nogil=True, cache=True)
 def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
-    """Fill `out` (3, N) with what is recorded of `radiance` (3, N) through `gain` (3,) and a curve `values` (3, K) at `knots` (K,).
+    """Fill `out` (3, N) with what is recorded of `radiance` (3, N) through `gain` (3,)
+    and a curve `values` (3, K) at `knots` (K,).
 
-    `inverse` (K - 1,) is 1 / width of the bins, `table` that of `bin_table`; not `leaky`: clamped instead of eq. 11."""
+    `inverse` (K - 1,) is 1 / width of the bins, `table` that of `bin_table`; not
+    `leaky`: clamped instead of eq. 11.
+    """
     n, top = radiance.shape[1], F1 + leak
     for k in numba.prange(CHUNKS):
         for c in range(3):
@@ -50,7 +61,9 @@ def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
                 x = seen[i] * factor
                 if F0 <= x <= F1:
                     b = bin_of(x, knots, table)
-                    told[i] = curve[b] + (curve[b + NEXT] - curve[b]) * ((x - knots[b]) * inverse[b])
+                    told[i] = curve[b] + (curve[b + NEXT] - curve[b]) * (
+                        (x - knots[b]) * inverse[b]
+                    )
                 elif x > F1:
                     told[i] = top - leak / np.sqrt(x) if leaky else curve[-1]
                 elif x < F0:
@@ -60,8 +73,23 @@ def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
 
 
 @numba.njit(parallel=True, nogil=True, cache=True)
-def backward(radiance, gain, values, knots, inverse, table, leaky, leak, grad_out, grad_radiance, grad_gain, grad_values):
-    """Fill `grad_radiance` (3, N) and `grad_gain` (CHUNKS, 3) and add to `grad_values` (CHUNKS, 3, K): sums over the chunks are to be taken."""
+def backward(
+    radiance,
+    gain,
+    values,
+    knots,
+    inverse,
+    table,
+    leaky,
+    leak,
+    grad_out,
+    grad_radiance,
+    grad_gain,
+    grad_values,
+):
+    """Fill `grad_radiance` (3, N) and `grad_gain` (CHUNKS, 3) and add to `grad_values`
+    (CHUNKS, 3, K): sums over the chunks are to be taken.
+    """
     n, half = radiance.shape[1], leak / np.float32(2)
     for k in numba.prange(CHUNKS):
         for c in range(3):
@@ -90,16 +118,32 @@ def backward(radiance, gain, values, knots, inverse, table, leaky, leak, grad_ou
 
 
 class Respond(torch.autograd.Function):
-    """Recorded rgb (N, 3) of `radiance` (N, 3) through `gain` (3,) and a curve (3, K) at `knots` (K,), all float32 on the CPU.
+    """Recorded rgb (N, 3) of `radiance` (N, 3) through `gain` (3,) and a curve (3, K)
+    at `knots` (K,), all float32 on the CPU.
 
-    Ends as in eq. 11 with `leak`, clamped where that is None. `table` is `bin_table(knots)`. The kernels work channel by channel, so
-    radiance that lies in memory like that is not copied, and the recording lies like that, too."""
+    Ends as in eq. 11 with `leak`, clamped where that is None. `table` is
+    `bin_table(knots)`. The kernels work channel by channel, so radiance that lies in
+    memory like that is not copied, and the recording lies like that, too.
+    """
 
     @staticmethod
     def forward(
-        ctx: Any, radiance: Tensor, gain: Tensor, values: Tensor, knots: Tensor, table: Tensor, leak: float | None
+        ctx: Any,
+        radiance: Tensor,
+        gain: Tensor,
+        values: Tensor,
+        knots: Tensor,
+        table: Tensor,
+        leak: float | None,
     ) -> Tensor:
-        saved = radiance.T.contiguous(), gain.contiguous(), values.contiguous(), knots, 1 / knots.diff(), table
+        saved = (
+            radiance.T.contiguous(),
+            gain.contiguous(),
+            values.contiguous(),
+            knots,
+            1 / knots.diff(),
+            table,
+        )
         ctx.save_for_backward(*saved)
         ctx.ends = leak is not None, np.float32(leak or 0)
         out = torch.empty_like(saved[0])
@@ -114,5 +158,17 @@ class Respond(torch.autograd.Function):
         grad_gain = torch.empty(CHUNKS, 3, dtype=torch.float64)
         grad_values = torch.zeros(CHUNKS, *saved[2].shape, dtype=torch.float64)
         grads = grad_radiance, grad_gain, grad_values
-        backward(*(t.detach().numpy() for t in saved), *ctx.ends, grad_out.T.contiguous().numpy(), *(t.numpy() for t in grads))
-        return grad_radiance.T, grad_gain.sum(0).float(), grad_values.sum(0).float(), None, None, None
+        backward(
+            *(t.detach().numpy() for t in saved),
+            *ctx.ends,
+            grad_out.T.contiguous().numpy(),
+            *(t.numpy() for t in grads),
+        )
+        return (
+            grad_radiance.T,
+            grad_gain.sum(0).float(),
+            grad_values.sum(0).float(),
+            None,
+            None,
+            None,
+        )

@@ -9,13 +9,18 @@ GAMMA = 2.2
 WIDTH = 128  # of the hidden layer
 SMALLEST = 1e-6  # exposure below which the logarithm is held
 MIDDLE = 0.5  # the recorded value that is held, where the starting curve reaches it
-BENDS = (-12.0, -0.4)  # log exposures where hidden units bend at the start; above, gently on, so that a gradient is left
+BENDS = (
+    -12.0,
+    -0.4,
+)  # log exposures where hidden units bend at the start; above, gently on, so that a gradient is left
 FLOOR = 0.004  # recorded values closer to 0 and 1 than this are taken for it: they have no logit
 RIDGE = 1e-6
 
 
 class SharedResponse(nn.Module):
-    """One monotone curve per camera and channel: cumulative positive steps that add up to 1, so g(0) = 0 and g(1) = 1."""
+    """One monotone curve per camera and channel: cumulative positive steps that add up
+    to 1, so g(0) = 0 and g(1) = 1.
+    """
 
     def __init__(self, num_cameras: int, knots: Tensor, min_step: float) -> None:
         super().__init__()
@@ -31,20 +36,28 @@ class SharedResponse(nn.Module):
         steps = torch.softmax(self.logits[camera_id], -1)
         steps = steps * (1 - self.min_step) + self.min_step / steps.shape[-1]
         inner = torch.cumsum(steps[..., :-1], -1)
-        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
+        return torch.cat(
+            [torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1
+        )
 
     def set_values(self, y: Tensor, camera_id: int | None = None) -> None:
-        """Take on the values `y` (K,) or (3, K) at the knots; falling or flat pieces become the smallest step."""
+        """Take on the values `y` (K,) or (3, K) at the knots; falling or flat pieces
+        become the smallest step.
+        """
         steps = y.double().diff(dim=-1).clamp_min(0)
         share = steps / steps.sum(-1, keepdim=True).clamp_min(1e-12)
         floor = self.min_step / steps.shape[-1]
         share = ((share - floor) / (1 - self.min_step)).clamp_min(floor * 1e-2)
         with torch.no_grad():
-            self.logits[slice(None) if camera_id is None else camera_id] = share.log().to(self.logits)
+            self.logits[slice(None) if camera_id is None else camera_id] = share.log().to(
+                self.logits
+            )
 
 
 class ImageResponse(nn.Module):
-    """The paper's response: free points per image and channel, ends fixed, started at x^(1/2.2); nothing keeps it monotone."""
+    """The paper's response: free points per image and channel, ends fixed, started at
+    x^(1/2.2); nothing keeps it monotone.
+    """
 
     def __init__(self, num_images: int, knots: Tensor) -> None:
         super().__init__()
@@ -56,7 +69,9 @@ class ImageResponse(nn.Module):
     def values(self, image: int | slice | Tensor) -> Tensor:
         """The curve at the knots: (3, K), or (images, 3, K)."""
         inner = self.points[image]
-        return torch.cat([torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1)
+        return torch.cat(
+            [torch.zeros_like(inner[..., :1]), inner, torch.ones_like(inner[..., :1])], -1
+        )
 
     def set_values(self, y: Tensor) -> None:
         """Take on the values `y` (K,) or (3, K) for every image."""
@@ -65,9 +80,12 @@ class ImageResponse(nn.Module):
 
 
 class NetworkResponse(nn.Module):
-    """The response as a network (HDR-NeRF, Huang et al. 2022): `sigmoid(out . relu(w ln x + b))` per channel, one for all cameras.
+    """The response as a network (HDR-NeRF, Huang et al. 2022): `sigmoid(out . relu(w ln
+    x + b))` per channel, one for all cameras.
 
-    It is not monotone by construction and its ends are free; HDR-NeRF fixes the scale by holding one point of it, as `unit_point` does."""
+    It is not monotone by construction and its ends are free; HDR-NeRF fixes the scale
+    by holding one point of it, as `unit_point` does.
+    """
 
     knots: Tensor
     unit: Tensor
@@ -85,7 +103,9 @@ class NetworkResponse(nn.Module):
         self.set_values(start)
 
     def forward(self, exposure: Tensor) -> Tensor:
-        """Recorded values (N, 3) in (0, 1) of exposures (N, 3); what is not above 0 counts as `SMALLEST`."""
+        """Recorded values (N, 3) in (0, 1) of exposures (N, 3); what is not above 0
+        counts as `SMALLEST`.
+        """
         return self.of_log(exposure.clamp_min(SMALLEST).log())
 
     def of_log(self, log: Tensor) -> Tensor:
@@ -101,12 +121,16 @@ class NetworkResponse(nn.Module):
         return self(self.knots[:, None].expand(-1, 3)).T
 
     def unit_point(self) -> Tensor:
-        """Square distance from `MIDDLE` of what is recorded at the unit exposure: HDR-NeRF's unit exposure loss, which fixes the scale."""
+        """Square distance from `MIDDLE` of what is recorded at the unit exposure:
+        HDR-NeRF's unit exposure loss, which fixes the scale.
+        """
         return (self.of_log(self.unit[None]) - MIDDLE).square().sum()
 
     @torch.no_grad()
     def set_values(self, y: Tensor) -> None:
-        """Take on the curve `y` (K,) or (3, K) at the knots: the outer layer by least squares in the recorded value, to first order."""
+        """Take on the curve `y` (K,) or (3, K) at the knots: the outer layer by least
+        squares in the recorded value, to first order.
+        """
         y = y.to(self.knots).expand(3, -1)
         self.unit.copy_(self.knots[(y >= MIDDLE).float().argmax(-1).clamp_min(1)].log())
         hidden = self.hidden(self.knots[1:, None].expand(-1, 3).log()).double()
@@ -116,5 +140,7 @@ class NetworkResponse(nn.Module):
             ones = torch.ones_like(hidden[:, c, :1])
             a = torch.cat([hidden[:, c], ones], -1) * slope
             ridge = RIDGE * torch.eye(WIDTH + 1, dtype=a.dtype, device=a.device)
-            found = torch.linalg.solve(a.T @ a + ridge, a.T @ (target[c, :, None].logit() * slope))[:, 0].to(self.out)
+            found = torch.linalg.solve(a.T @ a + ridge, a.T @ (target[c, :, None].logit() * slope))[
+                :, 0
+            ].to(self.out)
             self.out[c], self.level[c] = found[:-1], found[-1]

@@ -1,4 +1,6 @@
-"""The settings of a training run, composed from each room's own, and the presets. Saved in the run; enough to rebuild it."""
+"""The settings of a training run, composed from each room's own, and the presets. Saved
+in the run; enough to rebuild it.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,9 @@ VERSION = 2  # of a run's config.json
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Train a dynamic HDR radiance field from a prepared scene. Killed runs go on where they were."""
+    """Train a dynamic HDR radiance field from a prepared scene. Killed runs go on where
+    they were.
+    """
 
     scene: Path = Path("scene")
     """Scene folder, as `prepare` wrote it."""
@@ -33,9 +37,13 @@ class TrainConfig:
     tonemap: ToneMapConfig = dataclasses.field(default_factory=ToneMapConfig)
     loss: LossWeights = dataclasses.field(default_factory=LossWeights)
     steps: int | None = None
-    """Stop after this many steps. The same seed and steps give the same result, also through kills and restarts."""
+    """Stop after this many steps. The same seed and steps give the same result, also
+    through kills and restarts.
+    """
     minutes: float | None = 5.0
-    """Without `steps`: stop after this many minutes of training; learning rates and schedules follow the clock."""
+    """Without `steps`: stop after this many minutes of training; learning rates and
+    schedules follow the clock.
+    """
     rays: int = 1536
     """Uniformly drawn pixels of a batch; 0: the whole frame."""
     moving_rays: int = 512
@@ -45,22 +53,32 @@ class TrainConfig:
     batches: int = 1
     """Batches (each of one random frame) of a step, over all devices together."""
     period: float = 0.45
-    """The schedules' period K as a share of the run; 0: the published K = 1000 min(max(30, frames), 250) steps."""
+    """The schedules' period K as a share of the run; 0: the published K = 1000
+    min(max(30, frames), 250) steps.
+    """
     prior_fade: float = 1.0
     """Depth and flow weights are multiplied by this every period (published: 0.1)."""
     lr_final: float = 0.05
-    """Learning rates fall exponentially to this share of their start over the run; 0: the published 0.1 per 300k steps."""
+    """Learning rates fall exponentially to this share of their start over the run; 0:
+    the published 0.1 per 300k steps.
+    """
     tonemap_lr: float = 2e-3
     anchor_at: float = 0.05
-    """Share of the run after which response and exposures are held where they are (1: never), unless static points told them: then at once."""
+    """Share of the run after which response and exposures are held where they are (1:
+    never), unless static points told them: then at once.
+    """
     from_priors: bool = True
-    """Start the field from the depth prior and the recorded colors (no effect on the published network)."""
+    """Start the field from the depth prior and the recorded colors (no effect on the
+    published network).
+    """
     refine_poses: bool = False
-    """Correct the training cameras (poses and focal length) a little, by the picture."""
+    """Correct the training cameras (poses and focal length) a little, by the picture.
+    """
     pose_lr: float = 6e-4
     """Of these corrections, as a motion of the picture in shares of its width."""
     squared: bool = False
-    """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
+    """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference).
+    """
     saturation: bool = True
     """Trust recorded values near 0 and 1 less in the dynamic terms."""
     bf16: bool = False
@@ -69,7 +87,9 @@ class TrainConfig:
     device: str = "auto"
     """auto, cpu or cuda."""
     torch_threads: int = 1
-    """Threads of torch beside the kernels' own, which do the work: waking more for small operations costs more than they give. 0: all."""
+    """Threads of torch beside the kernels' own, which do the work: waking more for
+    small operations costs more than they give. 0: all.
+    """
     checkpoint_seconds: float = 60.0
     """Seconds between checkpoints and preview pictures."""
 
@@ -83,9 +103,13 @@ class TrainConfig:
 
     @staticmethod
     def from_json(data: dict[str, Any]) -> TrainConfig:
-        """The config of a run. InputError where it is of another version, or a key is missing or unknown."""
+        """The config of a run. InputError where it is of another version, or a key is
+        missing or unknown.
+        """
         if not isinstance(data, dict) or data.get("version") != VERSION:
-            raise InputError("the run's config.json is of another version of hdr-nsff; train again into a new folder")
+            raise InputError(
+                "the run's config.json is of another version of hdr-nsff; train again into a new folder"
+            )
         try:
             data = {k: v for k, v in data.items() if k != "version"}
             parts = {
@@ -127,7 +151,16 @@ FROM_ONE = {
     "render_samples",
     "levels",
 }
-FROM_ONE |= {"depth_cells", "max_rows", "layers", "width", "static", "code_size", "head_width", "grow_every"}
+FROM_ONE |= {
+    "depth_cells",
+    "max_rows",
+    "layers",
+    "width",
+    "static",
+    "code_size",
+    "head_width",
+    "grow_every",
+}
 FROM_ONE |= {"density_components", "appearance_components", "coarsest", "finest"}
 AT_MOST = {
     "static": 1e8,
@@ -140,13 +173,17 @@ AT_MOST = {
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """InputError that names the option whose value is of the wrong type or cannot be. Settings are frozen dataclasses of dataclasses,
-    numbers (none may be negative), words, switches and paths."""
+    """InputError that names the option whose value is of the wrong type or cannot be.
+    Settings are frozen dataclasses of dataclasses, numbers (none may be negative),
+    words, switches and paths.
+    """
     hints = get_type_hints(type(settings))
     for f in dataclasses.fields(settings):
         value, option = getattr(settings, f.name), f"--{prefix}{f.name.replace('_', '-')}"
         if not fits(value, hints[f.name]):
-            raise InputError(f"{option} {value!r:.40}: no such value; `hdr-nsff train --help` lists what there is")
+            raise InputError(
+                f"{option} {value!r:.40}: no such value; `hdr-nsff train --help` lists what there is"
+            )
         if dataclasses.is_dataclass(value):
             check(value, f"{prefix}{f.name.replace('_', '-')}.")
         elif isinstance(value, int | float) and not isinstance(value, bool):
@@ -168,9 +205,19 @@ def fits(value: Any, kind: Any) -> bool:
 
 
 def splat() -> TrainConfig:
-    """4D Gaussians: minutes to train on a CPU, tens of small frames a second. Flow and rigidity are looked at every second step each."""
+    """4D Gaussians: minutes to train on a CPU, tens of small frames a second. Flow and
+    rigidity are looked at every second step each.
+    """
     weights = LossWeights(
-        dynamic=0.0, temporal=0.0, chain=0.0, cycle=0.0, flow_magnitude=0.0, depth=0.2, flow=0.02, mask=0.1, rigidity=2.0
+        dynamic=0.0,
+        temporal=0.0,
+        chain=0.0,
+        cycle=0.0,
+        flow_magnitude=0.0,
+        depth=0.2,
+        flow=0.02,
+        mask=0.1,
+        rigidity=2.0,
     )
     return TrainConfig(field=SplatConfig(), loss=weights, rays=0, moving_rays=0, lr_final=0.03)
 
@@ -200,20 +247,28 @@ def paper() -> TrainConfig:
 def tiny() -> TrainConfig:
     """Seconds on a CPU, for tests and for trying out."""
     network = NSFFConfig(
-        GridConfig(finest=4.0, depth_cells=24, levels=2, max_rows=2**14), samples=16, render_samples=24, cull_after=20
+        GridConfig(finest=4.0, depth_cells=24, levels=2, max_rows=2**14),
+        samples=16,
+        render_samples=24,
+        cull_after=20,
     )
     return TrainConfig(field=network, steps=60, minutes=None, rays=192, moving_rays=64, batches=1)
 
 
-# Baselines (METHOD.md 6); docs/baselines.md says of each what is the same, what had to differ and why
+# Baselines (METHOD.md 6); docs/baselines.md says of each what is the same, what had to
+# differ and why
 
 
-NOTHING = LossWeights(**{f.name: 0.0 for f in dataclasses.fields(LossWeights)} | {"photometric": 1.0})
+NOTHING = LossWeights(
+    **{f.name: 0.0 for f in dataclasses.fields(LossWeights)} | {"photometric": 1.0}
+)
 LDR = ToneMapConfig(kind="none")
 
 
 def nsff_paper() -> TrainConfig:
-    """NSFF at its published size: `paper` without a tone mapper, with squared errors that trust every recorded value."""
+    """NSFF at its published size: `paper` without a tone mapper, with squared errors
+    that trust every recorded value.
+    """
     return replace(paper(), tonemap=LDR, squared=True, saturation=False)
 
 
@@ -230,14 +285,23 @@ def nsff() -> TrainConfig:
 
 def nerf_wt_paper() -> TrainConfig:
     """NeRF-W with time at the size of its public implementation."""
-    field = NerfWTConfig(MlpConfig(), samples=128, render_samples=128, density="relu", density_noise=1.0, cull=False)
+    field = NerfWTConfig(
+        MlpConfig(), samples=128, render_samples=128, density="relu", density_noise=1.0, cull=False
+    )
     return replace(nsff_paper(), field=field, loss=replace(NOTHING, transient=0.01), moving_rays=0)
 
 
 def nerf_wt() -> TrainConfig:
     """The same on the grids of `grid`, with the geometry that grids need."""
     weights = replace(NOTHING, transient=0.01, depth=0.5)
-    return TrainConfig(field=NerfWTConfig(), tonemap=LDR, loss=weights, squared=True, saturation=False, moving_rays=0)
+    return TrainConfig(
+        field=NerfWTConfig(),
+        tonemap=LDR,
+        loss=weights,
+        squared=True,
+        saturation=False,
+        moving_rays=0,
+    )
 
 
 def hexplane_paper() -> TrainConfig:
@@ -250,11 +314,21 @@ def hexplane_paper() -> TrainConfig:
 
 
 def hexplane() -> TrainConfig:
-    """The same for minutes on a CPU: smaller grids and batches, and rates for a twentieth of the steps."""
+    """The same for minutes on a CPU: smaller grids and batches, and rates for a
+    twentieth of the steps.
+    """
     field = HexPlaneConfig(
         coarsest=48, finest=128, grow_every=200, emptiness=5.0, samples=32, render_samples=48, cull_after=50, plane_lr=0.05, network_lr=5e-3
     )  # fmt: skip
-    return replace(hexplane_paper(), field=field, steps=None, minutes=5.0, rays=512, torch_threads=1, checkpoint_seconds=120)
+    return replace(
+        hexplane_paper(),
+        field=field,
+        steps=None,
+        minutes=5.0,
+        rays=512,
+        torch_threads=1,
+        checkpoint_seconds=120,
+    )
 
 
 # Ablations of ours
@@ -286,10 +360,15 @@ def ablated(config: TrainConfig, name: str) -> TrainConfig:
 
 
 def ablations() -> dict[str, TrainConfig]:
-    """By name, `grid-no-flow` and the like. Gaussians have no term that saturation weighs."""
+    """By name, `grid-no-flow` and the like. Gaussians have no term that saturation
+    weighs.
+    """
     presets = {"splat": splat(), "grid": TrainConfig()}
     return {
-        f"{p}-{a}": ablated(config, a) for p, config in presets.items() for a in ABLATIONS if (p, a) != ("splat", "no-saturation")
+        f"{p}-{a}": ablated(config, a)
+        for p, config in presets.items()
+        for a in ABLATIONS
+        if (p, a) != ("splat", "no-saturation")
     }
 
 

@@ -1,5 +1,7 @@
-"""Depth and motion against the exact ones. A scene's scale is its own: depth takes one scale for all views, the median ratio, and scene
-flow that of the similarity between estimated and true camera centers. Motion is per frame, to later and to earlier times."""
+"""Depth and motion against the exact ones. A scene's scale is its own: depth takes one
+scale for all views, the median ratio, and scene flow that of the similarity between
+estimated and true camera centers. Motion is per frame, to later and to earlier times.
+"""
 
 from __future__ import annotations
 
@@ -36,17 +38,25 @@ GEOMETRY_SCORES = {  # what they are called, and digits after the point
 class Units:
     """True units per scene unit."""
 
-    depth: float  # by which predicted depth is multiplied, for all views: the median of truth / prediction
-    world: float | None  # of the similarity between the camera paths; None where the cameras do not spread
+    # by which predicted depth is multiplied, for all views: the median of truth /
+    # prediction
+    depth: float
+    world: (
+        float | None
+    )  # of the similarity between the camera paths; None where the cameras do not spread
 
 
 def true_geometry(file: GeometryFile) -> Geometry:
     """Depth and motion of a truth file, in true units along the axes of the scene."""
     channels = io.read_exr(file.path)
     if lost := [n for n in GEOMETRY if n not in channels]:
-        raise InputError(f"{file.path}: no channel {lost[0]} in this truth file; make the truth anew")
+        raise InputError(
+            f"{file.path}: no channel {lost[0]} in this truth file; make the truth anew"
+        )
     if channels["Z"].shape != file.size:
-        raise InputError(f"{file.path}: depth of {channels['Z'].shape}, but the pictures of that view are {file.size}")
+        raise InputError(
+            f"{file.path}: depth of {channels['Z'].shape}, but the pictures of that view are {file.size}"
+        )
 
     def stacked(name: str, axes: str) -> Tensor:
         return torch.from_numpy(np.stack([channels[f"{name}.{a}"] for a in axes], -1))
@@ -59,8 +69,12 @@ def true_geometry(file: GeometryFile) -> Geometry:
     )
 
 
-def find_units(targets: Sequence[Target], predictions: Sequence[Path], world_scale: float | None) -> Units | None:
-    """One set of units for all views; None where no view has a true depth. `world_scale`: scene units per true unit."""
+def find_units(
+    targets: Sequence[Target], predictions: Sequence[Path], world_scale: float | None
+) -> Units | None:
+    """One set of units for all views; None where no view has a true depth.
+    `world_scale`: scene units per true unit.
+    """
     pairs = [
         (geometry_of(path, t.view).depth.flatten(), true_geometry(t.geometry).depth.flatten())
         for t, path in zip(targets, predictions, strict=True)
@@ -73,7 +87,9 @@ def find_units(targets: Sequence[Target], predictions: Sequence[Path], world_sca
 
 
 def score_geometry(target: Target, prediction: Path, units: Units) -> dict[str, float]:
-    """Depth and motion of a view; names as in `GEOMETRY_SCORES`. Only where the true ray hits something; moving-only where that moves."""
+    """Depth and motion of a view; names as in `GEOMETRY_SCORES`. Only where the true
+    ray hits something; moving-only where that moves.
+    """
     if target.geometry is None:
         return {}
     seen, true = geometry_of(prediction, target.view), true_geometry(target.geometry)
@@ -90,16 +106,22 @@ def score_geometry(target: Target, prediction: Path, units: Units) -> dict[str, 
 
 
 def motion_errors(seen: Geometry, true: Geometry, region: Tensor, units: Units) -> dict[str, float]:
-    """End-point errors over a region (H, W), mean of both directions (or of the one that the run tells); empty where it tells neither."""
+    """End-point errors over a region (H, W), mean of both directions (or of the one
+    that the run tells); empty where it tells neither.
+    """
     sides = list(seen.flow)
     if not sides:
         return {}
     errors = {
         "flow_epe": [metrics.end_point_error(seen.flow[s], true.flow[s], region) for s in sides],
-        "flow_epe_of_rest": [metrics.end_point_error(torch.zeros_like(true.flow[s]), true.flow[s], region) for s in sides],
+        "flow_epe_of_rest": [
+            metrics.end_point_error(torch.zeros_like(true.flow[s]), true.flow[s], region)
+            for s in sides
+        ],
     }
     if (world := units.world) is not None:
         errors["scene_flow_epe"] = [
-            metrics.end_point_error(seen.scene_flow[s] * world, true.scene_flow[s], region) for s in sides
+            metrics.end_point_error(seen.scene_flow[s] * world, true.scene_flow[s], region)
+            for s in sides
         ]
     return {name: float(np.mean(values)) for name, values in errors.items()}

@@ -1,5 +1,7 @@
-"""How steady the radiance is along the clip's own path: flicker that no single held-out view shows. Consecutive training frames are
-rendered and compared along the clip's optical flow, which every method trained on one scene folder shares."""
+"""How steady the radiance is along the clip's own path: flicker that no single held-out
+view shows. Consecutive training frames are rendered and compared along the clip's
+optical flow, which every method trained on one scene folder shares.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +19,37 @@ MOST_PAIRS = 12
 
 
 def chosen_pairs(run: Run) -> list[tuple[Frame, Frame]]:
-    """Training frames with flow to their neighbor, and that neighbor: all, or `MOST_PAIRS` spread evenly over the clip."""
+    """Training frames with flow to their neighbor, and that neighbor: all, or
+    `MOST_PAIRS` spread evenly over the clip.
+    """
     frames = run.scene.train
-    pairs = [(f, frames[f.neighbors[1]]) for f in frames if 1 in f.neighbors and 1 in f.flow and 1 in f.flow_valid]
+    pairs = [
+        (f, frames[f.neighbors[1]])
+        for f in frames
+        if 1 in f.neighbors and 1 in f.flow and 1 in f.flow_valid
+    ]
     return [pairs[round(k)] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS))]
 
 
 def stability(run: Run, folder: Path) -> dict[str, float]:
-    """`hdr_tae` (see `metrics.hdr_tae`) of the run along its training path, mean over all pixels where forward and backward flow agree, over
-    moving ones `hdr_tae_moving`, and the number of `pairs`; empty where the scene has no flow. Renders are kept in `folder`."""
+    """`hdr_tae` (see `metrics.hdr_tae`) of the run along its training path, mean over
+    all pixels where forward and backward flow agree, over moving ones `hdr_tae_moving`,
+    and the number of `pairs`; empty where the scene has no flow. Renders are kept in
+    `folder`.
+    """
     pairs = chosen_pairs(run)
     frames = {f"{f.index:05d}": f for pair in pairs for f in pair}
     views = {name: View(f.camera, f.time) for name, f in sorted(frames.items())}
     files = (
-        dict(zip(views, predict(run, views, folder, "rendering the training path", motion=False), strict=True)) if pairs else {}
+        dict(
+            zip(
+                views,
+                predict(run, views, folder, "rendering the training path", motion=False),
+                strict=True,
+            )
+        )
+        if pairs
+        else {}
     )
     sums = {"hdr_tae": [0.0, 0.0], "hdr_tae_moving": [0.0, 0.0]}
     for a, b in pairs:
@@ -43,5 +62,7 @@ def stability(run: Run, folder: Path) -> dict[str, float]:
             if pixels:
                 sums[name][0] += error * pixels
                 sums[name][1] += pixels
-    found: dict[str, float] = {name: total / pixels for name, (total, pixels) in sums.items() if pixels}
+    found: dict[str, float] = {
+        name: total / pixels for name, (total, pixels) in sums.items() if pixels
+    }
     return found | {"pairs": len(pairs)} if found else {}

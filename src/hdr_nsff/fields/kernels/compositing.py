@@ -1,13 +1,19 @@
-"""Numba kernels of the Gaussian rasterizer on the CPU: projected Gaussians to pictures, and back by hand.
+"""Numba kernels of the Gaussian rasterizer on the CPU: projected Gaussians to pictures,
+and back by hand.
 
-Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255 counts as nothing, above 0.999 as 0.999 (Kerbl
-et al. 2023). The backward pass goes front to back too, with one scalar per pixel: what is still to come behind. Each (Gaussian, tile)
-pair owns its place for gradients and a Gaussian's pairs are added up in a fixed order: no atomics, and the same result whatever the
-number of threads. The plain-torch twin is `rasterize.dense`.
+Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255
+counts as nothing, above 0.999 as 0.999 (Kerbl et al. 2023). The backward pass goes
+front to back too, with one scalar per pixel: what is still to come behind. Each
+(Gaussian, tile) pair owns its place for gradients and a Gaussian's pairs are added up
+in a fixed order: no atomics, and the same result whatever the number of threads. The
+plain-torch twin is `rasterize.dense`.
 
-Loops over the pixels of a tile are written so that LLVM vectorizes them: one flat array, unsigned ranges, no library call, no maximum
-carried along, no error for a division by zero. `FAST` lets it reorder sums; NaN and Inf stay what they are. What a pixel's BLOCK of
-channels does stands in `mixed`, `poured` and `gathered`, written out, for a loop inside would not be vectorized over pixels."""
+Loops over the pixels of a tile are written so that LLVM vectorizes them: one flat
+array, unsigned ranges, no library call, no maximum carried along, no error for a
+division by zero. `FAST` lets it reorder sums; NaN and Inf stay what they are. What a
+pixel's BLOCK of channels does stands in `mixed`, `poured` and `gathered`, written out,
+for a loop inside would not be vectorized over pixels.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +24,9 @@ from hdr_nsff.fields.kernels.projection import ALPHA_MIN, F0, MOMENTS, TILE_X, T
 
 PIXELS = TILE_X * TILE_Y
 BLOCK = 8  # channels that one pass over a Gaussian's pixels takes; features come in multiples of it
-X, Y, LEFT, WEIGHT, VALUE, GRAD_ALPHA, BEHIND, SUMS = (np.uint64(i * PIXELS) for i in range(8))  # a tile's planes of pixels
+X, Y, LEFT, WEIGHT, VALUE, GRAD_ALPHA, BEHIND, SUMS = (
+    np.uint64(i * PIXELS) for i in range(8)
+)  # a tile's planes of pixels
 N1, N2, N3, N4, N5, N6, N7 = (np.uint64(i * PIXELS) for i in range(1, BLOCK))
 OWN = 7  # planes before SUMS
 TWO_ROWS = np.uint64(2 * TILE_X)  # as wide as a vector
@@ -35,7 +43,9 @@ NOTHING = (F0, F0, F0, F0, F0, F0, F0, F0)
 
 @numba.njit(inline="always", fastmath=FAST)
 def exp_minus(s):
-    """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three times; vectorizes, unlike a library call."""
+    """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three
+    times; vectorizes, unlike a library call.
+    """
     x = -s * EIGHTH
     y = F1 + x * (F1 + x * (E2 + x * (E3 + x * (E4 + x * E5))))
     y = y * y
@@ -47,8 +57,10 @@ def exp_minus(s):
 def bin_tiles(boxes, order, tiles_x, tiles_y):
     """Lists of Gaussians per tile, front to back as `order` (G,) says.
 
-    Returns `starts` (tiles + 1,), `members` (P,) the Gaussian of every list entry, `places` (P,) the entry's own place for
-    gradients, and `owned` (G + 1,) where each Gaussian's places begin."""
+    Returns `starts` (tiles + 1,), `members` (P,) the Gaussian of every list entry,
+    `places` (P,) the entry's own place for gradients, and `owned` (G + 1,) where each
+    Gaussian's places begin.
+    """
     count = boxes.shape[0]
     owned = np.zeros(count + 1, np.int64)
     starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
@@ -74,22 +86,31 @@ def bin_tiles(boxes, order, tiles_x, tiles_y):
 
 @numba.njit(cache=True)
 def planes(count, tile, tiles_x):
-    """A tile's first column and row, and `count` planes of PIXELS numbers in one flat array at the start of a cache line: X, Y and LEFT
-    are filled, the others 0. One array with constant distances, for then LLVM need not ask before every loop whether two planes overlap."""
+    """A tile's first column and row, and `count` planes of PIXELS numbers in one flat
+    array at the start of a cache line: X, Y and LEFT are filled, the others 0. One
+    array with constant distances, for then LLVM need not ask before every loop whether
+    two planes overlap.
+    """
     room = np.zeros(count * PIXELS + LINE, np.float32)
     first = (LINE - room.ctypes.data // 4 % LINE) % LINE
     z = room[first : first + count * PIXELS]
     x0, y0 = (tile % tiles_x) * TILE_X, (tile // tiles_x) * TILE_Y
     for i in range(PIXELS):
         p = np.uint64(i)
-        z[X + p], z[Y + p], z[LEFT + p] = np.float32(x0 + i % TILE_X) + HALF, np.float32(y0 + i // TILE_X) + HALF, F1
+        z[X + p], z[Y + p], z[LEFT + p] = (
+            np.float32(x0 + i % TILE_X) + HALF,
+            np.float32(y0 + i // TILE_X) + HALF,
+            F1,
+        )
     return x0, y0, z
 
 
 @numba.njit(cache=True)
 def span(rows, g, y0):
-    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows: unsigned, or LLVM would not vectorize over them, and in a
-    way that it sees whole vectors, or it would look for what is left over."""
+    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows:
+    unsigned, or LLVM would not vectorize over them, and in a way that it sees whole
+    vectors, or it would look for what is left over.
+    """
     first, last = max(rows[g, 0] - y0, 0) // 2, (min(rows[g, 1] - y0, TILE_Y) + 1) // 2
     start = np.uint64(first) * TWO_ROWS
     return start, start + np.uint64(max(last - first, 0)) * TWO_ROWS
@@ -119,7 +140,9 @@ def plane(d):
 
 @numba.njit(inline="always")
 def poured(z, p, v, f):
-    """Add `v` times the features `f` to the BLOCK planes from the one on in which `p` is the pixel."""
+    """Add `v` times the features `f` to the BLOCK planes from the one on in which `p`
+    is the pixel.
+    """
     z[p] += f[0] * v
     z[p + N1] += f[1] * v
     z[p + N2] += f[2] * v
@@ -141,7 +164,13 @@ def mixed(z, p, f):
 def gathered(t, z, p, v):
     """The sums `t` plus `v` times those planes at the pixel."""
     first = t[0] + z[p] * v, t[1] + z[p + N1] * v, t[2] + z[p + N2] * v, t[3] + z[p + N3] * v
-    return (*first, t[4] + z[p + N4] * v, t[5] + z[p + N5] * v, t[6] + z[p + N6] * v, t[7] + z[p + N7] * v)
+    return (
+        *first,
+        t[4] + z[p + N4] * v,
+        t[5] + z[p + N5] * v,
+        t[6] + z[p + N6] * v,
+        t[7] + z[p + N7] * v,
+    )
 
 
 @numba.njit(inline="always")
@@ -153,7 +182,9 @@ def moved(m, u, dx, dy):
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
 def forward(starts, members, centers, conics, opacities, features, rows, maps, alpha):
-    """Composite features (G, D), D a multiple of BLOCK, into `maps` (C, H, W), the first C of them, and `alpha` (H, W)."""
+    """Composite features (G, D), D a multiple of BLOCK, into `maps` (C, H, W), the
+    first C of them, and `alpha` (H, W).
+    """
     height, width = alpha.shape
     channels = features.shape[1]
     tiles_x = (width + TILE_X - 1) // TILE_X
@@ -191,7 +222,9 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
 
 @numba.njit(inline="always", fastmath=FAST)
 def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
-    """Fill a tile's planes: gradients of its maps (SUMS), of alpha (GRAD_ALPHA), and the sum of weight * value (BEHIND)."""
+    """Fill a tile's planes: gradients of its maps (SUMS), of alpha (GRAD_ALPHA), and
+    the sum of weight * value (BEHIND).
+    """
     height, width = alpha.shape
     for y in range(min(TILE_Y, height - y0)):
         for x in range(min(TILE_X, width - x0)):
@@ -208,12 +241,37 @@ def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
 def tell(grad, d, t):
     """Write down the gradients `t` of the BLOCK channels from `d` on."""
     d += MOMENTS
-    grad[d], grad[d + 1], grad[d + 2], grad[d + 3], grad[d + 4], grad[d + 5], grad[d + 6], grad[d + 7] = t
+    (
+        grad[d],
+        grad[d + 1],
+        grad[d + 2],
+        grad[d + 3],
+        grad[d + 4],
+        grad[d + 5],
+        grad[d + 6],
+        grad[d + 7],
+    ) = t
 
 
 @numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
-def backward(starts, members, places, centers, conics, opacities, features, rows, maps, alpha, grad_maps, grad_alpha, out):
-    """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its pixels, then its features."""
+def backward(
+    starts,
+    members,
+    places,
+    centers,
+    conics,
+    opacities,
+    features,
+    rows,
+    maps,
+    alpha,
+    grad_maps,
+    grad_alpha,
+    out,
+):
+    """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its
+    pixels, then its features.
+    """
     channels = features.shape[1]
     tiles_x = (alpha.shape[1] + TILE_X - 1) // TILE_X
     for tile in numba.prange(len(starts) - 1):

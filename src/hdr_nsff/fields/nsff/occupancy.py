@@ -1,5 +1,7 @@
-"""Where it is worth asking the field: a coarse grid of the largest rendered weight seen in each cell (PROTOTYPES: culling by
-rendered weight, dilated, with a little exploration, keeps 37 % of the samples)."""
+"""Where it is worth asking the field: a coarse grid of the largest rendered weight seen
+in each cell (PROTOTYPES: culling by rendered weight, dilated, with a little
+exploration, keeps 37 % of the samples).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,9 @@ from torch import Tensor, nn
 
 
 class Occupancy(nn.Module):
-    """`slices` grids (one for static content, one per training time for dynamic content) over the unit cube."""
+    """`slices` grids (one for static content, one per training time for dynamic
+    content) over the unit cube.
+    """
 
     weight: Tensor
     mask: Tensor
@@ -19,8 +23,12 @@ class Occupancy(nn.Module):
         self.resolution = resolution
         x, y, z = resolution
         self.register_buffer("weight", torch.zeros(slices, z, y, x))
-        self.register_buffer("mask", torch.ones(slices, z, y, x, dtype=torch.bool))  # cells that are asked
-        self.register_buffer("allowed", torch.ones(slices, z, y, x, dtype=torch.bool))  # cells that may ever hold something
+        self.register_buffer(
+            "mask", torch.ones(slices, z, y, x, dtype=torch.bool)
+        )  # cells that are asked
+        self.register_buffer(
+            "allowed", torch.ones(slices, z, y, x, dtype=torch.bool)
+        )  # cells that may ever hold something
 
     def cells(self, coords: Tensor, knot: float = 0.0) -> Tensor:
         """Flat cell index (M,) of `coords` (M, 3) in [0, 1] at the nearest slice."""
@@ -30,14 +38,20 @@ class Occupancy(nn.Module):
         return ((round(knot) * z + i[:, 2]) * y + i[:, 1]) * x + i[:, 0]
 
     def centers(self) -> Tensor:
-        """Cube coordinates of one slice's cell centers, in storage order: (Z * Y * X, 3)."""
+        """Cube coordinates of one slice's cell centers, in storage order: (Z * Y * X,
+        3).
+        """
         x, y, z = self.resolution
         axes = [(torch.arange(n) + 0.5) / n for n in (z, y, x)]
         grid = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         return grid.flip(-1).to(self.weight)
 
-    def asks(self, coords: Tensor, knot: float, explore: float, generator: torch.Generator | None) -> Tensor:
-        """Which of `coords` (M, 3) to evaluate: (M,) bool. A share `explore` of the others (where allowed) comes along."""
+    def asks(
+        self, coords: Tensor, knot: float, explore: float, generator: torch.Generator | None
+    ) -> Tensor:
+        """Which of `coords` (M, 3) to evaluate: (M,) bool. A share `explore` of the
+        others (where allowed) comes along.
+        """
         cells = self.cells(coords, knot)
         keep = self.mask.view(-1)[cells]
         if explore and generator is not None:
@@ -52,7 +66,9 @@ class Occupancy(nn.Module):
 
     @torch.no_grad()
     def refresh(self, threshold: float, decay: float) -> None:
-        """Ask only cells within one cell of a remembered weight above `threshold`; memories fade by `decay`."""
+        """Ask only cells within one cell of a remembered weight above `threshold`;
+        memories fade by `decay`.
+        """
         near = nn.functional.max_pool3d(self.weight[:, None], 3, stride=1, padding=1)[:, 0]
         self.mask.copy_((near > threshold) & self.allowed)
         self.weight.mul_(decay)

@@ -37,27 +37,46 @@ class Content:
 
 
 def march(
-    space: Space, camera: Camera, pixels: Tensor, num_samples: int, near: float, far: float, generator: torch.Generator | None
+    space: Space,
+    camera: Camera,
+    pixels: Tensor,
+    num_samples: int,
+    near: float,
+    far: float,
+    generator: torch.Generator | None,
 ) -> March:
-    """Samples along the rays of `pixels` (N, 2), evenly in disparity from `near` to `far`; jittered where a generator is given."""
+    """Samples along the rays of `pixels` (N, 2), evenly in disparity from `near` to
+    `far`; jittered where a generator is given.
+    """
     rays = camera.rays(pixels)
     n = len(pixels)
     jitter = None if generator is None else torch.rand(n, num_samples, generator=generator)
     depths = volume.stratified_disparity(n, num_samples, near, far, jitter).to(pixels)
     points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]  # (N, S, 3)
     coords = space.encode(points)
-    return March(depths, points, coords, volume.step_lengths(coords), nn.functional.normalize(rays.directions, dim=-1))
+    return March(
+        depths,
+        points,
+        coords,
+        volume.step_lengths(coords),
+        nn.functional.normalize(rays.directions, dim=-1),
+    )
 
 
-def in_chunks(field: nn.Module, camera: Camera, pixels: Tensor | None, part: Callable[[Tensor], Render]) -> Render:
-    """What `part` renders of `pixels` (S, 2), or of every pixel row by row, a few thousand at once; the field is out of training meanwhile."""
+def in_chunks(
+    field: nn.Module, camera: Camera, pixels: Tensor | None, part: Callable[[Tensor], Render]
+) -> Render:
+    """What `part` renders of `pixels` (S, 2), or of every pixel row by row, a few
+    thousand at once; the field is out of training meanwhile.
+    """
     pixels = camera.pixel_grid() if pixels is None else pixels
     was_training = field.training
     field.eval()
     parts = [part(chunk) for chunk in pixels.split(CHUNK)]
     field.train(was_training)
     radiance, depth, opacity, motion = (
-        torch.cat(maps) for maps in zip(*((p.radiance, p.depth, p.opacity, p.motion) for p in parts), strict=True)
+        torch.cat(maps)
+        for maps in zip(*((p.radiance, p.depth, p.opacity, p.motion) for p in parts), strict=True)
     )
     flows = {o: torch.cat([p.scene_flow[o] for p in parts]) for o in parts[0].scene_flow}
     rgb = [p.rgb for p in parts if p.rgb is not None]

@@ -1,8 +1,11 @@
-"""What fields of a static and a dynamic branch share: sampling rays, culling, asking the branches, compositing. Grids and the published
-network are two encodings of one class. `NSFF` adds scene flow to it, `NerfWT` an appearance code per image.
+"""What fields of a static and a dynamic branch share: sampling rays, culling, asking
+the branches, compositing. Grids and the published network are two encodings of one
+class. `NSFF` adds scene flow to it, `NerfWT` an appearance code per image.
 
-Inside, a point is a coordinate of the unit cube (`space.py`) and time is a knot: the position on the list of training times. `M`
-counts the samples that survive culling, out of N rays x S samples."""
+Inside, a point is a coordinate of the unit cube (`space.py`) and time is a knot: the
+position on the list of training times. `M` counts the samples that survive culling, out
+of N rays x S samples.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +37,9 @@ class BranchesConfig:
     render_samples: int = 64
     """Samples along a ray when rendering."""
     compositing: Literal["add", "blend"] = "add"
-    """How static and dynamic content share a place: densities add up, or the blend weight of eq. 7."""
+    """How static and dynamic content share a place: densities add up, or the blend
+    weight of eq. 7.
+    """
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or the published one below 1."""
     density: Literal["exp", "relu"] = "exp"
@@ -63,7 +68,9 @@ class Pass:
 
 
 class TwoBranches(nn.Module):
-    """See the module. `times` (T,) are those of the training frames; frames are `width` x `height`."""
+    """See the module. `times` (T,) are those of the training frames; frames are `width`
+    x `height`.
+    """
 
     times: Tensor
     bias: Tensor
@@ -85,21 +92,31 @@ class TwoBranches(nn.Module):
         self.config, self.space, self.near, self.far = config, space, near, far
         self.register_buffer("times", times.double())
         knots = len(times)
-        self.branches = plain_branches(config.encoding, width, height, knots) if branches is None else branches
+        self.branches = (
+            plain_branches(config.encoding, width, height, knots) if branches is None else branches
+        )
         aspect = (max(8, round(width / 4)), max(8, round(height / 4)), 48)
         self.static_cells = Occupancy(aspect)
         self.dynamic_cells = Occupancy((aspect[0] // 2, aspect[1] // 2, 24), knots)
-        self.register_buffer("bias", torch.tensor(log_radiance))  # raw radiance 0 is this log radiance
+        self.register_buffer(
+            "bias", torch.tensor(log_radiance)
+        )  # raw radiance 0 is this log radiance
         self.step = 0
 
     # What the raw numbers mean
 
     def to_radiance(self, raw: Tensor) -> Tensor:
         """Linear HDR radiance, >= 0."""
-        return (raw + self.bias).clamp(max=14.0).exp() if self.config.radiance == "exp" else raw.sigmoid()
+        return (
+            (raw + self.bias).clamp(max=14.0).exp()
+            if self.config.radiance == "exp"
+            else raw.sigmoid()
+        )
 
     def from_radiance(self, radiance: Tensor) -> Tensor:
-        """Raw numbers of which `to_radiance` makes `radiance` (..., 3), as near as it can."""
+        """Raw numbers of which `to_radiance` makes `radiance` (..., 3), as near as it
+        can.
+        """
         if self.config.radiance == "exp":
             return radiance.clamp_min(1e-5).log() - self.bias
         return radiance.clamp(1 - HIGHEST, HIGHEST).logit()
@@ -107,7 +124,9 @@ class TwoBranches(nn.Module):
     def to_density(self, raw: Tensor, bias: float) -> Tensor:
         """Density per cube unit, >= 0."""
         if self.training and self.config.density_noise:
-            raw = raw + self.config.density_noise * torch.randn(raw.shape, generator=self.rng).to(raw)
+            raw = raw + self.config.density_noise * torch.randn(raw.shape, generator=self.rng).to(
+                raw
+            )
         return (raw + bias).clamp(max=10.0).exp() if self.config.density == "exp" else raw.relu()
 
     # Time and space
@@ -116,8 +135,12 @@ class TwoBranches(nn.Module):
         """Position of a time (in frames) on the list of training times."""
         return knot_of(self.times, time)
 
-    def march(self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None) -> March:
-        """Samples along the rays of `pixels` (N, 2); jittered where a generator is given."""
+    def march(
+        self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None
+    ) -> March:
+        """Samples along the rays of `pixels` (N, 2); jittered where a generator is
+        given.
+        """
         return march(self.space, camera, pixels, num_samples, self.near, self.far, generator)
 
     # Asking the branches
@@ -129,9 +152,17 @@ class TwoBranches(nn.Module):
         return self.spread(raw, index, keep.shape, self.density_bias(static=True))
 
     def dynamic_content(
-        self, coords: Tensor, index: Tensor, shape: torch.Size, knot: float, views: Tensor, motion: bool
+        self,
+        coords: Tensor,
+        index: Tensor,
+        shape: torch.Size,
+        knot: float,
+        views: Tensor,
+        motion: bool,
     ) -> tuple[Content, Tensor | None]:
-        """The dynamic branch at `coords` (M, 3), which are samples `index` (M,) of rays of `shape` (N, S), and raw motion (M, 8)."""
+        """The dynamic branch at `coords` (M, 3), which are samples `index` (M,) of rays
+        of `shape` (N, S), and raw motion (M, 8).
+        """
         raw, raw_motion = self.branches.dynamic(coords, knot, views, motion)
         return self.spread(raw, index, shape, self.density_bias(static=False)), raw_motion
 
@@ -144,7 +175,11 @@ class TwoBranches(nn.Module):
         total = shape[0] * shape[1]
         density = raw.new_zeros(total).index_copy(0, index, self.to_density(raw[:, 3], bias))
         radiance = raw.new_zeros(total, 3).index_copy(0, index, self.to_radiance(raw[:, :3]))
-        share = raw.new_zeros(total).index_copy(0, index, raw[:, 4].sigmoid()) if self.config.compositing == "blend" else density
+        share = (
+            raw.new_zeros(total).index_copy(0, index, raw[:, 4].sigmoid())
+            if self.config.compositing == "blend"
+            else density
+        )
         return Content(density.view(shape), radiance.view(*shape, 3), share.view(shape))
 
     def views(self, m: March, index: Tensor) -> Tensor:
@@ -159,8 +194,12 @@ class TwoBranches(nn.Module):
             return volume.add(static.density, dynamic.density, deltas)
         return volume.blend(static.density, dynamic.density, dynamic.blend, deltas)
 
-    def kept(self, m: March, knot: float, explore: float, generator: torch.Generator | None) -> tuple[Tensor, Tensor]:
-        """Which samples to ask of the static and of the dynamic branch, (N, S) bool each."""
+    def kept(
+        self, m: March, knot: float, explore: float, generator: torch.Generator | None
+    ) -> tuple[Tensor, Tensor]:
+        """Which samples to ask of the static and of the dynamic branch, (N, S) bool
+        each.
+        """
         flat, shape = m.coords.reshape(-1, 3), m.depths.shape
         if not self.config.cull:
             everything = torch.ones(shape, dtype=torch.bool, device=flat.device)
@@ -172,7 +211,9 @@ class TwoBranches(nn.Module):
     # Training
 
     def ask(self, batch: PixelBatch, motion: bool) -> Pass:
-        """Both branches at samples along the batch's rays, composited; raw motion if there is `motion`."""
+        """Both branches at samples along the batch's rays, composited; raw motion if
+        there is `motion`.
+        """
         rng = torch.Generator().manual_seed(batch.seed)
         self.rng = rng
         knot = self.knot(batch.time)
@@ -181,7 +222,9 @@ class TwoBranches(nn.Module):
         static = self.static_content(m, keep_static)
         index = keep_dynamic.reshape(-1).nonzero()[:, 0]
         coords = m.coords.reshape(-1, 3)[index]
-        dynamic, raw_motion = self.dynamic_content(coords, index, keep_dynamic.shape, knot, self.views(m, index), motion)
+        dynamic, raw_motion = self.dynamic_content(
+            coords, index, keep_dynamic.shape, knot, self.views(m, index), motion
+        )
         w = self.weights(static, dynamic, m.deltas)
         if self.config.cull:
             self.static_cells.observe(m.coords.reshape(-1, 3), w.static.reshape(-1))
@@ -203,12 +246,16 @@ class TwoBranches(nn.Module):
             self.dynamic_cells.refresh(threshold=1e-3, decay=0.97)
 
     def shared_maxima(self) -> list[Tensor]:
-        """What several processes must agree on between steps: the culling grids' memories."""
+        """What several processes must agree on between steps: the culling grids'
+        memories.
+        """
         return [self.static_cells.weight, self.dynamic_cells.weight] if self.config.cull else []
 
     @torch.no_grad()
     def allow_motion(self, frames: list[Any], dilate: int = 9) -> None:
-        """Dynamic content may only be where the moving masks (dilated by `dilate` pixels) of its time say; everywhere where a time has none."""
+        """Dynamic content may only be where the moving masks (dilated by `dilate`
+        pixels) of its time say; everywhere where a time has none.
+        """
         centers = self.space.decode(self.dynamic_cells.centers())
         for k, time in enumerate(self.times.tolist()):
             views = [f for f in frames if f.time == time and f.moving is not None]
@@ -216,16 +263,31 @@ class TwoBranches(nn.Module):
                 continue
             allowed = torch.zeros(len(centers), dtype=torch.bool)
             for f in views:
-                moving = nn.functional.max_pool2d(f.moving[None, None].float(), 2 * dilate + 1, 1, dilate)[0, 0] > 0
+                moving = (
+                    nn.functional.max_pool2d(
+                        f.moving[None, None].float(), 2 * dilate + 1, 1, dilate
+                    )[0, 0]
+                    > 0
+                )
                 xy, depth = f.camera.project(centers)
                 x, y = xy[:, 0].long(), xy[:, 1].long()
-                seen = (depth > 0) & (xy[:, 0] >= 0) & (xy[:, 1] >= 0) & (x < f.camera.width) & (y < f.camera.height)
-                allowed |= seen & moving[y.clamp(0, f.camera.height - 1), x.clamp(0, f.camera.width - 1)]
+                seen = (
+                    (depth > 0)
+                    & (xy[:, 0] >= 0)
+                    & (xy[:, 1] >= 0)
+                    & (x < f.camera.width)
+                    & (y < f.camera.height)
+                )
+                allowed |= (
+                    seen & moving[y.clamp(0, f.camera.height - 1), x.clamp(0, f.camera.width - 1)]
+                )
             self.dynamic_cells.allowed[k] = allowed.view_as(self.dynamic_cells.allowed[k])
             self.dynamic_cells.mask[k] = self.dynamic_cells.allowed[k]
 
 
-def plain_branches(encoding: GridConfig | MlpConfig, width: int, height: int, num_knots: int) -> GridBranches | MlpBranches:
+def plain_branches(
+    encoding: GridConfig | MlpConfig, width: int, height: int, num_knots: int
+) -> GridBranches | MlpBranches:
     """Branches as a config asks for them."""
     match encoding:
         case GridConfig():

@@ -1,6 +1,8 @@
-"""3D Gaussians to feature maps, differentiable in everything, the camera's pose and focal lengths included (EWA splatting; Zwicker et al. 2001, Kerbl
-et al. 2023). One call, twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`, the plain-torch one, slow and
-obviously right."""
+"""3D Gaussians to feature maps, differentiable in everything, the camera's pose and
+focal lengths included (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023). One
+call, twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`, the
+plain-torch one, slow and obviously right.
+"""
 
 from __future__ import annotations
 
@@ -24,22 +26,37 @@ class Maps(NamedTuple):
     alpha: Tensor  # (H, W) in [0, 1]: sum of weights
 
 
-def rasterize(means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: Camera) -> Maps:
+def rasterize(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+) -> Maps:
     """Composite G Gaussians front to back by the z-depth of their means.
 
-    `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units, `quaternions` (G, 4) w x y z of any length,
-    `opacities` (G,) in [0, 1], `features` (G, D) anything. Gaussians whose shape or opacity is no finite number
-    are not drawn. Float32 on the CPU or on CUDA; every other dtype and device takes `dense`."""
+    `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units,
+    `quaternions` (G, 4) w x y z of any length, `opacities` (G,) in [0, 1], `features`
+    (G, D) anything. Gaussians whose shape or opacity is no finite number are not drawn.
+    Float32 on the CPU or on CUDA; every other dtype and device takes `dense`.
+    """
     gaussians = means, quaternions, scales, opacities, features
     match means.device.type if means.dtype == torch.float32 else None:
         case "cpu":
             maps, alpha = Rasterize.apply(*gaussians, stretched(camera), camera)
-            seen, depth = maps.split([len(maps) - 1, 1])  # whose gradients are joined, where slices' would be added up
+            seen, depth = maps.split(
+                [len(maps) - 1, 1]
+            )  # whose gradients are joined, where slices' would be added up
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
         case "cuda" if rasterize_cuda.available():
             rules = camera.width, camera.height, projection.NEAREST, projection.BLUR
-            return Maps(*rasterize_cuda.composite(*gaussians, stretched(camera), camera.K.detach(), *rules))
-        case "cuda":  # `dense` would hold every Gaussian at every pixel: too much for a real picture
+            return Maps(
+                *rasterize_cuda.composite(*gaussians, stretched(camera), camera.K.detach(), *rules)
+            )
+        case (
+            "cuda"
+        ):  # `dense` would hold every Gaussian at every pixel: too much for a real picture
             seen = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
             return Maps(*(m.to(means.device) for m in seen))
         case _:
@@ -53,8 +70,10 @@ def world_to_camera(camera: Camera) -> Tensor:
 
 
 def stretched(camera: Camera) -> Tensor:
-    """`world_to_camera` that carries the gradient of the focal lengths as well, for kernels to which K is numbers: a longer focal length
-    is a camera whose x and y are stretched."""
+    """`world_to_camera` that carries the gradient of the focal lengths as well, for
+    kernels to which K is numbers: a longer focal length is a camera whose x and y are
+    stretched.
+    """
     w2c, focal = world_to_camera(camera), camera.K[[0, 1], [0, 1]]
     if not focal.requires_grad:
         return w2c
@@ -62,7 +81,9 @@ def stretched(camera: Camera) -> Tensor:
 
 
 def products(*wanted: str) -> Tensor:
-    """(16, n) that makes the `wanted` sums of products, such as "wx -zy", of the outer product (16) of two quaternions w x y z."""
+    """(16, n) that makes the `wanted` sums of products, such as "wx -zy", of the outer
+    product (16) of two quaternions w x y z.
+    """
     table = torch.zeros(16, len(wanted))
     for column, terms in enumerate(wanted):
         for term in terms.split():
@@ -81,10 +102,14 @@ ROTATION = products(
 def rotation_matrices(quaternions: Tensor) -> Tensor:
     """(G, 3, 3) from (G, 4) w x y z of any length."""
     unit = quaternions / (quaternions.norm(dim=-1, keepdim=True) + 1e-12)
-    return ((unit[..., None] * unit[..., None, :]).flatten(-2) @ ROTATION.to(unit)).unflatten(-1, (3, 3))
+    return ((unit[..., None] * unit[..., None, :]).flatten(-2) @ ROTATION.to(unit)).unflatten(
+        -1, (3, 3)
+    )
 
 
-def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
+def project(
+    means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera
+) -> tuple[Tensor, Tensor, Tensor]:
     """Pixel centers (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,)."""
     w2c, K = world_to_camera(camera), camera.K
     t = means @ w2c[:, :3].T + w2c[:, 3]
@@ -92,10 +117,20 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
     size = torch.tensor([camera.width, camera.height]).to(means)
     focal, center = K[[0, 1], [0, 1]], K[:2, 2]
     edge = projection.MARGIN * 0.5 * size / focal
-    xy = z[:, None] * torch.minimum(torch.maximum(t[:, :2] / z[:, None], -center / focal - edge), (size - center) / focal + edge)
+    xy = z[:, None] * torch.minimum(
+        torch.maximum(t[:, :2] / z[:, None], -center / focal - edge), (size - center) / focal + edge
+    )
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
-        [focal[0] / z, zero, -focal[0] * xy[:, 0] / z**2, zero, focal[1] / z, -focal[1] * xy[:, 1] / z**2], -1
+        [
+            focal[0] / z,
+            zero,
+            -focal[0] * xy[:, 0] / z**2,
+            zero,
+            focal[1] / z,
+            -focal[1] * xy[:, 1] / z**2,
+        ],
+        -1,
     ).unflatten(-1, (2, 3))
     half_axes = rotation_matrices(quaternions) * scales[:, None]
     spread = jacobian @ w2c[:, :3] @ half_axes
@@ -104,11 +139,21 @@ def project(means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera) 
 
 
 def dense(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, camera: Camera, cut: bool = True
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+    cut: bool = True,
 ) -> Maps:
-    """The plain-torch twin: every Gaussian at every pixel, any dtype and device. Without `cut`, no alpha is too small to count."""
+    """The plain-torch twin: every Gaussian at every pixel, any dtype and device.
+    Without `cut`, no alpha is too small to count.
+    """
     known = torch.cat([means, quaternions, scales, opacities[:, None]], 1).isfinite().all(1)
-    means, quaternions, scales, opacities, features = (t[known] for t in (means, quaternions, scales, opacities, features))
+    means, quaternions, scales, opacities, features = (
+        t[known] for t in (means, quaternions, scales, opacities, features)
+    )
     centers, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > projection.NEAREST]
@@ -125,14 +170,18 @@ def dense(
 
 
 def front_to_back(depths: np.ndarray) -> np.ndarray:
-    """Stable order (G,) of positive float32 depths, the others last: radix sort on the halves of their bits, which numpy has for 16 bits."""
+    """Stable order (G,) of positive float32 depths, the others last: radix sort on the
+    halves of their bits, which numpy has for 16 bits.
+    """
     bits = depths.view(np.uint32)
     low = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
     return low[np.argsort((bits >> 16).astype(np.uint16)[low], kind="stable")]
 
 
 def blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Features (G, D) and z-depths (G,) side by side, then zeros up to a whole number of the kernels' blocks."""
+    """Features (G, D) and z-depths (G,) side by side, then zeros up to a whole number
+    of the kernels' blocks.
+    """
     count, d = features.shape
     values = np.zeros((count, -(-(d + 1) // compositing.BLOCK) * compositing.BLOCK), np.float32)
     values[:, :d], values[:, d] = features, depths
@@ -140,7 +189,9 @@ def blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 class Rasterize(torch.autograd.Function):
-    """The numba twin. Returns maps (D + 1, H, W), the last one z-depth, and alpha (H, W)."""
+    """The numba twin. Returns maps (D + 1, H, W), the last one z-depth, and alpha (H,
+    W).
+    """
 
     @staticmethod
     def forward(
@@ -179,9 +230,13 @@ class Rasterize(torch.autograd.Function):
         values = drawn[3]
         pairs = np.empty((len(members), projection.MOMENTS + values.shape[1]), np.float32)
         seen = maps.numpy(), alpha.numpy()
-        compositing.backward(starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs)
+        compositing.backward(
+            starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs
+        )
         out = [torch.empty(a.shape) for a in (*arrays, values[:, : len(maps)])]
         poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
-        projection.project_backward(*arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy())
+        projection.project_backward(
+            *arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy()
+        )
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
         return *out[:4], out[4][:, :-1], grad_pose, None

@@ -1,5 +1,7 @@
-"""The rasterizer's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`. It draws by the same rules as the kernels for the CPU: 0.3
-pixels^2 of blur, alpha between 1/255 and 0.999, nothing nearer than 0.01, held linearization outside the frame."""
+"""The rasterizer's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`. It draws by the
+same rules as the kernels for the CPU: 0.3 pixels^2 of blur, alpha between 1/255 and
+0.999, nothing nearer than 0.01, held linearization outside the frame.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ def available() -> bool:
     try:
         import gsplat  # noqa: F401
     except ImportError:
-        say("gsplat is not installed, so Gaussians are rasterized on the CPU, which is slower: pip install 'hdr-nsff[gpu]'")
+        say(
+            "gsplat is not installed, so Gaussians are rasterized on the CPU, which is slower: pip install 'hdr-nsff[gpu]'"
+        )
         return False
     return True
 
@@ -26,8 +30,10 @@ def composite(
     means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, w2c: Tensor, K: Tensor,
     width: int, height: int, nearest: float, blur: float,
 ) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians as `rasterize.rasterize` takes them, seen by `w2c` (3, 4) and
-    `K` (3, 3). All on one CUDA device, float32; gradients reach everything but `K`."""
+    """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians as
+    `rasterize.rasterize` takes them, seen by `w2c` (3, 4) and `K` (3, 3). All on one
+    CUDA device, float32; gradients reach everything but `K`.
+    """
     from gsplat import rasterization
 
     view = torch.cat([w2c, w2c.new_tensor([[0.0, 0.0, 0.0, 1.0]])])

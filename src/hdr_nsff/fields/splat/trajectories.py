@@ -1,7 +1,10 @@
-"""How moving Gaussians move: a few shared rigid motions over the training times; each Gaussian follows its own mixture of them.
+"""How moving Gaussians move: a few shared rigid motions over the training times; each
+Gaussian follows its own mixture of them.
 
-Basis b turns by R_b(t) about its center c_b and shifts by s_b(t): x(t) = sum_b w_b (R_b(t) (x - c_b) + c_b + s_b(t)). Poses are kept
-at the training times (knots) and interpolated by a cubic with continuous velocity, so any time between can be asked for."""
+Basis b turns by R_b(t) about its center c_b and shifts by s_b(t): x(t) = sum_b w_b
+(R_b(t) (x - c_b) + c_b + s_b(t)). Poses are kept at the training times (knots) and
+interpolated by a cubic with continuous velocity, so any time between can be asked for.
+"""
 
 from __future__ import annotations
 
@@ -28,10 +31,14 @@ class Trajectories(nn.Module):
         self.num_bases, self.num_knots = num_bases, num_knots
         still = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num_knots * num_bases, 1)
         self.turns = nn.Parameter(still)  # (T * B, 4) quaternions w x y z of any length
-        self.shifts = nn.Parameter(torch.zeros(num_knots * num_bases, 4))  # (T * B, 3) scene units, and one unused column
+        self.shifts = nn.Parameter(
+            torch.zeros(num_knots * num_bases, 4)
+        )  # (T * B, 3) scene units, and one unused column
         self.register_buffer("centers", torch.zeros(num_bases, 3))  # scene units
         for name in ("turns_touched", "shifts_touched"):  # rows with a gradient
-            self.register_buffer(name, torch.zeros(num_knots * num_bases, dtype=torch.uint8), persistent=False)
+            self.register_buffer(
+                name, torch.zeros(num_knots * num_bases, dtype=torch.uint8), persistent=False
+            )
 
     def pose(self, knot: float) -> tuple[Tensor, Tensor]:
         """Unit quaternions (B, 4) and shifts (B, 3) at a knot."""
@@ -40,15 +47,21 @@ class Trajectories(nn.Module):
         return nn.functional.normalize(q, dim=-1), s[:, :3]
 
     def move(self, points: Tensor, mixture: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
-        """Where canonical `points` (G, 3) are in the bases' `pose`, given each one's `mixture` (B, G) of them."""
+        """Where canonical `points` (G, 3) are in the bases' `pose`, given each one's
+        `mixture` (B, G) of them.
+        """
         q, s = pose
         r = rotation_matrices(q)  # (B, 3, 3)
         offset = self.centers + s - (r @ self.centers[..., None])[..., 0]
-        motions = (mixture.T @ torch.cat([r, offset[..., None]], 2).flatten(1)).unflatten(1, (3, 4))  # each point's own
+        motions = (mixture.T @ torch.cat([r, offset[..., None]], 2).flatten(1)).unflatten(
+            1, (3, 4)
+        )  # each point's own
         return torch.baddbmm(motions[..., 3:], motions[..., :3], points[..., None])[..., 0]
 
     def turn(self, quaternions: Tensor, mixture: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
-        """Orientations (G, 4) of Gaussians with canonical `quaternions` (G, 4): the mixture's mean turn in that `pose`, then their own."""
+        """Orientations (G, 4) of Gaussians with canonical `quaternions` (G, 4): the
+        mixture's mean turn in that `pose`, then their own.
+        """
         return quaternion_product(mixture.T @ pose[0], quaternions)
 
     def mark(self, knot: float, reach: int = WINDOW) -> None:
@@ -58,7 +71,9 @@ class Trajectories(nn.Module):
             touched.view(self.num_knots, self.num_bases)[low:high] = 1
 
     def roughness(self, knot: float, unit: float) -> Tensor:
-        """Mean square third difference of the poses near a knot (quaternions; shifts in `unit`): 0 for constant acceleration."""
+        """Mean square third difference of the poses near a knot (quaternions; shifts in
+        `unit`): 0 for constant acceleration.
+        """
         low, high = max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
         turns = nn.functional.normalize(self.turns.view(self.num_knots, -1, 4)[low:high], dim=-1)
         if high - low < 4:

@@ -1,4 +1,6 @@
-"""Readers of public data layouts, one file each, and `recognize`: which of them a folder is."""
+"""Readers of public data layouts, one file each, and `recognize`: which of them a
+folder is.
+"""
 
 from __future__ import annotations
 
@@ -18,11 +20,17 @@ LAYOUTS = {  # the first that fits counts
 
 def layout_of(folder: Path) -> str | None:
     """The name of the layout of `folder`; None for footage."""
-    return next((name for name, reader in LAYOUTS.items() if reader.recognized(folder)), None) if folder.is_dir() else None
+    return (
+        next((name for name, reader in LAYOUTS.items() if reader.recognized(folder)), None)
+        if folder.is_dir()
+        else None
+    )
 
 
 def recognize(folder: Path) -> Capture | None:
-    """The training part of the public data set in `folder`; None where it is none. InputError where it is one and something is
-    missing or short. Held-out pictures are not opened."""
+    """The training part of the public data set in `folder`; None where it is none.
+    InputError where it is one and something is missing or short. Held-out pictures are
+    not opened.
+    """
     name = layout_of(folder)
     return None if name is None else LAYOUTS[name].read(folder)

@@ -1,9 +1,12 @@
-"""Blender layouts: `transforms_train.json` with OpenGL poses, a `time` per frame, RGBA pictures shown over white.
+"""Blender layouts: `transforms_train.json` with OpenGL poses, a `time` per frame, RGBA
+pictures shown over white.
 
 - D-NeRF: `time` in [0, 1], one exposure.
 - HDR-HexPlane: `exposures` in stops, `time` counts frames.
-- HDR-4D: `exposures` in exposure times, and `exr_file_path`, the picture's true radiance: opened for held-out views alone.
-- without `time` (NeRF's synthetic scenes): nothing moves, times only number the views."""
+- HDR-4D: `exposures` in exposure times, and `exr_file_path`, the picture's true
+  radiance: opened for held-out views alone.
+- without `time` (NeRF's synthetic scenes): nothing moves, times only number the views.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +41,10 @@ def read(folder: Path) -> Capture:
     path = folder / TRAIN
     document = read_document(path, "the training pictures and their poses")
     frames = document["frames"]
-    files = [named_file(folder, f["file_path"], f"training picture {k} of {TRAIN}") for k, f in enumerate(frames)]
+    files = [
+        named_file(folder, f["file_path"], f"training picture {k} of {TRAIN}")
+        for k, f in enumerate(frames)
+    ]
     moves = any("time" in f for f in frames)
     times = training_times(path, frames)
     clock = Clock.of(times)
@@ -46,12 +52,20 @@ def read(folder: Path) -> Capture:
     order = sorted(range(len(frames)), key=lambda k: (cameras[k], times[k]))
     evs = [exposure(path, f, layout(frames)) for f in frames]
     if any(e is None for e in evs) and any(e is not None for e in evs):
-        raise InputError(f"{path}: only some frames have `exposures`; they say how each was exposed, copy the file again")
-    notes = (f"{max(cameras) + 1} pictures share a time: taken as that many cameras",) if max(cameras) else ()
+        raise InputError(
+            f"{path}: only some frames have `exposures`; they say how each was exposed, copy the file again"
+        )
+    notes = (
+        (f"{max(cameras) + 1} pictures share a time: taken as that many cameras",)
+        if max(cameras)
+        else ()
+    )
     return Capture(
         layout=layout(frames),
         root=folder,
-        pictures=[Picture(source_of(folder, files[k]), clock(times[k]), cameras[k], evs[k]) for k in order],
+        pictures=[
+            Picture(source_of(folder, files[k]), clock(times[k]), cameras[k], evs[k]) for k in order
+        ],
         poses=reorder(poses(path, document), order),
         withheld=(folder / TEST).is_file(),
         over=1.0,
@@ -84,7 +98,9 @@ def exposure(path: Path, frame: dict[str, Any], kind: str) -> float | None:
     if not kind.startswith("HDR-4D"):
         return value
     if value <= 0:
-        raise InputError(f"{path}: {frame['file_path']} has an exposure time of {value:g}; it must be above 0")
+        raise InputError(
+            f"{path}: {frame['file_path']} has an exposure time of {value:g}; it must be above 0"
+        )
     return math.log2(value)
 
 
@@ -95,4 +111,6 @@ def poses(path: Path, document: dict[str, Any]) -> Given:
     except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f"{path}: its poses are not readable ({type(error).__name__}: {error}); copy it again") from error
+        raise InputError(
+            f"{path}: its poses are not readable ({type(error).__name__}: {error}); copy it again"
+        ) from error

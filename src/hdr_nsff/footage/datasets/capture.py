@@ -1,7 +1,10 @@
-"""What a public data set says about its training pictures, whatever its layout: footage whose frames are known better.
+"""What a public data set says about its training pictures, whatever its layout: footage
+whose frames are known better.
 
-A reader turns a folder into a `Capture` and opens nothing that the set keeps back for testing; `held_out.py` does that, for
-`evaluate` alone. Times are in frames of the set, axes OpenCV, depth in units of the poses unless `depth_units` says otherwise."""
+A reader turns a folder into a `Capture` and opens nothing that the set keeps back for
+testing; `held_out.py` does that, for `evaluate` alone. Times are in frames of the set,
+axes OpenCV, depth in units of the poses unless `depth_units` says otherwise.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,8 @@ from hdr_nsff.footage.ingest import FRAMES, LINEAR, Footage
 from hdr_nsff.footage.pose_files import Given
 from hdr_nsff.scene.scene import Strict, bracket_problem, first_problem, is_intrinsic, is_matrix
 
-SNAP = 1e-3  # frames: a time this near to a whole number is one, since files store rounded fractions
+# frames: a time this near to a whole number is one, since files store rounded fractions
+SNAP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,8 @@ class Picture:
     mask: Path | None = None
     depth: Path | None = None
     confidence: Path | None = None  # of the depth, in [0, 1]
-    flow: Mapping[str, Path] = field(default_factory=dict)  # source of another picture -> flow towards it
+    # source of another picture -> flow towards it
+    flow: Mapping[str, Path] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,9 @@ class Exposures:
 
 @dataclass(frozen=True)
 class Sighting:
-    """Static points that a picture sees, to bring its depth map to the units of the poses."""
+    """Static points that a picture sees, to bring its depth map to the units of the
+    poses.
+    """
 
     xy: np.ndarray  # (n, 2) in [0, 1], shares of width and height
     depth: np.ndarray  # (n,) z-depth, scene units
@@ -66,11 +73,17 @@ class Capture:
     pictures: list[Picture]  # camera by camera, in time
     poses: Given | None  # row by row those of `pictures`
     withheld: bool  # the set keeps views back, which `prepare` writes into a truth folder
-    over: float | None = None  # what shows through transparent pixels: 1 white, 0 black; None: no transparency expected
+    over: float | None = (
+        # what shows through transparent pixels: 1 white, 0 black; None: no transparency
+        # expected
+        None
+    )
     still: bool = False  # nothing moves: times only number the views
     white_moves: bool = True  # what is white in the masks
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
-    depth_units: Literal["scene", "own"] = "scene"  # own: of the depth network, brought to scene units by `sightings`
+    depth_units: Literal["scene", "own"] = (
+        "scene"  # own: of the depth network, brought to scene units by `sightings`
+    )
     depth_scale: float = 1.0  # what a metric depth file's unit is
     sightings: Mapping[str, Sighting] = field(default_factory=dict)  # by source
     points: np.ndarray | None = None  # (P, 3) static, scene units
@@ -94,8 +107,12 @@ class Capture:
         files = [[self.root / p.source for p in self.pictures if p.camera_id == c] for c in cameras]
         linear = {f.suffix.lower() in LINEAR for camera in files for f in camera}
         if len(linear) > 1:
-            raise InputError(f"{self.root}: linear (EXR, DNG) and recorded pictures are mixed; keep one kind")
-        return Footage(self.root, files, False, max(map(len, files)), self.fps, linear.pop(), self.over)
+            raise InputError(
+                f"{self.root}: linear (EXR, DNG) and recorded pictures are mixed; keep one kind"
+            )
+        return Footage(
+            self.root, files, False, max(map(len, files)), self.fps, linear.pop(), self.over
+        )
 
     def parts(self) -> dict[str, bool]:
         """What the set gives for all of its pictures."""
@@ -133,7 +150,9 @@ class ExtraView(Strict):
 
 
 class Extra(Strict):
-    """What `export` writes beside a public layout, so that reading it again gives the same scene."""
+    """What `export` writes beside a public layout, so that reading it again gives the
+    same scene.
+    """
 
     version: Literal[1] = 1
     fps: float = Field(gt=0)
@@ -145,7 +164,9 @@ class Extra(Strict):
     depth_kind: Literal["scene", "relative"]
     points: str | None = None  # .npy (P, 3) static, scene units
     frames: dict[str, ExtraFrame]  # by name of the picture
-    held_out: dict[str, ExtraView] = Field(default_factory=dict)  # by name of the picture, where the layout names none
+    held_out: dict[str, ExtraView] = Field(
+        default_factory=dict
+    )  # by name of the picture, where the layout names none
 
     def exposures(self) -> Exposures:
         """The exposures of the brackets."""
@@ -157,12 +178,20 @@ def parse_extra(path: Path, value: Any, names: Sequence[str]) -> Extra:
     try:
         extra = Extra.model_validate(value)
     except ValidationError as error:
-        raise InputError(f"{path}: what `export` noted there is damaged ({first_problem(error)}); export again") from error
+        raise InputError(
+            f"{path}: what `export` noted there is damaged ({first_problem(error)}); export again"
+        ) from error
     if lost := [n for n in names if n not in extra.frames]:
-        raise InputError(f"{path}: no entry for picture {lost[0]}, which holds its time and exposure; export again")
-    brackets = [f.bracket for f in extra.frames.values()] + [v.bracket for v in extra.held_out.values()]
+        raise InputError(
+            f"{path}: no entry for picture {lost[0]}, which holds its time and exposure; export again"
+        )
+    brackets = [f.bracket for f in extra.frames.values()] + [
+        v.bracket for v in extra.held_out.values()
+    ]
     problem = bracket_problem(brackets, extra.bracket_ev, extra.reference_bracket)
-    if any(f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic) for f in extra.frames.values()):
+    if any(
+        f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic) for f in extra.frames.values()
+    ):
         problem = "a K is no 3x3 camera matrix"
     if strange := {v.anchor for v in extra.held_out.values()} - set(names):
         problem = f"held-out views have the pose of {min(strange)}, which is no training picture"
@@ -178,7 +207,9 @@ def read_object(path: Path, purpose: str) -> dict[str, Any]:
     try:
         found = read_json(path)
     except ValueError as error:
-        raise InputError(f"{path}: not readable JSON ({error}), or cut short; it holds {purpose}, copy it again") from error
+        raise InputError(
+            f"{path}: not readable JSON ({error}), or cut short; it holds {purpose}, copy it again"
+        ) from error
     if not isinstance(found, dict):
         raise InputError(f"{path}: not a JSON object; it holds {purpose}, copy it again")
     return found
@@ -190,8 +221,14 @@ def read_document(path: Path, purpose: str) -> dict[str, Any]:
     if not isinstance(document.get("frames"), list) or not document["frames"]:
         raise InputError(f"{path}: no list of `frames` in it; it holds {purpose}, copy it again")
     for k, frame in enumerate(document["frames"]):
-        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str) or "transform_matrix" not in frame:
-            raise InputError(f"{path}: frame {k} has no `file_path` with a `transform_matrix`; copy the file again")
+        if (
+            not isinstance(frame, dict)
+            or not isinstance(frame.get("file_path"), str)
+            or "transform_matrix" not in frame
+        ):
+            raise InputError(
+                f"{path}: frame {k} has no `file_path` with a `transform_matrix`; copy the file again"
+            )
     return document
 
 
@@ -199,15 +236,21 @@ def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> f
     """A finite number of a frame; InputError that says what it is for."""
     value = frame.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(f"{path}: {frame.get('file_path')} has no number `{key}`, {purpose}; copy the file again")
+        raise InputError(
+            f"{path}: {frame.get('file_path')} has no number `{key}`, {purpose}; copy the file again"
+        )
     return float(value)
 
 
 def named_file(root: Path, name: str, purpose: str) -> Path:
-    """The file that `name` means in a JSON of the set, with or without its ending; InputError that says what it is for."""
+    """The file that `name` means in a JSON of the set, with or without its ending;
+    InputError that says what it is for.
+    """
     base = (root / name.replace("\\", "/")).resolve()
     if not base.is_relative_to(root.resolve()):
-        raise InputError(f"{root}: {name!r} ({purpose}) points outside the data set; names must stay inside it")
+        raise InputError(
+            f"{root}: {name!r} ({purpose}) points outside the data set; names must stay inside it"
+        )
     endings = ("", *sorted(FRAMES)) if base.suffix.lower() in FRAMES else (*sorted(FRAMES), "")
     found = next((p for e in endings if (p := base.with_name(base.name + e)).is_file()), None)
     if found is None:
@@ -221,15 +264,21 @@ def source_of(root: Path, path: Path) -> str:
 
 
 def same_number(folder: Path, files: Sequence[Path], wanted: int, purpose: str) -> list[Path]:
-    """`files`, one for each of the `wanted` pictures; InputError that says what they are for."""
+    """`files`, one for each of the `wanted` pictures; InputError that says what they
+    are for.
+    """
     if len(files) != wanted:
-        raise InputError(f"{folder}: {len(files)} files for {wanted} pictures; it holds {purpose}, one each, copy it again")
+        raise InputError(
+            f"{folder}: {len(files)} files for {wanted} pictures; it holds {purpose}, one each, copy it again"
+        )
     return list(files)
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Times as a set stores them, in whatever unit -> frames: the first training time is 0, the median gap between two is 1."""
+    """Times as a set stores them, in whatever unit -> frames: the first training time
+    is 0, the median gap between two is 1.
+    """
 
     start: float
     step: float
@@ -238,7 +287,9 @@ class Clock:
     def of(times: Sequence[float]) -> Clock:
         """The clock of the training times."""
         distinct = np.unique(np.asarray(times, np.float64))
-        return Clock(float(distinct[0]), float(np.median(np.diff(distinct))) if len(distinct) > 1 else 1.0)
+        return Clock(
+            float(distinct[0]), float(np.median(np.diff(distinct))) if len(distinct) > 1 else 1.0
+        )
 
     def __call__(self, time: float) -> float:
         """A time in frames."""
@@ -247,7 +298,9 @@ class Clock:
 
 
 def turns(times: Sequence[float]) -> list[int]:
-    """A camera for each picture: 0, and for a further picture of the same time 1, 2, ..."""
+    """A camera for each picture: 0, and for a further picture of the same time 1, 2,
+    ...
+    """
     seen: Counter[float] = Counter()
     cameras = []
     for t in times:

@@ -1,9 +1,11 @@
-"""HDR-NeRF's synthetic layout: still scenes, five exposures `<file_path>_{0..4}.png` of every view, their times in
-`exposure_{split}.json`, poses as Blender writes them.
+"""HDR-NeRF's synthetic layout: still scenes, five exposures `<file_path>_{0..4}.png` of
+every view, their times in `exposure_{split}.json`, poses as Blender writes them.
 
-One picture per view is trained on. The paper draws it at random from the first, third and fifth exposure; we let these three
-alternate from view to view, which is the same share of each and needs no seed. The second and fourth stay unseen: `evaluate` asks
-for them as novel exposures."""
+One picture per view is trained on. The paper draws it at random from the first, third
+and fifth exposure; we let these three alternate from view to view, which is the same
+share of each and needs no seed. The second and fourth stay unseen: `evaluate` asks for
+them as novel exposures.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,14 @@ from typing import Any
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.datasets.blender import TEST, TRAIN, poses
-from hdr_nsff.footage.datasets.capture import Capture, Picture, named_file, read_document, read_object, source_of
+from hdr_nsff.footage.datasets.capture import (
+    Capture,
+    Picture,
+    named_file,
+    read_document,
+    read_object,
+    source_of,
+)
 
 COUNT = 5
 TRAINED = (0, 2, 4)
@@ -21,19 +30,29 @@ TRAINED = (0, 2, 4)
 
 def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
-    return (folder / TRAIN).is_file() and any((folder / f"exposure_{split}.json").is_file() for split in ("train", "test"))
+    return (folder / TRAIN).is_file() and any(
+        (folder / f"exposure_{split}.json").is_file() for split in ("train", "test")
+    )
 
 
 def read(folder: Path) -> Capture:
-    """One picture of every training view; InputError where something is missing or short."""
+    """One picture of every training view; InputError where something is missing or
+    short.
+    """
     path = folder / TRAIN
     document = read_document(path, "the training views and their poses")
     table = exposures(folder, "train")
     pictures = []
     for k, frame in enumerate(document["frames"]):
         which = TRAINED[k % len(TRAINED)]
-        file = named_file(folder, f"{frame['file_path']}_{which}.png", f"exposure {which} of training view {k}")
-        pictures.append(Picture(source_of(folder, file), float(k), ev=ev_of(folder, "train", table, frame, which)))
+        file = named_file(
+            folder, f"{frame['file_path']}_{which}.png", f"exposure {which} of training view {k}"
+        )
+        pictures.append(
+            Picture(
+                source_of(folder, file), float(k), ev=ev_of(folder, "train", table, frame, which)
+            )
+        )
     return Capture(
         layout="HDR-NeRF (synthetic)",
         root=folder,
@@ -47,7 +66,9 @@ def read(folder: Path) -> Capture:
 
 def exposures(folder: Path, split: str) -> dict[str, Any]:
     """`exposure_{split}.json`: picture -> exposure time, names without a leading `./`."""
-    table = read_object(folder / f"exposure_{split}.json", f"the exposure times of the {split} pictures")
+    table = read_object(
+        folder / f"exposure_{split}.json", f"the exposure times of the {split} pictures"
+    )
     return {plain(name): value for name, value in table.items()}
 
 
@@ -56,13 +77,19 @@ def plain(name: str) -> str:
     return name.removeprefix("./")
 
 
-def ev_of(folder: Path, split: str, table: dict[str, Any], frame: dict[str, Any], which: int) -> float:
+def ev_of(
+    folder: Path, split: str, table: dict[str, Any], frame: dict[str, Any], which: int
+) -> float:
     """The EV of exposure `which` of a view."""
     name = plain(f"{frame['file_path']}_{which}.png")
     try:
         seconds = float(table[name])
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{folder / f'exposure_{split}.json'}: no exposure time for {name}; copy the file again") from error
+        raise InputError(
+            f"{folder / f'exposure_{split}.json'}: no exposure time for {name}; copy the file again"
+        ) from error
     if not (math.isfinite(seconds) and seconds > 0):
-        raise InputError(f"{folder / f'exposure_{split}.json'}: an exposure time of {seconds:g} for {name}; it must be above 0")
+        raise InputError(
+            f"{folder / f'exposure_{split}.json'}: an exposure time of {seconds:g} for {name}; it must be above 0"
+        )
     return math.log2(seconds)

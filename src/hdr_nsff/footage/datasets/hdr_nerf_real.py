@@ -1,8 +1,11 @@
-"""HDR-NeRF's real scenes: still, five exposures of every pose, one after the other in `input_images/`, and a row for every picture in
-`poses_bounds_exps.npy` (N, 18): LLFF's 3x5 matrix (columns down, right, back), near and far, exposure time in seconds.
+"""HDR-NeRF's real scenes: still, five exposures of every pose, one after the other in
+`input_images/`, and a row for every picture in `poses_bounds_exps.npy` (N, 18): LLFF's
+3x5 matrix (columns down, right, back), near and far, exposure time in seconds.
 
-Every second pose is trained on, the first one too, the others are held out with all five exposures: their protocol. As in the synthetic
-scenes, one picture per training pose counts, of the first, third and fifth exposure in turn (they draw it at random)."""
+Every second pose is trained on, the first one too, the others are held out with all
+five exposures: their protocol. As in the synthetic scenes, one picture per training
+pose counts, of the first, third and fifth exposure in turn (they draw it at random).
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,9 @@ def recognized(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """One picture of every training pose; InputError where something is missing or short."""
+    """One picture of every training pose; InputError where something is missing or
+    short.
+    """
     given, ev = rows(folder)
     files = pictures(folder, len(ev))
     poses = range(0, len(ev) // COUNT, 2)
@@ -34,7 +39,10 @@ def read(folder: Path) -> Capture:
     return Capture(
         layout="HDR-NeRF (real)",
         root=folder,
-        pictures=[Picture(source_of(folder, files[row]), float(k), ev=ev[row]) for k, row in enumerate(chosen)],
+        pictures=[
+            Picture(source_of(folder, files[row]), float(k), ev=ev[row])
+            for k, row in enumerate(chosen)
+        ],
         poses=reorder(given, chosen),
         withheld=len(ev) > COUNT,
         still=True,
@@ -52,9 +60,13 @@ def rows(folder: Path) -> tuple[Given, list[float]]:
     table = llff_table(path, 18)
     seconds = table[:, 17]
     if len(table) % COUNT:
-        raise InputError(f"{path}: {len(table)} rows, but every pose has {COUNT}, one per exposure; copy the file again")
+        raise InputError(
+            f"{path}: {len(table)} rows, but every pose has {COUNT}, one per exposure; copy the file again"
+        )
     if not (np.isfinite(seconds).all() and (seconds > 0).all()):
-        raise InputError(f"{path}: an exposure time in its last column is not above 0; copy the file again")
+        raise InputError(
+            f"{path}: an exposure time in its last column is not above 0; copy the file again"
+        )
     return llff_rows(table[:, :17]), np.log2(seconds).tolist()
 
 

@@ -1,8 +1,11 @@
-"""nerfstudio's layout: `transforms.json` with OpenGL poses and intrinsics for all or per frame; pictures named in `val_filenames` and
-`test_filenames` are held out. `depth_file_path` holds millimeters, as nerfstudio's default unit has it.
+"""nerfstudio's layout: `transforms.json` with OpenGL poses and intrinsics for all or
+per frame; pictures named in `val_filenames` and `test_filenames` are held out.
+`depth_file_path` holds millimeters, as nerfstudio's default unit has it.
 
-Its `mask_path` says which pixels to leave out of training, not what moves, and is not used. What the layout cannot say (exposures,
-times in frames, flow, moving masks) stands under the key `hdr_nsff` where `export` wrote the file."""
+Its `mask_path` says which pixels to leave out of training, not what moves, and is not
+used. What the layout cannot say (exposures, times in frames, flow, moving masks) stands
+under the key `hdr_nsff` where `export` wrote the file.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +41,10 @@ MILLIMETERS = 1000.0  # a unit of the poses in what depth files hold
 
 
 def recognized(folder: Path) -> bool:
-    """Whether `folder` holds this layout: poses, and the pictures that they are of. Poses of pictures elsewhere are for `--poses`; a
-    file cut short is one, so that somebody says so."""
+    """Whether `folder` holds this layout: poses, and the pictures that they are of.
+    Poses of pictures elsewhere are for `--poses`; a file cut short is one, so that
+    somebody says so.
+    """
     if not (folder / NAME).is_file():
         return False
     try:
@@ -56,10 +61,16 @@ def read(folder: Path) -> Capture:
     outside = held_out_names(path, document)
     kept = [k for k, f in enumerate(document["frames"]) if f["file_path"] not in outside]
     if not kept:
-        raise InputError(f"{path}: every picture is in {' or '.join(HELD_OUT)}; leave some to train on")
+        raise InputError(
+            f"{path}: every picture is in {' or '.join(HELD_OUT)}; leave some to train on"
+        )
     frames = [document["frames"][k] for k in kept]
     given = reorder(poses(path, document), kept)
-    extra = parse_extra(path, document[EXTRA], [f["file_path"] for f in frames]) if EXTRA in document else None
+    extra = (
+        parse_extra(path, document[EXTRA], [f["file_path"] for f in frames])
+        if EXTRA in document
+        else None
+    )
     if extra is not None:
         return exported(folder, frames, given, extra, bool(outside))
     every = stored_times(path, document["frames"])
@@ -80,7 +91,11 @@ def read(folder: Path) -> Capture:
 def notes(frames: list[dict[str, Any]]) -> tuple[str, ...]:
     """What is in the file and not used."""
     masked = any("mask_path" in f for f in frames)
-    return ("its `mask_path` says what to leave out of training, not what moves: not used",) if masked else ()
+    return (
+        ("its `mask_path` says what to leave out of training, not what moves: not used",)
+        if masked
+        else ()
+    )
 
 
 def held_out_names(path: Path, document: dict[str, Any]) -> set[str]:
@@ -89,11 +104,15 @@ def held_out_names(path: Path, document: dict[str, Any]) -> set[str]:
     for key in HELD_OUT:
         listed = document.get(key, [])
         if not isinstance(listed, list) or not all(isinstance(n, str) for n in listed):
-            raise InputError(f"{path}: `{key}` is no list of file names; it says which pictures are held out, mend it")
+            raise InputError(
+                f"{path}: `{key}` is no list of file names; it says which pictures are held out, mend it"
+            )
         names |= set(listed)
     known = {f["file_path"] for f in document["frames"]}
     if lost := names - known:
-        raise InputError(f"{path}: {min(lost)} is listed as held out, but no frame has that `file_path`; mend the lists")
+        raise InputError(
+            f"{path}: {min(lost)} is listed as held out, but no frame has that `file_path`; mend the lists"
+        )
     return names - set(document.get("train_filenames", []))
 
 
@@ -123,7 +142,9 @@ def named_depth(folder: Path, frame: dict[str, Any]) -> Path | None:
     return path
 
 
-def exported(folder: Path, frames: list[dict[str, Any]], given: Given, extra: Extra, withheld: bool) -> Capture:
+def exported(
+    folder: Path, frames: list[dict[str, Any]], given: Given, extra: Extra, withheld: bool
+) -> Capture:
     """A scene of ours, as `export` wrote it."""
     own = [extra.frames[f["file_path"]] for f in frames]
     order = sorted(range(len(frames)), key=lambda k: (own[k].camera_id, own[k].time))
@@ -132,19 +153,27 @@ def exported(folder: Path, frames: list[dict[str, Any]], given: Given, extra: Ex
         if name is None:
             return None
         if not (folder / name).is_file():
-            raise InputError(f"{folder / name}: missing; it is the {purpose} of {frame['file_path']}, export again")
+            raise InputError(
+                f"{folder / name}: missing; it is the {purpose} of {frame['file_path']}, export again"
+            )
         return folder / name
 
     pictures = [
         Picture(
-            source=source_of(folder, named_file(folder, f["file_path"], f"a training picture of {NAME}")),
+            source=source_of(
+                folder, named_file(folder, f["file_path"], f"a training picture of {NAME}")
+            ),
             time=e.time,
             camera_id=e.camera_id,
             bracket=e.bracket,
             mask=path_of(e.moving, "moving mask", f),
             depth=path_of(e.disparity, "disparity", f),
             confidence=path_of(e.confidence, "trust in the disparity", f),
-            flow={to: p for to, n in e.flow.items() if (p := path_of(n, f"optical flow to {to}", f)) is not None},
+            flow={
+                to: p
+                for to, n in e.flow.items()
+                if (p := path_of(n, f"optical flow to {to}", f)) is not None
+            },
         )
         for f, e in ((frames[k], own[k]) for k in order)
     ]

@@ -1,5 +1,8 @@
-"""Cameras, poses and static points as a COLMAP model in binary, as COLMAP's documentation describes the format. Scenes keep no tracks:
-a point counts as seen where it projects into a frame and the frame's depth agrees, and its keypoint is its projection."""
+"""Cameras, poses and static points as a COLMAP model in binary, as COLMAP's
+documentation describes the format. Scenes keep no tracks: a point counts as seen where
+it projects into a frame and the frame's depth agrees, and its keypoint is its
+projection.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +52,9 @@ def write_model(
     points: np.ndarray,
     views: Sequence[Seen],
 ) -> None:
-    """Write cameras.bin, images.bin and points3D.bin: frames `names` (N) with K (N, 3, 3) and c2w (N, 3, 4) of `size` (H, W)."""
+    """Write cameras.bin, images.bin and points3D.bin: frames `names` (N) with K (N, 3,
+    3) and c2w (N, 3, 4) of `size` (H, W).
+    """
     kinds = {k.tobytes(): i for i, k in reversed(list(enumerate(K)))}
     ids = {key: number for number, key in enumerate(sorted(kinds, key=lambda key: kinds[key]), 1)}
     cameras = struct.pack("<Q", len(ids))
@@ -59,14 +64,18 @@ def write_model(
     tracks: list[list[int]] = [[] for _ in points]
     for i, (name, pose, view) in enumerate(zip(names, c2w, views, strict=True)):
         quaternion = np.roll(Rotation.from_matrix(pose[:, :3].T).as_quat(), 1)
-        images += struct.pack("<i7di", i + 1, *quaternion, *(-pose[:, :3].T @ pose[:, 3]), ids[K[i].tobytes()])
+        images += struct.pack(
+            "<i7di", i + 1, *quaternion, *(-pose[:, :3].T @ pose[:, 3]), ids[K[i].tobytes()]
+        )
         images += name.encode() + b"\0" + struct.pack("<Q", len(view.index))
         for k, (row, (x, y)) in enumerate(zip(view.index, view.xy, strict=True)):
             images += struct.pack("<ddq", x, y, row + 1)
             tracks[row] += [i + 1, k]
     cloud = bytearray(struct.pack("<Q", len(points)))
     for row, (point, track) in enumerate(zip(points.astype(np.float64), tracks, strict=True)):
-        cloud += struct.pack(f"<Q3d3BdQ{len(track)}i", row + 1, *point, 128, 128, 128, 0.0, len(track) // 2, *track)
+        cloud += struct.pack(
+            f"<Q3d3BdQ{len(track)}i", row + 1, *point, 128, 128, 128, 0.0, len(track) // 2, *track
+        )
     for file, data in (("cameras.bin", cameras), ("images.bin", images), ("points3D.bin", cloud)):
         with atomic(folder / file) as temporary:
             temporary.write_bytes(data)
@@ -76,5 +85,9 @@ def camera(number: int, K: np.ndarray, size: tuple[int, int]) -> bytes:
     """One camera of cameras.bin."""
     height, width = size
     if K[0, 0] == K[1, 1]:
-        return struct.pack("<iiQQ3d", number, SIMPLE_PINHOLE, width, height, K[0, 0], K[0, 2], K[1, 2])
-    return struct.pack("<iiQQ4d", number, PINHOLE, width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+        return struct.pack(
+            "<iiQQ3d", number, SIMPLE_PINHOLE, width, height, K[0, 0], K[0, 2], K[1, 2]
+        )
+    return struct.pack(
+        "<iiQQ4d", number, PINHOLE, width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    )

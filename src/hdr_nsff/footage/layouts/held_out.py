@@ -1,5 +1,7 @@
-"""The views of a truth folder as pictures for the writers of layouts: where they stand in the scene, and what the true camera records
-of them at the exposure that they are compared at. `export --truth` alone imports this; nothing that learns does."""
+"""The views of a truth folder as pictures for the writers of layouts: where they stand
+in the scene, and what the true camera records of them at the exposure that they are
+compared at. `export --truth` alone imports this; nothing that learns does.
+"""
 
 from __future__ import annotations
 
@@ -18,8 +20,10 @@ from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
 
 
 def views_of(source: Source, folder: Path) -> list[HeldOutPicture]:
-    """The views of the truth `folder` in the world of the scene, as `evaluate` carries them over. InputError where the truth is not
-    of this scene; says which views have no place in it."""
+    """The views of the truth `folder` in the world of the scene, as `evaluate` carries
+    them over. InputError where the truth is not of this scene; says which views have no
+    place in it.
+    """
     truth, frames = Truth.open(folder), source.manifest.frames
     true, estimated = truth.clip_c2w, np.array([f.c2w for f in frames], np.float64)
     if true is not None and len(true) != len(frames):
@@ -33,15 +37,28 @@ def views_of(source: Source, folder: Path) -> list[HeldOutPicture]:
             f"{folder}: {len(lost)} views, {lost[0]} first, are off the clip's path, and the cameras of the scene fix no scale: left out"
         )
     brackets = scene_brackets(truth, frames, exposures_of(source))
-    return [placed(source, folder, truth, v, brackets, scale or 1.0) for v in truth.views if v.name not in lost]
+    return [
+        placed(source, folder, truth, v, brackets, scale or 1.0)
+        for v in truth.views
+        if v.name not in lost
+    ]
 
 
-def placed(source: Source, folder: Path, truth: Truth, view: TruthView, brackets: dict[int, int], scale: float) -> HeldOutPicture:
+def placed(
+    source: Source,
+    folder: Path,
+    truth: Truth,
+    view: TruthView,
+    brackets: dict[int, int],
+    scale: float,
+) -> HeldOutPicture:
     """One view; `scale` is how many units of the scene are one of the truth."""
     anchor = next((f for f in source.manifest.frames if f.index == view.anchor), None)
     if anchor is None or view.bracket not in brackets:
         what = f"anchored at frame {view.anchor}" if anchor is None else "of an exposure"
-        raise InputError(f"{folder}: view {view.name} is {what} that the scene does not have; prepare the whole clip")
+        raise InputError(
+            f"{folder}: view {view.name} is {what} that the scene does not have; prepare the whole clip"
+        )
     c2w = np.array(anchor.c2w)
     if view.c2w is not None:
         if truth.clip_c2w is None:
@@ -57,13 +74,19 @@ def placed(source: Source, folder: Path, truth: Truth, view: TruthView, brackets
         K=np.array(view.K or anchor.K),
         c2w=c2w,
         mask=None if view.mask is None else inside(folder, view.mask),
-        write=partial(write_picture, folder, truth, view, (source.manifest.height, source.manifest.width)),
+        write=partial(
+            write_picture, folder, truth, view, (source.manifest.height, source.manifest.width)
+        ),
     )
 
 
-def write_picture(folder: Path, truth: Truth, view: TruthView, size: tuple[int, int], path: Path) -> None:
-    """Write what was recorded of a view at its bracket, as it is stored; else in 8 bits what the true camera records. InputError for
-    pictures of another size than the scene's, (H, W)."""
+def write_picture(
+    folder: Path, truth: Truth, view: TruthView, size: tuple[int, int], path: Path
+) -> None:
+    """Write what was recorded of a view at its bracket, as it is stored; else in 8 bits
+    what the true camera records. InputError for pictures of another size than the
+    scene's, (H, W).
+    """
     rgb = true_pictures(truth, view, folder)[1][view.bracket]
     if rgb.shape[:2] != size:
         raise InputError(
@@ -77,8 +100,10 @@ def write_picture(folder: Path, truth: Truth, view: TruthView, size: tuple[int, 
 
 
 def exposures_of(source: Source) -> list[float]:
-    """The exposure of every bracket in stops; where the scene does not know them all, their order by brightness, which is all that is asked
-    of them where truth and scene have equally many."""
+    """The exposure of every bracket in stops; where the scene does not know them all,
+    their order by brightness, which is all that is asked of them where truth and scene
+    have equally many.
+    """
     m = source.manifest
     known = [ev for ev in m.bracket_ev if ev is not None]
     if known and len(known) == len(m.bracket_ev):

@@ -1,9 +1,12 @@
-"""A scene folder -> the HDR-GoPro / NSFF layout (LLFF), as `llff.py` describes it: training frames in time, and
-what a truth folder keeps back.
+"""A scene folder -> the HDR-GoPro / NSFF layout (LLFF), as `llff.py` describes it:
+training frames in time, and what a truth folder keeps back.
 
-The layout has one focal length and a principal point at the center, one picture per time, and no place for exposures and trust in the
-depth: `dense/hdr_nsff.json` and `dense/disp_confidence/` hold those, and other readers pass over them. Held-out views it knows from the
-poses of training pictures (camera k stands where training picture k - 1 does), at their times and half-way to the next."""
+The layout has one focal length and a principal point at the center, one picture per
+time, and no place for exposures and trust in the depth: `dense/hdr_nsff.json` and
+`dense/disp_confidence/` hold those, and other readers pass over them. Held-out views it
+knows from the poses of training pictures (camera k stands where training picture k - 1
+does), at their times and half-way to the next.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,9 @@ SAME_TIME = 1e-6  # frames
 
 
 def write(source: Source, out: Path, held_out: Sequence[HeldOutPicture] = ()) -> Path:
-    """Write the layout into `out`/dense and `out`/masks. InputError for a scene that it cannot hold."""
+    """Write the layout into `out`/dense and `out`/masks. InputError for a scene that it
+    cannot hold.
+    """
     scene, m = source.folder, source.manifest
     frames = sorted((f for f in m.frames if f.split == "train"), key=lambda f: f.time)
     if len({f.time for f in frames}) < len(frames):
@@ -47,14 +52,23 @@ def write(source: Source, out: Path, held_out: Sequence[HeldOutPicture] = ()) ->
             if 0 <= j < len(frames):
                 write_flow(source, f, frames[j], dense / f"flow_i1/{i:05d}_{side}.npz")
     write_poses(source, frames, dense)
-    own = {f"{i:05d}.png": ExtraFrame(time=f.time, camera_id=f.camera_id, bracket=f.bracket, K=f.K) for i, f in enumerate(frames)}
-    write_json(dense / NOTE, (source.extra(own).model_copy(update={"held_out": views})).model_dump())
+    own = {
+        f"{i:05d}.png": ExtraFrame(time=f.time, camera_id=f.camera_id, bracket=f.bracket, K=f.K)
+        for i, f in enumerate(frames)
+    }
+    write_json(
+        dense / NOTE, (source.extra(own).model_copy(update={"held_out": views})).model_dump()
+    )
     return out
 
 
-def write_held_out(frames: Sequence[FrameEntry], views: Sequence[HeldOutPicture], dense: Path) -> dict[str, ExtraView]:
-    """Write the held-out views that the layout has a place for, and their masks; what it cannot say of them, by their pictures' names.
-    Says which have none. `frames` are the training pictures in order."""
+def write_held_out(
+    frames: Sequence[FrameEntry], views: Sequence[HeldOutPicture], dense: Path
+) -> dict[str, ExtraView]:
+    """Write the held-out views that the layout has a place for, and their masks; what
+    it cannot say of them, by their pictures' names. Says which have none. `frames` are
+    the training pictures in order.
+    """
     noted: dict[str, ExtraView] = {}
     lost = []
     for view in track(views, "held-out views"):
@@ -67,7 +81,13 @@ def write_held_out(frames: Sequence[FrameEntry], views: Sequence[HeldOutPicture]
         mask = None if view.mask is None else name.replace("images", "masks")
         if view.mask is not None and mask is not None:
             copy(view.mask, dense / mask)
-        noted[name] = ExtraView(name=view.name, time=view.time, bracket=view.bracket, anchor=f"{camera:05d}.png", mask=mask)
+        noted[name] = ExtraView(
+            name=view.name,
+            time=view.time,
+            bracket=view.bracket,
+            anchor=f"{camera:05d}.png",
+            mask=mask,
+        )
     if lost:
         say(
             f"{dense}: left out {len(lost)} of {len(views)} held-out views ({', '.join(lost)}): the layout has a place for one view from the pose of "
@@ -77,15 +97,21 @@ def write_held_out(frames: Sequence[FrameEntry], views: Sequence[HeldOutPicture]
 
 
 def camera_of(frames: Sequence[FrameEntry], view: HeldOutPicture) -> int | None:
-    """The first of the training pictures that has exactly the pose and intrinsics of a view; of a rig that is its camera, from 0."""
+    """The first of the training pictures that has exactly the pose and intrinsics of a
+    view; of a rig that is its camera, from 0.
+    """
     same = (
-        i for i, f in enumerate(frames) if np.array_equal(np.array(f.c2w), view.c2w) and np.array_equal(np.array(f.K), view.K)
+        i
+        for i, f in enumerate(frames)
+        if np.array_equal(np.array(f.c2w), view.c2w) and np.array_equal(np.array(f.K), view.K)
     )
     return next(same, None)
 
 
 def step_of(frames: Sequence[FrameEntry], time: float) -> str | None:
-    """The folder of views at a `time`: that of a training picture, or half-way to the next."""
+    """The folder of views at a `time`: that of a training picture, or half-way to the
+    next.
+    """
     times = np.array([f.time for f in frames])
     for name, steps in zip(MULTI_VIEW, (times, (times[1:] + times[:-1]) / 2), strict=True):
         if len(found := np.flatnonzero(np.abs(steps - time) < SAME_TIME)):
@@ -116,23 +142,34 @@ def write_frame(source: Source, f: FrameEntry, i: int, out: Path) -> None:
 def write_flow(source: Source, f: FrameEntry, to: FrameEntry, path: Path) -> None:
     """`flow` (H, W, 2) px and `mask` (H, W) to a neighbor, float32."""
     if to.index not in f.flow:
-        raise InputError(f"{source.folder}: no flow from frame {f.index} to frame {to.index}; run `hdr-nsff prepare` again")
+        raise InputError(
+            f"{source.folder}: no flow from frame {f.index} to frame {to.index}; run `hdr-nsff prepare` again"
+        )
     files = f.flow[to.index]
     flow = np.array(read_npy(source.file(files.flow)), np.float32)
     buffer = BytesIO()
-    np.savez_compressed(buffer, flow=flow, mask=read_mask(source.file(files.valid)).astype(np.float32))
+    np.savez_compressed(
+        buffer, flow=flow, mask=read_mask(source.file(files.valid)).astype(np.float32)
+    )
     with atomic(path) as temporary:
         temporary.write_bytes(buffer.getbuffer())
 
 
 def write_poses(source: Source, frames: list[FrameEntry], dense: Path) -> None:
-    """`poses_bounds.npy`, and `sparse/` where the scene has static points. Bounds are the 5th and 95th percentile of the depth of the
-    points that a frame sees, else the scene's near and far."""
+    """`poses_bounds.npy`, and `sparse/` where the scene has static points. Bounds are
+    the 5th and 95th percentile of the depth of the points that a frame sees, else the
+    scene's near and far.
+    """
     m = source.manifest
-    K, c2w = np.array([f.K for f in frames], np.float64), np.array([f.c2w for f in frames], np.float64)
+    K, c2w = (
+        np.array([f.K for f in frames], np.float64),
+        np.array([f.c2w for f in frames], np.float64),
+    )
     centered = np.abs(K[:, :2, 2] - [m.width / 2, m.height / 2]).max()
     if max(centered, np.abs(K[:, 0, 0] - K[:, 1, 1]).max()) > 0.5:
-        say("the layout has one focal length and a centered principal point: exact only in dense/hdr_nsff.json and dense/sparse")
+        say(
+            "the layout has one focal length and a centered principal point: exact only in dense/hdr_nsff.json and dense/sparse"
+        )
     views = []
     if source.points is not None:
         for f, k, pose in zip(frames, K, c2w, strict=True):
@@ -140,8 +177,12 @@ def write_poses(source: Source, frames: list[FrameEntry], dense: Path) -> None:
             assert disparity is not None, f.index
             views.append(to_colmap.seen(source.points, k, pose, disparity.astype(np.float32)))
         names = [f"{i:05d}.png" for i in range(len(frames))]
-        to_colmap.write_model(dense / "sparse", names, K, c2w, (m.height, m.width), source.points, views)
-    bounds = [np.percentile(v.depth, [5, 95]) if len(v.depth) >= 10 else [m.near, m.far] for v in views]
+        to_colmap.write_model(
+            dense / "sparse", names, K, c2w, (m.height, m.width), source.points, views
+        )
+    bounds = [
+        np.percentile(v.depth, [5, 95]) if len(v.depth) >= 10 else [m.near, m.far] for v in views
+    ]
     last = np.stack([np.full(len(K), m.height), np.full(len(K), m.width), K[:, 0, 0]], -1)
     rotation = c2w[:, :, :3] @ np.linalg.inv(FROM_LLFF)
     matrices = np.concatenate([rotation, c2w[:, :, 3:], last[:, :, None]], 2)  # (N, 3, 5)

@@ -1,5 +1,8 @@
-"""A scene folder -> nerfstudio's `transforms.json` with pictures, depth in millimeters and held-out frames and views as `test_filenames`.
-What nerfstudio has no word for (exposures, times in frames, flow, moving masks, trust in the depth) stands under `hdr_nsff`."""
+"""A scene folder -> nerfstudio's `transforms.json` with pictures, depth in millimeters
+and held-out frames and views as `test_filenames`. What nerfstudio has no word for
+(exposures, times in frames, flow, moving masks, trust in the depth) stands under
+`hdr_nsff`.
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,9 @@ def frame_entry(source: Source, f: FrameEntry, out: Path, name: str, time: float
 
 def pose_entry(name: str, K: np.ndarray, c2w: np.ndarray, time: float) -> dict[str, Any]:
     """A picture with its camera: K (3, 3), c2w (3, 4)."""
-    matrix = np.concatenate([np.concatenate([c2w[:, :3] @ FROM_OPENGL, c2w[:, 3:]], 1), [[0, 0, 0, 1]]])
+    matrix = np.concatenate(
+        [np.concatenate([c2w[:, :3] @ FROM_OPENGL, c2w[:, 3:]], 1), [[0, 0, 0, 1]]]
+    )
     return {
         "file_path": name,
         "transform_matrix": matrix.tolist(),

@@ -1,5 +1,6 @@
-"""What the writers of public layouts share: which scene, into which folder, file by file. Pictures and maps that a layout takes as they
-are, are copied byte by byte."""
+"""What the writers of public layouts share: which scene, into which folder, file by
+file. Pictures and maps that a layout takes as they are, are copied byte by byte.
+"""
 
 from __future__ import annotations
 
@@ -73,12 +74,16 @@ class HeldOutPicture:
 
 
 def claim(out: Path, layout: str, scene: Path) -> None:
-    """Make `out` ready; what an earlier export left there is removed. InputError where it holds something else."""
+    """Make `out` ready; what an earlier export left there is removed. InputError where
+    it holds something else.
+    """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --layout writes a folder, name another one")
     if out.is_dir() and any(out.iterdir()):
         if notes.read(out / NOTE, notes.Layout) is None:
-            raise InputError(f"{out}: is there already and was not made by export; choose an empty or new folder")
+            raise InputError(
+                f"{out}: is there already and was not made by export; choose an empty or new folder"
+            )
         for path in out.iterdir():
             if path.is_dir():
                 shutil.rmtree(path)

@@ -1,4 +1,6 @@
-"""The steps of `prepare` that look at the footage alone: frames, and which exposure each was taken with."""
+"""The steps of `prepare` that look at the footage alone: frames, and which exposure
+each was taken with.
+"""
 
 from __future__ import annotations
 
@@ -19,12 +21,20 @@ MIN_FRAMES = 3
 
 
 def frames_step(work: Work) -> Step:
-    """Decode the chosen frames into `images/`, and check that there is something to see on them."""
+    """Decode the chosen frames into `images/`, and check that there is something to see
+    on them.
+    """
     c, m = work.config, work.manifest
-    total = len(range(c.start, c.end or work.footage.count, c.stride)) * len(work.footage.cameras) if work.footage.count else None
+    total = (
+        len(range(c.start, c.end or work.footage.count, c.stride)) * len(work.footage.cameras)
+        if work.footage.count
+        else None
+    )
     entries: list[FrameEntry] = []
     extents = []
-    for frame in track(ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size), "frames", total):
+    for frame in track(
+        ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size), "frames", total
+    ):
         entry = FrameEntry(
             index=len(entries),
             image=f"images/{len(entries):05d}.png",
@@ -35,23 +45,39 @@ def frames_step(work: Work) -> Step:
         )
         if not (work.folder / entry.image).is_file():
             exact = np.rint(frame.rgb * 255) / 255
-            write_png(work.folder / entry.image, frame.rgb, bits=8 if np.abs(frame.rgb - exact).max() < 1e-6 else 16)
+            write_png(
+                work.folder / entry.image,
+                frame.rgb,
+                bits=8 if np.abs(frame.rgb - exact).max() < 1e-6 else 16,
+            )
         m.height, m.width = frame.rgb.shape[:2]
         extents.append(exposure.extent(frame.rgb))
         entries.append(entry)
     times = len({e.time for e in entries})
     if times < MIN_FRAMES:
-        raise InputError(f"{c.clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are needed to see motion")
+        raise InputError(
+            f"{c.clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are needed to see motion"
+        )
     if (color := exposure.all_clipped(extents)) is not None:
-        raise InputError(f"{c.clip}: all frames are {color}; nothing can be learned from them, choose other frames")
+        raise InputError(
+            f"{c.clip}: all frames are {color}; nothing can be learned from them, choose other frames"
+        )
     m.frames, m.fps = entries, work.footage.fps / c.stride
     vars(work).pop("video", None)
-    linear = "; linear frames, scaled by one constant and encoded as x^(1/2.2)" if work.footage.linear else ""
-    return Step(provenance="given", note=f"{len(entries)} frames of {m.width}x{m.height} pixels{linear}")
+    linear = (
+        "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
+        if work.footage.linear
+        else ""
+    )
+    return Step(
+        provenance="given", note=f"{len(entries)} frames of {m.width}x{m.height} pixels{linear}"
+    )
 
 
 def exposure_step(work: Work) -> Step:
-    """Which frames share an exposure, what the exposures are where that is known, and which frames are kept out of training."""
+    """Which frames share an exposure, what the exposures are where that is known, and
+    which frames are kept out of training.
+    """
     m = work.manifest
     cameras = work.camera_frames()
     source, given = given_exposures(work)
@@ -67,12 +93,18 @@ def exposure_step(work: Work) -> Step:
         notes += found_cycle(work, cycles)
     else:
         brackets, known = exposure.by_value(given)
-        notes += [d for frames in cameras for d in exposure.doubts(work.video[frames], [given[i] for i in frames])]
+        notes += [
+            d
+            for frames in cameras
+            for d in exposure.doubts(work.video[frames], [given[i] for i in frames])
+        ]
         values = list(known)
     for note in notes[:3]:
         say(f"exposure: {note}")
     m.cycle = exposure.period([brackets[i] for i in cameras[0]])
-    m.reference_bracket = stored.reference if stored else exposure.reference_bracket(work.video, brackets)
+    m.reference_bracket = (
+        stored.reference if stored else exposure.reference_bracket(work.video, brackets)
+    )
     gauge = values[m.reference_bracket]
     m.bracket_ev = [None if v is None or gauge is None else v - gauge for v in values]
     m.exposure_given = stored.given if stored else given is not None
@@ -81,16 +113,24 @@ def exposure_step(work: Work) -> Step:
     if m.protocol is not None:
         check_protocol(m.protocol, brackets, test)
     for f, bracket in zip(m.frames, brackets, strict=True):
-        f.bracket, f.ev, f.split = bracket, m.bracket_ev[bracket], "test" if f.index in test else "train"
+        f.bracket, f.ev, f.split = (
+            bracket,
+            m.bracket_ev[bracket],
+            "test" if f.index in test else "train",
+        )
     vars(work).pop("equalized", None)
     what = "no alternation" if m.cycle == 1 else f"cycle of {m.cycle}, {len(values)} exposures"
     step: Literal["given", "estimated"] = "given" if stored or given is not None else "estimated"
     details = {"source": source, "doubts": notes}
-    return Step(provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details)
+    return Step(
+        provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details
+    )
 
 
 def kept_out(work: Work) -> set[int]:
-    """Indices of the frames that are kept out of training, by the protocol or every so many of each camera."""
+    """Indices of the frames that are kept out of training, by the protocol or every so
+    many of each camera.
+    """
     c, cycle, cameras = work.config, work.manifest.cycle, work.camera_frames()
     match c.protocol:
         case "novel-view":
@@ -98,18 +138,26 @@ def kept_out(work: Work) -> set[int]:
         case "novel-view-time":
             return {frames[k] for frames in cameras for k in ingest.between(len(frames), cycle)}
         case None:
-            return {frames[k] for frames in cameras for k in ingest.held_out(len(frames), held_out_every(work), cycle)}
+            return {
+                frames[k]
+                for frames in cameras
+                for k in ingest.held_out(len(frames), held_out_every(work), cycle)
+            }
 
 
 def held_out_every(work: Work) -> int:
-    """Every how many frames are kept out of training; 0 for none, as where a data set brings held-out views of its own."""
+    """Every how many frames are kept out of training; 0 for none, as where a data set
+    brings held-out views of its own.
+    """
     if work.config.hold_out is not None:
         return work.config.hold_out
     return 0 if work.capture is not None and work.capture.withheld else ingest.HOLD_OUT
 
 
 def check_protocol(protocol: Protocol, brackets: list[int], test: set[int]) -> None:
-    """InputError where the frames that are not kept out (`test`, indices) show fewer exposures than all, by their `brackets`."""
+    """InputError where the frames that are not kept out (`test`, indices) show fewer
+    exposures than all, by their `brackets`.
+    """
     shown, trained = set(brackets), {b for i, b in enumerate(brackets) if i not in test}
     if len(trained) < len(shown):
         raise InputError(
@@ -119,7 +167,9 @@ def check_protocol(protocol: Protocol, brackets: list[int], test: set[int]) -> N
 
 
 def given_exposures(work: Work) -> tuple[str, list[float] | None]:
-    """Where the EV of every frame comes from, and the EVs; None where brightness has to tell, or a data set stores brackets."""
+    """Where the EV of every frame comes from, and the EVs; None where brightness has to
+    tell, or a data set stores brackets.
+    """
     c, footage, frames = work.config, work.footage, work.manifest.frames
     numbers = [c.start + int(f.time) * c.stride for f in frames]
     cycle = ingest.parse_exposures(c.exposures, c.ev)
@@ -139,7 +189,9 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         ]
         missing = next((f.source for f, k in zip(frames, keys, strict=True) if k is None), None)
         if missing is not None:
-            raise InputError(f"{path}: no row for frame {missing}; add it, or give `--exposures auto`")
+            raise InputError(
+                f"{path}: no row for frame {missing}; add it, or give `--exposures auto`"
+            )
         return path.name, [rows[k] for k in keys if k is not None]
     if not footage.video:
         files = footage.files
@@ -148,7 +200,9 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         if len(known) == len(found) and max(known) - min(known) >= exposure.MIN_STEP:
             return "EXIF", known
         if known and len(known) < len(found):
-            say(f"exposure: EXIF of {len(found) - len(known)} frames holds no exposure time; brightness decides instead")
+            say(
+                f"exposure: EXIF of {len(found) - len(known)} frames holds no exposure time; brightness decides instead"
+            )
     return "brightness", None
 
 
@@ -186,9 +240,12 @@ def found_cycle(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
                 "list the exposures in a CSV if they were set"
             )
         else:
-            notes.append(f"{who}no alternation of exposures found; treated as an ordinary clip of one exposure")
+            notes.append(
+                f"{who}no alternation of exposures found; treated as an ordinary clip of one exposure"
+            )
     if len({c.length for c in cycles}) > 1:
         notes.insert(
-            0, f"the cameras disagree on the length of the cycle ({[c.length for c in cycles]}); list the exposures in a CSV"
+            0,
+            f"the cameras disagree on the length of the cycle ({[c.length for c in cycles]}); list the exposures in a CSV",
         )
     return notes

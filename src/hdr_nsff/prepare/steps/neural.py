@@ -1,5 +1,6 @@
-"""Masks and depth by networks: what `prepare --mask sam2` and `--depth depth-anything` do with a clip of one or more cameras; and which
-weights the steps read."""
+"""Masks and depth by networks: what `prepare --mask sam2` and `--depth depth-anything`
+do with a clip of one or more cameras; and which weights the steps read.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +27,9 @@ PROMPTS = "masks/prompts.json"
 
 
 def check_networks(config: PrepareConfig) -> None:
-    """InputError where a network that was chosen cannot run, before anything else is done; its weights are downloaded where they may be."""
+    """InputError where a network that was chosen cannot run, before anything else is
+    done; its weights are downloaded where they may be.
+    """
     check_matcher(config.matcher)
     if config.masks == "sam2":
         architecture(SAM2)
@@ -41,7 +44,9 @@ def check_networks(config: PrepareConfig) -> None:
 
 
 def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
-    """The hashes of the weights that a step reads. InputError where they are not to be had."""
+    """The hashes of the weights that a step reads. InputError where they are not to be
+    had.
+    """
     match step:
         case "flow":
             paths = flow_weights(config.flow, config.flow_weights, config.semantic)
@@ -62,13 +67,24 @@ def ready(network: str, weights: str) -> Any:
 
 
 def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
-    """`moving` (T, H, W) bool outlined by SAM 2, camera by camera; what it was asked is written to `masks/prompts.json`.
+    """`moving` (T, H, W) bool outlined by SAM 2, camera by camera; what it was asked is
+    written to `masks/prompts.json`.
 
-    Masks of training frames come from training frames alone; held-out ones get theirs from a second run over all frames."""
+    Masks of training frames come from training frames alone; held-out ones get theirs
+    from a second run over all frames.
+    """
     m, c = work.manifest, work.config
-    given = PointsFile() if c.mask_points is None else read_points(c.mask_points, len(m.frames), (m.height, m.width))
-    if other := sorted({e.frame for e in (*given.points, *given.boxes) if m.frames[e.frame].split != "train"}):
-        raise InputError(f"{c.mask_points}: frame {other[0]} is held out of training; point at frames beside it")
+    given = (
+        PointsFile()
+        if c.mask_points is None
+        else read_points(c.mask_points, len(m.frames), (m.height, m.width))
+    )
+    if other := sorted(
+        {e.frame for e in (*given.points, *given.boxes) if m.frames[e.frame].split != "train"}
+    ):
+        raise InputError(
+            f"{c.mask_points}: frame {other[0]} is held out of training; point at frames beside it"
+        )
     network = ready(SAM2, c.mask_weights)
     video = work.equalized[0]
     outlined = np.zeros_like(moving)
@@ -92,11 +108,17 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     return outlined
 
 
-def network_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, float, Kind]:
-    """Disparity and confidence of the frames `index` (increasing), near and far, by Depth Anything; and its kind."""
+def network_depth(
+    work: Work, index: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float, float, Kind]:
+    """Disparity and confidence of the frames `index` (increasing), near and far, by
+    Depth Anything; and its kind.
+    """
     m = work.manifest
     video, clipped = work.equalized
-    answered, kind = network_disparity(ready(DEPTH_ANYTHING, work.config.depth_weights), video[index])
+    answered, kind = network_disparity(
+        ready(DEPTH_ANYTHING, work.config.depth_weights), video[index]
+    )
     K, c2w = work.cameras()
     moving = np.stack([read_mask(work.folder / str(m.frames[i].mask)) for i in index])
     times = np.array([m.frames[i].time for i in index], np.float64)
@@ -104,4 +126,12 @@ def network_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray
     points = np.array(read_npy(work.folder / m.points)) if m.points else np.zeros((0, 3))
     flow, valid, pairs = work.raw_flows
     among = np.isin(pairs, index).all(1)
-    return *anchored_depth(answered, kind, clip, points, flow[among], valid[among], np.searchsorted(index, pairs[among])), kind
+    return *anchored_depth(
+        answered,
+        kind,
+        clip,
+        points,
+        flow[among],
+        valid[among],
+        np.searchsorted(index, pairs[among]),
+    ), kind

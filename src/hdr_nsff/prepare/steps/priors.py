@@ -1,6 +1,9 @@
-"""The steps of `prepare` that find what training starts from: flow, poses, moving masks, depth; and the contact sheet of it all.
+"""The steps of `prepare` that find what training starts from: flow, poses, moving
+masks, depth; and the contact sheet of it all.
 
-Pixels of held-out frames are used for their own pose and mask only: nothing about a training frame depends on them but poses."""
+Pixels of held-out frames are used for their own pose and mask only: nothing about a
+training frame depends on them but poses.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import colorize, colorize_flow, contact_sheet, read_mask, read_npy, write_npy, write_png
+from hdr_nsff.core.io import (
+    colorize,
+    colorize_flow,
+    contact_sheet,
+    read_mask,
+    read_npy,
+    write_npy,
+    write_png,
+)
 from hdr_nsff.core.parallel import in_threads
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
@@ -37,40 +48,59 @@ DEPTH_FILES = {".npy", ".exr", ".png"}
 ROUNDS = 2  # of structure from motion after the first
 SAME_MASKS = 0.85  # intersection over union from which masks count as the same
 FLOW_CHUNK = 8  # pairs between two savings
-SPHERE_NEAR, SPHERE_FAR = 0.5, 2.0  # around distance 1, where everything lies when there is no parallax
+SPHERE_NEAR, SPHERE_FAR = (
+    0.5,
+    2.0,
+)  # around distance 1, where everything lies when there is no parallax
 
 
 def flow_pairs(frames: list[FrameEntry]) -> list[tuple[int, int]]:
-    """The pairs (from, to) that flow is wanted for, both directions side by side: neighbors in the clip, and neighbors among the
-    training frames, of each camera."""
+    """The pairs (from, to) that flow is wanted for, both directions side by side:
+    neighbors in the clip, and neighbors among the training frames, of each camera.
+    """
     pairs = dict.fromkeys(
         pair
         for camera in sorted({f.camera_id for f in frames})
         for split in ({"train", "test"}, {"train"})
-        for pair in pairwise([f.index for f in frames if f.camera_id == camera and f.split in split])
+        for pair in pairwise(
+            [f.index for f in frames if f.camera_id == camera and f.split in split]
+        )
     )
     return [p for i, j in pairs for p in ((i, j), (j, i))]
 
 
 def learning_pairs(frames: list[FrameEntry]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Of the training frames of each camera: neighbors, and consecutive ones of equal exposure."""
+    """Of the training frames of each camera: neighbors, and consecutive ones of equal
+    exposure.
+    """
     among: list[dict[tuple[int, ...], list[int]]] = [{}, {}]
     for f in frames:
         if f.split == "train":
             among[0].setdefault((f.camera_id,), []).append(f.index)
             among[1].setdefault((f.camera_id, f.bracket), []).append(f.index)
-    neighbors, equal = ([pair for line in lines.values() for pair in pairwise(line)] for lines in among)
+    neighbors, equal = (
+        [pair for line in lines.values() for pair in pairwise(line)] for lines in among
+    )
     return neighbors, equal
 
 
 def flow_step(work: Work) -> Step:
-    """Optical flow between neighbors, from a folder or estimated, a few pairs at a time so that a killed run keeps them."""
+    """Optical flow between neighbors, from a folder or estimated, a few pairs at a time
+    so that a killed run keeps them.
+    """
     m, c = work.manifest, work.config
     pairs = flow_pairs(m.frames)
     names = {
-        (i, j): FlowFiles(flow=f"raw_flow/{i:05d}_{j:05d}.npy", valid=f"raw_flow/{i:05d}_{j:05d}_valid.png") for i, j in pairs
+        (i, j): FlowFiles(
+            flow=f"raw_flow/{i:05d}_{j:05d}.npy", valid=f"raw_flow/{i:05d}_{j:05d}_valid.png"
+        )
+        for i, j in pairs
     }
-    missing = [p for p in pairs if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))]
+    missing = [
+        p
+        for p in pairs
+        if not all((work.folder / n).is_file() for n in (names[p].flow, names[p].valid))
+    ]
     own = given_flow(work, names)
     missing = [p for p in missing if p not in own]
     from_folder = isinstance(c.flow, Path)
@@ -90,7 +120,8 @@ def flow_step(work: Work) -> Step:
     note = f"{len(pairs)} pairs ({name}{why}), {share:.0%} of the pixels pass the forward-backward check"
     return Step(
         provenance="given" if given == len(pairs) else "estimated",
-        note=note + (f"; {given} given, {len(pairs) - given} estimated" if 0 < given < len(pairs) else ""),
+        note=note
+        + (f"; {given} given, {len(pairs) - given} estimated" if 0 < given < len(pairs) else ""),
         details={"valid_share": round(float(share), 4), "source": name},
     )
 
@@ -118,15 +149,25 @@ def write_flow(work: Work, names: FlowFiles, flow: np.ndarray, valid: np.ndarray
 
 
 def poses_step(work: Work) -> Step:
-    """Cameras of all frames: given, or by structure from motion in up to three rounds, since poses need masks and good masks need poses.
+    """Cameras of all frames: given, or by structure from motion in up to three rounds,
+    since poses need masks and good masks need poses.
 
-    The last is the one whose masks are nearly those before. A killed run keeps the first round."""
+    The last is the one whose masks are nearly those before. A killed run keeps the
+    first round.
+    """
     c = work.config
     capture = work.gives("poses")
     if capture is not None and capture.poses is not None:
         store(work, given_poses(work))
     elif c.poses is not None:
-        store(work, import_poses(c.poses, [f.source for f in work.manifest.frames], (work.manifest.height, work.manifest.width)))
+        store(
+            work,
+            import_poses(
+                c.poses,
+                [f.source for f in work.manifest.frames],
+                (work.manifest.height, work.manifest.width),
+            ),
+        )
     elif isinstance(c.masks, Path) or work.gives("masks") is not None:
         store(work, estimate(work, given_masks(work)))
     else:
@@ -141,7 +182,9 @@ def poses_step(work: Work) -> Step:
             moving = geometric_mask(*work.raw_flows, work.equalized[0], *work.cameras())
             agreement = (before & moving).sum() / max((before | moving).sum(), 1)
             again = agreement < SAME_MASKS
-            say(f"poses: masks from these poses agree to {agreement:.0%} with those before{': once more' if again else ''}")
+            say(
+                f"poses: masks from these poses agree to {agreement:.0%} with those before{': once more' if again else ''}"
+            )
             if not again:
                 break
             store(work, estimate(work, moving))
@@ -163,10 +206,17 @@ def given_poses(work: Work) -> Poses:
 
 
 def estimate(work: Work, moving: np.ndarray) -> Poses:
-    """Poses by structure from motion on equalized frames, leaving out what is `moving` (T, H, W) bool."""
+    """Poses by structure from motion on equalized frames, leaving out what is `moving`
+    (T, H, W) bool.
+    """
     video, clipped = work.equalized
     return estimate_poses(
-        video, moving, work.folder / "poses", clipped, [f.camera_id for f in work.manifest.frames], matcher=work.config.matcher
+        video,
+        moving,
+        work.folder / "poses",
+        clipped,
+        [f.camera_id for f in work.manifest.frames],
+        matcher=work.config.matcher,
     )
 
 
@@ -176,7 +226,9 @@ def store(work: Work, poses: Poses) -> None:
     for f, K, c2w in zip(m.frames, poses.K, poses.c2w, strict=True):
         f.K, f.c2w = K.tolist(), c2w.tolist()
     m.parallax = poses.parallax
-    m.near, m.far = (poses.near, poses.far) if poses.near and poses.far else (SPHERE_NEAR, SPHERE_FAR)
+    m.near, m.far = (
+        (poses.near, poses.far) if poses.near and poses.far else (SPHERE_NEAR, SPHERE_FAR)
+    )
     m.points = "points.npy" if len(poses.points) else None
     if m.points:
         write_npy(work.folder / m.points, poses.points.astype(np.float32))
@@ -184,8 +236,9 @@ def store(work: Work, poses: Poses) -> None:
 
 
 def given_masks(work: Work) -> np.ndarray:
-    """The moving masks (T, H, W) of a data set, or the user's, one file per frame in order; InputError where one is missing or of
-    another size."""
+    """The moving masks (T, H, W) of a data set, or the user's, one file per frame in
+    order; InputError where one is missing or of another size.
+    """
     m, folder, capture = work.manifest, work.config.masks, work.gives("masks")
     if capture is not None:
         files = [work.picture(f).mask for f in m.frames]
@@ -210,17 +263,28 @@ def given_masks(work: Work) -> np.ndarray:
 
 
 def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
-    """The file for each frame in the user's folder of maps: as many files as frames, in order (of each camera, in a folder like the footage's)."""
+    """The file for each frame in the user's folder of maps: as many files as frames, in
+    order (of each camera, in a folder like the footage's).
+    """
     folders = ingest.sorted_folders(folder) if len(work.footage.cameras) > 1 else [folder]
-    found = [p for d in folders for p in sorted(d.iterdir(), key=ingest.natural) if p.suffix.lower() in suffixes]
+    found = [
+        p
+        for d in folders
+        for p in sorted(d.iterdir(), key=ingest.natural)
+        if p.suffix.lower() in suffixes
+    ]
     frames = work.manifest.frames
     if len(found) != len(frames):
-        raise InputError(f"{folder}: {len(found)} maps for {len(frames)} frames; one per used frame, in order")
+        raise InputError(
+            f"{folder}: {len(found)} maps for {len(frames)} frames; one per used frame, in order"
+        )
     return found
 
 
 def masks_step(work: Work) -> Step:
-    """What moves, per frame. Training frames are judged by flow among training frames alone; held-out ones by all."""
+    """What moves, per frame. Training frames are judged by flow among training frames
+    alone; held-out ones by all.
+    """
     m, c = work.manifest, work.config
     given = isinstance(c.masks, Path) or work.gives("masks") is not None
     if given:
@@ -246,28 +310,46 @@ def masks_step(work: Work) -> Step:
 
 
 def refined_flow_step(work: Work) -> Step:
-    """Estimated flow once more where things move, from what moves alone, and where it is not sure, from what is around; given flow stays as it is."""
+    """Estimated flow once more where things move, from what moves alone, and where it
+    is not sure, from what is around; given flow stays as it is.
+    """
     m = work.manifest
-    own = [(f.index, j) for f in m.frames for j in f.raw_flow if not flow_is_given(work, f.index, j)]
+    own = [
+        (f.index, j) for f in m.frames for j in f.raw_flow if not flow_is_given(work, f.index, j)
+    ]
     clipped = work.equalized[1]
     moving = np.stack([read_mask(work.folder / str(f.mask)) for f in m.frames])
     video, how = through_response(work, moving) if own else (work.equalized[0], "")
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
     names = {
-        (i, j): FlowFiles(flow=f"refined_flow/{i:05d}_{j:05d}.npy", valid=f"refined_flow/{i:05d}_{j:05d}_valid.png")
+        (i, j): FlowFiles(
+            flow=f"refined_flow/{i:05d}_{j:05d}.npy",
+            valid=f"refined_flow/{i:05d}_{j:05d}_valid.png",
+        )
         for i, j in own
     }
 
     def mend(i: int, j: int) -> None:
-        if all((work.folder / n).is_file() for p in ((i, j), (j, i)) for n in (names[p].flow, names[p].valid)):
+        if all(
+            (work.folder / n).is_file()
+            for p in ((i, j), (j, i))
+            for n in (names[p].flow, names[p].valid)
+        ):
             return  # by a run that was killed
         seen = common_rgb(video, ranges, i, j), common_rgb(video, ranges, j, i)
         there, back = (
-            mended(*pictures, read_npy(work.folder / m.frames[a].raw_flow[b].flow).astype(np.float32), moving[a] & ~clipped[a])
+            mended(
+                *pictures,
+                read_npy(work.folder / m.frames[a].raw_flow[b].flow).astype(np.float32),
+                moving[a] & ~clipped[a],
+            )
             for pictures, (a, b) in zip(seen, ((i, j), (j, i)), strict=True)
         )
         a, b = common_gray(video, ranges, i, j)
-        sure = agreement(there, back, clipped[i], clipped[j]), agreement(back, there, clipped[j], clipped[i])
+        sure = (
+            agreement(there, back, clipped[i], clipped[j]),
+            agreement(back, there, clipped[j], clipped[i]),
+        )
         there, back = (
             told(there, back, a, b, clipped[i], clipped[j], moving[i]),
             told(back, there, b, a, clipped[j], clipped[i], moving[j]),
@@ -289,10 +371,15 @@ def refined_flow_step(work: Work) -> Step:
 
 
 def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
-    """All frames at one brightness (T, H, W, 3): through the response of their camera where matched flow tells it, else by the brackets'
-    brightness; and how, in words. `moving` (T, H, W) bool."""
+    """All frames at one brightness (T, H, W, 3): through the response of their camera
+    where matched flow tells it, else by the brackets' brightness; and how, in words.
+    `moving` (T, H, W) bool.
+    """
     frames, ev = work.manifest.frames, work.manifest.bracket_ev
-    bracket, train = np.array([f.bracket for f in frames]), np.array([f.split == "train" for f in frames])
+    bracket, train = (
+        np.array([f.bracket for f in frames]),
+        np.array([f.split == "train" for f in frames]),
+    )
     known, reference = ev or [None] * int(bracket.max() + 1), work.manifest.reference_bracket
     video, (flow, valid, pairs) = work.equalized[0].copy(), work.raw_flows
     cameras = [np.array(own) for own in work.camera_frames()]
@@ -301,19 +388,35 @@ def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
         learn = own[train[own]]
         among = np.isin(pairs, learn).all(1)
         flows = flow[among], valid[among], np.searchsorted(learn, pairs[among])
-        fit = response_from_flow(work.video[learn], bracket[learn], known, reference, flows, moving[learn])
+        fit = response_from_flow(
+            work.video[learn], bracket[learn], known, reference, flows, moving[learn]
+        )
         if fit is not None:
             like = own[np.isin(bracket[own], bracket[learn])]
             video[like] = at_one_exposure(work.video[like], bracket[like], fit)
             told.append(fit.misfit)
     if told:
-        where = "" if len(told) == len(cameras) else f" in {len(told)} of {len(cameras)} cameras, else by brightness"
-        return video, f", at one exposure through the response that flow tells{where} (misfit {max(told):.3f} stops)"
-    return video, ", frames equalized by brightness: too few pixels at rest in several exposures" if len(set(bracket)) > 1 else ""
+        where = (
+            ""
+            if len(told) == len(cameras)
+            else f" in {len(told)} of {len(cameras)} cameras, else by brightness"
+        )
+        return (
+            video,
+            f", at one exposure through the response that flow tells{where} (misfit {max(told):.3f} stops)",
+        )
+    return (
+        video,
+        ", frames equalized by brightness: too few pixels at rest in several exposures"
+        if len(set(bracket)) > 1
+        else "",
+    )
 
 
 def flow_is_given(work: Work, i: int, j: int) -> bool:
-    """Whether the flow between the frames `i` and `j` is the user's or the data set's, one way or both."""
+    """Whether the flow between the frames `i` and `j` is the user's or the data set's,
+    one way or both.
+    """
     if isinstance(work.config.flow, Path) or work.gives("flow") is None:
         return isinstance(work.config.flow, Path)
     a, b = (work.manifest.frames[k] for k in (i, j))
@@ -331,30 +434,44 @@ def depth_step(work: Work) -> Step:
     given = capture is not None or isinstance(c.depth, Path)
     details: dict[str, Any] = {"source": "given" if given else c.depth or "geometric"}
     if capture is not None:
-        disparity, confidence, how = maps.disparities(capture, [work.picture(f) for f in train], size)
+        disparity, confidence, how = maps.disparities(
+            capture, [work.picture(f) for f in train], size
+        )
         m.depth_kind = "relative" if capture.depth_kind == "relative" else "scene"
         note = "; ".join(n for n in (f"given ({capture.depth_kind})", how) if n)
         if m.depth_kind == "scene" and capture.poses is not None and capture.poses.near is None:
             m.near, m.far = depth_range(disparity, confidence)
     elif isinstance(c.depth, Path):
-        disparity, confidence = read_depth(given_files(work, c.depth, DEPTH_FILES), c.depth_kind, size)
+        disparity, confidence = read_depth(
+            given_files(work, c.depth, DEPTH_FILES), c.depth_kind, size
+        )
         disparity, confidence = disparity[index], confidence[index]
         m.depth_kind = "relative" if c.depth_kind == "relative" else "scene"
         note = f"given ({c.depth_kind})"
     elif m.parallax != "full":
-        disparity, confidence = np.ones((len(train), *size), np.float32), np.ones((len(train), *size), np.float32)
+        disparity, confidence = (
+            np.ones((len(train), *size), np.float32),
+            np.ones((len(train), *size), np.float32),
+        )
         note = "everything at distance 1: without parallax there is no depth to find"
     elif c.depth == "depth-anything":
         disparity, confidence, m.near, m.far, details["kind"] = network_depth(work, index)
         details["weights"] = c.depth_weights
-        note = f"{c.depth_weights} ({details['kind']}), near {m.near:.2f}, far {m.far:.2f} scene units"
+        note = (
+            f"{c.depth_weights} ({details['kind']}), near {m.near:.2f}, far {m.far:.2f} scene units"
+        )
     else:
         disparity, confidence, m.near, m.far = dense_depth(work, index)
         note = f"{(confidence > 0.5).mean():.0%} of the pixels well known, near {m.near:.2f}, far {m.far:.2f} scene units"
     for f in m.frames:
-        f.disparity = f.disparity_confidence = None  # of a frame that is held out now and was not before
+        f.disparity = f.disparity_confidence = (
+            None  # of a frame that is held out now and was not before
+        )
     for f, d, w in zip(train, disparity, confidence, strict=True):
-        f.disparity, f.disparity_confidence = f"disparity/{f.index:05d}.npy", f"disparity_confidence/{f.index:05d}.npy"
+        f.disparity, f.disparity_confidence = (
+            f"disparity/{f.index:05d}.npy",
+            f"disparity_confidence/{f.index:05d}.npy",
+        )
         write_npy(work.folder / f.disparity, d.astype(np.float16))
         write_npy(work.folder / f.disparity_confidence, w.astype(np.float16))
     return Step(provenance="given" if given else "estimated", note=note, details=details)
@@ -383,11 +500,15 @@ def dense_depth(work: Work, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, 
 
 
 def sheet_step(work: Work) -> Step:
-    """`contact_sheet.png`: a few training frames as recorded, equalized, with moving pixels red, flow to the next frame (from the last to the one before), and disparity."""
+    """`contact_sheet.png`: a few training frames as recorded, equalized, with moving
+    pixels red, flow to the next frame (from the last to the one before), and disparity.
+    """
     m = work.manifest
     train = [f for f in m.frames if f.split == "train"]
     some = [train[k] for k in np.unique(np.linspace(0, len(train) - 1, 6).astype(int))]
-    disparity = [read_npy(work.folder / f.disparity).astype(np.float32) for f in some if f.disparity]
+    disparity = [
+        read_npy(work.folder / f.disparity).astype(np.float32) for f in some if f.disparity
+    ]
     low, high = (float(v) for v in np.percentile(np.stack(disparity), [1, 99]))
     rows: list[list[np.ndarray]] = [[], [], [], [], []]
     for f, d in zip(some, disparity, strict=True):
@@ -397,7 +518,9 @@ def sheet_step(work: Work) -> Step:
         names = f.flow[max(f.flow)]
         flow_rgb = colorize_flow(read_npy(work.folder / names.flow).astype(np.float32))
         flow_rgb = np.where(read_mask(work.folder / names.valid)[..., None], flow_rgb, 0.25)
-        for row, cell in zip(rows, (work.video[f.index], shown, red, flow_rgb, colorize(d, low, high)), strict=True):
+        for row, cell in zip(
+            rows, (work.video[f.index], shown, red, flow_rgb, colorize(d, low, high)), strict=True
+        ):
             row.append(cell.astype(np.float32))
     if m.parallax != "full":
         rows.pop()  # the same disparity everywhere

@@ -1,5 +1,6 @@
-"""Many noisy disparity maps of one static scene into one good map per frame: carry the neighbors' maps over, let them vote,
-and fill what nobody saw along the image's edges."""
+"""Many noisy disparity maps of one static scene into one good map per frame: carry the
+neighbors' maps over, let them vote, and fill what nobody saw along the image's edges.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +16,12 @@ jit = numba.njit(cache=True, nogil=True, fastmath=True)
 
 @jit
 def carry_over(disparity, weight, rotation, shift, result, result_weight):
-    """Splat one frame's map into another: pixels go to `rotation` (x, y, 1) + disparity `shift`, whose third entry is z * disparity.
+    """Splat one frame's map into another: pixels go to `rotation` (x, y, 1) + disparity
+    `shift`, whose third entry is z * disparity.
 
-    Each lands on the nearest pixel; the nearest surface wins. `result_weight` is 0 where nothing landed."""
+    Each lands on the nearest pixel; the nearest surface wins. `result_weight` is 0
+    where nothing landed.
+    """
     h, w = result.shape
     result[:] = 0
     result_weight[:] = 0
@@ -29,8 +33,16 @@ def carry_over(disparity, weight, rotation, shift, result, result_weight):
             q = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2] + d * shift[2]
             if q <= 1e-6:
                 continue
-            px = int(np.floor((rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2] + d * shift[0]) / q))
-            py = int(np.floor((rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2] + d * shift[1]) / q))
+            px = int(
+                np.floor(
+                    (rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2] + d * shift[0]) / q
+                )
+            )
+            py = int(
+                np.floor(
+                    (rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2] + d * shift[1]) / q
+                )
+            )
             if 0 <= px < w and 0 <= py < h and d / q > result[py, px]:
                 result[py, px] = d / q
                 result_weight[py, px] = weight[y, x]
@@ -38,10 +50,15 @@ def carry_over(disparity, weight, rotation, shift, result, result_weight):
 
 @jit
 def vote(disparities, weights):
-    """Weighted median over `n` maps (n, H, W), averaged over those within `AGREE` of it: disparity (H, W), weight that agrees
-    (H, W), weight of all (H, W)."""
+    """Weighted median over `n` maps (n, H, W), averaged over those within `AGREE` of
+    it: disparity (H, W), weight that agrees (H, W), weight of all (H, W).
+    """
     n, h, w = disparities.shape
-    fused, agreeing, everything = np.zeros((h, w), np.float32), np.zeros((h, w), np.float32), np.zeros((h, w), np.float32)
+    fused, agreeing, everything = (
+        np.zeros((h, w), np.float32),
+        np.zeros((h, w), np.float32),
+        np.zeros((h, w), np.float32),
+    )
     for y in range(h):
         for x in range(w):
             order = np.argsort(disparities[:, y, x])
@@ -67,12 +84,18 @@ def vote(disparities, weights):
 
 @jit
 def clean(disparity, weight, rgb):
-    """Weighted median (H, W) over the pixels around that look alike: depth edges move onto image edges, outliers go.
+    """Weighted median (H, W) over the pixels around that look alike: depth edges move
+    onto image edges, outliers go.
 
-    `weight` (H, W) as found, `rgb` (H, W, 3) in [0, 1]. A pixel without any weight around it keeps its value."""
+    `weight` (H, W) as found, `rgb` (H, W, 3) in [0, 1]. A pixel without any weight
+    around it keeps its value.
+    """
     h, w = disparity.shape
     result = disparity.copy()
-    values, weights = np.empty((2 * REACH + 1) ** 2, np.float32), np.empty((2 * REACH + 1) ** 2, np.float32)
+    values, weights = (
+        np.empty((2 * REACH + 1) ** 2, np.float32),
+        np.empty((2 * REACH + 1) ** 2, np.float32),
+    )
     for y in range(h):
         for x in range(w):
             n, total = 0, np.float32(0)

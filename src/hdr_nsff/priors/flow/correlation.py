@@ -1,7 +1,9 @@
-"""Where a feature of one frame lies in another: cosine cost volume, and a soft-argmax around its maximum.
+"""Where a feature of one frame lies in another: cosine cost volume, and a soft-argmax
+around its maximum.
 
-Positions are in cells (x, y), a cell's middle at its whole number, so they need no rounding; everything is differentiable but for
-the choice of the maximum."""
+Positions are in cells (x, y), a cell's middle at its whole number, so they need no
+rounding; everything is differentiable but for the choice of the maximum.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,14 @@ def cells(height: int, width: int) -> Tensor:
 
 
 def sample(maps: Tensor, positions: Tensor) -> Tensor:
-    """`maps` (C, h, w) at `positions` (N, 2), between cells linearly, outside as at the edge: (N, C)."""
+    """`maps` (C, h, w) at `positions` (N, 2), between cells linearly, outside as at the
+    edge: (N, C).
+    """
     h, w = maps.shape[-2:]
     grid = (2 * positions + 1) / positions.new_tensor([w, h]) - 1
-    found = functional.grid_sample(maps[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False)
+    found = functional.grid_sample(
+        maps[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
+    )
     return found[0, :, 0].T
 
 
@@ -33,15 +39,21 @@ def costs(queries: Tensor, target: Tensor) -> Tensor:
 
 
 def soft_argmax(cost: Tensor, place: Tensor, radius: float, temperature: float) -> Tensor:
-    """Sub-cell positions (N, 2) of the maxima of `cost` (N, M) at `place` (M, 2): the mean of the places within `radius` cells of the
-    largest cost, weighted by softmax(cost / temperature)."""
+    """Sub-cell positions (N, 2) of the maxima of `cost` (N, M) at `place` (M, 2): the
+    mean of the places within `radius` cells of the largest cost, weighted by
+    softmax(cost / temperature).
+    """
     best = place[cost.detach().argmax(1)]
     near = ((place - best[:, None]).abs() <= radius).all(-1)
     return torch.softmax(cost.masked_fill(~near, FAR) / temperature, 1) @ place
 
 
-def locate(queries: Tensor, start: Tensor, target: Tensor, reach: float, radius: float, temperature: float) -> Tensor:
-    """Where in `target` (C, h, w) each of `queries` (N, C) is: positions (N, 2), at most `reach` cells in x and in y from `start` (N, 2)."""
+def locate(
+    queries: Tensor, start: Tensor, target: Tensor, reach: float, radius: float, temperature: float
+) -> Tensor:
+    """Where in `target` (C, h, w) each of `queries` (N, C) is: positions (N, 2), at
+    most `reach` cells in x and in y from `start` (N, 2).
+    """
     place = cells(*target.shape[-2:]).to(target)
     found = []
     for some, origin in zip(queries.split(CHUNK), start.split(CHUNK), strict=True):
@@ -52,6 +64,10 @@ def locate(queries: Tensor, start: Tensor, target: Tensor, reach: float, radius:
 
 
 def motion(a: Tensor, b: Tensor, reach: float, radius: float, temperature: float) -> Tensor:
-    """Motion (h, w, 2), in cells, of all cells of `a` (C, h, w) to where they are in `b` (C, h, w)."""
+    """Motion (h, w, 2), in cells, of all cells of `a` (C, h, w) to where they are in
+    `b` (C, h, w).
+    """
     start = cells(*a.shape[-2:]).to(a)
-    return (locate(a.flatten(1).T, start, b, reach, radius, temperature) - start).reshape(*a.shape[-2:], 2)
+    return (locate(a.flatten(1).T, start, b, reach, radius, temperature) - start).reshape(
+        *a.shape[-2:], 2
+    )

@@ -1,4 +1,6 @@
-"""What `--flow` can name, each as one function behind `FlowPrior`: a matcher that needs no weights, networks, or a folder of maps."""
+"""What `--flow` can name, each as one function behind `FlowPrior`: a matcher that needs
+no weights, networks, or a folder of maps.
+"""
 
 from __future__ import annotations
 
@@ -17,11 +19,15 @@ from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, semantic_flow
 from hdr_nsff.priors.weights import entry, find, locate
 
 FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
-NETWORKS = frozenset({"semantic", "gmflow", "raft", "raft-finetuned"})  # the names that `--flow-weights` is for
+NETWORKS = frozenset(
+    {"semantic", "gmflow", "raft", "raft-finetuned"}
+)  # the names that `--flow-weights` is for
 
 
 def resolved(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
-    """What was chosen; None stands for `semantic` where the weights of its `features` are on this machine, else for `dis`, which needs none."""
+    """What was chosen; None stands for `semantic` where the weights of its `features`
+    are on this machine, else for `dis`, which needs none.
+    """
     if chosen is not None:
         return chosen
     return "dis" if locate(entry(features)) is None else "semantic"
@@ -30,11 +36,17 @@ def resolved(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
 def fallback_note(chosen: FlowName | Path | None, features: str) -> str:
     """Half a sentence where None stands for `dis` for want of weights."""
     lacking = chosen is None and resolved(chosen, features) == "dis"
-    return f", for the weights of {features} are not on this machine: see `hdr-nsff weights {features}`" if lacking else ""
+    return (
+        f", for the weights of {features} are not on this machine: see `hdr-nsff weights {features}`"
+        if lacking
+        else ""
+    )
 
 
 def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
-    """InputError where the source that was chosen, or its weights, cannot be used; a network is loaded, so that this is known early."""
+    """InputError where the source that was chosen, or its weights, cannot be used; a
+    network is loaded, so that this is known early.
+    """
     if isinstance(chosen, Path) and not chosen.is_dir():
         raise InputError(
             f"--flow {chosen}: no such folder of flow maps, and no source of that name; use {', '.join(get_args(FlowName))}, or mend the path"
@@ -63,9 +75,12 @@ def flow_source(
     neighbors: Pairs = (),
     equal: Pairs = (),
 ) -> FlowPrior:
-    """The flow prior that `--flow` chose, None for what it stands for; its `video` and `pairs` are those of the whole clip.
+    """The flow prior that `--flow` chose, None for what it stands for; its `video` and
+    `pairs` are those of the whole clip.
 
-    `semantic` (its defaults where None), `neighbors` and `equal` are what `SemanticFlow` fits its features by."""
+    `semantic` (its defaults where None), `neighbors` and `equal` are what
+    `SemanticFlow` fits its features by.
+    """
     semantic = semantic or SemanticConfig()
     match source := resolved(chosen, semantic.features):
         case Path():
@@ -82,8 +97,12 @@ def flow_source(
             assert_never(source)
 
 
-def flow_weights(chosen: FlowName | Path | None, weights: Path | None, semantic: SemanticConfig) -> list[Path]:
-    """The weights that the flow prior of these settings reads; none where it reads none. InputError where they are not to be had."""
+def flow_weights(
+    chosen: FlowName | Path | None, weights: Path | None, semantic: SemanticConfig
+) -> list[Path]:
+    """The weights that the flow prior of these settings reads; none where it reads
+    none. InputError where they are not to be had.
+    """
     match source := resolved(chosen, semantic.features):
         case Path() | "dis":
             return []
@@ -102,6 +121,8 @@ def device() -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def from_folder(folder: Path, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def from_folder(
+    folder: Path, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """`FlowPrior` of maps made elsewhere."""
     return read_flow(folder, pairs, clipped.shape[1:3])

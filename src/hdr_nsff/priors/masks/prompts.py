@@ -1,7 +1,10 @@
-"""What to ask a segmentation network about a clip, made from its motion masks instead of mouse clicks: which things move, the frame in
-which each shows best, and there points on it, points beside it and a box around it. A file of points corrects or adds to that.
+"""What to ask a segmentation network about a clip, made from its motion masks instead
+of mouse clicks: which things move, the frame in which each shows best, and there points
+on it, points beside it and a box around it. A file of points corrects or adds to that.
 
-Points are pixels of the scene's frames, x right and y down, centers at +0.5; label 1 lies on the object, 0 beside it."""
+Points are pixels of the scene's frames, x right and y down, centers at +0.5; label 1
+lies on the object, 0 beside it.
+"""
 
 from __future__ import annotations
 
@@ -40,15 +43,16 @@ class Mover:
 
     number: int
     prompts: tuple[Prompt, ...]
-    seen: dict[int, np.ndarray] = field(
-        default_factory=dict
-    )  # frame -> (H, W) bool, its part of the motion mask; empty for the user's own
+    # frame -> (H, W) bool, its part of the motion mask; empty for the user's own
+    seen: dict[int, np.ndarray] = field(default_factory=dict)
 
     def among(self, frames: Sequence[int], others: Sequence[int]) -> Mover:
         """The same in a clip of the frames `others`, which hold this one's `frames`."""
         place = {f: k for k, f in enumerate(others)}
         prompts = tuple(replace(p, frame=place[frames[p.frame]]) for p in self.prompts)
-        return replace(self, prompts=prompts, seen={place[frames[k]]: mask for k, mask in self.seen.items()})
+        return replace(
+            self, prompts=prompts, seen={place[frames[k]]: mask for k, mask in self.seen.items()}
+        )
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,9 @@ class Part:
 
 
 def movers(moving: np.ndarray, first: int = 1) -> list[Mover]:
-    """The things that move in `moving` (T, H, W) bool, largest (summed over frames) first and numbered from `first`, each with one prompt."""
+    """The things that move in `moving` (T, H, W) bool, largest (summed over frames)
+    first and numbered from `first`, each with one prompt.
+    """
     frames = [parts(mask, t) for t, mask in enumerate(moving)]
     least = min(SHORTEST, len(moving))
     tracks = [t for t in link(frames) if len(t) >= least]
@@ -70,7 +76,9 @@ def movers(moving: np.ndarray, first: int = 1) -> list[Mover]:
     found = []
     for number, track in enumerate(tracks[:MOST], first):
         best = clearest(track)
-        found.append(Mover(number, (prompt(best, moving[best.frame]),), {p.frame: p.mask for p in track}))
+        found.append(
+            Mover(number, (prompt(best, moving[best.frame]),), {p.frame: p.mask for p in track})
+        )
     return found
 
 
@@ -86,11 +94,15 @@ def parts(mask: np.ndarray, frame: int) -> list[Part]:
 
 
 def link(frames: list[list[Part]]) -> list[list[Part]]:
-    """The same thing's parts in consecutive frames: those that are each other's best match in place and size."""
+    """The same thing's parts in consecutive frames: those that are each other's best
+    match in place and size.
+    """
     tracks = [[p] for p in frames[0]]
     open_tracks = list(tracks)
     for new in frames[1:]:
-        score = np.array([[likeness(t[-1], p) for p in new] for t in open_tracks]).reshape(len(open_tracks), len(new))
+        score = np.array([[likeness(t[-1], p) for p in new] for t in open_tracks]).reshape(
+            len(open_tracks), len(new)
+        )
         following = {}
         for a in range(len(open_tracks)) if len(new) else ():
             b = int(np.argmax(score[a]))
@@ -106,15 +118,26 @@ def link(frames: list[list[Part]]) -> list[list[Part]]:
 
 
 def likeness(a: Part, b: Part) -> float:
-    """How well two parts fit in place and size, 1 at best; 0 where they lie farther apart than the larger one is wide."""
+    """How well two parts fit in place and size, 1 at best; 0 where they lie farther
+    apart than the larger one is wide.
+    """
     apart = float(np.linalg.norm(a.center - b.center)) / np.sqrt(max(a.area, b.area))
     return max(0.0, 1 - apart) * min(a.area, b.area) / max(a.area, b.area)
 
 
 def clearest(track: list[Part]) -> Part:
-    """The part that is largest and most certain: certain where its neighbors in time have the same outline, moved."""
+    """The part that is largest and most certain: certain where its neighbors in time
+    have the same outline, moved.
+    """
     return max(
-        track, key=lambda p: p.area * (0.1 + np.mean([agreement(p, q) for q in track if abs(p.frame - q.frame) == 1] or [0]))
+        track,
+        key=lambda p: (
+            p.area
+            * (
+                0.1
+                + np.mean([agreement(p, q) for q in track if abs(p.frame - q.frame) == 1] or [0])
+            )
+        ),
     )
 
 
@@ -122,7 +145,9 @@ def agreement(a: Part, b: Part) -> float:
     """Intersection over union of two outlines, center laid on center."""
     shift = (a.center - b.center).astype(np.float32)
     moved = cv2.warpAffine(
-        b.mask.astype(np.uint8), np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32), b.mask.shape[::-1]
+        b.mask.astype(np.uint8),
+        np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32),
+        b.mask.shape[::-1],
     )
     return iou(a.mask, moved > 0)
 
@@ -133,18 +158,24 @@ def iou(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def prompt(part: Part, moving: np.ndarray) -> Prompt:
-    """Points on and beside a part, and its box; `moving` (H, W) bool is the whole motion mask: nothing in it is called beside."""
+    """Points on and beside a part, and its box; `moving` (H, W) bool is the whole
+    motion mask: nothing in it is called beside.
+    """
     inside, beside = on_it(part.mask), beside_it(part, moving)
     rows, columns = np.flatnonzero(part.mask.any(1)), np.flatnonzero(part.mask.any(0))
     low, high = np.array([columns[0], rows[0]]), np.array([columns[-1], rows[-1]]) + 1
     margin = BOX_MARGIN * (high - low)
-    box = np.concatenate([np.maximum(low - margin, 0), np.minimum(high + margin, part.mask.shape[::-1])])
+    box = np.concatenate(
+        [np.maximum(low - margin, 0), np.minimum(high + margin, part.mask.shape[::-1])]
+    )
     labels = np.array([1] * len(inside) + [0] * len(beside))
     return Prompt(part.frame, np.concatenate([inside, beside]), labels, box)
 
 
 def on_it(mask: np.ndarray) -> np.ndarray:
-    """Up to `INSIDE` points (N, 2) deep inside `mask` (H, W): where the distance to its outline is largest, then likewise farther off."""
+    """Up to `INSIDE` points (N, 2) deep inside `mask` (H, W): where the distance to its
+    outline is largest, then likewise farther off.
+    """
     padded = np.pad(mask.astype(np.uint8), 1)  # the frame's edge counts as outline
     depth = cv2.distanceTransform(padded, cv2.DIST_L2, 5)[1:-1, 1:-1]
     y, x = np.indices(mask.shape)
@@ -158,7 +189,9 @@ def on_it(mask: np.ndarray) -> np.ndarray:
 
 
 def beside_it(part: Part, moving: np.ndarray) -> np.ndarray:
-    """Up to `BESIDE` points (N, 2) around a part, one per side, about half its radius from its outline and outside all that moves."""
+    """Up to `BESIDE` points (N, 2) around a part, one per side, about half its radius
+    from its outline and outside all that moves.
+    """
     radius = np.sqrt(part.area / np.pi)
     away = cv2.distanceTransform(1 - part.mask.astype(np.uint8), cv2.DIST_L2, 5)
     free = cv2.dilate(moving.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0
@@ -167,7 +200,11 @@ def beside_it(part: Part, moving: np.ndarray) -> np.ndarray:
     points: list[tuple[float, float]] = []
     for direction in np.arange(BESIDE) * 2 * np.pi / BESIDE:
         turn = np.abs(np.angle(np.exp(1j * (angle - direction))))
-        cost = np.where(free & (turn < np.pi / BESIDE) & (away < 2 * radius), turn + np.abs(away / radius - 0.5), np.inf)
+        cost = np.where(
+            free & (turn < np.pi / BESIDE) & (away < 2 * radius),
+            turn + np.abs(away / radius - 0.5),
+            np.inf,
+        )
         v, u = np.unravel_index(np.argmin(cost), cost.shape)
         if np.isfinite(cost[v, u]):
             points.append((u + 0.5, v + 0.5))
@@ -210,17 +247,25 @@ class PointsFile(BaseModel):
 
 
 def read_points(path: Path, count: int, size: tuple[int, int]) -> PointsFile:
-    """The points of a file for a clip of `count` frames of `size` (height, width); InputError where it is none or points outside."""
+    """The points of a file for a clip of `count` frames of `size` (height, width);
+    InputError where it is none or points outside.
+    """
     try:
         found = PointsFile.model_validate(read_json(path))
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); mend the path of --mask-points") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); mend the path of --mask-points"
+        ) from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(v) for v in first["loc"]) or "the file"
-        raise InputError(f"{path}: {where}: {first['msg']}; docs/formats.md says what a points file holds") from error
+        raise InputError(
+            f"{path}: {where}: {first['msg']}; docs/formats.md says what a points file holds"
+        ) from error
     except ValueError as error:
-        raise InputError(f"{path}: not a JSON file ({error}); docs/formats.md says what a points file holds") from error
+        raise InputError(
+            f"{path}: not a JSON file ({error}); docs/formats.md says what a points file holds"
+        ) from error
     height, width = size
     for p in found.points:
         if p.frame >= count or not (0 <= p.x <= width and 0 <= p.y <= height):
@@ -236,8 +281,11 @@ def read_points(path: Path, count: int, size: tuple[int, int]) -> PointsFile:
 
 
 def corrected(found: Sequence[Mover], given: PointsFile, frames: Sequence[int]) -> list[Mover]:
-    """`found` with the user's points and boxes: those of an object's number are added to its prompts (a box replaces that frame's), those of
-    other numbers make objects of their own. `frames` names the clip's frames as the file numbers them; entries of others are left out."""
+    """`found` with the user's points and boxes: those of an object's number are added
+    to its prompts (a box replaces that frame's), those of other numbers make objects of
+    their own. `frames` names the clip's frames as the file numbers them; entries of
+    others are left out.
+    """
     place = {f: k for k, f in enumerate(frames)}
     objects = {m.number: m for m in found}
     entries: list[PointEntry | BoxEntry] = [*given.points, *given.boxes]
@@ -249,22 +297,36 @@ def corrected(found: Sequence[Mover], given: PointsFile, frames: Sequence[int]) 
         if isinstance(entry, BoxEntry):
             new = replace(old, box=np.array([entry.left, entry.top, entry.right, entry.bottom]))
         else:
-            new = replace(old, points=np.vstack([old.points, [entry.x, entry.y]]), labels=np.append(old.labels, entry.label))
+            new = replace(
+                old,
+                points=np.vstack([old.points, [entry.x, entry.y]]),
+                labels=np.append(old.labels, entry.label),
+            )
         by_frame[frame] = new
         objects[entry.object] = replace(mover, prompts=tuple(by_frame[f] for f in sorted(by_frame)))
     return [objects[n] for n in sorted(objects)]
 
 
 def as_file(asked: Sequence[Mover], frames: Sequence[int]) -> dict[str, Any]:
-    """The prompts of a clip as a points file holds them; `frames` are the numbers of the clip's frames."""
+    """The prompts of a clip as a points file holds them; `frames` are the numbers of
+    the clip's frames.
+    """
     points = [
-        PointEntry(frame=frames[p.frame], object=m.number, x=round(float(x), 2), y=round(float(y), 2), label=int(label))
+        PointEntry(
+            frame=frames[p.frame],
+            object=m.number,
+            x=round(float(x), 2),
+            y=round(float(y), 2),
+            label=int(label),
+        )
         for m in asked
         for p in m.prompts
         for (x, y), label in zip(p.points, p.labels, strict=True)
     ]
     boxes = [
-        BoxEntry(frame=frames[p.frame], object=m.number, left=left, top=top, right=right, bottom=bottom)
+        BoxEntry(
+            frame=frames[p.frame], object=m.number, left=left, top=top, right=right, bottom=bottom
+        )
         for m in asked
         for p in m.prompts
         if p.box is not None

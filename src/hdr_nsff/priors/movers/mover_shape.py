@@ -1,5 +1,7 @@
-"""The relief of moving things: depth of moving pixels from the shape and motion that their tracks tell (`groups.py`, `bundle.py`),
-where `movers.py` knew one distance per region only."""
+"""The relief of moving things: depth of moving pixels from the shape and motion that
+their tracks tell (`groups.py`, `bundle.py`), where `movers.py` knew one distance per
+region only.
+"""
 
 from __future__ import annotations
 
@@ -20,11 +22,19 @@ CHANGE = 2.0  # a pixel's depth may change by this factor
 
 
 def relief(
-    clip: PosedVideo, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, disparity: np.ndarray, confidence: np.ndarray
+    clip: PosedVideo,
+    flow: np.ndarray,
+    valid: np.ndarray,
+    pairs: np.ndarray,
+    disparity: np.ndarray,
+    confidence: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`disparity` and `confidence` (T, H, W) with relief inside the moving masks of `clip`, where tracks tell it.
+    """`disparity` and `confidence` (T, H, W) with relief inside the moving masks of
+    `clip`, where tracks tell it.
 
-    `flow` (P, H, W, 2) px and `valid` (P, H, W) of `pairs` (P, 2). Several frames of one time: the first of them speaks."""
+    `flow` (P, H, W, 2) px and `valid` (P, H, W) of `pairs` (P, 2). Several frames of
+    one time: the first of them speaks.
+    """
     frames, views = views_in_time(clip, flow, valid, pairs, disparity, confidence)
     if len(frames) < 4 or not any(v.moving.any() for v in views):
         return disparity, confidence
@@ -34,7 +44,9 @@ def relief(
     cameras = Cameras(clip.K[frames], clip.c2w[frames])
     found = things(tracks, cameras)
     shapes = [shape for _, shape in found if shape]
-    say(f"depth: the shape of {len(shapes)} of {len(found)} moving things found from {len(tracks.trust)} tracks")
+    say(
+        f"depth: the shape of {len(shapes)} of {len(found)} moving things found from {len(tracks.trust)} tracks"
+    )
     disparity, confidence = disparity.copy(), confidence.copy()
     for t, f in enumerate(frames):
         apply(clip.moving[f], clip.c2w[f], t, tracks, shapes, disparity[f], confidence[f])
@@ -42,9 +54,16 @@ def relief(
 
 
 def views_in_time(
-    clip: PosedVideo, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, disparity: np.ndarray, confidence: np.ndarray
+    clip: PosedVideo,
+    flow: np.ndarray,
+    valid: np.ndarray,
+    pairs: np.ndarray,
+    disparity: np.ndarray,
+    confidence: np.ndarray,
 ) -> tuple[list[int], list[View]]:
-    """One frame of every time, in order, and what it knows of its moving pixels; flow joins frames that follow each other."""
+    """One frame of every time, in order, and what it knows of its moving pixels; flow
+    joins frames that follow each other.
+    """
     _, first = np.unique(clip.times, return_index=True)
     frames = [int(f) for f in first]
     steps = {(s.start, s.end): s for s in steps_in_time(clip.times, flow, valid, pairs)}
@@ -53,9 +72,9 @@ def views_in_time(
     pixels = np.stack([x, y], -1).reshape(-1, 2)
     views = []
     for k, f in enumerate(frames):
-        points = clip.unproject(f, pixels, np.maximum(disparity[f].reshape(-1), 1e-9).astype(np.float64)).reshape(
-            height, width, 3
-        )
+        points = clip.unproject(
+            f, pixels, np.maximum(disparity[f].reshape(-1), 1e-9).astype(np.float64)
+        ).reshape(height, width, 3)
         flows, valids = {}, {}
         if k + 1 < len(frames) and (s := steps.get((f, frames[k + 1]))):
             flows[1], valids[1] = s.flow, s.valid
@@ -74,8 +93,10 @@ def apply(
     disparity: np.ndarray,
     confidence: np.ndarray,
 ) -> None:
-    """Put the shapes' depth into the maps (H, W) of time `t`, in place: every `moving` pixel near a track, from the tracks of its thing,
-    as the camera at `c2w` (3, 4) sees it."""
+    """Put the shapes' depth into the maps (H, W) of time `t`, in place: every `moving`
+    pixel near a track, from the tracks of its thing, as the camera at `c2w` (3, 4) sees
+    it.
+    """
     at, inverse, owner = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0, int)]
     for k, shape in enumerate(shapes):
         pixels, points = tracks.pixels[shape.group.members, t], shape.at(t)
@@ -92,7 +113,11 @@ def apply(
     distance, nearest = distance.reshape(len(y), -1), nearest.reshape(len(y), -1)
     weight = (label[nearest] == label[nearest[:, :1]]) / (distance + 0.5) ** 2
     found = (weight * value[nearest]).sum(1) / weight.sum(1)
-    near = (distance[:, 0] < REACH) & (np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9))) < np.log(CHANGE))
+    near = (distance[:, 0] < REACH) & (
+        np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9))) < np.log(CHANGE)
+    )
     y, x = y[near], x[near]
     disparity[y, x] = found[near]
-    confidence[y, x] = np.maximum(confidence[y, x], SURE * np.exp(-((distance[near, 0] / REACH) ** 2)))
+    confidence[y, x] = np.maximum(
+        confidence[y, x], SURE * np.exp(-((distance[near, 0] / REACH) ** 2))
+    )

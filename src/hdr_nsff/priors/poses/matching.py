@@ -1,7 +1,10 @@
-"""Sparse correspondences: SIFT keypoints on exposure-equalized frames, matched between chosen pairs of frames.
+"""Sparse correspondences: SIFT keypoints on exposure-equalized frames, matched between
+chosen pairs of frames.
 
-Small frames are doubled and their local contrast is leveled first: at 240x136 there are too few keypoints otherwise, and too
-coarse ones. Positions are pixels of the frames as given, centers at +0.5."""
+Small frames are doubled and their local contrast is leveled first: at 240x136 there are
+too few keypoints otherwise, and too coarse ones. Positions are pixels of the frames as
+given, centers at +0.5.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +24,9 @@ class Keypoints:
     """What SIFT found in one frame."""
 
     xy: np.ndarray  # (N, 2) pixels
-    descriptors: np.ndarray  # (N, 128) square-rooted SIFT: unit length, so a dot product is a cosine
+    descriptors: (
+        np.ndarray
+    )  # (N, 128) square-rooted SIFT: unit length, so a dot product is a cosine
 
 
 @dataclass(frozen=True)
@@ -35,12 +40,16 @@ class PairMatches:
 
 
 def upsampling(width: int) -> int:
-    """How many times larger a frame of this width is made before keypoints are looked for."""
+    """How many times larger a frame of this width is made before keypoints are looked
+    for.
+    """
     return 2 if width < SMALL else 1
 
 
 def picture(frame: np.ndarray, scale: int, level_contrast: bool) -> np.ndarray:
-    """The 8-bit gray picture (H * scale, W * scale) in which keypoints are looked for, from rgb (H, W, 3) in [0, 1]."""
+    """The 8-bit gray picture (H * scale, W * scale) in which keypoints are looked for,
+    from rgb (H, W, 3) in [0, 1].
+    """
     gray = cv2.cvtColor(np.rint(np.clip(frame, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     if scale != 1:
         gray = cv2.resize(gray, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
@@ -48,13 +57,19 @@ def picture(frame: np.ndarray, scale: int, level_contrast: bool) -> np.ndarray:
 
 
 def usable(ignore: np.ndarray, scale: int, margin: int = 2) -> np.ndarray:
-    """255 where keypoints may lie, (H * scale, W * scale) uint8: outside `ignore` (H, W) bool grown by `margin` pixels."""
-    grown = cv2.dilate(ignore.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1,) * 2))
+    """255 where keypoints may lie, (H * scale, W * scale) uint8: outside `ignore` (H,
+    W) bool grown by `margin` pixels.
+    """
+    grown = cv2.dilate(
+        ignore.astype(np.uint8), cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1,) * 2)
+    )
     return np.kron(255 - 255 * grown, np.ones((scale, scale), np.uint8)).astype(np.uint8)
 
 
 def keypoints(video: np.ndarray, ignore: np.ndarray, limit: int = 1500) -> list[Keypoints]:
-    """The `limit` strongest keypoints of every frame of `video` (T, H, W, 3) in [0, 1], none in `ignore` (T, H, W) bool."""
+    """The `limit` strongest keypoints of every frame of `video` (T, H, W, 3) in [0, 1],
+    none in `ignore` (T, H, W) bool.
+    """
     sift = cv2.SIFT.create(nfeatures=limit, contrastThreshold=0.02, enable_precise_upscale=True)
     scale = upsampling(video.shape[2])
     found = []
@@ -70,7 +85,9 @@ def keypoints(video: np.ndarray, ignore: np.ndarray, limit: int = 1500) -> list[
 
 
 def match(a: Keypoints, b: Keypoints, ratio: float = 0.85) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (M, 2), (M, 2) of mutual nearest neighbors whose second-best match is at least `1 / ratio` times farther."""
+    """Positions (M, 2), (M, 2) of mutual nearest neighbors whose second-best match is
+    at least `1 / ratio` times farther.
+    """
     if len(a.xy) < 2 or len(b.xy) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     cosine = a.descriptors @ b.descriptors.T
@@ -85,9 +102,12 @@ def match(a: Keypoints, b: Keypoints, ratio: float = 0.85) -> tuple[np.ndarray, 
 
 
 def spread_pairs(count: int, neighbors: int = 4) -> list[tuple[int, int]]:
-    """Pairs (i, j), i < j, of `count` frames: the next few of each, then gaps of 6, 8, 12, 16, 24, 32, ... frames.
+    """Pairs (i, j), i < j, of `count` frames: the next few of each, then gaps of 6, 8,
+    12, 16, 24, 32, ... frames.
 
-    Gaps in this series are multiples of 2 or 3 or both, so that for every usual exposure cycle each frame also meets frames of its own exposure."""
+    Gaps in this series are multiples of 2 or 3 or both, so that for every usual
+    exposure cycle each frame also meets frames of its own exposure.
+    """
     gaps = set(range(1, neighbors + 1))
     gaps |= {g for k in range(1, 20) for g in (2 * 2**k, 3 * 2**k)}
     return [(i, i + g) for g in sorted(gaps) for i in range(count - g)]
@@ -100,11 +120,15 @@ def match_all(found: list[Keypoints], pairs: list[tuple[int, int]]) -> list[Pair
 
 def camera_groups(camera_ids: list[int]) -> list[list[int]]:
     """Frame indices of each physical camera, cameras in ascending order."""
-    return [[t for t, c in enumerate(camera_ids) if c == camera] for camera in sorted(set(camera_ids))]
+    return [
+        [t for t, c in enumerate(camera_ids) if c == camera] for camera in sorted(set(camera_ids))
+    ]
 
 
 def view_pairs(groups: list[list[int]], few: int = 30) -> list[tuple[int, int]]:
-    """Which views to match: all of up to `few`; of more, those of one camera as `spread_pairs` says, and those of two cameras at the same time."""
+    """Which views to match: all of up to `few`; of more, those of one camera as
+    `spread_pairs` says, and those of two cameras at the same time.
+    """
     count = sum(len(g) for g in groups)
     if count <= few:
         return list(itertools.combinations(sorted(v for g in groups for v in g), 2))

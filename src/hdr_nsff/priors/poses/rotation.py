@@ -1,7 +1,10 @@
-"""Cameras without parallax: a tripod or a pan. Decides whether the footage is of that kind, and recovers the rotations.
+"""Cameras without parallax: a tripod or a pan. Decides whether the footage is of that
+kind, and recovers the rotations.
 
-A camera that only turns sees every static point move by the homography `K R_j^T R_i K^-1` (R camera to world). The rotations of all
-frames and the focal length are those that explain the matches between near and far frames at once, so nothing drifts."""
+A camera that only turns sees every static point move by the homography `K R_j^T R_i
+K^-1` (R camera to world). The rotations of all frames and the focal length are those
+that explain the matches between near and far frames at once, so nothing drifts.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +29,14 @@ class Panorama:
     linked: np.ndarray  # (T,) bool: enough matches tie this frame to the others
     focal: float  # pixels
     focal_known: bool  # else the default field of view
-    slides: bool  # a sideways shift before something flat explains the matches much better than any turn does
+    # a sideways shift before something flat explains the matches much better than any
+    # turn does
+    slides: bool
     explained: float  # share of the matches that these rotations explain to 2 px
     errors: np.ndarray  # (T,) median residual in pixels, NaN where not linked
-    motion: float  # pixels: how far the image center or a corner ever strays from where it lies in the middle frame
+    # pixels: how far the image center or a corner ever strays from where it lies in the
+    # middle frame
+    motion: float
 
 
 def default_focal(width: int) -> float:
@@ -37,8 +44,12 @@ def default_focal(width: int) -> float:
     return width / 2 / float(np.tan(np.radians(DEFAULT_FOV) / 2))
 
 
-def epipolar(p: np.ndarray, q: np.ndarray, threshold: float) -> tuple[np.ndarray | None, np.ndarray]:
-    """The fundamental matrix (3, 3) that most of the matches p, q (M, 2) obey, and which (M,) bool do, to `threshold` pixels."""
+def epipolar(
+    p: np.ndarray, q: np.ndarray, threshold: float
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """The fundamental matrix (3, 3) that most of the matches p, q (M, 2) obey, and
+    which (M,) bool do, to `threshold` pixels.
+    """
     try:
         matrix, inlier = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, threshold, 0.999, 2000)
     except cv2.error:  # raised for matches so degenerate that no model fits at all
@@ -46,20 +57,31 @@ def epipolar(p: np.ndarray, q: np.ndarray, threshold: float) -> tuple[np.ndarray
     return (None, np.zeros(len(p), bool)) if matrix is None else (matrix, inlier.ravel() > 0)
 
 
-def homography(p: np.ndarray, q: np.ndarray, threshold: float) -> tuple[np.ndarray | None, np.ndarray]:
-    """The homography (3, 3) that most of the matches p, q (M, 2) obey, and which (M,) bool do, to `threshold` pixels."""
+def homography(
+    p: np.ndarray, q: np.ndarray, threshold: float
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """The homography (3, 3) that most of the matches p, q (M, 2) obey, and which (M,)
+    bool do, to `threshold` pixels.
+    """
     try:
-        matrix, inlier = cv2.findHomography(p, q, cv2.USAC_MAGSAC, threshold, maxIters=2000, confidence=0.999)
+        matrix, inlier = cv2.findHomography(
+            p, q, cv2.USAC_MAGSAC, threshold, maxIters=2000, confidence=0.999
+        )
     except cv2.error:
         matrix = None
     return (None, np.zeros(len(p), bool)) if matrix is None else (matrix, inlier.ravel() > 0)
 
 
-def rotation_share(matches: list[PairMatches], found: Panorama, width: int, height: int, least: int = 30) -> float | None:
-    """How much of what an epipolar geometry explains these rotations explain as well, in [0, 1], over pairs far apart in time.
+def rotation_share(
+    matches: list[PairMatches], found: Panorama, width: int, height: int, least: int = 30
+) -> float | None:
+    """How much of what an epipolar geometry explains these rotations explain as well,
+    in [0, 1], over pairs far apart in time.
 
-    Near 1 for a camera that only turns, well below with parallax; a flat scene does not deceive it. Explained means to 1.5 pixels,
-    or 0.4 % of the width. None where too few pairs far apart match at all."""
+    Near 1 for a camera that only turns, well below with parallax; a flat scene does not
+    deceive it. Explained means to 1.5 pixels, or 0.4 % of the width. None where too few
+    pairs far apart match at all.
+    """
     wide = max((m.j - m.i for m in matches), default=0) / 6
     center, tolerance = np.array([width / 2, height / 2]), max(1.5, 0.004 * width)
     rotational = general = 0
@@ -71,13 +93,17 @@ def rotation_share(matches: list[PairMatches], found: Panorama, width: int, heig
             continue
         ends = np.tile([m.i, m.j], (int(static.sum()), 1))
         predicted = turned(found.rotations, found.focal, ends, m.p[static] - center)[0]
-        rotational += int((np.linalg.norm(predicted + center - m.q[static], axis=1) < tolerance).sum())
+        rotational += int(
+            (np.linalg.norm(predicted + center - m.q[static], axis=1) < tolerance).sum()
+        )
         general += int(static.sum())
     return rotational / general if general >= 5 * least else None
 
 
 def panorama(matches: list[PairMatches], count: int, width: int, height: int) -> Panorama | None:
-    """Rotations of all `count` frames, and the focal length where the turn is wide enough to tell. None where nothing matches."""
+    """Rotations of all `count` frames, and the focal length where the turn is wide
+    enough to tell. None where nothing matches.
+    """
     kept, homographies = planar_matches(matches)
     if not kept:
         return None
@@ -91,7 +117,9 @@ def panorama(matches: list[PairMatches], count: int, width: int, height: int) ->
     fov = np.degrees(2 * np.arctan(width / 2 / focal))
     known = bool(spread < 0.05 and 25 < fov < 120)
     # through an endlessly long lens a turn is a shift of the picture
-    slides = bool(fov <= 25) and cost(rotations, default_focal(width), ends, p, q) > 1.5 * cost(free, focal, ends, p, q)
+    slides = bool(fov <= 25) and cost(rotations, default_focal(width), ends, p, q) > 1.5 * cost(
+        free, focal, ends, p, q
+    )
     rotations, focal = (free, focal) if known else (rotations, default_focal(width))
     residual = np.linalg.norm(turned(rotations, focal, ends, p)[0] - q, axis=1)
     errors = np.full(count, np.nan)
@@ -110,8 +138,12 @@ def panorama(matches: list[PairMatches], count: int, width: int, height: int) ->
     )
 
 
-def planar_matches(matches: list[PairMatches], least: int = 20, most: int = 60) -> tuple[list[PairMatches], list[np.ndarray]]:
-    """Of every pair that a homography explains (at least `least` matches, a third of all): at most `most` of those matches, and the homography."""
+def planar_matches(
+    matches: list[PairMatches], least: int = 20, most: int = 60
+) -> tuple[list[PairMatches], list[np.ndarray]]:
+    """Of every pair that a homography explains (at least `least` matches, a third of
+    all): at most `most` of those matches, and the homography.
+    """
     kept, homographies = [], []
     for m in matches:
         if len(m.p) < least:
@@ -126,16 +158,28 @@ def planar_matches(matches: list[PairMatches], least: int = 20, most: int = 60) 
 
 
 def chain(
-    kept: list[PairMatches], homographies: list[np.ndarray], count: int, focal: float, center: np.ndarray
+    kept: list[PairMatches],
+    homographies: list[np.ndarray],
+    count: int,
+    focal: float,
+    center: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """First rotations (T, 3, 3) along the best-matched tree of pairs, and which frames (T,) it reaches from the best-linked one."""
+    """First rotations (T, 3, 3) along the best-matched tree of pairs, and which frames
+    (T,) it reaches from the best-linked one.
+    """
     K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
-    edges = {(m.i, m.j): nearest_rotation(np.linalg.inv(K) @ h @ K) for m, h in zip(kept, homographies, strict=True)}  # R_j^T R_i
+    edges = {
+        (m.i, m.j): nearest_rotation(np.linalg.inv(K) @ h @ K)
+        for m, h in zip(kept, homographies, strict=True)
+    }  # R_j^T R_i
     i, j = np.array(list(edges)).T
     lengths = 1.0 / np.array([len(m.p) for m in kept]) * (1 + 0.01 * (j - i))
     tree = minimum_spanning_tree(coo_matrix((lengths, (i, j)), shape=(count, count)))
     order, parent = max(
-        (breadth_first_order(tree, int(t), directed=False) for t in np.unique(i)[:: max(1, len(np.unique(i)) // 8)]),
+        (
+            breadth_first_order(tree, int(t), directed=False)
+            for t in np.unique(i)[:: max(1, len(np.unique(i)) // 8)]
+        ),
         key=lambda found: len(found[0]),
     )
     rotations, linked = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count, bool)
@@ -152,20 +196,35 @@ def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
     return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
 
 
-def turned(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where frame j sees points `p` (M, 2) of frame i, both in pixels from the image center, and their directions (M, 3) in frame j."""
+def turned(
+    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where frame j sees points `p` (M, 2) of frame i, both in pixels from the image
+    center, and their directions (M, 3) in frame j.
+    """
     bearing = np.concatenate([p / focal, np.ones((len(p), 1))], 1)
-    seen = np.einsum("mji,mj->mi", rotations[ends[:, 1]], np.einsum("mij,mj->mi", rotations[ends[:, 0]], bearing))
+    seen = np.einsum(
+        "mji,mj->mi", rotations[ends[:, 1]], np.einsum("mij,mj->mi", rotations[ends[:, 0]], bearing)
+    )
     return focal * seen[:, :2] / np.maximum(seen[:, 2:], 1e-3), seen
 
 
 def refine(
-    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray, free_focal: bool, steps: int = 40
+    rotations: np.ndarray,
+    focal: float,
+    ends: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    free_focal: bool,
+    steps: int = 40,
 ) -> tuple[np.ndarray, float, float]:
-    """Rotations and focal length with the least robust (Cauchy, 1 px) residual over all matches, by Levenberg-Marquardt; and how
-    uncertain the logarithm of the focal length is (standard deviation).
+    """Rotations and focal length with the least robust (Cauchy, 1 px) residual over all
+    matches, by Levenberg-Marquardt; and how uncertain the logarithm of the focal length
+    is (standard deviation).
 
-    `rotations` (T, 3, 3) camera to world; `ends` (M, 2) the frames i, j of each match; `p`, `q` (M, 2) pixels from the image center."""
+    `rotations` (T, 3, 3) camera to world; `ends` (M, 2) the frames i, j of each match;
+    `p`, `q` (M, 2) pixels from the image center.
+    """
     damping, least = 1e-4, cost(rotations, focal, ends, p, q)
     normal, right = normal_equations(rotations, focal, ends, p, q, free_focal)
     for _ in range(steps):
@@ -185,34 +244,66 @@ def refine(
         least = now
     residual = np.linalg.norm(turned(rotations, focal, ends, p)[0] - q, axis=1)
     # a point is matched about ten times over: those errors are one error
-    return rotations, focal, float(1.48 * np.median(residual) * np.sqrt(np.linalg.inv(normal)[-1, -1] * 10))
+    return (
+        rotations,
+        focal,
+        float(1.48 * np.median(residual) * np.sqrt(np.linalg.inv(normal)[-1, -1] * 10)),
+    )
 
 
 def normal_equations(
-    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray, free_focal: bool
+    rotations: np.ndarray,
+    focal: float,
+    ends: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    free_focal: bool,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """J^T W J (3T + 1, 3T + 1) and J^T W r (3T + 1) of the matches; unknowns are three turns per frame and the logarithm of the focal length."""
+    """J^T W J (3T + 1, 3T + 1) and J^T W r (3T + 1) of the matches; unknowns are three
+    turns per frame and the logarithm of the focal length.
+    """
     count = len(rotations)
     predicted, seen = turned(rotations, focal, ends, p)
     residual = q - predicted  # (M, 2)
     weight = 1 / (1 + np.sum(residual**2, 1))
     jacobian = derivatives(rotations, focal, ends, p, seen)  # (M, 2, 7)
-    columns = np.concatenate([3 * ends[:, :1] + np.arange(3), 3 * ends[:, 1:] + np.arange(3), np.full((len(p), 1), 3 * count)], 1)
+    columns = np.concatenate(
+        [
+            3 * ends[:, :1] + np.arange(3),
+            3 * ends[:, 1:] + np.arange(3),
+            np.full((len(p), 1), 3 * count),
+        ],
+        1,
+    )
     normal, right = np.zeros((3 * count + 1,) * 2), np.zeros(3 * count + 1)
-    np.add.at(normal, (columns[:, :, None], columns[:, None, :]), np.einsum("mki,m,mkj->mij", jacobian, weight, jacobian))
+    np.add.at(
+        normal,
+        (columns[:, :, None], columns[:, None, :]),
+        np.einsum("mki,m,mkj->mij", jacobian, weight, jacobian),
+    )
     np.add.at(right, columns, np.einsum("mki,m,mk->mi", jacobian, weight, residual))
-    normal[np.diag_indices(3 * count)] += 1e-3 * focal**2  # holds the common turn, which is free, and frames without matches
+    normal[np.diag_indices(3 * count)] += (
+        1e-3 * focal**2
+    )  # holds the common turn, which is free, and frames without matches
     normal[-1, -1] += 1.0 if free_focal else 1e18
     return normal, right
 
 
-def cost(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray) -> float:
-    """The mean robust residual that `refine` lowers, `log(1 + r^2)`, of matches in pixels from the image center."""
+def cost(
+    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray
+) -> float:
+    """The mean robust residual that `refine` lowers, `log(1 + r^2)`, of matches in
+    pixels from the image center.
+    """
     return float(np.mean(np.log1p(np.sum((turned(rotations, focal, ends, p)[0] - q) ** 2, 1))))
 
 
-def derivatives(rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """How `turned` moves (M, 2, 7) when frame i turns (3, right-hand perturbation), frame j turns (3), log focal grows (1)."""
+def derivatives(
+    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
+    """How `turned` moves (M, 2, 7) when frame i turns (3, right-hand perturbation),
+    frame j turns (3), log focal grows (1).
+    """
     z = np.maximum(seen[:, 2], 1e-3)
     project = np.zeros((len(p), 2, 3))  # pixels per direction
     project[:, 0, 0] = project[:, 1, 1] = focal / z
@@ -234,9 +325,13 @@ def cross(v: np.ndarray) -> np.ndarray:
 
 
 def stray(rotations: np.ndarray, focal: float, width: int, height: int) -> float:
-    """The farthest, in pixels, that any of `rotations` (T, 3, 3) carries the image's center or a corner from where the middle frame has it."""
+    """The farthest, in pixels, that any of `rotations` (T, 3, 3) carries the image's
+    center or a corner from where the middle frame has it.
+    """
     spots = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * np.array([width, height]) / 2
     middle = len(rotations) // 2
-    ends = np.stack([np.repeat(np.arange(len(rotations)), 5), np.full(5 * len(rotations), middle)], 1)
+    ends = np.stack(
+        [np.repeat(np.arange(len(rotations)), 5), np.full(5 * len(rotations), middle)], 1
+    )
     p = np.tile(spots, (len(rotations), 1))
     return float(np.linalg.norm(turned(rotations, focal, ends, p)[0] - p, axis=1).max())

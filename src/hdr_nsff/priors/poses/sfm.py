@@ -1,8 +1,12 @@
-"""Structure from motion by pycolmap, in a process of its own: `python -m hdr_nsff.priors.poses.sfm JOB.json`.
+"""Structure from motion by pycolmap, in a process of its own: `python -m
+hdr_nsff.priors.poses.sfm JOB.json`.
 
-A separate process because pycolmap brings its own zlib, which breaks PNG and EXR writing in the process that imports it, and because
-native code that crashes must not take the user's run along. The worker extracts and matches keypoints once per job folder, maps, and
-leaves COLMAP models behind; the parent shows its progress and kills it when it is itself interrupted."""
+A separate process because pycolmap brings its own zlib, which breaks PNG and EXR
+writing in the process that imports it, and because native code that crashes must not
+take the user's run along. The worker extracts and matches keypoints once per job
+folder, maps, and leaves COLMAP models behind; the parent shows its progress and kills
+it when it is itself interrupted.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +32,9 @@ from hdr_nsff.priors.poses.trimming import ROUNDS, trim
 Mapping = Literal["incremental", "global"]
 GIVEN = "given.npz"
 CHUNKS = 24  # progress steps of matching
-TOLD = 0.9998  # of the error with focal lengths held: what others must reach, for thousands of observations tell less than that by chance
+# of the error with focal lengths held: what others must reach, for thousands of
+# observations tell less than that by chance
+TOLD = 0.9998
 ROOM = 2**20  # bytes: a disk with less than this free is full
 
 
@@ -36,13 +42,16 @@ ROOM = 2**20  # bytes: a disk with less than this free is full
 class Job:
     """One run of structure from motion; every path is inside `folder`."""
 
-    folder: str  # holds images/NAME.png, and masks/NAME.png.png where black pixels carry no keypoints
+    folder: (
+        str  # holds images/NAME.png, and masks/NAME.png.png where black pixels carry no keypoints
+    )
     groups: list[list[str]]  # image names of each physical camera, which share intrinsics
     pairs: list[tuple[str, str]]  # image names to match
     focal: float  # first guess, pixels of the images
     mapping: Mapping
     threads: int = 0  # 0 = all cores
-    given: bool = False  # keypoints and matches lie in the folder (`write_matches`): none are looked for
+    # keypoints and matches lie in the folder (`write_matches`): none are looked for
+    given: bool = False
 
 
 class SfmError(RuntimeError):
@@ -50,12 +59,15 @@ class SfmError(RuntimeError):
 
 
 def run(job: Job) -> list[Path]:
-    """Run `job` in a worker process, with progress; the folders of the models it found, largest first. SfmError when it breaks down,
-    OSError where the disk is full."""
+    """Run `job` in a worker process, with progress; the folders of the models it found,
+    largest first. SfmError when it breaks down, OSError where the disk is full.
+    """
     folder = Path(job.folder)
     (folder / "job.json").write_text(json.dumps(asdict(job)))
     command = [sys.executable, "-m", "hdr_nsff.priors.poses.sfm", str(folder / "job.json")]
-    worker = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace")
+    worker = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
+    )
     assert worker.stdout is not None and worker.stderr is not None
     said: deque[str] = deque(maxlen=20)  # in memory: on a full disk a log would stay empty
     listener = threading.Thread(target=said.extend, args=(worker.stderr,), daemon=True)
@@ -75,17 +87,29 @@ def run(job: Job) -> list[Path]:
 
 
 def write_matches(
-    folder: Path, names: list[str], keypoints: list[np.ndarray], pairs: list[tuple[str, str]], matches: list[np.ndarray]
+    folder: Path,
+    names: list[str],
+    keypoints: list[np.ndarray],
+    pairs: list[tuple[str, str]],
+    matches: list[np.ndarray],
 ) -> None:
-    """Put keypoints (N, 2) of each image, pixels with centers at +0.5, and matches (M, 2) of each pair, rows of both, beside a job."""
-    points = {f"points_{name}": xy.astype(np.float32) for name, xy in zip(names, keypoints, strict=True)}
-    rows = {f"matches_{a}|{b}": m.astype(np.uint32) for (a, b), m in zip(pairs, matches, strict=True)}
+    """Put keypoints (N, 2) of each image, pixels with centers at +0.5, and matches (M,
+    2) of each pair, rows of both, beside a job.
+    """
+    points = {
+        f"points_{name}": xy.astype(np.float32) for name, xy in zip(names, keypoints, strict=True)
+    }
+    rows = {
+        f"matches_{a}|{b}": m.astype(np.uint32) for (a, b), m in zip(pairs, matches, strict=True)
+    }
     np.savez(folder / GIVEN, allow_pickle=False, **points, **rows)
 
 
 def need_room(folder: Path, said: str) -> None:
-    """OSError where the disk is full, or was when the worker wrote `said`. On a full disk COLMAP may die without a word, or leave
-    files cut short and not notice, so it is asked whatever the worker's end was."""
+    """OSError where the disk is full, or was when the worker wrote `said`. On a full
+    disk COLMAP may die without a word, or leave files cut short and not notice, so it
+    is asked whatever the worker's end was.
+    """
     if any(words in said for words in ("No space left", "disk is full")):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder.parent))
     with tempfile.TemporaryFile(dir=folder) as file:
@@ -95,7 +119,9 @@ def need_room(folder: Path, said: str) -> None:
 
 
 def follow(lines: IO[str]) -> None:
-    """Show the worker's stages ("stage NAME TOTAL", then "tick" lines, then "end") as progress bars."""
+    """Show the worker's stages ("stage NAME TOTAL", then "tick" lines, then "end") as
+    progress bars.
+    """
 
     def ticks() -> Iterator[None]:
         for line in iter(lines.readline, ""):
@@ -146,7 +172,13 @@ def extract(job: Job, database: Path, threads: int) -> None:
         for k in range(0, len(group), 6):
             names = group[k : k + 6]
             pycolmap.extract_features(
-                database, Path(job.folder) / "images", names, pycolmap.CameraMode.AUTO, reading, extraction, pycolmap.Device.cpu
+                database,
+                Path(job.folder) / "images",
+                names,
+                pycolmap.CameraMode.AUTO,
+                reading,
+                extraction,
+                pycolmap.Device.cpu,
             )
             for _ in names:
                 tell("tick")
@@ -154,15 +186,19 @@ def extract(job: Job, database: Path, threads: int) -> None:
 
 
 def enter(job: Job, database: Path) -> None:
-    """Images into the database, one camera per group with the first guess of its focal length. In the order of the job, for threads that extract would
-    number them as they come, and structure from motion of another order is another."""
+    """Images into the database, one camera per group with the first guess of its focal
+    length. In the order of the job, for threads that extract would number them as they
+    come, and structure from motion of another order is another.
+    """
     import pycolmap
 
     reading = pycolmap.ImageReaderOptions()
     reading.camera_model = "SIMPLE_PINHOLE"
     pycolmap.Database.open(database).close()  # makes it
     for group in job.groups:
-        pycolmap.import_images(database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading)
+        pycolmap.import_images(
+            database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading
+        )
     with pycolmap.Database.open(database) as db:
         for camera in db.read_all_cameras():
             camera.focal_length = job.focal
@@ -175,7 +211,10 @@ def take_given(job: Job, database: Path) -> None:
 
     with np.load(Path(job.folder) / GIVEN) as given, pycolmap.Database.open(database) as db:
         ids = {
-            name: image.image_id for group in job.groups for name in group if (image := db.read_image_with_name(name)) is not None
+            name: image.image_id
+            for group in job.groups
+            for name in group
+            if (image := db.read_image_with_name(name)) is not None
         }
         for name, number in ids.items():
             db.write_keypoints(number, given[f"points_{name}"])
@@ -203,13 +242,17 @@ def match(job: Job, database: Path, threads: int) -> None:
         if job.given:
             pycolmap.verify_matches(database, file, verification)
         else:
-            pycolmap.match_image_pairs(database, matching, pairing, verification, pycolmap.Device.cpu)
+            pycolmap.match_image_pairs(
+                database, matching, pairing, verification, pycolmap.Device.cpu
+            )
         tell("tick")
     tell("end")
 
 
 def reconstruct(job: Job, database: Path, threads: int) -> None:
-    """Map the matches; models are left in `<folder>/<mapping>/<n>`, adjusted to the points that stand still."""
+    """Map the matches; models are left in `<folder>/<mapping>/<n>`, adjusted to the
+    points that stand still.
+    """
     import pycolmap
 
     out = Path(job.folder) / job.mapping
@@ -223,7 +266,9 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
         options.extract_colors = False
         options.max_num_models = 4
         options.min_model_size = 3
-        models = pycolmap.incremental_mapping(database, images, out, options, next_image_callback=lambda: tell("tick"))
+        models = pycolmap.incremental_mapping(
+            database, images, out, options, next_image_callback=lambda: tell("tick")
+        )
     else:
         whole = pycolmap.GlobalPipelineOptions()
         whole.num_threads = threads
@@ -240,7 +285,9 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
 
 
 def adjust(model: Any) -> None:
-    """Fit cameras and points to each other, and focal lengths where that lowers the error: a camera that slides without turning tells none."""
+    """Fit cameras and points to each other, and focal lengths where that lowers the
+    error: a camera that slides without turning tells none.
+    """
     import pycolmap
 
     held = pycolmap.BundleAdjustmentOptions()

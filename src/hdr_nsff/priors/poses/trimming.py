@@ -1,9 +1,14 @@
-"""What stands still, told by structure from motion itself: trimmed least squares (Rousseeuw and Leroy 1987) over whole points.
+"""What stands still, told by structure from motion itself: trimmed least squares
+(Rousseeuw and Leroy 1987) over whole points.
 
-A cloth in the wind or a dancer who stays in place is matched from frame to frame as well as a wall is. Its points fit a rigid world
-worse, but where they are many they bend cameras and focal length until they fit better. So points whose error is far beyond that of the
-best ones are dropped and everything is adjusted anew, until nothing changes: each time the static ones fit better and the others worse.
-In the end what fits the cameras found that way comes back. Runs in the process of `sfm.py`, on a `pycolmap.Reconstruction`."""
+A cloth in the wind or a dancer who stays in place is matched from frame to frame as
+well as a wall is. Its points fit a rigid world worse, but where they are many they bend
+cameras and focal length until they fit better. So points whose error is far beyond that
+of the best ones are dropped and everything is adjusted anew, until nothing changes:
+each time the static ones fit better and the others worse. In the end what fits the
+cameras found that way comes back. Runs in the process of `sfm.py`, on a
+`pycolmap.Reconstruction`.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +26,9 @@ NEEDED = 30  # points of an image; one that would keep fewer keeps all it has
 
 
 def trim(model: Any, adjust: Callable[[Any], object]) -> None:
-    """Drop the points that do not stand still; `adjust` fits cameras and points of the `model` to what is left."""
+    """Drop the points that do not stand still; `adjust` fits cameras and points of the
+    `model` to what is left.
+    """
     before, dropped = len(model.points3D), []
     for _ in range(ROUNDS if before else 0):
         keys, noise = errors(model)
@@ -42,7 +49,9 @@ def trim(model: Any, adjust: Callable[[Any], object]) -> None:
 
 
 def errors(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Every point's key (P,) and its error (P,) in pixels, made up for the three coordinates that were fitted to it."""
+    """Every point's key (P,) and its error (P,) in pixels, made up for the three
+    coordinates that were fitted to it.
+    """
     model.update_point_3d_errors()
     keys = np.array(sorted(model.points3D), np.int64)
     points = [model.points3D[int(k)] for k in keys]
@@ -50,7 +59,9 @@ def errors(model: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def made_up(error: float, views: int) -> float:
-    """A mean reprojection error of `views` >= 2 views as it would be had the point not been fitted to them."""
+    """A mean reprojection error of `views` >= 2 views as it would be had the point not
+    been fitted to them.
+    """
     return error * float(np.sqrt(2 * views / (2 * views - 3)))
 
 
@@ -70,13 +81,19 @@ def misfits(model: Any, keys: np.ndarray, bad: np.ndarray) -> list[int]:
 
 
 def triangulated(model: Any, track: Any) -> tuple[np.ndarray, float]:
-    """The point (3,) nearest to the rays of a `track`, and its error in pixels; infinite behind a camera."""
+    """The point (3,) nearest to the rays of a `track`, and its error in pixels;
+    infinite behind a camera.
+    """
     images = [model.images[e.image_id] for e in track.elements]
-    seen = np.array([i.points2D[e.point2D_idx].xy for i, e in zip(images, track.elements, strict=True)])
+    seen = np.array(
+        [i.points2D[e.point2D_idx].xy for i, e in zip(images, track.elements, strict=True)]
+    )
     K = np.array([model.cameras[i.camera_id].calibration_matrix() for i in images])
     pose = np.array([i.cam_from_world().matrix() for i in images])  # (V, 3, 4)
     turn, shift = pose[:, :, :3], pose[:, :, 3]
-    rays = np.einsum("vji,vjk,vk->vi", turn, np.linalg.inv(K), np.concatenate([seen, np.ones((len(seen), 1))], 1))
+    rays = np.einsum(
+        "vji,vjk,vk->vi", turn, np.linalg.inv(K), np.concatenate([seen, np.ones((len(seen), 1))], 1)
+    )
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     across = np.eye(3) - rays[:, :, None] * rays[:, None]  # what lies beside the ray
     centers = -np.einsum("vji,vj->vi", turn, shift)

@@ -1,5 +1,8 @@
-"""A courtyard on a windy day: a cloth waves on its line, an inflated tube bends and breathes. Hard: nothing that moves is rigid. Both are
-meshes whose every vertex is a formula of time. The soft light is an environment map (see `sky.exr` in NOTICE), the hard one a sun."""
+"""A courtyard on a windy day: a cloth waves on its line, an inflated tube bends and
+breathes. Hard: nothing that moves is rigid. Both are meshes whose every vertex is a
+formula of time. The soft light is an environment map (see `sky.exr` in NOTICE), the
+hard one a sun.
+"""
 
 from __future__ import annotations
 
@@ -19,24 +22,42 @@ LEFT, RIGHT, TOP, FLOOR, BACK = -3.7, 3.7, -3.6, 1.25, 6.6
 LINE = np.array([-0.98, -0.72, 2.8])  # the left end of the cloth's upper edge
 WIDTH, HEIGHT = 1.6, 1.15  # of the cloth
 TURN = np.radians(28.0)  # of its line out of the picture's plane
-ALONG, OUT = np.array([np.cos(TURN), 0.0, np.sin(TURN)]), np.array([np.sin(TURN), 0.0, -np.cos(TURN)])  # the line; across it
+ALONG, OUT = (
+    np.array([np.cos(TURN), 0.0, np.sin(TURN)]),
+    np.array([np.sin(TURN), 0.0, -np.cos(TURN)]),
+)  # the line; across it
 FOOT = np.array([1.02, FLOOR, 2.6])  # of the tube
 TALL, THICK = 1.9, 0.19  # height and radius of the tube
 
 
 def cloth_shape(uv: np.ndarray, t: float) -> np.ndarray:
-    """World points (..., 3) of the cloth: pinned along its upper edge, waves run across it and grow downwards."""
+    """World points (..., 3) of the cloth: pinned along its upper edge, waves run across
+    it and grow downwards.
+    """
     u, v = uv[..., 0], uv[..., 1]
     loose = v**0.8
     a, b, c = (2 * np.pi * t / period for period in (13.0, 9.0, 19.0))
-    out = 0.2 * np.sin(6.5 * u + 1.5 * v - a) + 0.06 * np.sin(11 * u - 3 * v - b + 1) + 0.2 * np.sin(c + 0.5)
+    out = (
+        0.2 * np.sin(6.5 * u + 1.5 * v - a)
+        + 0.06 * np.sin(11 * u - 3 * v - b + 1)
+        + 0.2 * np.sin(c + 0.5)
+    )
     x = WIDTH * (u - 0.05 * loose * np.sin(5 * u - a + 0.8)) + 0.14 * v * np.sin(c)
-    y = HEIGHT * v * (1 - 0.06 * np.cos(6.5 * u - a)) + 0.05 * np.sin(np.pi * u)  # hems rise, the line sags
-    return LINE + x[..., None] * ALONG + y[..., None] * [0.0, 1.0, 0.0] + (loose * out)[..., None] * OUT
+    y = HEIGHT * v * (1 - 0.06 * np.cos(6.5 * u - a)) + 0.05 * np.sin(
+        np.pi * u
+    )  # hems rise, the line sags
+    return (
+        LINE
+        + x[..., None] * ALONG
+        + y[..., None] * [0.0, 1.0, 0.0]
+        + (loose * out)[..., None] * OUT
+    )
 
 
 def tube_shape(uv: np.ndarray, t: float) -> np.ndarray:
-    """World points (..., 3) of the tube: rooted in the ground, it sways more the higher, and bulges travel up in it."""
+    """World points (..., 3) of the tube: rooted in the ground, it sways more the
+    higher, and bulges travel up in it.
+    """
     angle, height = 2 * np.pi * uv[..., 0], 1 - uv[..., 1]
     sway, lean, breath = (2 * np.pi * t / period for period in (21.0, 15.0, 12.0))
     x = 0.36 * height**2 * np.sin(sway) - 0.14 * height**3 * np.sin(2 * sway + 1)
@@ -51,8 +72,15 @@ def camera_pose(t: float) -> np.ndarray:
     """Camera to world, (3, 4) OpenCV, at time `t` in frames: around the cloth by hand."""
     a = 2 * np.pi * t / 30 + 2.2
     shake = 0.008 * np.array([np.sin(1.6 * t), np.sin(1.2 * t + 1), np.sin(1.3 * t + 2)])
-    eye = np.array([0.42 * np.sin(a), -0.12 + 0.16 * np.sin(2 * a + 0.4), 0.16 * np.cos(0.79 * a)]) + shake
-    return look_at(eye, np.array([-0.02 + 0.06 * np.sin(0.6 * a), -0.08 + 0.04 * np.sin(0.9 * a), 3.4]) + 1.5 * shake[::-1])
+    eye = (
+        np.array([0.42 * np.sin(a), -0.12 + 0.16 * np.sin(2 * a + 0.4), 0.16 * np.cos(0.79 * a)])
+        + shake
+    )
+    return look_at(
+        eye,
+        np.array([-0.02 + 0.06 * np.sin(0.6 * a), -0.08 + 0.04 * np.sin(0.9 * a), 3.4])
+        + 1.5 * shake[::-1],
+    )
 
 
 def sky() -> np.ndarray:
@@ -72,7 +100,9 @@ def build(seed: int) -> list[Part]:
 
 
 def walls(b: Builder) -> None:
-    """Paving; walls with posters and windows; a gate that lets in the light of the street."""
+    """Paving; walls with posters and windows; a gate that lets in the light of the
+    street.
+    """
     b.panel((LEFT, FLOOR, -1.0), (RIGHT - LEFT, 0, 0), (0, 0, BACK + 1.0), textures.tiles, rows=30)
     bricks = partial(textures.bricks, rows=30)
     room(b, (LEFT, RIGHT, TOP, FLOOR, -1.0, BACK), ceiling=None, sides=bricks, back=bricks)
@@ -84,21 +114,39 @@ def walls(b: Builder) -> None:
         (0.3, -0.7, 0.6, 0.6),
     ]:
         b.panel((x, y, BACK - 0.03), (w, 0, 0), (0, h, 0), textures.poster)
-    for side, z, w, h in [(-1, 3.4, 1.0, 0.9), (-1, 5.0, 1.0, 1.2), (1, 3.2, 0.9, 1.1), (1, 4.6, 1.1, 0.9)]:
+    for side, z, w, h in [
+        (-1, 3.4, 1.0, 0.9),
+        (-1, 5.0, 1.0, 1.2),
+        (1, 3.2, 0.9, 1.1),
+        (1, 4.6, 1.1, 0.9),
+    ]:
         b.panel((side * (RIGHT - 0.03), -1.1, z), (0, 0, w), (0, h, 0), textures.poster)
     left, right, top = -3.1, -2.05, -1.2
-    b.light((right, top, BACK - 0.02), (left - right, 0, 0), (0, FLOOR - top, 0), 2.5 * textures.sky(180, 96, b.rng)[:, ::-1])
+    b.light(
+        (right, top, BACK - 0.02),
+        (left - right, 0, 0),
+        (0, FLOOR - top, 0),
+        2.5 * textures.sky(180, 96, b.rng)[:, ::-1],
+    )
     for x in (left, right):
         b.block((0.16, FLOOR - top, 0.2), (x, (top + FLOOR) / 2, BACK), textures.planks, rows=4)
-    b.block((right - left + 0.3, 0.16, 0.2), ((left + right) / 2, top, BACK), textures.planks, rows=4)
+    b.block(
+        (right - left + 0.3, 0.16, 0.2), ((left + right) / 2, top, BACK), textures.planks, rows=4
+    )
 
 
 def yard(b: Builder) -> None:
-    """The line between its posts, a dark shed with an open front, pots, crates and barrels."""
+    """The line between its posts, a dark shed with an open front, pots, crates and
+    barrels.
+    """
     height = FLOOR - LINE[1] + 0.1
     for along in (-0.12, WIDTH + 0.12):
         post = (LINE + along * ALONG)[[0, 2]]
-        b.add(cylinder(0.035, height), textures.tiles(240, 40, b.rng, rows=24), (post[0], FLOOR - height / 2, post[1]))
+        b.add(
+            cylinder(0.035, height),
+            textures.tiles(240, 40, b.rng, rows=24),
+            (post[0], FLOOR - height / 2, post[1]),
+        )
     middle = LINE + WIDTH / 2 * ALONG - np.array([0, 0.01, 0])
     b.block((WIDTH + 0.3, 0.012, 0.012), middle, textures.planks, turn=-np.degrees(TURN), rows=4)
     shed(b)
@@ -120,9 +168,19 @@ def shed(b: Builder) -> None:
     """Boards around darkness, and something in there."""
     x0, x1, y0, z0 = 1.15, 2.75, -0.75, 5.0
     wood = {"base": (0.16, 0.11, 0.07), "rows": 8}
-    b.block((x1 - x0 + 0.2, 0.06, BACK - z0 + 0.5), ((x0 + x1) / 2, y0, (z0 + BACK) / 2 - 0.25), textures.planks, **wood)
+    b.block(
+        (x1 - x0 + 0.2, 0.06, BACK - z0 + 0.5),
+        ((x0 + x1) / 2, y0, (z0 + BACK) / 2 - 0.25),
+        textures.planks,
+        **wood,
+    )
     for x in (x0, x1):
-        b.block((0.06, FLOOR - y0, BACK - z0), (x, (y0 + FLOOR) / 2, (z0 + BACK) / 2), textures.planks, **wood)
+        b.block(
+            (0.06, FLOOR - y0, BACK - z0),
+            (x, (y0 + FLOOR) / 2, (z0 + BACK) / 2),
+            textures.planks,
+            **wood,
+        )
     b.panel((x0, y0, BACK - 0.05), (x1 - x0, 0, 0), (0, FLOOR - y0, 0), textures.planks, **wood)
     b.block((0.5, 0.5, 0.4), (1.7, FLOOR - 0.25, BACK - 0.4), textures.poster, paper=0.2)
 
@@ -130,7 +188,11 @@ def shed(b: Builder) -> None:
 def movers(b: Builder) -> None:
     """The cloth and the tube."""
     for body in (WAVING, BENDING):
-        b.add(sheet(body.rows, body.columns), textures.poster(240, 320, b.rng, paper=0.8, figures=160), body=body.name)
+        b.add(
+            sheet(body.rows, body.columns),
+            textures.poster(240, 320, b.rng, paper=0.8, figures=160),
+            body=body.name,
+        )
 
 
 WAVING = Deforming("cloth", cloth_shape, rows=64, columns=88)
@@ -139,7 +201,10 @@ CLOTH = SynthScene(
     build=build,
     bodies=(WAVING, BENDING),
     camera_pose=camera_pose,
-    rig=(*((0.32 * k, -0.28, 0.0) for k in range(-2, 3)), *((0.48 - 0.32 * k, 0.04, 0.0) for k in range(4))),
+    rig=(
+        *((0.32 * k, -0.28, 0.0) for k in range(-2, 3)),
+        *((0.48 - 0.32 * k, 0.04, 0.0) for k in range(4)),
+    ),
     rig_target=(0.0, -0.08, 3.4),
     blur=0.08,
     sky=sky,

@@ -1,4 +1,6 @@
-"""Pinhole cameras and rotations as plain arrays: OpenCV axes (+x right, +y down, +z forward), meters, pixel centers at +0.5."""
+"""Pinhole cameras and rotations as plain arrays: OpenCV axes (+x right, +y down, +z
+forward), meters, pixel centers at +0.5.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ def intrinsics(width: int, height: int) -> np.ndarray:
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """Camera to world (3, 4) at `eye`, +z towards `target`, level (+y of the world is down)."""
+    """Camera to world (3, 4) at `eye`, +z towards `target`, level (+y of the world is
+    down).
+    """
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)

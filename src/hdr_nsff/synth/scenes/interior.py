@@ -1,4 +1,6 @@
-"""A room with a bright window and a bare bulb; a box tumbles through it and a ball swings on a cord. Hard: five decades of radiance."""
+"""A room with a bright window and a bare bulb; a box tumbles through it and a ball
+swings on a cord. Hard: five decades of radiance.
+"""
 
 from __future__ import annotations
 
@@ -20,12 +22,18 @@ def box_pose(t: float) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = rotation(np.array([0.55, 0.75, 0.35]), np.radians(7.0) * t)
     angle = 2 * np.pi * (t + 1) / 78
-    pose[:3, 3] = [-0.12 - 0.42 * np.cos(angle), 0.2 - 0.16 * np.sin(angle), 1.9 + 0.12 * np.sin(2 * angle)]
+    pose[:3, 3] = [
+        -0.12 - 0.42 * np.cos(angle),
+        0.2 - 0.16 * np.sin(angle),
+        1.9 + 0.12 * np.sin(2 * angle),
+    ]
     return pose
 
 
 def ball_pose(t: float) -> np.ndarray:
-    """The ball swings on its cord, in a plane turned 20 degrees out of the picture, its pattern with it."""
+    """The ball swings on its cord, in a plane turned 20 degrees out of the picture, its
+    pattern with it.
+    """
     pose = np.eye(4)
     swing = np.radians(18.0) * np.sin(2 * np.pi * (t + 4) / 30)
     pose[:3, :3] = rotation(np.array([np.sin(0.35), 0.0, np.cos(0.35)]), swing)
@@ -34,13 +42,21 @@ def ball_pose(t: float) -> np.ndarray:
 
 
 def camera_pose(t: float) -> np.ndarray:
-    """Camera to world, (3, 4) OpenCV, at time `t` in frames: a figure of eight by hand, looking at the middle of the room.
+    """Camera to world, (3, 4) OpenCV, at time `t` in frames: a figure of eight by hand,
+    looking at the middle of the room.
 
-    One loop takes 28 frames, so that places recur at other times."""
+    One loop takes 28 frames, so that places recur at other times.
+    """
     a = 2 * np.pi * t / 28 + 0.4
     shake = 0.008 * np.array([np.sin(1.9 * t), np.sin(1.3 * t + 1), np.sin(1.1 * t + 2)])
-    eye = np.array([0.34 * np.sin(a), -0.06 + 0.13 * np.sin(2 * a + 0.5), 0.14 * np.cos(0.77 * a)]) + shake
-    target = np.array([0.05 * np.sin(0.61 * a + 1), 0.02 + 0.04 * np.sin(0.9 * a), 3.0]) + 1.5 * shake[::-1]
+    eye = (
+        np.array([0.34 * np.sin(a), -0.06 + 0.13 * np.sin(2 * a + 0.5), 0.14 * np.cos(0.77 * a)])
+        + shake
+    )
+    target = (
+        np.array([0.05 * np.sin(0.61 * a + 1), 0.02 + 0.04 * np.sin(0.9 * a), 3.0])
+        + 1.5 * shake[::-1]
+    )
     return look_at(eye, target)
 
 
@@ -55,15 +71,26 @@ def build(seed: int) -> list[Part]:
 
 
 def walls(b: Builder) -> None:
-    """Floor, ceiling and walls; the back wall has a hole for the window; posters hang a finger's breadth before them."""
+    """Floor, ceiling and walls; the back wall has a hole for the window; posters hang a
+    finger's breadth before them.
+    """
     width, depth, height = RIGHT - LEFT, BACK - FRONT, FLOOR - TOP
     b.panel((LEFT, FLOOR, FRONT), (width, 0, 0), (0, 0, depth), textures.tiles, rows=26)
-    b.panel((LEFT, TOP, FRONT), (width, 0, 0), (0, 0, depth), textures.planks, rows=24, base=(0.5, 0.42, 0.32))
+    b.panel(
+        (LEFT, TOP, FRONT),
+        (width, 0, 0),
+        (0, 0, depth),
+        textures.planks,
+        rows=24,
+        base=(0.5, 0.42, 0.32),
+    )
     b.panel((LEFT, TOP, FRONT), (0, 0, depth), (0, height, 0), textures.plaster)
     b.panel((RIGHT, TOP, FRONT), (0, 0, depth), (0, height, 0), textures.bricks, rows=24)
     b.panel((LEFT, TOP, FRONT), (width, 0, 0), (0, height, 0), textures.plaster)
     left, right, top, bottom = WINDOW
-    wall = textures.bricks(int(b.per_meter * height), int(b.per_meter * width), b.rng, rows=26, base=(0.34, 0.3, 0.24))
+    wall = textures.bricks(
+        int(b.per_meter * height), int(b.per_meter * width), b.rng, rows=26, base=(0.34, 0.3, 0.24)
+    )
     for x0, x1, y0, y1 in [
         (LEFT, left, TOP, FLOOR),
         (right, RIGHT, TOP, FLOOR),
@@ -75,7 +102,12 @@ def walls(b: Builder) -> None:
             quad(np.array([x0, y0, BACK]), np.array([x1 - x0, 0, 0]), np.array([0, y1 - y0, 0])),
             np.ascontiguousarray(wall[ys:ye, xs:xe]),
         )
-    for x, y, w, h in [(0.05, -0.8, 0.42, 0.55), (0.62, -0.6, 0.55, 0.4), (0.1, -0.12, 0.36, 0.3), (-0.9, 0.3, 0.5, 0.34)]:
+    for x, y, w, h in [
+        (0.05, -0.8, 0.42, 0.55),
+        (0.62, -0.6, 0.55, 0.4),
+        (0.1, -0.12, 0.36, 0.3),
+        (-0.9, 0.3, 0.5, 0.34),
+    ]:
         b.panel((x, y, BACK - 0.015), (w, 0, 0), (0, h, 0), textures.poster)
     b.panel((RIGHT - 0.015, -0.55, 2.55), (0, 0, 0.7), (0, 0.75, 0), textures.poster)
     b.panel((LEFT + 0.015, -0.85, 2.2), (0, 0, 0.5), (0, 0.42, 0), textures.poster)
@@ -86,7 +118,9 @@ def walls(b: Builder) -> None:
 
 
 def furniture(b: Builder) -> None:
-    """A table with things on it, a bookcase, a dark open cupboard, crates near the camera."""
+    """A table with things on it, a bookcase, a dark open cupboard, crates near the
+    camera.
+    """
     b.block((1.05, 0.04, 0.6), (0.2, 0.55, 2.7), textures.planks, turn=8)
     for x, z in [(-0.22, 2.5), (0.62, 2.38), (-0.12, 3.0), (0.7, 2.9)]:
         b.block((0.05, 0.38, 0.05), (x, 0.76, z), textures.planks, rows=4)
@@ -106,11 +140,17 @@ def furniture(b: Builder) -> None:
 
 
 def cupboard(b: Builder) -> None:
-    """An open cupboard of dark wood in the far right corner, below the lamp: hardly any light finds its way into it."""
+    """An open cupboard of dark wood in the far right corner, below the lamp: hardly any
+    light finds its way into it.
+    """
     x0, x1, y0, y1, z0 = 0.85, 1.42, 0.3, FLOOR, 2.95
     wood = {"base": (0.13, 0.09, 0.06), "rows": 6}
-    b.block((x1 - x0, 0.03, BACK - z0), ((x0 + x1) / 2, y0, (z0 + BACK) / 2), textures.planks, **wood)
-    b.block((0.03, y1 - y0, BACK - z0), (x0, (y0 + y1) / 2, (z0 + BACK) / 2), textures.planks, **wood)
+    b.block(
+        (x1 - x0, 0.03, BACK - z0), ((x0 + x1) / 2, y0, (z0 + BACK) / 2), textures.planks, **wood
+    )
+    b.block(
+        (0.03, y1 - y0, BACK - z0), (x0, (y0 + y1) / 2, (z0 + BACK) / 2), textures.planks, **wood
+    )
     b.panel((x0, y0, BACK - 0.02), (x1 - x0, 0, 0), (0, y1 - y0, 0), textures.planks, **wood)
     b.block((0.2, 0.2, 0.1), (1.05, y1 - 0.12, BACK - 0.15), textures.poster, paper=0.15)
 
@@ -119,27 +159,53 @@ def movers(b: Builder) -> None:
     """The tumbling box; the ball on its cord."""
     b.block((0.33, 0.28, 0.3), (0, 0, 0), textures.poster, body="box", figures=140)
     b.add(sphere(0.165), textures.poster(160, 320, b.rng, figures=120), (0, CORD, 0), body="ball")
-    b.add(cylinder(0.012, CORD - 0.16), textures.tiles(256, 16, b.rng, rows=20), (0, (CORD - 0.16) / 2, 0), body="ball")
+    b.add(
+        cylinder(0.012, CORD - 0.16),
+        textures.tiles(256, 16, b.rng, rows=20),
+        (0, (CORD - 0.16) / 2, 0),
+        body="ball",
+    )
 
 
 def lights(b: Builder) -> None:
-    """The window's view, a little behind the back wall; a window behind the camera; a bare bulb on a stand."""
+    """The window's view, a little behind the back wall; a window behind the camera; a
+    bare bulb on a stand.
+    """
     left, right, top, bottom = WINDOW
     w, h = right - left + 0.3, bottom - top + 0.3
-    b.light((left - 0.15 + w, top - 0.15, BACK + 0.2), (-w, 0, 0), (0, h, 0), textures.sky(192, 176, b.rng)[:, ::-1])
-    b.light((-0.9, -0.9, FRONT + 0.02), (1.8, 0, 0), (0, 1.2, 0), np.full((1, 1, 3), 5.0) * [0.85, 0.95, 1.1])
+    b.light(
+        (left - 0.15 + w, top - 0.15, BACK + 0.2),
+        (-w, 0, 0),
+        (0, h, 0),
+        textures.sky(192, 176, b.rng)[:, ::-1],
+    )
+    b.light(
+        (-0.9, -0.9, FRONT + 0.02),
+        (1.8, 0, 0),
+        (0, 1.2, 0),
+        np.full((1, 1, 3), 5.0) * [0.85, 0.95, 1.1],
+    )
     at = np.array([1.1, -0.6, 2.5])
     b.bulb(at, 0.03, 700.0 * np.array([1.0, 0.78, 0.52]))
     stand = FLOOR - at[1] - 0.1
-    b.add(cylinder(0.018, 0.08), np.full((1, 1, 3), 0.02), at + np.array([0, 0.078, 0]))  # black, or it sparkles
-    b.add(cylinder(0.012, stand), textures.planks(256, 16, b.rng), at + np.array([0, 0.1 + stand / 2, 0]))
+    b.add(
+        cylinder(0.018, 0.08), np.full((1, 1, 3), 0.02), at + np.array([0, 0.078, 0])
+    )  # black, or it sparkles
+    b.add(
+        cylinder(0.012, stand),
+        textures.planks(256, 16, b.rng),
+        at + np.array([0, 0.1 + stand / 2, 0]),
+    )
 
 
 INTERIOR = SynthScene(
     build=build,
     bodies=(Rigid("box", box_pose), Rigid("ball", ball_pose)),
     camera_pose=camera_pose,
-    rig=(*((0.3 * k, -0.2, 0.0) for k in range(-2, 3)), *((0.45 - 0.3 * k, 0.08, 0.0) for k in range(4))),
+    rig=(
+        *((0.3 * k, -0.2, 0.0) for k in range(-2, 3)),
+        *((0.45 - 0.3 * k, 0.08, 0.0) for k in range(4)),
+    ),
     rig_target=(0.0, 0.02, 3.0),
     spp=256,
     truth_spp=768,

@@ -1,5 +1,7 @@
-"""A workshop lit by one bare globe; a crate on a rail, a hammer on a rod and a ball on an arm rush past it. Hard: sideways motion of more
-than a twentieth of the picture per frame, each mover hides the lamp and the others, and their shadows sweep the room."""
+"""A workshop lit by one bare globe; a crate on a rail, a hammer on a rod and a ball on
+an arm rush past it. Hard: sideways motion of more than a twentieth of the picture per
+frame, each mover hides the lamp and the others, and their shadows sweep the room.
+"""
 
 from __future__ import annotations
 
@@ -31,25 +33,36 @@ def crate_pose(t: float) -> np.ndarray:
 def hammer_pose(t: float) -> np.ndarray:
     """The hammer swings in the picture's plane, past the crate."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation(np.array([0.0, 0.12, 1.0]), np.radians(40.0) * np.sin(2 * np.pi * (t + 2) / 13))
+    pose[:3, :3] = rotation(
+        np.array([0.0, 0.12, 1.0]), np.radians(40.0) * np.sin(2 * np.pi * (t + 2) / 13)
+    )
     pose[:3, 3] = HINGE
     return pose
 
 
 def ball_pose(t: float) -> np.ndarray:
-    """The ball circles the lamp, in front of it below the line of sight, behind it above."""
+    """The ball circles the lamp, in front of it below the line of sight, behind it
+    above.
+    """
     pose = np.eye(4)
-    pose[:3, :3] = rotation(np.array([1.0, 0.0, 0.0]), 0.22) @ rotation(np.array([0.0, 1.0, 0.0]), 2 * np.pi * t / 13)
+    pose[:3, :3] = rotation(np.array([1.0, 0.0, 0.0]), 0.22) @ rotation(
+        np.array([0.0, 1.0, 0.0]), 2 * np.pi * t / 13
+    )
     pose[:3, 3] = GLOBE + np.array([0.0, 0.17, 0.0])
     return pose
 
 
 def camera_pose(t: float) -> np.ndarray:
-    """Camera to world, (3, 4) OpenCV, at time `t` in frames: wide arcs by hand, with the lamp in the middle."""
+    """Camera to world, (3, 4) OpenCV, at time `t` in frames: wide arcs by hand, with
+    the lamp in the middle.
+    """
     a = 2 * np.pi * t / 31 + 1.1
     shake = 0.008 * np.array([np.sin(1.7 * t + 1), np.sin(1.4 * t), np.sin(1.2 * t + 2)])
     eye = np.array([0.36 * np.sin(a), -0.1 + 0.14 * np.sin(2 * a), 0.1 * np.cos(0.83 * a)]) + shake
-    return look_at(eye, np.array([0.05 * np.sin(0.7 * a), -0.04 + 0.03 * np.sin(0.9 * a), 3.0]) + 1.5 * shake[::-1])
+    return look_at(
+        eye,
+        np.array([0.05 * np.sin(0.7 * a), -0.04 + 0.03 * np.sin(0.9 * a), 3.0]) + 1.5 * shake[::-1],
+    )
 
 
 def build(seed: int) -> list[Part]:
@@ -64,7 +77,9 @@ def build(seed: int) -> list[Part]:
 
 def walls(b: Builder) -> None:
     """A room of bricks and boards with prints on them."""
-    b.panel((LEFT, FLOOR, FRONT), (RIGHT - LEFT, 0, 0), (0, 0, BACK - FRONT), textures.planks, rows=20)
+    b.panel(
+        (LEFT, FLOOR, FRONT), (RIGHT - LEFT, 0, 0), (0, 0, BACK - FRONT), textures.planks, rows=20
+    )
     room(
         b,
         (LEFT, RIGHT, TOP, FLOOR, FRONT, BACK),
@@ -82,11 +97,15 @@ def walls(b: Builder) -> None:
     for x, y, w, h in [*prints, (0.55, -0.3, 0.35, 0.4), (-0.7, -0.2, 0.4, 0.3)]:
         b.panel((x, y, BACK - 0.015), (w, 0, 0), (0, h, 0), textures.poster)
     for x, sign in ((RIGHT - 0.015, 1), (LEFT + 0.015, -1)):
-        b.panel((x, -0.7, 2.2 if sign > 0 else 2.9), (0, 0, 0.7 * sign), (0, 0.8, 0), textures.poster)
+        b.panel(
+            (x, -0.7, 2.2 if sign > 0 else 2.9), (0, 0, 0.7 * sign), (0, 0.8, 0), textures.poster
+        )
 
 
 def furniture(b: Builder) -> None:
-    """A bench along the back wall, shelves, barrels, boxes, the rail and the hammer's beam."""
+    """A bench along the back wall, shelves, barrels, boxes, the rail and the hammer's
+    beam.
+    """
     b.block((3.2, 0.06, 0.5), (0, 0.42, BACK - 0.25), textures.planks, rows=6)
     b.block((3.1, 0.5, 0.04), (0, 0.72, BACK - 0.1), textures.books)
     for x, size in [(-1.3, 0.3), (-0.75, 0.2), (0.7, 0.24), (1.25, 0.32)]:
@@ -105,24 +124,45 @@ def movers(b: Builder) -> None:
     b.block((0.4, 0.32, 0.24), (0, 0.42, 0), textures.poster, body="crate", paper=0.8, figures=140)
     b.block((0.04, 0.3, 0.02), (0, 0.13, 0), textures.planks, body="crate", rows=4)
     b.block((0.44, 0.24, 0.22), (0, ROD, 0), textures.poster, body="hammer", figures=120)
-    b.add(cylinder(0.014, ROD - 0.1), textures.tiles(256, 16, b.rng, rows=20), (0, (ROD - 0.1) / 2, 0), body="hammer")
+    b.add(
+        cylinder(0.014, ROD - 0.1),
+        textures.tiles(256, 16, b.rng, rows=20),
+        (0, (ROD - 0.1) / 2, 0),
+        body="hammer",
+    )
     b.add(sphere(0.17), textures.poster(160, 320, b.rng, figures=120), (0, 0, ARM), body="ball")
-    b.block((0.025, 0.025, ARM - 0.1), (0, 0, (ARM - 0.1) / 2), textures.planks, body="ball", rows=4)
+    b.block(
+        (0.025, 0.025, ARM - 0.1), (0, 0, (ARM - 0.1) / 2), textures.planks, body="ball", rows=4
+    )
 
 
 def lights(b: Builder) -> None:
-    """The globe on its stand, and a dim panel behind the camera that keeps what is seen against the light from being black."""
+    """The globe on its stand, and a dim panel behind the camera that keeps what is seen
+    against the light from being black.
+    """
     b.bulb(GLOBE, 0.06, np.array([300.0, 250.0, 180.0]))
     b.add(cylinder(0.03, 0.1), np.full((1, 1, 3), 0.02), GLOBE + np.array([0, 0.11, 0]))
     stand = FLOOR - GLOBE[1] - 0.16
-    b.add(cylinder(0.02, stand), textures.planks(256, 16, b.rng), GLOBE + np.array([0, 0.16 + stand / 2, 0]))
-    b.light((-1.2, -1.1, FRONT + 0.02), (2.4, 0, 0), (0, 1.0, 0), np.full((1, 1, 3), 2.4) * [0.8, 0.95, 1.2])
+    b.add(
+        cylinder(0.02, stand),
+        textures.planks(256, 16, b.rng),
+        GLOBE + np.array([0, 0.16 + stand / 2, 0]),
+    )
+    b.light(
+        (-1.2, -1.1, FRONT + 0.02),
+        (2.4, 0, 0),
+        (0, 1.0, 0),
+        np.full((1, 1, 3), 2.4) * [0.8, 0.95, 1.2],
+    )
 
 
 LAMP = SynthScene(
     build=build,
     bodies=(Rigid("crate", crate_pose), Rigid("hammer", hammer_pose), Rigid("ball", ball_pose)),
     camera_pose=camera_pose,
-    rig=(*((0.3 * k, -0.22, 0.0) for k in range(-2, 3)), *((0.45 - 0.3 * k, 0.06, 0.0) for k in range(4))),
+    rig=(
+        *((0.3 * k, -0.22, 0.0) for k in range(-2, 3)),
+        *((0.45 - 0.3 * k, 0.06, 0.0) for k in range(4)),
+    ),
     rig_target=(0.0, -0.04, 3.0),
 )

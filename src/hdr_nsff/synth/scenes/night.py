@@ -1,5 +1,7 @@
-"""An alley at night: a car turns round with its head lights on, somebody walks by with a lantern, a lamp swings on a cable. Hard: small, very
-bright lights that move and carry the light on everything else with them, deep shadow, more than five decades of radiance."""
+"""An alley at night: a car turns round with its head lights on, somebody walks by with
+a lantern, a lamp swings on a cable. Hard: small, very bright lights that move and carry
+the light on everything else with them, deep shadow, more than five decades of radiance.
+"""
 
 from __future__ import annotations
 
@@ -53,17 +55,27 @@ def lantern_pose(t: float) -> np.ndarray:
 def bulb_pose(t: float) -> np.ndarray:
     """The lamp swings in the wind on its cable."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation(np.array([0.45, 0.0, 1.0]), np.radians(20.0) * np.sin(2 * np.pi * (t + 3) / 27))
+    pose[:3, :3] = rotation(
+        np.array([0.45, 0.0, 1.0]), np.radians(20.0) * np.sin(2 * np.pi * (t + 3) / 27)
+    )
     pose[:3, 3] = CABLE
     return pose
 
 
 def camera_pose(t: float) -> np.ndarray:
-    """Camera to world, (3, 4) OpenCV, at time `t` in frames: strolling from side to side, looking down the alley."""
+    """Camera to world, (3, 4) OpenCV, at time `t` in frames: strolling from side to
+    side, looking down the alley.
+    """
     a = 2 * np.pi * t / 29 + 0.9
     shake = 0.016 * np.array([np.sin(1.8 * t), np.sin(1.3 * t + 1), np.sin(1.1 * t + 2)])
-    eye = np.array([0.62 * np.sin(a), -0.05 + 0.24 * np.sin(2 * a + 0.3), 0.3 * np.cos(0.8 * a)]) + shake
-    return look_at(eye, np.array([0.15 * np.sin(0.6 * a), 0.12 + 0.08 * np.sin(0.9 * a), 6.0]) + 1.5 * shake[::-1])
+    eye = (
+        np.array([0.62 * np.sin(a), -0.05 + 0.24 * np.sin(2 * a + 0.3), 0.3 * np.cos(0.8 * a)])
+        + shake
+    )
+    return look_at(
+        eye,
+        np.array([0.15 * np.sin(0.6 * a), 0.12 + 0.08 * np.sin(0.9 * a), 6.0]) + 1.5 * shake[::-1],
+    )
 
 
 def build(seed: int) -> list[Part]:
@@ -79,12 +91,25 @@ def build(seed: int) -> list[Part]:
 
 def houses(b: Builder) -> None:
     """Cobbles, and fronts of houses with doors, posters and a dark gateway."""
-    b.panel((LEFT, FLOOR, FRONT), (RIGHT - LEFT, 0, 0), (0, 0, BACK - FRONT), textures.tiles, rows=44)
+    b.panel(
+        (LEFT, FLOOR, FRONT), (RIGHT - LEFT, 0, 0), (0, 0, BACK - FRONT), textures.tiles, rows=44
+    )
     bricks = partial(textures.bricks, rows=36)
     room(b, (LEFT, RIGHT, TOP, FLOOR, FRONT, BACK), ceiling=None, sides=bricks, back=bricks)
-    for x, y, w, h in [(-2.9, -0.7, 1.2, 2.2), (1.9, -0.6, 1.1, 2.1), (-1.2, -1.6, 1.3, 0.9), (0.5, -0.4, 0.9, 1.0)]:
+    for x, y, w, h in [
+        (-2.9, -0.7, 1.2, 2.2),
+        (1.9, -0.6, 1.1, 2.1),
+        (-1.2, -1.6, 1.3, 0.9),
+        (0.5, -0.4, 0.9, 1.0),
+    ]:
         b.panel((x, y, BACK - 0.03), (w, 0, 0), (0, h, 0), textures.poster)
-    for side, z, w, h in [(-1, 5.2, 1.2, 1.3), (-1, 8.6, 1.6, 1.5), (1, 4.6, 1.1, 1.6), (1, 7.2, 1.5, 1.2), (1, 10.2, 1.2, 1.6)]:
+    for side, z, w, h in [
+        (-1, 5.2, 1.2, 1.3),
+        (-1, 8.6, 1.6, 1.5),
+        (1, 4.6, 1.1, 1.6),
+        (1, 7.2, 1.5, 1.2),
+        (1, 10.2, 1.2, 1.6),
+    ]:
         x = side * (RIGHT - 0.03)
         b.panel((x, -0.9, z), (0, 0, w), (0, h, 0), textures.poster)
     for side, z in [(-1, 4.0), (-1, 7.4), (1, 6.3), (1, 9.4)]:  # buttresses
@@ -104,7 +129,9 @@ def clutter(b: Builder) -> None:
     b.block((0.5, 0.45, 0.5), (-2.2, FLOOR - 0.92, 4.6), textures.planks, turn=-10)
     for x, z in [(2.0, 3.7), (-2.6, 6.2), (1.6, 11.4)]:
         b.add(cylinder(0.33, 0.95), textures.planks(96, 160, b.rng, rows=6), (x, FLOOR - 0.475, z))
-    b.add(cylinder(0.06, 3.9), textures.tiles(320, 40, b.rng, rows=32), (-1.5, FLOOR - 1.95, 5.6))  # the street lamp's post
+    b.add(
+        cylinder(0.06, 3.9), textures.tiles(320, 40, b.rng, rows=32), (-1.5, FLOOR - 1.95, 5.6)
+    )  # the street lamp's post
     b.add(cylinder(0.05, 1.0), textures.tiles(120, 40, b.rng, rows=12), (1.45, FLOOR - 0.5, 2.9))
     b.add(cylinder(0.05, 1.0), textures.tiles(120, 40, b.rng, rows=12), (-1.5, FLOOR - 0.5, 2.7))
 
@@ -116,7 +143,12 @@ def car(b: Builder) -> None:
     for x in (-0.72, 0.72):
         for z in (-1.05, 1.05):
             vertices, faces, uv = sphere(0.32, 16)
-            b.add((vertices * [0.4, 1, 1], faces, uv), textures.tiles(48, 96, b.rng, rows=6), (x, -0.32, z), body="car")
+            b.add(
+                (vertices * [0.4, 1, 1], faces, uv),
+                textures.tiles(48, 96, b.rng, rows=6),
+                (x, -0.32, z),
+                body="car",
+            )
     for x in (-0.58, 0.58):
         hood, faces, uv = revolved(np.array([[0.11, -0.19], [0.11, 0.0], [0.01, 0.0]]))
         b.add((hood[:, [0, 2, 1]], faces, uv), BLACK, (x, -0.56, -1.65), body="car")
@@ -125,10 +157,22 @@ def car(b: Builder) -> None:
 
 def walker(b: Builder) -> None:
     """A wide coat, a head with a hat, an arm and the lantern."""
-    coat = np.array([[0.01, -1.42], [0.2, -1.36], [0.27, -1.1], [0.25, -0.75], [0.36, -0.15], [0.34, 0.0], [0.01, 0.0]])
+    coat = np.array(
+        [
+            [0.01, -1.42],
+            [0.2, -1.36],
+            [0.27, -1.1],
+            [0.25, -0.75],
+            [0.36, -0.15],
+            [0.34, 0.0],
+            [0.01, 0.0],
+        ]
+    )
     b.add(revolved(coat), textures.poster(160, 240, b.rng, figures=90), body="walker")
     b.add(sphere(0.14), textures.plaster(60, 120, b.rng, base=0.6), (0, -1.55, 0), body="walker")
-    b.add(cylinder(0.24, 0.05), textures.planks(32, 96, b.rng, rows=4), (0, -1.66, 0), body="walker")
+    b.add(
+        cylinder(0.24, 0.05), textures.planks(32, 96, b.rng, rows=4), (0, -1.66, 0), body="walker"
+    )
     b.block((0.42, 0.1, 0.1), (0.24, -1.1, -0.1), textures.poster, body="walker")
     b.add(cylinder(0.008, 0.24), BLACK, (0, 0.12, 0), body="lantern")
     for y in (0.24, 0.46):
@@ -148,7 +192,11 @@ def lights(b: Builder) -> None:
     window = textures.books(64, 48, b.rng) * np.array([3.0, 2.0, 0.9], np.float32)
     b.light((-2.35, -2.3, BACK - 0.04), (0, 1.1, 0), (0.8, 0, 0), window, DIM)
     b.light(
-        (LEFT, TOP + 0.01, FRONT), (0, 0, BACK - FRONT), (RIGHT - LEFT, 0, 0), np.full((1, 1, 3), 0.004) * [0.6, 0.8, 1.5], DIM
+        (LEFT, TOP + 0.01, FRONT),
+        (0, 0, BACK - FRONT),
+        (RIGHT - LEFT, 0, 0),
+        np.full((1, 1, 3), 0.004) * [0.6, 0.8, 1.5],
+        DIM,
     )
 
 
@@ -161,7 +209,10 @@ NIGHT = SynthScene(
         Rigid("bulb", bulb_pose),
     ),
     camera_pose=camera_pose,
-    rig=(*((0.5 * k, -0.3, 0.0) for k in range(-2, 3)), *((0.75 - 0.5 * k, 0.2, 0.0) for k in range(4))),
+    rig=(
+        *((0.5 * k, -0.3, 0.0) for k in range(-2, 3)),
+        *((0.75 - 0.5 * k, 0.2, 0.0) for k in range(4)),
+    ),
     rig_target=(0.0, 0.12, 6.0),
     ev="-6,-3,0",
     blur=0.12,

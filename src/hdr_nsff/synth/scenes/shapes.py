@@ -1,4 +1,6 @@
-"""Meshes, and what collects them into a scene: vertices (V, 3), faces (F, 3) counter-clockwise seen from outside, uv (V, 2) in [0, 1]."""
+"""Meshes, and what collects them into a scene: vertices (V, 3), faces (F, 3)
+counter-clockwise seen from outside, uv (V, 2) in [0, 1].
+"""
 
 from __future__ import annotations
 
@@ -15,7 +17,11 @@ Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 def quad(corner: np.ndarray, u: np.ndarray, v: np.ndarray) -> Mesh:
     """A parallelogram: vertices (4, 3), faces (2, 3), uv (4, 2). Its normal is u x v."""
     c, u, v = (np.asarray(a, float) for a in (corner, u, v))
-    return np.stack([c, c + u, c + u + v, c + v]), np.array([[0, 1, 2], [0, 2, 3]]), np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    return (
+        np.stack([c, c + u, c + u + v, c + v]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+        np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]]),
+    )
 
 
 def cuboid(size: tuple[float, float, float]) -> Mesh:
@@ -37,11 +43,18 @@ def revolved(profile: np.ndarray, sides: int = 40) -> Mesh:
     """A surface of revolution about y; `profile` (P, 2) holds radius and y, downwards."""
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     ring = np.stack([np.cos(angle), np.sin(angle)], -1)
-    points = np.stack([np.column_stack([r * ring[:, 0], np.full(sides + 1, y), r * ring[:, 1]]) for r, y in profile])
+    points = np.stack(
+        [
+            np.column_stack([r * ring[:, 0], np.full(sides + 1, y), r * ring[:, 1]])
+            for r, y in profile
+        ]
+    )
     uv = np.stack(np.meshgrid(np.linspace(0, 1, sides + 1), np.linspace(0, 1, len(profile))), -1)
     i, j = np.meshgrid(np.arange(len(profile) - 1), np.arange(sides), indexing="ij")
     a = (i * (sides + 1) + j).ravel()
-    faces = np.concatenate([np.stack([a, a + sides + 2, a + 1], -1), np.stack([a, a + sides + 1, a + sides + 2], -1)])
+    faces = np.concatenate(
+        [np.stack([a, a + sides + 2, a + 1], -1), np.stack([a, a + sides + 1, a + sides + 2], -1)]
+    )
     return points.reshape(-1, 3), faces, uv.reshape(-1, 2)
 
 
@@ -58,8 +71,12 @@ def cylinder(radius: float, height: float) -> Mesh:
 
 
 def sheet(rows: int, columns: int) -> Mesh:
-    """A grid of cells of two triangles each, for `base.Deforming`; its vertices are its uv until a time says where they are."""
-    uv = np.stack(np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)), -1).reshape(-1, 2)
+    """A grid of cells of two triangles each, for `base.Deforming`; its vertices are its
+    uv until a time says where they are.
+    """
+    uv = np.stack(
+        np.meshgrid(np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)), -1
+    ).reshape(-1, 2)
     i, j = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     a = (i * (columns + 1) + j).ravel()
     right, below, opposite = a + 1, a + columns + 1, a + columns + 2
@@ -77,15 +94,21 @@ class Builder:
 
     def add(self, mesh: Mesh, texture: np.ndarray, at=(0, 0, 0), turn=0.0, body=STILL):
         """A mesh turned by `turn` degrees about the vertical and moved to `at`."""
-        vertices = mesh[0] @ rotation(np.array([0.0, 1.0, 0.0]), np.radians(turn)).T + np.asarray(at, float)
-        self.parts.append(Part(f"{body}{len(self.parts)}", vertices, mesh[1], mesh[2], texture, body))
+        vertices = mesh[0] @ rotation(np.array([0.0, 1.0, 0.0]), np.radians(turn)).T + np.asarray(
+            at, float
+        )
+        self.parts.append(
+            Part(f"{body}{len(self.parts)}", vertices, mesh[1], mesh[2], texture, body)
+        )
 
     def panel(self, corner, u, v, paint: Callable[..., np.ndarray], **style) -> None:
         """A flat panel painted at the scene's texture resolution."""
         w, h = (max(16, int(self.per_meter * np.linalg.norm(e))) for e in (u, v))
         self.add(quad(corner, u, v), paint(h, w, self.rng, **style))
 
-    def block(self, size, at, paint: Callable[..., np.ndarray], turn=0.0, body=STILL, **style) -> None:
+    def block(
+        self, size, at, paint: Callable[..., np.ndarray], turn=0.0, body=STILL, **style
+    ) -> None:
         """A box whose sides show cells of one painting."""
         side = max(16, int(self.per_meter * max(size)))
         self.add(cuboid(size), paint(2 * side, 3 * side, self.rng, **style), at, turn, body)
@@ -93,17 +116,45 @@ class Builder:
     def light(self, corner, u, v, radiance: np.ndarray, circuit: str | None = None) -> None:
         """A flat light that shines along u x v."""
         vertices, faces, uv = quad(corner, u, v)
-        self.parts.append(Part(f"light{len(self.parts)}", vertices, faces, uv, radiance, emits=True, circuit=circuit))
+        self.parts.append(
+            Part(
+                f"light{len(self.parts)}",
+                vertices,
+                faces,
+                uv,
+                radiance,
+                emits=True,
+                circuit=circuit,
+            )
+        )
 
-    def bulb(self, at, radius: float, radiance: np.ndarray, body=STILL, circuit: str | None = None) -> None:
+    def bulb(
+        self, at, radius: float, radiance: np.ndarray, body=STILL, circuit: str | None = None
+    ) -> None:
         """A round light of one color (3,)."""
         none, glow = np.zeros((0, 3), int), np.reshape(radiance, (1, 1, 3)).astype(float)
         name, center = f"bulb{len(self.parts)}", np.asarray(at, float)[None]
-        self.parts.append(Part(name, center, none, np.zeros((1, 2)), glow, body, emits=True, circuit=circuit, radius=radius))
+        self.parts.append(
+            Part(
+                name,
+                center,
+                none,
+                np.zeros((1, 2)),
+                glow,
+                body,
+                emits=True,
+                circuit=circuit,
+                radius=radius,
+            )
+        )
 
 
-def room(b: Builder, bounds: tuple[float, ...], ceiling: Callable | None, sides: Callable, back: Callable) -> None:
-    """Both side walls, the back wall and, unless None, the ceiling, each with its painting; `bounds` are left, right, top, floor, front, back."""
+def room(
+    b: Builder, bounds: tuple[float, ...], ceiling: Callable | None, sides: Callable, back: Callable
+) -> None:
+    """Both side walls, the back wall and, unless None, the ceiling, each with its
+    painting; `bounds` are left, right, top, floor, front, back.
+    """
     left, right, top, floor, front, rear = bounds
     depth, height, width = rear - front, floor - top, right - left
     if ceiling is not None:
