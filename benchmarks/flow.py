@@ -34,7 +34,7 @@ from hdr_nsff.priors.flow.semantic import SemanticConfig, SemanticFlow, semantic
 from hdr_nsff.radiometry.common_range import LUMA, common_gray, recorded_range
 from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import Noise, record, response_curve
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 
 FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
 

@@ -21,7 +21,7 @@ import numpy as np
 
 from hdr_nsff.core import io
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 
 
 def main() -> None:

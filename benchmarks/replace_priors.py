@@ -20,7 +20,7 @@ import numpy as np
 
 from hdr_nsff.core import io
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
 
 PRIORS = ("masks", "mover-depth", "depth", "flow")
 

@@ -14,7 +14,8 @@ from bad_input import Capture, call, clip, edit, reading, refused, snapshot, tra
 from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_npy, write_png
-from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 
 Change = Callable[[dict[str, Any]], object]

@@ -20,6 +20,7 @@ from bad_input import Capture, call, edit, refused, snapshot, truth
 from toy_scene import ToyScene
 
 from hdr_nsff.bench import bench
+from hdr_nsff.scene.movers import write_movers
 from hdr_nsff.training.run_folder import Run, last_logged, snapshots
 from hdr_nsff.training.train import Trainer
 
@@ -35,6 +36,7 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     truth_of(root / "two/truth")
     ToyScene(32, 24).write(root / "three")
     edit(root / "three/scene.json", lambda m: m["frames"][3].update(split="test"))
+    write_movers(root / "three/movers.npz", [])
     return root
 
 

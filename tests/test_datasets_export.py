@@ -31,7 +31,8 @@ from hdr_nsff.footage.layouts import colmap as to_colmap
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.rendering.export import Coloring, ExportConfig, export
-from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView, true_pictures
 
 LAYOUTS = ("hdr-gopro", "nerfstudio")

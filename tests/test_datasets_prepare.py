@@ -19,7 +19,8 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_exr, read_image, read_mask, write_npy, write_png
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
-from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 
 
@@ -59,9 +60,18 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
         in " ".join(told.split())
     )
     assert provenance(gopro.out) == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "masks": "given", "refined_flow": "given",
-        "depth": "given", "sheet": "estimated",
-    }  # fmt: skip
+        "frames": "given",
+        "exposure": "estimated",
+        "flow": "given",
+        "poses": "given",
+        "masks": "given",
+        "static_depth": "given",
+        "response": "estimated",
+        "refined_flow": "given",
+        "movers": "estimated",
+        "depth": "given",
+        "sheet": "estimated",
+    }
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 3 and not scene.test
     assert [f.time for f in scene.train] == list(range(9)) and {
         f.camera_id for f in scene.train
@@ -229,8 +239,18 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
     prepare(gopro)
     steps = Manifest.load(gopro.out).steps
     assert {n: s.details["attempt"] for n, s in steps.items()} == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "masks": 2, "refined_flow": 2, "depth": 2, "sheet": 2,
-    }  # fmt: skip
+        "frames": 1,
+        "exposure": 1,
+        "flow": 1,
+        "poses": 1,
+        "masks": 2,
+        "static_depth": 2,
+        "response": 2,
+        "refined_flow": 2,
+        "movers": 2,
+        "depth": 2,
+        "sheet": 2,
+    }
 
 
 # What training must not see

@@ -12,7 +12,7 @@ from toy_scene import WALL, ToyScene, camera_center
 
 from hdr_nsff import cli
 from hdr_nsff.core import io
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.training.run_folder import Run
 
 FRAMES, WIDTH, HEIGHT = 14, 112, 64

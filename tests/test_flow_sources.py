@@ -9,7 +9,7 @@ import pytest
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_npy, write_text
-from hdr_nsff.prepare.steps.priors import learning_pairs
+from hdr_nsff.prepare.steps.flow import learning_pairs
 from hdr_nsff.priors import weights
 from hdr_nsff.priors.flow.dense import flow
 from hdr_nsff.priors.flow.semantic import SemanticConfig
@@ -21,7 +21,7 @@ from hdr_nsff.priors.flow.sources import (
     resolved,
 )
 from hdr_nsff.priors.weights import find
-from hdr_nsff.scene.scene import FrameEntry
+from hdr_nsff.scene.manifest import FrameEntry
 
 FRAMES = np.random.default_rng(0).random((3, 24, 32, 3)).astype(np.float32)
 CLIPPED = np.zeros(FRAMES.shape[:3], bool)

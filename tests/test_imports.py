@@ -145,7 +145,9 @@ def knows_the_truth(modules: set[str]) -> set[str]:
 LEARNERS = [
     "training.train",
     "prepare.steps.footage",
-    "prepare.steps.priors",
+    "prepare.steps.poses",
+    "prepare.steps.movers",
+    "prepare.engine",
     "footage.datasets",
     "scene.scene",
     "scene.batch",

@@ -15,7 +15,7 @@ from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.prepare.steps.neural import weights_of
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.weights import KNOWN
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 
 COUNT, H, W, FOCAL, SIDE = 9, 64, 96, 80.0, 20
 

@@ -18,7 +18,8 @@ from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.ingest import between
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
-from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.training.config import PRESETS
 from hdr_nsff.training.train import train

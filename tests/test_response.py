@@ -2,20 +2,15 @@
 outliers and misplaced points do not matter.
 """
 
-import math
-from pathlib import Path
-
 import numpy as np
 import pytest
-import torch
+from wall import EV, GAMMA22, S_CURVE, SRGB, record, rmse, wall_view
 
-from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.debevec import (
     HIGH,
     LOW,
     SATURATED,
     Samples,
-    View,
     brightness_ev,
     debevec,
     linked,
@@ -24,27 +19,6 @@ from hdr_nsff.radiometry.debevec import (
     static_samples,
     typical_factor,
 )
-from hdr_nsff.scene.scene import Frame, Manifest, Scene
-from hdr_nsff.tonemap.initialize import initialize
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
-
-U = np.linspace(0, 1, 2001)
-X = U**2.2
-GAMMA22 = np.stack([U] * 3)
-SRGB = np.stack([np.where(X <= 0.0031308, 12.92 * X, 1.055 * X ** (1 / 2.4) - 0.055)] * 3)
-S_CURVE = np.stack(
-    [U - k * np.sin(2 * np.pi * U) / (2 * np.pi) for k in (0.2, 0.3, 0.4)]
-)  # other per channel
-EV = [-4.0, -2.0, 0.0]
-
-
-def record(exposure, curve, rng):
-    """8 bits of a noisy sensor: (..., 3)."""
-    noisy = exposure + rng.standard_normal(exposure.shape) * np.sqrt(
-        1e-6 + np.clip(exposure, 0, 1) / 6000
-    )
-    z = np.stack([np.interp(np.clip(noisy[..., c], 0, 1), X, curve[c]) for c in range(3)], -1)
-    return np.rint(z * 255) / 255
 
 
 def points(curve, ev, num=700, outliers=0.0, seed=0):
@@ -56,10 +30,6 @@ def points(curve, ev, num=700, outliers=0.0, seed=0):
         np.where(wrong, exposure * 2 ** rng.normal(0, 1, exposure.shape), exposure), curve, rng
     )
     return Samples(z, (z >= LOW) & (z <= HIGH), z >= SATURATED)
-
-
-def rmse(fit_x, fit_y, curve):
-    return math.sqrt(np.mean([(np.interp(X, fit_x, fit_y[c]) - curve[c]) ** 2 for c in range(3)]))
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
@@ -167,41 +137,6 @@ def test_brightness_alone_gives_gamma_exposures():
     )
 
 
-K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
-HEIGHT, WIDTH = 48, 64
-
-
-def wall(x, y):
-    """Radiance of a wall at z = 4: a smooth pattern over three decades."""
-    level = 2 ** (3.2 * np.sin(0.9 * x) + 2.4 * np.cos(1.1 * y) - 3)
-    return np.stack([level, level * 2 ** (0.5 * np.sin(x + y)), level * 0.8], -1)
-
-
-def wall_view(index, curve, rng, depth_noise=0.0, shift=0.06):
-    """Camera `index` beside the others, before the wall; a square that moves is marked
-    as moving.
-    """
-    column, row = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    x = (column - K[0, 2]) / K[0, 0] * 4 + shift * index
-    y = (row - K[1, 2]) / K[1, 1] * 4
-    moving = np.zeros((HEIGHT, WIDTH), bool)
-    moving[10:20, 3 * index : 3 * index + 10] = True
-    radiance = np.where(moving[..., None], 3.0, wall(x, y))
-    c2w = np.concatenate([np.eye(3), [[shift * index], [0], [0]]], 1)
-    disparity = 0.25 * (1 + depth_noise * rng.standard_normal((HEIGHT, WIDTH)))
-    bracket = index % 3
-    return View(
-        record(radiance * 2.0 ** EV[bracket], curve, rng),
-        bracket,
-        float(index),
-        K,
-        c2w,
-        disparity,
-        None,
-        moving,
-    )
-
-
 def test_static_points_are_the_same_points_in_every_bracket():
     rng = np.random.default_rng(0)
     samples = static_samples([wall_view(i, GAMMA22, rng) for i in range(9)], 3, 900, rng)
@@ -221,65 +156,3 @@ def test_points_hidden_behind_something_are_not_read():
     samples = static_samples(views, 3, 300, rng)
     first = samples.valid[:100, 0].any(-1)  # points of the first frame
     assert first.any() and not samples.valid[:100, 1][first].any()
-
-
-def scene_of(views, bracket_ev):
-    frames = [
-        Frame(
-            index=i,
-            time=v.time,
-            camera=Camera(torch.from_numpy(v.K), torch.from_numpy(v.c2w), WIDTH, HEIGHT),
-            camera_id=0,
-            bracket=v.bracket,
-            exposure=bracket_ev[v.bracket],
-            image=torch.from_numpy(v.image).float(),
-            moving=torch.from_numpy(v.moving),
-            disparity=torch.from_numpy(v.disparity),
-        )
-        for i, v in enumerate(views)
-    ]
-    manifest = Manifest(
-        source="wall",
-        width=WIDTH,
-        height=HEIGHT,
-        cycle=3,
-        reference_bracket=2,
-        bracket_ev=bracket_ev,
-    )
-    return Scene(Path("."), frames, [], 1.0, 10.0, torch.zeros(0, 3), manifest)
-
-
-def test_initialize_finds_the_curve_through_noisy_depth():
-    rng = np.random.default_rng(0)
-    scene = scene_of([wall_view(i, S_CURVE, rng, depth_noise=0.02) for i in range(18)], EV)
-    tonemapper = ToneMapper.for_scene(ToneMapConfig(), scene)
-    note = initialize(tonemapper, scene, num=1800)
-    x, y = tonemapper.curve()
-    assert rmse(x.numpy(), y.numpy(), S_CURVE) < 0.01
-    assert "static points" in note and "as given" in note
-    assert tonemapper.anchored  # what was measured is held from the first step on
-
-
-def test_initialize_falls_back_on_brightness_and_says_so():
-    rng = np.random.default_rng(0)
-    views = [wall_view(i, GAMMA22, rng) for i in range(6)]
-    for v in views:
-        v.moving[:] = True
-    scene = scene_of(views, [None, None, None])
-    tonemapper = ToneMapper.for_scene(ToneMapConfig(), scene)
-    note = initialize(tonemapper, scene)
-    assert "too few static points" in note and "brightness" in note
-    assert not tonemapper.anchored
-    assert tonemapper.exposures().tolist() == pytest.approx(EV, abs=0.4)
-    x, y = tonemapper.curve()
-    torch.testing.assert_close(y, (x ** (1 / 2.2)).expand(3, -1), atol=1e-5, rtol=0)
-
-
-def test_the_papers_tone_mapper_is_left_as_published():
-    rng = np.random.default_rng(0)
-    scene = scene_of([wall_view(i, S_CURVE, rng) for i in range(3)], [None, None, None])
-    tonemapper = ToneMapper.for_scene(
-        ToneMapConfig(kind="per_image", knots="even", from_recordings=False), scene
-    )
-    assert "published" in initialize(tonemapper, scene)
-    assert (tonemapper.gains() == 0).all()

@@ -30,7 +30,7 @@ from hdr_nsff.bench.pool import last_words
 from hdr_nsff.bench.tables import Row, best_cells, means
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.notes import RunRecord, Trained
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.synth.oracle import NOTE
 from hdr_nsff.training.config import PRESETS
 

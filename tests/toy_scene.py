@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core import io
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.synth.oracle import write_estimates
 
 EV = [2.0, 0.0, -2.0]
 WALL, CARD = 4.0, 2.5
@@ -113,5 +114,8 @@ class ToyScene:
                     )
                     entry.flow[t + o] = FlowFiles(flow=f"{pair}.npy", valid=f"{pair}_valid.png")
             m.frames.append(entry)
+        m.response, m.movers = "response.json", "movers.npz"
+        video = np.stack([io.read_image(folder / f.image) for f in m.frames])
+        write_estimates(folder, m, video)
         m.save(folder)
         return folder

@@ -20,7 +20,7 @@ from hdr_nsff.evaluation.report import check_place, write_report
 from hdr_nsff.footage.ingest import every_of
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.rendering.render import render_all
-from hdr_nsff.scene.scene import Protocol
+from hdr_nsff.scene.manifest import Protocol
 from hdr_nsff.training.config import PRESETS, check
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train

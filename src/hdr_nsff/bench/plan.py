@@ -29,7 +29,7 @@ from hdr_nsff.evaluation.report import check_place
 from hdr_nsff.footage.datasets import layout_of
 from hdr_nsff.pipeline import RunConfig, held_out_every
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, held_out_truth
-from hdr_nsff.scene.scene import Manifest, Protocol
+from hdr_nsff.scene.manifest import Manifest, Protocol
 from hdr_nsff.synth.oracle import NOTE as ORACLE
 from hdr_nsff.training.config import PRESETS, TrainConfig, check
 from hdr_nsff.training.train import open_folder

@@ -32,7 +32,7 @@ from hdr_nsff.evaluation.scores.stability import stability
 from hdr_nsff.evaluation.targets import Target, choose_targets, world_scale
 from hdr_nsff.maths import color, metrics
 from hdr_nsff.priors.weights import find
-from hdr_nsff.scene.scene import Protocol
+from hdr_nsff.scene.manifest import Protocol
 from hdr_nsff.scene.truth import Truth
 from hdr_nsff.training.run_folder import Run
 

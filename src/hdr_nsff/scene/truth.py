@@ -22,8 +22,8 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import SIDES, read_exr, read_image, read_json
 from hdr_nsff.core.notes import first_problem
 from hdr_nsff.radiometry.recording import Curve, vignette
-from hdr_nsff.scene.scene import (
-    LARGEST_EV,
+from hdr_nsff.scene.manifest import (
+    MAX_EV,
     FrameEntry,
     Strict,
     inside,
@@ -136,7 +136,7 @@ class Truth(Strict):
         """What makes no sense together; None where all does."""
         num = len(self.bracket_ev)
         if not 0 <= self.reference_bracket < num or any(
-            ev is not None and abs(ev) > LARGEST_EV for ev in self.bracket_ev
+            ev is not None and abs(ev) > MAX_EV for ev in self.bracket_ev
         ):
             return f"bracket_ev {self.bracket_ev} and reference_bracket {self.reference_bracket} are no exposures in stops"
         if self.bracket_frame is None and None in self.bracket_ev:

@@ -17,7 +17,13 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core import io
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest, Step
+from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.radiometry.debevec import View as ResponseView
+from hdr_nsff.radiometry.response import estimate_response
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, StepRecord
+from hdr_nsff.scene.movers import write_movers
+from hdr_nsff.scene.posed_video import PosedVideo
+from hdr_nsff.scene.response import write_response
 from hdr_nsff.synth.motion import depth_there
 from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.geometry import back_project
@@ -86,13 +92,45 @@ def write_oracle(
         near=0.95 * float(depths.min()),
         far=1.05 * float(depths.max()),
         points="points.npy",
+        response="response.json",
+        movers="movers.npz",
         frames=entries,
         steps={
-            name: Step(done=True, provenance="given", note=NOTE)
-            for name in ("frames", "exposure", "poses", "masks", "flow", "depth")
+            name: StepRecord(done=True, provenance="given", note=NOTE)
+            for name in ("frames", "exposure", "flow", "poses", "masks", "depth")
         },
     )
+    write_estimates(folder, manifest, video)
     manifest.save(folder)
+
+
+def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None:
+    """What `prepare` would estimate from the other parts: the response and the movers."""
+    frames = manifest.frames
+    disparity = read_maps(folder, [str(f.disparity) for f in frames])
+    moving = np.stack([io.read_mask(folder / str(f.mask)) for f in frames])
+    K, c2w = np.array([f.K for f in frames]), np.array([f.c2w for f in frames])
+    views = [
+        ResponseView(video[i], f.bracket, f.time, K[i], c2w[i], disparity[i], None, moving[i])
+        for i, f in enumerate(frames)
+    ]
+    known, reference = manifest.known_ev, manifest.reference_bracket
+    response = estimate_response(views, [0] * len(frames), known, reference, num_cameras=1)
+    write_response(folder / "response.json", response)
+    times = np.array([f.time for f in frames])
+    clip = PosedVideo(K, c2w, times, video, np.zeros(moving.shape, bool), moving)
+    pairs = [(f.index, j) for f in frames for j in f.flow]
+    files = [frames[i].flow[j] for i, j in pairs]
+    flow = read_maps(folder, [f.flow for f in files])
+    valid = np.stack([io.read_mask(folder / f.valid) for f in files])
+    confidence = np.ones_like(disparity)
+    movers = estimate_movers(clip, flow, valid, np.array(pairs), disparity, confidence)
+    write_movers(folder / "movers.npz", movers)
+
+
+def read_maps(folder: Path, names: list[str]) -> np.ndarray:
+    """Maps of one size, stacked, in single precision."""
+    return np.stack([io.read_npy(folder / name).astype(np.float32) for name in names])
 
 
 def frame_entry(i: int, count: int, K: np.ndarray, c2w: np.ndarray, ev: list[float]) -> FrameEntry:

@@ -23,7 +23,8 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene.batch import Recorder
-from hdr_nsff.scene.scene import Scene, bracket_problem
+from hdr_nsff.scene.manifest import bracket_problem
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.kernel import Respond, bin_table
 from hdr_nsff.tonemap.responses import GAMMA, ImageResponse, NetworkResponse, SharedResponse
 
@@ -491,6 +492,11 @@ class ToneMapper(nn.Module):
                 self.bracket_gain.learned_ev.copy_(
                     torch.tensor([ev[int(i)] for i in self.bracket_gain.unknown])
                 )
+
+    def set_white_balance(self, stops: Tensor) -> None:
+        """Start the white balance of every camera from `stops` (C, 3), camera 0 being 0."""
+        with torch.no_grad():
+            self.bracket_gain.white_balance.copy_(stops[1:] * LN2)
 
     def smoothness(self) -> Tensor:
         """Eq. 15: sum of squared second differences of every curve over its own knots,

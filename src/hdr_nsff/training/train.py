@@ -190,7 +190,7 @@ class Trainer:
             self.clock = replace(self.clock, step=found.step, seconds=found.seconds)
             self.report(f"going on at step {found.step}, {found.seconds:.0f} s into the training")
             return
-        self.report(f"response curve: {initialize(self.tonemapper, self.scene)}")
+        initialize(self.tonemapper, self.scene.response)
         told = start_field(
             self.field,
             heeded(self.scene, self.config.loss),

@@ -20,9 +20,10 @@ from pydantic import Field, ValidationError
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_json
+from hdr_nsff.core.notes import first_problem
 from hdr_nsff.footage.ingest import FRAMES, LINEAR, Footage
 from hdr_nsff.footage.pose_files import Given
-from hdr_nsff.scene.scene import Strict, bracket_problem, first_problem, is_intrinsic, is_matrix
+from hdr_nsff.scene.manifest import Strict, bracket_problem, is_intrinsic, is_matrix
 
 # frames: a time this near to a whole number is one, since files store rounded fractions
 SNAP = 1e-3

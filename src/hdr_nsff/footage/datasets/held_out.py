@@ -46,7 +46,7 @@ from hdr_nsff.footage.datasets.capture import (
 from hdr_nsff.footage.ingest import hash_file, shrink
 from hdr_nsff.footage.pose_files import Given, placed
 from hdr_nsff.geometry.poses import Poses
-from hdr_nsff.scene.scene import FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
 from hdr_nsff.scene.truth import Truth, TruthView
 
 NOTE = "made_of.json"

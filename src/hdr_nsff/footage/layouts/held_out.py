@@ -15,7 +15,7 @@ from hdr_nsff.core.io import read_image, write_png
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.layouts.writer import HeldOutPicture, Source, copy
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import FrameEntry, inside
+from hdr_nsff.scene.manifest import FrameEntry, inside
 from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
 
 

@@ -24,7 +24,7 @@ from hdr_nsff.footage.datasets.llff import MULTI_VIEW, NOTE
 from hdr_nsff.footage.layouts import colmap as to_colmap
 from hdr_nsff.footage.layouts.writer import HeldOutPicture, Source, claim, copy, z_depth
 from hdr_nsff.footage.pose_files import FROM_LLFF
-from hdr_nsff.scene.scene import FrameEntry
+from hdr_nsff.scene.manifest import FrameEntry
 
 SAME_TIME = 1e-6  # frames
 

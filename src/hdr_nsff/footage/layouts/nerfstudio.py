@@ -18,7 +18,7 @@ from hdr_nsff.footage.datasets.capture import ExtraFrame
 from hdr_nsff.footage.datasets.nerfstudio import EXTRA, MILLIMETERS, NAME, VIEWS
 from hdr_nsff.footage.layouts.writer import HeldOutPicture, Source, claim, copy, z_depth
 from hdr_nsff.footage.pose_files import FROM_OPENGL
-from hdr_nsff.scene.scene import FrameEntry
+from hdr_nsff.scene.manifest import FrameEntry
 
 
 def write(source: Source, out: Path, held_out: Sequence[HeldOutPicture] = ()) -> Path:

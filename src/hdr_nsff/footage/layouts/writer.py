@@ -15,7 +15,8 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, read_npy
 from hdr_nsff.footage.datasets.capture import Extra, ExtraFrame
-from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene, inside
+from hdr_nsff.scene.manifest import FrameEntry, Manifest, inside
+from hdr_nsff.scene.scene import Scene
 
 NOTE = "hdr_nsff_export.json"
 

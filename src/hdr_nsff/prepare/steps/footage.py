@@ -13,14 +13,15 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.scene.scene import FrameEntry, Protocol, Step
+from hdr_nsff.scene.manifest import FrameEntry, Protocol
 
 MIN_FRAMES = 3
 
 
-def frames_step(work: Work) -> Step:
+def frames_step(work: Work) -> StepResult:
     """Decode the chosen frames into `images/`, and check that there is something to see
     on them.
     """
@@ -62,19 +63,25 @@ def frames_step(work: Work) -> Step:
         raise InputError(
             f"{c.clip}: all frames are {color}; nothing can be learned from them, choose other frames"
         )
-    m.frames, m.fps = entries, work.footage.fps / c.stride
-    vars(work).pop("video", None)
+    m.fps = work.footage.fps / c.stride
+    if [identity(f) for f in m.frames] != [identity(f) for f in entries]:
+        m.frames = entries  # else what later steps found of these frames stays
     linear = (
         "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
         if work.footage.linear
         else ""
     )
-    return Step(
+    return StepResult(
         provenance="given", note=f"{len(entries)} frames of {m.width}x{m.height} pixels{linear}"
     )
 
 
-def exposure_step(work: Work) -> Step:
+def identity(entry: FrameEntry) -> tuple[int, str, float, int]:
+    """What makes a frame of the scene the same frame."""
+    return entry.index, entry.source, entry.time, entry.camera_id
+
+
+def exposure_step(work: Work) -> StepResult:
     """Which frames share an exposure, what the exposures are where that is known, and
     which frames are kept out of training.
     """
@@ -118,11 +125,10 @@ def exposure_step(work: Work) -> Step:
             m.bracket_ev[bracket],
             "test" if f.index in test else "train",
         )
-    vars(work).pop("equalized", None)
     what = "no alternation" if m.cycle == 1 else f"cycle of {m.cycle}, {len(values)} exposures"
     step: Literal["given", "estimated"] = "given" if stored or given is not None else "estimated"
     details = {"source": source, "doubts": notes}
-    return Step(
+    return StepResult(
         provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details
     )
 

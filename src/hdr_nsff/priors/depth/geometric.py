@@ -1,17 +1,12 @@
-"""Depth of every frame: inverse z-depth (disparity) of every pixel in scene units, and
-how far it can be believed.
+"""Depth of the static scene, the offline default: inverse z-depth (disparity) of every
+pixel in scene units, and how far it can be believed.
 
-A depth prior is a function `(K, c2w, flow, valid, pairs, moving, points, video,
-clipped) -> (disparity, confidence, near, far)`. `geometric_depth` is the offline
-default: the static scene by a plane sweep over the frames (`sweep.py`) between the
-disparities that structure from motion found, fused over all frames (`fuse.py`); moving
-objects by their path (`movers.py`). `read_depth` reads maps made by any other tool.
+A plane sweep over the frames (`plane_sweep.py`) between the disparities that structure
+from motion found, fused over all frames (`fuse.py`). Moving objects are put where
+`priors/movers` finds them, afterwards.
 """
 
 from __future__ import annotations
-
-from dataclasses import replace
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -21,8 +16,6 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.priors.depth.fuse import AGREE, carry_over, clean, vote
 from hdr_nsff.priors.depth.parallax import choose_views, disparity_range, triangulate
 from hdr_nsff.priors.depth.plane_sweep import sweep
-from hdr_nsff.priors.movers.distance import mover_depth
-from hdr_nsff.priors.movers.mover_shape import relief
 from hdr_nsff.scene.posed_video import PosedVideo
 
 CANDIDATES = 64  # disparities tried per pixel
@@ -40,83 +33,39 @@ EDGE = 0.06
 AT_EDGE = 0.5  # its confidence is multiplied by this
 
 
-class DepthPrior(Protocol):
-    """What `prepare` calls, whatever is behind it."""
-
-    def __call__(
-        self,
-        K: np.ndarray,
-        c2w: np.ndarray,
-        flow: np.ndarray,
-        valid: np.ndarray,
-        pairs: np.ndarray,
-        moving: np.ndarray,
-        points: np.ndarray,
-        video: np.ndarray,
-        clipped: np.ndarray,
-        times: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """See `geometric_depth`."""
-        ...
-
-
-def geometric_depth(
-    K: np.ndarray,
-    c2w: np.ndarray,
+def static_geometric_depth(
+    clip: PosedVideo,
     flow: np.ndarray,
     valid: np.ndarray,
     pairs: np.ndarray,
-    moving: np.ndarray,
     points: np.ndarray,
-    video: np.ndarray,
-    clipped: np.ndarray,
-    times: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Disparity (T, H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], near and
-    far z-depth, from known poses.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth of the static scene from known poses, also behind what moves.
 
-    `K` (3, 3) or (T, 3, 3) px, `c2w` (T, 3, 4) OpenCV; `flow` (P, H, W, 2) px, `valid`
-    (P, H, W) of `pairs` (P, 2), both directions of neighbors; `moving`, `clipped` (T,
-    H, W) bool; `points` (N, 3) static, may be none; `video` (T, H, W, 3) equalized rgb;
-    `times` (T,) in frames, 0, 1, 2, ... if not given. Without parallax all is at
-    distance 1, confidence 0.
+    `flow` (P, H, W, 2) px and `valid` (P, H, W) of `pairs` (P, 2) of frames, both
+    directions of neighbors; `points` (N, 3) static, may be none. Returns disparity (T,
+    H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], and the pixels (T, H, W)
+    of the moving masks that stand still after all. Without parallax all is at distance
+    1, with confidence 0.
     """
-    count, size = len(video), video.shape[1:3]
-    times = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, np.float64)
-    clip = PosedVideo(
-        np.broadcast_to(np.asarray(K, np.float64), (count, 3, 3)),
-        np.asarray(c2w, np.float64),
-        times,
-        video,
-        clipped,
-        moving,
-    )
-    if sum(clip.project(i, points)[2].sum() for i in range(count)) < LEAST_POINTS * count:
-        points = np.concatenate(
-            [np.asarray(points).reshape(-1, 3), triangulate(clip, flow, valid, pairs)]
-        )
-    views, parallax = (
-        choose_views(clip, points, VIEWS) if len(points) >= LEAST_POINTS else ([], 0.0)
-    )
+    count = len(clip.video)
+    seen = sum(clip.project(i, points)[2].sum() for i in range(count))
+    if seen < LEAST_POINTS * count:
+        known = np.asarray(points).reshape(-1, 3)
+        points = np.concatenate([known, triangulate(clip, flow, valid, pairs)])
+    views: list[list[int]] = []
+    parallax = 0.0
+    if len(points) >= LEAST_POINTS:
+        views, parallax = choose_views(clip, points, VIEWS)
     if parallax < LEAST_PARALLAX:
         say(
-            f"depth: {parallax:.1f} pixels of parallax between the frames are too few: everything is put at distance 1"
+            f"depth: {parallax:.1f} pixels of parallax between the frames are too few: "
+            "everything is put at distance 1"
         )
-        return np.ones((count, *size), np.float32), np.zeros((count, *size), np.float32), 0.5, 2.0
-    disparity, confidence, still = static_depth(clip, views, *disparity_range(clip, points))
-    moves = moving & ~still
-    with_movers, mover_confidence = mover_depth(
-        replace(clip, moving=moves), flow, valid, pairs, disparity
-    )
-    disparity, confidence = (
-        np.where(moves, with_movers, disparity),
-        np.where(moves, mover_confidence, confidence),
-    )
-    disparity, confidence = relief(
-        replace(clip, moving=moves), flow, valid, pairs, disparity, confidence
-    )
-    confidence = np.stack([doubt_edges(d, c) for d, c in zip(disparity, confidence, strict=True)])
-    return disparity, confidence, *depth_range(disparity, confidence)
+        shape = (count, *clip.size)
+        flat = np.ones(shape, np.float32)
+        return flat, np.zeros(shape, np.float32), np.zeros(shape, bool)
+    return static_depth(clip, views, *disparity_range(clip, points))
 
 
 def static_depth(

@@ -1,17 +1,20 @@
-"""Relief of a turning ellipsoid in front of a wall, in closed form: exact flow, and
-depth that knows one distance per time only.
+"""Movers and their depth, of a turning ellipsoid before a wall in closed form: exact
+flow, and depth that knows one distance per time only.
 """
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from estimates import video_of
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.movers.bundle import Shape
-from hdr_nsff.priors.movers.mover_shape import apply, relief
-from hdr_nsff.priors.movers.rigid_groups import Group, Tracks
+from hdr_nsff.priors.movers.estimate import estimate_movers, mover_without_tracks, views_in_time
+from hdr_nsff.priors.movers.rigid_groups import View
+from hdr_nsff.scene.movers import fill_mover_depth
 from hdr_nsff.scene.posed_video import PosedVideo
+from hdr_nsff.scene.scene import Scene
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -50,7 +53,7 @@ def flow(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Clip:
-    """What `relief` is given: flat maps, and the truth beside them."""
+    """What `estimate_movers` is given: flat maps, and the truth beside them."""
 
     def __init__(self, times: int = TIMES) -> None:
         order = [p for t in range(times - 1) for p in ((t, t + 1), (t + 1, t))]
@@ -88,7 +91,14 @@ class Clip:
             "pairs": self.pairs,
             "disparity": self.flat,
         } | other
-        return relief(**given, confidence=self.confidence)
+        movers = estimate_movers(**given, confidence=self.confidence)
+        disparity, confidence = given["disparity"].copy(), self.confidence.copy()
+        clip = given["clip"]
+        for t, f in enumerate(movers[0].frames if movers else []):
+            disparity[f], confidence[f] = fill_mover_depth(
+                movers, t, clip.moving[f], clip.c2w[f], disparity[f], confidence[f]
+            )
+        return disparity, confidence
 
     def wrong(self, disparity: np.ndarray) -> np.ndarray:
         """Mean absolute error (T,) of disparity inside the masks."""
@@ -214,32 +224,41 @@ def test_of_several_frames_of_one_time_the_first_speaks(short: Clip) -> None:
     )
 
 
-def test_a_pixel_takes_the_depth_of_the_tracks_near_it_unless_it_differs_much(short: Clip) -> None:
-    disparity, confidence = np.full((H, W), 0.4, np.float32), np.zeros((H, W), np.float32)
-    disparity[32, 50], disparity[32, 51], confidence[32, 49] = 0, 0.2, 0.9
-    points = EYES[:1] + RAYS[32, 48] * 2.2  # a track whose disparity is 1 / 2.2 = 0.455
-    place = np.array([[[48.5, 32.5]]])
-    tracks = Tracks(
-        place, points[None], np.ones((1, 1)), np.ones((1, 1), int), np.zeros((1, 1), int)
-    )
-    group = Group(np.eye(3)[None], np.zeros((1, 3)), np.zeros(3), np.array([0]), np.array([True]))
-    apply(
-        short.clip.moving[0],
-        short.clip.c2w[0],
-        0,
-        tracks,
-        [Shape(group, points, 0.1)],
-        disparity,
-        confidence,
-    )
-    assert disparity[32, [48, 49, 50, 51, 57]] == pytest.approx(
-        [1 / 2.2, 1 / 2.2, 0, 0.2, 0.4]
-    )  # 57 is out of reach
-    assert confidence[32, [48, 49, 50, 57]] == pytest.approx([0.5, 0.9, 0, 0])
-
-
 def test_wild_flow_is_no_error(short: Clip) -> None:
     wild = np.random.default_rng(0).normal(0, 6, short.flow.shape).astype(np.float32)
     disparity, confidence = short.relief(flow=wild)
     assert np.isfinite(disparity).all() and np.isfinite(confidence).all()
     assert (abs(np.log(disparity / short.flat)) < np.log(1.5) + 1e-6).all()
+
+
+def scene_views(scene: Scene) -> tuple[list[int], list[View]]:
+    clip, flow, valid, pairs = video_of(scene)
+    disparity = np.stack([f.disparity.numpy() for f in scene.train])
+    return views_in_time(clip, flow, valid, pairs, disparity, np.ones_like(disparity))
+
+
+def test_a_second_camera_counts_where_the_first_has_no_frame(toy: Scene) -> None:
+    twin = replace(toy.train[2], camera_id=1, neighbors={}, flow={}, flow_valid={})
+    chosen, views = scene_views(replace(toy, train=[*toy.train, twin]))
+    assert chosen == [0, 1, 2, 3, 4, 5] and len(views) == 6
+
+
+def test_flow_to_a_frame_that_does_not_stand_for_its_time_is_left_out(toy: Scene) -> None:
+    train = [*toy.train]
+    train[2] = replace(train[2], camera_id=1, neighbors={}, flow={}, flow_valid={})
+    train.append(toy.train[2])  # what frames 1 and 3 know the flow to
+    for i, o in ((1, 1), (3, -1)):
+        train[i] = replace(train[i], neighbors=train[i].neighbors | {o: 6})
+    chosen, views = scene_views(replace(toy, train=train))
+    assert chosen == [0, 1, 2, 3, 4, 5]
+    assert [sorted(v.flow) for v in views] == [[1], [-1], [], [1], [-1, 1], [-1]]
+
+
+def test_without_tracks_the_path_fills_times_at_which_nothing_is_seen(toy: Scene) -> None:
+    hidden = torch.zeros(34, 60, dtype=torch.bool)
+    train = [replace(f, moving=hidden) if f.time in (0, 3, 5) else f for f in toy.train]
+    frames, views = scene_views(replace(toy, train=train))
+    mover = mover_without_tracks(np.array(frames), views)
+    assert mover.known.tolist() == [False, True, True, False, True, False]
+    steps = np.diff(mover.translations[:, 0])
+    assert np.isfinite(steps).all() and (steps[1:4] > 0.03).all()  # 0.1 a time, smoothed

@@ -8,19 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from estimates import with_movers
 from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
-    drift,
     neighbor_distance,
     place,
     quaternions,
     seed,
-    spread,
+    spread_centers,
     surely_moving,
-    views_of,
 )
 from hdr_nsff.fields.splat.splat import FAINTEST, Splat, SplatConfig
 from hdr_nsff.fields.surface import Points
@@ -50,8 +49,10 @@ def seeded(
 
 
 def changed(scene: Scene, change: Callable[[Frame], Frame], frames: int = 6) -> Scene:
-    """The scene with its first frames changed."""
-    return replace(scene, train=[change(f) for f in scene.train[:frames]])
+    """The scene with its first frames changed, and the movers that these show."""
+    train = [change(f) for f in scene.train[:frames]]
+    scene = replace(scene, train=train)
+    return scene if any(f.disparity is None for f in train) else with_movers(scene)
 
 
 def seen(gaussians: Gaussians) -> Tensor:
@@ -115,15 +116,15 @@ def test_a_start_is_told_in_a_sentence_and_is_the_same_again(field: Splat, toy: 
     again, told = seeded(toy)
     still, moving = int(seen(field.static).sum()), int(seen(field.moving).sum())
     assert (
-        told == f"{still} static Gaussians from the depth prior; {moving} moving ones in 1 groups"
+        told == f"{still} static Gaussians from the depth prior; {moving} moving ones on 1 movers"
     )
     assert all(torch.equal(v, field.state_dict()[k]) for k, v in again.state_dict().items())
 
 
 @pytest.mark.parametrize("bases", [1, 2, 6])
-def test_groups_are_never_more_than_bases(toy: Scene, bases: int) -> None:
+def test_movers_are_never_more_than_bases(toy: Scene, bases: int) -> None:
     started, told = seeded(toy, replace(CONFIG, bases=bases))
-    assert 1 <= int(told.split(" in ")[1].split()[0]) <= bases
+    assert 1 <= int(told.split(" on ")[1].split()[0]) <= bases
     mixture = started.mixture_logits.detach()[:, : int(seen(started.moving).sum())].softmax(0)
     assert float(mixture.amax(0).min()) > 1 / bases - 1e-6  # everyone has a basis of its own
     assert moving_at(started, 4.0)[:, :2].mean(0).numpy() == pytest.approx(
@@ -134,7 +135,7 @@ def test_groups_are_never_more_than_bases(toy: Scene, bases: int) -> None:
 @pytest.mark.parametrize("none", [None, torch.zeros(34, 60, dtype=torch.bool)])
 def test_without_movers_all_is_static(toy: Scene, none: Tensor | None) -> None:
     started, told = seeded(changed(toy, lambda f: replace(f, moving=none)))
-    assert told.endswith("0 moving ones in 0 groups") and not seen(started.moving).any()
+    assert told.endswith("0 moving ones on 0 movers") and not seen(started.moving).any()
     assert (
         float(started.static.means.detach()[seen(started.static), 2].min()) < 2.6
     )  # the card as well
@@ -166,7 +167,7 @@ def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Sc
 
 def test_without_flow_movers_drift_with_their_middle(toy: Scene) -> None:
     started, told = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))
-    assert told.endswith("in 1 groups")
+    assert told.endswith("on 1 movers")
     for t in (1.0, 2.0, 3.0, 4.0):  # smoothing shortens the ends
         assert moving_at(started, t)[:, :2].mean(0).numpy() == pytest.approx(
             card_offset(t), abs=0.12
@@ -198,7 +199,7 @@ def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_few_training_frames(toy: Scene, frames: int) -> None:
     started, told = seeded(changed(toy, lambda f: f, frames))
-    assert started.trajectories.num_knots == frames and " 0 groups" not in told
+    assert started.trajectories.num_knots == frames and " 0 movers" not in told
     assert moving_at(started, 0.0)[:, :2].mean(0).numpy() == pytest.approx(
         card_offset(0.0), abs=0.05
     )
@@ -239,41 +240,6 @@ def test_frozen_footage(toy: Scene) -> None:
     )
     started, _ = seeded(scene)
     torch.testing.assert_close(moving_at(started, 0.0), moving_at(started, 5.0), atol=1e-4, rtol=0)
-
-
-def test_a_second_camera_speaks_where_the_first_has_no_frame(toy: Scene) -> None:
-    f = toy.train[2]
-    twin = replace(f, camera_id=1, neighbors={}, flow={}, flow_valid={})
-    views, chosen = views_of(
-        Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=[*toy.train, twin])
-    )
-    assert chosen == [0, 1, 2, 3, 4, 5] and len(views) == 6
-
-
-def test_flow_to_a_frame_that_does_not_speak_is_left_out(toy: Scene) -> None:
-    train = [*toy.train]
-    train[2] = replace(train[2], camera_id=1)
-    train.append(
-        replace(toy.train[2])
-    )  # what frames 1 and 3 know the flow to; its time is spoken for
-    train[1], train[3] = (
-        replace(train[i], neighbors=train[i].neighbors | {o: 6}) for i, o in ((1, 1), (3, -1))
-    )
-    views, chosen = views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), replace(toy, train=train))
-    assert chosen == [0, 1, 2, 3, 4, 5]
-    assert [sorted(v.flow) for v in views] == [[1], [-1], [-1, 1], [1], [-1, 1], [-1]]
-
-
-def test_drift_fills_times_at_which_nothing_is_seen(toy: Scene) -> None:
-    hidden = torch.zeros(34, 60, dtype=torch.bool)
-    scene = changed(toy, lambda f: replace(f, moving=hidden) if f.time in (0, 3, 5) else f)
-    group = drift(views_of(Splat(CONFIG, toy.times, 1.8, 5.0, 60 * 34), scene)[0])
-    assert (
-        group.known.tolist() == [False, True, True, False, True, False]
-        and np.isfinite(group.shifts).all()
-    )
-    steps = np.diff(group.shifts[:, 0])
-    assert (steps[1:4] > 0.03).all()  # 0.1 from one time to the next, smoothed
 
 
 def test_movers_are_hidden_while_nothing_of_them_is_seen(toy: Scene) -> None:
@@ -322,13 +288,13 @@ def test_bases_spread_over_separate_heaps(count: int) -> None:
     points = heaps[:count].repeat_interleave(20, 0) + 0.1 * torch.randn(
         20 * count, 3, generator=torch.Generator().manual_seed(0)
     )
-    places = spread(points, count, torch.zeros(3))
+    places = spread_centers(points, count, torch.zeros(3))
     assert float(torch.cdist(places, heaps[:count]).amin(0).max()) < 0.2
 
 
 @pytest.mark.parametrize("points", [torch.zeros(0, 3), torch.ones(2, 3), torch.ones(9, 3)])
 def test_bases_of_hardly_any_points_are_finite(points: Tensor) -> None:
-    places = spread(points, 4, torch.tensor([1.0, 2, 3]))
+    places = spread_centers(points, 4, torch.tensor([1.0, 2, 3]))
     assert places.shape == (4, 3) and torch.isfinite(places).all()
 
 

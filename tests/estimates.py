@@ -1,0 +1,54 @@
+"""What `prepare` estimates of a scene in memory, for tests that change its frames."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.scene.movers import Mover
+from hdr_nsff.scene.posed_video import PosedVideo
+from hdr_nsff.scene.scene import Scene
+
+
+def movers_of(scene: Scene) -> tuple[Mover, ...]:
+    """The movers of a scene's training frames, from the maps in memory."""
+    clip, flow, valid, pairs = video_of(scene)
+    frames = scene.train
+    disparity = np.stack([f.disparity.numpy() for f in frames])
+    confidence = np.ones_like(disparity)
+    movers = estimate_movers(clip, flow, valid, pairs, disparity, confidence)
+    index = np.array([f.index for f in frames])
+    return tuple(replace(mover, frames=index[mover.frames]) for mover in movers)
+
+
+def video_of(scene: Scene) -> tuple[PosedVideo, np.ndarray, np.ndarray, np.ndarray]:
+    """The training frames with poses, and the flow between them with its pairs."""
+    frames, size = scene.train, scene.train[0].image.shape[:2]
+    nothing = np.zeros(size, bool)
+    clip = PosedVideo(
+        np.stack([f.camera.K.double().numpy() for f in frames]),
+        np.stack([f.camera.c2w.double().numpy() for f in frames]),
+        np.array([f.time for f in frames]),
+        np.stack([f.image.numpy() for f in frames]),
+        np.zeros((len(frames), *size), bool),
+        np.stack([nothing if f.moving is None else f.moving.numpy() for f in frames]),
+    )
+    pairs = [
+        (i, f.neighbors[o], o)
+        for i, f in enumerate(frames)
+        for o in f.flow
+        if f.neighbors.get(o, len(frames)) < len(frames)
+    ]
+    flow = [frames[i].flow[o].numpy() for i, _, o in pairs]
+    valid = [frames[i].flow_valid[o].numpy() for i, _, o in pairs]
+    return (
+        clip,
+        np.array(flow).reshape(-1, *size, 2),
+        np.array(valid, bool).reshape(-1, *size),
+        np.array([(i, j) for i, j, _ in pairs]).reshape(-1, 2),
+    )
+
+
+def with_movers(scene: Scene) -> Scene:
+    """The scene with its movers estimated anew."""
+    return replace(scene, movers=movers_of(scene))
