@@ -1,12 +1,16 @@
-"""Frames brought to one exposure: by pixels at rest that flow found in several,
-whatever else comes and goes.
+"""Frames brought to one exposure: by pixels at rest that flow matches in several,
+whatever enters and leaves the frame.
 """
 
 import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.priors.flow.one_exposure import at_one_exposure, matched_samples, response_from_flow
+from hdr_nsff.priors.flow.one_exposure import (
+    equalize_through_response,
+    matched_samples,
+    response_from_flow,
+)
 from hdr_nsff.radiometry.debevec import linked
 from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import Noise, record, response_curve
@@ -16,12 +20,12 @@ EV = (0.0, 2.0, 4.0)
 BRACKETS = np.arange(T) % 3
 SLIDE = 2  # pixels a frame
 PAIRS = np.array([p for i in range(T - 1) for p in ((i, i + 1), (i + 1, i))])
-STILL = np.zeros((T, H, W), bool)
+NOTHING = np.zeros((T, H, W), bool)
 
 
 def radiance(curtain: bool = False) -> np.ndarray:
     """A smooth wall (T, H, W, 3) over six stops that slides by; with a bright curtain
-    that a third of it is behind whenever the exposure is the shortest.
+    that hides a third of it whenever the exposure is the shortest.
     """
     noise = np.random.default_rng(0).random((H, W + SLIDE * T, 3)).astype(np.float32)
     wall = cv2.GaussianBlur(noise, (0, 0), 7)
@@ -33,31 +37,30 @@ def radiance(curtain: bool = False) -> np.ndarray:
 
 
 def recorded(frames: np.ndarray) -> np.ndarray:
+    """The frames as a camera with alternating exposures records them."""
     rng, camera = np.random.default_rng(1), response_curve("film")
-    return np.stack(
-        [
-            record(f, EV[b] - 3.0, (1, 1, 1), camera, Noise(), rng)
-            for f, b in zip(frames, BRACKETS, strict=True)
-        ]
-    ).astype(np.float32)
+    video = []
+    for frame, bracket in zip(frames, BRACKETS, strict=True):
+        video.append(record(frame, EV[bracket] - 3.0, (1, 1, 1), camera, Noise(), rng))
+    return np.stack(video).astype(np.float32)
 
 
-def flows(believed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The exact flow, and where it is believed: all but the margins, or `believed` (T,
-    H, W) too.
+def flows(allowed: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The exact flow, its validity and its pairs: valid but for the margins, and where
+    `allowed` (T, H, W).
     """
     flow = np.zeros((len(PAIRS), H, W, 2), np.float32)
     flow[..., 0] = -SLIDE * np.diff(PAIRS, axis=1)[:, :, None]
     valid = np.zeros((len(PAIRS), H, W), bool)
     valid[:, :, SLIDE:-SLIDE] = True
-    if believed is not None:
+    if allowed is not None:
         for k, (i, _) in enumerate(PAIRS):
-            valid[k] &= believed[i]
+            valid[k] &= allowed[i]
     return flow, valid, PAIRS
 
 
-def unlike(frames: np.ndarray, video: np.ndarray) -> float:
-    """How much neighbors differ where both recorded the wall, mean absolute."""
+def difference(frames: np.ndarray, video: np.ndarray) -> float:
+    """Mean absolute difference of neighboring frames where both recorded the wall."""
     parts = []
     for t in range(T - 1):
         a, b = frames[t, :, SLIDE:], frames[t + 1, :, :-SLIDE]
@@ -69,72 +72,74 @@ def unlike(frames: np.ndarray, video: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("known", [[None] * 3, list(EV), [None, 2.0, None]])
-def test_matched_pixels_look_alike_and_their_steps_are_found(known: list[float | None]) -> None:
+def test_matched_pixels_become_alike_and_their_exposure_steps_are_found(
+    known: list[float | None],
+) -> None:
     video = recorded(radiance())
-    fit = response_from_flow(video, BRACKETS, known, 1, flows(), STILL)
+    fit = response_from_flow(video, BRACKETS, known, 1, flows(), NOTHING)
     assert fit is not None and fit.misfit < 0.1
     assert np.allclose(np.diff(fit.ev), 2.0, atol=0.1)
-    level = at_one_exposure(video, BRACKETS, fit)
-    assert unlike(level, video) < 0.016 < 0.1 < unlike(video, video)
-    assert level.min() >= 0 and level.max() <= 1
+    equalized = equalize_through_response(video, BRACKETS, fit)
+    assert difference(equalized, video) < 0.016 < 0.1 < difference(video, video)
+    assert equalized.min() >= 0 and equalized.max() <= 1
 
 
-def test_what_comes_and_goes_bends_brightness_but_not_the_response() -> None:
+def test_what_enters_and_leaves_biases_brightness_but_not_the_response() -> None:
     video = recorded(radiance(curtain=True))
     wall = np.ones((T, H, W), bool)
     wall[:, :, : W // 3 + SLIDE] = False
-    fit = response_from_flow(video, BRACKETS, [None] * 3, 0, flows(wall), STILL)
+    fit = response_from_flow(video, BRACKETS, [None] * 3, 0, flows(wall), NOTHING)
     assert fit is not None
-    by_response, by_brightness = (
-        at_one_exposure(video, BRACKETS, fit),
-        equalize(video, BRACKETS.tolist())[0],
-    )
-    assert unlike(by_response, video) < 0.5 * unlike(by_brightness, video)
+    by_response = equalize_through_response(video, BRACKETS, fit)
+    by_brightness, _ = equalize(video, BRACKETS.tolist())
+    assert difference(by_response, video) < 0.5 * difference(by_brightness, video)
 
 
-def test_what_moves_is_not_asked() -> None:
-    video, moving = recorded(radiance()), STILL.copy()
+def test_moving_pixels_are_not_sampled() -> None:
+    """The 3 x 3 pixels around a sample count with it, so 39 of 40 moving rows may
+    change.
+    """
+    video, moving = recorded(radiance()), NOTHING.copy()
     moving[:, :40] = True
     samples = matched_samples(video, BRACKETS, 3, flows(), moving)
-    video[:, :39] = np.random.default_rng(2).random(
-        (T, 39, W, 3)
-    )  # the pixels around a pixel count with it
+    video[:, :39] = np.random.default_rng(2).random((T, 39, W, 3))
     again = matched_samples(video, BRACKETS, 3, flows(), moving)
     assert len(samples.rgb) > 500
     assert np.array_equal(samples.rgb, again.rgb) and np.array_equal(samples.valid, again.valid)
 
 
-def test_believed_flow_links_the_same_places() -> None:
-    samples = matched_samples(recorded(radiance()), BRACKETS, 3, flows(), STILL)
-    pair = samples.valid[:, :2].all((1, 2))
-    assert pair.sum() > 200
-    assert (
-        samples.rgb[pair, 0] < samples.rgb[pair, 1]
-    ).all()  # every one brighter in the brighter bracket
+def test_samples_of_one_place_are_brighter_in_the_brighter_bracket() -> None:
+    samples = matched_samples(recorded(radiance()), BRACKETS, 3, flows(), NOTHING)
+    in_both = samples.valid[:, :2].all((1, 2))
+    assert in_both.sum() > 200
+    assert (samples.rgb[in_both, 0] < samples.rgb[in_both, 1]).all()
 
 
-def test_nothing_is_told_where_no_flow_is_believed_all_moves_or_there_is_one_exposure() -> None:
+def test_there_is_no_response_without_valid_flow_without_pixels_at_rest_or_of_one_exposure() -> (
+    None
+):
     video = recorded(radiance())
-    assert response_from_flow(video, BRACKETS, [None] * 3, 0, flows(STILL), STILL) is None
-    assert response_from_flow(video, BRACKETS, [None] * 3, 0, flows(), ~STILL) is None
-    assert response_from_flow(video, 0 * BRACKETS, [None], 0, flows(), STILL) is None
-    nothing = tuple(part[:0] for part in flows())
-    assert (
-        response_from_flow(video[:0], BRACKETS[:0], [None] * 3, 0, nothing, STILL[:0]) is None
-    )  # a camera that is all held out
+    unknown = [None] * 3
+    assert response_from_flow(video, BRACKETS, unknown, 0, flows(NOTHING), NOTHING) is None
+    assert response_from_flow(video, BRACKETS, unknown, 0, flows(), ~NOTHING) is None
+    assert response_from_flow(video, 0 * BRACKETS, [None], 0, flows(), NOTHING) is None
 
 
-def test_points_that_do_not_agree_tell_nothing() -> None:
-    video = (
-        np.random.default_rng(3).random((T, 1, 1, 3)).astype(np.float32).repeat(H, 1).repeat(W, 2)
-    )  # flickers at will
+def test_there_is_no_response_of_a_camera_without_training_frames() -> None:
+    video = recorded(radiance())
+    no_flows = tuple(part[:0] for part in flows())
+    fit = response_from_flow(video[:0], BRACKETS[:0], [None] * 3, 0, no_flows, NOTHING[:0])
+    assert fit is None
+
+
+def test_there_is_no_response_where_points_do_not_agree() -> None:
+    """Every frame has brightnesses of its own, so there are points, but no response
+    explains them.
+    """
+    size = np.ones((1, H, W, 1), np.float32)
+    video = size * np.random.default_rng(3).random((T, 1, 1, 3)).astype(np.float32)
     video[:, :, ::2] = np.random.default_rng(4).random((T, 1, 1, 3)).astype(np.float32)
-    video = blurred(video)
-    assert linked(
-        matched_samples(video, BRACKETS, 3, flows(), STILL), {0, 1, 2}
-    )  # it is not for want of points
-    assert response_from_flow(video, BRACKETS, list(EV), 0, flows(), STILL) is None
-
-
-def blurred(video: np.ndarray) -> np.ndarray:
-    return np.stack([cv2.GaussianBlur(frame, (0, 0), 9) for frame in video])
+    video = np.stack([cv2.GaussianBlur(frame, (0, 0), 9) for frame in video])
+    samples = matched_samples(video, BRACKETS, 3, flows(), NOTHING)
+    assert linked(samples, {0, 1, 2})
+    assert response_from_flow(video, BRACKETS, list(EV), 0, flows(), NOTHING) is None

@@ -35,10 +35,11 @@ from hdr_nsff.geometry.round_trip import agreement
 from hdr_nsff.prepare.steps.neural import network_depth, sam2_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, geometric_depth
-from hdr_nsff.priors.flow.dense import halfway, told
-from hdr_nsff.priors.flow.masked_least_squares import mended
-from hdr_nsff.priors.flow.one_exposure import at_one_exposure, response_from_flow
-from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolved
+from hdr_nsff.priors.flow.dense import average_with_reverse
+from hdr_nsff.priors.flow.local_motion import fill_uncertain_flow
+from hdr_nsff.priors.flow.masked_least_squares import refine_mover_flow
+from hdr_nsff.priors.flow.one_exposure import equalize_through_response, response_from_flow
+from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolve_source
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses
 from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
@@ -115,7 +116,9 @@ def flow_step(work: Work) -> Step:
     share = np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()])
     vars(work).pop("flows", None)
     given = len(pairs) if from_folder else len(own)
-    name = "data set" if len(own) == len(pairs) else f"{resolved(c.flow, c.semantic.features)}"
+    name = (
+        "data set" if len(own) == len(pairs) else f"{resolve_source(c.flow, c.semantic.features)}"
+    )
     why = "" if len(own) == len(pairs) else fallback_note(c.flow, c.semantic.features)
     note = f"{len(pairs)} pairs ({name}{why}), {share:.0%} of the pixels pass the forward-backward check"
     return Step(
@@ -338,7 +341,7 @@ def refined_flow_step(work: Work) -> Step:
             return  # by a run that was killed
         seen = common_rgb(video, ranges, i, j), common_rgb(video, ranges, j, i)
         there, back = (
-            mended(
+            refine_mover_flow(
                 *pictures,
                 read_npy(work.folder / m.frames[a].raw_flow[b].flow).astype(np.float32),
                 moving[a] & ~clipped[a],
@@ -351,11 +354,11 @@ def refined_flow_step(work: Work) -> Step:
             agreement(back, there, clipped[j], clipped[i]),
         )
         there, back = (
-            told(there, back, a, b, clipped[i], clipped[j], moving[i]),
-            told(back, there, b, a, clipped[j], clipped[i], moving[j]),
+            fill_uncertain_flow(there, back, a, b, clipped[i], clipped[j], moving[i]),
+            fill_uncertain_flow(back, there, b, a, clipped[j], clipped[i], moving[j]),
         )
-        write_flow(work, names[i, j], halfway(there, back), sure[0])
-        write_flow(work, names[j, i], halfway(back, there), sure[1])
+        write_flow(work, names[i, j], average_with_reverse(there, back), sure[0])
+        write_flow(work, names[j, i], average_with_reverse(back, there), sure[1])
 
     in_threads(lambda pair: mend(*pair), [(i, j) for i, j in own if i < j], "flow of movers")
     for f in m.frames:
@@ -393,7 +396,7 @@ def through_response(work: Work, moving: np.ndarray) -> tuple[np.ndarray, str]:
         )
         if fit is not None:
             like = own[np.isin(bracket[own], bracket[learn])]
-            video[like] = at_one_exposure(work.video[like], bracket[like], fit)
+            video[like] = equalize_through_response(work.video[like], bracket[like], fit)
             told.append(fit.misfit)
     if told:
         where = (

@@ -1,16 +1,16 @@
-"""Frames brought to one exposure through the camera's response, which the frames tell
-themselves as soon as flow is there.
+"""Frames at one exposure, through a response that is estimated from matched pixels.
 
-Equalizing by brightness (`exposure.equalize`) assumes that all exposures saw the same
-things, equally often; whatever moves in or out bends it. Pixels that flow has found in
-two exposures assume nothing: from those at rest the response and the steps are
-estimated (`response.debevec`), and what is matched from then on is equalized through
+Equalizing by brightness (`exposure_cycle.equalize`) assumes that all exposures saw the
+same surfaces, equally often; anything that enters or leaves the frame biases it. Pixels
+that flow matches in two exposures need no such assumption: those at rest give the
+response and the exposure steps (`radiometry.debevec`), and frames are equalized through
 them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,8 +25,19 @@ from hdr_nsff.radiometry.debevec import (
     spread_over_levels,
 )
 
-POINTS = 4000
-LEVELS = 1025  # recorded values that are tabulated
+TABLE_SIZE = 1025  # entries of the lookup table from recorded to equalized values
+SEED = 0  # of the choice of points
+
+
+@dataclass(frozen=True)
+class OneExposureTuning:
+    """Tuning constants of the response from matched pixels."""
+
+    max_points: int = 4000
+    """Points in all frames together (hand-chosen on rendered scenes)."""
+
+
+ONE_EXPOSURE_TUNING = OneExposureTuning()
 
 
 def response_from_flow(
@@ -36,103 +47,120 @@ def response_from_flow(
     reference: int,
     flows: tuple[np.ndarray, np.ndarray, np.ndarray],
     moving: np.ndarray,
+    tuning: OneExposureTuning = ONE_EXPOSURE_TUNING,
 ) -> ResponseFit | None:
-    """Response and exposures of one camera; None where too few pixels at rest are found
-    in several exposures, or they do not agree.
+    """Response and exposures of one camera, or None.
 
-    `video` (T, H, W, 3) as recorded in [0, 1]; `brackets` (T,) int; `ev` per bracket
-    the log2 exposures that are known; `flows`: flow (P, H, W, 2) px, where it is
-    believed (P, H, W) bool, and pairs (P, 2) of frames of the video; `moving` (T, H, W)
-    bool.
+    None where too few pixels at rest are matched in several exposures, or where they do
+    not agree. `video` (T, H, W, 3) as recorded in [0, 1]; `brackets` (T,) int; `ev` the
+    known log2 exposure of each bracket, None where unknown; `reference` the bracket of
+    EV 0; `flows`: flow (P, H, W, 2) px, its validity (P, H, W) bool, and pairs (P, 2)
+    of frames of the video; `moving` (T, H, W) bool.
     """
     occurring = {int(b) for b in brackets}
     if len(occurring) < 2:
         return None
-    samples = matched_samples(video, brackets, len(ev), flows, moving)
+    samples = matched_samples(video, brackets, len(ev), flows, moving, tuning)
     if not linked(samples, occurring):
         return None
-    fit = debevec(samples, ev, reference if reference in occurring else min(occurring))
+    if reference not in occurring:
+        reference = min(occurring)
+    fit = debevec(samples, ev, reference)
     return fit if fit.misfit < MAX_MISFIT else None
 
 
 def matched_samples(
     video: np.ndarray,
     brackets: np.ndarray,
-    num: int,
+    num_brackets: int,
     flows: tuple[np.ndarray, np.ndarray, np.ndarray],
     moving: np.ndarray,
+    tuning: OneExposureTuning = ONE_EXPOSURE_TUNING,
 ) -> Samples:
-    """Pixels at rest on smooth surface, spread over the recorded levels, and what they
-    became where believed flow leads them.
+    """Recorded values, in several brackets, of pixels at rest on smooth surfaces.
+
+    The pixels are spread over the recorded levels; valid flow finds them in other
+    brackets. The arguments are those of `response_from_flow`.
     """
     flow, valid, pairs = flows
-    maps = [smooth(frame, ~mask) for frame, mask in zip(video, moving, strict=True)]
-    height, width = moving.shape[1:]
-    rng, parts = np.random.default_rng(0), []
+    neighborhoods = [smooth(frame, ~mask) for frame, mask in zip(video, moving, strict=True)]
+    points_per_frame = max(1, tuning.max_points // len(brackets))
+    rng = np.random.default_rng(SEED)
+    parts = []
     for i, bracket in enumerate(brackets):
-        onward = [
-            (int(j), flow[k], valid[k])
-            for k, (a, j) in enumerate(pairs)
-            if a == i and brackets[j] != bracket
-        ]
-        believed = (
-            np.any([v for _, _, v in onward], axis=0) if onward else np.zeros((height, width), bool)
+        onward = [k for k, (a, j) in enumerate(pairs) if a == i and brackets[j] != bracket]
+        matched = valid[onward].any(0)
+        candidates = neighborhoods[i].good & matched
+        x, y = spread_over_levels(video[i], candidates, points_per_frame, rng).T
+        samples = Samples(
+            rgb=np.zeros((len(x), num_brackets, 3)),
+            valid=np.zeros((len(x), num_brackets, 3), bool),
+            saturated=np.zeros((len(x), num_brackets, 3), bool),
         )
-        x, y = spread_over_levels(
-            video[i], maps[i].good & believed, max(1, POINTS // len(brackets)), rng
-        ).T
-        found = Samples(np.zeros((len(x), num, 3)), *np.zeros((2, len(x), num, 3), bool))
-        read(found, bracket, maps[i], y, x, np.ones(len(x), bool))
-        for j, there, sure in onward:
-            to_x, to_y = np.rint(there[y, x] + np.stack([x, y], -1)).astype(int).T
-            inside = (to_x >= 0) & (to_x < width) & (to_y >= 0) & (to_y < height)
-            to_x, to_y = to_x.clip(0, width - 1), to_y.clip(0, height - 1)
-            read(
-                found,
-                brackets[j],
-                maps[j],
-                to_y,
-                to_x,
-                inside & sure[y, x] & maps[j].good[to_y, to_x],
-            )
-        parts.append(found)
+        enter_samples(samples, bracket, neighborhoods[i], y, x, np.ones(len(x), bool))
+        for k in onward:
+            j = int(pairs[k, 1])
+            end_x, end_y, inside = matched_pixels(flow[k], x, y)
+            usable = inside & valid[k][y, x] & neighborhoods[j].good[end_y, end_x]
+            enter_samples(samples, brackets[j], neighborhoods[j], end_y, end_x, usable)
+        parts.append(samples)
     return Samples(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("rgb", "valid", "saturated")
-        )
+        rgb=np.concatenate([part.rgb for part in parts]),
+        valid=np.concatenate([part.valid for part in parts]),
+        saturated=np.concatenate([part.saturated for part in parts]),
     )
 
 
-def read(
-    found: Samples,
+def matched_pixels(
+    flow: np.ndarray, x: np.ndarray, y: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The columns and rows (P,), (P,) to which `flow` moves the pixels `x`, `y` (P,).
+
+    They are rounded and held inside the frame; the third array (P,) bool tells which
+    were inside. `flow` is (H, W, 2) px.
+    """
+    height, width = flow.shape[:2]
+    end_x, end_y = np.rint(flow[y, x] + np.stack([x, y], -1)).astype(int).T
+    inside = (end_x >= 0) & (end_x < width) & (end_y >= 0) & (end_y < height)
+    return end_x.clip(0, width - 1), end_y.clip(0, height - 1), inside
+
+
+def enter_samples(
+    samples: Samples,
     bracket: int,
-    maps: Neighborhoods,
+    neighborhoods: Neighborhoods,
     y: np.ndarray,
     x: np.ndarray,
-    some: np.ndarray,
+    usable: np.ndarray,
 ) -> None:
-    """Enter what `some` (P,) of the points are at pixels `y`, `x` (P,) of a frame,
-    where nothing is entered for its bracket.
+    """Enter the recorded values at pixels `y`, `x` (P,) for a `bracket`, in place.
+
+    Only where `usable` (P,) bool, and where nothing was entered before.
     """
-    some = some & ~(found.valid | found.saturated)[:, bracket].any(-1)
-    found.rgb[some, bracket] = maps.mean[y, x][some]
-    found.valid[some, bracket] = maps.unclipped[y, x][some]
-    found.saturated[some, bracket] = maps.saturated[y, x][some]
+    entered = (samples.valid | samples.saturated)[:, bracket].any(-1)
+    chosen = usable & ~entered
+    samples.rgb[chosen, bracket] = neighborhoods.mean[y, x][chosen]
+    samples.valid[chosen, bracket] = neighborhoods.unclipped[y, x][chosen]
+    samples.saturated[chosen, bracket] = neighborhoods.saturated[y, x][chosen]
 
 
-def at_one_exposure(video: np.ndarray, brackets: np.ndarray, fit: ResponseFit) -> np.ndarray:
-    """`video` (T, H, W, 3) recorded in [0, 1] at one brightness, in [0, 1]: every pixel
-    the mean of what it would be in all brackets that occur, which keeps contrast
-    wherever any of them has some.
+def equalize_through_response(
+    video: np.ndarray, brackets: np.ndarray, fit: ResponseFit
+) -> np.ndarray:
+    """`video` (T, H, W, 3), recorded in [0, 1], at one brightness, in [0, 1].
+
+    Each pixel becomes the mean of its recorded values in all brackets (T,) that occur,
+    which keeps contrast wherever one of them has some.
     """
-    result, value = np.empty(video.shape, np.float32), np.linspace(0, 1, LEVELS)
-    for t, own in enumerate(brackets):
+    equalized = np.empty(video.shape, np.float32)
+    recorded = np.linspace(0, 1, TABLE_SIZE)
+    for t, own_bracket in enumerate(brackets):
         for c in range(3):
-            exposure = np.interp(value, fit.y[c], fit.x)
-            images = [
-                np.interp(exposure * 2 ** (fit.ev[b] - fit.ev[own]), fit.x, fit.y[c])
-                for b in np.unique(brackets)
-            ]
-            result[t, ..., c] = np.interp(video[t, ..., c], value, np.mean(images, axis=0))
-    return result
+            exposure = np.interp(recorded, fit.y[c], fit.x)
+            images = []
+            for bracket in np.unique(brackets):
+                gain = 2 ** (fit.ev[bracket] - fit.ev[own_bracket])
+                images.append(np.interp(exposure * gain, fit.x, fit.y[c]))
+            table = np.mean(images, axis=0)
+            equalized[t, ..., c] = np.interp(video[t, ..., c], recorded, table)
+    return equalized
