@@ -11,9 +11,10 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_npy, write_text
 from hdr_nsff.prepare.steps.priors import learning_pairs
 from hdr_nsff.priors import weights
-from hdr_nsff.priors.flow.dense import dense_flow
+from hdr_nsff.priors.flow.dense import DenseFlowTuning, dense_flow
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.flow.sources import (
+    FlowTuning,
     check_flow,
     fallback_note,
     flow_source,
@@ -61,6 +62,13 @@ def test_with_the_weights_of_its_features_the_default_is_semantic(bare: Path):
 def test_the_weights_that_the_prepare_extra_brings_are_found():
     assert find("xfeat", download=False).name == "xfeat.pt"
     assert resolve_source(None, "xfeat") == "semantic"
+
+
+def test_tuning_reaches_the_source():
+    blurred = FlowTuning(dense=DenseFlowTuning(blur_px=3.0))
+    found, _ = flow_source("dis", tuning=blurred)(FRAMES, CLIPPED, PAIRS)
+    assert np.array_equal(found, dense_flow(FRAMES, CLIPPED, PAIRS, blurred.dense)[0])
+    assert not np.array_equal(found, dense_flow(FRAMES, CLIPPED, PAIRS)[0])
 
 
 def test_a_folder_gives_its_maps(tmp_path: Path):

@@ -18,7 +18,9 @@ import numpy as np
 
 from hdr_nsff.geometry.round_trip import follow, round_trip
 
-MOVING, STATIC, UNKNOWN = 1, -1, 0  # layers of pixels
+MOVING = 1  # layers of pixels
+STATIC = -1
+UNKNOWN = 0
 EMPTY_WEIGHT = 1e-4  # a sample of less weight is skipped to save time
 
 jit = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")

@@ -100,9 +100,11 @@ def lucas_kanade_step(
     )
     products = np.stack([(weight * (a * b)).sum(-1) for a, b in factors], -1)
     means = masked_mean(products, mask, tuning.window_px)  # (H, W, 5)
-    xx, xy, yy, xe, ye = np.moveaxis(means, -1, 0)
-    xx = xx + tuning.flat_gradient
-    yy = yy + tuning.flat_gradient
+    xx = means[..., 0] + tuning.flat_gradient
+    xy = means[..., 1]
+    yy = means[..., 2] + tuning.flat_gradient
+    xe = means[..., 3]
+    ye = means[..., 4]
     determinant = xx * yy - xy**2
     return np.stack([xy * ye - yy * xe, xy * xe - xx * ye], -1) / determinant[..., None]
 

@@ -213,7 +213,9 @@ def static_residual(
     shape = chains[0].valid.shape
     starts = np.concatenate([pixel_centers(shape), np.ones((*shape, 1))], -1)
     rays = starts @ np.linalg.inv(K[frame]).T
-    slopes, offsets, trusts = [], [], []  # residual = slope * rho + offset
+    slopes = []  # residual = slope * rho + offset
+    offsets = []
+    trusts = []
     for chained in chains:
         other = chained.frame
         focal = K[other, 0, 0]
