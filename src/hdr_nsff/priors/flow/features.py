@@ -39,7 +39,7 @@ LINEAR = {"skip1.1": (1, 24), "block_fusion.2": (64, 64)}  # 1x1 convolutions wi
 NORM_EPSILON = 1e-5  # of torch's normalization layers, with which the weights were trained
 XFEAT_STRIDE = 8  # pixels per cell
 XFEAT_MULTIPLE = 32  # pixels: sides of XFeat's input are multiples of this
-XFEAT_ORIGIN = 2.0  # pixels: center of the first cell's gradients, measured (1.9 +- 0.5)
+XFEAT_ORIGIN = 2.0  # pixels: center of the first cell's field, by its gradients (1.9 +- 0.5)
 
 
 @dataclass(frozen=True)

@@ -31,8 +31,7 @@ class MaskedLeastSquaresTuning:
     iterations: int = 6
     """Gauss-Newton steps."""
     outlier_rgb: float = 0.06
-    """Difference of color, in [0, 1], at which a pixel counts half (Geman & McClure).
-    """
+    """Difference of color, in [0, 1], at which a pixel counts half (Cauchy weight)."""
     flat_gradient: float = 1e-4
     """Added to the windows' mean squared gradients (per squared pixel): a window
     without texture is not corrected.

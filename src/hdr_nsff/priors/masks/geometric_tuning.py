@@ -30,7 +30,7 @@ class GeometricMaskTuning:
     epipolar geometries.
     """
     robust_px: float = 0.5
-    """Residual at which a frame counts half for a pixel's depth."""
+    """Residual at which a frame counts half for a pixel's depth (Cauchy weight)."""
     depth_iterations: int = 3
     """Reweighted least-squares solutions for a pixel's depth."""
     invalid_trust: float = 1e-3

@@ -206,7 +206,7 @@ def static_residual(
 
     A point at inverse depth `rho >= 0` along a pixel's ray is `rotated + rho * shift`
     in another camera (up to scale); that it projects to the flow's end is linear in
-    rho. Rho is solved from all frames at once, robustly (Geman & McClure). Invalid flow
+    rho. Rho is solved from all frames at once, robustly (Cauchy weights). Invalid flow
     counts over one link only, and only where nothing is valid. `K` is (T, 3, 3) px of
     the working grid, `c2w` (T, 3, 4) OpenCV.
     """
