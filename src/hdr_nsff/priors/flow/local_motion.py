@@ -43,8 +43,7 @@ class LocalMotionTuning:
     corner_window_px: int = 5
     """Side of the window of corner responses."""
     clipped_trust: float = 0.1
-    """Trust in a clipped pixel relative to others: patches around it may show texture.
-    """
+    """Trust in a clipped pixel relative to others: patches around it may match."""
     window_radius: int = 7
     """Samples to either side of the window's center, in x and in y."""
     samples_per_side: int = 128

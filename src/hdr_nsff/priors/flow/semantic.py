@@ -76,8 +76,7 @@ class SemanticTuning:
     """Tuning constants of flow by features, hand-chosen on rendered scenes."""
 
     reach: float = 1 / 6
-    """Largest motion from frame to frame, in x and in y, as a share of the longer side.
-    """
+    """Largest motion between frames, in x and in y, as a share of the longer side."""
     argmax_radius_cells: float = 1.0
     """Cells around the best one that the soft-argmax covers."""
     temperature: float = 0.05
