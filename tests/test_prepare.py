@@ -17,7 +17,8 @@ import pytest
 from hdr_nsff.core.io import read_image, read_mask, write_npy, write_png
 from hdr_nsff.geometry.round_trip import round_trip
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare
-from hdr_nsff.priors.flow.dense import MISSED, halfway
+from hdr_nsff.priors.flow.dense import average_with_reverse
+from hdr_nsff.priors.flow.local_motion import LOCAL_MOTION_TUNING
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 
@@ -183,8 +184,11 @@ def test_flow_of_movers_is_refined_and_what_was_matched_stays(config):
         np.load(config.out / files[5].flow).astype(np.float32) for files in (f.raw_flow, f.flow)
     )
     back = np.load(config.out / m.frames[5].raw_flow[4].flow).astype(np.float32)
-    sure = read_mask(config.out / f.raw_flow[5].valid) & (round_trip(before, back) < MISSED - 0.02)
-    changed = np.abs(halfway(before, back) - after).max(-1)
+    trusted_px = LOCAL_MOTION_TUNING.trusted_round_trip_px
+    sure = read_mask(config.out / f.raw_flow[5].valid) & (
+        round_trip(before, back) < trusted_px - 0.02
+    )
+    changed = np.abs(average_with_reverse(before, back) - after).max(-1)
     assert (
         changed[:, :4].max() > 0.05 and sure[:, 7:].mean() > 0.5
     )  # 4 columns move, and others go there

@@ -12,7 +12,7 @@ from hdr_nsff.core.progress import track
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolved
+from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolve_source
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry
 
 FLOW_CHUNK = 8  # pairs between two savings
@@ -40,7 +40,9 @@ def find_flow(work: Work) -> StepResult:
             write_flow(work, names[pair], f, v)
     share = float(np.mean([read_mask(work.folder / n.valid).mean() for n in names.values()]))
     num_given = len(pairs) if from_folder else len(given)
-    name = "data set" if len(given) == len(pairs) else str(resolved(c.flow, c.semantic.features))
+    name = (
+        "data set" if len(given) == len(pairs) else str(resolve_source(c.flow, c.semantic.features))
+    )
     fallback = "" if len(given) == len(pairs) else fallback_note(c.flow, c.semantic.features)
     note = f"{len(pairs)} pairs ({name}{fallback})"
     note += f", {share:.0%} of the pixels pass the forward-backward check"

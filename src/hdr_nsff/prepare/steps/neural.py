@@ -15,7 +15,13 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
 from hdr_nsff.priors.depth.depth_anything import Kind, anchored_depth, network_disparity
 from hdr_nsff.priors.flow.sources import flow_weights
-from hdr_nsff.priors.masks.prompts import PointsFile, as_file, corrected, movers, read_points
+from hdr_nsff.priors.masks.points_file import (
+    PointsFile,
+    merge_prompts,
+    read_points,
+    to_points_file,
+)
+from hdr_nsff.priors.masks.prompts import find_objects
 from hdr_nsff.priors.masks.sam2 import sam2_mask
 from hdr_nsff.priors.poses.lightglue import check_matcher, matcher_weights
 from hdr_nsff.priors.pretrained import architecture, pretrained
@@ -91,14 +97,14 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     number = 0  # of objects of the cameras before
     for frames in work.camera_frames():
         train = [i for i in frames if m.frames[i].split == "train"]
-        asked = corrected(movers(moving[train], number + 1), given, train)
+        asked = merge_prompts(find_objects(moving[train], number + 1), given, train)
         number = max([number, *(a.number for a in asked)])
-        for key, entries in as_file(asked, train).items():
+        for key, entries in to_points_file(asked, train).items():
             written[key] += entries
         outlined[train] = sam2_mask(network, video[train], asked, "masks: sam2")
         held_out = [i for i in frames if i not in train]
         if held_out:
-            again = [a.among(train, frames) for a in asked]
+            again = [a.remap_frames(train, frames) for a in asked]
             among = sam2_mask(network, video[frames], again, "masks: sam2, held-out frames")
             outlined[held_out] = among[np.searchsorted(frames, held_out)]
     if not written["points"] and not written["boxes"]:

@@ -15,8 +15,9 @@ from hdr_nsff.geometry.round_trip import agreement
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.flow import Pair, flow_files, flow_is_given, stored, write_flow
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.priors.flow.dense import halfway, told
-from hdr_nsff.priors.flow.masked_least_squares import mended
+from hdr_nsff.priors.flow.dense import average_with_reverse
+from hdr_nsff.priors.flow.local_motion import fill_uncertain_flow
+from hdr_nsff.priors.flow.masked_least_squares import refine_mover_flow
 from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
 from hdr_nsff.radiometry.response import at_one_exposure
 from hdr_nsff.scene.response import read_response
@@ -85,19 +86,19 @@ class Refiner:
         valid_back = agreement(back, there, self.clipped[j], self.clipped[i])
         here_gray, there_gray = common_gray(self.video, self.ranges, i, j)
         filled = (
-            told(
+            fill_uncertain_flow(
                 there, back, here_gray, there_gray,
                 self.clipped[i], self.clipped[j], self.moving[i],
             ),
-            told(
+            fill_uncertain_flow(
                 back, there, there_gray, here_gray,
                 self.clipped[j], self.clipped[i], self.moving[j],
             ),
         )  # fmt: skip
         there, back = filled
         return [
-            ((i, j), halfway(there, back), valid_there),
-            ((j, i), halfway(back, there), valid_back),
+            ((i, j), average_with_reverse(there, back), valid_there),
+            ((j, i), average_with_reverse(back, there), valid_back),
         ]
 
     def least_squares(self, i: int, j: int) -> np.ndarray:
@@ -105,4 +106,4 @@ class Refiner:
         files = self.work.manifest.frames[i].raw_flow[j]
         matched = read_npy(self.work.folder / files.flow).astype(np.float32)
         pictures = common_rgb(self.video, self.ranges, i, j)
-        return mended(*pictures, matched, self.moving[i] & ~self.clipped[i])
+        return refine_mover_flow(*pictures, matched, self.moving[i] & ~self.clipped[i])

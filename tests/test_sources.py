@@ -1,5 +1,5 @@
-"""What `--flow` names: a matcher, or a folder; bad names and weights nobody asked for
-are refused before anything is done.
+"""The sources that `--flow` names; bad names and needless weights are refused before
+any work is done.
 """
 
 from pathlib import Path
@@ -11,14 +11,15 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_npy, write_text
 from hdr_nsff.prepare.steps.flow import learning_pairs
 from hdr_nsff.priors import weights
-from hdr_nsff.priors.flow.dense import flow
+from hdr_nsff.priors.flow.dense import DenseFlowTuning, dense_flow
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.flow.sources import (
+    FlowTuning,
     check_flow,
     fallback_note,
     flow_source,
     flow_weights,
-    resolved,
+    resolve_source,
 )
 from hdr_nsff.priors.weights import find
 from hdr_nsff.scene.manifest import FrameEntry
@@ -30,40 +31,44 @@ PAIRS = np.array([[1, 2], [2, 1]])
 
 @pytest.fixture
 def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A machine on which no weights are; the folder where they would be kept."""
+    """A machine without weights; the folder where they would be kept."""
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "weights"))
     monkeypatch.setattr(weights, "package_folder", lambda entry: None)
     return tmp_path / "weights"
 
 
-def test_without_weights_the_default_is_dense_inverse_search_over_the_whole_clip_and_says_so(
-    bare: Path,
-):
-    assert resolved(None, "xfeat") == "dis" and "hdr-nsff weights xfeat" in fallback_note(
-        None, "xfeat"
-    )
+def test_without_weights_the_default_is_dense_inverse_search_and_a_note_says_so(bare: Path):
+    assert resolve_source(None, "xfeat") == "dis"
+    assert "hdr-nsff weights xfeat" in fallback_note(None, "xfeat")
     assert fallback_note("dis", "xfeat") == "" and flow_weights(None, None, SemanticConfig()) == []
+    expected, _ = dense_flow(FRAMES, CLIPPED, PAIRS)
     for chosen in (None, "dis"):
-        found = flow_source(chosen)(FRAMES, CLIPPED, PAIRS)
-        assert np.array_equal(found[0], flow(FRAMES, CLIPPED, PAIRS, None)[0])
-    assert np.array_equal(
-        found[0], flow(FRAMES[1:], CLIPPED[1:], PAIRS - 1, None)[0]
-    )  # frames of no pair change nothing
+        assert np.array_equal(flow_source(chosen)(FRAMES, CLIPPED, PAIRS)[0], expected)
+
+
+def test_frames_of_no_pair_change_nothing():
+    found, _ = flow_source("dis")(FRAMES, CLIPPED, PAIRS)
+    assert np.array_equal(found, dense_flow(FRAMES[1:], CLIPPED[1:], PAIRS - 1)[0])
 
 
 def test_with_the_weights_of_its_features_the_default_is_semantic(bare: Path):
     write_text(bare / "xfeat" / "xfeat.pt", "something else")
-    assert resolved(None, "xfeat") == "semantic" and fallback_note(None, "xfeat") == ""
-    assert resolved("dis", "xfeat") == "dis" and resolved(None, "dinov2-small") == "dis"
-    with pytest.raises(
-        InputError, match=r"xfeat.pt"
-    ):  # broken weights are no reason to fall back silently
+    assert resolve_source(None, "xfeat") == "semantic" and fallback_note(None, "xfeat") == ""
+    assert resolve_source("dis", "xfeat") == "dis" and resolve_source(None, "dinov2-small") == "dis"
+    with pytest.raises(InputError, match=r"xfeat.pt"):  # broken weights: no silent fallback
         flow_weights(None, None, SemanticConfig())
 
 
 def test_the_weights_that_the_prepare_extra_brings_are_found():
     assert find("xfeat", download=False).name == "xfeat.pt"
-    assert resolved(None, "xfeat") == "semantic"
+    assert resolve_source(None, "xfeat") == "semantic"
+
+
+def test_tuning_reaches_the_source():
+    blurred = FlowTuning(dense=DenseFlowTuning(blur_px=3.0))
+    found, _ = flow_source("dis", tuning=blurred)(FRAMES, CLIPPED, PAIRS)
+    assert np.array_equal(found, dense_flow(FRAMES, CLIPPED, PAIRS, blurred.dense)[0])
+    assert not np.array_equal(found, dense_flow(FRAMES, CLIPPED, PAIRS)[0])
 
 
 def test_a_folder_gives_its_maps(tmp_path: Path):
@@ -74,18 +79,18 @@ def test_a_folder_gives_its_maps(tmp_path: Path):
 
 
 def test_a_name_that_is_neither_a_source_nor_a_folder_is_refused():
-    with pytest.raises(InputError, match=r"--flow farneback: no such folder .* use dis"):
+    with pytest.raises(InputError, match=r"--flow farneback: neither a folder .* use dis"):
         check_flow(Path("farneback"), None)
 
 
-def test_weights_for_what_takes_none_are_refused(tmp_path: Path):
+def test_weights_for_a_source_without_weights_are_refused(tmp_path: Path):
     with pytest.raises(InputError, match="takes no weights"):
         check_flow("dis", tmp_path)
     with pytest.raises(InputError, match="name the network"):
         check_flow(None, tmp_path)
 
 
-def test_semantic_flow_takes_its_features_weights(tmp_path: Path):
+def test_semantic_flow_takes_the_weights_of_its_features(tmp_path: Path):
     broken = tmp_path / "xfeat.pt"
     broken.write_bytes(b"nothing")
     check_flow("semantic", broken)
@@ -114,7 +119,7 @@ def test_features_learn_from_training_frames_of_one_camera_at_a_time():
     assert equal == [(0, 2), (2, 4)]
 
 
-def test_missing_weights_are_said_before_anything_is_done(
+def test_missing_weights_are_reported_before_any_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
