@@ -22,13 +22,12 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import encode
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.colmap import ColmapModel, read_model
+from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
     ADVICE,
-    ENOUGH,
     LEAST,
     Poses,
     interpolate,
-    intrinsics,
     project,
     ranges,
     trusted_points,
@@ -54,6 +53,7 @@ ROTATION = 0.7
 PERHAPS = 0.5  # the same where structure from motion has failed
 STILL = 0.75  # pixels that a camera on a tripod may seem to move
 LOOK = 24  # frames looked at to decide about parallax
+ENOUGH = 0.9  # share of frames to be content with
 
 
 @dataclass(frozen=True)
