@@ -47,8 +47,7 @@ def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity | None:
 
 
 def spread_share(points: np.ndarray) -> float:
-    """Standard deviation of `points` (N, 3) over their largest coordinate, at least 1.
-    """
+    """Standard deviation of `points` (N, 3) per largest coordinate (at least 1)."""
     variance = ((points - points.mean(0)) ** 2).sum() / len(points)
     return float(np.sqrt(variance) / max(1.0, np.abs(points).max()))
 

@@ -8,12 +8,11 @@ import torch
 from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
     ResponseFit,
-    View,
     brightness_ev,
     debevec,
     linked,
-    static_samples,
 )
+from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapper
 
@@ -105,7 +104,7 @@ def exposure_note(tonemapper: ToneMapper, how: str) -> str:
     return f"EV {ev} " + (f"(unknown ones {how})" if len(unknown) else "(as given)")
 
 
-def view_of(frame: Frame) -> View:
+def view_of(frame: Frame) -> ResponseView:
     """A frame's recording, camera and maps in numpy."""
 
     def array(t: torch.Tensor | None) -> np.ndarray | None:
@@ -113,7 +112,7 @@ def view_of(frame: Frame) -> View:
 
     disparity = array(frame.disparity)
     assert disparity is not None, frame.index
-    return View(
+    return ResponseView(
         image=frame.image.cpu().numpy(),
         bracket=frame.bracket,
         time=frame.time,

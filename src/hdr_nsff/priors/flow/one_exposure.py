@@ -16,14 +16,12 @@ import numpy as np
 
 from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
-    Neighborhoods,
     ResponseFit,
     Samples,
     debevec,
     linked,
-    smooth,
-    spread_over_levels,
 )
+from hdr_nsff.radiometry.static_samples import PatchStatistics, smooth, spread_over_levels
 
 POINTS = 4000
 LEVELS = 1025  # recorded values that are tabulated
@@ -107,7 +105,7 @@ def matched_samples(
 def read(
     found: Samples,
     bracket: int,
-    maps: Neighborhoods,
+    maps: PatchStatistics,
     y: np.ndarray,
     x: np.ndarray,
     some: np.ndarray,
