@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 MAX_CYCLE = 6  # frames: the longest cycle looked for, two more than cameras offer
-# EV between the darkest and brightest bracket below which brightness merely flickers
-# (hand-chosen on recorded clips: cameras step by 1/3 EV at least)
+# EV between the darkest and brightest bracket below which brightness merely flickers;
+# positions of a cycle that are closer than this share a bracket (hand-chosen on
+# recorded clips: cameras step by 1/3 EV at least)
 MIN_STEP = 0.3
 GAMMA = 2.2  # of the assumed response
 BINS = 1024  # of the histograms; 8-bit codes fall four bins apart
@@ -51,7 +52,9 @@ class Cycle:
     """An exposure cycle found in a clip."""
 
     length: int  # frames; 1: no alternation
-    brackets: list[int]  # per frame: its position in the cycle
+    # per frame: positions of the cycle closer than `min_step_ev` share a bracket,
+    # numbered in the order of appearance
+    brackets: list[int]
     order: list[int]  # the brackets from the darkest to the brightest
     # per bracket: EV relative to the darkest, under a gamma of 2.2 (a rough
     # measurement)
@@ -144,13 +147,36 @@ def detect_cycle(video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleT
     if too_small or 1 - misfit / misfit_without < tuning.min_explained:
         length = 1
         misfit, levels = fits[1]
+    bracket_of_phase = share_brackets(levels, tuning)
+    ev = [float(levels[bracket_of_phase == b].mean()) for b in range(bracket_of_phase.max() + 1)]
     return Cycle(
         length=length,
-        brackets=[t % length for t in range(len(video))],
-        order=np.argsort(levels, kind="stable").tolist(),
-        ev=levels.tolist(),
+        brackets=[int(bracket_of_phase[t % length]) for t in range(len(video))],
+        order=np.argsort(ev, kind="stable").tolist(),
+        ev=ev,
         confidence=1 - misfit / misfit_without,
     )
+
+
+def share_brackets(
+    levels: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> np.ndarray:
+    """The bracket (length,) of each position of a cycle with these `levels` (length,)
+    in EV, numbered in the order of appearance.
+
+    A camera that goes up and down again (-2, 0, 2, 0 EV) shows one exposure at two
+    positions. From the darkest on, positions within `min_step_ev` of a bracket's
+    darkest join it, so a ramp of small steps never becomes one bracket.
+    """
+    rank = np.zeros(len(levels), int)  # of each position's bracket, 0 the darkest
+    current, darkest = -1, -np.inf
+    for k in np.argsort(levels, kind="stable"):
+        if levels[k] - darkest >= tuning.min_step_ev:
+            current += 1
+            darkest = levels[k]
+        rank[k] = current
+    appearance = list(dict.fromkeys(rank.tolist()))
+    return np.array([appearance.index(r) for r in rank])
 
 
 def period(brackets: list[int]) -> int:
@@ -180,19 +206,21 @@ def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
     """Per synchronized camera the bracket of each frame, such that equal brackets are
     equally bright in every camera.
 
-    The most frequent cycle length wins; the first camera with it numbers the brackets.
-    A camera with another length keeps its position in the cycle.
+    The most frequent cycle (its length and number of brackets) wins, and the first
+    camera with it numbers the brackets. A camera with another cycle, whose own was not
+    found, takes that of the others.
     """
-    lengths = [c.length for c in cycles]
-    length = max(set(lengths), key=lengths.count)
-    reference = next(c for c in cycles if c.length == length)
+    kinds = [(c.length, len(c.order)) for c in cycles]
+    usual = max(sorted(set(kinds)), key=kinds.count)
+    reference = cycles[kinds.index(usual)]
     brackets = []
-    for cycle in cycles:
-        bracket_of_phase = list(range(length))
-        if cycle.length == length:
-            ranks = [cycle.order.index(phase) for phase in range(length)]
-            bracket_of_phase = [reference.order[rank] for rank in ranks]
-        brackets.append([bracket_of_phase[t % length] for t in range(len(cycle.brackets))])
+    for cycle, kind in zip(cycles, kinds, strict=True):
+        if kind == usual:
+            same_rank = dict(zip(cycle.order, reference.order, strict=True))
+            brackets.append([same_rank[b] for b in cycle.brackets])
+        else:
+            frames = range(len(cycle.brackets))
+            brackets.append([reference.brackets[t % reference.length] for t in frames])
     return brackets
 
 
