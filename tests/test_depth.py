@@ -111,13 +111,13 @@ def test_cameras_at_one_instant_see_movers_stand_still():
 
 
 def test_without_parallax_everything_is_at_distance_one_and_a_message_says_so(monkeypatch):
-    said = []
-    monkeypatch.setattr(depth_module, "say", said.append)
+    messages = []
+    monkeypatch.setattr(depth_module, "say", messages.append)
     c2w = cameras_at(*[(0.001 * t, 0, 0) for t in range(4)])
     video, depth = plane(c2w, 4.0, 0.0)
     disparity, confidence, near, far = solve(c2w, video, depth)
     assert (disparity == 1).all() and (confidence == 0).all() and (near, far) == (0.5, 2.0)
-    assert "parallax" in said[0]
+    assert "parallax" in messages[0]
 
 
 def test_frames_without_anything_to_match_do_not_crash():

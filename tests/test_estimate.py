@@ -66,7 +66,7 @@ def test_a_tripod_stands_still(tmp_path):
     poses = estimate_poses(video.astype(np.float32), None, tmp_path)
     assert poses.parallax == "none"
     assert np.array_equal(poses.c2w, np.tile(np.eye(4)[:3], (9, 1, 1)))
-    assert "60 degrees" in poses.notes[1]  # nothing tells the focal length
+    assert "60 degrees" in poses.notes[1]  # nothing fixes the focal length
 
 
 def test_parallax_is_distinguished_from_a_turn():

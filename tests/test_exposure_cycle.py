@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hdr_nsff.radiometry.exposure_cycle import (
+    ExposureCycleTuning,
     by_value,
     common_brackets,
     detect_cycle,
@@ -80,6 +81,12 @@ def test_positions_of_one_exposure_share_a_bracket(evs, brackets, order):
 def test_a_ramp_of_small_steps_is_not_one_bracket():
     assert share_brackets(np.array([0.0, 0.2, 0.4, 0.6])).tolist() == [0, 0, 1, 1]
     assert share_brackets(np.array([2.0, 0.0, 2.1, 4.0])).tolist() == [0, 1, 0, 2]
+
+
+def test_steps_below_the_least_one_are_flicker():
+    """Brackets 4 EV apart are a cycle by default, and flicker if it takes 5 EV."""
+    video = clip([-2, 0, 2])
+    assert detect_cycle(video, ExposureCycleTuning(min_step_ev=5.0)).length == 1
 
 
 def test_cycle_survives_a_pan_flicker_and_a_light_switched_on():

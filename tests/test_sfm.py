@@ -71,8 +71,10 @@ def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, mon
         io.write_png(tmp_path / f"clip/{t:03d}.png", frame)
     with pytest.raises(SystemExit) as stop:
         cli.main(["prepare", str(tmp_path / "clip"), str(tmp_path / "scene"), "--ev", "0"])
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("hdr-nsff: ")]
-    assert stop.value.code == 2 and len(said) == 1 and "scene/poses: the disk is full" in said[0]
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if line.startswith("hdr-nsff: ")]
+    assert stop.value.code == 2 and len(errors) == 1
+    assert "scene/poses: the disk is full" in errors[0]
     assert not list((tmp_path / "scene/poses").glob(".sfm-*"))
 
 

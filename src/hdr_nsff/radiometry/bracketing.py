@@ -16,10 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# how often neighboring exposures are so many whole stops apart (hand-chosen from the
-# brackets that cameras offer and that HDR data sets use)
+# share of neighboring exposures that are this many whole stops apart (hand-chosen from
+# the brackets that cameras offer and that HDR data sets use)
 WHOLE_STOPS = {1: 0.2, 2: 0.36, 3: 0.22, 4: 0.04, 5: 0.01, 6: 0.01, 7: 0.005, 8: 0.005}
-# how often each of 0.5, 1.5, .. 4.5 stops, and each of 1/3, 2/3, 4/3, .. 14/3 stops
+# the same of each of 0.5, 1.5, .. 4.5 stops, and of each of 1/3, 2/3, .. 14/3 stops
 HALF_STOP, THIRD_STOP = 0.02, 0.005
 FACTORS = np.geomspace(0.65, 1.5, 841)  # candidates, 0.1 % apart
 

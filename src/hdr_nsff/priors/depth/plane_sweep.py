@@ -20,7 +20,9 @@ from hdr_nsff.radiometry.common_range import LUMA
 from hdr_nsff.scene.posed_video import PosedVideo
 
 UNKNOWN_COST = 1.0  # where no view contributes: no correlation
-STATIC, MOVING, CLIPPED, OUTSIDE = 0, 1, 2, 3  # what a pixel shows, see `obstacle_map`
+# what a pixel shows, see `obstacle_map`
+STATIC, MOVING = 0, 1
+CLIPPED, OUTSIDE = 2, 3
 # by what the pixel itself shows: obstacles of a view from this one on do not count
 TOLERANCE = np.array([MOVING, CLIPPED, STATIC], np.uint8)
 
@@ -334,7 +336,9 @@ def select_disparity(
         tuning.edge_weight,
     )
     middle = np.clip(total.argmin(-1), 1, len(disparities) - 2)[..., None]
-    before, at, after = (np.take_along_axis(total, middle + o, -1)[..., 0] for o in (-1, 0, 1))
+    at = np.take_along_axis(total, middle, -1)[..., 0]
+    before = np.take_along_axis(total, middle - 1, -1)[..., 0]
+    after = np.take_along_axis(total, middle + 1, -1)[..., 0]
     curvature = np.maximum(before - 2 * at + after, 1e-6)
     offset = np.clip((before - after) / (2 * curvature), -1, 1)
     spacing = disparities[1] - disparities[0]

@@ -32,7 +32,7 @@ class LightGlueTuning:
     """How many keypoints are matched."""
 
     max_keypoints: int = 1024  # per image (LightGlue's evaluation: up to 2048)
-    # so many times more are detected, since some lie where they must not (hand-chosen)
+    # times as many are detected, since masks remove some (hand-chosen)
     candidate_factor: int = 2
 
 
