@@ -13,8 +13,8 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import Layers, Render
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.radiometry.debevec import View
 from hdr_nsff.radiometry.response import from_brightness
+from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
@@ -27,10 +27,10 @@ SPEED = torch.tensor([0.4, 0.1, 0.0])  # scene units per frame: (8, 2) pixels at
 EV = (-4.0, -2.0, 0.0)
 
 
-def views_of(frames: list[Frame]) -> list[View]:
+def views_of(frames: list[Frame]) -> list[ResponseView]:
     """The frames as the response is estimated from them."""
     return [
-        View(f.image.numpy(), f.bracket, f.time, np.eye(3), np.eye(3, 4), np.ones((H, W)))
+        ResponseView(f.image.numpy(), f.bracket, f.time, np.eye(3), np.eye(3, 4), np.ones((H, W)))
         for f in frames
     ]
 

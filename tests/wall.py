@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from hdr_nsff.radiometry.debevec import View
+from hdr_nsff.radiometry.static_samples import ResponseView
 
 U = np.linspace(0, 1, 2001)
 X = U**2.2
@@ -52,7 +52,7 @@ def wall_view(index, curve, rng, depth_noise=0.0, shift=0.06, gain=1.0):
     c2w = np.concatenate([np.eye(3), [[shift * index], [0], [0]]], 1)
     disparity = 0.25 * (1 + depth_noise * rng.standard_normal((HEIGHT, WIDTH)))
     bracket = index % 3
-    return View(
+    return ResponseView(
         record(radiance * gain * 2.0 ** EV[bracket], curve, rng),
         bracket,
         float(index),

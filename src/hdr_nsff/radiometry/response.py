@@ -10,29 +10,35 @@ brightness of the frames, and `source` says so.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 
 from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
-    MIN_SHARED,
+    DebevecTuning,
     ResponseFit,
-    View,
     brightness_ev,
     debevec,
     linked,
-    static_samples,
 )
+from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
 
-NUM_SAMPLES = 4000  # static points; half or twice changes the curve by less than its error
-GAMMA = 2.2
+GAMMA = 2.2  # of the fallback
 NUM_KNOTS = 256
-MEDIAN_ROUNDS = 20
 SEED = 0  # of the choice of static points
 
 Source = Literal["static points", "brightness", "one exposure"]
+
+
+@dataclass(frozen=True)
+class ResponseTuning:
+    """Evidence that the response needs (hand-chosen on rendered scenes)."""
+
+    num_samples: int = 4000  # static points
+    median_rounds: int = 20  # of the robust fit of white balance
+    debevec: DebevecTuning = field(default_factory=DebevecTuning)
 
 
 @dataclass(frozen=True)
@@ -56,11 +62,12 @@ class Response:
 
 
 def estimate_response(
-    views: Sequence[View],
+    views: Sequence[ResponseView],
     view_cameras: Sequence[int],
     ev: Sequence[float | None],
     reference: int,
     num_cameras: int,
+    tuning: ResponseTuning = ResponseTuning(),
 ) -> Response:
     """Response and exposures from recorded frames with depth and poses.
 
@@ -71,21 +78,22 @@ def estimate_response(
     brackets = {v.bracket for v in views}
     if len(brackets) == 1:
         return from_brightness(views, ev, reference, num_cameras, "one exposure", "")
-    samples = static_samples(views, len(ev), NUM_SAMPLES, np.random.default_rng(SEED))
-    if not linked(samples, brackets):
+    rng = np.random.default_rng(SEED)
+    samples = static_samples(views, len(ev), tuning.num_samples, rng)
+    if not linked(samples, brackets, tuning.debevec):
         problem = "too few static points seen in several exposures"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
-    fit = debevec(samples, ev, reference)
+    fit = debevec(samples, ev, reference, tuning.debevec)
     if fit.misfit >= MAX_MISFIT:
         problem = f"static points differ by {fit.misfit:.2f} stops"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
-    own = camera_fits(views, view_cameras, fit, reference) if num_cameras > 1 else {}
+    own = camera_fits(views, view_cameras, fit, reference, tuning) if num_cameras > 1 else {}
     y = np.stack([own[c].y if c in own else fit.y for c in range(num_cameras)])
     return Response(
         x=fit.x,
         y=y,
         ev=fit.ev,
-        white_balance=estimate_white_balance(views, view_cameras, fit.x, y, fit.ev),
+        white_balance=estimate_white_balance(views, view_cameras, fit.x, y, fit.ev, tuning),
         source="static points",
         misfit=fit.misfit,
         num_points=len(samples.rgb),
@@ -95,7 +103,11 @@ def estimate_response(
 
 
 def camera_fits(
-    views: Sequence[View], view_cameras: Sequence[int], fit: ResponseFit, reference: int
+    views: Sequence[ResponseView],
+    view_cameras: Sequence[int],
+    fit: ResponseFit,
+    reference: int,
+    tuning: ResponseTuning,
 ) -> dict[int, ResponseFit]:
     """The own curve of every camera with enough static points, at the exposures of the
     common `fit`.
@@ -103,21 +115,23 @@ def camera_fits(
     own = {}
     for camera in sorted(set(view_cameras)):
         mine = [v for v, c in zip(views, view_cameras, strict=True) if c == camera]
-        samples = static_samples(mine, len(fit.ev), NUM_SAMPLES, np.random.default_rng(SEED))
+        rng = np.random.default_rng(SEED)
+        samples = static_samples(mine, len(fit.ev), tuning.num_samples, rng)
         seen = {v.bracket for v in mine}
-        if len(seen) > 1 and linked(samples, seen):
-            camera_fit = debevec(samples, fit.ev.tolist(), reference)
+        if len(seen) > 1 and linked(samples, seen, tuning.debevec):
+            camera_fit = debevec(samples, fit.ev.tolist(), reference, tuning.debevec)
             if camera_fit.misfit < MAX_MISFIT:
                 own[camera] = camera_fit
     return own
 
 
 def estimate_white_balance(
-    views: Sequence[View],
+    views: Sequence[ResponseView],
     view_cameras: Sequence[int],
     x: np.ndarray,
     y: np.ndarray,
     ev: np.ndarray,
+    tuning: ResponseTuning = ResponseTuning(),
 ) -> np.ndarray:
     """White balance (C, 3) in stops of every camera against camera 0, from static points
     that several cameras recorded, through their curves `y` (C, 3, K) over `x` (K,).
@@ -135,7 +149,7 @@ def estimate_white_balance(
         for v, c in zip(views, view_cameras, strict=True)
     ]
     count = num_cameras * num_brackets
-    samples = static_samples(slots, count, NUM_SAMPLES, np.random.default_rng(SEED))
+    samples = static_samples(slots, count, tuning.num_samples, np.random.default_rng(SEED))
     camera = np.repeat(np.arange(num_cameras), num_brackets)  # (S,) of every slot
     for channel in range(3):
         valid = samples.valid[..., channel]
@@ -145,31 +159,37 @@ def estimate_white_balance(
         )
         stops = np.log2(np.maximum(exposure, 1e-9)) - np.tile(ev, num_cameras)
         stops = np.where(valid & (exposure > 0), stops, np.nan)
-        white_balance[:, channel] = alternating_medians(stops, camera, num_cameras)
+        white_balance[:, channel] = alternating_medians(stops, camera, num_cameras, tuning)
     return white_balance
 
 
-def alternating_medians(stops: np.ndarray, camera: np.ndarray, num_cameras: int) -> np.ndarray:
+def alternating_medians(
+    stops: np.ndarray,
+    camera: np.ndarray,
+    num_cameras: int,
+    tuning: ResponseTuning = ResponseTuning(),
+) -> np.ndarray:
     """Offsets (C,) of cameras, that of camera 0 being 0, in `stops` (P, S), NaN where
     unknown, of points seen in slots of a `camera` (S,).
     """
     offsets = np.zeros(num_cameras)
     several = np.array([len(set(camera[np.isfinite(row)])) > 1 for row in stops], bool)
     stops = stops[several]
-    if len(stops) < MIN_SHARED:
+    least = tuning.debevec.min_shared_points
+    if len(stops) < least:
         return offsets
-    for _ in range(MEDIAN_ROUNDS):
+    for _ in range(tuning.median_rounds):
         radiance = np.nanmedian(stops - offsets[camera], axis=1, keepdims=True)
         left = stops - radiance
         for c in range(num_cameras):
             seen = left[:, camera == c]
             seen = seen[np.isfinite(seen)]
-            offsets[c] = np.median(seen) if len(seen) >= MIN_SHARED else 0.0
+            offsets[c] = np.median(seen) if len(seen) >= least else 0.0
     return offsets - offsets[0]
 
 
 def from_brightness(
-    views: Sequence[View],
+    views: Sequence[ResponseView],
     ev: Sequence[float | None],
     reference: int,
     num_cameras: int,

@@ -18,8 +18,8 @@ import numpy as np
 
 from hdr_nsff.core import io
 from hdr_nsff.priors.movers.estimate import estimate_movers
-from hdr_nsff.radiometry.debevec import View as ResponseView
 from hdr_nsff.radiometry.response import estimate_response
+from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.movers import write_movers
 from hdr_nsff.scene.posed_video import PosedVideo

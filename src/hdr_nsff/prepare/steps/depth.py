@@ -7,7 +7,7 @@ import numpy as np
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.priors.depth.geometric import depth_range, doubt_edges
+from hdr_nsff.priors.depth.geometric import depth_range, lower_confidence_at_edges
 from hdr_nsff.scene.movers import fill_mover_depth, read_movers
 
 
@@ -59,5 +59,5 @@ def depth_with_movers(work: Work, moving: np.ndarray) -> tuple[np.ndarray, np.nd
             disparity[k], confidence[k] = fill_mover_depth(
                 movers, time_of[f.index], moving[k], c2w, disparity[k], confidence[k]
             )
-        confidence[k] = doubt_edges(disparity[k], confidence[k])
+        confidence[k] = lower_confidence_at_edges(disparity[k], confidence[k])
     return disparity, confidence

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hdr_nsff.core.io import read_mask, read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.radiometry.debevec import View
 from hdr_nsff.radiometry.response import describe, estimate_response
+from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry
 from hdr_nsff.scene.response import write_response
 
@@ -27,7 +27,7 @@ def find_response(work: Work) -> StepResult:
     )
 
 
-def response_view(work: Work, f: FrameEntry) -> View:
+def response_view(work: Work, f: FrameEntry) -> ResponseView:
     """A training frame as the response is estimated from it. Depth that is known up to
     scale and shift does not lead from frame to frame: it counts as unknown.
     """
@@ -35,7 +35,7 @@ def response_view(work: Work, f: FrameEntry) -> View:
     disparity = read_npy(work.folder / str(f.static_disparity)).astype("f4")
     if work.manifest.depth_kind == "relative":
         disparity = 0 * disparity
-    return View(
+    return ResponseView(
         image=work.video[f.index],
         bracket=f.bracket,
         time=f.time,

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from hdr_nsff.geometry import pinhole
+
 
 def intrinsics(width: int, height: int) -> np.ndarray:
     """K (3, 3) in pixels of a camera that sees 57 degrees across."""
     focal = width / 2 / np.tan(np.radians(57 / 2))
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    return pinhole.intrinsics(focal, width, height)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -32,14 +34,9 @@ def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
 
 def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (..., 2), centers at +0.5, and z-depth (...) of world points (..., 3)."""
-    local = (points - c2w[:, 3]) @ c2w[:, :3]
-    depth = local[..., 2]
-    return local[..., :2] / depth[..., None] * K[[0, 1], [0, 1]] + K[:2, 2], depth
+    return pinhole.project(points, K, c2w)
 
 
 def back_project(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
-    """World points (H, W, 3) at z-depth (H, W) on the rays through the pixel centers."""
-    height, width = depth.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
-    return c2w[:, 3] + depth[..., None] * (rays @ c2w[:, :3].T)
+    """World points (H, W, 3) at z-depth (H, W) behind the pixel centers."""
+    return pinhole.unproject(pinhole.pixel_centers(*depth.shape), depth, K, c2w)

@@ -1,10 +1,10 @@
-"""Debevec's initialization against simulated cameras: response and exposures come back,
-outliers and misplaced points do not matter.
+"""Debevec's least squares against simulated cameras: response and exposures come back,
+outliers do not matter.
 """
 
 import numpy as np
 import pytest
-from wall import EV, GAMMA22, S_CURVE, SRGB, record, rmse, wall_view
+from wall import EV, GAMMA22, S_CURVE, SRGB, record, rmse
 
 from hdr_nsff.radiometry.debevec import (
     HIGH,
@@ -16,19 +16,18 @@ from hdr_nsff.radiometry.debevec import (
     linked,
     response_of,
     saturation,
-    static_samples,
     typical_factor,
 )
 
 
 def points(curve, ev, num=700, outliers=0.0, seed=0):
+    """Random points recorded at exposures `ev`; outliers change by a stop or so."""
     rng = np.random.default_rng(seed)
     radiance = 2 ** rng.uniform(-7, 3, (num, 1, 1)) * 2 ** rng.normal(0, 0.5, (num, 1, 3))
     exposure = radiance * 2.0 ** np.array(ev)[:, None]
     wrong = rng.random((num, len(ev), 1)) < outliers
-    z = record(
-        np.where(wrong, exposure * 2 ** rng.normal(0, 1, exposure.shape), exposure), curve, rng
-    )
+    changed = exposure * 2 ** rng.normal(0, 1, exposure.shape)
+    z = record(np.where(wrong, changed, exposure), curve, rng)
     return Samples(z, (z >= LOW) & (z <= HIGH), z >= SATURATED)
 
 
@@ -135,24 +134,3 @@ def test_brightness_alone_gives_gamma_exposures():
     assert brightness_ev(images, [0, 1, 2], reference=2, num_brackets=3) == pytest.approx(
         EV, abs=0.15
     )
-
-
-def test_static_points_are_the_same_points_in_every_bracket():
-    rng = np.random.default_rng(0)
-    samples = static_samples([wall_view(i, GAMMA22, rng) for i in range(9)], 3, 900, rng)
-    both = samples.valid[:, 1] & samples.valid[:, 2]
-    ratio = 2.2 * np.log2(samples.rgb[:, 2][both] / samples.rgb[:, 1][both])
-    assert both.sum() > 300
-    assert (
-        np.median(ratio) == pytest.approx(2.0, abs=0.03)
-        and np.percentile(np.abs(ratio - 2), 90) < 0.4
-    )
-
-
-def test_points_hidden_behind_something_are_not_read():
-    rng = np.random.default_rng(0)
-    views = [wall_view(i, GAMMA22, rng) for i in range(3)]
-    views[1].disparity[:] = 0.5  # something at half the distance stands before the second camera
-    samples = static_samples(views, 3, 300, rng)
-    first = samples.valid[:100, 0].any(-1)  # points of the first frame
-    assert first.any() and not samples.valid[:100, 1][first].any()
