@@ -1,11 +1,18 @@
 """What `prepare` estimates of a scene in memory, for tests that change its frames."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from hdr_nsff.priors.depth.geometric import (
+    depth_range,
+    lower_confidence_at_edges,
+    static_geometric_depth,
+)
+from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
-from hdr_nsff.scene.movers import Mover
+from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
 from hdr_nsff.scene.posed_video import PosedVideo
 from hdr_nsff.scene.scene import Scene
 
@@ -52,3 +59,29 @@ def video_of(scene: Scene) -> tuple[PosedVideo, np.ndarray, np.ndarray, np.ndarr
 def with_movers(scene: Scene) -> Scene:
     """The scene with its movers estimated anew."""
     return replace(scene, movers=movers_of(scene))
+
+
+def geometric_depth(
+    clip: PosedVideo, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float, float]:
+    """Disparity, confidence, near and far, as the steps from `static_depth` to `depth`
+    find them one after the other.
+    """
+    disparity, confidence, still = static_geometric_depth(clip, flow, valid, pairs, points)
+    clip = replace(clip, moving=clip.moving & ~still)
+    found, trust = mover_depth(clip, flow, valid, pairs, disparity)
+    disparity = np.where(clip.moving, found, disparity)
+    confidence = np.where(clip.moving, trust, confidence)
+    movers = estimate_movers(clip, flow, valid, pairs, disparity, confidence)
+    for t, k in enumerate(movers[0].frames if movers else []):
+        disparity[k], confidence[k] = fill_mover_depth(
+            movers, t, clip.moving[k], clip.c2w[k], disparity[k], confidence[k]
+        )
+    pairs_of_maps = zip(disparity, confidence, strict=True)
+    confidence = np.stack([lower_confidence_at_edges(d, c) for d, c in pairs_of_maps])
+    return disparity, confidence, *depth_range(disparity, confidence)
+
+
+def forget_movers(folder: Path) -> None:
+    """Leave a scene folder without movers, after its frames were edited."""
+    write_movers(folder / "movers.npz", [])

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bad_input import Capture, call, clip, edit, reading, refused, snapshot, training
+from estimates import forget_movers
 
 from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
@@ -253,6 +254,7 @@ def test_a_link_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
 
 def test_a_scene_with_a_single_frame_opens(folder: Path) -> None:
     edit(folder / "scene.json", lambda d: d.update(frames=[{**d["frames"][1], "flow": {}}]))
+    forget_movers(folder)
     scene = Scene.open(folder)
     assert len(scene.train) == 1 and scene.train[0].neighbors == {}
 

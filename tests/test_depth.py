@@ -4,6 +4,7 @@ without evidence.
 
 import numpy as np
 import pytest
+from estimates import geometric_depth
 from posed_planes import (
     RAYS,
     SWEEPING,
@@ -24,7 +25,6 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_exr, write_npy
 from hdr_nsff.footage.depth_files import read_depth
 from hdr_nsff.priors.depth import geometric as depth_module
-from hdr_nsff.priors.depth.geometric import geometric_depth
 from hdr_nsff.priors.movers.distance import (
     differences,
     link,
@@ -34,6 +34,7 @@ from hdr_nsff.priors.movers.distance import (
     split,
     steps_in_time,
 )
+from hdr_nsff.scene.posed_video import PosedVideo
 
 NO_POINTS = np.zeros((0, 3))
 
@@ -45,9 +46,10 @@ def solve(c2w, video, depth, moving=None, clipped=None, **given):
     pairs = neighbors(len(c2w))
     flow = exact_flow(c2w, depth, pairs)
     valid = ~clipped[pairs[:, 0]] & ~clipped[pairs[:, 1]]
-    return geometric_depth(
-        K, c2w, flow, valid, pairs, moving, given.pop("points", NO_POINTS), video, clipped, **given
-    )
+    count = len(c2w)
+    times = given.get("times", np.arange(count, dtype=np.float64))
+    clip = PosedVideo(np.tile(K, (count, 1, 1)), c2w, times, video, clipped, moving)
+    return geometric_depth(clip, flow, valid, pairs, given.get("points", NO_POINTS))
 
 
 @pytest.mark.parametrize(("z0", "slope"), [(4.0, 0.0), (4.0, 0.6), (2.5, -0.4)])

@@ -164,6 +164,9 @@ def changed(weights: Path) -> None:
     save_file(tensors | {name: tensors[name] + 1}, weights, metadata={"format": "pt"})
 
 
+CHANGED = ("static_depth", "response", "refined_flow", "movers", "depth", "sheet")
+
+
 def test_a_step_is_done_again_where_its_weights_changed_under_their_name(
     clip, motion, tmp_path, monkeypatch
 ):
@@ -177,7 +180,7 @@ def test_a_step_is_done_again_where_its_weights_changed_under_their_name(
     before = attempts()
     assert attempts() == before
     changed(network / "model.safetensors")
-    assert attempts() == before | {n: before[n] + 1 for n in ("depth", "sheet")}
+    assert attempts() == before | {n: before[n] + 1 for n in CHANGED}
 
 
 def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
@@ -194,7 +197,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         "gmflow": ("flow", {"flow": "gmflow"}), "raft": ("flow", {"flow": "raft"}), "xfeat": ("flow", {"flow": "semantic"}),
         "dinov2-small": ("flow", {"flow": "semantic", "semantic": SemanticConfig(features="dinov2-small")}), "tuned": ("flow", tuned),
         "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("masks", {"masks": "sam2"}),
-        "depth-anything": ("depth", {"depth": "depth-anything"}),
+        "depth-anything": ("static_depth", {"depth": "depth-anything"}),
     }  # fmt: skip
     for name, (step, chosen) in read.items():
         config = replace(clip, **chosen)
@@ -206,7 +209,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         assert not any(weights_of(config, other) for other in ("frames", "exposure", "sheet"))
     assert not any(
         weights_of(replace(clip, flow="dis", depth=None, poses=None), s)
-        for s in ("flow", "poses", "masks", "depth")
+        for s in ("flow", "poses", "masks", "static_depth")
     )
 
 

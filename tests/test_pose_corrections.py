@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from estimates import forget_movers
 from presets import interrupted_at, random_field, small, trainer
 from safetensors.torch import load_file
 from torch import Tensor
@@ -42,6 +43,7 @@ def edited(
         for i, value in values.items():
             setattr(manifest.frames[i], name, value)
     manifest.save(folder)
+    forget_movers(folder)
     return folder
 
 

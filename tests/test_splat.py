@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from estimates import with_movers
 from presets import small, trainer
 from torch import Tensor
 from toy_scene import CARD, card_offset
@@ -211,6 +212,7 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(
     long = replace(
         toy, train=[replace(toy.train[i % 6], time=float(i), neighbors={}) for i in range(12)]
     )
+    long = with_movers(replace(long, train=[replace(f, index=i) for i, f in enumerate(long.train)]))
     t = trainer(small("splat", toy_folder, tmp_path / "run"), long)
     field = t.field
     assert isinstance(field, Splat)

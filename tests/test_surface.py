@@ -32,9 +32,7 @@ def frame(
 ) -> Frame:
     """A frame of 4 x 2 pixels, gray unless given."""
     image = torch.full((2, 4, 3), 0.5) if image is None else image
-    return Frame(
-        0, 0.0, CAMERA, 0, 0, None, image, disparity=disparity, disparity_confidence=confidence
-    )
+    return Frame(0, 0.0, CAMERA, 0, 0, image, disparity=disparity, disparity_confidence=confidence)
 
 
 def double(rgb: Tensor, frame: int) -> Tensor:

@@ -19,13 +19,14 @@ def find_depth(work: Work) -> StepResult:
     """
     m = work.manifest
     record = m.steps["static_depth"]
+    details = {k: v for k, v in record.details.items() if k != "attempt"}  # the source
     still = work.still()
     if still is None:
         files = {
             "disparity": {f.index: f.static_disparity for f in work.train},
             "disparity_confidence": {f.index: f.static_confidence for f in work.train},
         }
-        return StepResult(note=record.note, provenance=record.provenance, frames=files)
+        return StepResult(record.note, record.provenance, details, frames=files)
     disparity, confidence = depth_with_movers(work, work.training_masks() & ~still)
     near, far = depth_range(disparity, confidence)
     indices = [f.index for f in work.train]
@@ -34,6 +35,7 @@ def find_depth(work: Work) -> StepResult:
             f"{(confidence > 0.5).mean():.0%} of the pixels well known, "
             f"near {near:.2f}, far {far:.2f} scene units"
         ),
+        details=details,
         manifest={"near": near, "far": far},
         maps={
             "disparity": dict(zip(indices, disparity, strict=True)),
