@@ -14,7 +14,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry import pinhole
 
 ADVICE = (
-    "film with the camera moving sideways past textured, unmoving things, give masks of the "
+    "film with the camera moving sideways past textured, static surfaces, give masks of the "
     "moving objects (--mask FOLDER), or import poses (--poses FOLDER or FILE)"
 )
 # share of frames with poses of their own below which poses have failed (hand-chosen)
