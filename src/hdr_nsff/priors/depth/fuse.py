@@ -4,17 +4,16 @@ neighbors' maps over, let them vote, and fill what nobody saw along the image's 
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from hdr_nsff.core.jit import jit
 
 AGREE = 0.03  # disparities within this share of the median are the same surface
 REACH = 4  # pixels a cleaned value may come from
 ALIKE = 0.1  # sum of rgb differences at which a pixel speaks e times less for another
 
-jit = numba.njit(cache=True, nogil=True, fastmath=True)
 
-
-@jit
+@jit(nogil=True, fastmath=True)
 def carry_over(disparity, weight, rotation, shift, result, result_weight):
     """Splat one frame's map into another: pixels go to `rotation` (x, y, 1) + disparity
     `shift`, whose third entry is z * disparity.
@@ -48,7 +47,7 @@ def carry_over(disparity, weight, rotation, shift, result, result_weight):
                 result_weight[py, px] = weight[y, x]
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def vote(disparities, weights):
     """Weighted median over `n` maps (n, H, W), averaged over those within `AGREE` of
     it: disparity (H, W), weight that agrees (H, W), weight of all (H, W).
@@ -82,7 +81,7 @@ def vote(disparities, weights):
     return fused, agreeing, everything
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def clean(disparity, weight, rgb):
     """Weighted median (H, W) over the pixels around that look alike: depth edges move
     onto image edges, outliers go.

@@ -11,9 +11,9 @@ one thread per frame.
 from __future__ import annotations
 
 import cv2
-import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
 from hdr_nsff.radiometry.common_range import LUMA
 from hdr_nsff.scene.posed_video import PosedVideo
 
@@ -29,10 +29,8 @@ EDGE = 20.0  # how much an image edge lowers the price of a jump
 
 OUTSIDE = 3  # obstacle where a view does not look at all
 
-jit = numba.njit(cache=True, nogil=True, fastmath=True)
 
-
-@jit
+@jit(nogil=True, fastmath=True)
 def box(image, radius, result):
     """Mean over a square window, edges repeated less often: running sums along rows,
     then columns.
@@ -67,7 +65,7 @@ def box(image, radius, result):
         result[y] = totals / np.float32(n)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def warp(image, obstacles, rotation, shift, disparity, warped, met):
     """`image` read where the pixels of the first frame fall if all lie at `disparity`;
     `met`: the `obstacles` there, `OUTSIDE`.
@@ -94,7 +92,7 @@ def warp(image, obstacles, rotation, shift, disparity, warped, met):
             met[y, x] = obstacles[int(py + 0.5), int(px + 0.5)] if inside else OUTSIDE
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def correlation_cost(gray, mean, square, other, scratch, result):
     """1 - normalized cross-correlation of two images over the window, per pixel, into
     `result`; in [0, 2].
@@ -111,7 +109,7 @@ def correlation_cost(gray, mean, square, other, scratch, result):
             result[y, x] = 1.0 - covariance / np.sqrt(variance * other_variance)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def best_share(values, n):
     """Mean of the lowest `BEST` share of the first `n` values, which are sorted in
     place; `UNKNOWN` if there are none.
@@ -131,7 +129,7 @@ def best_share(values, n):
     return total / np.float32(count)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def matching_costs(grays, others, tolerance, obstacles, rotations, shifts, disparities):
     """Costs (H, W, D) of each candidate disparity over `n` views.
 
@@ -168,7 +166,7 @@ def matching_costs(grays, others, tolerance, obstacles, rotations, shifts, dispa
     return costs
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def aggregate(costs, guide):
     """Semi-global matching: the sum over eight directions of the cheapest path to each
     candidate (H, W, D).

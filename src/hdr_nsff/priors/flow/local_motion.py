@@ -10,8 +10,9 @@ What shows nothing and is trusted by nobody so gets the motion of around.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
+
+from hdr_nsff.core.jit import jit
 
 SAMPLES = 7  # window: so many samples to either side, ...
 LONGER = 128  # ... one every 1/128 of the longer side
@@ -21,8 +22,6 @@ WIDTH = 3.0  # samples: standard deviation of the window
 ALIKE = 0.5
 LINEAR, QUADRATIC = 0.02, 0.1  # ridge of the model's terms, in shares of the weight
 LEAST = 0.01  # weight in the window below which the flow stays as it was
-
-jit = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 
 
 def filled(flow: np.ndarray, trust: np.ndarray, unsure: np.ndarray, side: np.ndarray) -> np.ndarray:
@@ -47,7 +46,7 @@ def filled(flow: np.ndarray, trust: np.ndarray, unsure: np.ndarray, side: np.nda
     return result
 
 
-@jit
+@jit(nogil=True, fastmath=True, error_model="numpy")
 def fit(flow, trust, unsure, side, window, step, result):
     """Fill `result` (H, W, 2) where `unsure` (H, W) from `flow` (H, W, 2), `trust` (H,
     W) and `side` (H, W) with a `window` (2n + 1, 2n + 1) of samples `step` pixels
@@ -83,7 +82,7 @@ def fit(flow, trust, unsure, side, window, step, result):
                 result[y, x, 1] = v + system[0, 7]
 
 
-@jit
+@jit(nogil=True, fastmath=True, error_model="numpy")
 def solve(system):
     """Solve the ridged normal equations (6, 8) in place: the last two columns become
     the coefficients. Only their upper half is read.
