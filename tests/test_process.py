@@ -1,4 +1,4 @@
-"""Freed memory stays with the process."""
+"""The process is set up by the command line, and importing the package changes nothing."""
 
 import subprocess
 import sys
@@ -21,18 +21,45 @@ for _ in range(20):
     pictures()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
+FRESH_PAGES = 20 * 1000  # page faults where every picture gets its memory anew
 
 
-def faults(first: str) -> int:
+def output_of(code: str) -> str:
+    """What a new process prints."""
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, capture_output=True, check=True, text=True).stdout
+
+
+def page_faults(setup: str) -> int:
     """Page faults of a new process that makes the same pictures 20 times."""
-    return int(
-        subprocess.run(
-            [sys.executable, "-c", first + PICTURES], capture_output=True, check=True, text=True
-        ).stdout
-    )
+    return int(output_of(setup + PICTURES))
 
 
 @pytest.mark.skipif(not keep_memory(), reason="not glibc's allocator")
-def test_what_a_picture_needs_is_asked_of_the_system_once() -> None:
-    assert faults("import hdr_nsff") < 1000
-    assert faults("") > 20 * 1000  # or there were nothing to keep
+def test_a_prepared_process_asks_the_system_for_memory_once() -> None:
+    prepare = "from hdr_nsff.core.process import prepare_process; prepare_process()"
+    assert page_faults(prepare) < 1000
+    assert page_faults("") > FRESH_PAGES  # otherwise there is nothing to keep
+
+
+@pytest.mark.skipif(not keep_memory(), reason="not glibc's allocator")
+def test_importing_the_package_leaves_the_allocator_alone() -> None:
+    assert page_faults("import hdr_nsff, hdr_nsff.cli, hdr_nsff.core.process") > FRESH_PAGES
+
+
+def test_importing_the_package_leaves_the_environment_alone() -> None:
+    compare = """
+import os, cv2  # which changes LD_LIBRARY_PATH itself
+before = dict(os.environ)
+import hdr_nsff, hdr_nsff.pipeline
+print(dict(os.environ) == before)
+"""
+    assert output_of(compare) == "True\n"
+
+
+def test_idle_threads_sleep_unless_the_user_says_otherwise() -> None:
+    wait = "import os; from hdr_nsff.core.process import prepare_process; prepare_process()"
+    show = "\nprint(os.environ['OMP_WAIT_POLICY'])"
+    assert output_of(wait + show) == "PASSIVE\n"
+    given = "import os; os.environ['OMP_WAIT_POLICY'] = 'ACTIVE'\n"
+    assert output_of(given + wait + show) == "ACTIVE\n"
