@@ -25,6 +25,7 @@ from typing import Any
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
@@ -60,7 +61,7 @@ def prepare(config: PrepareConfig) -> Path:
     """Do every step that is not done; the scene folder. InputError where the footage or
     a setting is at fault.
     """
-    with writing_to(config.out):
+    with writing_to(config.out), lock_output(config.out):
         work = begin(config)
         introduce(work)
         for name in STEPS:
