@@ -131,8 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except BrokenPipeError:
         silence_stdout()
         raise SystemExit(CLOSED_PIPE) from None
-    except KeyboardInterrupt:
-        print("hdr-nsff: stopped; the same command continues where it was", file=sys.stderr)
+    except KeyboardInterrupt:  # before the verb has begun
         raise SystemExit(INTERRUPTED) from None
 
 
@@ -164,10 +163,14 @@ def run_verb(name: str, verb: Verb, options: list[str]) -> None:
     from hdr_nsff.core.io import writing_to
 
     try:
+        settings = parse(name, config, options)
         with writing_to("output"):
-            function(parse(name, config, options))
+            function(settings)
     except InputError as error:
         fail(str(error))
+    except KeyboardInterrupt:
+        print("hdr-nsff: stopped; the same command continues where it was", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
 
 
 def load(place: str) -> Any:

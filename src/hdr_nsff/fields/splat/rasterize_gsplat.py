@@ -67,7 +67,7 @@ def draw_one_gaussian(device: str) -> float:
     gaussians = means, quaternions, scales, opacities, features
     _, _, alpha = composite(*gaussians, w2c, K, width=15, height=15, nearest=0.01, blur=0.3)
     alpha.sum().backward()
-    return float(alpha[7, 7])
+    return float(alpha[7, 7].detach())
 
 
 def composite(
