@@ -110,8 +110,8 @@ def in_temporary_folder(place: Path) -> Path:
 
 
 def open_locked(path: Path) -> BinaryIO:
-    """Open and lock a file. BlockingIOError where another process has locked it, another
-    OSError where that is impossible here.
+    """Open and lock a file. BlockingIOError where another process holds the lock, other
+    OSErrors where none can be taken here.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     file = path.open("a+b")

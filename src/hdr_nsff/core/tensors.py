@@ -1,5 +1,5 @@
-"""Map a function over the tensors of a frozen dataclass, so that moving or slicing one
-is a single call.
+"""A function mapped over the tensors of a frozen dataclass, so that moving or slicing
+one is a single call; devices by name.
 """
 
 from __future__ import annotations
@@ -18,22 +18,21 @@ T = TypeVar("T")
 
 
 def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
-    """`value` with `function` applied to every tensor in it: dataclasses, dicts, lists
-    and tuples are entered.
+    """`value` with `function` applied to every tensor in it. Dataclasses, dicts, lists
+    and tuples are entered; anything else stays as it is.
     """
 
-    def walk(v: Any) -> Any:
-        if isinstance(v, Tensor):
-            return function(v)
-        if dataclasses.is_dataclass(v) and not isinstance(v, type):
-            return dataclasses.replace(
-                v, **{f.name: walk(getattr(v, f.name)) for f in dataclasses.fields(v)}
-            )
-        if isinstance(v, dict):
-            return {k: walk(x) for k, x in v.items()}
-        if isinstance(v, (list, tuple)):
-            return type(v)(walk(x) for x in v)
-        return v
+    def walk(node: Any) -> Any:
+        if isinstance(node, Tensor):
+            return function(node)
+        if dataclasses.is_dataclass(node) and not isinstance(node, type):
+            names = [f.name for f in dataclasses.fields(node)]
+            return dataclasses.replace(node, **{name: walk(getattr(node, name)) for name in names})
+        if isinstance(node, dict):
+            return {key: walk(child) for key, child in node.items()}
+        if isinstance(node, list | tuple):
+            return type(node)(walk(child) for child in node)
+        return node
 
     return walk(value)
 
