@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.tensors import hold_threads
+from hdr_nsff.core.process import hold_threads, prepare_process
 from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.config import PRESETS
@@ -48,6 +48,7 @@ AXES: dict[str, tuple[str, list[int]]] = {
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

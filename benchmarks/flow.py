@@ -26,6 +26,7 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.io import read_exr, read_mask, read_npy, write_json, write_png
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.geometry.round_trip import agreement
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.flow.dense import (
@@ -46,6 +47,7 @@ FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -25,7 +25,8 @@ import numba
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.tensors import hold_threads, pick_device
+from hdr_nsff.core.process import hold_threads, prepare_process
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
@@ -36,6 +37,7 @@ TIMES = 36  # training times of the made-up field
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

@@ -20,6 +20,7 @@ from pathlib import Path
 import torch
 
 from hdr_nsff.core import distributed
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.config import PRESETS
@@ -27,6 +28,7 @@ from hdr_nsff.training.train import Trainer
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

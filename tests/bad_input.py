@@ -46,16 +46,18 @@ def refused(capsys: Capture, *arguments: object) -> str:
 
 def verbs_with(setting: str) -> list[str]:
     """The verbs that have a setting of this name."""
-    return [
-        v
-        for v, it in cli.VERBS.items()
-        if is_dataclass(it.config) and setting in {f.name for f in fields(it.config)}
-    ]
+    verbs = []
+    for name, verb in cli.VERBS.items():
+        config = cli.load(verb.config) if verb.config is not None else None
+        if is_dataclass(config) and setting in {f.name for f in fields(config)}:
+            verbs.append(name)
+    return verbs
 
 
 FOOTAGE_VERBS = verbs_with("clip")  # that read footage
 RUN_VERBS = verbs_with("run")  # that read a run
-WORKING_VERBS = [v for v in cli.VERBS if v != "weights"]  # that write something
+# Verbs that write something.
+WORKING_VERBS = [v for v in cli.VERBS if v not in ("weights", "doctor")]
 
 
 def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:

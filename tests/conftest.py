@@ -8,9 +8,12 @@ import pytest
 import torch
 from toy_scene import ToyScene
 
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.priors.flow import networks as flow_networks
 from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.scene.scene import Scene
+
+prepare_process()  # as the command line does
 
 
 @pytest.fixture(scope="session")

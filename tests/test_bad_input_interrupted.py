@@ -1,5 +1,5 @@
 """A full disk and Ctrl-C: what was complete stays, nothing is half-written, and the
-same command goes on.
+same command continues.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ def test_ctrl_c_loses_nothing_and_the_same_command_goes_on(
         patch.setattr(os, "fsync", interrupted)
         assert call(*command) == 130
     error = capsys.readouterr().err
-    assert "Traceback" not in error and "the same command goes on where it was" in error
+    assert "Traceback" not in error and "the same command continues where it was" in error
     kept = {
         p: p.stat().st_mtime_ns
         for p in tmp_path.rglob("*")

@@ -274,6 +274,8 @@ def test_a_config_edited_into_nonsense_is_named_by_every_verb_that_reads_it(
         "--minutes=-1",
         "--minutes=nan",
         "--rays=-5",
+        "--rays=1000000",
+        "--torch-threads=100000",
         "--field.bases=0",
         "--loss.depth=-1",
         "--seed=-1",

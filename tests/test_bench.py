@@ -286,13 +286,13 @@ def test_a_run_at_work_is_not_done_twice(scenes: Path, tmp_path: Path, capsys: C
     import fcntl
 
     command = words(scenes, tmp_path / "out", METHODS, "--only", "toy/a")
-    (tmp_path / "out/runs/toy/a").mkdir(parents=True)
+    (tmp_path / "out/runs/toy").mkdir(parents=True)
     (tmp_path / "out/bench.json").write_text(
         json.dumps({"settings": settings(command), "scenes": {}})
     )
-    with open(tmp_path / "out/runs/toy/a/.lock", "w") as file:
+    with open(tmp_path / "out/runs/toy/.a.lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        assert "another process is at work" in refused(capsys, *command)
+        assert "another hdr-nsff works in" in refused(capsys, *command)
     assert not (tmp_path / "out/runs/toy/a/config.json").exists()
 
 

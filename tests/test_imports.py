@@ -21,6 +21,7 @@ VERBS = {
     "evaluation.report",
     "flow_training.finetune_flow",
     "prepare.weights",
+    "doctor",
 }
 # who reads it, for `evaluate` and for `export --truth`, and the last three, which write
 # it

@@ -391,9 +391,11 @@ def test_a_missing_gsplat_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setitem(sys.modules, "gsplat", None)
     monkeypatch.setattr(rasterize_cuda, "say", said.append)
+    rasterize_cuda.fault.cache_clear()
     rasterize_cuda.available.cache_clear()
     assert not rasterize_cuda.available() and not rasterize_cuda.available()
     assert len(said) == 1 and "hdr-nsff[gpu]" in said[0]
+    rasterize_cuda.fault.cache_clear()
     rasterize_cuda.available.cache_clear()
 
 

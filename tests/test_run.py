@@ -15,7 +15,6 @@ from safetensors.torch import save_file
 
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, save_checkpoint
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.config import PRESETS, TrainConfig
 from hdr_nsff.training.run_folder import Run, read_config, read_log, write_config
@@ -225,15 +224,3 @@ def test_config_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert read_config(tmp_path) == PRESETS["tiny"] and [p.name for p in tmp_path.iterdir()] == [
         "config.json"
     ]
-
-
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
-def test_asking_for_cuda_where_there_is_none_is_an_error() -> None:
-    assert pick_device("auto") == pick_device("cpu") == torch.device("cpu")
-    with pytest.raises(InputError, match="no CUDA device"):
-        pick_device("cuda")
-
-
-def test_a_device_that_does_not_exist_is_an_error() -> None:
-    with pytest.raises(InputError, match="--device gpu7"):
-        pick_device("gpu7")

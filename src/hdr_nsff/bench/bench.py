@@ -5,6 +5,7 @@ own, what is done is kept, what fails is shown.
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,6 +18,7 @@ from hdr_nsff.bench.tables import row_of, write_tables
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import bar, say
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.maths.metrics import Lpips
@@ -39,7 +41,9 @@ def bench(config: BenchConfig) -> None:
         Lpips(config.lpips)  # refuses what it cannot read, before anything is trained
     if config.devices is None:
         pick_device(config.device)
-    with writing_to(config.out):
+    # `--only` is part of a benchmark that may hold the lock; its run has one of its own.
+    lock = lock_output(config.out) if config.only is None else nullcontext()
+    with writing_to(config.out), lock:
         claim(plan)
         if config.only is not None:
             do_one(plan, config.only)

@@ -16,6 +16,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from hdr_nsff.core.process import usable_cores
+
 PARENT = "HDR_NSFF_BENCH_PARENT"  # environment: whose end is that of this process
 THREADS = ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 PAUSE = 0.2  # seconds between looks at the processes
@@ -45,9 +47,7 @@ def slots(jobs: int, devices: str | None) -> list[dict[str, str]]:
     """
     names = [d.strip() for d in devices.split(",")] if devices else []
     count = len(names) or jobs
-    share = str(
-        max(1, len(os.sched_getaffinity(0)) // count) if hasattr(os, "sched_getaffinity") else 1
-    )
+    share = str(max(1, usable_cores() // count))
     threads = {
         name: os.environ.get(name) or os.environ.get("OMP_NUM_THREADS") or share for name in THREADS
     }
@@ -105,14 +105,22 @@ def start(job: Job, place: dict[str, str]) -> subprocess.Popen[bytes]:
 
 def stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
     """End these processes and all that they have started."""
-    for number in (signal.SIGTERM, signal.SIGKILL):
+    for force in (False, True):
         for process in processes:
             if process.poll() is None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, number)
+                end(process, force)
         deadline = time.monotonic() + GRACE
         while any(p.poll() is None for p in processes) and time.monotonic() < deadline:
             time.sleep(PAUSE / 4)
+
+
+def end(process: subprocess.Popen[bytes], force: bool) -> None:
+    """Ask a process and its children to end, or with `force` make them end."""
+    if not hasattr(os, "killpg"):  # Windows (not tried), where its children stay
+        process.kill()
+        return
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL if force else signal.SIGTERM)
 
 
 def end_with_parent() -> None:
@@ -120,7 +128,7 @@ def end_with_parent() -> None:
     killed.
     """
     parent = int(os.environ.get(PARENT) or 0)
-    if not parent:
+    if not parent or not hasattr(os, "killpg"):
         return
 
     def watch() -> None:

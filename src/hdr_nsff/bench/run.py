@@ -10,13 +10,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import resource
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -26,7 +21,9 @@ from hdr_nsff.bench.plan import BenchRun, BenchScene
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.notes import RunRecord, Trained
+from hdr_nsff.core.process import peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
@@ -39,29 +36,11 @@ FRAMES = 5  # rendered to time it
 ENOUGH = 10.0  # seconds after which no further one is
 
 
-@contextmanager
-def alone(place: Path, wait: bool) -> Iterator[None]:
-    """No other process is in here with the same `place`. Where one is: wait for it, or
-    InputError.
-    """
-    import fcntl  # not on every system, and needed nowhere else
-
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with open(place, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError as error:
-            raise InputError(
-                f"{place.parent}: another process is at work on this run; wait for it, or end it"
-            ) from error
-        yield
-
-
 def get_ready(scene: BenchScene) -> None:
     """Prepare a scene, once however many processes ask for it."""
     if scene.footage is None or scene.ready:
         return
-    with alone(scene.folder.parent / f".{scene.folder.name}.lock", wait=True):
+    with lock_output(scene.folder, wait=True):
         prepare(scene.footage)
 
 
@@ -69,7 +48,7 @@ def run_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
     """All of a run that is not done yet. What makes it fail is kept in `failure.json`,
     and raised.
     """
-    with alone(cell.folder / ".lock", wait=False):
+    with lock_output(cell.folder):
         (cell.folder / "failure.json").unlink(missing_ok=True)
         try:
             get_ready(cell.scene)
@@ -118,9 +97,7 @@ def train_cell(cell: BenchRun, views: int) -> None:
     found = latest_checkpoint(cell.folder)
     train(cell.config, keep_at=SHARES if views else (), previews=False)
     wall = time.monotonic() - start
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
-        1 if sys.platform == "darwin" else 1024
-    )
+    memory = peak_memory()
     run = Run.open(cell.folder, cell.config.device)
     device = device_of(run)
     cuda = device.type == "cuda"

@@ -22,6 +22,7 @@ import tyro
 from torch import Tensor
 
 from hdr_nsff.core import io
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.evaluation.predictions import predict, radiance_of, recordings
 from hdr_nsff.evaluation.scores.camera import camera_errors, trajectory_errors
@@ -57,7 +58,7 @@ class EvaluateConfig:
 
 def evaluate(config: EvaluateConfig) -> dict[str, Any]:
     """The verb: what `metrics.json` holds."""
-    with io.writing_to(config.run):
+    with io.writing_to(config.run), lock_output(config.run / "evaluation"):
         return evaluate_run(Run.open(config.run, config.device), config.truth, config.lpips)
 
 

@@ -6,11 +6,17 @@ from __future__ import annotations
 
 from typing import assert_never
 
+import torch
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.progress import say
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
 from hdr_nsff.fields.baselines.nerf_wt import NerfWT, NerfWTConfig
 from hdr_nsff.fields.nsff.initialize_grid import paint
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.space import build_space
+from hdr_nsff.fields.splat import rasterize_gsplat
 from hdr_nsff.fields.splat.initialize_gaussians import seed
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.fields.surface import ToRadiance
@@ -18,6 +24,23 @@ from hdr_nsff.scene.scene import Scene
 
 FieldConfig = NSFFConfig | NerfWTConfig | HexPlaneConfig | SplatConfig
 AnyField = NSFF | NerfWT | HexPlane | Splat
+
+
+def device_for(config: FieldConfig, name: str) -> torch.device:
+    """The device of a `--device` flag for this field. Gaussians use CUDA only where
+    gsplat has drawn one there: `auto` takes the CPU instead and says so, `cuda` is an
+    InputError.
+    """
+    device = pick_device(name)
+    if device.type != "cuda" or not isinstance(config, SplatConfig):
+        return device
+    reason = rasterize_gsplat.fault(str(device))
+    if reason is None:
+        return device
+    if name == "auto":
+        say(f"--device auto: using the CPU although there is a CUDA device, for {reason}")
+        return torch.device("cpu")
+    raise InputError(f"--device {name}: {reason}, or use --device cpu")
 
 
 def build_field(config: FieldConfig, scene: Scene) -> AnyField:

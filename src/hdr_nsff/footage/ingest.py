@@ -216,7 +216,7 @@ def read_dng(path: Path) -> np.ndarray:
         import rawpy
     except ImportError as error:
         raise InputError(
-            f"{path}: DNG frames need rawpy; install it with `pip install 'hdr-nsff[prepare]'`"
+            f"{path}: DNG frames need rawpy; install it with `pip install rawpy`"
         ) from error
     try:
         with rawpy.imread(str(path)) as raw:

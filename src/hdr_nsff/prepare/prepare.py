@@ -15,6 +15,7 @@ from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
@@ -42,7 +43,7 @@ def prepare(config: PrepareConfig) -> Path:
     """Do every step that is not done; the scene folder. InputError where the footage or
     a setting is at fault.
     """
-    with writing_to(config.out):
+    with writing_to(config.out), lock_output(config.out):
         work = begin(config)
         introduce(work)
         for name, step in STEPS.items():

@@ -22,6 +22,7 @@ import tyro
 
 from hdr_nsff.core import io, notes
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.fields.base import GaussianCloud, RadianceField
 from hdr_nsff.footage.layouts import held_out as to_held_out
@@ -111,7 +112,7 @@ def export(config: ExportConfig) -> Path:
     if config.layout is not None:
         return export_scene(config.run, config.out, config.layout, config.truth)
     run = Run.open(config.run, config.device)
-    with io.writing_to(config.out):
+    with io.writing_to(config.out), lock_output(config.out):
         if config.ply_sequence:
             return export_sequence(run, config.out, config.coloring)
         times = sorted({f.time for f in run.scene.train})
@@ -174,7 +175,7 @@ def export_scene(
             )
     source = Source.open(folder)
     views = to_held_out.views_of(source, truth) if truth is not None else []
-    with io.writing_to(out):
+    with io.writing_to(out), lock_output(out):
         match layout:
             case "hdr-gopro":
                 to_llff.write(source, out, views)

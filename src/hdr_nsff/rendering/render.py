@@ -17,6 +17,7 @@ import tyro
 
 from hdr_nsff.core import io, notes
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.geometry import paths
@@ -75,7 +76,7 @@ def render(config: RenderConfig) -> dict[str, Path]:
     if config.output.between == "splat" and not isinstance(run.field, LayeredField):
         raise InputError("--between splat: this field has no layers to splat; use --between direct")
     out = config.out or Path(config.run) / "render"
-    with io.writing_to(out):
+    with io.writing_to(out), lock_output(out):
         if config.path == "all":
             return render_all(run, out, config.budget, config.output)
         shot = plan_shot(run, config.path, config.frame, config.factor, config.views)

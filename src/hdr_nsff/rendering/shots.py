@@ -23,8 +23,9 @@ import torch
 
 from hdr_nsff.core import io, notes
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.process import hold_threads
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.core.tensors import hold_threads, to_device
+from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.base import Render, recorded
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import View

@@ -31,6 +31,7 @@ from hdr_nsff.core.io import (
     write_png,
     writing_to,
 )
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.pose_files import import_poses
@@ -104,7 +105,7 @@ def reexpose(config: ReexposeConfig) -> Path:
     """Write the new footage and its truth; the output folder. A killed run goes on
     where it was.
     """
-    with writing_to(config.out):
+    with writing_to(config.out), lock_output(config.out):
         evs = ingest.parse_exposures(None, config.ev)
         if evs is None:
             raise InputError(

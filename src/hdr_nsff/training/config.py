@@ -169,6 +169,9 @@ AT_MOST = {
     "steps": 1e12,
     "seed": 2**63 - 1,
     "checkpoint_seconds": 1e12,
+    "torch_threads": 1024,  # torch crashes where the system refuses it more threads
+    "rays": 2**18,  # all samples of a step are in memory at once
+    "moving_rays": 2**18,
 }  # else a million
 
 

@@ -15,8 +15,7 @@ from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, unpack
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.notes import LogLine
-from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.fields import build_field
+from hdr_nsff.fields import build_field, device_for
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.tonemapper import ToneMapper
@@ -72,7 +71,7 @@ class Run:
         poses = PoseCorrections(scene) if config.refine_poses else None
         unpack(found.tensors, modules if poses is None else {**modules, "poses": poses}, {})
         scene = scene if poses is None else poses.applied(scene)
-        target = pick_device(device)
+        target = device_for(config.field, device)
         return Run(
             folder,
             config,

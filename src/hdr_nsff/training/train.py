@@ -22,9 +22,11 @@ from hdr_nsff.core import distributed
 from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, unpack
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_png, writing_to
+from hdr_nsff.core.lock import lock_output
+from hdr_nsff.core.process import hold_threads
 from hdr_nsff.core.progress import bar, say
-from hdr_nsff.core.tensors import hold_threads, pick_device, to_device
-from hdr_nsff.fields import build_field, start_field
+from hdr_nsff.core.tensors import to_device
+from hdr_nsff.fields import build_field, device_for, start_field
 from hdr_nsff.fields.base import FrameError, Render, recorded
 from hdr_nsff.fields.nsff.encodings import TouchedAdam
 from hdr_nsff.geometry.cameras import Camera
@@ -87,12 +89,12 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
     config = replace(
         config, scene=config.scene.resolve()
     )  # the run can then be opened from anywhere
-    with writing_to(config.out), distributed.group() as ranks:
+    with writing_to(config.out), lock_output(config.out), distributed.group() as ranks:
         if ranks.world > config.batches:
             raise InputError(
                 f"{ranks.world} processes share {config.batches} batches a step; start fewer, or raise --batches"
             )
-        device, scene = pick_device(config.device), Scene.open(config.scene)
+        device, scene = device_for(config.field, config.device), Scene.open(config.scene)
         if ranks.main:
             open_folder(config)
         Trainer(config, scene, device, ranks).loop(keep_at, previews)

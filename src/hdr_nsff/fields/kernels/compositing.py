@@ -20,6 +20,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
 from hdr_nsff.fields.kernels.projection import ALPHA_MIN, F0, MOMENTS, TILE_X, TILE_Y
 
 PIXELS = TILE_X * TILE_Y
@@ -41,7 +42,7 @@ FAST = {"contract", "reassoc", "nsz"}
 NOTHING = (F0, F0, F0, F0, F0, F0, F0, F0)
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@jit(inline="always", fastmath=FAST)
 def exp_minus(s):
     """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three
     times; vectorizes, unlike a library call.
@@ -53,7 +54,7 @@ def exp_minus(s):
     return y * y
 
 
-@numba.njit(cache=True, nogil=True)
+@jit(nogil=True)
 def bin_tiles(boxes, order, tiles_x, tiles_y):
     """Lists of Gaussians per tile, front to back as `order` (G,) says.
 
@@ -84,7 +85,7 @@ def bin_tiles(boxes, order, tiles_x, tiles_y):
     return starts, members, places, owned
 
 
-@numba.njit(cache=True)
+@jit()
 def planes(count, tile, tiles_x):
     """A tile's first column and row, and `count` planes of PIXELS numbers in one flat
     array at the start of a cache line: X, Y and LEFT are filled, the others 0. One
@@ -105,7 +106,7 @@ def planes(count, tile, tiles_x):
     return x0, y0, z
 
 
-@numba.njit(cache=True)
+@jit()
 def span(rows, g, y0):
     """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows:
     unsigned, or LLVM would not vectorize over them, and in a way that it sees whole
@@ -116,7 +117,7 @@ def span(rows, g, y0):
     return start, start + np.uint64(max(last - first, 0)) * TWO_ROWS
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@jit(inline="always", fastmath=FAST)
 def spent(z):
     """Whether nothing behind can be seen any more."""
     most = F0
@@ -125,20 +126,20 @@ def spent(z):
     return most < SPENT
 
 
-@numba.njit(cache=True)
+@jit()
 def block(features, g, d):
     """BLOCK features of Gaussian `g` from channel `d` on."""
     first = features[g, d], features[g, d + 1], features[g, d + 2], features[g, d + 3]
     return (*first, features[g, d + 4], features[g, d + 5], features[g, d + 6], features[g, d + 7])
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def plane(d):
     """Where the plane of channel `d` begins."""
     return SUMS + np.uint64(d * PIXELS)
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def poured(z, p, v, f):
     """Add `v` times the features `f` to the BLOCK planes from the one on in which `p`
     is the pixel.
@@ -153,14 +154,14 @@ def poured(z, p, v, f):
     z[p + N7] += f[7] * v
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def mixed(z, p, f):
     """Sum of the features `f` times those planes at the pixel."""
     first = f[0] * z[p] + f[1] * z[p + N1] + f[2] * z[p + N2] + f[3] * z[p + N3]
     return first + f[4] * z[p + N4] + f[5] * z[p + N5] + f[6] * z[p + N6] + f[7] * z[p + N7]
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def gathered(t, z, p, v):
     """The sums `t` plus `v` times those planes at the pixel."""
     first = t[0] + z[p] * v, t[1] + z[p + N1] * v, t[2] + z[p + N2] * v, t[3] + z[p + N3] * v
@@ -173,14 +174,14 @@ def gathered(t, z, p, v):
     )
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def moved(m, u, dx, dy):
     """The moments `m` plus those of `u` at an offset from the center."""
     ux, uy = u * dx, u * dy
     return m[0] + u, m[1] + ux, m[2] + uy, m[3] + ux * dx, m[4] + ux * dy, m[5] + uy * dy
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def forward(starts, members, centers, conics, opacities, features, rows, maps, alpha):
     """Composite features (G, D), D a multiple of BLOCK, into `maps` (C, H, W), the
     first C of them, and `alpha` (H, W).
@@ -220,7 +221,7 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
                     maps[d, y0 + y, x0 + x] = z[plane(d) + here]
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@jit(inline="always", fastmath=FAST)
 def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
     """Fill a tile's planes: gradients of its maps (SUMS), of alpha (GRAD_ALPHA), and
     the sum of weight * value (BEHIND).
@@ -237,7 +238,7 @@ def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
                 z[BEHIND + p] += grad * maps[d, y0 + y, x0 + x]
 
 
-@numba.njit(cache=True)
+@jit()
 def tell(grad, d, t):
     """Write down the gradients `t` of the BLOCK channels from `d` on."""
     d += MOMENTS
@@ -253,7 +254,7 @@ def tell(grad, d, t):
     ) = t
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def backward(
     starts,
     members,

@@ -18,6 +18,8 @@ from typing import Any
 import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
+
 PRIMES = (
     1,
     2654435761,
@@ -31,7 +33,7 @@ F0, F1 = np.float32(0), np.float32(1)
 C = 4
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def cell_of(u: Any, resolution: Any) -> Any:
     """Lower grid point and fraction of a coordinate in [0, 1]; outside values clamp to
     the edge.
@@ -41,7 +43,7 @@ def cell_of(u: Any, resolution: Any) -> Any:
     return low, position - np.float32(low)
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def row_of(
     x: Any, y: Any, z: Any, s: Any, nx: Any, ny: Any, nz: Any, hashed: Any, size: Any
 ) -> Any:
@@ -52,7 +54,7 @@ def row_of(
     return np.int64(((s * nz + z) * ny + y) * nx + x)
 
 
-@numba.njit(parallel=True, nogil=True, cache=True)
+@jit(parallel=True, nogil=True)
 def forward(coords, table, res, offset, size, hashed, slices, slice_weights, out):
     """Values (N, C) at coords (N, 3)."""
     for i in numba.prange(coords.shape[0]):
@@ -88,7 +90,7 @@ def forward(coords, table, res, offset, size, hashed, slices, slice_weights, out
                                 out[i, c] += w * table[r, c]
 
 
-@numba.njit(parallel=True, nogil=True, cache=True)
+@jit(parallel=True, nogil=True)
 def backward_table(
     coords, grad_out, res, offset, size, hashed, slices, slice_weights, grad_table, touched
 ):
@@ -127,7 +129,7 @@ def backward_table(
                                 grad_table[r, c] += w * grad_out[i, c]
 
 
-@numba.njit(parallel=True, nogil=True, cache=True)
+@jit(parallel=True, nogil=True)
 def backward_coords(
     coords, table, grad_out, res, offset, size, hashed, slices, slice_weights, grad_coords
 ):
@@ -172,7 +174,7 @@ def backward_coords(
         grad_coords[i, 2] = gz if F0 < coords[i, 2] < F1 else F0
 
 
-@numba.njit(parallel=True, nogil=True, cache=True)
+@jit(parallel=True, nogil=True)
 def adam_rows(p, g, m, v, touched, lr, beta1, beta2, eps, correction1, correction2):
     """One Adam step on the marked rows of (rows, C) arrays; their gradients and marks
     are cleared. Other rows, moments included, stay.

@@ -14,6 +14,8 @@ import math
 import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
+
 TILE_X, TILE_Y = 8, 32  # pixels
 # gradients of a pair before its features: sums of u, u dx, u dy, u dx^2, u dx dy, u
 # dy^2
@@ -33,7 +35,7 @@ FAST = {
 MARGIN = 0.3
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def rotation(q):
     """Unit quaternion (w, x, y, z), its rotation matrix row by row, and the length it
     had.
@@ -48,7 +50,7 @@ def rotation(q):
     return (w, x, y, z), r, n
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def limited(x, z, low, high):
     """x moved so that x / z lies within [low, high], and whether it had to be."""
     ratio = x / z
@@ -59,13 +61,13 @@ def limited(x, z, low, high):
     return x, False
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def dot(a, b):
     """Of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def gaussian(means, quaternions, scales, g):
     """Mean (3,), quaternion (4,) and scales (3,) of Gaussian `g` in float64."""
     return (
@@ -80,7 +82,7 @@ def gaussian(means, quaternions, scales, g):
     )
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def jacobian(k, held):
     """The entries 00, 02, 11, 12 of J (2, 3), the projection linearized at the point
     `held`; the others are 0.
@@ -89,7 +91,7 @@ def jacobian(k, held):
     return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def footprint(m, q, s, v, k, width, height):
     """A Gaussian in the picture: camera point t, the point where the projection is
     linearized and whether x and y are held there, T = J W (2, 3), the rotation R of
@@ -135,7 +137,7 @@ def footprint(m, q, s, v, k, width, height):
     )
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def project(
     means,
     quaternions,
@@ -190,7 +192,7 @@ def project(
         boxes[g, 3] = min(int(bottom) // TILE_Y + 1, tiles_y)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def project_backward(
     means, quaternions, scales, opacities, w2c, k, width, height, owned, pairs,
     grad_means, grad_quaternions, grad_scales, grad_opacities, grad_features, grad_pose,
@@ -236,7 +238,7 @@ def project_backward(
             pose_gradient((dx, dy, dz), d_projection, m, jacobian(k, held), grad_pose[g])
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def sum_moments(pairs, first, last):
     """The moments of a Gaussian's pairs, added up in float64."""
     u0 = u1 = u2 = u3 = u4 = u5 = 0.0
@@ -250,7 +252,7 @@ def sum_moments(pairs, first, last):
     return u0, u1, u2, u3, u4, u5
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def picture_gradient(covariance, u):
     """From the moments `u` to dL / d pixel center (2,) and dL / d 2D covariance (xx,
     xy, yy), with Q its inverse: -Q (dL / dQ) Q.
@@ -268,7 +270,7 @@ def picture_gradient(covariance, u):
     return (-(a * u[1] + b * u[2]), -(b * u[1] + c * u[2])), inner
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def shape_gradient(g, projection, spread, r, s):
     """From G = dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3).
     The covariance is V V^T + blur with V = T M and M = R S, so dV = 2 G V, dM = T^T dV,
@@ -318,7 +320,7 @@ def shape_gradient(g, projection, spread, r, s):
     return d_scales, d_rotation, d_projection
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def point_gradient(center, d_projection, t, held, w2c, k):
     """dL / d camera point (3,), through the pixel center and through J in T = J W,
     which does not see x or y where they are held.
@@ -344,7 +346,7 @@ def point_gradient(center, d_projection, t, held, w2c, k):
     return dx, dy, dz
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def pose_gradient(point, d_projection, m, j, out):
     """dL / d world-to-camera `out` (12,), row by row: through the camera point `W m +
     t`, and through W in T = J W.
@@ -357,7 +359,7 @@ def pose_gradient(point, d_projection, m, j, out):
     out[3], out[7], out[11] = dx, dy, dz
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def quaternion_gradient(unit, n, dr, out):
     """From dL / dR (3, 3) to the quaternion before it was made a unit one."""
     w, x, y, z = unit

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 
-jit = numba.njit(cache=True, nogil=True, fastmath=True)
+from hdr_nsff.core.jit import jit
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class FuseTuning:
     rgb_scale: float = 0.1
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def warp_disparity(disparity, weight, rotation, shift, warped, warped_weight):
     """Splat one frame's map into another: pixels go to `rotation` (x, y, 1) + disparity
     `shift`, homogeneous, whose third entry is z * disparity (see `pinhole.transfer`).
@@ -56,7 +55,7 @@ def warp_disparity(disparity, weight, rotation, shift, warped, warped_weight):
                 warped_weight[py, px] = weight[y, x]
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def vote(disparities, weights, max_difference):
     """Weighted median over `n` maps (n, H, W), averaged over those within the share
     `max_difference` of it.
@@ -93,7 +92,7 @@ def vote(disparities, weights, max_difference):
     return fused, agreeing_weight, total_weight
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def joint_median(disparity, weight, rgb, radius, rgb_scale):
     """Weighted median (H, W) over the pixels around that look alike: depth edges move
     onto image edges, outliers disappear.

@@ -25,7 +25,6 @@ from hdr_nsff.priors.depth.parallax import (
 from hdr_nsff.priors.depth.plane_sweep import PlaneSweepTuning, sweep
 from hdr_nsff.scene.posed_video import PosedVideo
 
-
 NO_PARALLAX_RANGE = (0.5, 2.0)  # near and far around distance 1, scene units
 
 

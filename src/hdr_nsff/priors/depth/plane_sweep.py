@@ -13,9 +13,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
 from hdr_nsff.radiometry.common_range import LUMA
 from hdr_nsff.scene.posed_video import PosedVideo
 
@@ -25,8 +25,6 @@ STATIC, MOVING = 0, 1
 CLIPPED, OUTSIDE = 2, 3
 # by what the pixel itself shows: obstacles of a view from this one on do not count
 TOLERANCE = np.array([MOVING, CLIPPED, STATIC], np.uint8)
-
-jit = numba.njit(cache=True, nogil=True, fastmath=True)
 
 
 @dataclass(frozen=True)
@@ -44,7 +42,7 @@ class PlaneSweepTuning:
     edge_weight: float = 20.0
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def box(image, radius, result):
     """Mean (H, W) over a square window, of its pixels inside the image: running sums
     along rows, then columns.
@@ -79,7 +77,7 @@ def box(image, radius, result):
         result[y] = totals / np.float32(n)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def warp(image, obstacles, rotation, shift, disparity, warped, met):
     """`image` (H, W) read, bilinearly, where the pixels of the first frame fall if all
     lie at `disparity`, into `warped`; the `obstacles` there, or `OUTSIDE`, into `met`.
@@ -105,7 +103,7 @@ def warp(image, obstacles, rotation, shift, disparity, warped, met):
             met[y, x] = obstacles[int(py + 0.5), int(px + 0.5)] if inside else OUTSIDE
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def correlation_cost(gray, mean, square, other, radius, noise_variance, scratch, result):
     """1 - normalized cross-correlation of two images over the window, per pixel, into
     `result`; in [0, 2].
@@ -124,7 +122,7 @@ def correlation_cost(gray, mean, square, other, radius, noise_variance, scratch,
             result[y, x] = 1.0 - covariance / np.sqrt(variance * other_variance)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def mean_of_lowest(values, n, share):
     """Mean of the lowest `share` of the first `n` values, which are sorted in place;
     `UNKNOWN_COST` if there are none.
@@ -144,7 +142,7 @@ def mean_of_lowest(values, n, share):
     return total / np.float32(count)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def matching_costs(
     grays,
     others,
@@ -201,7 +199,7 @@ def matching_costs(
     return costs
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def aggregate(costs, guide, step_penalty, jump_penalty, edge_weight):
     """Semi-global matching: the sum (H, W, D) over eight directions of the cheapest
     path to each candidate.

@@ -13,17 +13,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
 from hdr_nsff.geometry.round_trip import follow, round_trip
 
 MOVING = 1  # layers of pixels
 STATIC = -1
 UNKNOWN = 0
 EMPTY_WEIGHT = 1e-4  # a sample of less weight is skipped to save time
-
-jit = numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 
 
 @dataclass(frozen=True)
@@ -148,7 +146,7 @@ def window_weights(tuning: LocalMotionTuning) -> np.ndarray:
     return np.exp(-0.5 * squared_distance / tuning.window_sigma**2)
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def fit_local_motion(
     flow,
     trust,
@@ -214,7 +212,7 @@ def fit_local_motion(
                 result[y, x, 1] = v + system[0, 7]
 
 
-@jit
+@jit(nogil=True, fastmath=True)
 def solve_ridge(system, linear_ridge, quadratic_ridge):
     """Solve the normal equations (6, 8) with a ridge, in place.
 

@@ -26,6 +26,7 @@ from typing import IO, Any, Literal
 
 import numpy as np
 
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.progress import track
 from hdr_nsff.priors.poses.trimming import TrimmingTuning, trim
 
@@ -346,6 +347,7 @@ def main() -> None:
     import zlib  # the system's zlib must be in place before pycolmap brings its own
 
     die_with_parent()
+    prepare_process()
     import pycolmap
 
     assert zlib and np
