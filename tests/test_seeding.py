@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
+from hdr_nsff.fields.point_cloud import PointCloud as Points
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
     drift,
@@ -23,7 +24,6 @@ from hdr_nsff.fields.splat.initialize_gaussians import (
     views_of,
 )
 from hdr_nsff.fields.splat.splat import FAINTEST, Splat, SplatConfig
-from hdr_nsff.fields.surface import Points
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")

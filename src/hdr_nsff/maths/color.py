@@ -63,15 +63,18 @@ def srgb_decode(encoded: A) -> A:
 
 
 def mu_law(radiance: A, mu: float = 5000.0) -> A:
-    """`log(1 + mu E) / log(1 + mu)` (HDR-NSFF, eq. 17) of radiance E in units of the
-    sequence's peak: 0 to 0, 1 to 1.
+    """`log(1 + mu E) / log(1 + mu)` of radiance E (HDR-NSFF, eq. 17): 0 to 0, 1 to 1.
+
+    E is in units of the sequence's peak.
     """
     return array_module(radiance).log1p(mu * radiance.clip(min=0)) / math.log1p(mu)
 
 
 def pu21_encode(nits: A) -> A:
-    """PU21 (Mantiuk and Azimi 2021, banding + glare) of luminance in cd/m^2, clipped to
-    [0.005, 10000]: about 0 to 595, and 256 at 100 cd/m^2.
+    """PU21 (Mantiuk and Azimi 2021, banding + glare) of luminance in cd/m^2.
+
+    Luminance is clipped to [0.005, 10000]. Codes go from about 0 to 595, and are 256 at
+    100 cd/m^2.
     """
     p1, p2, p3, p4, p5, p6, p7 = PU21_BANDING_GLARE
     y = nits.clip(*PU21_RANGE) ** p4
@@ -80,11 +83,11 @@ def pu21_encode(nits: A) -> A:
 
 
 def auto_exposure(radiance: A, key: float = KEY) -> float:
-    """The factor that brings the log-average luminance of `radiance` (..., 3) to `key`
-    (Reinhard et al. 2002, eq. 1-2).
+    """The factor that brings the log-average luminance of `radiance` to `key`.
 
-    The average leaves out the darkest and the brightest 2 % of the pixels, so that a
-    lamp entering or leaving the view changes little.
+    Reinhard et al. 2002, eq. 1-2, of `radiance` (..., 3). The average leaves out the
+    darkest and the brightest 2 % of the pixels, so that a lamp entering or leaving the
+    view changes little.
     """
     rgb = radiance.reshape(-1, 3)
     y = np.sort(np.asarray(luminance(rgb), np.float64).ravel())
@@ -97,10 +100,10 @@ def auto_exposure(radiance: A, key: float = KEY) -> float:
 
 
 def display(radiance: A, exposure: float = 1.0, white: float = DISPLAY_WHITE) -> A:
-    """An sRGB picture (..., 3) in [0, 1] of linear HDR `radiance` (..., 3), by the
-    curve `L (1 + L / white^2) / (1 + L)` on luminance (Reinhard et al. 2002, eq. 4).
+    """An sRGB picture (..., 3) in [0, 1] of linear HDR `radiance` (..., 3).
 
-    `exposure` is a factor (see `auto_exposure`): one per shot, never per frame.
+    The curve is `L (1 + L / white^2) / (1 + L)` on luminance (Reinhard et al. 2002, eq.
+    4). `exposure` is a factor (see `auto_exposure`): one per shot, never per frame.
     Luminance `white / exposure` becomes display white. Hue is kept: a color too bright
     for the display is desaturated towards white rather than clipped per channel.
     """

@@ -37,11 +37,11 @@ def photometric(
 def saturation_weight(
     rgb: Tensor, low: float = 0.15, high: float = 0.9, floor: float = 0.25
 ) -> Tensor:
-    """Trust (N, 3) in recorded values: 1 in [low, high], falling quadratically to
-    `floor` at 0 and at 1.
+    """Trust (N, 3) in recorded values: less near 0 and 1, where they clip.
 
-    The paper does not mention it; its published code weights the dynamic terms by it,
-    with these defaults.
+    It is 1 in [low, high] and falls quadratically to `floor` at 0 and at 1. The paper
+    does not mention it; its published code weights the dynamic terms by it, with these
+    defaults.
     """
     under = ((low - rgb) / low).clamp_min(0)
     over = ((rgb - high) / (1 - high)).clamp_min(0)
@@ -50,27 +50,30 @@ def saturation_weight(
 
 
 def cycle(there: Tensor, back: Tensor, confidence: Tensor) -> Tensor:
-    """Cycle consistency of scene flow: `confidence * |f_ij(x) + f_ji(x + f_ij(x))|_1`,
-    over the sum of the confidences (Li et al. 2021).
+    """Cycle consistency of scene flow (Li et al. 2021).
 
-    `there` and `back` (N, 3) are the two flows, `confidence` (N,) is one minus the
-    disocclusion.
+    The sum of `confidence * |f_ij(x) + f_ji(x + f_ij(x))|_1` over the sum of the
+    confidences. `there` and `back` (N, 3) are the two flows, `confidence` (N,) is one
+    minus the disocclusion.
     """
     residual = (there + back).abs().sum(-1)
     return (confidence * residual).sum() / confidence.sum().clamp_min(MIN_TOTAL_WEIGHT)
 
 
 def kinetic(forward: Tensor, backward: Tensor) -> Tensor:
-    """Least kinetic energy: mean of `0.5 |f_(t->t+1) + f_(t->t-1)|^2`, which is 0 for
-    constant velocity (Li et al. 2021). Flows (N, 3) are in scene units.
+    """Least kinetic energy: mean of `0.5 |f_(t->t+1) + f_(t->t-1)|^2` (Li et al. 2021).
+
+    It is 0 for constant velocity. Flows (N, 3) are in scene units.
     """
     acceleration = forward + backward
     return 0.5 * acceleration.square().sum(-1).mean()
 
 
 def smoothness(a: Tensor, b: Tensor) -> Tensor:
-    """Mean absolute difference of scene flow (N, 3) between neighboring samples of a
-    ray (Li et al. 2021); 0 where there are none.
+    """Mean absolute difference of scene flow between neighbors on a ray.
+
+    `a` and `b` (N, 3) are flows of neighboring samples (Li et al. 2021); 0 where there
+    are none.
     """
     if not len(a):
         return a.sum()
@@ -87,41 +90,47 @@ def flow_magnitude(scene_flow: Tensor) -> Tensor:
 
 
 def blend_entropy(share: Tensor) -> Tensor:
-    """Mean of `-b log b` of blend shares b (N,) in [0, 1]: shares near 0 or 1 cost
-    nothing (Li et al. 2021; HDR-NSFF, section 3.1).
+    """Mean of `-b log b` of blend shares b (N,) in [0, 1] (Li et al. 2021).
+
+    Shares near 0 or 1 cost nothing: the "entropy loss" of HDR-NSFF, section 3.1.
     """
     return -(share * share.clamp_min(MIN_LOG_SHARE).log()).mean()
 
 
 def normalize_shift_scale(values: Tensor) -> Tensor:
-    """Values (N,) minus their median, over their mean absolute deviation from it:
-    invariant to scale and shift (MiDaS, Ranftl et al. 2020).
+    """Values (N,) minus their median, over their mean absolute deviation from it.
+
+    Invariant to scale and shift (MiDaS, Ranftl et al. 2020).
     """
     shifted = values - values.median()
     return shifted / shifted.abs().mean().clamp_min(1e-6)
 
 
 def depth_relative(depth: Tensor, prior_disparity: Tensor) -> Tensor:
-    """`L_depth` of eq. 14 for a prior known up to scale and shift: mean squared
-    difference of normalized disparities. Both inputs are (N,); `depth` is z-depth.
+    """`L_depth` of eq. 14 for a prior known up to scale and shift.
+
+    Mean squared difference of normalized disparities. Both inputs are (N,); `depth` is
+    z-depth.
     """
     difference = normalize_shift_scale(1 / depth) - normalize_shift_scale(prior_disparity)
     return difference.square().mean()
 
 
 def depth_scene(depth: Tensor, prior_disparity: Tensor, confidence: Tensor, near: float) -> Tensor:
-    """`L_depth` of eq. 14 for a prior in scene units: mean of the confidence times the
-    absolute difference of disparities, in units of 1 / near. All inputs are (N,).
+    """`L_depth` of eq. 14 for a prior in scene units.
+
+    Mean of the confidence times the absolute difference of disparities, in units of 1 /
+    near. All inputs are (N,).
     """
     error = (1 / depth - prior_disparity).abs()
     return (confidence * error).mean() * near
 
 
 def optical_flow(flow: Tensor, target: Tensor, valid: Tensor, limit: float | None = None) -> Tensor:
-    """`L_flow` of eq. 14: mean over `valid` (N,) bool of the sum of both axes' absolute
-    differences, in pixels; 0 where nothing is valid.
+    """`L_flow` of eq. 14: mean absolute difference in pixels, both axes added up.
 
-    `flow` and `target` are (N, 2). `limit` (pixels) caps the error of an outlier.
+    `flow` and `target` are (N, 2); the mean is over `valid` (N,) bool, 0 where nothing
+    is valid. `limit` (pixels) caps the error of an outlier.
     """
     # one tensor per axis: `sum` is slow over an axis of length two
     error_x, error_y = (flow - target).abs().unbind(-1)
@@ -132,8 +141,9 @@ def optical_flow(flow: Tensor, target: Tensor, valid: Tensor, limit: float | Non
 
 
 def motion_mask(motion: Tensor, moving: Tensor, trust: Tensor | None = None) -> Tensor:
-    """Mean binary cross-entropy between the rendered share of dynamic content (N,) and
-    the moving mask (N,) bool, weighted by `trust` (N,); in float32. Ours.
+    """Mean binary cross-entropy of the rendered motion share and the moving mask. Ours.
+
+    `motion` (N,) is in [0, 1], `moving` (N,) bool, `trust` (N,) weights pixels.
     """
     # a linear squeeze and no clamp: its gradient must not vanish at 0 and 1, or a mover
     # that is not rendered anywhere yet would never appear

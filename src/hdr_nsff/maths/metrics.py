@@ -47,8 +47,9 @@ FLIP_TARGET = 0.85
 
 
 def psnr(a: Tensor, b: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio in dB, `10 log10(peak^2 / mean square error)`, over
-    pixels of `mask` and channels; at most 100, for equal pictures.
+    """Peak signal-to-noise ratio in dB, over pixels of `mask` and channels.
+
+    `10 log10(peak^2 / mean square error)`; at most 100, for equal pictures.
     """
     assert a.shape == b.shape, (a.shape, b.shape)
     error = (a.double() - b.double()).square()
@@ -89,13 +90,12 @@ def ssim_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def align(radiance: Tensor, truth: Tensor, recordable: Tensor, per_channel: bool = False) -> Tensor:
-    """The scale () or per-channel scales (3,) by which to multiply predicted `radiance`
-    (..., 3): the median of truth / prediction over the whole sequence; 1 where there is
-    nothing to compare.
+    """The scale () by which to multiply predicted `radiance` (..., 3), or scales (3,).
 
-    Only pixels that are `recordable` (...) count: at least one exposure records them
-    unclipped. Brighter ones cannot be known, and a least-squares scale would follow
-    them alone.
+    It is the median of truth / prediction over the whole sequence; 1 where there is
+    nothing to compare. Only pixels that are `recordable` (...) count: at least one
+    exposure records them unclipped. Brighter ones cannot be known, and a least-squares
+    scale would follow them alone.
     """
     use = recordable & (radiance > 0).all(-1) & (truth > 0).all(-1)
     if not use.any():
@@ -108,11 +108,10 @@ def align(radiance: Tensor, truth: Tensor, recordable: Tensor, per_channel: bool
 def mu_law_psnr(
     radiance: Tensor, truth: Tensor, peak: float, mu: float = 5000.0, mask: Tensor | None = None
 ) -> float:
-    """PSNR in dB, at most 100, of mu-law compressed radiance (HDR-NSFF, eq. 17;
-    Kalantari and Ramamoorthi 2017).
+    """PSNR in dB, at most 100, of mu-law compressed radiance (HDR-NSFF, eq. 17).
 
     `radiance` is aligned before (see `align`). It and `truth` are compared in units of
-    the sequence's `peak`, clipped to it.
+    the sequence's `peak`, clipped to it (Kalantari and Ramamoorthi 2017).
     """
     compressed = mu_law((radiance / peak).clip(0, 1), mu)
     compressed_truth = mu_law((truth / peak).clip(0, 1), mu)
@@ -120,11 +119,11 @@ def mu_law_psnr(
 
 
 def pu21_white(truths: list[Tensor]) -> float:
-    """The luminance that is shown at `PU21_NITS`, one for a whole sequence of true
-    radiance (H, W, 3).
+    """The luminance that is shown at `PU21_NITS`, one for a whole sequence.
 
-    The 99.5th percentile keeps a lamp of a few pixels from deciding how dark the rest
-    is. PU21 distinguishes luminances up to ten times that.
+    `truths` are pictures (H, W, 3) of true radiance. The 99.5th percentile keeps a lamp
+    of a few pixels from deciding how dark the rest is; PU21 distinguishes luminances up
+    to ten times that.
     """
     y = torch.cat([luminance(t).flatten() for t in truths]).double()
     quantile = float(np.quantile(y.numpy(), PU21_WHITE))
@@ -132,11 +131,11 @@ def pu21_white(truths: list[Tensor]) -> float:
 
 
 def pu21_psnr(radiance: Tensor, truth: Tensor, white: float, mask: Tensor | None = None) -> float:
-    """PSNR in dB, at most 100, of PU21-encoded rgb (Mantiuk and Azimi 2021, banding +
-    glare), over pixels of `mask` and channels.
+    """PSNR in dB, at most 100, of PU21-encoded rgb, over pixels of `mask` and channels.
 
-    Aligned `radiance` and `truth` are taken as the light of a display on which
-    luminance `white` has 1000 cd/m^2: an assumption to report beside the number.
+    Mantiuk and Azimi 2021, banding + glare. Aligned `radiance` and `truth` are taken as
+    the light of a display on which luminance `white` has 1000 cd/m^2: an assumption to
+    report beside the number.
     """
     scale = PU21_NITS / white
     encoded = pu21_encode(radiance.double() * scale)
@@ -145,11 +144,11 @@ def pu21_psnr(radiance: Tensor, truth: Tensor, white: float, mask: Tensor | None
 
 
 def flip_exposures(truths: list[Tensor]) -> tuple[float, float]:
-    """The exposure range (start, stop; log2) for HDR-FLIP of a whole sequence of true
-    radiance (H, W, 3) (Andersson et al. 2021, section 3).
+    """The exposure range (start, stop; log2) of a whole sequence for HDR-FLIP.
 
-    At `start` the brightest, at `stop` the median luminance comes out at 0.85 of the
-    ACES curve.
+    `truths` are pictures (H, W, 3) of true radiance. At `start` the brightest, at
+    `stop` the median luminance comes out at 0.85 of the ACES curve (Andersson et al.
+    2021, section 3).
     """
     y = torch.cat([luminance(t).flatten() for t in truths]).double()
     # ACES(x) = 0.85 is the quadratic a x^2 + b x + c = 0
@@ -163,11 +162,11 @@ def flip_exposures(truths: list[Tensor]) -> tuple[float, float]:
 
 
 def hdr_flip_map(radiance: Tensor, truth: Tensor, exposures: tuple[float, float]) -> Tensor | None:
-    """HDR-FLIP (Andersson et al. 2021): the largest visible difference (H, W) in [0, 1]
-    of aligned linear radiance over a range of exposures.
+    """HDR-FLIP: the largest visible difference (H, W) in [0, 1] over exposures.
 
+    Of aligned linear radiance (Andersson et al. 2021), at 67 pixels per degree.
     `exposures` (start, stop; log2) are those of the whole sequence, see
-    `flip_exposures`; 67 pixels per degree. None where flip-evaluator is not installed.
+    `flip_exposures`. None where flip-evaluator is not installed.
     """
     try:
         import flip_evaluator
@@ -191,14 +190,13 @@ def hdr_flip_map(radiance: Tensor, truth: Tensor, exposures: tuple[float, float]
 
 
 def hdr_tae(radiance: Tensor, other: Tensor, flow: Tensor, mask: Tensor) -> tuple[float, int]:
-    """HDR-TAE in [0, 1], 0 for a steady picture, and the number of pixels it is taken
-    over (Mono4DGS-HDR, arXiv 2510.18489).
+    """HDR-TAE in [0, 1], 0 for a steady picture, and the number of pixels it is over.
 
     The mean of `|H1 - warp(H2)| / (H1 + warp(H2))` over `mask` (H, W) and channels of
-    two pictures in linear radiance (H, W, 3). `flow` (H, W, 2), in pixels, leads from
-    `radiance` to `other`, which is read bilinearly; pixels that leave the picture do
-    not count. Two zeros do not differ. A scale of the radiance, also per channel,
-    cancels. NaN where no pixel is left.
+    two pictures in linear radiance (H, W, 3) (Mono4DGS-HDR, arXiv 2510.18489). `flow`
+    (H, W, 2), in pixels, leads from `radiance` to `other`, which is read bilinearly;
+    pixels that leave the picture do not count. Two zeros do not differ. A scale of the
+    radiance, also per channel, cancels. NaN where no pixel is left.
     """
     height, width = mask.shape
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -217,11 +215,11 @@ def hdr_tae(radiance: Tensor, other: Tensor, flow: Tensor, mask: Tensor) -> tupl
 
 
 def depth_errors(depth: Tensor, truth: Tensor, known: Tensor) -> tuple[float, float]:
-    """AbsRel, `mean |d - d*| / d*`, and RMSE, `sqrt(mean (d - d*)^2)`, over pixels that
-    are `known` (H, W) (Eigen et al. 2014); 0 for equal maps.
+    """AbsRel and RMSE of `depth` over pixels that are `known` (Eigen et al. 2014).
 
-    `depth` (H, W) is aligned before by one scale per sequence, see `median_ratio`. RMSE
-    is in units of `truth`.
+    `mean |d - d*| / d*` and `sqrt(mean (d - d*)^2)`, the latter in units of `truth`; 0
+    for equal maps. All are (H, W). `depth` is aligned before by one scale per sequence,
+    see `median_ratio`.
     """
     error = (depth.double() - truth.double())[known]
     abs_rel = (error.abs() / truth.double()[known]).mean()
@@ -230,8 +228,9 @@ def depth_errors(depth: Tensor, truth: Tensor, known: Tensor) -> tuple[float, fl
 
 
 def median_ratio(values: Tensor, truth: Tensor) -> float:
-    """The median of `truth / values` over entries where both are above 0: one scale for
-    a whole sequence; 1 where there are none.
+    """The median of `truth / values` over entries where both are above 0.
+
+    One scale for a whole sequence; 1 where there are none.
     """
     use = (values > 0) & (truth > 0)
     if not use.any():
@@ -240,22 +239,20 @@ def median_ratio(values: Tensor, truth: Tensor) -> float:
 
 
 def end_point_error(motion: Tensor, truth: Tensor, known: Tensor) -> float:
-    """Mean Euclidean distance of two motions (H, W, D) over pixels that are `known` (H,
-    W), in the motions' unit.
+    """Mean Euclidean distance of two motions (H, W, D) over pixels that are `known`.
 
-    Pixels for optical flow (D = 2; Baker et al. 2011), world units for scene flow (D =
-    3; FlowNet3D, Liu et al. 2019).
+    In pixels for optical flow (D = 2; Baker et al. 2011), in world units for scene flow
+    (D = 3; FlowNet3D, Liu et al. 2019).
     """
     return float((motion.double() - truth.double()).norm(dim=-1)[known].mean())
 
 
 class Lpips(nn.Module):
-    """LPIPS (Zhang et al. 2018), AlexNet, version 0.1: a distance of deep features, 0
-    for equal and about 0.7 for unrelated pictures.
+    """LPIPS (Zhang et al. 2018), AlexNet, version 0.1: a distance of deep features.
 
-    `weights`: a `.pth` file with both the AlexNet features (as torchvision names them)
-    and the linear layers (as the authors' package names them), a folder of such files,
-    or a list of them.
+    It is 0 for equal and about 0.7 for unrelated pictures. `weights`: a `.pth` file
+    with both the AlexNet features (as torchvision names them) and the linear layers (as
+    the authors' package names them), a folder of such files, or a list of them.
     """
 
     CHANNELS = (64, 192, 384, 256, 256)  # of AlexNet's convolutions, and what follows
@@ -277,8 +274,9 @@ class Lpips(nn.Module):
         self.requires_grad_(False).eval()
 
     def forward(self, a: Tensor, b: Tensor) -> float:
-        """The distance of two rgb pictures (H, W, 3) in [0, 1], both sides at least 64
-        pixels.
+        """The distance of two rgb pictures (H, W, 3) in [0, 1].
+
+        Both sides are at least 64 pixels.
         """
         return sum(float(distance.mean()) for distance in self.distances(a, b))
 
@@ -318,8 +316,9 @@ class Lpips(nn.Module):
 
 
 def lpips_state(weights: Path | str | Sequence[Path]) -> dict[str, Tensor]:
-    """`Lpips` parameters from a file, a folder of files, or several files; InputError
-    where they do not hold all of them.
+    """`Lpips` parameters from a file, a folder of files, or several files.
+
+    InputError where they do not hold all of them.
     """
     files = list_weights(weights)
     found: dict[str, Tensor] = {}
@@ -350,8 +349,9 @@ def list_weights(weights: Path | str | Sequence[Path]) -> list[Path]:
 
 
 def lpips_name(key: str) -> str | None:
-    """Our name of a parameter that torchvision's AlexNet or the authors' package calls
-    `key`; None for one that LPIPS does not use.
+    """Our name of a parameter that AlexNet or the authors' package calls `key`.
+
+    None for one that LPIPS does not use.
     """
     if match := re.search(r"(?:features|slice\d)\.(\d+)\.(weight|bias)$", key):
         position = int(match[1])
@@ -364,8 +364,9 @@ def lpips_name(key: str) -> str | None:
 
 
 def read_weights(file: Path) -> dict[str, Tensor]:
-    """The tensors of a `.pth` state dict, nothing else unpickled; InputError where the
-    file is none.
+    """The tensors of a `.pth` state dict, nothing else unpickled.
+
+    InputError where the file is none.
     """
     try:
         state = torch.load(file, map_location="cpu", weights_only=True)

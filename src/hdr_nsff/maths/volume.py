@@ -28,8 +28,9 @@ def stratified_disparity(
 
 
 def step_lengths(points: Tensor) -> Tensor:
-    """Distances (N, S) from each sample of `points` (N, S, 3) to the next; the last one
-    repeats the one before.
+    """Distances (N, S) from each sample of `points` (N, S, 3) to the next.
+
+    The last one repeats the one before.
     """
     steps = (points[:, 1:] - points[:, :-1]).norm(dim=-1)
     return torch.cat([steps, steps[:, -1:]], -1)
@@ -41,8 +42,9 @@ def alpha_from_density(density: Tensor, deltas: Tensor) -> Tensor:
 
 
 def transmittance(alpha: Tensor) -> Tensor:
-    """Share of light (N, S) that reaches each sample: the exclusive cumulative product
-    of `1 - alpha`.
+    """Share of light (N, S) that reaches each sample, of `alpha` (N, S).
+
+    It is the exclusive cumulative product of `1 - alpha`.
     """
     through = torch.cumprod(1 - alpha, -1)
     return torch.cat([torch.ones_like(through[:, :1]), through[:, :-1]], -1)
@@ -57,8 +59,10 @@ class Weights:
 
     @property
     def opacity(self) -> Tensor:
-        """Of each ray (N,) in [0, 1]. The clamp is for eq. 6-7, in which two contents
-        in one place may add up to more than 1.
+        """Of each ray (N,), in [0, 1].
+
+        The clamp is for eq. 6-7, in which two contents in one place may add up to more
+        than 1.
         """
         return (self.static + self.dynamic).sum(-1).clamp(max=1)
 
@@ -78,11 +82,10 @@ def blend(
 
 
 def add(static_density: Tensor, dynamic_density: Tensor, deltas: Tensor) -> Weights:
-    """Two media in one place: densities add up, and each content has its density's
-    share of the sample's weight.
+    """Two media in one place: densities add up, and share the sample's weight.
 
-    Unlike eq. 7, neither content can blank the other: +0.5 dB in early experiments on
-    rendered scenes.
+    Each content has its density's share. Unlike eq. 7, neither content can blank the
+    other: +0.5 dB in early experiments on rendered scenes.
     """
     total = static_density + dynamic_density
     weights = single(total, deltas)
@@ -97,8 +100,9 @@ def single(density: Tensor, deltas: Tensor) -> Tensor:
 
 
 def expected_depth(weights: Tensor, depths: Tensor, far: float) -> Tensor:
-    """z-depth (N,) from the mean disparity over a ray; light that no sample stops comes
-    from `far`.
+    """z-depth (N,) from the mean disparity over a ray.
+
+    Light that no sample stops comes from `far`.
     """
     disparity = (weights / depths).sum(-1)
     passed = (1 - weights.sum(-1)).clamp_min(0)

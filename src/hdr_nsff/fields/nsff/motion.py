@@ -204,5 +204,7 @@ class Motion:
         result = {name: torch.stack(values).mean() for name, values in terms.items() if values}
         result["disocclusion"] = self.disocclusion.mean()
         if self.field.config.compositing == "blend":
-            result["blend_entropy"] = losses.blend_entropy(self.dynamic.blend.reshape(-1)[self.index])
+            result["blend_entropy"] = losses.blend_entropy(
+                self.dynamic.blend.reshape(-1)[self.index]
+            )
         return result

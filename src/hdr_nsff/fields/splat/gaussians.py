@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.fields.base import HIGHEST
-from hdr_nsff.fields.knots import linear
+from hdr_nsff.fields.knots import interpolate_linear
 
 BRIGHTEST = 16.0  # log radiance beyond this is held: exp stays finite
 
@@ -70,5 +70,5 @@ class Gaussians(nn.Module):
 
     def radiance(self, share: float) -> Tensor:
         """Radiance (G, 3) at a share in [0, 1] of the clip's time."""
-        log = self.log_radiance + linear(self.offsets, share * (len(self.offsets) - 1))
+        log = self.log_radiance + interpolate_linear(self.offsets, share * (len(self.offsets) - 1))
         return to_radiance(log, self.bounded)

@@ -16,19 +16,17 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
 from hdr_nsff.fields.knots import knot_of
+from hdr_nsff.fields.point_cloud import CELLS_PER_KIND as CELLS
+from hdr_nsff.fields.point_cloud import PointCloud as Points
+from hdr_nsff.fields.point_cloud import ToRadiance
+from hdr_nsff.fields.point_cloud import assign_cells as cells_for
+from hdr_nsff.fields.point_cloud import concatenate as joined
+from hdr_nsff.fields.point_cloud import merge_by_cell as thinned
+from hdr_nsff.fields.point_cloud import thin_points as thinned_to
+from hdr_nsff.fields.point_cloud import unproject_frame as lift
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.splat import Splat
-from hdr_nsff.fields.surface import (
-    CELLS,
-    Points,
-    ToRadiance,
-    cells_for,
-    joined,
-    lift,
-    thinned,
-    thinned_to,
-)
 from hdr_nsff.priors.movers.bundle import Cameras, Shape
 from hdr_nsff.priors.movers.motion_segmentation import things
 from hdr_nsff.priors.movers.mover_shape import apply

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.base import FrameError, GaussianCloud, Render, Warp
-from hdr_nsff.fields.knots import knot_of, linear
+from hdr_nsff.fields.knots import interpolate_linear, knot_of
 from hdr_nsff.fields.splat.gaussians import Gaussians, brightened, to_radiance
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import relocate
@@ -153,7 +153,7 @@ class Splat(nn.Module):
 
     def opacities(self, share: float) -> Tensor:
         """(G,) in [0, 1] at a share of the clip."""
-        present = linear(self.opacity_offsets, share * (len(self.opacity_offsets) - 1))
+        present = interpolate_linear(self.opacity_offsets, share * (len(self.opacity_offsets) - 1))
         return torch.cat([self.static.logits, self.moving.logits + present]).sigmoid()
 
     def positions(self, knot: float) -> Tensor:
