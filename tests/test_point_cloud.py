@@ -38,7 +38,7 @@ def frame(
 
 
 def double(rgb: Tensor, frame: int) -> Tensor:
-    """A recording that halves radiance in frame 0, and takes a third of it in frame 1."""
+    """The inverse of a recording that halves radiance in frame 0, and thirds it in 1."""
     return rgb * (2 + frame)
 
 

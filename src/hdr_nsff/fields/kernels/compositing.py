@@ -252,10 +252,10 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
                 break
         for y in range(min(TILE_Y, height - y0)):
             for x in range(min(TILE_X, width - x0)):
-                p = np.uint64(y * TILE_X + x)
-                alpha[y0 + y, x0 + x] = ONE - z[LEFT + p]
+                here = np.uint64(y * TILE_X + x)
+                alpha[y0 + y, x0 + x] = ONE - z[LEFT + here]
                 for d in range(len(maps)):
-                    maps[d, y0 + y, x0 + x] = z[channel_plane(d) + p]
+                    maps[d, y0 + y, x0 + x] = z[channel_plane(d) + here]
 
 
 @numba.njit(inline="always", fastmath=FAST)
