@@ -23,7 +23,8 @@ from hdr_nsff.fields.splat.initialize_gaussians import (
     surely_moving,
     views_of,
 )
-from hdr_nsff.fields.splat.splat import FAINTEST, Splat, SplatConfig
+from hdr_nsff.fields.splat.splat import MIN_OPACITY as FAINTEST
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")
