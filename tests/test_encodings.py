@@ -57,7 +57,8 @@ def test_a_linear_ramp_is_reproduced_exactly() -> None:
 
 def test_time_blends_two_slices_linearly_and_a_knot_reads_one() -> None:
     g = AdditiveGrid([(4, 4, 4, 3)], num_knots=3)
-    g.table.data[:64], g.table.data[64:128], g.table.data[128:] = 1.0, 3.0, 7.0
+    for s, value in enumerate((1.0, 3.0, 7.0)):
+        g.table.data[64 * s : 64 * (s + 1)] = value
     point = torch.full((1, 3), 0.5)
     assert float(g(point, 1.0)[0, 0].detach()) == 3.0
     np.testing.assert_allclose(float(g(point, 1.25)[0, 0].detach()), 0.75 * 3 + 0.25 * 7)

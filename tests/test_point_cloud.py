@@ -38,7 +38,7 @@ def frame(
 
 
 def double(rgb: Tensor, frame: int) -> Tensor:
-    """The inverse of a recording that halves radiance in frame 0, and thirds it in 1."""
+    """The inverse of a recording: half the radiance in frame 0, a third in frame 1."""
     return rgb * (2 + frame)
 
 

@@ -3,7 +3,7 @@ tone map.
 
 Every function takes and gives back numpy arrays or torch tensors of any shape; where a
 luminance is needed, the last axis is linear Rec. 709 rgb. `radiance` is linear and
-non-negative; encoded values are in [0, 1] unless the function says otherwise. The
+non-negative; encoded values are in [0, 1] unless the docstring gives another range. The
 recorded rgb of a camera is made by the learned `ToneMapper`, not here.
 """
 

@@ -1,7 +1,7 @@
 """How close a picture, a depth map or a motion comes to the truth.
 
-Pictures are tensors (H, W, 3): rgb in [0, 1], or linear radiance where the docstring
-says so. Masks (H, W) bool select pixels; None selects all. Every metric returns plain
+Pictures are tensors (H, W, 3): rgb in [0, 1], or linear radiance where they are called
+so. Masks (H, W) bool select pixels; None selects all. Every metric returns plain
 floats. docs/metrics.md lists them with their keys.
 
 LDR recordings leave the scale of radiance free. `align` therefore fits one scale (or

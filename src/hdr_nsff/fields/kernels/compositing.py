@@ -48,7 +48,9 @@ TWO_ROWS = np.uint64(2 * TILE_X)  # as many pixels as a vector has lanes
 CACHE_LINE = 16  # float32
 CHECK_EVERY = 16  # Gaussians after which a tile is tested for being opaque
 
-ONE, HALF, EIGHTH = np.float32(1), np.float32(0.5), np.float32(0.125)
+ONE = np.float32(1)
+HALF = np.float32(0.5)
+EIGHTH = np.float32(0.125)
 ALPHA_MAX = np.float32(0.999)  # alpha above counts as this
 MIN_TRANSMITTANCE = np.float32(1e-4)  # a tile with less is finished (Kerbl et al. 2023)
 # exp(-s) is cut to 0 here: exp(-6) < 1/255, so alpha is below the cut for opacities <=
@@ -230,7 +232,8 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
         x0, y0, z = tile_planes(PLANES + channels, tile, tiles_x)
         for i in range(starts[tile], starts[tile + 1]):
             g = members[i]
-            cx, cy, o = centers[g, 0], centers[g, 1], opacities[g]
+            o = opacities[g]
+            cx, cy = centers[g, 0], centers[g, 1]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = pixel_span(rows, g, y0)
             f = load_block(features, g, 0)
@@ -326,7 +329,8 @@ def backward(
             if done:
                 grad[:] = ZERO
                 continue
-            cx, cy, o = centers[g, 0], centers[g, 1], opacities[g]
+            o = opacities[g]
+            cx, cy = centers[g, 0], centers[g, 1]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
             first, last = pixel_span(rows, g, y0)
             if channels > BLOCK:
@@ -336,7 +340,8 @@ def backward(
                 plane, f = channel_plane(d), load_block(features, g, d)
                 for p in range(first, last):
                     z[VALUE + p] += dot_block(z, plane + p, f)
-            f, t, m = load_block(features, g, 0), NO_GRADIENT, NO_GRADIENT[:MOMENTS]
+            f = load_block(features, g, 0)
+            t, m = NO_GRADIENT, NO_GRADIENT[:MOMENTS]
             for p in range(first, last):
                 value = z[GRAD_ALPHA + p] + z[VALUE + p] + dot_block(z, SUMS + p, f)
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
@@ -350,7 +355,9 @@ def backward(
                 behind = z[BEHIND + p] - v * value
                 slope = left * value - behind / (ONE - q)  # dL / d alpha
                 u = -slope * (q if full <= ALPHA_MAX else ZERO)
-                z[WEIGHT + p], z[BEHIND + p], z[LEFT + p] = v, behind, left - v
+                z[WEIGHT + p] = v
+                z[BEHIND + p] = behind
+                z[LEFT + p] = left - v
                 m, t = add_moments(m, u, dx, dy), gather_block(t, z, SUMS + p, v)
             grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = m
             store_block(grad, 0, t)

@@ -141,7 +141,7 @@ class GridFunction(torch.autograd.Function):
     The table's gradient is added to `table.grad` in place instead of being returned: a
     step reads the same large table several times, and a fresh gradient each time would
     cost more than the interpolation. Hence `backward()` only, not
-    `torch.autograd.grad`. Coordinates get a gradient where they ask for one.
+    `torch.autograd.grad`. Coordinates get a gradient where they require one.
     """
 
     @staticmethod

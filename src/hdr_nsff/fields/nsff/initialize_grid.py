@@ -43,7 +43,7 @@ class SurfaceSamples:
     trust: Tensor  # (P,) > 0
     moving: Tensor  # (P,) bool
     crossed: Tensor  # (P, FREE_SAMPLES, 3) cube points in front of the surface
-    lengths: Tensor  # (P,) cube length of ray that each of those stands for
+    lengths: Tensor  # (P,) cube length of ray that each of those represents
     knot: float  # of the frame's time
 
 

@@ -38,7 +38,8 @@ class SceneFlowPass:
         base: BranchPass,
     ) -> None:
         assert base.raw_motion is not None
-        self.field, self.to_flow, self.batch, self.base = field, to_flow, batch, base
+        self.field, self.to_flow = field, to_flow
+        self.batch, self.base = batch, base
         self.flow = to_flow(base.raw_motion)  # (M, 2, 3) cube
         self.disocclusion = base.raw_motion[:, 3::4].sigmoid()  # (M, 2)
         last_knot = len(field.times) - 1

@@ -39,7 +39,7 @@ from hdr_nsff.maths import volume
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Frame
 
-MIN_RADIANCE = 1e-5  # that a raw number is asked to give: keeps its logarithm finite
+MIN_RADIANCE = 1e-5  # that is turned into a raw number: keeps its logarithm finite
 MAX_LOG_DENSITY = 10.0  # per cube side: keeps the exponential finite
 # raw density at the start: a thin static fog, almost no dynamic one, so that static
 # content explains what it can (hand-chosen on rendered scenes)
@@ -151,7 +151,7 @@ class TwoBranches(nn.Module):
         return radiance.clamp(1 - HIGHEST, HIGHEST).logit()
 
     def to_density(self, raw: Tensor, bias: float) -> Tensor:
-        """Density per cube side, >= 0; noisy while training where the settings ask."""
+        """Density per cube side, >= 0; with noise while training, by the settings."""
         if self.training and self.config.density_noise:
             noise = torch.randn(raw.shape, generator=self.generator).to(raw)
             raw = raw + self.config.density_noise * noise

@@ -170,8 +170,9 @@ def dense(
     """
     shape = torch.cat([means, quaternions, scales, opacities[:, None]], 1)
     finite = shape.isfinite().all(1)
-    means, quaternions, scales = means[finite], quaternions[finite], scales[finite]
-    opacities, features = opacities[finite], features[finite]
+    means, features = means[finite], features[finite]
+    quaternions, scales = quaternions[finite], scales[finite]
+    opacities = opacities[finite]
     centers, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > projection.NEAREST]

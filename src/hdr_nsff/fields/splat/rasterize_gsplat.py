@@ -17,7 +17,7 @@ from hdr_nsff.core.progress import say
 
 @cache
 def available() -> bool:
-    """Whether gsplat is installed; says so once where it is not."""
+    """Whether gsplat is installed; reports once where it is not."""
     try:
         import gsplat  # noqa: F401
     except ImportError:

@@ -80,7 +80,7 @@ def copy_gaussians(
 def separate_halves(gaussians: Gaussians, one: Tensor, other: Tensor) -> None:
     """Turn equal pairs `one` (N,) and `other` (N,) into halves of the whole.
 
-    They lie beside each other along its longest axis.
+    They lie side by side along its longest axis.
     """
     axis = gaussians.log_scales[one].argmax(1)
     length = gaussians.log_scales[one, axis].exp()  # scene units

@@ -38,7 +38,7 @@ MIN_OPACITY = 0.003  # below, a Gaussian draws nothing: less than ALPHA_MIN = 1/
 MIN_ALPHA = 1e-3  # of a pixel: below, it has no depth of its own
 MIN_DEPTH_SHARE = 1e-3  # of `near`: the least z-depth that a pixel gets
 MAX_FLOW = 2.0  # picture widths: keeps the flow of Gaussians near the camera finite
-COLOR_OFFSET_SHARE = 0.01  # weight of the color offsets themselves beside their changes
+COLOR_OFFSET_SHARE = 0.01  # weight of color offsets relative to their changes in time
 ADAM_EPS = 1e-15  # as 3D Gaussian splatting has it (Kerbl et al. 2023)
 
 
