@@ -59,9 +59,7 @@ def relocate(
 def copy_gaussians(
     gaussians: Gaussians, companions: Sequence[Tensor], source: Tensor, target: Tensor
 ) -> None:
-    """Make the Gaussians `target` (N,) like the ones `source` (N,), companions
-    included.
-    """
+    """Make the Gaussians `target` (N,) like `source` (N,), companions included."""
     for parameter in (
         gaussians.means,
         gaussians.quaternions,

@@ -236,10 +236,10 @@ class Splat(nn.Module):
         return render if pixels is None else select_pixels(render, camera, pixels)
 
     def displacement(self, means: Tensor, knot: float, offset: int) -> Tensor:
-        """From `means` (G, 3) at a knot to those one training interval later or
-        earlier.
+        """From `means` (G, 3) at a knot to the means one training interval away.
 
-        Beyond the clip's ends, the displacement of the other direction is continued.
+        `offset` is +1 (later) or -1 (earlier). Beyond the clip's ends, the displacement
+        of the other direction is continued.
         """
         if self.has_knot(knot + offset):
             return self.positions(knot + offset) - means
@@ -294,8 +294,7 @@ class Splat(nn.Module):
         return (neighbor.project(moved)[0] - camera.project(means)[0]).clamp(-limit, limit)
 
     def regularizers(self, cloud: GaussianCloud, knot: float) -> dict[str, Tensor]:
-        """The field's own terms of the `cloud` at `knot`, by the names of
-        `LossWeights`.
+        """The field's own terms of the `cloud` at `knot`, by their `LossWeights` names.
 
         Mean opacity and scale keep Gaussians few and small (3DGS-MCMC, Kheradmand et
         al. 2024); the others keep poses smooth and changes in time small.
@@ -392,8 +391,7 @@ class Splat(nn.Module):
 
     @torch.no_grad()
     def error_scores(self, frame_error: FrameError) -> Tensor:
-        """Every Gaussian's weights in a frame: times the pixels' error, and alone (G,
-        2).
+        """Every Gaussian's weights in a frame, times the error and alone: (G, 2).
 
         Both are summed over the frame's pixels, as gradients of two drawn features.
         """
