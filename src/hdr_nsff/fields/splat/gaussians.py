@@ -36,10 +36,9 @@ def from_log_radiance(log: Tensor, bounded: bool) -> Tensor:
 
 
 def scale_radiance(radiance: Tensor, log_factor: Tensor, bounded: bool) -> Tensor:
-    """`to_radiance` of stored numbers plus `log_factor`, where they alone give
-    `radiance`.
+    """`to_radiance` of stored numbers plus `log_factor`, given their `radiance`.
 
-    For a bounded field that is odds times the factor: `E f / (1 - E + E f)`.
+    For a bounded field that is odds times the factor f: `E f / (1 - E + E f)`.
     """
     factor = log_factor.exp()
     if not bounded:

@@ -219,8 +219,7 @@ class Splat(nn.Module):
     def render(
         self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
     ) -> Render:
-        """Every pixel of `camera` (row by row) or those of `pixels` (S, 2), no
-        gradients.
+        """Every pixel of `camera` (row by row) or of `pixels` (S, 2), no gradients.
 
         `time` is in frames. Scene flow is the displacement to one training interval
         later and earlier; at the clip's ends it continues in a straight line.
