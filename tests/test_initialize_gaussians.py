@@ -12,6 +12,7 @@ from estimates import with_movers
 from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
+from hdr_nsff.fields.point_cloud import PointCloud as Points
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
     neighbor_distance,
@@ -21,8 +22,8 @@ from hdr_nsff.fields.splat.initialize_gaussians import (
     spread_centers,
     surely_moving,
 )
-from hdr_nsff.fields.splat.splat import FAINTEST, Splat, SplatConfig
-from hdr_nsff.fields.surface import Points
+from hdr_nsff.fields.splat.splat import MIN_OPACITY as FAINTEST
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")

@@ -32,7 +32,7 @@ def holder(output: Path, seconds: float = 60.0) -> subprocess.Popen[str]:
 
 def test_a_second_process_is_refused_and_learns_who_works_there(tmp_path: Path) -> None:
     first = holder(tmp_path / "out")
-    with pytest.raises(InputError, match="another hdr-nsff works in .*out") as refusal:
+    with pytest.raises(InputError, match=r"another hdr-nsff works in .*out") as refusal:
         lock_output(tmp_path / "out").__enter__()
     assert f"process {first.pid} on " in str(refusal.value)
     first.kill()

@@ -13,13 +13,13 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
 from hdr_nsff.fields.baselines.nerf_wt import NerfWT, NerfWTConfig
-from hdr_nsff.fields.nsff.initialize_grid import paint
+from hdr_nsff.fields.nsff.initialize_grid import initialize_grid
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
+from hdr_nsff.fields.point_cloud import ToRadiance
 from hdr_nsff.fields.space import build_space
 from hdr_nsff.fields.splat import rasterize_gsplat
 from hdr_nsff.fields.splat.initialize_gaussians import seed
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
-from hdr_nsff.fields.surface import ToRadiance
 from hdr_nsff.scene.scene import Scene
 
 FieldConfig = NSFFConfig | NerfWTConfig | HexPlaneConfig | SplatConfig
@@ -80,8 +80,8 @@ def start_field(
     match field:
         case NSFF() | NerfWT():
             field.bias.fill_(typical)
-            painted = from_priors and paint(field, scene.train, to_radiance)
-            return "field: painted from the depth prior" if painted else None
+            initialized = from_priors and initialize_grid(field, scene.train, to_radiance)
+            return "field: initialized from the depth prior" if initialized else None
         case HexPlane():
             field.bias.fill_(typical)
             return None

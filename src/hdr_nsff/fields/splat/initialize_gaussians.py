@@ -18,19 +18,19 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
+from hdr_nsff.fields.point_cloud import (
+    CELLS_PER_KIND,
+    PointCloud,
+    ToRadiance,
+    assign_cells,
+    concatenate,
+    merge_by_cell,
+    thin_points,
+    unproject_frame,
+)
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.splat import Splat
-from hdr_nsff.fields.surface import (
-    CELLS,
-    Points,
-    ToRadiance,
-    cells_for,
-    joined,
-    lift,
-    thinned,
-    thinned_to,
-)
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene
 
@@ -61,8 +61,11 @@ def seed(
                 "static Gaussians start at random places and moving ones not at all, "
                 "without a depth prior in scene units"
             )
-        static = joined(
-            [lift(f, i, still(f), scene.near, scene.far, to_radiance) for i, f in enumerate(frames)]
+        static = concatenate(
+            [
+                unproject_frame(f, i, still(f), scene.near, scene.far, to_radiance)
+                for i, f in enumerate(frames)
+            ]
         )
         count = place(field.static, thin(static, scene, int(FILL * len(field.static))))
         num_movers, moving = place_movers(field, scene, to_radiance)
@@ -80,17 +83,17 @@ def still(f: Frame) -> Tensor:
     return ~near.reshape(-1)
 
 
-def thin(points: Points, scene: Scene, limit: int) -> Points:
+def thin(points: PointCloud, scene: Scene, limit: int) -> PointCloud:
     """At most `limit` points, one per cell: pixel-shaped in a frustum, cubes elsewhere."""
     space = build_space([f.camera for f in scene.train], scene.near, scene.far)
     coords = space.encode(points.positions)
     if isinstance(space, FrustumSpace):
         extent = space.high - space.low
         coords = coords * torch.stack([extent[0], extent[1], extent[0] / DEPTH_CELLS]) / extent[0]
-    return thinned_to(points, coords, limit)
+    return thin_points(points, coords, limit)
 
 
-def place(gaussians: Gaussians, points: Points) -> int:
+def place(gaussians: Gaussians, points: PointCloud) -> int:
     """Put the first Gaussians at the points, as wide as their neighbors are away; the
     others stay invisible. How many.
     """
@@ -131,8 +134,10 @@ def scatter(field: Splat, scene: Scene, typical: float) -> None:
         rays = f.camera.rays(pixels)
         positions = rays.origins + rays.directions / disparity[:, None]
         footprint = 2 / (disparity * f.camera.K[0, 0])
-        parts.append(Points(positions, torch.full((per, 3), typical), torch.ones(per), footprint))
-    place(field.static, joined(parts))
+        parts.append(
+            PointCloud(positions, torch.full((per, 3), typical), torch.ones(per), footprint)
+        )
+    place(field.static, concatenate(parts))
 
 
 # Movers
@@ -151,10 +156,10 @@ def place_movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[i
     parts = [
         mover_points(scene, frames[t], t, movers, to_radiance) for t in key_times(scene, frames)
     ]
-    points, owner = joined([p for p, _ in parts]), torch.cat([o for _, o in parts])
+    points, owner = concatenate([p for p, _ in parts]), torch.cat([o for _, o in parts])
     limit = int(FILL * len(field.moving))
-    cell = cells_for(points.positions, owner, limit)  # movers never share one
-    kept, kept_owner = thinned(points, cell), torch.unique(cell) // CELLS
+    cell = assign_cells(points.positions, owner, limit)  # movers never share one
+    kept, kept_owner = merge_by_cell(points, cell), torch.unique(cell) // CELLS_PER_KIND
     count = place(field.moving, kept)
     hide_unseen(field, movers, kept_owner[:count])
     share_bases(field, movers, kept.positions[:count], kept_owner[:count])
@@ -174,13 +179,13 @@ def key_times(scene: Scene, frames: list[int]) -> list[int]:
 
 def mover_points(
     scene: Scene, i: int, t: int, movers: Sequence[Mover], to_radiance: ToRadiance
-) -> tuple[Points, Tensor]:
+) -> tuple[PointCloud, Tensor]:
     """The moving pixels of training frame `i` (the t-th time of `movers`) as points at
     their canonical places, and the mover of each (P,).
     """
     f = with_mover_depth(scene.train[i], t, movers)
     moving = surely_moving(f)
-    points = lift(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
+    points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
     y, x = np.nonzero(moving.numpy())
     owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
     canonical = points.positions.double().numpy().copy()

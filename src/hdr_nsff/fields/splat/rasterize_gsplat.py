@@ -1,6 +1,8 @@
-"""The rasterizer's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`. It draws by the
-same rules as the kernels for the CPU: 0.3 pixels^2 of blur, alpha between 1/255 and
-0.999, nothing nearer than 0.01, held linearization outside the frame.
+"""The rasterizer's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`.
+
+It draws by the same rules as the kernels for the CPU: 0.3 pixels^2 of blur, alpha
+between 1/255 and 0.999, nothing nearer than 0.01, and outside of the frame a projection
+that is linearized at its edge.
 """
 
 from __future__ import annotations
@@ -65,24 +67,46 @@ def draw_one_gaussian(device: str) -> float:
     w2c = torch.eye(4, device=device)[:3]
     K = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 7.5], [0.0, 0.0, 1.0]], device=device)
     gaussians = means, quaternions, scales, opacities, features
-    _, _, alpha = composite(*gaussians, w2c, K, width=15, height=15, nearest=0.01, blur=0.3)
+    _, _, alpha = composite(*gaussians, w2c, K, size=(15, 15), nearest=0.01, blur=0.3)
     alpha.sum().backward()
     return float(alpha[7, 7].detach())
 
 
 def composite(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor, w2c: Tensor, K: Tensor,
-    width: int, height: int, nearest: float, blur: float,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians as
-    `rasterize.rasterize` takes them, seen by `w2c` (3, 4) and `K` (3, 3). All on one
-    CUDA device, float32; gradients reach everything but `K`.
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    w2c: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+    nearest: float,
+    blur: float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians.
+
+    They are as `rasterize.rasterize` takes them, seen by `w2c` (3, 4) and `K` (3, 3) in
+    a picture of `size` (width, height). All on one CUDA device, float32; gradients
+    reach everything but `K`.
     """
     from gsplat import rasterization
 
-    view = torch.cat([w2c, w2c.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
-    seen, alpha, _ = rasterization(
-        means, quaternions, scales, opacities, features, view[None], K[None], width, height,
-        near_plane=nearest, eps2d=blur, packed=False, render_mode="RGB+D",
-    )  # fmt: skip
-    return seen[0, ..., :-1], seen[0, ..., -1], alpha[0, ..., 0]
+    width, height = size
+    last_row = w2c.new_tensor([[0.0, 0.0, 0.0, 1.0]])
+    maps, alpha, _ = rasterization(
+        means,
+        quaternions,
+        scales,
+        opacities,
+        features,
+        torch.cat([w2c, last_row])[None],
+        K[None],
+        width,
+        height,
+        near_plane=nearest,
+        eps2d=blur,
+        packed=False,
+        render_mode="RGB+D",
+    )
+    return maps[0, ..., :-1], maps[0, ..., -1], alpha[0, ..., 0]

@@ -146,7 +146,7 @@ def window_weights(tuning: LocalMotionTuning) -> np.ndarray:
     return np.exp(-0.5 * squared_distance / tuning.window_sigma**2)
 
 
-@jit(nogil=True, fastmath=True)
+@jit(nogil=True, fastmath=True, error_model="numpy")
 def fit_local_motion(
     flow,
     trust,
@@ -212,7 +212,7 @@ def fit_local_motion(
                 result[y, x, 1] = v + system[0, 7]
 
 
-@jit(nogil=True, fastmath=True)
+@jit(nogil=True, fastmath=True, error_model="numpy")
 def solve_ridge(system, linear_ridge, quadratic_ridge):
     """Solve the normal equations (6, 8) with a ridge, in place.
 

@@ -1,4 +1,4 @@
-"""Gaussians that nobody sees go where the picture is wrong, and nothing else changes."""
+"""Unseen Gaussians are relocated to where the picture is wrong; no others change."""
 
 import math
 from dataclasses import replace
@@ -11,15 +11,21 @@ from test_splat import CAMERA, card_field, scattered
 
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.splat.rasterize import dense
-from hdr_nsff.fields.splat.relocate import MOST, NARROWER, PARTED, relocate
+from hdr_nsff.fields.splat.relocate import (
+    HALF_OFFSET,
+    HALF_SCALE,
+    MAX_RELOCATED_SHARE,
+    relocate,
+)
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 
 
-def misfit(
+def frame_error(
     error: torch.Tensor | None = None, time: float = 3.0, camera: Camera = CAMERA
 ) -> FrameError:
+    """An error (H, W) of a frame, 1 everywhere by default."""
     wrong = torch.ones(camera.height, camera.width) if error is None else error
     return FrameError(camera, time, lambda radiance: wrong.flatten())
 
@@ -31,19 +37,18 @@ def corner() -> torch.Tensor:
     return error
 
 
-def test_blame_is_the_weights_of_the_slow_twin_times_the_error() -> None:
-    field, error = (
-        scattered(),
-        torch.rand(CAMERA.height, CAMERA.width, generator=torch.Generator().manual_seed(1)),
-    )
+def test_scores_are_the_weights_of_the_slow_twin_times_the_error() -> None:
+    field = scattered()
+    generator = torch.Generator().manual_seed(1)
+    error = torch.rand(CAMERA.height, CAMERA.width, generator=generator)
     cloud = field.cloud(field.knot(3.0))
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
-    own = dense(*(p.detach() for p in parts), torch.eye(len(cloud.means)), CAMERA)  # weights
-    told = field.error_scores(misfit(error))
-    torch.testing.assert_close(
-        told[:, 0], (own.features * error[..., None]).sum((0, 1)), atol=1e-3, rtol=1e-3
-    )
-    torch.testing.assert_close(told[:, 1], own.features.sum((0, 1)), atol=1e-3, rtol=1e-3)
+    one_hot = torch.eye(len(cloud.means))
+    weights = dense(*(p.detach() for p in parts), one_hot, CAMERA).features  # (H, W, G)
+    times_error, alone = field.error_scores(frame_error(error)).unbind(1)
+    expected = (weights * error[..., None]).sum((0, 1))
+    torch.testing.assert_close(times_error, expected, atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close(alone, weights.sum((0, 1)), atol=1e-3, rtol=1e-3)
 
 
 def in_corner(field: Splat) -> int:
@@ -57,18 +62,17 @@ def in_corner(field: Splat) -> int:
 def test_unseen_gaussians_go_where_the_error_is() -> None:
     field = card_field()
     field.static.logits.data[::20] = -10.0  # faded away; others lie outside the picture
-    there = in_corner(field)
-    count = field.relocate([misfit(corner())], torch.Generator().manual_seed(0))
-    assert count == int(MOST * len(field.static))  # more are unseen
-    assert (
-        there + 0.6 * count < in_corner(field) <= there + count
-    )  # some were faint ones of that quarter
+    before = in_corner(field)
+    count = field.relocate([frame_error(corner())], torch.Generator().manual_seed(0))
+    assert count == int(MAX_RELOCATED_SHARE * len(field.static))  # more are unseen
+    # some that were relocated had faded in that very quarter
+    assert before + 0.6 * count < in_corner(field) <= before + count
 
 
-def test_floaters_that_no_view_sees_are_put_to_use() -> None:
+def test_floaters_that_no_view_sees_are_relocated() -> None:
     field = card_field()
     field.static.means.data[:5] = torch.tensor([0.0, 0.0, -3.0])  # behind every camera
-    field.relocate([misfit()], torch.Generator().manual_seed(0))
+    field.relocate([frame_error()], torch.Generator().manual_seed(0))
     assert bool((field.static.means[:5, 2] > 3).all())
 
 
@@ -76,46 +80,34 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
     field = card_field()
     away = CAMERA.moved(torch.tensor([[1.0, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0]]))  # sees nothing
     before = {n: p.detach().clone() for n, p in field.named_parameters()}
-    field.relocate([misfit(), misfit(camera=away)], torch.Generator().manual_seed(0))
-    seen = field.error_scores(misfit())[: len(field.static), 1] > 1
+    errors = [frame_error(), frame_error(camera=away)]
+    field.relocate(errors, torch.Generator().manual_seed(0))
+    seen = field.error_scores(frame_error())[: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
-    assert int((~kept & seen).sum()) <= 2 * MOST * len(
-        field.static
-    )  # the halves and what they were cut from
+    limit = 2 * MAX_RELOCATED_SHARE * len(field.static)  # the halves and what they were cut from
+    assert int((~kept & seen).sum()) <= limit
 
 
 def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
     field = scattered()
-    g, told = field.moving, torch.zeros(30, 2)
-    told[:, 1], told[4, 0], told[7, 1] = (
-        1.0,
-        3.0,
-        0.0,
-    )  # all seen but the eighth; only the fifth is to error_scores
-    g.quaternions.data[4], g.log_scales.data[4] = (
-        torch.tensor([1.0, 0, 0, 0]),
-        torch.tensor([-2.0, -1.0, -3.0]),
-    )
-    mean, mixture, opacity_offsets = (
-        g.means[4].detach().clone(),
-        field.mixture_logits[:, 4].clone(),
-        field.opacity_offsets[:, 4].clone(),
-    )
+    g, scores = field.moving, torch.zeros(30, 2)
+    scores[:, 1] = 1.0
+    scores[7, 1] = 0.0  # only the eighth is unseen
+    scores[4, 0] = 3.0  # only the fifth has an error
+    g.quaternions.data[4] = torch.tensor([1.0, 0, 0, 0])
+    g.log_scales.data[4] = torch.tensor([-2.0, -1.0, -3.0])
+    mean, mixture = g.means[4].detach().clone(), field.mixture_logits[:, 4].clone()
+    opacity_offsets = field.opacity_offsets[:, 4].clone()
     others = g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]].clone()
-    assert (
-        relocate(
-            g, told, [field.opacity_offsets, field.mixture_logits], torch.Generator().manual_seed(0)
-        )
-        == 1
-    )
-    along = torch.tensor([0.0, PARTED * math.exp(-1.0), 0.0])
+    companions = [field.opacity_offsets, field.mixture_logits]
+    assert relocate(g, scores, companions, torch.Generator().manual_seed(0)) == 1
+    along = torch.tensor([0.0, HALF_OFFSET * math.exp(-1.0), 0.0])
     torch.testing.assert_close(g.means[4].detach(), mean - along)
     torch.testing.assert_close(g.means[7].detach(), mean + along)
+    log_scales = torch.tensor([-2.0, -1.0 + math.log(HALF_SCALE), -3.0])
     for i in (4, 7):
-        torch.testing.assert_close(
-            g.log_scales[i].detach(), torch.tensor([-2.0, -1.0 + math.log(NARROWER), -3.0])
-        )
+        torch.testing.assert_close(g.log_scales[i].detach(), log_scales)
         torch.testing.assert_close(field.mixture_logits[:, i], mixture)
         torch.testing.assert_close(field.opacity_offsets[:, i], opacity_offsets)
     torch.testing.assert_close(g.means.detach()[[0, 1, 2, 3, 5, 6, 8, 9]], others)
@@ -124,21 +116,19 @@ def test_a_half_lies_beside_the_other_and_is_narrower() -> None:
 def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]
-    assert (
-        field.relocate(
-            [misfit(torch.zeros(CAMERA.height, CAMERA.width))], torch.Generator().manual_seed(0)
-        )
-        == 0
-    )
+    no_error = frame_error(torch.zeros(CAMERA.height, CAMERA.width))
+    assert field.relocate([no_error], torch.Generator().manual_seed(0)) == 0
     assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
 
 
-@pytest.mark.parametrize("shiny", [False, True])
-def test_training_renews_until_late_in_the_run(
-    toy: Scene, toy_folder: Path, tmp_path: Path, shiny: bool
+@pytest.mark.parametrize("view_dependence", [False, True])
+def test_training_relocates_until_late_in_the_run(
+    toy: Scene, toy_folder: Path, tmp_path: Path, view_dependence: bool
 ) -> None:
     config = small("splat", toy_folder, tmp_path / "run", steps=10)
-    config = replace(config, field=replace(config.field, relocate_every=1, view_dependence=shiny))
+    config = replace(
+        config, field=replace(config.field, relocate_every=1, view_dependence=view_dependence)
+    )
     t = trainer(config, toy)
     assert isinstance(t.field, Splat)
     t.field.static.means.data[:40] = torch.tensor([0.0, 0.0, -50.0])  # floaters
@@ -149,10 +139,12 @@ def test_training_renews_until_late_in_the_run(
         behind.append(int((t.field.static.means[:50, 2] < 0).sum()))
         t.clock = replace(t.clock, step=t.clock.step + 1)
     assert behind[3] < 40  # at most 20 of 400 find a place at a time
-    assert behind[-1] >= 10 and behind[-2] >= 10  # from 80 % on nothing is rearranged
+    assert behind[-1] >= 10 and behind[-2] >= 10  # from 80 % on nothing is relocated
 
 
-def test_misfits_are_the_recorded_differences(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+def test_frame_errors_are_the_recorded_differences(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
     t = trainer(small("splat", toy_folder, tmp_path / "run"), toy)
     found = t.frame_errors(len(toy.train))
     assert [x.time for x in found] == [f.time for f in toy.train]
