@@ -32,7 +32,7 @@ from hdr_nsff.core import distributed
 from hdr_nsff.core.process import hold_threads, prepare_process
 from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
 MOVING = 0.2  # of all Gaussians

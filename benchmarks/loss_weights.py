@@ -21,7 +21,8 @@ import numba
 
 from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 

@@ -29,8 +29,8 @@ from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Frame, Scene
-from hdr_nsff.training.config import PRESETS
 from hdr_nsff.training.pose_corrections import moved, similarities, typical_depth, visible_motion
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 

@@ -23,7 +23,7 @@ from hdr_nsff.core import distributed
 from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
 

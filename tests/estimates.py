@@ -15,6 +15,8 @@ from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
 from hdr_nsff.scene.posed_video import PosedVideo
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import Recordings, ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.build import build_tone_mapper
 
 
 def movers_of(scene: Scene) -> tuple[Mover, ...]:
@@ -85,3 +87,17 @@ def geometric_depth(
 def forget_movers(folder: Path) -> None:
     """Leave a scene folder without movers, after its frames were edited."""
     write_movers(folder / "movers.npz", [])
+
+
+def tone_mapper(
+    brackets: list[int],
+    cameras: list[int],
+    ev: list[float | None],
+    reference: int = 0,
+    num_cameras: int | None = None,
+    **config,
+) -> ToneMapper:
+    """A tone mapper of the kind and settings in `config`, for frames as given."""
+    count = num_cameras or max(cameras, default=0) + 1
+    recordings = Recordings(tuple(brackets), tuple(cameras), tuple(ev), reference, count)
+    return build_tone_mapper(ToneMapConfig(**config), recordings)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from estimates import tone_mapper
 from torch import Tensor
 
 from hdr_nsff.fields.base import Layers, Render
@@ -17,7 +18,6 @@ from hdr_nsff.radiometry.response import from_brightness
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.scene import Frame, Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.run_folder import Run
 
@@ -117,8 +117,8 @@ def fake_run(
     """
     field = field or DiscBeforeWall(speed=SPEED / 4, red=3.0)
     spacing = 0.05 if parallax == "full" else 0.0
-    tonemapper = ToneMapper(
-        ToneMapConfig(residual=False), [i % 3 for i in range(num_frames)], [0] * num_frames, EV, 2
+    tonemapper = tone_mapper(
+        [i % 3 for i in range(num_frames)], [0] * num_frames, EV, reference=2, residual=False
     )
     frames = []
     for i in range(num_frames):

@@ -9,13 +9,14 @@ import pytest
 import torch
 
 from hdr_nsff.core import distributed
-from hdr_nsff.fields import AnyField, build_field, start_field
 from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
+from hdr_nsff.fields.build import AnyField, build_field, start_field
 from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpConfig
 from hdr_nsff.fields.nsff.two_branches import TwoBranches
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer, open_folder, train
 
 GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from bad_input import Capture, call, clip, edit, reading, refused, snapshot, training
 from estimates import forget_movers
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig
 
 from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_npy, write_png
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -31,7 +31,7 @@ def folder(toy_folder: Path, tmp_path: Path) -> Path:
 def sentence(folder: Path) -> str:
     """What opening the scene, or making its tone mapper, says; one line."""
     with pytest.raises(InputError) as caught:
-        ToneMapper.for_scene(ToneMapConfig(), Scene.open(folder))
+        tone_mapper_for(ToneMapConfig(), Scene.open(folder))
     text = str(caught.value)
     assert "\n" not in text and len(text) < 400, text
     return text

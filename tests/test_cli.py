@@ -18,7 +18,8 @@ import pytest
 
 from hdr_nsff import __version__, cli
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.training.config import ABLATIONS, METHODS, PRESETS, TrainConfig
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import ABLATIONS, METHODS, PRESETS
 from hdr_nsff.training.run_folder import Run
 
 Act = Callable[[Callable[[Any], Any]], None]

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from estimates import tone_mapper
 from wall import EV, GAMMA22, S_CURVE, rmse, wall_view
 
 from hdr_nsff.core.errors import InputError
@@ -16,15 +17,14 @@ from hdr_nsff.radiometry.response import (
     estimate_response,
 )
 from hdr_nsff.scene.response import read_response, write_response
-from hdr_nsff.tonemap.initialize import initialize
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.base import ToneMapper
 
 UNKNOWN = [None, None, None]
 BRACKETS = [0, 1, 2] * 2
 
 
-def tone_mapper(ev=UNKNOWN, cameras=(0,) * 6, **config) -> ToneMapper:
-    return ToneMapper(ToneMapConfig(**config), BRACKETS, list(cameras), ev, reference_bracket=2)
+def mapper(ev=UNKNOWN, cameras=(0,) * 6, **config) -> ToneMapper:
+    return tone_mapper(BRACKETS, list(cameras), ev, reference=2, **config)
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,8 @@ def test_the_curve_is_found_through_noisy_depth(measured: Response) -> None:
 
 
 def test_the_tone_mapper_starts_there_and_is_held_from_the_first_step(measured: Response) -> None:
-    t = tone_mapper(EV)
-    initialize(t, measured)
+    t = mapper(EV)
+    t.start(measured)
     x, y = t.curve()
     assert t.anchored and rmse(x.numpy(), y.numpy(), S_CURVE) < 0.01
 
@@ -56,8 +56,8 @@ def test_it_falls_back_on_brightness_and_says_so() -> None:
     response = estimate_response(views, [0] * 6, UNKNOWN, reference=2, num_cameras=1)
     words = describe(response, UNKNOWN)
     assert "too few static points" in words and "brightness" in words
-    t = tone_mapper()
-    initialize(t, response)
+    t = mapper()
+    t.start(response)
     assert not t.anchored and t.exposures().tolist() == pytest.approx(EV, abs=0.4)
     x, y = t.curve()
     torch.testing.assert_close(y, (x ** (1 / 2.2)).expand(3, -1), atol=1e-5, rtol=0)
@@ -73,8 +73,8 @@ def test_a_single_exposure_leaves_gamma() -> None:
 
 
 def test_the_papers_tone_mapper_is_left_as_published(measured: Response) -> None:
-    t = tone_mapper(kind="per_image", knots="even", from_recordings=False)
-    initialize(t, measured)
+    t = mapper(kind="per_image", knots="even", from_recordings=False)
+    t.start(measured)
     assert (t.gains() == 0).all()
 
 
@@ -87,8 +87,8 @@ def test_white_balance_of_a_second_camera_comes_back() -> None:
     assert response.own_curves == (0, 1)
     saturation = response.white_balance[1] - np.log2(gains)  # curves end where each saturates
     assert np.abs(saturation).max() < 0.1
-    t = tone_mapper(EV, cameras=(0, 0, 0, 1, 1, 1))
-    initialize(t, response)
+    t = mapper(EV, cameras=(0, 0, 0, 1, 1, 1))
+    t.start(response)
     stops = t.log_gain(2, 1, None) / np.log(2)
     torch.testing.assert_close(stops.detach().double(), torch.from_numpy(response.white_balance[1]))
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from fakes import fake_run
+from hdr_nsff.tonemap.tonemapper import ToneMapConfig
 from presets import random_field, small
 
 from hdr_nsff import cli
@@ -30,7 +31,7 @@ from hdr_nsff.rendering.export import (
 )
 from hdr_nsff.rendering.shots import develop
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.run_folder import Run, write_config
 
 LINEAR = Coloring(linear=True)
@@ -38,7 +39,7 @@ LINEAR = Coloring(linear=True)
 
 def make_run(toy: Scene, folder: Path, preset: str = "splat") -> Run:
     """An untrained run with something in every part of its field."""
-    tonemapper = ToneMapper.for_scene(ToneMapConfig(), toy)
+    tonemapper = tone_mapper_for(ToneMapConfig(), toy)
     return Run(
         folder, small(preset), toy, random_field(preset, toy), tonemapper, step=7, seconds=1.0
     )

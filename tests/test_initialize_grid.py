@@ -8,7 +8,7 @@ import pytest
 import torch
 from presets import random_field, small, trainer
 
-from hdr_nsff.fields import build_field
+from hdr_nsff.fields.build import build_field
 from hdr_nsff.fields.nsff.branches import GridConfig
 from hdr_nsff.fields.nsff.encodings import AdditiveGrid
 from hdr_nsff.fields.nsff.initialize_grid import SurfaceSamples, fit_radiance, initialize_grid

@@ -7,8 +7,8 @@ import torch
 from presets import random_field, small
 from torch import Tensor
 
-from hdr_nsff.fields import build_field
 from hdr_nsff.fields.baselines.nerf_wt import NerfWT
+from hdr_nsff.fields.build import build_field
 from hdr_nsff.fields.nsff.samples import BranchOutput, RaySamples
 from hdr_nsff.scene.batch import Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene

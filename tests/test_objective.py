@@ -11,9 +11,10 @@ import torch
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.scene.batch import PixelBatch, draw_pixels
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.objective import LossWeights, Objective
+from hdr_nsff.training.presets import PRESETS
 
 N = 20
 OBJECTIVE = Objective(LossWeights(), "scene", near=1.8)
@@ -21,7 +22,7 @@ OBJECTIVE = Objective(LossWeights(), "scene", near=1.8)
 
 @pytest.fixture
 def tonemap(toy: Scene) -> ToneMapper:
-    return ToneMapper.for_scene(ToneMapConfig(kind="none"), toy)
+    return tone_mapper_for(ToneMapConfig(kind="none"), toy)
 
 
 @pytest.fixture
@@ -74,7 +75,7 @@ def test_the_total_is_the_weighted_sum_and_weight_zero_lets_no_gradient_through(
 def test_every_term_of_every_preset_has_a_weight(batch: PixelBatch, toy: Scene) -> None:
     names = {f.name for f in fields(LossWeights)}
     for config in PRESETS.values():
-        tonemap = ToneMapper.for_scene(config.tonemap, toy)
+        tonemap = tone_mapper_for(config.tonemap, toy)
         terms = OBJECTIVE.terms(perfect(batch), batch, tonemap, 2.0) | tonemap.regularizers()
         assert set(terms) <= names
 
@@ -193,7 +194,7 @@ def test_photometric_gradients_reach_radiance_response_and_exposures(
     batch: PixelBatch, toy: Scene
 ) -> None:
     learned = toy.manifest.model_copy(update={"bracket_ev": [None, 0.0, None]})
-    tonemap = ToneMapper.for_scene(ToneMapConfig(), replace(toy, manifest=learned))
+    tonemap = tone_mapper_for(ToneMapConfig(), replace(toy, manifest=learned))
     two = draw_pixels(
         toy, 2, N, 0, torch.Generator().manual_seed(0)
     )  # bracket 2: not the reference

@@ -20,7 +20,7 @@ from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 
 COUNT = 21
 

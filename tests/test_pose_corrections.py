@@ -27,8 +27,9 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import Trainer, train
 

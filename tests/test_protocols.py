@@ -21,7 +21,7 @@ from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import train
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hdr_nsff import cli, fields
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.fields import device_for
+from hdr_nsff.fields.build import device_for
 from hdr_nsff.fields.nsff.nsff import NSFFConfig
 from hdr_nsff.fields.splat import rasterize_gsplat
 from hdr_nsff.fields.splat.rasterize import dense

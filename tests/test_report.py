@@ -15,11 +15,11 @@ import pytest
 from fakes import fake_run
 from test_scores import truth_of, with_flow
 
+from estimates import tone_mapper
 from hdr_nsff.core.page import figure, table
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.evaluation.report import ReportConfig, report, smoothed, write_report
 from hdr_nsff.rendering.render import render_all
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 from hdr_nsff.training.run_folder import Run
 
 VOID = {"meta", "img", "link", "br", "path", "use", "rect", "line", "circle"}
@@ -155,9 +155,7 @@ def test_refused_bullet_time_is_explained(tmp_path: Path) -> None:
 def test_every_tone_mapper_can_be_reported(tmp_path: Path, kind) -> None:
     run = replace(
         fake_run(tmp_path),
-        tonemapper=ToneMapper(
-            ToneMapConfig(kind=kind), [0, 1, 2, 0, 1, 2], [0] * 6, [-4.0, None, 0.0], 2
-        ),
+        tonemapper=tone_mapper([0, 1, 2, 0, 1, 2], [0] * 6, [-4.0, None, 0.0], 2, kind=kind),
     )
     text, _ = read(write_report(run, tmp_path / "report.html", tmp_path / "render"))
     assert "response of camera 0" in text

@@ -16,7 +16,8 @@ from safetensors.torch import save_file
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, save_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_config, read_log, write_config
 from hdr_nsff.training.train import train
 

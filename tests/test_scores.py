@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from estimates import tone_mapper
 from fakes import DISC, FOCAL, SPEED, DiscBeforeWall, H, W, fake_run
 from test_evaluate import TURN, field_of, write_truth
 from torch import Tensor
@@ -27,7 +28,7 @@ from hdr_nsff.evaluation.targets import choose_targets
 from hdr_nsff.fields.base import Render
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.truth import Truth, TruthView
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper, knot_positions
+from hdr_nsff.tonemap.curve import knot_positions
 from hdr_nsff.training.run_folder import Run
 
 MOTION = SPEED / 4  # of the fake run's disc, scene units per frame
@@ -312,8 +313,8 @@ def test_long_clips_are_sampled_and_clips_without_flow_have_no_stability(tmp_pat
 
 def learned(run: Run, ev: list[float], gamma: float) -> Run:
     """The run with learned exposures and the response x^(1 / gamma)."""
-    tonemapper = ToneMapper(
-        ToneMapConfig(residual=False), [i % 3 for i in range(6)], [0] * 6, [None, None, 0.0], 2
+    tonemapper = tone_mapper(
+        [i % 3 for i in range(6)], [0] * 6, [None, None, 0.0], reference=2, residual=False
     )
     tonemapper.set_exposures(ev)
     knots = knot_positions("gamma")

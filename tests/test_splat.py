@@ -14,8 +14,8 @@ from presets import small, trainer
 from torch import Tensor
 from toy_scene import CARD, card_offset
 
-from hdr_nsff.fields import start_field
 from hdr_nsff.fields.base import RadianceField
+from hdr_nsff.fields.build import start_field
 from hdr_nsff.fields.splat.gaussians import MAX_LOG_RADIANCE, Gaussians
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig, select_pixels
 from hdr_nsff.fields.splat.trajectories import WINDOW

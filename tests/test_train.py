@@ -23,8 +23,9 @@ from hdr_nsff.core import distributed
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_json
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_log, snapshots
 from hdr_nsff.training.train import Clock, Trainer, train
 

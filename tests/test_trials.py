@@ -32,7 +32,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.notes import RunRecord, Trained
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.synth.oracle import NOTE
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,7 @@ VERBS = {
     ),
     "train": Verb(
         "hdr_nsff.training.train:train",
-        "hdr_nsff.training.config:PRESETS",
+        "hdr_nsff.training.presets:PRESETS",
         "Train a radiance field from a scene folder; `train --help` lists the presets.",
     ),
     "render": Verb(
@@ -210,7 +210,8 @@ def parse_preset(name: str, presets: dict[str, Any], options: Sequence[str]) -> 
 
     import tyro
 
-    from hdr_nsff.training.config import ABLATIONS, TrainConfig
+    from hdr_nsff.training.config import TrainConfig
+    from hdr_nsff.training.presets import ABLATIONS
 
     shown = PRESET_HELP
     if options and options[0] in presets and options[0] not in PRESET_HELP:

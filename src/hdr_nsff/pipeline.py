@@ -17,11 +17,13 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.evaluate import evaluate_run, views_of_clip
 from hdr_nsff.evaluation.report import check_place, write_report
-from hdr_nsff.fields import device_for
+from hdr_nsff.fields.build import device_for
 from hdr_nsff.footage.ingest import every_of
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.rendering.render import render_all
-from hdr_nsff.training.config import PRESETS, TrainConfig, check
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig, check_config
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
@@ -70,7 +72,7 @@ def run_all(config: RunConfig) -> None:
     device = str(device_for(settings.field, config.device))
     check_truth(config)
     check_place(config.out / "report.html")
-    check(settings)
+    check_config(settings)
     footage = prepare_settings(config)
     with writing_to(config.out), lock_output(config.out):
         scene = prepare(footage)
@@ -92,7 +94,7 @@ def train_settings(config: RunConfig) -> TrainConfig:
         preset, out=config.out / "run", seed=config.seed, refine_poses=config.refine_poses
     )
     if config.minutes is not None:
-        settings = replace(settings, minutes=config.minutes, steps=None)
+        settings = replace(settings, budget=Budget(minutes=config.minutes))
     return settings
 
 

@@ -31,7 +31,8 @@ from hdr_nsff.pipeline import RunConfig, held_out_every
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, held_out_truth
 from hdr_nsff.scene.manifest import Manifest, Protocol
 from hdr_nsff.synth.oracle import NOTE as ORACLE
-from hdr_nsff.training.config import PRESETS, TrainConfig, check
+from hdr_nsff.training.config import TrainConfig, check
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import open_folder
 
 

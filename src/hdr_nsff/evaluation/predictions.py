@@ -15,7 +15,7 @@ from hdr_nsff.core import io
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.targets import Target
-from hdr_nsff.fields import base
+from hdr_nsff.fields.build import base
 from hdr_nsff.geometry.paths import View
 from hdr_nsff.rendering.interpolate import LayeredField, render_at
 from hdr_nsff.rendering.shots import device_of, fingerprint

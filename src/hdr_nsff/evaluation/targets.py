@@ -20,7 +20,7 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import View
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, inside
 from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
-from hdr_nsff.tonemap.tonemapper import informative
+from hdr_nsff.tonemap.base import informative
 from hdr_nsff.training.run_folder import Run
 
 SEEN = "training view"  # the group of views that were trained on

@@ -20,12 +20,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import FrameError, Render
+from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
+from hdr_nsff.fields.base import FrameError, ParamGroup, Render
 from hdr_nsff.fields.baselines.planes import Planes
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.encodings import frequencies
@@ -60,31 +61,34 @@ REFRESH_EVERY = 16  # steps
 class HexPlaneConfig:
     """HDR-HexPlane."""
 
-    density_components: int = 24
+    type: Advanced[Literal["hdr-hexplane"]] = "hdr-hexplane"
+    total_variation: Weight = 1e-4
+    """Loss: mean square difference of neighbors in the planes."""
+    density_components: Count = 24
     """Numbers per plane that make density."""
-    appearance_components: int = 48
+    appearance_components: Count = 48
     """Numbers per plane that make color."""
-    coarsest: int = 64
+    coarsest: Count = 64
     """Cells per side of the cube at the start."""
-    finest: int = 200
+    finest: Count = 200
     """Cells per side at the end."""
-    grow_every: int = 3000
+    grow_every: Advanced[Count] = 3000
     """Steps after which the grid grows, three times in all."""
-    emptiness: float = 10.0
+    emptiness: Advanced[Weight] = 10.0
     """Subtracted from raw density, so that space is empty at the start."""
-    width: int = 128
+    width: Advanced[Count] = 128
     """Width of the color network."""
-    samples: int = 64
+    samples: Count = 64
     """Samples along a ray while training."""
-    render_samples: int = 128
+    render_samples: Count = 128
     """Samples along a ray when rendering."""
-    cull_after: int = 500
+    cull_after: Advanced[Number] = 500
     """Steps before samples in cells that never mattered are skipped."""
-    explore: float = 0.04
+    explore: Advanced[Share] = 0.04
     """Share of the culled samples that is evaluated all the same."""
-    plane_lr: float = 0.02
+    plane_lr: Advanced[Rate] = 0.02
     """Learning rate of the planes."""
-    network_lr: float = 1e-3
+    network_lr: Advanced[Rate] = 1e-3
     """Learning rate of the linear maps and the color network."""
 
 
@@ -229,7 +233,11 @@ class HexPlane(nn.Module):
         assert rgb is not None
         return list(rgb.clamp(0, 1).split(3, 1))
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def loss_weights(self) -> dict[str, float]:
+        """Of the planes' total variation."""
+        return {"total_variation": self.config.total_variation}
+
+    def param_groups(self) -> list[ParamGroup]:
         """Planes and networks, at the published rates and betas."""
         planes = [*self.density_planes.parameters(), *self.appearance_planes.parameters()]
         networks = [
@@ -239,8 +247,8 @@ class HexPlane(nn.Module):
         ]
         betas = (0.9, 0.99)
         return [
-            {"params": planes, "lr": self.config.plane_lr, "betas": betas},
-            {"params": networks, "lr": self.config.network_lr, "betas": betas},
+            ParamGroup(planes, self.config.plane_lr, betas),
+            ParamGroup(networks, self.config.network_lr, betas),
         ]
 
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:

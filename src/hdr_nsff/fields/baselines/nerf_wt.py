@@ -15,12 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import Render
+from hdr_nsff.core.settings import Advanced, Count, Rate, Weight
+from hdr_nsff.fields.base import ParamGroup, Render
 from hdr_nsff.fields.nsff.branches import (
     GridBranches,
     GridConfig,
@@ -41,13 +42,16 @@ from hdr_nsff.scene.batch import PixelBatch, Recorder
 class NerfWTConfig(BranchesConfig):
     """NeRF-W with time."""
 
+    type: Advanced[Literal["nerf-wt"]] = "nerf-wt"
+    transient: Weight = 0.01
+    """Loss: mean optical thickness of a sample of the transient branch."""
     radiance: Literal["exp", "sigmoid"] = "sigmoid"
     """Unbounded radiance, or the published one below 1."""
-    code_size: int = 48
+    code_size: Count = 48
     """Numbers of an image's appearance code."""
-    head_width: int = 128
+    head_width: Advanced[Count] = 128
     """Width of the network that turns a grid's values and the code into colors."""
-    head_lr: float = 5e-3
+    head_lr: Advanced[Rate] = 5e-3
     """Learning rate of the codes and of that network, where grids are used."""
 
 
@@ -105,7 +109,7 @@ class CodedGrids(GridBranches):
         assert not motion, "NeRF-W has no scene flow"
         return nn.functional.pad(self.dynamic_grid(coords, knot), (0, 1)), None
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def param_groups(self) -> list[ParamGroup]:
         head = [
             *self.codes.parameters(),
             *self.from_color.parameters(),
@@ -113,7 +117,7 @@ class CodedGrids(GridBranches):
             *self.to_color.parameters(),
         ]
         tables = table_group([self.static_grid, self.dynamic_grid], self.config.lr)
-        return [tables, {"params": head, "lr": self.head_lr}]
+        return [tables, ParamGroup(head, self.head_lr)]
 
 
 class CodedMlp(MlpBranches):
@@ -142,6 +146,10 @@ class NerfWT(TwoBranches):
     """
 
     config: NerfWTConfig
+
+    def loss_weights(self) -> dict[str, float]:
+        """Of the transient branch's thickness."""
+        return {"transient": self.config.transient}
 
     def __init__(
         self,

@@ -8,11 +8,14 @@ turn them into radiance, density and scene flow.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor, nn
 
+from hdr_nsff.core.settings import Advanced, Count, Number, Positive, Rate
+from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.fields.nsff.encodings import AdditiveGrid, Shape, frequencies
 
 APPEARANCE = 5  # raw radiance (3), raw density, raw blend share (used of the dynamic branch)
@@ -27,19 +30,20 @@ MOTION_DEPTH_SHARE = 8  # times fewer grid points of scene flow than `depth_cell
 class GridConfig:
     """Additive multiresolution grids without a network behind them."""
 
-    finest: float = 1.0
+    type: Advanced[Literal["grids"]] = "grids"
+    finest: Positive = 1.0
     """Size of the finest cell across the image, in pixels of the training frames."""
-    depth_cells: int = 96
+    depth_cells: Count = 96
     """Grid points along the third axis at the finest level."""
-    levels: int = 4
+    levels: Advanced[Count] = 4
     """Levels of the appearance grids, each twice as fine as the one before."""
-    max_rows: int = 2**20
+    max_rows: Advanced[Annotated[int, Ge(1), Le(10**9)]] = 2**20
     """Rows of a hashed level (a power of two)."""
-    motion_cell: float = 8.0
+    motion_cell: Advanced[Positive] = 8.0
     """Cell size of the finer of the two scene-flow grids, in pixels."""
-    lr: float = 0.1
+    lr: Advanced[Rate] = 0.1
     """Learning rate of the appearance grids."""
-    motion_lr: float = 0.01
+    motion_lr: Advanced[Rate] = 0.01
     """Learning rate of the scene-flow grids."""
 
 
@@ -47,17 +51,18 @@ class GridConfig:
 class MlpConfig:
     """The published network: a skip connection, position encoding, view dependence."""
 
-    layers: int = 8
+    type: Advanced[Literal["network"]] = "network"
+    layers: Count = 8
     """Hidden layers of each branch."""
-    width: int = 256
+    width: Count = 256
     """Width of a hidden layer."""
-    skip_after: int = 5
+    skip_after: Advanced[Number] = 5
     """Layers before the encoded position is fed in again."""
-    octaves: int = 10
+    octaves: Advanced[Number] = 10
     """Octaves of the position encoding."""
-    direction_octaves: int = 4
+    direction_octaves: Advanced[Number] = 4
     """Octaves of the encoding of view directions."""
-    lr: float = 5e-4
+    lr: Advanced[Rate] = 5e-4
     """Learning rate."""
 
 
@@ -80,11 +85,8 @@ class Branches(Protocol):
         """
         ...
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Parameter groups with learning rates, for the optimizer.
-
-        `touched` (row marks) comes with tables of which only marked rows should move.
-        """
+    def param_groups(self) -> list[ParamGroup]:
+        """Parameters with their learning rates."""
         ...
 
 
@@ -129,7 +131,7 @@ class GridBranches(nn.Module):
             return appearance, None
         return appearance, torch.cat([grid(coords, knot) for grid in self.motion_grids], -1)
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def param_groups(self) -> list[ParamGroup]:
         appearance, motion = [self.static_grid, self.dynamic_grid], list(self.motion_grids)
         return [
             table_group(appearance, self.config.lr),
@@ -137,9 +139,9 @@ class GridBranches(nn.Module):
         ]
 
 
-def table_group(grids: list[Any], lr: float) -> dict[str, Any]:
+def table_group(grids: list[Any], lr: float) -> ParamGroup:
     """A parameter group of grids' tables, of which only touched rows move."""
-    return {"params": [g.table for g in grids], "touched": [g.touched for g in grids], "lr": lr}
+    return ParamGroup([g.table for g in grids], lr, row_marks=[g.touched for g in grids])
 
 
 class Trunk(nn.Module):
@@ -204,5 +206,5 @@ class MlpBranches(nn.Module):
         raw_motion = raw[:, APPEARANCE:] if motion else None
         return raw[:, :APPEARANCE], raw_motion
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        return [{"params": list(self.parameters()), "lr": self.config.lr}]
+    def param_groups(self) -> list[ParamGroup]:
+        return [ParamGroup(list(self.parameters()), self.config.lr)]

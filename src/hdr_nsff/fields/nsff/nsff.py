@@ -7,11 +7,13 @@ Inside, scene flow is a displacement in the unit cube.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from hdr_nsff.core.settings import Advanced, Weight
 from hdr_nsff.fields.base import Layers, Render
 from hdr_nsff.fields.nsff.branches import MlpConfig
 from hdr_nsff.fields.nsff.samples import BranchOutput, RaySamples, map_chunks, render_in_chunks
@@ -27,10 +29,34 @@ ON_KNOT = 1e-4  # knots: a time this near to a training time is that training ti
 
 
 @dataclass(frozen=True)
+class SceneFlowLosses:
+    """Weights of what scene flow adds to the objective; 0 turns a term off."""
+
+    temporal: Weight = 0.3
+    """Eq. 13: renders warped from the neighboring times."""
+    chain: Weight = 0.1
+    """The same through two steps, from phase 2 on."""
+    cycle: Weight = 0.5
+    """Flow there and back returns."""
+    flow_magnitude: Weight = 0.01
+    """Length of the rendered scene flow, per axis."""
+    smoothness: Weight = 0.1
+    """Scene flow of neighboring samples of a ray."""
+    kinetic: Weight = 0.1
+    """Least kinetic energy: flow changes slowly in time."""
+    disocclusion: Weight = 0.02
+    """Mean disocclusion."""
+    blend_entropy: Weight = 0.0
+    """Entropy of the blend weight (compositing `blend`)."""
+
+
+@dataclass(frozen=True)
 class NSFFConfig(BranchesConfig):
     """A neural scene flow field."""
 
-    flow_scale: float = 0.05
+    type: Advanced[Literal["nsff"]] = "nsff"
+    loss: SceneFlowLosses = field(default_factory=SceneFlowLosses)
+    flow_scale: Advanced[Weight] = 0.05
     """Cube units per unit of raw scene flow (published: tanh in NDC, which is 0.5
     here).
     """
@@ -40,6 +66,10 @@ class NSFF(TwoBranches):
     """A neural scene flow field."""
 
     config: NSFFConfig
+
+    def loss_weights(self) -> dict[str, float]:
+        """Of the terms that scene flow makes possible."""
+        return asdict(self.config.loss)
 
     def to_flow(self, raw: Tensor) -> Tensor:
         """Scene flow (M, 2, 3) of raw motion (M, 8).

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Discriminator
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import HIGHEST, FrameError
+from hdr_nsff.core.settings import Advanced, Count, Number, Share, Weight
+from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE, FrameError, ParamGroup
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.branches import (
     Branches,
@@ -61,10 +63,12 @@ MASK_DILATION_PX = 9  # dynamic content may lie this far outside of the moving m
 class BranchesConfig:
     """A static and a dynamic branch."""
 
-    encoding: GridConfig | MlpConfig = field(default_factory=GridConfig)
-    samples: int = 32
+    encoding: Annotated[GridConfig | MlpConfig, Discriminator("type")] = field(
+        default_factory=GridConfig
+    )
+    samples: Count = 32
     """Samples along a ray while training."""
-    render_samples: int = 64
+    render_samples: Count = 64
     """Samples along a ray when rendering."""
     compositing: Literal["add", "blend"] = "add"
     """How static and dynamic content share a place: densities add up, or the blend
@@ -72,15 +76,15 @@ class BranchesConfig:
     """
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or the published one below 1."""
-    density: Literal["exp", "relu"] = "exp"
+    density: Advanced[Literal["exp", "relu"]] = "exp"
     """Density as an exponential, or the published ReLU."""
-    density_noise: float = 0.0
+    density_noise: Advanced[Weight] = 0.0
     """Standard deviation added to raw densities while training (published: 1)."""
-    cull: bool = True
+    cull: Advanced[bool] = True
     """Skip samples in cells that never mattered."""
-    cull_after: int = 100
+    cull_after: Advanced[Number] = 100
     """Steps before culling starts."""
-    explore: float = 0.04
+    explore: Advanced[Share] = 0.04
     """Share of the culled samples that is evaluated all the same."""
 
 
@@ -148,7 +152,7 @@ class TwoBranches(nn.Module):
         """Raw numbers of which `to_radiance` makes `radiance` (..., 3), clamped."""
         if self.config.radiance == "exp":
             return radiance.clamp_min(MIN_RADIANCE).log() - self.bias
-        return radiance.clamp(1 - HIGHEST, HIGHEST).logit()
+        return radiance.clamp(1 - MAX_SIGMOID_RADIANCE, MAX_SIGMOID_RADIANCE).logit()
 
     def to_density(self, raw: Tensor, bias: float) -> Tensor:
         """Density per cube side, >= 0; with noise while training, by the settings."""
@@ -266,7 +270,7 @@ class TwoBranches(nn.Module):
 
     # Housekeeping
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def param_groups(self) -> list[ParamGroup]:
         """The branches' groups."""
         return self.branches.param_groups()
 

@@ -12,7 +12,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import HIGHEST
+from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.knots import interpolate_linear
 
 MAX_LOG_RADIANCE = 16.0  # of a Gaussian: keeps its exponential and sums of it finite
@@ -31,7 +31,7 @@ def from_log_radiance(log: Tensor, bounded: bool) -> Tensor:
     """Stored numbers of which `to_radiance` makes the exponential of `log`, clamped."""
     if not bounded:
         return log
-    log = log.clamp_max(math.log(HIGHEST))
+    log = log.clamp_max(math.log(MAX_SIGMOID_RADIANCE))
     return log - torch.log1p(-log.exp())
 
 

@@ -45,7 +45,7 @@ KMEANS_ROUNDS = 10
 OWN = 4.0  # logit of the nearest basis over the others
 
 
-def seed(
+def initialize_gaussians(
     field: Splat, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool = True
 ) -> str:
     """Place all Gaussians; one sentence about what was found. `typical` is the median

@@ -10,15 +10,17 @@ fade away draw nothing and cost next to nothing. docs/method.md, section "4D Gau
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import asdict, dataclass, field, replace
+from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
 from hdr_nsff.core.tensors import tree_map
-from hdr_nsff.fields.base import FrameError, GaussianCloud, Render, Warp
+from hdr_nsff.fields.base import FrameError, GaussianCloud, ParamGroup, Render, Warp
 from hdr_nsff.fields.knots import interpolate_linear, knot_of
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
@@ -43,20 +45,44 @@ ADAM_EPS = 1e-15  # as 3D Gaussian splatting has it (Kerbl et al. 2023)
 
 
 @dataclass(frozen=True)
+class SplatLosses:
+    """Weights of the field's own terms; 0 turns one off."""
+
+    opacity: Weight = 0.01
+    """Mean opacity: what is not needed fades and is used elsewhere."""
+    scale: Weight = 0.01
+    """Mean scale, in units of the near depth."""
+    trajectory: Weight = 30.0
+    """Third differences of the shared motions, in units of the near depth."""
+    brightness_drift: Weight = 0.01
+    """Changes of static Gaussians' log radiance in time."""
+    opacity_offsets: Weight = 1e-3
+    """Changes of moving Gaussians' opacity from one knot to the next."""
+    color_change: Weight = 0.01
+    """Changes of moving Gaussians' log radiance from one knot to the next."""
+    rigidity: Weight = 2.0
+    """Differences in how neighboring moving Gaussians mix the shared motions."""
+    sh1: Weight = 0.01
+    """Changes of log radiance with the direction of view."""
+
+
+@dataclass(frozen=True)
 class SplatConfig:
     """A field of 4D Gaussians."""
 
-    static: int | None = None
+    type: Advanced[Literal["splat"]] = "splat"
+    loss: SplatLosses = field(default_factory=SplatLosses)
+    static: Annotated[int, Ge(1), Le(10**8)] | None = None
     """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
-    moving: int | None = None
+    moving: Annotated[int, Ge(0), Le(10**8)] | None = None
     """Moving Gaussians; default: 0.15 for every pixel of a frame, at most 20,000."""
-    bases: int = 6
+    bases: Count = 6
     """Shared rigid motions that the moving ones mix."""
-    color_knots: int = 7
+    color_knots: Advanced[Count] = 7
     """Times at which a moving Gaussian has a color of its own."""
-    brightness_knots: int = 5
+    brightness_knots: Advanced[Count] = 5
     """Times at which a static Gaussian has a brightness of its own (1: none)."""
-    opacity_knots: int = 13
+    opacity_knots: Advanced[Count] = 13
     """Times at which a moving Gaussian has an opacity of its own, to appear and vanish.
     """
     view_dependence: bool = False
@@ -65,21 +91,21 @@ class SplatConfig:
     """
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or one below 1."""
-    relocate_every: int = 200
+    relocate_every: Advanced[Number] = 200
     """Steps after which unseen Gaussians are moved to where the picture is wrong (0:
     never).
     """
-    lr: float = 1.0
+    lr: Advanced[Rate] = 1.0
     """Multiplies all learning rates below."""
-    position_lr: float = 2e-3
+    position_lr: Advanced[Rate] = 2e-3
     """Learning rate of positions, per typical length of the scene (its near depth)."""
-    pose_lr: float = 2e-3
+    pose_lr: Advanced[Rate] = 2e-3
     """Learning rate of the shared motions."""
-    color_lr: float = 2e-2
+    color_lr: Advanced[Rate] = 2e-2
     """Learning rate of colors and of the mixtures of motions."""
-    shape_lr: float = 2e-2
+    shape_lr: Advanced[Rate] = 2e-2
     """Learning rate of orientations and log scales."""
-    opacity_lr: float = 5e-2
+    opacity_lr: Advanced[Rate] = 5e-2
     """Learning rate of opacities."""
 
     def counts(self, num_pixels: int) -> tuple[int, int]:
@@ -333,7 +359,14 @@ class Splat(nn.Module):
         _, nearest = cKDTree(places).query(places, NUM_NEIGHBORS + 1)
         self.neighbors.copy_(torch.from_numpy(nearest[:, 1:]))  # the first is itself
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def loss_weights(self) -> dict[str, float]:
+        """Of the field's own terms; `sh1` only where colors depend on the view."""
+        weights = asdict(self.config.loss)
+        if not self.config.view_dependence:
+            del weights["sh1"]
+        return weights
+
+    def param_groups(self) -> list[ParamGroup]:
         """One group for every learning rate, as an optimizer works group by group.
 
         Of the poses, only those near the drawn frame move.
@@ -354,16 +387,15 @@ class Splat(nn.Module):
             by_rate.setdefault(rate, []).extend(p for p in both if p.numel())
         by_rate[config.opacity_lr].append(self.opacity_offsets)
         by_rate[config.color_lr] += [self.mixture_logits, self.background]
-        groups: list[dict[str, Any]] = [
-            {"params": params, "lr": config.lr * rate, "eps": ADAM_EPS}
-            for rate, params in by_rate.items()
+        groups = [
+            ParamGroup(params, config.lr * rate, eps=ADAM_EPS) for rate, params in by_rate.items()
         ]
         t = self.trajectories
-        poses = {
-            "params": [t.turns, t.shifts],
-            "touched": [t.turns_touched, t.shifts_touched],
-            "lr": config.lr * config.pose_lr,
-        }
+        poses = ParamGroup(
+            [t.turns, t.shifts],
+            config.lr * config.pose_lr,
+            row_marks=[t.turns_touched, t.shifts_touched],
+        )
         return [*groups, poses]
 
     # Relocation

@@ -13,15 +13,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.tonemap.kernel import Respond, bin_of, bin_table
-from hdr_nsff.tonemap.tonemapper import (
+from hdr_nsff.tonemap.curve import (
     GAMMA,
-    ToneMapConfig,
-    ToneMapper,
     knot_positions,
     leaky_ends,
     piecewise_linear,
+    record,
 )
+from hdr_nsff.tonemap.kernel import Respond, bin_of, bin_table
 
 LEAK = 0.01
 POWER = {"gamma": 1 / GAMMA, "even": 1.0}
@@ -181,12 +180,13 @@ def test_no_pixels_are_an_empty_answer() -> None:
     assert y.shape == (0, 3) and not any(g.any() for g in gradients)
 
 
-def test_the_tone_mapper_takes_the_kernel_for_float32_and_the_twin_for_the_rest() -> None:
-    tonemap, tensors = ToneMapper(ToneMapConfig(), [0], [0], [0.0]), inputs()
+def test_recording_takes_the_kernel_for_float32_and_the_twin_for_the_rest() -> None:
+    knots, tensors = knot_positions("gamma"), inputs()
+    bins = bin_table(knots)
     leaves = [t.requires_grad_() for t in tensors]
-    fast = tonemap.respond(*leaves, leaky=True)
+    fast = record(*leaves, knots, bins, 1 / GAMMA, LEAK)
     assert "Respond" in type(fast.grad_fn).__name__
-    slow = tonemap.double().respond(*(t.double() for t in leaves), leaky=True)
+    slow = record(*(t.double() for t in leaves), knots.double(), bins, 1 / GAMMA, LEAK)
     assert slow.dtype == torch.float64
     torch.testing.assert_close(fast, slow.float(), atol=1e-5, rtol=1e-5)
 
@@ -201,7 +201,7 @@ def fingerprints() -> None:
 
 def test_the_result_is_the_same_to_the_bit_for_any_number_of_threads() -> None:
     environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
-    code = "import test_response_kernel; test_response_kernel.fingerprints()"
+    code = "import test_kernel; test_kernel.fingerprints()"
     said = subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
     )
