@@ -95,7 +95,7 @@ Change = Callable[[dict], object]
 PLAN, VIEWS, METRICS = "run/render/plan.json", "run/render/views.json", "run/metrics.json"
 SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply/sequence.json"
 KINDS: dict[str, type[notes.Note]] = {
-    PLAN: notes.Plan, VIEWS: notes.Colored, SEQUENCE: notes.Sequence, EXPORTED: notes.Exported, METRICS: notes.Metrics
+    PLAN: notes.RenderPlan, VIEWS: notes.PictureRanges, SEQUENCE: notes.Sequence, EXPORTED: notes.ExportedSequence, METRICS: notes.Metrics
 }  # fmt: skip
 NONSENSE: dict[str, tuple[str, Change]] = {
     "views beyond the shot": (PLAN, lambda d: d["shots"]["fixed"].update(views=[999])),

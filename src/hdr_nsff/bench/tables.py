@@ -93,7 +93,7 @@ def row_of(cell: BenchRun, plan: Plan) -> Row:
     if complete(cell, plan.config.views, plan.config.lpips):
         found = notes.read(cell.folder / "metrics.json", notes.Metrics)
         if found is not None:
-            return Row(cell, "done", "", notes.plain(found), read_trial(cell))
+            return Row(cell, "done", "", notes.to_dict(found), read_trial(cell))
     failure = notes.read(cell.folder / "failure.json", notes.Failure)
     if failure is not None:
         return Row(

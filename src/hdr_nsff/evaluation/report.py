@@ -71,7 +71,7 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
     """Write the report of `run` with the pictures in `renders` to `path`."""
     check_place(path)
     found = notes.read(run.folder / "metrics.json", notes.Metrics)
-    metrics = None if found is None else notes.plain(found)
+    metrics = None if found is None else notes.to_dict(found)
     log = run.log()
     sections = [
         ("Results", headline(metrics)),
@@ -164,7 +164,7 @@ def videos(renders: Path, beside: Path) -> str:
 
 def why_absent(renders: Path) -> str:
     """Why videos are missing, as far as the renders tell."""
-    plan = notes.read(renders / "plan.json", notes.Plan)
+    plan = notes.read(renders / "plan.json", notes.RenderPlan)
     return (
         " ".join(plan.refused)
         if plan is not None and plan.refused
@@ -174,7 +174,7 @@ def why_absent(renders: Path) -> str:
 
 def side_by_side(run: Run, renders: Path) -> str:
     """Rows of recorded frame, tone-mapped HDR, three exposures, depth, scene flow."""
-    colored = notes.read(renders / "views.json", notes.Colored)
+    colored = notes.read(renders / "views.json", notes.PictureRanges)
     sequence = notes.read(renders / "training" / "sequence.json", notes.Sequence)
     if colored is None or sequence is None:
         return missing("No pictures yet: `hdr-nsff render RUN` makes the standard set.")
