@@ -121,8 +121,8 @@ def geometry_of(path: Path, view: View) -> Geometry:
 
 
 def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
-    """Recordings {bracket: (H, W, 3)} in [0, 1] of predicted `radiance` (H, W, 3) by the
-    learned camera, at every bracket that the target has.
+    """Recordings {bracket: (H, W, 3)} in [0, 1] of predicted `radiance` (H, W, 3): by
+    the learned camera, at every bracket that the target has.
     """
     brackets = list(target.rgb)
     recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]

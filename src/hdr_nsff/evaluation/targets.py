@@ -93,8 +93,8 @@ def recordable(target: Target) -> Tensor:
 def choose_targets(
     run: Run, truth: Truth | None, folder: Path | None
 ) -> tuple[str, list[Target], list[str]]:
-    """The kind of the targets in words; the targets; sentences about views that had to be
-    left out.
+    """The kind of the targets in words; the targets; sentences about views that had to
+    be left out.
     """
     if truth is not None and folder is not None:
         targets, notes = truth_targets(run, truth, folder)
@@ -249,7 +249,7 @@ def group_of(run: Run, view: TruthView) -> str:
 def geometry_file(
     truth: Truth, view: TruthView, folder: Path, size: tuple[int, int], pose: np.ndarray
 ) -> GeometryFile | None:
-    """The file of a truth view's depth and motion; `pose` (3, 4) is that in the scene."""
+    """The file of a truth view's depth and motion; `pose` (3, 4): that in the scene."""
     if view.geometry is None:
         return None
     assert truth.clip_c2w is not None, "Truth.problem refuses this"
