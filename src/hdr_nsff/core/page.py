@@ -119,7 +119,7 @@ def legend(axes: Any, **place: Any) -> None:
 
 
 def svg(drawing: Any) -> Markup:
-    """A drawing as inline SVG."""
+    """A drawing as inline SVG that knows its own width, for the style sheet."""
     import matplotlib
 
     for axes in drawing.axes:
@@ -128,5 +128,5 @@ def svg(drawing: Any) -> Markup:
     text = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "report"}):
         drawing.savefig(text, format="svg", transparent=True, metadata={"Date": None})
-    document = text.getvalue()
-    return Markup(document[document.index("<svg") :])
+    _, opening, rest = text.getvalue().partition("<svg ")
+    return Markup(f'{opening}style="--width: {drawing.get_figwidth():g}in" {rest}')
