@@ -241,7 +241,8 @@ def joined(texts: Iterable[str]) -> str:
 
 def command(plan: BenchPlan) -> str:
     """The command of the whole benchmark, for a shell."""
-    return shell_line(bench_words(plan.config, ("only", "list", "collect")))
+    words = bench_words(plan.config, ("only", "list", "collect"))
+    return shell_line([part for word in words for part in word.split("=", 1)])
 
 
 def describe_measurements(rows: Sequence[Row]) -> list[str]:
