@@ -69,8 +69,9 @@ def do_one(plan: BenchPlan, name: str) -> None:
 
 
 def prepare_scenes(plan: BenchPlan) -> None:
-    """Prepare the scenes that are not there yet, in parallel; where one fails, so do
-    its runs, with the reason.
+    """Prepare the scenes that are not there yet, in parallel.
+
+    Where one fails, so do its runs, with the reason.
     """
     waiting = [scene.name for scene in plan.scenes if not scene.ready]
     if not waiting:
@@ -151,8 +152,9 @@ def share_done(run: BenchRun) -> float:
 
 
 def report_end(state: Progress, job: Job, code: int) -> None:
-    """Print the result of a run that has ended; where it failed without a note, write
-    one.
+    """Print the result of a run that has ended.
+
+    Where it failed without a note, write one.
     """
     state.num_ended += 1
     run = state.runs[job.name]

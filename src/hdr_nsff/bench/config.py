@@ -1,5 +1,6 @@
-"""The settings of `bench` and the records they become: scenes x methods, each pair a
-run in a folder of its own.
+"""The settings of `bench`, and the records they become.
+
+Every pair of a scene and a method is a run in a folder of its own:
 
     OUT/bench.json               settings that all runs share
     OUT/scenes/NAME/             footage, prepared once for all methods
@@ -29,12 +30,11 @@ MAX_NAME_LENGTH = 60  # letters of a folder's name
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """Train and measure methods on scenes, every pair a run of its own; tables, curves
-    and pictures side by side.
+    """Train and measure methods on scenes; tables, curves and pictures side by side.
 
-    Killed, the same command goes on where it was; with more scenes or methods it adds
-    theirs. A run that fails is shown with its reason, the others go on, and the exit
-    code is 1.
+    Every pair is a run of its own. Killed, the same command goes on where it was; with
+    more scenes or methods it adds theirs. A run that fails is shown with its reason,
+    the others go on, and the exit code is 1.
     """
 
     out: Positional[Path]
@@ -188,8 +188,10 @@ class BenchPlan:
 
 
 def safe_name(text: str, option: str) -> str:
-    """`text` as the name of a folder: letters, digits, `_`, `-` and dots inside; others
-    become `_`. InputError, which names the `option`, where nothing is left.
+    """`text` as the name of a folder: letters, digits, `_`, `-` and dots inside.
+
+    Other characters become `_`. InputError, which names the `option`, where nothing
+    is left.
     """
     name = re.sub(r"[^\w.\-]", "_", text).strip("._")[:MAX_NAME_LENGTH]
     if not name:
@@ -199,15 +201,17 @@ def safe_name(text: str, option: str) -> str:
 
 
 def arguments(config: BenchConfig, only: str) -> list[str]:
-    """The words after `hdr-nsff` of the command that does one run, or prepares one
-    scene, of a benchmark.
+    """The words after `hdr-nsff` of the command for one run.
+
+    `only`: its name, or that of a scene to be prepared.
     """
     return [*bench_words(config, WHOLE_ONLY), "--only", only]
 
 
 def bench_words(config: BenchConfig, without: tuple[str, ...]) -> list[str]:
-    """The words after `hdr-nsff` of a command with these settings, defaults and the
-    settings `without` left out.
+    """The words after `hdr-nsff` of a command with these settings.
+
+    Defaults and the settings `without` are left out.
     """
     words = ["bench", str(config.out)]
     for field in fields(config):

@@ -1,8 +1,8 @@
-"""Quality over training time: scores of a run's snapshots on a few of the held-out
-views, and pictures of those views.
+"""Quality over training time, on a few of the held-out views.
 
-The views are spread evenly over those of the headline, so every method on a scene is
-measured on the same ones.
+The snapshots of a run are scored, and pictures of the views are kept. The views are
+spread evenly over those of the headline, so every method on a scene is measured on the
+same ones.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ Scores = dict[str, Any]
 
 
 def curve_of(run: Run, truth: Path | None, count: int) -> tuple[list[CurvePoint], list[ShownView]]:
-    """The curve of a trained and evaluated run over `count` views, and those views;
-    pictures of them go to RUN/shown.
+    """The curve of a trained and evaluated run over `count` views, and those views.
+
+    Pictures of the views go to RUN/shown.
     """
     targets = spread(headline_targets(run, truth), count)
     curve = []
@@ -74,9 +75,7 @@ def evaluation_file(run: Run, target: Target) -> Path:
 
 
 def score_views(run: Run, targets: Sequence[Target], radiance: Sequence[Tensor]) -> list[Scores]:
-    """The scores of predictions, view by view; radiance after one scale for these
-    views.
-    """
+    """The scores of predictions, view by view; radiance takes one scale for all."""
     gauge = find_gauge(targets, radiance)
     scores = []
     for target, predicted in zip(targets, radiance, strict=True):
@@ -105,8 +104,9 @@ def curve_point(run: Run, share: float, views: Sequence[Scores]) -> CurvePoint:
 
 
 def write_shown(run: Run, target: Target) -> None:
-    """Write RUN/shown/NAME_run.png, NAME_truth.png and, where some pixels move,
-    NAME_moving.png, as recorded at the view's own exposure.
+    """Write pictures of a view, as recorded at its own exposure, into RUN/shown.
+
+    NAME_run.png, NAME_truth.png and, where some pixels move, NAME_moving.png.
     """
     folder = run.folder / "shown"
     radiance = radiance_of(evaluation_file(run, target))

@@ -1,6 +1,7 @@
-"""index.html of a benchmark: the tables, quality over training time, and crops of the
-same views side by side with their errors. One file that opens offline, laid out in
-`gallery.html`.
+"""The page of a benchmark, index.html: one file that opens offline.
+
+Tables, quality over training time, and crops of the same views side by side with their
+errors; laid out in `gallery.html`.
 """
 
 from __future__ import annotations
@@ -146,8 +147,9 @@ def shown_views(row: Row) -> list[ShownView]:
 
 
 def plot_curves(rows: Sequence[Row]) -> list[Markup]:
-    """Quality against training time, a line per method; scores without a point are left
-    out.
+    """Quality against training time, a line per method.
+
+    Scores without a point are left out.
     """
     drawings = []
     for score, label in CURVES.items():
@@ -189,8 +191,10 @@ def plot_curve(score: str, label: str, points: dict[str, list[CurvePoint]]) -> M
 
 
 def choose_views(rows: Sequence[Row]) -> list[ShownView]:
-    """Of the views that all runs show, the one of the best and the one of the worst
-    mean PSNR over the methods (of moving pixels where there are some).
+    """The views of the best and of the worst mean PSNR over the methods.
+
+    Only views that all runs show count, and of each its moving pixels where there
+    are some.
     """
     by_run = [{view.name: view for view in shown_views(row)} for row in rows]
     common = [name for name in by_run[0] if all(name in views for views in by_run)]
@@ -208,9 +212,7 @@ def psnr_of(view: ShownView) -> float:
 
 
 def crops_of(rows: Sequence[Row], view: ShownView) -> Crops:
-    """The moving region of a view: the truth and the pictures of every method, and
-    below them the errors.
-    """
+    """The moving region of a view: the truth, the methods' pictures, the errors."""
     folder = rows[0].run.folder / "shown"
     truth = read_image(folder / f"{view.name}_truth.png")
     box = moving_box(folder / f"{view.name}_moving.png", truth.shape[:2])
@@ -230,8 +232,9 @@ def crops_of(rows: Sequence[Row], view: ShownView) -> Crops:
 
 
 def moving_box(mask: Path, size: tuple[int, int]) -> tuple[slice, slice]:
-    """The box of the moving mask in the file `mask`, with a margin, in a picture of
-    `size` (H, W); the whole picture where there is no such file.
+    """The box of a moving mask, with a margin, in a picture of `size` (H, W).
+
+    The whole picture where the file `mask` does not exist.
     """
     if not mask.is_file():
         return slice(0, size[0]), slice(0, size[1])

@@ -44,9 +44,7 @@ def split_words(text: str, rest: str) -> list[str]:
 
 
 def check_words(text: str, name: str | None, words: list[str]) -> None:
-    """InputError where the words name no preset, or change settings that all runs
-    share.
-    """
+    """InputError where the words name no preset, or change a setting of all runs."""
     if not words or words[0] not in PRESETS:
         asked = " ".join(words[:1])
         raise InputError(f"--methods: no preset {asked!r:.60}; there are {', '.join(PRESETS)}")

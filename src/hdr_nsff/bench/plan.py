@@ -1,5 +1,6 @@
-"""The plan of a benchmark, and its folder: settings are checked before anything runs,
-and a folder holds one benchmark.
+"""The plan of a benchmark, and its folder.
+
+Settings are checked before anything runs, and a folder holds one benchmark.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ T = TypeVar("T")
 
 
 def make_plan(config: BenchConfig) -> BenchPlan:
-    """The scenes and methods of the settings; InputError where they make no sense or
-    are not there. Writes nothing.
+    """The scenes and methods of the settings. Writes nothing.
+
+    InputError where they make no sense or are not there.
     """
     check_settings(config)
     methods = [parse_method(text, config) for text in config.methods.split(",")]
@@ -60,8 +62,9 @@ def distinct(named: Iterable[tuple[str, T]], option: str) -> dict[str, T]:
 
 
 def claim(plan: BenchPlan) -> None:
-    """Make the folder this benchmark's; InputError where it holds other files, or runs
-    with other settings.
+    """Make the folder this benchmark's.
+
+    InputError where it holds other files, or runs with other settings.
     """
     out = plan.config.out
     path = out / "bench.json"
@@ -84,9 +87,7 @@ def claim(plan: BenchPlan) -> None:
 def check_same(
     plan: BenchPlan, before: notes.Bench, settings: dict[str, object], sources: dict[str, str]
 ) -> None:
-    """InputError where the folder holds runs with other `settings`, or of other scenes
-    under the names of `sources`.
-    """
+    """InputError where the folder holds runs with other settings or of other scenes."""
     out = plan.config.out
     for name, value in settings.items():
         earlier = before.settings.get(name)
@@ -102,8 +103,9 @@ def check_same(
 
 
 def check_run(run: BenchRun) -> None:
-    """InputError where the folder of a run holds one with other settings, or of another
-    state of the scene.
+    """InputError where the folder of a run holds another one.
+
+    That is a run with other settings, or of another state of the scene.
     """
     if (run.folder / "config.json").is_file():
         open_folder(run.config)

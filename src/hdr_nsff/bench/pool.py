@@ -1,5 +1,6 @@
-"""A pool of processes: a few at a time, each with its share of the threads or a device
-of its own, each with its own log.
+"""A pool of processes, a few at a time.
+
+Each has its share of the threads or a device of its own, and its own log.
 """
 
 from __future__ import annotations
@@ -51,8 +52,10 @@ def shell_line(arguments: Sequence[str]) -> str:
 
 
 def slots(jobs: int, devices: str | None) -> list[Environment]:
-    """The environments of parallel processes: a share of the threads each, unless the
-    user's environment sets their number, and a device.
+    """The environments of parallel processes.
+
+    Each has a share of the threads, unless the user's environment sets their number,
+    and a device where `devices` names some.
     """
     names = [device.strip() for device in devices.split(",")] if devices else []
     count = len(names) or jobs
@@ -132,8 +135,9 @@ def stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
 
 
 def end_with_parent() -> None:
-    """In a process that `run_jobs` started: end it once its parent is gone, even where
-    that was killed.
+    """End this process once its parent is gone, even where that was killed.
+
+    Only in a process that `run_jobs` started.
     """
     parent = int(os.environ.get(PARENT) or 0)
     if not parent:

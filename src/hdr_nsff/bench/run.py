@@ -43,8 +43,9 @@ MAX_TIMING_S = 10.0  # seconds of rendering after which no further frame is time
 
 @contextmanager
 def exclusive(path: Path, wait: bool) -> Iterator[None]:
-    """Hold the lock file `path`. Where another process holds it: wait for it, or
-    InputError.
+    """Hold the lock file `path`.
+
+    Where another process holds it: wait for it, or InputError.
     """
     import fcntl  # not on every system, and needed nowhere else
 
@@ -67,8 +68,9 @@ def prepare_scene(scene: BenchScene) -> None:
 
 
 def do_run(run: BenchRun, views: int, lpips: str | None) -> None:
-    """All parts of a run that are not done yet. The reason of a failure is kept in
-    `failure.json`, and the error raised.
+    """All parts of a run that are not done yet.
+
+    The reason of a failure is kept in `failure.json`, and the error raised.
     """
     with exclusive(run.folder / ".lock", wait=False):
         run.failure.unlink(missing_ok=True)
@@ -164,8 +166,9 @@ def measure_run(run: BenchRun, views: int, lpips: str | None) -> None:
 
 @torch.no_grad()
 def frame_seconds(run: Run) -> float:
-    """Median seconds to render a frame of the scene: radiance, depth and motion,
-    nothing written.
+    """Median seconds to render a frame of the scene, without writing it.
+
+    Radiance, depth and motion are rendered.
     """
     frames = run.scene.train[:: max(1, len(run.scene.train) // TIMED_FRAMES)][:TIMED_FRAMES]
     camera = frames[0].camera

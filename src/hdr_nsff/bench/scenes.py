@@ -1,5 +1,7 @@
-"""Scenes of a benchmark: scene folders, folders of `synth` and `reexpose` with footage
-and truth, and public data sets.
+"""Scenes of a benchmark.
+
+Scene folders, folders of `synth` and `reexpose` with footage and truth, and public
+data sets.
 """
 
 from __future__ import annotations
@@ -41,8 +43,9 @@ def parse_scene(text: str, config: BenchConfig) -> BenchScene:
 
 
 def split_scene(text: str) -> tuple[str | None, Path, Path | None]:
-    """Name, folder and truth folder of "[NAME=]FOLDER[:TRUTH]". A text that is a folder
-    as it stands counts as one.
+    """Name, folder and truth folder of "[NAME=]FOLDER[:TRUTH]".
+
+    A text that is a folder as it stands counts as one.
     """
     candidates: list[tuple[str | None, str]] = [(None, text)]
     label, equals, rest = text.partition("=")

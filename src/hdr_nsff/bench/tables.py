@@ -1,6 +1,7 @@
-"""The results of a benchmark as numbers: rows of runs, means, best and worst scenes;
-CSV, JSON, Markdown. Every score is that of the run's own metrics.json, from its
-`headline`.
+"""The results of a benchmark as numbers, in CSV, JSON and Markdown.
+
+Rows of runs, means, best and worst scenes. Every score is that of the run's own
+metrics.json, from its `headline`.
 """
 
 from __future__ import annotations
@@ -148,8 +149,9 @@ def text(value: float | None, column: Column) -> str:
 
 
 def best_numbers(rows: Sequence[Row], columns: Sequence[Column]) -> frozenset[tuple[int, int]]:
-    """(row, column) of the best value, as shown, of each column on each scene, where at
-    least two runs have one.
+    """(row, column) of the best value, as shown, of each column on each scene.
+
+    Only where at least two runs have one.
     """
     found = set()
     for j, column in enumerate(columns):
@@ -176,8 +178,9 @@ class Mean:
 
 
 def means(rows: Sequence[Row], oracle: bool) -> list[Mean]:
-    """The mean of each method over the scenes that all of them have finished, of oracle
-    runs or of others. Methods that have finished no scene do not count.
+    """The mean of each method over the scenes that all of them have finished.
+
+    Of oracle runs or of others. Methods that have finished no scene do not count.
     """
     done = [row for row in rows if row.status == "done" and row.run.scene.oracle == oracle]
     by_method = {name: [row for row in done if row.run.method == name] for name in methods_of(done)}
@@ -287,8 +290,9 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def as_data(plan: BenchPlan, rows: Sequence[Row]) -> dict[str, Any]:
-    """All results as plain data. `machine` is that of the tables; every run has its
-    own.
+    """All results as plain data.
+
+    `machine` is that of the tables; every run has its own.
     """
     settings = {}
     for field in fields(plan.config):
@@ -395,9 +399,7 @@ def mean_title(found: Sequence[Mean], oracle: bool) -> str:
 
 
 def mean_table(found: Sequence[Mean], rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Header and lines of the means, with the best and the worst scene of every
-    method.
-    """
+    """Header and lines of the means, with every method's best and worst scene."""
     columns = used(rows, SCORES)
     lines = []
     for mean in found:

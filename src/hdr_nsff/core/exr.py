@@ -29,12 +29,11 @@ def write_exr(
     header: dict[str, Any] | None = None,
     half: bool = True,
 ) -> None:
-    """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped. NaN and Inf
-    are an error.
+    """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped.
 
-    With `half`, channels take 16 bits, but depth `Z` and radiance beyond 65504 keep 32.
-    Header defaults: ZIP compression, Rec. 709 chromaticities. Extra keys (str, float)
-    become attributes.
+    NaN and Inf are an error. With `half`, channels take 16 bits, but depth `Z` and
+    radiance beyond 65504 keep 32. Header defaults: ZIP compression, Rec. 709
+    chromaticities. Extra keys (str, float) become attributes.
     """
     arrays = {}
     for name, array in channels.items():
@@ -65,8 +64,9 @@ def to_pixels(array: np.ndarray, half: bool) -> np.ndarray:
 
 @contextmanager
 def quiet_stderr() -> Iterator[None]:
-    """Keeps what the C library prints to stderr away from the terminal: the error that
-    it raises names the same problem.
+    """Keeps what the C library prints to stderr away from the terminal.
+
+    The error that it raises names the same problem.
     """
     with open(os.devnull, "wb") as nowhere:
         stderr = os.dup(2)
@@ -79,8 +79,9 @@ def quiet_stderr() -> Iterator[None]:
 
 
 def read_exr(path: Path | str) -> dict[str, np.ndarray]:
-    """Channels of an EXR as float32: {"RGB": (H, W, 3)} and {name: (H, W)} for the
-    others. InputError for a file cut short, NaN or Inf.
+    """Channels of an EXR as float32: {"RGB": (H, W, 3)}, {name: (H, W)} for the others.
+
+    InputError for a file cut short, NaN or Inf.
     """
     path = Path(path)
     if not path.is_file():

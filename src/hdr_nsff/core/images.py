@@ -32,8 +32,9 @@ def encode(path: Path | str, image: np.ndarray) -> None:
 
 
 def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
-    """Write rgb (H, W, 3) or gray (H, W) in [0, 1] with 8 or 16 `bits`, or a bool mask
-    (H, W).
+    """Write rgb (H, W, 3) or gray (H, W) in [0, 1], or a bool mask (H, W).
+
+    `bits`: 8 or 16. Values outside [0, 1] are clipped.
     """
     if rgb.dtype == bool:
         encode(path, rgb.astype(np.uint8) * 255)
@@ -46,8 +47,8 @@ def write_png(path: Path | str, rgb: np.ndarray, bits: int = 8) -> None:
 def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
     """A PNG, JPEG or TIFF of 8 or 16 bits as float32 rgb (H, W, 3) in [0, 1].
 
-    `over` is the gray in [0, 1] that shows through transparent pixels; None ignores
-    transparency.
+    `over` is the gray in [0, 1] that shows through transparent pixels; with None
+    transparency is ignored.
     """
     path = Path(path)
     image = decode(path, transparency=over is not None)
@@ -62,8 +63,10 @@ def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
 
 
 def decode(path: Path, transparency: bool) -> np.ndarray:
-    """The pixels of an image file, uint8 or uint16, (H, W), BGR or, with
-    `transparency`, BGRA; InputError where there are none.
+    """The pixels of an image file, uint8 or uint16, (H, W) or (H, W, 3 or 4).
+
+    BGR, with `transparency` BGRA where the file has it. InputError where it is
+    no image.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such image; put it back or correct the name")
@@ -144,8 +147,9 @@ def colorize(
 
 
 def colorize_flow(flow: np.ndarray, maximum: float | None = None) -> np.ndarray:
-    """Optical flow (H, W, 2) px as rgb (H, W, 3): hue is direction, saturation is
-    length up to `maximum` px (98th percentile).
+    """Optical flow (H, W, 2) px as rgb (H, W, 3).
+
+    Hue is direction, saturation is length up to `maximum` px (98th percentile).
     """
     length = np.linalg.norm(flow, axis=-1)
     maximum = maximum or max(float(np.percentile(length, FLOW_PERCENTILE)), 1e-6)

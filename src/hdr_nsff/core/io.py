@@ -44,8 +44,10 @@ FOREIGN_AGE_S = 24 * 3600
 
 @contextmanager
 def atomic(path: Path | str) -> Iterator[Path]:
-    """A temporary path beside `path` with the same suffix; renamed onto `path` once the
-    block ends without an error.
+    """A temporary path beside `path`, renamed onto it once the block has ended.
+
+    After an error it is removed instead. It has the same suffix as `path`, by which
+    libraries choose the format.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -66,8 +68,9 @@ def atomic(path: Path | str) -> Iterator[Path]:
 
 @functools.cache
 def remove_leftovers(folder: Path) -> None:
-    """Remove the temporary files that killed processes have left in `folder`, not below
-    it. Looks once per process and folder.
+    """Remove the temporary files that killed processes have left in `folder`.
+
+    Not in folders below it. Looks once per process and folder.
     """
     for path in folder.glob(".partial-*"):
         if is_leftover(path):
@@ -107,8 +110,10 @@ BROKEN = (errno.EIO,)
 
 @contextmanager
 def writing_to(place: Path | str) -> Iterator[None]:
-    """Turns a full disk, and a place that cannot or may not be read or written, into an
-    InputError. What was complete stays; nothing is half-written.
+    """Turns errors of the disk and of the path into an InputError.
+
+    A full disk, and a place that cannot or may not be read or written. Complete files
+    stay; nothing is half-written.
     """
     try:
         yield
@@ -126,8 +131,9 @@ def writing_to(place: Path | str) -> Iterator[None]:
 
 
 def describe_disk_error(error: Exception, place: Path | str) -> str | None:
-    """The sentence for an `error` whose cause is the disk or the path; None for any
-    other error. `place`: the path to name where the error names none.
+    """The sentence for an `error` whose cause is the disk or the path, None for others.
+
+    `place`: the path to name where the error names none.
     """
     code = getattr(error, "errno", None)
     text = getattr(error, "strerror", None) or str(error).partition("\n")[0]
@@ -152,8 +158,9 @@ def describe_disk_error(error: Exception, place: Path | str) -> str | None:
 
 
 def path_of(error: Exception, place: Path | str) -> Path:
-    """The path that an error is about, a folder for a temporary file in it; `place`
-    where the error names none.
+    """The path that an error is about; `place` where the error names none.
+
+    Of a temporary file its folder.
     """
     name = getattr(error, "filename", None)
     path = Path(name) if isinstance(name, str | os.PathLike) and name else Path(place)

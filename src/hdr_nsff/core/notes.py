@@ -1,9 +1,9 @@
-"""Notes: JSON files of fixed shape that verbs leave beside their results, for a restart
-and for the report.
+"""Notes: JSON files of fixed shape that verbs leave beside their results.
 
-A note that was cut short or edited into another shape counts as missing. The user reads
-a message about it, and the verb that needs it makes it again. A JSON file of the same
-name that no verb has written belongs to the user and stays as it is.
+A restart and the report read them. A note that was cut short or edited into another
+shape counts as missing. The user reads a message about it, and the verb that needs it
+makes it again. A JSON file of the same name that no verb has written belongs to the
+user and stays as it is.
 """
 
 from __future__ import annotations
@@ -114,8 +114,9 @@ class FlowError(Note):
 
 
 class FlowErrors(Note):
-    """`before.json` of `finetune-flow`: errors of the network that it starts from, on
-    the pairs kept out of training.
+    """`before.json` of `finetune-flow`: errors of the network that it starts from.
+
+    On the pairs kept out of training.
     """
 
     by_stops: dict[str, FlowError] = Field(min_length=1)  # EV between the two pictures -> error
@@ -291,8 +292,10 @@ class Metrics(Note):
 
 
 def read(path: Path, kind: type[N]) -> N | None:
-    """The note at `path`; None where there is none, or, with a message, where it is
-    damaged. InputError where the file is not a note of this kind.
+    """The note at `path`; None where there is none.
+
+    None, with a message, also where it is damaged. InputError where the file is not a
+    note of this kind.
     """
     if not path.is_file():
         return None

@@ -1,9 +1,9 @@
-"""Self-contained HTML pages: files embedded as data URIs, plots as inline SVG, and the
-Jinja templates that both kinds of pages share.
+"""Self-contained HTML pages.
 
-A page is one file that opens offline and reads on light and dark, at desktop and phone
-width. Templates escape every value (autoescape); SVG is the only markup that Python
-makes, and matplotlib escapes its text.
+Files are embedded as data URIs, plots as inline SVG, and the Jinja templates here are
+those that all pages share. A page is one file that opens offline and reads on light and
+dark, at desktop and phone width. Templates escape every value (autoescape); SVG is the
+only markup that Python makes, and matplotlib escapes its text.
 """
 
 from __future__ import annotations
@@ -97,8 +97,9 @@ def plural(count: int, noun: str) -> str:
 
 
 def plot(width: float, height: float) -> tuple[Any, Any]:
-    """An empty matplotlib figure of `width` x `height` inches, transparent, in grays
-    that read on light and dark; and its axes.
+    """An empty matplotlib figure of `width` x `height` inches, and its axes.
+
+    Transparent, in grays that read on light and dark.
     """
     from matplotlib.figure import Figure as Drawing
 

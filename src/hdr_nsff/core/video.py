@@ -28,12 +28,12 @@ def write_video(
     crf: int = 16,
     footage: bool = False,
 ) -> int:
-    """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4 (8 bits, Rec. 709 tags, fast
-    start), atomically; returns the number of frames.
+    """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4, atomically; their number.
 
-    `footage` keeps the color of every pixel (4:4:4) and the grain: for video to be
-    measured, browsers do not play it. Odd sizes lose their last row or column (4:2:0
-    needs even ones), so pictures have at least 2 pixels a side.
+    8 bits, Rec. 709 tags, fast start. `footage` keeps the color of every pixel (4:4:4)
+    and the grain: for video to be measured, browsers do not play it. Odd sizes lose
+    their last row or column (4:2:0 needs even ones), so pictures have at least 2 pixels
+    a side.
     """
     import av
 
@@ -77,8 +77,9 @@ def tag_rec709(target: Any) -> None:
 
 
 def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
-    """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds,
-    turned as the file says. InputError where nothing can be decoded.
+    """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
+
+    Rotated as the file says. InputError where nothing can be decoded.
     """
     import av
 

@@ -68,9 +68,10 @@ def evaluate(config: EvaluateConfig) -> dict[str, Any]:
 
 
 def views_of_clip(folder: Path) -> list[int]:
-    """The frames of the clip that the views of a truth folder are, to be kept out of
-    training; none where any view is of another place or time. InputError where `folder`
-    is no truth folder.
+    """The frames of the clip that the views of a truth folder are, by index.
+
+    They are to be kept out of training. None where any view is of another place or
+    time. InputError where `folder` is no truth folder.
     """
     views = Truth.open(folder).views
     own = all(v.c2w is None and v.time == v.anchor for v in views)
@@ -78,8 +79,9 @@ def views_of_clip(folder: Path) -> list[int]:
 
 
 def evaluate_run(run: Run, truth_folder: Path | None, lpips: str | None = None) -> dict[str, Any]:
-    """Measure a run, write `metrics.json` and `evaluation/*.png` into its folder, and
-    return the content of `metrics.json`.
+    """Measure a run; return and write the content of `metrics.json`.
+
+    Pictures of the comparisons go to `evaluation/` in the run folder.
     """
     start = time.monotonic()
     perceptual = load_lpips(lpips)
@@ -183,8 +185,9 @@ def headline_views(run: Run, views: Sequence[dict[str, Any]]) -> list[dict[str, 
 
 
 def headline_targets(run: Run, truth_folder: Path | None) -> list[Target]:
-    """The views that the headline averages: the same, in the same order, for every run
-    on a scene.
+    """The views that the headline averages.
+
+    They are the same, in the same order, for every run on a scene.
     """
     truth = Truth.open(truth_folder) if truth_folder else None
     targets = choose_targets(run, truth, truth_folder)[1]
@@ -275,8 +278,10 @@ def write_picture(
     exposure: float,
     folder: Path,
 ) -> None:
-    """Prediction | truth | 4 x error, as recorded (`own`) and, where the radiance is
-    known, tone-mapped for a display at `exposure`.
+    """Write prediction | truth | 4 x error of a view.
+
+    As recorded (`own`) and, where the radiance is known, tone-mapped for a display
+    at `exposure`.
     """
     pairs = [(own, target.rgb[target.bracket])]
     if gauge is not None and target.radiance is not None:

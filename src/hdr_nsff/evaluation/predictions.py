@@ -1,5 +1,6 @@
-"""Predictions of a run for the views it is compared with: maps rendered once, kept as
-EXR files, and developed at any exposure.
+"""Predictions of a run for the views it is compared with.
+
+Maps are rendered once, kept as EXR files, and developed at any exposure.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ class Geometry:
 def predict(
     run: Run, views: Mapping[str, View], folder: Path, description: str, motion: bool
 ) -> list[Path]:
-    """An EXR per named view, `folder`/NAME.exr: radiance, depth and, with `motion`,
-    scene flow per frame in channels like `forward.x`.
+    """Render an EXR per named view, `folder`/NAME.exr: radiance and depth.
 
-    Files of the same run are kept, so that a killed evaluation goes on where it was.
+    With `motion` also scene flow per frame in channels like `forward.x`. Files of the
+    same run are kept, so that a killed evaluation goes on where it was.
     """
     key = json.dumps(fingerprint(run, motion, list(views.items())))
     path = folder / "predictions.json"
@@ -59,8 +60,10 @@ def predict(
 
 
 def render_maps(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
-    """The EXR channels of one view. Where a time between frames is splatted, the scene
-    flow is that of the field at this time.
+    """The EXR channels of one view.
+
+    Where a time between frames is splatted, the scene flow is that of the field at
+    this time.
     """
     camera = to_device(view.camera, device_of(run))
     times = run.scene.times.tolist()
@@ -85,8 +88,8 @@ def intervals(time: float, times: Sequence[float]) -> dict[int, float]:
     """The frames that a field's scene flow at `time` spans, {+-1: forward, backward}.
 
     At one of the training `times` it reaches the next one; between two of them its end
-    is interpolated as well. A side beyond the clip is left out: nothing was learned
-    there.
+    is interpolated as well. A side beyond the clip is left out, because nothing was
+    learned there.
     """
     positions = np.arange(len(times))
     knot = float(np.interp(time, times, positions))
@@ -121,8 +124,9 @@ def geometry_of(path: Path, view: View) -> Geometry:
 
 
 def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
-    """Recordings {bracket: (H, W, 3)} in [0, 1] of predicted `radiance` (H, W, 3): by
-    the learned camera, at every bracket that the target has.
+    """Recordings {bracket: (H, W, 3)} in [0, 1] of predicted `radiance` (H, W, 3).
+
+    By the learned camera, at every bracket that the target has.
     """
     brackets = list(target.rgb)
     recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]

@@ -1,5 +1,7 @@
-"""The views that a run is compared with: those of a truth folder, carried over to the
-estimated poses, or recorded frames.
+"""The views that a run is compared with.
+
+They are those of a truth folder, carried over to the estimated poses, or
+recorded frames.
 """
 
 from __future__ import annotations
@@ -56,8 +58,9 @@ class Target:
     novel: dict[float, Tensor] = field(default_factory=dict)
 
     def protocol(self, times: Sequence[float]) -> Protocol | None:
-        """The published comparison that the view belongs to, for a run trained at
-        `times`; None where it was trained on.
+        """The published comparison that the view belongs to; None if it was trained on.
+
+        `times`: of the training frames.
         """
         if self.group == TRAINED_ON:
             return None
@@ -83,8 +86,9 @@ def exact_of(target: Target) -> Tensor:
 
 
 def recordable(target: Target) -> Tensor:
-    """True (H, W) where at least one exposure of the clip, of those at which the view
-    is known, records all channels unclipped.
+    """True (H, W) where some exposure of the clip records all channels unclipped.
+
+    Of the exposures at which the view is known.
     """
     unclipped = [informative(rgb.reshape(-1, 3)) for rgb in target.rgb.values()]
     return torch.stack(unclipped).any(0).view(target.rgb[target.bracket].shape[:2])
@@ -93,8 +97,9 @@ def recordable(target: Target) -> Tensor:
 def choose_targets(
     run: Run, truth: Truth | None, folder: Path | None
 ) -> tuple[str, list[Target], list[str]]:
-    """The kind of the targets in words; the targets; sentences about views that had to
-    be left out.
+    """The kind of the targets in words; the targets; sentences about other views.
+
+    The last are views of the truth that had to be left out.
     """
     if truth is not None and folder is not None:
         targets, notes = truth_targets(run, truth, folder)
@@ -131,8 +136,9 @@ def frame_targets(frames: Sequence[Frame], group: str) -> list[Target]:
 
 
 def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], list[str]]:
-    """The views of a truth folder, carried over to the estimated poses; sentences about
-    the others.
+    """The views of a truth folder, carried over to the estimated poses.
+
+    And sentences about views that were left out.
     """
     num_frames = len(run.scene.manifest.frames)
     if truth.clip_c2w is not None and len(truth.clip_c2w) != num_frames:
@@ -210,8 +216,9 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
 
 
 def anchor_of(run: Run, view: TruthView, folder: Path) -> FrameEntry:
-    """The frame of the scene that a truth view is anchored at; InputError where the
-    scene has no camera of it.
+    """The frame of the scene that a truth view is anchored at.
+
+    InputError where the scene has no camera of it.
     """
     for entry in run.scene.manifest.frames:
         if entry.index == view.anchor and entry.c2w is not None and entry.K is not None:
@@ -224,8 +231,9 @@ def anchor_of(run: Run, view: TruthView, folder: Path) -> FrameEntry:
 def camera_of(
     run: Run, view: TruthView, anchor: FrameEntry, pose: np.ndarray, size: tuple[int, int]
 ) -> Camera:
-    """The camera of a truth view at `pose` (3, 4) for pictures of `size` (H, W): with a
-    K of its own, else with that of its anchor.
+    """The camera of a truth view at `pose` (3, 4) for pictures of `size` (H, W).
+
+    With a K of its own, else with that of its anchor.
     """
     manifest = run.scene.manifest
     height, width = size
@@ -259,8 +267,9 @@ def geometry_file(
 
 
 def moving_mask(run: Run, view: TruthView, folder: Path, size: tuple[int, int]) -> Tensor | None:
-    """The moving mask (H, W) of a truth view; without one, that of the scene where the
-    view is a frame of the clip.
+    """The moving mask (H, W) of a truth view, None where it is unknown.
+
+    Without one of its own, that of the scene where the view is a frame of the clip.
     """
     if view.mask is not None:
         mask = read_mask(inside(folder, view.mask))
@@ -278,8 +287,9 @@ def moving_mask(run: Run, view: TruthView, folder: Path, size: tuple[int, int]) 
 
 
 def trajectories(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray] | None:
-    """True and estimated poses (T, 3, 4) of the clip's frames; None where the truth has
-    none.
+    """True and estimated poses (T, 3, 4) of the clip's frames.
+
+    None where the truth has none.
     """
     if truth.clip_c2w is None:
         return None

@@ -1,5 +1,6 @@
-"""The verb `export`: the Gaussians of a splat run as PLY files, or a scene in a public
-data layout, for other programs. The writers of layouts are in `footage/layouts/`.
+"""The verb `export`: Gaussians as PLY files, or a scene in a public data layout.
+
+Both are for other programs. The writers of layouts are in `footage/layouts/`.
 """
 
 from __future__ import annotations
@@ -24,16 +25,15 @@ MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """The Gaussians of a splat run for viewers, or a scene in a public data layout for
-    other methods.
+    """Gaussians of a splat run for viewers, or a scene in a public data layout.
 
     Gaussians at a time: hdr-nsff export out/run frame.ply --ply --time 12.5
 
     Images, poses_bounds.npy, masks, depth, flow and a COLMAP model: hdr-nsff export
     out/scene out/gopro --layout hdr-gopro
 
-    transforms.json, images and depth: hdr-nsff export out/scene out/ns --layout
-    nerfstudio
+    transforms.json, images and depth: hdr-nsff export out/scene out/ns
+    --layout nerfstudio
 
     With held-out views, as recorded: hdr-nsff export out/scene out/ns --layout
     nerfstudio --truth truth
@@ -125,8 +125,9 @@ def check_colors(colors: ColorTransform) -> None:
 
 
 def export_scene(folder: Path, out: Path, layout: Layout, truth: Path | None = None) -> Path:
-    """Write the scene of a scene or run folder in a public layout, with the views of a
-    `truth` folder; the folder that was written.
+    """Write the scene of a scene or run folder in a public layout; the folder written.
+
+    The views of a `truth` folder become held-out pictures.
     """
     scene = scene_folder(folder)
     check_apart(out, scene, "scene")
@@ -145,8 +146,9 @@ def export_scene(folder: Path, out: Path, layout: Layout, truth: Path | None = N
 
 
 def scene_folder(folder: Path) -> Path:
-    """`folder` itself where it is a scene folder, the scene of a run folder; InputError
-    for any other.
+    """`folder` itself where it is a scene folder, the scene of a run folder.
+
+    InputError for any other.
     """
     if (folder / "scene.json").is_file():
         return folder

@@ -1,10 +1,9 @@
-"""The Gaussians of a splat run as PLY files for other programs: at any time, or one
-file per training time.
+"""The Gaussians of a splat run as PLY files for other programs.
 
-Coordinates are the scene's: OpenCV axes (+x right, +y down, +z forward of the first
-cameras), the units of its poses. A PLY knows neither background nor tone curve, so
-every Gaussian gets a color of its own, developed as `render` develops pixels, or its
-linear radiance. The background is left out.
+At any time, or one file per training time. Coordinates are the scene's: OpenCV axes (+x
+right, +y down, +z forward of the first cameras), the units of its poses. A PLY knows
+neither background nor tone curve, so every Gaussian gets a color of its own, developed
+as `render` develops pixels, or its linear radiance. The background is left out.
 """
 
 from __future__ import annotations
@@ -72,8 +71,9 @@ def export_one(run: Run, path: Path, time: float, transform: ColorTransform) -> 
 
 
 def export_sequence(run: Run, folder: Path, transform: ColorTransform) -> Path:
-    """Write `folder/00000.ply`, ... at the training times, in order; files already
-    there with the same fingerprint are kept.
+    """Write `folder/00000.ply`, ... at the training times, in order.
+
+    Files already there with the same fingerprint are kept.
     """
     source = gaussian_field(run, transform)
     times = sorted({f.time for f in run.scene.train})
@@ -90,8 +90,10 @@ def export_sequence(run: Run, folder: Path, transform: ColorTransform) -> Path:
 def open_sequence(
     run: Run, folder: Path, times: list[float], transform: ColorTransform
 ) -> notes.ExportedSequence:
-    """The note of a sequence, new or as it was left; files of other settings or of
-    another checkpoint are removed. InputError for PLY files that no `export` wrote.
+    """The note of a sequence, new or as it was left.
+
+    Files of other settings or of another checkpoint are removed. InputError for PLY
+    files that no `export` wrote.
     """
     key = fingerprint(run, times, transform)
     files = sorted(folder.glob("[0-9]*.ply"))
@@ -113,8 +115,9 @@ def open_sequence(
 
 
 def gaussian_field(run: Run, transform: ColorTransform) -> GaussianField:
-    """The run's field; InputError where it is not made of Gaussians, or for a camera
-    that the run has not learned.
+    """The run's field, if it is made of Gaussians.
+
+    InputError where it is not, or for a camera that the run has not learned.
     """
     if not isinstance(run.field, GaussianField):
         problem = "its field is not made of Gaussians, so there are none to export"
@@ -127,8 +130,9 @@ def gaussian_field(run: Run, transform: ColorTransform) -> GaussianField:
 
 
 def exposure_of(run: Run, transform: ColorTransform) -> float:
-    """The display exposure of the clip as filmed, one for all times; 1 where colors are
-    not tone-mapped for a display.
+    """The display exposure of the clip as filmed, one for all times.
+
+    1 where colors are not tone-mapped for a display.
     """
     if transform.linear or transform.ev is not None:
         return 1.0
@@ -147,8 +151,9 @@ def color_function(run: Run, transform: ColorTransform, exposure: float) -> Colo
 def write_gaussians(
     source: GaussianField, path: Path, time: float, colors: ColorFunction, linear: bool
 ) -> int:
-    """Write the visible Gaussians at `time` in frames; their number. Those with NaN or
-    Inf are left out.
+    """Write the visible Gaussians at `time` in frames; their number.
+
+    Those with NaN or Inf are left out.
     """
     cloud = source.gaussians(time)
     numbers = torch.cat([cloud.means, cloud.quaternions, cloud.scales, cloud.radiance], 1)

@@ -45,8 +45,9 @@ class LayeredField(RadianceField, Protocol):
     """A field that gives access to its samples, for splatting."""
 
     def layers(self, camera: Camera, time: float) -> Layers:
-        """The samples along the rays of `camera` at the training time `time`, without
-        gradients.
+        """The samples along the rays of `camera` at the training time `time`.
+
+        Without gradients.
         """
         ...
 
@@ -60,11 +61,10 @@ class Picture:
 
 
 def neighbors(time: float, times: Sequence[float]) -> tuple[float, float, float]:
-    """The training times just before and after `time`, and the fraction in [0, 1] of
-    the way between them.
+    """The training times just before and after `time`, and the fraction in between.
 
-    At a training time, and outside their range, both are the nearest one and the
-    fraction is 0.
+    The fraction is in [0, 1]. At a training time, and outside their range, both are the
+    nearest one and the fraction is 0.
     """
     nearest = min(times, key=lambda t: abs(t - time))
     earlier = [t for t in times if t <= time]
@@ -84,12 +84,11 @@ def render_at(
     mode: Mode = "auto",
     scene_flow: bool = True,
 ) -> Render:
-    """The whole picture (S = height * width, row by row) at any `time`; `times` are the
-    training times in order.
+    """The whole picture (S = height * width, row by row) at any `time` in frames.
 
-    `auto` splats where the field has layers and renders directly where it has none;
-    `splat` demands layers. A splatted `Render` carries no scene flow, nor does one
-    without `scene_flow`.
+    `times` are the training times in order. `auto` splats where the field has layers
+    and renders directly where it has none; `splat` demands layers. A splatted `Render`
+    carries no scene flow, nor does one without `scene_flow`.
     """
     before, after, fraction = neighbors(time, times)
     layered = isinstance(field, LayeredField)
@@ -104,11 +103,11 @@ def render_at(
 def splat(
     layers: Layers, camera: Camera, direction: int, fraction: float
 ) -> tuple[Picture, Picture]:
-    """The layers moved by `fraction` of their scene flow towards `direction` (+-1) and
-    composited; and the same unmoved.
+    """The layers moved by a `fraction` of their scene flow; and the same unmoved.
 
-    Empty samples (alpha below `MIN_ALPHA`) do not move. Only the samples that move, and
-    those they leave or land on, are recomputed; the rest of the picture is that of the
+    The flow is that towards `direction` (+-1); both pictures are composited. Empty
+    samples (alpha below `MIN_ALPHA`) do not move. Only the samples that move, and those
+    they leave or land on, are recomputed; the rest of the picture is that of the
     unmoved layers.
     """
     num_layers = layers.alpha.shape[1]
@@ -137,23 +136,23 @@ def splat(
 
 
 def summands(alpha: Tensor, value: Tensor) -> Tensor:
-    """The quantities of samples that splatting adds up, (M, 2 + C): weight 1, alpha,
-    alpha * value.
-    """
+    """The quantities (M, 2 + C) that splatting adds up: 1, alpha, alpha * value."""
     return torch.cat([torch.ones_like(alpha), alpha, alpha * value], -1)
 
 
 def normalize(sums: Tensor) -> tuple[Tensor, Tensor]:
     """Alpha (M, 1) and value (M, C) of the sums (M, 2 + C) of splatted samples."""
-    weight, opaque, value = sums[:, :1], sums[:, 1:2], sums[:, 2:]
+    weight, opaque = sums[:, :1], sums[:, 1:2]
+    value = sums[:, 2:]
     alpha = (opaque / weight.clamp(MIN_WEIGHT_SUM, 1.0)).clamp(0, 1)
     return alpha, value / opaque.clamp_min(1e-6)
 
 
 def corners(pixels: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
-    """The four pixels around each of `pixels` (M, 2; centers at +0.5) as positions row
-    by row (4 M,), and their bilinear weights (4 M,), which add up to 1; weight 0
-    outside the picture.
+    """The four pixels around each point (M, 2), and their bilinear weights (4 M,).
+
+    `pixels` have their centers at +0.5. The four are positions row by row (4 M,). The
+    weights of a point add up to 1; those outside the picture are 0.
     """
     corner = (pixels - 0.5).floor()
     share = (pixels - 0.5) - corner  # (M, 2) of the way to the next column, row
@@ -176,8 +175,9 @@ def composite(
     num_layers: int,
     changes: tuple[Tensor, Tensor, Tensor] | None = None,
 ) -> Picture:
-    """Samples of alpha (S L, 1) and value (S L, C) front to back; `changes` are samples
-    (M,) with another alpha (M, 1) and value (M, C).
+    """Samples of alpha (S L, 1) and value (S L, C), front to back.
+
+    `changes` are samples (M,) with another alpha (M, 1) and value (M, C).
     """
     if changes is not None:
         alpha = alpha.index_copy(0, changes[0], changes[1])
@@ -229,7 +229,8 @@ def blend(moved: Sequence[Picture], unmoved: Sequence[Picture], fraction: float)
 
 
 def presence_of(moved: Picture, unmoved: Picture) -> Tensor:
-    """The share (S, 1) in [0, 1] of the unmoved picture's opacity that is still there;
+    """The share (S, 1) in [0, 1] of the unmoved picture's opacity that is still there.
+
     1 where the unmoved picture is empty.
     """
     ratio = moved.opacity / unmoved.opacity.clamp_min(MIN_OPACITY)

@@ -1,9 +1,9 @@
-"""3D Gaussians as a PLY file, the common exchange format (Kerbl et al. 2023): binary
-little-endian float32, one vertex per Gaussian.
+"""3D Gaussians as a PLY file, the common exchange format (Kerbl et al. 2023).
 
-Color is the constant term of spherical harmonics, opacity a logit, scales natural logs
-of standard deviations, rotation a unit quaternion w x y z; normals are there because
-readers expect them, and are zero.
+Binary little-endian float32, one vertex per Gaussian. Color is the constant term of
+spherical harmonics, opacity a logit, scales natural logs of standard deviations,
+rotation a unit quaternion w x y z; normals are there because readers expect them, and
+are zero.
 """
 
 from __future__ import annotations
@@ -41,8 +41,9 @@ class Splats:
 
 
 def write(path: Path | str, splats: Splats, comments: Sequence[str] = ()) -> None:
-    """Write `splats`, atomically; `comments` go into the header. NaN and Inf are an
-    error.
+    """Write `splats`, atomically; `comments` go into the header.
+
+    NaN and Inf are an error.
     """
     data = vertices(splats)
     assert np.isfinite(data).all(), f"{path}: Gaussians hold NaN or Inf"
@@ -75,8 +76,9 @@ def vertices(splats: Splats) -> np.ndarray:
 
 
 def read(path: Path | str) -> Splats:
-    """The Gaussians of a file that `write` wrote. InputError for anything else and
-    where it is cut short.
+    """The Gaussians of a file that `write` wrote.
+
+    InputError for any other file, and where it is cut short.
     """
     if not Path(path).is_file():
         raise InputError(f"{path}: no such file; put it back or correct the name")

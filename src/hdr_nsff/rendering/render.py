@@ -72,7 +72,8 @@ def render(config: RenderConfig) -> dict[str, Path]:
 
 
 def resize_shot(shot: Shot, scale: float, fps: float | None) -> Shot:
-    """The shot with `scale` times the pixels along each side, at `fps` (None: its own);
+    """The shot with `scale` times the pixels along each side, at `fps` (None: its own).
+
     InputError for pictures that are too large or too small.
     """
     for view in shot.views:
@@ -81,8 +82,9 @@ def resize_shot(shot: Shot, scale: float, fps: float | None) -> Shot:
 
 
 def check_size(width: int, height: int, scale: float) -> None:
-    """InputError where a picture of `width` x `height` pixels times `scale` is too
-    large or too small.
+    """InputError where a scaled picture is too large or too small.
+
+    It has `width` x `height` pixels times `scale`.
     """
     scaled_width, scaled_height = width * scale, height * scale
     size = f"pictures of {scaled_width:.3g} x {scaled_height:.3g} pixels"

@@ -1,8 +1,7 @@
-"""Pictures of the standard set, made from the EXR sequence of its training path: LDR
-views at three exposures, depth, motion, and an overview of all of them.
+"""Pictures of the standard set, made from the EXR sequence of its training path.
 
-Depth and motion take one range for the whole sequence, so that colors compare between
-pictures.
+LDR views at three exposures, depth, motion, and an overview of all of them. Depth and
+motion take one range for the whole sequence, so that colors compare between pictures.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ MIN_EV_RANGE = 0.5  # stops: a clip of less has one exposure (hand-chosen)
 EV_STEP = 2.0  # stops between the pictures of a clip of one exposure
 DEPTH_PERCENTILES = (2, 98)  # near and far end of the colors (hand-chosen on rendered scenes)
 MOTION_PERCENTILE = 99  # of the lengths: full saturation (hand-chosen on rendered scenes)
-# Every so many pixels a side enter the percentiles: they need no more.
+# Pixels between those that enter the percentiles, which need no more.
 DEPTH_STRIDE, MOTION_STRIDE = 4, 2
 MIN_DEPTH = 1e-6  # scene units
 MIN_MOTION_PX = 1e-3
@@ -45,8 +44,9 @@ class SequenceRanges:
 
 
 def write_pictures(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
-    """Write the pictures of the training path `shot`, whose EXR sequence is in
-    `out`/training; folders and files by name.
+    """Write the pictures of the training path `shot`; folders and files by name.
+
+    Its EXR sequence is in `out`/training.
     """
     evs = three_exposures(run.tonemapper.exposures().tolist())
     results = {f"LDR at EV {ev:+.1f}": ldr_folder(out, ev) for ev in evs}
@@ -77,8 +77,9 @@ def write_pictures(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
 
 
 def three_exposures(ev: Sequence[float]) -> list[float]:
-    """Darkest, middle and brightest exposure of the clip in EV; two stops apart where
-    it has one, the mean as the middle where it has two.
+    """Darkest, middle and brightest exposure of the clip in EV.
+
+    Two stops apart where it has one; the mean is the middle where it has two.
     """
     values = sorted(ev)
     if values[-1] - values[0] < MIN_EV_RANGE:
@@ -136,8 +137,9 @@ def write_pictures_of_view(
 
 
 def write_overview(run: Run, out: Path, shot: Shot, evs: Sequence[float], moves: bool) -> None:
-    """`overview.png`: rows of recorded frame, tone-mapped HDR, three exposures, depth
-    and motion.
+    """`overview.png`: rows of the recorded frame and of all pictures of its view.
+
+    Tone-mapped HDR, three exposures, depth and motion.
     """
     folders = [out / "training", *(ldr_folder(out, ev) for ev in evs), out / "depth"]
     if moves:

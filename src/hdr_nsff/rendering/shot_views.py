@@ -32,8 +32,9 @@ VIEWPOINT_SHARE = 1e-3  # of the near distance: a view closer to a camera is at 
 def plan_shot(
     run: Run, path: str, frame: int | None = None, factor: int = 2, num_views: int = 24
 ) -> Shot:
-    """The views of a named path or of a JSON file; InputError where the footage cannot
-    show them.
+    """The views of a named path or of a JSON file.
+
+    InputError where the footage cannot show them.
     """
     frames = sorted(run.scene.train, key=lambda f: f.time)
     cameras = [f.camera for f in frames]
@@ -91,8 +92,9 @@ def find_frame(run: Run, index: int | None) -> Frame:
 
 
 def bullet_views(run: Run, start: Frame, num_views: int) -> list[View]:
-    """The spiral around a frame, as wide as the cameras of the clip reach; InputError
-    where the footage has no parallax.
+    """The spiral around a frame, as wide as the cameras of the clip reach.
+
+    InputError where the footage has no parallax.
     """
     parallax = run.scene.manifest.parallax
     if parallax != "full":
@@ -108,8 +110,9 @@ def bullet_views(run: Run, start: Frame, num_views: int) -> list[View]:
 
 
 def focus_depth(run: Run, frame: Frame) -> float:
-    """Median z-depth of a small picture from the frame's camera, in scene units; the
-    middle of the scene in disparity where the picture is empty.
+    """Median z-depth of a small picture from the frame's camera, in scene units.
+
+    Where the picture is empty, the middle of the scene in disparity.
     """
     small = View(frame.camera, frame.time).resized(0.25)
     seen = run.field.render(to_device(small.camera, device_of(run)), small.time)
@@ -120,8 +123,9 @@ def focus_depth(run: Run, frame: Frame) -> float:
 
 
 def check_views(run: Run, path: str, views: Sequence[View]) -> None:
-    """InputError where a path file leaves the clip's time, or its viewpoint where the
-    clip has no parallax.
+    """InputError where a path file leaves the clip's time or its viewpoint.
+
+    Its viewpoint only where the clip has no parallax.
     """
     first, last = float(run.scene.times[0]), float(run.scene.times[-1])
     centers = torch.stack([f.camera.c2w[:, 3] for f in run.scene.train])

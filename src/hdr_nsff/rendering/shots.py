@@ -107,8 +107,9 @@ def render_still(run: Run, view: View, between: Mode = "auto", motion: bool = Tr
 
 
 def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
-    """The scene flow of a picture as pixels (S, 2) in the same camera: the motion of
-    the content, not of the camera.
+    """The scene flow of a picture as pixels (S, 2) in the same camera.
+
+    It is the motion of the content, not of the camera.
     """
     pixels = camera.pixel_grid()
     rays = camera.rays(pixels)
@@ -122,8 +123,10 @@ def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
 def develop(
     run: Run, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float
 ) -> np.ndarray:
-    """Radiance (..., 3) as an rgb picture in [0, 1]: recorded by a learned camera at
-    `ev`, or (None) tone-mapped for a display at `exposure`.
+    """Radiance (..., 3) as an rgb picture in [0, 1].
+
+    Recorded by a learned camera at `ev`, or (None) tone-mapped for a display
+    at `exposure`.
     """
     if ev is None:
         neutral = run.tonemapper.neutral(camera_id).cpu().numpy()
@@ -135,8 +138,9 @@ def develop(
 def develop_view(
     run: Run, view: View, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float
 ) -> np.ndarray:
-    """The same for a view of which the run rendered `radiance` (H, W, 3); fields that
-    record before they composite are rendered again.
+    """The same for a view of which the run rendered `radiance` (H, W, 3).
+
+    Fields that record before they composite are rendered again.
     """
     if ev is None:
         return develop(run, radiance, ev, camera_id, exposure)
@@ -148,8 +152,9 @@ def develop_view(
 
 
 def display_exposure(run: Run, views: Sequence[View]) -> float:
-    """One display exposure for a whole shot, from small pictures of its first, middle
-    and last view.
+    """One display exposure for a whole shot.
+
+    It is that of small pictures of its first, middle and last view.
     """
     probes = [views[i] for i in sorted({0, len(views) // 2, len(views) - 1})]
     radiance = []
@@ -160,8 +165,9 @@ def display_exposure(run: Run, views: Sequence[View]) -> float:
 
 
 def write_still(path: Path, still: Still, view: View, half: bool, header: dict[str, Any]) -> None:
-    """One EXR: RGB radiance, `Z`, `motion`, and motion vectors `forward.u`, `.v`,
-    `backward.u`, `.v` in pixels where known.
+    """One EXR: RGB radiance, `Z`, `motion`, and motion vectors where known.
+
+    The vectors are `forward.u`, `.v`, `backward.u`, `.v` in pixels.
     """
     channels = {"RGB": still.radiance, "Z": still.depth, "motion": still.motion}
     for offset, flow in still.flow.items():
@@ -175,8 +181,7 @@ def write_still(path: Path, still: Still, view: View, half: bool, header: dict[s
 
 
 def fingerprint(run: Run, *parts: Any) -> str:
-    """A hash of the checkpoint, the config and everything else given: pictures of one
-    hash are the same.
+    """A hash of the checkpoint, the config and `parts`: equal hashes, equal pictures.
 
     Where the folders of the run and of its scene are does not count, so a moved run
     keeps its pictures. The seconds of training distinguish runs of equal configs.
@@ -197,8 +202,9 @@ def to_plain(value: Any) -> Any:
 
 
 def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
-    """Write the shot's stills to `out/<name>/`, its video and contact sheet beside it;
-    the path of the video (without one, of the folder).
+    """Write the shot's stills to `out/<name>/`, its video and contact sheet beside it.
+
+    Returns the path of the video; without one, of the folder.
     """
     cameras = run.tonemapper.num_cameras
     if not 0 <= output.camera_id < cameras:
@@ -251,9 +257,10 @@ def write_sheet(path: Path, pictures: Sequence[Path]) -> None:
 def open_sequence(
     run: Run, shot: Shot, folder: Path, output: Output, products: Sequence[Path]
 ) -> notes.Sequence:
-    """The note of a shot, new or as it was left; pictures and `products` of other
-    settings or of another checkpoint are removed. InputError for files that no `render`
-    has written.
+    """The note of a shot, new or as it was left.
+
+    Pictures and `products` of other settings or of another checkpoint are removed.
+    InputError for files that no `render` has written.
     """
     key = fingerprint(run, shot.views, shot.fps, output)
     path = folder / "sequence.json"
@@ -291,8 +298,9 @@ def ev_of(view: View, output: Output) -> float | None:
 
 
 def write_view(run: Run, view: View, picture: Path, output: Output, exposure: float) -> None:
-    """Write `picture` and the EXR beside it where one of them is missing; `exposure` is
-    that of the display.
+    """Write `picture` and the EXR beside it where one of them is missing.
+
+    `exposure` is that of the display.
     """
     exr = picture.with_suffix(".exr")
     with_exr = output.exr != "none"

@@ -3,8 +3,7 @@
 Training path (EXR sequence, LDR views at three exposures, depth and motion pictures)
 and three videos: fixed camera, bullet time where the clip has parallax, slow motion.
 Under a tight budget the training path skips frames; videos shrink first and then keep
-to the middle of the clip. The plan stays in `plan.json`, so a restart follows the same
-one.
+to the middle of the clip. The plan stays in `plan.json`, which a restart follows.
 """
 
 from __future__ import annotations
@@ -90,9 +89,7 @@ def check_folder(out: Path) -> None:
 
 
 def plan_standard_shots(run: Run) -> tuple[list[Shot], list[str]]:
-    """The four shots in full, as far as the clip allows them; sentences about the
-    others.
-    """
+    """The four shots in full, if the clip allows them; sentences about the others."""
     shots, refused = [], []
     for name in SHOTS:
         try:
@@ -127,8 +124,9 @@ def fit_to_budget(
 def read_plan(
     run: Run, out: Path, budget: float, shots: Sequence[Shot], refused: Sequence[str]
 ) -> dict[str, notes.ShotShare]:
-    """Per shot the scale and the positions of the views to render: from `plan.json`
-    where that is of this checkpoint, else planned and written.
+    """Per shot the scale and the positions of the views to render.
+
+    From `plan.json` where that is of this checkpoint, else planned and written.
     """
     path = out / "plan.json"
     key = fingerprint(run, budget)
@@ -174,8 +172,9 @@ def share_of(run: Run, shot: Shot, speed: RenderSpeed, budget: float) -> notes.S
 
 
 def measure_speed(run: Run) -> RenderSpeed:
-    """Time one picture at a training time and one between two of them, after a small
-    one each, so that compiling is not counted.
+    """Time one picture at a training time and one between two of them.
+
+    After a small one each, so that compiling is not counted.
     """
     frame = find_frame(run, None)
     times = run.scene.times.tolist()
@@ -200,11 +199,11 @@ def time_render(run: Run, camera: Camera, moment: float) -> float:
 def cut(
     costs: Sequence[float], seconds: float, smallest: float, thin: bool
 ) -> tuple[float, list[int]]:
-    """Scale and positions of the views that fit into `seconds`, given the `costs` of
-    the views in seconds at full size.
+    """Scale and positions of the views that fit into `seconds`.
 
-    Smaller pictures first, down to the scale `smallest`; then fewer views: evenly
-    chosen ones if `thin`, else those in the middle.
+    `costs`: seconds of each view at full size. Smaller pictures first, down to the
+    scale `smallest`; then fewer views: evenly chosen ones if `thin`, else those in
+    the middle.
     """
     total = max(sum(costs), 1e-9)
     num_views = len(costs)

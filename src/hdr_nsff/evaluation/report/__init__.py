@@ -1,9 +1,9 @@
-"""The verb `report`: one HTML file that opens offline and shows what a run made, how
-good it is, and what it is based on.
+"""The verb `report`: one HTML file about a run that opens offline.
 
-Pictures, plots and short videos are inside the file. A part that is missing is named,
-with the command that makes it. The sections are built in `pictures`, `score_tables`,
-`plots` and `provenance`, and laid out in `report.html`.
+It shows what the run made, how good it is, and what it is based on. Pictures, plots and
+short videos are inside the file. A part that is missing is named, with the command that
+makes it. The sections are built in `pictures`, `score_tables`, `plots` and
+`provenance`, and laid out in `report.html`.
 """
 
 from __future__ import annotations
@@ -64,8 +64,9 @@ def report(config: ReportConfig) -> Path:
 
 
 def write_report(run: Run, path: Path, renders: Path) -> Path:
-    """Write the report of `run` with the pictures in `renders` to `path`, which is
-    returned.
+    """Write the report of `run` to `path`, which is returned.
+
+    `renders`: the folder of the files of `render`.
     """
     check_place(path)
     note = notes.read(run.folder / "metrics.json", notes.Metrics)
@@ -93,8 +94,9 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
 
 
 def check_place(path: Path) -> None:
-    """InputError where `path` is a folder, or a file that is no report, so that writing
-    one would destroy it.
+    """InputError where `path` is a folder, or a file that is no report.
+
+    Writing a report would destroy it.
     """
     if path.is_dir():
         advice = f"name the file to write, such as {path / 'report.html'}"

@@ -1,5 +1,6 @@
-"""Pictures and videos of a report: the standard set of `render`, and the comparisons of
-`evaluate`.
+"""Pictures and videos of a report.
+
+They are those of the standard set of `render` and the comparisons of `evaluate`.
 """
 
 from __future__ import annotations
@@ -75,8 +76,9 @@ class HeldOutViews:
 
 
 def find_videos(renders: Path, beside: Path) -> Videos:
-    """The videos in the folder `renders`: embedded if short, else linked, relative to
-    the folder `beside`; the others named.
+    """The videos in the folder `renders`: embedded if short, else linked.
+
+    Links are relative to the folder `beside`. Those that are missing are named.
     """
     embedded, linked, absent = [], [], []
     for name, caption in VIDEOS.items():
@@ -100,7 +102,8 @@ def why_absent(renders: Path) -> str:
 
 
 def side_by_side(run: Run, renders: Path) -> SideBySide | None:
-    """Rows of recorded frame, tone-mapped HDR, depth, scene flow and three exposures;
+    """Rows of recorded frame, tone-mapped HDR, depth, scene flow and three exposures.
+
     None where `render` has not made them.
     """
     ranges = notes.read(renders / "views.json", notes.PictureRanges)
@@ -146,8 +149,9 @@ def nearest_frame(run: Run, time: float) -> Frame:
 
 
 def held_out_views(folder: Path, metrics: dict[str, Any] | None) -> HeldOutViews | None:
-    """Prediction, truth and error of the best, the middle and the worst view of every
-    group, from the pictures of `evaluate` in `folder`; None before it has run.
+    """Comparisons of the best, the middle and the worst view of every group.
+
+    From the pictures of `evaluate` in `folder`; None before it has run.
     """
     if metrics is None:
         return None

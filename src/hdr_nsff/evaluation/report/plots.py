@@ -85,8 +85,9 @@ def plot_gains(run: Run) -> Markup:
 
 
 def plot_radiance(run: Run, renders: Path) -> Plots | None:
-    """Histogram of rendered radiance on a log axis, with the range that each exposure
-    of the clip records; None without an EXR sequence in `renders`.
+    """Histogram of rendered radiance, with the range that each exposure records.
+
+    None without an EXR sequence in `renders`.
     """
     files = sorted((renders / "training").glob("*.exr"))
     if not files:
@@ -117,8 +118,9 @@ def plot_radiance(run: Run, renders: Path) -> Plots | None:
 
 
 def draw_recorded_ranges(axes: Any, run: Run, left: float) -> None:
-    """A bar per exposure above the histogram: the radiance that it records. `left` is
-    the left end of the histogram.
+    """A bar per exposure above the histogram: the radiance that it records.
+
+    `left` is the left end of the histogram.
     """
     dark = darkest_exposure(run)
     exposures = sorted(run.tonemapper.exposures().tolist())
@@ -141,9 +143,7 @@ def darkest_exposure(run: Run) -> float:
 
 
 def plot_training(log: Sequence[notes.LogLine]) -> Plots | None:
-    """PSNR on training pixels, and every loss term on a log axis, against time; None
-    without a log.
-    """
+    """PSNR on training pixels, and every loss term, over time; None without a log."""
     if len(log) < 2:
         return None
     note = f"{log[-1].step} steps, {log[-1].rays_per_second:,.0f} rays per second."

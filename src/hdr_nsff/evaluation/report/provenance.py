@@ -1,6 +1,4 @@
-"""The tables of a report about its origin: how long everything took, and what was
-estimated or given.
-"""
+"""Tables of a report: how long everything took, and what was estimated or given."""
 
 from __future__ import annotations
 

@@ -167,8 +167,10 @@ def geometry_note(metrics: dict[str, Any]) -> str:
 
 
 def text(value: int | float | list[float]) -> str:
-    """A count as it is, a number with four digits after the point, a list of numbers
-    with three and their signs.
+    """A value for people.
+
+    A count as it is, a number with four digits after the point, a list of numbers with
+    three and their signs.
     """
     if isinstance(value, int):
         return str(value)

@@ -15,16 +15,15 @@ from hdr_nsff.training.run_folder import Run
 
 POWERS = np.geomspace(0.25, 4, 385)  # candidates for the response, 0.7 % apart
 RESPONSE_SAMPLES = 256  # exposures at which curves are compared
-RESPONSE_STRIDE = 5  # every so many samples of the true curve go into metrics.json
+RESPONSE_STRIDE = 5  # metrics.json has every fifth sample of the true curve
 
 
 def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
-    """The learned response and exposures against the true ones; empty where the true
-    response is not known.
+    """The learned response and exposures against the true ones.
 
-    `response_rmse`: root mean square error of the recorded value in [0, 1], over
-    exposures evenly spaced in x^(1/2.2) and the three channels. The scale is fixed,
-    because both curves reach 1 at exposure 1.
+    Empty where the true response is not known. `response_rmse`: root mean square error
+    of the recorded value in [0, 1], over exposures evenly spaced in x^(1/2.2) and the
+    three channels. The scale is fixed, because both curves reach 1 at exposure 1.
 
     Where exposures are learned, radiance is known up to a power p only: if E explains
     the clip through a curve g, then so does E^p through g(x^(1/p)) with exposures p
@@ -71,8 +70,9 @@ def camera_errors(run: Run, truth: Truth) -> dict[str, Any]:
 
 
 def power_between(learned_ev: np.ndarray, true_ev: np.ndarray) -> float:
-    """Learned exposures (B,) over true ones (B,), by least squares; 1 where that is no
-    positive number.
+    """Learned exposures (B,) over true ones (B,), by least squares.
+
+    1 where that is no positive number.
     """
     if not true_ev.any():
         return 1.0
@@ -81,8 +81,9 @@ def power_between(learned_ev: np.ndarray, true_ev: np.ndarray) -> float:
 
 
 def step_errors(learned_ev: np.ndarray, true_ev: np.ndarray, power: float) -> dict[str, Any]:
-    """Errors of the steps between exposures, in EV, as they are and once `power` is
-    undone; empty where there is one exposure.
+    """Errors of the steps between exposures in EV, also once `power` is undone.
+
+    Empty where there is one exposure.
     """
     order = np.argsort(true_ev, kind="stable")
     true_steps, learned_steps = np.diff(true_ev[order]), np.diff(learned_ev[order])
@@ -102,8 +103,9 @@ def rounded(values: np.ndarray) -> list[float]:
 
 
 def exposure_pairs(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
-    """True and learned EV of every bracket of the truth that the scene has, relative to
-    its reference bracket.
+    """True and learned EV of every bracket that truth and scene have, (B,) each.
+
+    Relative to the reference bracket of the truth.
     """
     ev = run.tonemapper.exposures().cpu().double().numpy()
     match = scene_brackets(truth, run.scene.manifest.frames, ev.tolist())
@@ -115,8 +117,9 @@ def exposure_pairs(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
 
 
 def trajectory_errors(run: Run, truth: Truth, targets: Sequence[Target]) -> dict[str, float]:
-    """Errors of poses and of the focal length of the clip's first frame; empty where
-    the truth has neither.
+    """Errors of poses and of the focal length of the clip's first frame.
+
+    Empty where the truth has neither.
     """
     paths = trajectories(run, truth)
     errors = {} if paths is None else alignment.pose_errors(*paths)

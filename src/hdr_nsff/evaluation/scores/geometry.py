@@ -83,8 +83,9 @@ def find_units(
 
 
 def score_geometry(target: Target, prediction: Path, units: Units) -> dict[str, float]:
-    """Depth and motion of a view; names as in `GEOMETRY_SCORES`. Only where the true
-    ray hits something; moving-only where that moves.
+    """Depth and motion of a view; names as in `GEOMETRY_SCORES`.
+
+    Over pixels whose true ray hits a surface, moving-only where that moves.
     """
     if target.geometry is None:
         return {}
@@ -109,8 +110,9 @@ def score_geometry(target: Target, prediction: Path, units: Units) -> dict[str, 
 def motion_errors(
     predicted: Geometry, true: Geometry, region: Tensor, units: Units
 ) -> dict[str, float]:
-    """End-point errors over a region (H, W), the mean of both directions, or of the one
-    that the run has; empty where it has neither.
+    """End-point errors over a region (H, W); empty where the run has no motion.
+
+    The mean of both directions, or the one that the run has.
     """
     sides = list(predicted.flow)
     if not sides:

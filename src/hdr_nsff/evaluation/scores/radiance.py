@@ -29,8 +29,9 @@ class Gauge:
 
 
 def find_gauge(targets: Sequence[Target], radiance: Sequence[Tensor]) -> Gauge | None:
-    """One gauge for all views: median ratios on recordable pixels. None where no view
-    has exact radiance.
+    """One gauge for all views: median ratios on recordable pixels.
+
+    None where no view has exact radiance.
     """
     pairs = [(t, r) for t, r in zip(targets, radiance, strict=True) if t.radiance is not None]
     if not pairs:
@@ -75,11 +76,11 @@ HDR_SCORES = {  # label, and digits after the point
 
 
 def score_radiance(target: Target, radiance: Tensor, gauge: Gauge) -> dict[str, float]:
-    """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`. Empty
-    where the exact one is not known.
+    """Linear radiance (H, W, 3) against the exact one; names as in `HDR_SCORES`.
 
-    Normalized by the largest exact radiance of all views; `recordable`: over recordable
-    pixels only, normalized by the largest of them.
+    Empty where the exact one is not known. Normalized by the largest exact radiance
+    of all views; `recordable`: over recordable pixels only, normalized by the largest
+    of them.
     """
     if target.radiance is None:
         return {}

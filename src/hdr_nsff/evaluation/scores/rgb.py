@@ -28,8 +28,7 @@ def score_rgb(
 
     At the view's own exposure PSNR, SSIM and, with `perceptual`, LPIPS; and PSNR
     averaged over all exposures of the clip at which the view is known, and over those
-    that no frame of the clip has. Moving-only scores where some pixel of the view
-    moves.
+    that no frame of the clip has. Moving-only scores where a part of the view moves.
     """
     moving = moving_of(target)
     own, truth = recorded[target.bracket], target.rgb[target.bracket]

@@ -1,8 +1,8 @@
-"""Stability of the radiance along the clip's own path: flicker that no single held-out
-view shows.
+"""Stability of the radiance along the clip's own path.
 
-Consecutive training frames are rendered and compared along the clip's optical flow,
-which every method trained on one scene folder shares.
+That is flicker, which no single held-out view shows. Consecutive training frames are
+rendered and compared along the clip's optical flow, which every method trained on one
+scene folder shares.
 """
 
 from __future__ import annotations
@@ -51,8 +51,9 @@ def stability(run: Run, folder: Path) -> dict[str, float]:
 
 
 def choose_pairs(run: Run) -> list[tuple[Frame, Frame]]:
-    """Training frames with flow to the next frame, and that frame: all, or `MAX_PAIRS`
-    spread evenly over the clip.
+    """Training frames with flow to the next frame, each with that frame.
+
+    All, or `MAX_PAIRS` spread evenly over the clip.
     """
     frames = run.scene.train
     pairs = []
@@ -73,9 +74,7 @@ def render_pairs(run: Run, pairs: Sequence[tuple[Frame, Frame]], folder: Path) -
 
 
 def regions_of(frame: Frame) -> dict[str, Tensor]:
-    """Pixels (H, W) whose flow to the next frame passes the round trip, by the name of
-    their score.
-    """
+    """Pixels (H, W) whose flow to the next frame passes the round trip, by score."""
     valid = frame.flow_valid[1]
     regions = {"hdr_tae": valid.cpu()}
     if frame.moving is not None:
