@@ -25,7 +25,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from hdr_nsff.core.io import read_exr, read_mask, read_npy, write_json, write_png
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_json
 from hdr_nsff.core.process import prepare_process
 from hdr_nsff.geometry.round_trip import agreement
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core import io
+from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.geometry import intrinsics
@@ -65,7 +65,7 @@ def make_truth(rig: Path, out: Path, spp: int | None) -> None:
     """OUT/truth of the half times' cameras, half a frame before, at, and half a frame
     after.
     """
-    settings = io.read_json(rig / "truth" / "truth.json")["settings"]
+    settings = read_json(rig / "truth" / "truth.json")["settings"]
     known = {f.name for f in fields(SynthConfig)}
     config = SynthConfig(out=out, **{k: v for k, v in settings.items() if k in known})
     config = replace(config, truth_spp=spp or config.truth_spp)

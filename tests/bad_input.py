@@ -14,7 +14,9 @@ import pytest
 from toy_scene import ToyScene, camera_center
 
 from hdr_nsff import cli
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_json, write_npy
 
 Capture = pytest.CaptureFixture[str]
 FRAMES = 9
@@ -163,7 +165,7 @@ def recorded(count: int = FRAMES) -> list[np.ndarray]:
 def clip(folder: Path, pictures: list[np.ndarray] | None = None) -> Path:
     """A folder of PNG frames."""
     for t, picture in enumerate(recorded() if pictures is None else pictures):
-        io.write_png(folder / f"{t:03d}.png", picture)
+        write_png(folder / f"{t:03d}.png", picture)
     return folder
 
 
@@ -176,7 +178,7 @@ def poses(path: Path, count: int = FRAMES) -> Path:
             [[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]]
         )  # columns: down, right, back
         rows.append([*pose.ravel(), 1.8, 5.0])
-    io.write_npy(path, np.array(rows))
+    write_npy(path, np.array(rows))
     return path
 
 
@@ -185,7 +187,7 @@ def truth(folder: Path) -> Path:
     scene, x = ToyScene(), (np.linspace(0, 1, 64) ** 2.2).tolist()
     views = []
     for t in (1, 3):
-        io.write_exr(folder / f"radiance/{t}.exr", {"RGB": scene.see(t)[0].astype(np.float32)})
+        write_exr(folder / f"radiance/{t}.exr", {"RGB": scene.see(t)[0].astype(np.float32)})
         views.append(
             {
                 "name": f"{t:05d}",
@@ -203,7 +205,7 @@ def truth(folder: Path) -> Path:
         "views": views,
     }
     centers = [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(6)]
-    io.write_json(folder / "truth.json", {**told, "K": scene.K.tolist(), "clip_c2w": centers})
+    write_json(folder / "truth.json", {**told, "K": scene.K.tolist(), "clip_c2w": centers})
     return folder
 
 

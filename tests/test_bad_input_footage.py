@@ -14,7 +14,10 @@ import OpenEXR
 import pytest
 from bad_input import FOOTAGE_VERBS, FRAMES, Capture, call, clip, cut, recorded, refused, snapshot
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import encode, write_png
+from hdr_nsff.core.io import write_npy, write_text
+from hdr_nsff.core.video import write_video
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:
@@ -52,7 +55,7 @@ def one_bad(folder: Path, damage: Callable[[Path], object], suffix: str = ".png"
     """Frames, the fifth of them damaged."""
     for t, picture in enumerate(recorded()):
         name = folder / f"{t:03d}{suffix}"
-        io.write_png(name, picture) if suffix == ".png" else io.write_exr(name, {"RGB": picture})
+        write_png(name, picture) if suffix == ".png" else write_exr(name, {"RGB": picture})
     damage(folder / f"004{suffix}")
     return folder
 
@@ -76,7 +79,7 @@ def text_video(folder: Path) -> Path:
 
 
 def cut_video(folder: Path) -> Path:
-    io.write_video(folder / "clip.mp4", recorded(20))
+    write_video(folder / "clip.mp4", recorded(20))
     cut(folder / "clip.mp4")
     return folder / "clip.mp4"
 
@@ -104,7 +107,7 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "one frame": (lambda p: clip(p, recorded(1)), "1 frame "),
     "two frames": (lambda p: clip(p, recorded(2)), "2 frames "),
     "frames of two sizes": (
-        lambda p: one_bad(p, lambda f: io.write_png(f, np.full((30, 60, 3), 0.5))),
+        lambda p: one_bad(p, lambda f: write_png(f, np.full((30, 60, 3), 0.5))),
         "004.png: 60x30 pixels",
     ),
     "all black": (lambda p: clip(p, [np.zeros((34, 60, 3))] * FRAMES), "all frames are black"),
@@ -143,7 +146,7 @@ def test_a_video_cut_short_anywhere(
     suffix: str, share: float, tmp_path: Path, capsys: Capture
 ) -> None:
     path = tmp_path / f"clip{suffix}"
-    io.write_video(path, recorded(40))
+    write_video(path, recorded(40))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     assert "cut short" in prepared(capsys, path)
 
@@ -151,7 +154,7 @@ def test_a_video_cut_short_anywhere(
 def test_a_jpeg_cut_short(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     (folder / "004.png").unlink()
-    io.encode(folder / "004.jpg", (recorded()[4] * 255).astype(np.uint8))
+    encode(folder / "004.jpg", (recorded()[4] * 255).astype(np.uint8))
     cut(folder / "004.jpg")
     assert "004.jpg: the JPEG is cut short" in prepared(capsys, folder)
 
@@ -225,11 +228,11 @@ def test_settings_out_of_range(tmp_path: Path, capsys: Capture) -> None:
 def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     for i in range(FRAMES):
-        io.write_png(tmp_path / f"masks/{i}.png", np.zeros((34, 59), bool))
-        io.write_png(tmp_path / f"few/{i // 2}.png", np.zeros((34, 60), bool))
+        write_png(tmp_path / f"masks/{i}.png", np.zeros((34, 59), bool))
+        write_png(tmp_path / f"few/{i // 2}.png", np.zeros((34, 60), bool))
         for j in range(FRAMES):
-            io.write_npy(tmp_path / f"small/{i:05d}_{j:05d}.npy", np.zeros((17, 30, 2), np.float32))
-            io.write_npy(tmp_path / f"flow/{i:05d}_{j:05d}.npy", np.zeros((34, 60, 2), np.float32))
+            write_npy(tmp_path / f"small/{i:05d}_{j:05d}.npy", np.zeros((17, 30, 2), np.float32))
+            write_npy(tmp_path / f"flow/{i:05d}_{j:05d}.npy", np.zeros((34, 60, 2), np.float32))
     flow = ["--flow", tmp_path / "flow"]
     assert "flow of shape (17, 30, 2)" in prepared(capsys, folder, "--flow", tmp_path / "small")
     assert "no flow from frame" in prepared(capsys, folder, "--flow", tmp_path / "few")
@@ -267,7 +270,7 @@ def test_output_that_is_a_file_or_holds_something_else(tmp_path: Path, capsys: C
     (tmp_path / "scene").write_text("mine")
     assert "is a file" in prepared(capsys, folder)
     (tmp_path / "scene").unlink()
-    io.write_text(tmp_path / "scene/thesis.txt", "mine")
+    write_text(tmp_path / "scene/thesis.txt", "mine")
     assert "holds other files" in prepared(capsys, folder)
     assert (tmp_path / "scene/thesis.txt").read_text() == "mine"
 

@@ -25,8 +25,9 @@ from bad_input import (
 )
 from safetensors.torch import save_file
 
-from hdr_nsff.core import io, notes
+from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint
+from hdr_nsff.core.io import write_text
 from hdr_nsff.training.run_folder import Run
 
 # Checkpoints
@@ -95,7 +96,7 @@ Change = Callable[[dict], object]
 PLAN, VIEWS, METRICS = "run/render/plan.json", "run/render/views.json", "run/metrics.json"
 SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply/sequence.json"
 KINDS: dict[str, type[notes.Note]] = {
-    PLAN: notes.Plan, VIEWS: notes.Colored, SEQUENCE: notes.Sequence, EXPORTED: notes.Exported, METRICS: notes.Metrics
+    PLAN: notes.RenderPlan, VIEWS: notes.PictureRanges, SEQUENCE: notes.Sequence, EXPORTED: notes.ExportedSequence, METRICS: notes.Metrics
 }  # fmt: skip
 NONSENSE: dict[str, tuple[str, Change]] = {
     "views beyond the shot": (PLAN, lambda d: d["shots"]["fixed"].update(views=[999])),
@@ -212,7 +213,7 @@ def test_the_mark_of_footage_that_was_made_is_not_written_over(
     text: str, tmp_path: Path, capsys: Capture
 ) -> None:
     for verb, mark in (("reexpose", "reexpose.json"), ("synth", "exact/key.json")):
-        io.write_text(tmp_path / verb / mark, text)
+        write_text(tmp_path / verb / mark, text)
         command = commands(tmp_path, clip(tmp_path / "clip"), tmp_path / verb)[verb]
         assert (
             "made with other settings" in (said := refused(capsys, *command))

@@ -22,7 +22,7 @@ from bad_input import (
     training,
 )
 
-from hdr_nsff.core import io
+from hdr_nsff.core.io import write_text
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
@@ -110,7 +110,7 @@ def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys
 def test_pictures_of_the_users_own_are_not_replaced(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    io.write_text(tmp_path / "mine" / name, "mine")
+    write_text(tmp_path / "mine" / name, "mine")
     assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["render"])
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b"mine"}
 
@@ -118,7 +118,7 @@ def test_pictures_of_the_users_own_are_not_replaced(
 def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
     run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    io.write_text(tmp_path / "mine/depth/00000.png", "mine")
+    write_text(tmp_path / "mine/depth/00000.png", "mine")
     assert "depth" in refused(
         capsys, "render", run_folder, "--out", tmp_path / "mine", "--device", "cpu"
     )
@@ -129,7 +129,7 @@ def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
 def test_files_of_the_users_own_are_not_replaced_by_gaussians(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    io.write_text(tmp_path / "mine" / name, '{"takes": 3}')
+    write_text(tmp_path / "mine" / name, '{"takes": 3}')
     assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["export"])
     assert name in refused(capsys, "export", run_folder, tmp_path / "mine" / name, "--ply")
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b'{"takes": 3}'}

@@ -13,11 +13,12 @@ from bad_input import Capture, call, clip, edit, reading, refused, snapshot, tra
 from estimates import forget_movers
 from hdr_nsff.tonemap.tonemapper import ToneMapConfig
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_npy, write_png
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.build import tone_mapper_for
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -326,7 +327,7 @@ def test_missing_maps_and_maps_of_the_wrong_size(
         ("raw_flow/00002_00003.npy", np.zeros((9, 60, 2))),
     ):
         kept = (scene / name).read_bytes()
-        (io.write_png if name.endswith("png") else io.write_npy)(scene / name, wrong)
+        (write_png if name.endswith("png") else write_npy)(scene / name, wrong)
         assert all(
             name in said and "shape (9, 60" in said
             for said in (refused(capsys, *c) for c in commands)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_image, write_png, write_video
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.datasets import held_out, layout_of, recognize
 from hdr_nsff.footage.datasets.capture import Capture, Clock, turns
 from hdr_nsff.footage.pose_files import Given, placed

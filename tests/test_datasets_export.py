@@ -17,15 +17,9 @@ from estimates import forget_movers
 from toy_scene import ToyScene
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import (
-    read_image,
-    read_mask,
-    read_npy,
-    write_exr,
-    write_json,
-    write_npy,
-    write_png,
-)
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_json, write_npy
 from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.layouts import colmap as to_colmap

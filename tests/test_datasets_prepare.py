@@ -16,7 +16,9 @@ import pytest
 from miniatures import EV, H, W
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, read_mask, write_npy, write_png
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.scene.manifest import Manifest

@@ -22,7 +22,8 @@ from posed_planes import (
 )
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_exr, write_npy
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.depth_files import read_depth
 from hdr_nsff.priors.depth import geometric as depth_module
 from hdr_nsff.priors.movers.distance import (

@@ -11,7 +11,10 @@ import pytest
 from toy_scene import WALL, ToyScene, camera_center
 
 from hdr_nsff import cli
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import read_npy, write_npy
+from hdr_nsff.core.video import read_video
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.training.run_folder import Run
 
@@ -36,7 +39,7 @@ def write_clip(folder: Path) -> list[str]:
     scene, rows = made_scene(), []
     for t in range(FRAMES):
         radiance, _, _ = scene.see(t)
-        io.write_png(
+        write_png(
             folder / f"frames/{t:05d}.png",
             np.clip(radiance * 2.0 ** EXPOSURES[t % 3], 0, 1) ** (1 / 2.2),
         )
@@ -45,7 +48,7 @@ def write_clip(folder: Path) -> list[str]:
             [[0, 1, 0, x, HEIGHT], [1, 0, 0, y, WIDTH], [0, 0, -1, z, scene.f]]
         )  # columns: down, right, back
         rows.append([*pose.ravel(), 1.8, 5.0])
-    io.write_npy(folder / "poses_bounds.npy", np.array(rows))
+    write_npy(folder / "poses_bounds.npy", np.array(rows))
     options = [
         "--ev",
         ",".join(f"{e:g}" for e in EXPOSURES),
@@ -90,7 +93,7 @@ def test_the_scene_is_what_was_filmed(out: Path) -> None:
     for f in m.frames[4:8]:
         if f.disparity is not None:
             _, moving, _ = scene.see(f.time)
-            disparity = np.asarray(io.read_npy(out / "scene" / f.disparity), np.float32)
+            disparity = np.asarray(read_npy(out / "scene" / f.disparity), np.float32)
             assert abs(float(np.median(disparity[~moving])) * WALL - 1) < 0.1
 
 
@@ -102,7 +105,7 @@ def test_radiance_comes_out_linear_unclipped_and_at_the_right_scale(out: Path) -
         2.0 ** EXPOSURES[run.scene.manifest.reference_bracket]
     )  # radiance 1 saturates the reference exposure
     for path, frame in list(zip(files, run.scene.train, strict=True))[2:10]:
-        channels = io.read_exr(path)
+        channels = read_exr(path)
         assert channels["RGB"].shape == (HEIGHT, WIDTH, 3) and float(channels["RGB"].min()) >= 0
         truth = scene.see(frame.time)[0] * unit
         ratio = channels["RGB"] / truth
@@ -115,14 +118,14 @@ def test_radiance_comes_out_linear_unclipped_and_at_the_right_scale(out: Path) -
 
 def test_videos_play(out: Path) -> None:
     for name, at_least in (("training", 12), ("fixed", 12), ("bullet", 10), ("slowmo", 20)):
-        frames = [rgb for rgb, _ in io.read_video(out / f"render/{name}.mp4")]
+        frames = [rgb for rgb, _ in read_video(out / f"render/{name}.mp4")]
         assert len(frames) >= at_least and frames[0].shape[:2] == (HEIGHT, WIDTH)
         assert 0.02 < float(np.mean(frames)) < 0.98 and float(np.std(frames[0])) > 0.02
 
 
 def test_ldr_views_depth_and_scene_flow_are_there_for_every_frame(out: Path) -> None:
     brightness = [
-        np.mean([io.read_image(p).mean() for p in folder.glob("*.png")])
+        np.mean([read_image(p).mean() for p in folder.glob("*.png")])
         for folder in sorted((out / "render/ldr").iterdir())
     ]
     assert len(brightness) == 3 and max(brightness) > 1.5 * min(brightness)
@@ -178,7 +181,7 @@ def test_the_other_verbs_work_on_what_run_made(
             "cpu",
         ]
     )
-    assert io.read_exr(next((tmp_path / "fixed").rglob("*.exr")))["RGB"].shape == (
+    assert read_exr(next((tmp_path / "fixed").rglob("*.exr")))["RGB"].shape == (
         HEIGHT // 2,
         WIDTH // 2,
         3,
@@ -220,7 +223,7 @@ def test_gaussians_trained_on_the_same_scene_come_closer_and_move_between_frames
     cli.main(
         ["render", str(run), "--path", "slowmo", "--factor", "2", "--no-video", "--device", "cpu"]
     )
-    moving = [io.read_exr(p)["motion"] for p in sorted((run / "render/slowmo").glob("*.exr"))[4:9]]
+    moving = [read_exr(p)["motion"] for p in sorted((run / "render/slowmo").glob("*.exr"))[4:9]]
     columns = [float((m * np.arange(m.shape[1])).sum() / m.sum()) for m in moving]
     assert all(m.max() > 0.5 for m in moving) and columns == sorted(columns), (
         "the card moves to the right, half frames between"

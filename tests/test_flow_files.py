@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_npy, write_png
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.flow_files import read_flow
 
 H, W = 64, 96

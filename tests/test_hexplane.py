@@ -9,8 +9,9 @@ import torch
 from presets import HEXPLANE, random_field, small
 from torch import nn
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image
 from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
 from hdr_nsff.fields.base import recorded
 from hdr_nsff.fields.baselines.hexplane import NUM_GROWTHS, HexPlane
@@ -132,10 +133,10 @@ def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(
 ) -> None:
     render(RenderConfig(run_of, "fixed", tmp_path, output=Output(ev=2.0, video=False, exr="float")))
     run = Run.open(run_of)
-    exr = torch.from_numpy(io.read_exr(tmp_path / "fixed/00002.exr")["RGB"]).reshape(-1, 3)
+    exr = torch.from_numpy(read_exr(tmp_path / "fixed/00002.exr")["RGB"]).reshape(-1, 3)
     camera = run.scene.train[3].camera  # the middle frame's
     torch.testing.assert_close(exr, run.field.render(camera, 2.0).radiance, atol=1e-5, rtol=1e-4)
-    png = torch.from_numpy(io.read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
+    png = torch.from_numpy(read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
     (rgb,) = recorded(run.field, camera, 2.0, [run.tonemapper.recorder_at(2.0)])
     torch.testing.assert_close(png, rgb, atol=0.003, rtol=0)
 

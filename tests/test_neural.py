@@ -10,7 +10,8 @@ import pytest
 from tiny_networks import tiny_depth_anything, tiny_sam2
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask, read_npy, write_npy, write_png, write_text
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_npy, write_text
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.prepare.steps.neural import weights_of
 from hdr_nsff.priors.flow.semantic import SemanticConfig

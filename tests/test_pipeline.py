@@ -13,8 +13,9 @@ import pytest
 from test_prepare import H, W, given
 
 from hdr_nsff import cli, pipeline
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_json
 from hdr_nsff.pipeline import RunConfig, held_out_every, prepare_settings, train_settings
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.scene import Scene
@@ -31,7 +32,7 @@ def problem(root: Path, hold_out: int) -> Path:
     """
     world = np.exp(np.random.default_rng(0).normal(size=(H, W + 2 * COUNT, 3)) * 0.5 - 1.5)
     for t in range(COUNT):
-        io.write_png(root / f"ordinary/{t:03d}.png", np.clip(world[:, 2 * t : 2 * t + W], 0, 1))
+        write_png(root / f"ordinary/{t:03d}.png", np.clip(world[:, 2 * t : 2 * t + W], 0, 1))
     return reexpose(ReexposeConfig(root / "ordinary", root / "problem", hold_out=hold_out))
 
 
@@ -48,7 +49,7 @@ def truth_of(folder: Path, *views: tuple[float, int]) -> Path:
         response_y=[[0, 1]] * 3,
         views=entries,
     )
-    io.write_json(folder / "truth.json", truth.model_dump())
+    write_json(folder / "truth.json", truth.model_dump())
     return folder
 
 

@@ -14,7 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.core.io import read_image, read_mask, write_npy, write_png
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.geometry.round_trip import round_trip
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare
 from hdr_nsff.priors.flow.dense import average_with_reverse

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 from test_prepare import COUNT, footage, given
 
-from hdr_nsff.core import io
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_json
 from hdr_nsff.footage.ingest import between
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.scene.manifest import Manifest
@@ -126,8 +128,8 @@ def made(root: Path) -> Path:
     """Footage with its truth beside it, as `synth` leaves them."""
     footage(root / "clip")
     wall = np.ones((32, 48, 3), np.float32)
-    io.write_exr(root / "truth/radiance/a.exr", {"RGB": wall})
-    io.write_png(root / "truth/masks/a.png", wall[..., 0] > 2)
+    write_exr(root / "truth/radiance/a.exr", {"RGB": wall})
+    write_png(root / "truth/masks/a.png", wall[..., 0] > 2)
     view = TruthView(
         name="a", time=2.5, bracket=0, anchor=2, radiance="radiance/a.exr", mask="masks/a.png"
     )
@@ -138,7 +140,7 @@ def made(root: Path) -> Path:
         response_y=[[0.0, 1.0]] * 3,
         views=[view],
     )
-    io.write_json(root / "truth/truth.json", truth.model_dump())
+    write_json(root / "truth/truth.json", truth.model_dump())
     return root
 
 

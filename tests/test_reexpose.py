@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, write_npy, write_png
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import response_curve

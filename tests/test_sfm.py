@@ -13,7 +13,8 @@ import pytest
 from posed_clips import PLACES, sliding
 
 from hdr_nsff import cli
-from hdr_nsff.core import io
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import FULL
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.trimming import TrimmingTuning
 
@@ -68,7 +69,7 @@ def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, mon
     (tmp_path / "inject/sitecustomize.py").write_text(FULL_DISK)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "inject"), *sys.path]))
     for t, frame in enumerate(sliding(PLACES)):
-        io.write_png(tmp_path / f"clip/{t:03d}.png", frame)
+        write_png(tmp_path / f"clip/{t:03d}.png", frame)
     with pytest.raises(SystemExit) as stop:
         cli.main(["prepare", str(tmp_path / "clip"), str(tmp_path / "scene"), "--ev", "0"])
     lines = capsys.readouterr().err.splitlines()
@@ -89,7 +90,7 @@ def test_a_disk_without_free_space_is_full_however_the_worker_ended(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
-    assert full.value.errno in io.FULL and not list(tmp_path.iterdir())
+    assert full.value.errno in FULL and not list(tmp_path.iterdir())
 
 
 def test_a_job_survives_its_way_to_the_worker(tmp_path):

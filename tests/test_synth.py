@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image, read_mask
+from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.video import read_video
 from hdr_nsff.footage.ingest import open_footage, read_exposure_csv
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
@@ -275,7 +278,7 @@ def test_exposures_alternate_about_the_middle_bracket(flat: SynthConfig) -> None
     synth(flat)
     truth = Truth.open(flat.out / "truth")
     assert truth.bracket_ev == [-2, 0, 2] and truth.reference_bracket == 1
-    greens = [float(io.read_image(flat.out / "clip" / f"{t:05d}.png")[0, 0, 1]) for t in range(6)]
+    greens = [float(read_image(flat.out / "clip" / f"{t:05d}.png")[0, 0, 1]) for t in range(6)]
     assert greens[:3] == greens[3:] and greens[2] == 1
     expected = np.interp([1 / 16, 1 / 4], truth.response_x, truth.response_y[1])
     np.testing.assert_allclose(greens[:2], expected, atol=0.5 / 255)
@@ -287,10 +290,10 @@ def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
     assert len(truth.views) == 16 and len(truth.clip_c2w or []) == 12
     view = truth.views[0]
     np.testing.assert_array_equal(
-        io.read_exr(flat.out / "truth" / view.radiance)["RGB"], np.full((16, 16, 3), 0.25)
+        read_exr(flat.out / "truth" / view.radiance)["RGB"], np.full((16, 16, 3), 0.25)
     )
-    assert io.read_mask(flat.out / "truth" / str(view.mask)).sum() == 4 * 16
-    assert sum(1 for _ in io.read_video(flat.out / "clip.mp4")) == 12
+    assert read_mask(flat.out / "truth" / str(view.mask)).sum() == 4 * 16
+    assert sum(1 for _ in read_video(flat.out / "clip.mp4")) == 12
 
 
 @pytest.mark.parametrize("views", ["mono", "rig"])
@@ -352,7 +355,7 @@ def test_the_cameras_settings_are_in_the_truth_and_in_the_recording(flat: SynthC
     )
     _, pictures = true_pictures(truth, truth.views[0], flat.out / "truth")
     for bracket in (0, 1):
-        recorded = io.read_image(flat.out / "clip" / f"{bracket:05d}.png")
+        recorded = read_image(flat.out / "clip" / f"{bracket:05d}.png")
         np.testing.assert_allclose(recorded, pictures[bracket], atol=0.51 / 255)
     assert pictures[1][8, 8, 1] > pictures[1][0, 0, 1] + 0.02  # darker in the corner
 
@@ -416,13 +419,11 @@ def test_the_poses_of_a_rig_are_in_its_truth_and_its_oracle(flat: SynthConfig) -
 def test_a_rig_goes_on_after_a_kill_and_does_not_mix_with_one_camera(flat: SynthConfig) -> None:
     rig = replace(flat, views="rig")
     synth(rig)
-    before = io.read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy")
+    before = read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy")
     (rig.out / "exact" / "clip_00003.exr").unlink()
     synth(rig)
     assert Flat.rendered == 12 + 16 + 1
-    np.testing.assert_array_equal(
-        io.read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy"), before
-    )
+    np.testing.assert_array_equal(read_npy(rig.out / "oracle" / "flow" / "00003_00004.npy"), before)
     with pytest.raises(InputError, match="other settings"):
         synth(flat)
 
@@ -518,14 +519,14 @@ def test_the_demo_is_whole_and_small_enough_for_git() -> None:
         f for f in demo.rglob("*") if f.is_file() and demo / "out" not in f.parents
     ]  # `make demo` writes its results there
     assert sum(f.stat().st_size for f in kept) < 4_000_000
-    frames = np.stack([rgb for rgb, _ in io.read_video(demo / "clip.mp4")])
+    frames = np.stack([rgb for rgb, _ in read_video(demo / "clip.mp4")])
     assert frames.shape == (36, 136, 240, 3)
     means = frames.mean((1, 2, 3)).reshape(12, 3)
     assert (np.diff(means, axis=1) > 0.1).all()  # dark, middle, bright, over and over
     truth = Truth.open(demo / "truth")
     for view in truth.views:
-        assert io.read_exr(demo / "truth" / view.radiance)["RGB"].shape == (136, 240, 3)
-        assert 0.02 < io.read_mask(demo / "truth" / str(view.mask)).mean() < 0.15
+        assert read_exr(demo / "truth" / view.radiance)["RGB"].shape == (136, 240, 3)
+        assert 0.02 < read_mask(demo / "truth" / str(view.mask)).mean() < 0.15
     np.testing.assert_allclose(
         np.array(truth.clip_c2w), [s.c2w for s in clip_shots(INTERIOR, 36, 1, 0)]
     )  # the code still makes this clip

@@ -5,7 +5,7 @@ comes with it.
 import numpy as np
 from test_synth import BALL, BOX, ROOM, flat, tracer  # noqa: F401  (fixtures)
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import SIDES, read_exr
 from hdr_nsff.scene.truth import GEOMETRY, Truth
 from hdr_nsff.synth.motion import view_geometry
 from hdr_nsff.synth.pathtracer import Tracer
@@ -25,7 +25,7 @@ def test_every_pixel_moves_as_its_body_does() -> None:
     depth, bodies = rng.uniform(1.5, 3, (9, 12)), rng.integers(0, 3, (9, 12))
     channels = view_geometry(INTERIOR, {"Z": depth, "body": bodies}, time, K, c2w)
     np.testing.assert_array_equal(channels["Z"], depth)
-    for side, name in io.SIDES.items():
+    for side, name in SIDES.items():
         for y, x in np.ndindex(9, 12):
             ray = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1]
             point = c2w[:, :3] @ (depth[y, x] * ray) + c2w[:, 3]
@@ -58,7 +58,7 @@ def test_every_held_out_view_and_half_time_has_depth_and_motion(flat: SynthConfi
     truth = Truth.open(flat.out / "truth")
     assert len(truth.views) == 16 and sum(v.time % 1 == 0.5 for v in truth.views) == 6
     for view in truth.views:
-        channels = io.read_exr(flat.out / "truth" / str(view.geometry))
+        channels = read_exr(flat.out / "truth" / str(view.geometry))
         assert sorted(channels) == sorted(GEOMETRY) and (channels["Z"] == 3).all()
         assert (np.abs(channels["forward.x"][:, :4]) > 0).all() and (
             channels["forward.x"][:, 4:] == 0
@@ -78,7 +78,7 @@ def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:  # noqa: F
     distance = np.linalg.norm(surface.points - center[0], axis=-1)
     ball = (surface.bodies == BALL) & (distance < 0.17)  # and not its cord
     assert ball.sum() > 20 and (surface.bodies == BOX).any()
-    for side, name in io.SIDES.items():
+    for side, name in SIDES.items():
         moved = surface.points + np.stack([channels[f"{name}.{a}"] for a in "xyz"], -1)
         assert np.linalg.norm(center[side] - center[0]) > 0.02
         np.testing.assert_allclose(

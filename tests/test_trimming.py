@@ -5,7 +5,7 @@ bends no camera.
 import numpy as np
 import pytest
 
-from hdr_nsff.core.io import encode
+from hdr_nsff.core.images import encode
 from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.trimming import TrimmingTuning

@@ -21,7 +21,9 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, read_video, video_info
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image
+from hdr_nsff.core.video import read_video, video_info
 
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hdr_nsff.core.io import write_npy, write_png
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.scene.manifest import Manifest, Provenance
 
 

@@ -10,7 +10,8 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from hdr_nsff.core.io import read_image, read_mask, read_npy
+from hdr_nsff.core.images import read_image, read_mask
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Capture, Picture
 from hdr_nsff.priors.flow.semantic import SemanticConfig

@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_image, read_mask, read_npy
+from hdr_nsff.core.images import read_image, read_mask
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord, inside

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdr_nsff.core.io import SIDES
+from hdr_nsff.core.exr import SIDES
 from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.geometry import back_project, project
 

@@ -16,7 +16,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import SIDES
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.static_samples import ResponseView
@@ -62,25 +64,23 @@ def write_oracle(
     entries = [frame_entry(i, count, K, c2w[i], ev) for i in range(count)]
     for i, (channels, entry) in enumerate(zip(exact, entries, strict=True)):
         error = depth_error(noise, (height, width), rng, i)
-        io.write_png(folder / entry.image, video[i])
-        io.write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
-        io.write_npy(
-            folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16)
-        )
-        io.write_npy(
+        write_png(folder / entry.image, video[i])
+        write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
+        write_npy(folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16))
+        write_npy(
             folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16)
         )
         for j, files in entry.flow.items():
             flow = rendered_flow(channels, j - i)
-            io.write_png(
+            write_png(
                 folder / files.valid,
                 visible(flow, depth_there(scene, channels, K, c2w, i, j), depths[j]),
             )
-            io.write_npy(
+            write_npy(
                 folder / files.flow,
                 (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16),
             )
-    io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
+    write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
     manifest = Manifest(
         source="clip",
         width=width,
@@ -108,7 +108,7 @@ def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None
     """What `prepare` would estimate from the other parts: the response and the movers."""
     frames = manifest.frames
     disparity = read_maps(folder, [str(f.disparity) for f in frames])
-    moving = np.stack([io.read_mask(folder / str(f.mask)) for f in frames])
+    moving = np.stack([read_mask(folder / str(f.mask)) for f in frames])
     K, c2w = np.array([f.K for f in frames]), np.array([f.c2w for f in frames])
     views = [
         ResponseView(video[i], f.bracket, f.time, K[i], c2w[i], disparity[i], None, moving[i])
@@ -122,7 +122,7 @@ def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None
     pairs = [(f.index, j) for f in frames for j in f.flow]
     files = [frames[i].flow[j] for i, j in pairs]
     flow = read_maps(folder, [f.flow for f in files])
-    valid = np.stack([io.read_mask(folder / f.valid) for f in files])
+    valid = np.stack([read_mask(folder / f.valid) for f in files])
     confidence = np.ones_like(disparity)
     movers = estimate_movers(clip, flow, valid, np.array(pairs), disparity, confidence)
     write_movers(folder / "movers.npz", movers)
@@ -130,7 +130,7 @@ def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None
 
 def read_maps(folder: Path, names: list[str]) -> np.ndarray:
     """Maps of one size, stacked, in single precision."""
-    return np.stack([io.read_npy(folder / name).astype(np.float32) for name in names])
+    return np.stack([read_npy(folder / name).astype(np.float32) for name in names])
 
 
 def frame_entry(i: int, count: int, K: np.ndarray, c2w: np.ndarray, ev: list[float]) -> FrameEntry:
@@ -171,7 +171,7 @@ def depth_error(
 
 def rendered_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
     """The rendered flow (H, W, 2) px to the next (+1) or previous (-1) frame."""
-    return np.stack([channels[f"{io.SIDES[side]}.u"], channels[f"{io.SIDES[side]}.v"]], -1)
+    return np.stack([channels[f"{SIDES[side]}.u"], channels[f"{SIDES[side]}.v"]], -1)
 
 
 def visible(flow: np.ndarray, expected: np.ndarray, depth: np.ndarray) -> np.ndarray:

@@ -22,15 +22,9 @@ import numpy as np
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import (
-    read_json,
-    read_mask,
-    write_exr,
-    write_json,
-    write_npy,
-    write_png,
-    writing_to,
-)
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest

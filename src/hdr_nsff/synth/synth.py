@@ -31,9 +31,12 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import SIDES, read_exr, write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_json, write_text
 from hdr_nsff.core.progress import say, track
+from hdr_nsff.core.video import write_video
 from hdr_nsff.radiometry.recording import Noise, record, response_curve, vignette
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.motion import UV, exact_flow, view_geometry
@@ -297,7 +300,7 @@ def claim(config: SynthConfig) -> None:
         )
     if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
         raise InputError(f"{config.out}: holds something else; choose a new or an empty folder")
-    io.write_json(path, {"digest": digest, **key})
+    write_json(path, {"digest": digest, **key})
 
 
 def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: SynthConfig) -> None:
@@ -319,7 +322,7 @@ def render(shots: list[Shot], K: np.ndarray, size: tuple[int, int], config: Synt
         surface = tracer.surface(shot.time, K, shot.c2w, size)
         channels = geometry_channels(scene, surface, shot, K, config.views)
         channels["RGB"] = tracer.radiance(shot.time, K, shot.c2w, size, shot.spp, shot.seed)
-        io.write_exr(config.out / "exact" / f"{shot.name}.exr", channels, half=False)
+        write_exr(config.out / "exact" / f"{shot.name}.exr", channels, half=False)
         spent.setdefault(shot.spp, []).append(clock.monotonic() - began)
     cost = ", ".join(
         f"{np.mean(s):.1f} s per picture at {spp} paths per pixel" for spp, s in spent.items()
@@ -352,7 +355,7 @@ def geometry_channels(
     if scene.deforms:
         channels |= {name: surface.uv[..., k] * (surface.bodies > 0) for k, name in enumerate(UV)}
     if shot.name.startswith("clip"):
-        for side, name in io.SIDES.items():
+        for side, name in SIDES.items():
             there = scene.moved(
                 surface.points, surface.bodies, surface.uv, shot.time, shot.time + side
             )
@@ -363,7 +366,7 @@ def geometry_channels(
 
 def exact(out: Path, shot: Shot) -> dict[str, np.ndarray]:
     """The rendered channels of a shot."""
-    return io.read_exr(out / "exact" / f"{shot.name}.exr")
+    return read_exr(out / "exact" / f"{shot.name}.exr")
 
 
 def record_clip(
@@ -382,8 +385,8 @@ def record_clip(
         video.append(
             record(radiance, relative[t % len(relative)], gains, curve, noise, rng, passed)
         )
-        io.write_png(config.out / "clip" / f"{t:05d}.png", video[-1])
-    io.write_video(config.out / "clip.mp4", video, crf=VIDEO_CRF, footage=True)
+        write_png(config.out / "clip" / f"{t:05d}.png", video[-1])
+    write_video(config.out / "clip.mp4", video, crf=VIDEO_CRF, footage=True)
     return np.stack(video)
 
 
@@ -393,7 +396,7 @@ def list_exposures(evs: list[float], config: SynthConfig) -> None:
     """
     rows = [f"{t},{evs[t % len(evs)]:g}" for t in range(config.frames)]
     for path in (config.out / "clip.csv", config.out / "clip" / "exposures.csv"):
-        io.write_text(path, "\n".join(["frame,ev", *rows, ""]))
+        write_text(path, "\n".join(["frame,ev", *rows, ""]))
 
 
 def write_truth(
@@ -411,10 +414,10 @@ def write_truth(
     entries = []
     for k, shot in enumerate(views):
         channels = exact(config.out, shot)
-        io.write_exr(folder / "radiance" / f"{shot.name}.exr", {"RGB": channels["RGB"]})
-        io.write_png(folder / "masks" / f"{shot.name}.png", channels["body"] > 0)
+        write_exr(folder / "radiance" / f"{shot.name}.exr", {"RGB": channels["RGB"]})
+        write_png(folder / "masks" / f"{shot.name}.png", channels["body"] > 0)
         geometry = view_geometry(SCENES[config.name], channels, shot.time, K, shot.c2w)
-        io.write_exr(folder / "geometry" / f"{shot.name}.exr", geometry, half=False)
+        write_exr(folder / "geometry" / f"{shot.name}.exr", geometry, half=False)
         entries.append(
             TruthView(
                 name=shot.name,
@@ -439,4 +442,4 @@ def write_truth(
         clip_c2w=[s.c2w.tolist() for s in clip],
         views=entries,
     )
-    io.write_json(folder / "truth.json", truth.model_dump())
+    write_json(folder / "truth.json", truth.model_dump())

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, unpack, write_checkpoint
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_json, write_json, write_png
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.notes import LogLine
 from hdr_nsff.fields.base import RadianceField, recorded
 from hdr_nsff.fields.build import build_field, device_for

@@ -23,7 +23,9 @@ import numpy as np
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, write_exr, write_json, write_png
+from hdr_nsff.core.exr import read_exr, write_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import write_json
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.datasets import (
     blender,

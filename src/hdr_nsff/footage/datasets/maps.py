@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask, read_npy
+from hdr_nsff.core.images import read_mask
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.footage.datasets.capture import Capture, Picture, Sighting
 from hdr_nsff.footage.depth_files import read_map
 from hdr_nsff.footage.flow_files import read_npz

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import atomic, read_mask, read_npy, write_json, write_npy, write_png
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import atomic, read_npy, write_json, write_npy
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.datasets.capture import ExtraFrame, ExtraView
 from hdr_nsff.footage.datasets.llff import MULTI_VIEW, NOTE

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.io import read_mask, write_npy, write_png
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.core.progress import track
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult

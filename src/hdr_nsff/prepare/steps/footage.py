@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_png
+from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.prepare.result import StepResult

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask
+from hdr_nsff.core.images import read_mask
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from hdr_nsff.core.io import read_mask, read_npy
+from hdr_nsff.core.images import read_mask
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry.response import describe, estimate_response

@@ -7,14 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hdr_nsff.core.io import (
-    colorize,
-    colorize_flow,
-    contact_sheet,
-    read_mask,
-    read_npy,
-    write_png,
-)
+from hdr_nsff.core.images import colorize, colorize_flow, contact_sheet, read_mask, write_png
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.scene.manifest import FrameEntry

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import encode
+from hdr_nsff.core.images import encode
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.geometry.pinhole import intrinsics

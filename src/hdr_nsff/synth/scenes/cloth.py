@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.io import read_exr
+from hdr_nsff.core.exr import read_exr
 from hdr_nsff.synth import textures as textures
 from hdr_nsff.synth.scenes.base import Deforming, Part, SynthScene
 from hdr_nsff.synth.scenes.geometry import look_at
