@@ -68,7 +68,8 @@ def explain(error: ErrorDetails, command: str) -> str:
     """One of pydantic's findings as a sentence about an option."""
     names = [str(part) for part in error["loc"]]
     types = {"splat", "nsff", "nerf-wt", "hdr-hexplane", "grids", "network"}
-    flags = [name.replace("_", "-") for name in names if name not in types]
+    # `budget` is written out into flags of its own
+    flags = [name.replace("_", "-") for name in names if name not in types | {"budget"}]
     option = "--" + ".".join(flags) if flags else "the settings"
     shown = repr(error["input"])
     if len(shown) > MAX_SHOWN:

@@ -55,7 +55,7 @@ class NSFFConfig(BranchesConfig):
     """A neural scene flow field."""
 
     type: Advanced[Literal["nsff"]] = "nsff"
-    loss: SceneFlowLosses = field(default_factory=SceneFlowLosses)
+    loss: Advanced[SceneFlowLosses] = field(default_factory=SceneFlowLosses)
     flow_scale: Advanced[Weight] = 0.05
     """Cube units per unit of raw scene flow (published: tanh in NDC, which is 0.5
     here).

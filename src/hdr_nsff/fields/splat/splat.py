@@ -71,7 +71,7 @@ class SplatConfig:
     """A field of 4D Gaussians."""
 
     type: Advanced[Literal["splat"]] = "splat"
-    loss: SplatLosses = field(default_factory=SplatLosses)
+    loss: Advanced[SplatLosses] = field(default_factory=SplatLosses)
     static: Annotated[int, Ge(1), Le(10**8)] | None = None
     """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
     moving: Annotated[int, Ge(0), Le(10**8)] | None = None
