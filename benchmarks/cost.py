@@ -32,6 +32,7 @@ from hdr_nsff.core import distributed
 from hdr_nsff.core.process import hold_threads, prepare_process
 from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
@@ -90,8 +91,7 @@ def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any
             field=field,
             scene=folder,
             out=Path(out),
-            steps=100 * steps,
-            minutes=None,
+            budget=Budget(steps=100 * steps, minutes=None),
         )
         trainer = Trainer(config, scene, torch.device("cpu"), distributed.Ranks())
         numba.set_num_threads(setting["cores"])

@@ -29,6 +29,7 @@ from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.pose_corrections import moved, similarities, typical_depth, visible_motion
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
@@ -67,8 +68,7 @@ def main() -> None:
                 PRESETS[args.preset],
                 scene=scene,
                 out=out,
-                steps=args.steps,
-                minutes=None,
+                budget=Budget(steps=args.steps, minutes=None),
                 refine_poses=refine,
                 device="cpu",
             )

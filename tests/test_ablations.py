@@ -8,7 +8,7 @@ import torch
 from presets import random_field, small, trainer
 
 from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE
-from hdr_nsff.fields.build import build_field, start_field
+from hdr_nsff.fields.build import build_field, initialize_field
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.batch import whole_frame
 from hdr_nsff.scene.scene import Scene
@@ -67,7 +67,7 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     assert isinstance(config, SplatConfig)
     field = build_field(replace(config, view_dependence=True), toy)
     assert isinstance(field, Splat)
-    start_field(
+    initialize_field(
         field, toy, lambda rgb, i: 3 * rgb, 0.5, True
     )  # brighter than 1, the background too
     for g in (field.static, field.moving):
@@ -94,7 +94,7 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
 ) -> None:
     fields = [build_field(small(name).field, toy) for name in ("splat-sigmoid", "splat")]
     for field in fields:
-        start_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)
+        initialize_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)
     bounded, free = fields
     assert isinstance(bounded, Splat) and isinstance(free, Splat)
     for share in (0.0, 0.3):

@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from bad_input import Capture, call, clip, edit, reading, refused, snapshot, training
 from estimates import forget_movers
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.tonemap.build import tone_mapper_for
 
 Change = Callable[[dict[str, Any]], object]

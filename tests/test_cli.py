@@ -18,6 +18,7 @@ import pytest
 
 from hdr_nsff import __version__, cli
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import ABLATIONS, METHODS, PRESETS
 from hdr_nsff.training.run_folder import Run
@@ -92,7 +93,7 @@ def test_train_lists_methods_line_by_line_and_ablations_in_a_sentence(
 
 def test_an_ablation_reaches_the_verb_by_its_name(trained_with: list[TrainConfig]) -> None:
     assert call("train", "splat-response-mlp", "--steps", "7") == 0
-    assert trained_with == [replace(PRESETS["splat-response-mlp"], steps=7)]
+    assert trained_with == [replace(PRESETS["splat-response-mlp"], budget=Budget(steps=7))]
 
 
 def test_every_preset_with_a_line_of_help_exists() -> None:

@@ -25,7 +25,8 @@ from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.layouts import colmap as to_colmap
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.radiometry.recording import response_curve
-from hdr_nsff.rendering.export import Coloring, ExportConfig, export
+from hdr_nsff.rendering.export import ExportConfig, export
+from hdr_nsff.rendering.export_gaussians import ColorTransform
 from hdr_nsff.scene.manifest import FrameEntry, Manifest
 from hdr_nsff.scene.response import read_response, write_response
 from hdr_nsff.scene.scene import Scene
@@ -294,8 +295,8 @@ def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(
             export(wrong)
     for wrong in (
         replace(config, time=1.0),
-        replace(config, coloring=Coloring(ev=1.0)),
-        replace(config, coloring=Coloring(linear=True)),
+        replace(config, colors=ColorTransform(ev=1.0)),
+        replace(config, colors=ColorTransform(linear=True)),
     ):
         with pytest.raises(InputError, match="are for Gaussians"):
             export(wrong)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from fakes import fake_run
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 from presets import random_field, small
 
 from hdr_nsff.core.errors import InputError
@@ -29,6 +28,8 @@ from hdr_nsff.rendering.export_gaussians import (
 )
 from hdr_nsff.rendering.shots import develop
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.run_folder import Run
 
 LINEAR = ColorTransform(linear=True)
@@ -38,7 +39,7 @@ SH_0 = 0.28209479177387814
 def make_run(toy: Scene, folder: Path, preset: str = "splat") -> Run:
     """An untrained run with content in every part of its field."""
     field = random_field(preset, toy)
-    tonemapper = ToneMapper.for_scene(ToneMapConfig(), toy)
+    tonemapper = tone_mapper_for(ToneMapConfig(), toy)
     return Run(folder, small(preset), toy, field, tonemapper, step=7, seconds=1.0)
 
 

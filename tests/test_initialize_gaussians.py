@@ -12,18 +12,17 @@ from estimates import with_movers
 from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
-from hdr_nsff.fields.point_cloud import PointCloud as Points
+from hdr_nsff.fields.point_cloud import PointCloud
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
+    initialize_gaussians,
     neighbor_distance,
     place,
     quaternions,
-    seed,
     spread_centers,
     surely_moving,
 )
-from hdr_nsff.fields.splat.splat import MIN_OPACITY as FAINTEST
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat, SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -43,7 +42,7 @@ def seeded(
 ) -> tuple[Splat, str]:
     """A field started from a scene, none of whose numbers is NaN; and what was said."""
     field = Splat(config, scene.times, scene.near, scene.far, 60 * 34)
-    told = seed(field, scene, recorded, -1.0, from_priors)
+    told = initialize_gaussians(field, scene, recorded, -1.0, from_priors)
     assert all(torch.isfinite(v).all() for v in field.state_dict().values())
     assert all(torch.isfinite(field.positions(k)).all() for k in (0.0, 0.5, len(scene.times) - 1.0))
     return field, told
@@ -58,7 +57,7 @@ def changed(scene: Scene, change: Callable[[Frame], Frame], frames: int = 6) -> 
 
 def seen(gaussians: Gaussians) -> Tensor:
     """(G,) bool: which of them draw anything."""
-    return gaussians.logits.detach().sigmoid() > FAINTEST
+    return gaussians.logits.detach().sigmoid() > MIN_OPACITY
 
 
 def moving_at(field: Splat, time: float) -> Tensor:
@@ -261,7 +260,8 @@ def test_a_gaussian_is_as_wide_as_its_neighbors_are_away() -> None:
     gaussians = Gaussians(40, 1, 1)
     with torch.no_grad():
         assert (
-            place(gaussians, Points(grid, torch.zeros(36, 3), torch.ones(36), torch.ones(36))) == 36
+            place(gaussians, PointCloud(grid, torch.zeros(36, 3), torch.ones(36), torch.ones(36)))
+            == 36
         )
     inner = (grid[:, :2] > 0).all(1) & (grid[:, :2] < 5).all(1)
     torch.testing.assert_close(gaussians.log_scales[:36][inner].exp(), torch.full((16, 3), 0.6))
@@ -275,7 +275,8 @@ def test_few_points_are_placed_with_finite_sizes(count: int) -> None:
     with torch.no_grad():
         assert (
             place(
-                gaussians, Points(at, torch.zeros(count, 3), torch.ones(count), torch.ones(count))
+                gaussians,
+                PointCloud(at, torch.zeros(count, 3), torch.ones(count), torch.ones(count)),
             )
             == count
         )

@@ -12,7 +12,7 @@ import pytest
 from hdr_nsff.bench.config import BenchConfig
 from hdr_nsff.bench.methods import minutes_of, parse_method
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 
 CONFIG = BenchConfig(Path("out"), "scene", "tiny")
 

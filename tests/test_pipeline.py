@@ -21,6 +21,7 @@ from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.presets import PRESETS
 
 COUNT = 21
@@ -60,7 +61,9 @@ def test_frames_that_the_truth_is_of_are_kept_out_of_training(
     """Scored on exact radiance of the frames that were kept out, and of none that was
     trained on.
     """
-    monkeypatch.setitem(PRESETS, "tiny", replace(PRESETS["tiny"], steps=20, minutes=None))
+    monkeypatch.setitem(
+        PRESETS, "tiny", replace(PRESETS["tiny"], budget=Budget(steps=20, minutes=None))
+    )
     monkeypatch.setattr(pipeline, "render_all", lambda run, out: {})
     made, poses = problem(tmp_path, hold_out), given(tmp_path / "given", COUNT)["poses"]
     pipeline.run_all(
@@ -134,7 +137,7 @@ def test_the_options_of_train_reach_it(tmp_path: Path) -> None:
     passed = train_settings(config)
     assert (passed.minutes, passed.refine_poses, passed.seed) == (3, True, 7)
     assert passed == replace(
-        PRESETS["grid"], minutes=3, refine_poses=True, seed=7, out=tmp_path / "run"
+        PRESETS["grid"], budget=Budget(minutes=3), refine_poses=True, seed=7, out=tmp_path / "run"
     )
 
 

@@ -13,7 +13,7 @@ from test_bench_scenes import made
 from hdr_nsff.bench.config import BenchConfig, BenchRun
 from hdr_nsff.bench.plan import make_plan
 from hdr_nsff.scene.scene import Manifest
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 
 
 def runs_of(

@@ -23,6 +23,7 @@ from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import train
 
@@ -158,7 +159,13 @@ def trained(root: Path, maps: dict[str, Path]) -> dict[str, np.ndarray | dict[st
         PrepareConfig(root / "clip", root / "scene", protocol="novel-view-time", **maps)
     )
     run = train(
-        replace(PRESETS["tiny"], scene=scene, out=root / "run", steps=6, minutes=None, device="cpu")
+        replace(
+            PRESETS["tiny"],
+            scene=scene,
+            out=root / "run",
+            budget=Budget(steps=6, minutes=None),
+            device="cpu",
+        )
     )
     manifest = Manifest.load(scene).model_dump(exclude={"source"})
     steps = {

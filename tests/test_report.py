@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from estimates import tone_mapper
 from fakes import fake_run
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
 from test_scores import truth_of, with_flow
 
 from hdr_nsff.core.errors import InputError
@@ -151,8 +151,7 @@ def test_refused_bullet_time_is_explained(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["none", "fixed", "per_image", "mlp", "sigmoid"])
 def test_every_tone_mapper_can_be_reported(tmp_path: Path, kind) -> None:
-    config = ToneMapConfig(kind=kind)
-    tonemapper = ToneMapper(config, [0, 1, 2, 0, 1, 2], [0] * 6, [-4.0, None, 0.0], 2)
+    tonemapper = tone_mapper([0, 1, 2, 0, 1, 2], [0] * 6, [-4.0, None, 0.0], 2, kind=kind)
     run = replace(fake_run(tmp_path), tonemapper=tonemapper)
     text, _ = read(write_report(run, tmp_path / "report.html", tmp_path / "render"))
     assert "response of camera 0" in text

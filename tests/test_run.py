@@ -16,6 +16,7 @@ from safetensors.torch import save_file
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, save_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_config, read_log, write_config
@@ -200,7 +201,7 @@ def test_a_log_line_cut_short_is_left_out_and_the_next_one_is_whole(run: Path, t
     whole = '{"step": 25, "seconds": 1.0, "psnr": 10.0, "rays_per_second": 9.0, "losses": {}}'
     path.write_text(f"{whole}\n{whole[:40]}")
     assert [line.step for line in read_log(run)] == [25]
-    t = trainer(replace(read_config(run), steps=2, out=run), toy)
+    t = trainer(replace(read_config(run), budget=Budget(steps=2), out=run), toy)
     t.log({"psnr": 20.0, "depth": 1.0})
     t.clock = replace(t.clock, step=75)
     t.log({"psnr": 30.0})

@@ -15,7 +15,7 @@ from torch import Tensor
 from toy_scene import CARD, card_offset
 
 from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.fields.build import start_field
+from hdr_nsff.fields.build import initialize_field
 from hdr_nsff.fields.splat.gaussians import MAX_LOG_RADIANCE, Gaussians
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig, select_pixels
 from hdr_nsff.fields.splat.trajectories import WINDOW
@@ -352,7 +352,7 @@ def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> Non
 def test_an_initialized_field_has_the_cards_flow(toy: Scene) -> None:
     config = SplatConfig(static=1500, moving=400, bases=2)
     field = Splat(config, toy.times, toy.near, toy.far, 60 * 34)
-    start_field(field, toy, lambda rgb, i: rgb + 0.1, 0.0, True)
+    initialize_field(field, toy, lambda rgb, i: rgb + 0.1, 0.0, True)
     f = toy.train[2]
     offset = card_offset(2.0)
     pixel = f.camera.project(torch.tensor([*offset, CARD], dtype=torch.float32))[0]

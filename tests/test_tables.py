@@ -9,7 +9,7 @@ from hdr_nsff.bench import tables
 from hdr_nsff.bench.config import BenchRun, BenchScene
 from hdr_nsff.bench.tables import Row, best_numbers, describe_machines, means
 from hdr_nsff.core.notes import Machine, RunRecord, Trained
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.presets import PRESETS
 
 MACHINE = Machine(
     cpu="Some CPU",
