@@ -14,7 +14,7 @@ from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.scene.truth import Truth
-from hdr_nsff.synth.reexpose import ReexposeConfig, plan, reexpose
+from hdr_nsff.synth.reexpose import ReexposeConfig, plan_frames, reexpose
 
 
 def ordinary_clip(folder: Path, count: int = 20, width: int = 40) -> Path:
@@ -87,7 +87,7 @@ def test_exposures_of_a_reexposed_clip_are_found_again(tmp_path):
 
 
 def test_the_cycle_runs_unbroken_over_the_recorded_frames():
-    work = plan(20, 3, 8, remove=True)
+    work = plan_frames(20, 3, 8, remove=True)
     assert [work.bracket[k] for k in work.kept] == [n % 3 for n in range(18)]
 
 

@@ -20,7 +20,7 @@ from hdr_nsff.synth import synth as verb
 from hdr_nsff.synth import textures as synth_textures
 from hdr_nsff.synth.motion import exact_flow
 from hdr_nsff.synth.oracle import visible
-from hdr_nsff.synth.pathtracer import PASS, Surface, Tracer, smooth
+from hdr_nsff.synth.pathtracer import PASS_SPP, Surface, Tracer, smooth
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics, look_at, project
 from hdr_nsff.synth.scenes.interior import (
@@ -33,7 +33,9 @@ from hdr_nsff.synth.scenes.interior import (
     box_pose,
     camera_pose,
 )
-from hdr_nsff.synth.synth import SynthConfig, clip_shots, parse_ev, parse_size, synth, truth_shots
+from hdr_nsff.synth.settings import SynthConfig, parse_ev, parse_size, parse_white_balance
+from hdr_nsff.synth.synth import synth
+from hdr_nsff.synth.views import clip_views, held_out_views
 
 ROOM, BOX, BALL = 0, 1, 2
 
@@ -116,7 +118,7 @@ def test_motion_between_frames_stays_within_ten_pixels() -> None:
 
 
 def test_held_out_views_are_never_frames_of_the_clip() -> None:
-    clip, views = clip_shots(INTERIOR, 36, 1, 0), truth_shots(INTERIOR, 36, 1, 0)
+    clip, views = clip_views(INTERIOR, 36, 1, 0), held_out_views(INTERIOR, 36, 1, 0)
     assert [v.name.split("_")[0] for v in views] == ["view"] * 8 + ["time"] * 6 + ["off"] * 2
     for view in views:
         same_time = [c for c in clip if c.time == view.time]
@@ -155,7 +157,7 @@ def test_every_camera_of_the_rig_always_sees_both_movers() -> None:
 
 
 def test_frame_i_of_a_rig_is_what_camera_i_modulo_nine_records() -> None:
-    for t, shot in enumerate(clip_shots(INTERIOR, 20, 1, 0, "rig")):
+    for t, shot in enumerate(clip_views(INTERIOR, 20, 1, 0, "rig")):
         assert shot.time == t and shot.anchor == t
         np.testing.assert_allclose(shot.c2w[:, 3], INTERIOR.rig[t % 9])
 
@@ -163,8 +165,8 @@ def test_frame_i_of_a_rig_is_what_camera_i_modulo_nine_records() -> None:
 @pytest.mark.parametrize("frames", [12, 36])
 def test_a_rig_holds_out_other_cameras_than_the_one_that_records_then(frames: int) -> None:
     clip, views = (
-        clip_shots(INTERIOR, frames, 1, 0, "rig"),
-        truth_shots(INTERIOR, frames, 1, 0, "rig"),
+        clip_views(INTERIOR, frames, 1, 0, "rig"),
+        held_out_views(INTERIOR, frames, 1, 0, "rig"),
     )
     assert len({v.name for v in views}) == 16 and sum(v.time % 1 == 0.5 for v in views) == 6
     for view in views:
@@ -257,7 +259,7 @@ class Flat:
     def radiance(
         self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int
     ) -> np.ndarray:
-        Flat.rendered += spp > PASS  # what is traced for the estimate of time does not count
+        Flat.rendered += spp > PASS_SPP  # what is traced for the estimate of time does not count
         return np.full((size[1], size[0], 3), 0.25, np.float32)
 
 
@@ -385,8 +387,8 @@ def test_the_estimate_of_time_is_exact_where_a_path_costs_the_same_every_time(
             return super().radiance(t, K, c2w, size, spp, seed)
 
     monkeypatch.setattr(verb.clock, "monotonic", lambda: now[0])
-    shots = [clip_shots(INTERIOR, 12, 256, 0)[0], truth_shots(INTERIOR, 12, 768, 0)[0]]
-    assert verb.estimate(Steady(), shots, intrinsics(16, 16), (16, 16)) == pytest.approx(
+    shots = [clip_views(INTERIOR, 12, 256, 0)[0], held_out_views(INTERIOR, 12, 768, 0)[0]]
+    assert verb.estimate_seconds(Steady(), shots, intrinsics(16, 16), (16, 16)) == pytest.approx(
         27.6 + 78.8
     )
 
@@ -394,7 +396,7 @@ def test_the_estimate_of_time_is_exact_where_a_path_costs_the_same_every_time(
 @pytest.mark.parametrize("text", ["1,1", "a,b,c", "0,1,1", "nan,1,1", "1,1,1,1"])
 def test_a_bad_white_balance_is_refused_in_a_sentence(text: str) -> None:
     with pytest.raises(InputError, match="--white-balance"):
-        verb.parse_white_balance(text)
+        parse_white_balance(text)
 
 
 def test_a_rig_lists_its_exposures_for_prepare(flat: SynthConfig) -> None:
@@ -527,8 +529,8 @@ def test_the_demo_is_whole_and_small_enough_for_git() -> None:
         assert io.read_exr(demo / "truth" / view.radiance)["RGB"].shape == (136, 240, 3)
         assert 0.02 < io.read_mask(demo / "truth" / str(view.mask)).mean() < 0.15
     np.testing.assert_allclose(
-        np.array(truth.clip_c2w), [s.c2w for s in clip_shots(INTERIOR, 36, 1, 0)]
+        np.array(truth.clip_c2w), [s.c2w for s in clip_views(INTERIOR, 36, 1, 0)]
     )  # the code still makes this clip
     assert [(v.name, v.time, v.anchor) for v in truth.views] == [
-        (s.name, s.time, s.anchor) for s in truth_shots(INTERIOR, 36, 1, 0)
+        (s.name, s.time, s.anchor) for s in held_out_views(INTERIOR, 36, 1, 0)
     ]
