@@ -137,3 +137,15 @@ def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
     still = np.zeros((*SIZE[::-1], 2))
     assert visible(still, expected, np.full(SIZE[::-1], 2.3))[:-1, :-1].all()
     assert not visible(still, expected, np.full(SIZE[::-1], 2.0)).any()
+
+
+def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
+    """Everything moves two pixels to the right, where a pole now stands in columns 4
+    and 5 of eight.
+    """
+    flow = np.zeros((6, 8, 2))
+    flow[..., 0] = 2.0
+    there = np.full((6, 8), 3.0)
+    there[:, 4:6] = 1.0
+    seen = visible(flow, np.full((6, 8), 3.0), there)
+    np.testing.assert_array_equal(seen[0], [True, True, False, True, True, False, False, False])

@@ -14,7 +14,7 @@ from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at, project
 from hdr_nsff.synth.scenes.night import DROP, bulb_pose
 from hdr_nsff.synth.scenes.shapes import Builder
-from hdr_nsff.synth.synth import SynthConfig
+from hdr_nsff.synth.settings import SynthConfig
 
 NAMES = sorted(SCENES)
 SIZE = (48, 27)
