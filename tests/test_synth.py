@@ -13,7 +13,7 @@ from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 from hdr_nsff.synth import synth as verb
 from hdr_nsff.synth.scenes.base import Views
-from hdr_nsff.synth.scenes.geometry import intrinsics, project
+from hdr_nsff.synth.scenes.geometry import intrinsics, pixel_centers, project
 from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
 from hdr_nsff.synth.synth import synth

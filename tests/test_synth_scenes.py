@@ -154,7 +154,8 @@ def test_what_is_carried_over_a_half_time_arrives_where_it_does_at_once(name: st
 @pytest.mark.parametrize("name", NAMES)
 def test_the_seed_repeats_a_scene_and_another_paints_it_otherwise(name: str) -> None:
     a, b, other = (SCENES[name].build(seed) for seed in (1, 1, 2))
-    assert len({p.name for p in a}) == len(a) and {p.body for p in a} == {
+    assert len({p.name for p in a}) == len(a)
+    assert {p.body for p in a} == {
         "room",
         *(m.name for m in SCENES[name].bodies),
     }
@@ -292,7 +293,8 @@ def test_light_from_all_around_comes_from_above() -> None:
 def test_the_interior_is_the_one_that_measurements_rest_on() -> None:
     """Counted and summed when the demo clip was made."""
     parts = SCENES["interior"].build(0)
-    assert len(parts) == 52 and [p.name for p in parts if p.emits] == [
+    assert len(parts) == 52
+    assert [p.name for p in parts if p.emits] == [
         "light47",
         "light48",
         "bulb49",
