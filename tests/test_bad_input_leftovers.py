@@ -53,7 +53,7 @@ def test_a_bad_checkpoint_gives_way_to_the_one_before_for_every_verb(
         capsys.readouterr()
         assert call(*command) == 0
         said = " ".join(capsys.readouterr().err.split())
-        assert "going on from the one before, step 0" in said and checkpoints[-1].name in said
+        assert "using the one before, of step 0" in said and checkpoints[-1].name in said
     found = latest_checkpoint(run_folder)
     assert found is not None and found.step == 2  # training made it again
     for path in (run_folder / "checkpoints").iterdir():

@@ -1,6 +1,6 @@
-"""The house's laws about imports, read from the source: one order (that of the README's
-tree), verbs apart, the truth out of training's sight, heavy libraries behind one door
-each.
+"""Rules about imports, read from the source: one order (that of the tree in
+docs/architecture.md), verbs apart, the truth out of training's sight, each heavy
+library imported by one file.
 """
 
 import ast

@@ -34,7 +34,11 @@ def by_plain_torch(
     """What gsplat draws, by the slow twin; only for a camera at the origin."""
     camera = Camera(Ks[0], torch.eye(4)[:3], width, height)
     seen = dense(means, quaternions, scales, opacities, features, camera)
-    return torch.cat([seen.features, seen.depth[..., None]], -1)[None], seen.alpha[None, ..., None], {}
+    return (
+        torch.cat([seen.features, seen.depth[..., None]], -1)[None],
+        seen.alpha[None, ..., None],
+        {},
+    )
 
 
 def too_faint(*gaussians: Tensor, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:

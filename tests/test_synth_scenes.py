@@ -174,7 +174,7 @@ def test_a_rig_is_two_rows_of_nine_aimed_at_one_place(name: str) -> None:
     eyes = np.array(scene.rig)
     assert sorted(np.unique(eyes[:, 1], return_counts=True)[1]) == [4, 5]
     width, beside = np.ptp(eyes[:, 0]), np.linalg.norm(eyes - np.roll(eyes, 1, axis=0), axis=1)
-    assert beside.max() < 0.36 * width  # whoever records next stands beside, also after the last
+    assert beside.max() < 0.36 * width  # the next to record stands beside
     for k in range(9):
         np.testing.assert_allclose(
             project(np.array(scene.rig_target), K, scene.pose("rig", k))[0], [24, 13.5], atol=1e-9
