@@ -26,11 +26,8 @@ def prepared(capsys: Capture, clip: Path, *options: object) -> str:
     """
 
     def rest() -> dict[Path, bytes]:
-        return {
-            p: b
-            for p, b in snapshot(clip.parent).items()
-            if "scene" not in p.relative_to(clip.parent).parts
-        }
+        files = snapshot(clip.parent)
+        return {p: b for p, b in files.items() if not p.is_relative_to(clip.parent / "scene")}
 
     before = rest()
     said = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
@@ -64,9 +61,8 @@ def exr_with(value: float) -> Callable[[Path], None]:
     def damage(path: Path) -> None:
         pixels = np.full((34, 60, 3), 0.5, np.float32)
         pixels[3, 5, 1] = value
-        with OpenEXR.File(
-            {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"RGB": pixels}
-        ) as file:
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, {"RGB": pixels}) as file:
             file.write(str(path))
 
     return damage
@@ -125,9 +121,8 @@ def test_footage_that_cannot_be_is_named(
     before = snapshot(tmp_path)
     assert expected in refused(capsys, verb, footage, tmp_path / "out")
     after = snapshot(tmp_path)
-    assert all(after[p] == contents for p, contents in before.items()) and not list(
-        tmp_path.rglob(".partial-*")
-    )
+    assert all(after[p] == contents for p, contents in before.items())
+    assert not list(tmp_path.rglob(".partial-*"))
 
 
 def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
@@ -135,9 +130,8 @@ def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
 ) -> None:
     footage = one_bad(tmp_path / "clip", cut, ".exr")
     assert call("prepare", footage, tmp_path / "scene") == 2
-    assert (
-        len(capfd.readouterr().err.strip().splitlines()) == 1
-    )  # OpenEXR has words of its own for it
+    printed = capfd.readouterr().err.strip()  # OpenEXR itself would print more
+    assert len(printed.splitlines()) == 1
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
@@ -250,9 +244,8 @@ def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capt
 
 
 def test_a_scene_of_other_footage_stays(tmp_path: Path, capsys: Capture) -> None:
-    prepared(
-        capsys, clip(tmp_path / "one", recorded(24)), "--ev=0,1"
-    )  # its frames are in the scene already
+    first = clip(tmp_path / "one", recorded(24))
+    prepared(capsys, first, "--ev=0,1")  # its frames are in the scene already
     before = snapshot(tmp_path / "scene")
     assert "holds the scene of other footage" in prepared(capsys, clip(tmp_path / "other"))
     assert before and snapshot(tmp_path / "scene") == before
@@ -282,9 +275,8 @@ def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> Non
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)
         assert (tmp_path / "scene/scene.json").read_text() == text
-    assert "at least 3" in prepared(
-        capsys, folder, "--redo", "frames"
-    )  # offered by the sentence: starts anew
+    # What the sentence offers starts anew.
+    assert "at least 3" in prepared(capsys, folder, "--redo", "frames")
 
 
 def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
@@ -303,8 +295,7 @@ def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
         assert "the disk is full" in prepared(capsys, folder, "--ev=0,1")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "scene/images").glob("*.png")}
     assert kept and not list((tmp_path / "scene").rglob(".partial-*"))
-    assert "2 exposures listed" in prepared(
-        capsys, folder, "--ev=0,1"
-    )  # as far as it goes: frames are done
+    said = prepared(capsys, folder, "--ev=0,1")
+    assert "2 exposures listed" in said  # in the step after the frames
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert len(list((tmp_path / "scene/images").glob("*.png"))) == 24

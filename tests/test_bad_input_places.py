@@ -27,12 +27,8 @@ from hdr_nsff.core.io import write_text
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
     assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
-    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {
-        "render",
-        "export",
-        "evaluate",
-        "report",
-    } == set(RUN_VERBS)
+    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS)
+    assert {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
 
 
 # Missing and empty
@@ -42,9 +38,8 @@ def test_there_is_a_command_of_every_verb_to_try() -> None:
 def test_a_missing_and_an_empty_run(verb: str, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "empty").mkdir()
     for name in ("nowhere", "empty"):
-        assert "not a run folder" in refused(
-            capsys, *commands(tmp_path / name, tmp_path, tmp_path / "out")[verb]
-        )
+        command = commands(tmp_path / name, tmp_path, tmp_path / "out")[verb]
+        assert "not a run folder" in refused(capsys, *command)
     assert [p.name for p in tmp_path.rglob("*")] == ["empty"]
 
 
@@ -88,9 +83,8 @@ def test_a_place_that_cannot_be_written_is_named(
 ) -> None:
     (tmp_path / "file").write_text("mine")
     footage, out = clip(tmp_path / "clip", recorded(3)), tmp_path / place
-    assert place.partition("/")[0][:40] in refused(
-        capsys, *commands(run_folder, footage, out)[verb]
-    )
+    said = refused(capsys, *commands(run_folder, footage, out)[verb])
+    assert place.partition("/")[0][:40] in said
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -152,9 +146,7 @@ def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(
 def test_footage_is_not_prepared_over_another_scene(
     toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    scene = shutil.copytree(
-        toy_folder, tmp_path / "out/scene"
-    )  # it was not made by `prepare`: none of its steps is done
+    scene = shutil.copytree(toy_folder, tmp_path / "out/scene")  # no step of it is done
     before = snapshot(tmp_path / "out")
     footage = clip(tmp_path / "clip")
     assert "other footage" in refused(capsys, "prepare", footage, scene)

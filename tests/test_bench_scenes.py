@@ -18,7 +18,7 @@ from toy_scene import ToyScene, camera_center
 from hdr_nsff.bench.config import BenchConfig, BenchScene
 from hdr_nsff.bench.scenes import parse_scene
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.synth.oracle import NOTE
+from hdr_nsff.synth.oracle import ORACLE_NOTE
 
 
 def parse(text: object, out: Path = Path("out"), **settings: Any) -> BenchScene:
@@ -36,7 +36,7 @@ def made(folder: Path) -> Path:
     edit(folder / "truth/truth.json", lambda t: t.update(clip_c2w=centers))
     poses(folder / "poses_bounds.npy")
     ToyScene().write(folder / "oracle")
-    step = {"poses": {"done": True, "note": NOTE}}
+    step = {"poses": {"done": True, "note": ORACLE_NOTE}}
     edit(folder / "oracle/scene.json", lambda m: m["steps"].update(step))
     return folder
 

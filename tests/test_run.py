@@ -117,7 +117,7 @@ def test_a_bad_checkpoint_gives_way_to_the_one_before_and_that_is_said(
     assert (
         opened.step == 0
         and what in said
-        and "going on from the one before, step 0" in said
+        and "using the one before, of step 0" in said
         and newest(run).name in said
     )
 

@@ -44,11 +44,13 @@ REQUIRED = {
     "av>=14": "av",
     "exifread>=3": "exifread",
     "safetensors>=0.4": "safetensors",
-    "pydantic>=2.7": "pydantic",
+    "pydantic>=2.12": "pydantic",
     "opencv-python-headless>=4.10": "cv2",
     "scipy>=1.11": "scipy",
     "matplotlib>=3.8": "matplotlib",
     "pycolmap>=4.0.4,<5": "pycolmap",
+    "jinja2>=3.1": "jinja2",
+    "annotated-types>=0.6": "annotated_types",
 }
 # Installed with the package, though `run` works without: DNG frames, weights of XFeat.
 # The package of XFeat is never imported, only its file of weights is read.

@@ -16,7 +16,7 @@ from hdr_nsff.footage.datasets import layout_of
 from hdr_nsff.pipeline import RunConfig, held_out_every
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.manifest import Manifest
-from hdr_nsff.synth.oracle import NOTE as ORACLE_NOTE
+from hdr_nsff.synth.oracle import ORACLE_NOTE
 
 
 def parse_scene(text: str, config: BenchConfig) -> BenchScene:

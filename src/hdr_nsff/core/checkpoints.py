@@ -87,7 +87,7 @@ def latest_checkpoint(folder: Path) -> Checkpoint | None:
             problems.append(str(error))
             continue
         for problem in problems:
-            say(f"{problem}; going on from the one before, step {found.step}")
+            say(f"{problem}; using the one before, of step {found.step}")
         return found
     if problems:
         raise InputError(

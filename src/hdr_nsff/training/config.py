@@ -15,7 +15,6 @@ from tyro.conf import arg
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.settings import (
     Advanced,
-    Number,
     Rate,
     Share,
     Weight,
@@ -34,6 +33,7 @@ from hdr_nsff.training.objective import LossWeights
 VERSION = 2  # of a run's config.json
 HELP = "hdr-nsff train --help"
 MAX_SEED = 2**63 - 1
+MAX_RAYS = 2**18  # of a batch: beyond it, no machine has the memory
 
 
 @dataclass(frozen=True)
@@ -52,9 +52,9 @@ class TrainConfig:
     tonemap: ToneMapConfig = dataclasses.field(default_factory=ToneMapConfig)
     loss: LossWeights = dataclasses.field(default_factory=LossWeights)
     schedule: Advanced[Schedule] = dataclasses.field(default_factory=Schedule)
-    rays: Annotated[int, Ge(0), Le(10**6)] = 1536
+    rays: Annotated[int, Ge(0), Le(MAX_RAYS)] = 1536
     """Uniformly drawn pixels of a batch; 0: the whole frame."""
-    moving_rays: Number = 512
+    moving_rays: Annotated[int, Ge(0), Le(MAX_RAYS)] = 512
     """More pixels of a batch, from the moving mask."""
     moving_until: Advanced[Weight] = 1.0
     """Share of the run (or phase, for `paper`) up to which moving pixels are added."""

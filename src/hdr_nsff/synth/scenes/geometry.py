@@ -8,10 +8,12 @@ import numpy as np
 
 from hdr_nsff.geometry import pinhole
 
+FIELD_OF_VIEW = np.radians(57)  # across the picture, of every camera (hand-chosen)
+
 
 def intrinsics(width: int, height: int) -> np.ndarray:
     """K (3, 3) in pixels of a camera that sees 57 degrees across."""
-    focal = width / 2 / np.tan(np.radians(57 / 2))
+    focal = width / 2 / np.tan(FIELD_OF_VIEW / 2)
     return pinhole.intrinsics(focal, width, height)
 
 
@@ -22,14 +24,27 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z, eye], 1)
+    y = np.cross(z, x)
+    return np.stack([x, y, z, eye], 1)
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation matrix (3, 3) by Rodrigues' formula."""
+    """Rotation matrix (3, 3) about `axis` by `angle` radians (Rodrigues' formula)."""
     x, y, z = axis / np.linalg.norm(axis)
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
+def pixel_centers(height: int, width: int) -> np.ndarray:
+    """Coordinates (H, W, 2) px of the pixels' centers."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], -1)
+
+
+def ray_directions(height: int, width: int, K: np.ndarray) -> np.ndarray:
+    """Directions (H, W, 3) through the pixels' centers in the camera's axes, z = 1."""
+    x, y = np.moveaxis(pixel_centers(height, width), -1, 0)
+    return np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
 
 
 def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
