@@ -12,7 +12,7 @@ import torch
 from estimates import tone_mapper
 from torch import Tensor
 
-from hdr_nsff.fields.base import Layers, Render
+from hdr_nsff.fields.base import Layers, ParamGroup, Render
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import from_brightness
 from hdr_nsff.radiometry.static_samples import ResponseView
@@ -54,13 +54,11 @@ class DiscBeforeWall:
         speed: Tensor = SPEED,
         red: float = 100.0,
     ) -> None:
-        self.wall, self.empty_moves, self.speed, self.red, self.calls = (
-            wall,
-            empty_moves,
-            speed,
-            red,
-            0,
-        )
+        self.wall = wall
+        self.empty_moves = empty_moves
+        self.speed = speed
+        self.red = red
+        self.calls = 0
 
     def layers(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Layers:
         rays = camera.rays(camera.pixel_grid() if pixels is None else pixels)
@@ -98,11 +96,17 @@ class DiscBeforeWall:
     def __call__(self, batch: Any) -> Any:
         raise AssertionError("not trained here")
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def loss_weights(self) -> dict[str, float]:
+        return {}
+
+    def param_groups(self) -> list[ParamGroup]:
         return []
 
-    def after_step(self, step: int, misfits: object = None) -> None:
+    def after_step(self, step: int, frame_errors: object = None) -> None:
         del step
+
+    def shared_maxima(self) -> list[Tensor]:
+        return []
 
 
 def fake_run(

@@ -12,8 +12,10 @@ from hdr_nsff.fields.build import build_field, initialize_field
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.batch import whole_frame
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.presets import ABLATIONS, METHODS, PRESETS, ablated
-from hdr_nsff.training.train import heeded
+from hdr_nsff.training.start import start_field
 
 NAMES = [name for name in PRESETS if name not in METHODS]
 
@@ -34,10 +36,22 @@ def test_every_ablation_that_makes_sense_is_a_preset() -> None:
     }
 
 
-def test_without_flow_nothing_is_started_from_it(toy: Scene) -> None:
-    assert heeded(toy, PRESETS["grid"].loss) is toy
-    blind = heeded(toy, PRESETS["splat-no-flow"].loss)
-    assert all(f.flow == {} and f.flow_valid == {} for f in blind.train) and toy.train[0].flow
+def test_without_flow_nothing_is_started_from_it(
+    toy: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(with_flow: bool) -> tuple[bool, ...]:
+        """Whether the field is given flow at its start, per training frame."""
+        given: list[Scene] = []
+        monkeypatch.setattr(
+            "hdr_nsff.training.start.initialize_field",
+            lambda field, scene, *rest: given.append(scene),
+        )
+        field, tonemapper = random_field("grid", toy), tone_mapper_for(ToneMapConfig(), toy)
+        start_field(field, tonemapper, toy, True, with_flow)
+        return tuple(bool(f.flow) or bool(f.flow_valid) for f in given[0].train)
+
+    assert all(start(True)) and not any(start(False))
+    assert PRESETS["splat-no-flow"].loss.flow == 0
 
 
 def test_without_depth_the_prior_neither_paints_nor_pulls() -> None:

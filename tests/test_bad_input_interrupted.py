@@ -96,6 +96,7 @@ def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path
 FAILING = """
 import gc, pathlib, sys
 import numpy as np
+from hdr_nsff.core.io import write_npy
 
 
 def broken(self, data):

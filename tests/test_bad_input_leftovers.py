@@ -96,10 +96,10 @@ Change = Callable[[dict], object]
 PLAN, VIEWS, METRICS = "run/render/plan.json", "run/render/views.json", "run/metrics.json"
 SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply/sequence.json"
 KINDS: dict[str, type[notes.Note]] = {
-    PLAN: notes.Plan,
-    VIEWS: notes.Colored,
+    PLAN: notes.RenderPlan,
+    VIEWS: notes.PictureRanges,
     SEQUENCE: notes.Sequence,
-    EXPORTED: notes.Exported,
+    EXPORTED: notes.ExportedSequence,
     METRICS: notes.Metrics,
 }
 NONSENSE: dict[str, tuple[str, Change]] = {
@@ -237,13 +237,10 @@ SETTINGS: dict[str, tuple[Change, str]] = {
     "a setting nobody knows": (lambda d: d.update(sparkle=1), "sparkle"),
     "no field": (lambda d: d.pop("field"), "field"),
     "a field that is a number": (lambda d: d.update(field=7), "config.json"),
-    "grids for a field": (
-        lambda d: d.update(kinds=["GridConfig"], field={}),
-        "GridConfig is no field",
-    ),
-    "a kind of field nobody knows": (lambda d: d.update(kinds=["Cloud"]), "Cloud"),
-    "no kinds": (lambda d: d.update(kinds=[]), "config.json"),
-    "kinds that are a number": (lambda d: d.update(kinds=7), "config.json"),
+    "grids for a field": (lambda d: d["field"].update(type="grids"), "--field"),
+    "a kind of field nobody knows": (lambda d: d["field"].update(type="cloud"), "cloud"),
+    "a field of no kind": (lambda d: d["field"].pop("type"), "--field"),
+    "a kind that is a number": (lambda d: d["field"].update(type=7), "--field"),
     "a scene that is a number": (lambda d: d.update(scene=7), "config.json"),
 }
 

@@ -28,7 +28,7 @@ from hdr_nsff.training.run_folder import Run, last_logged, snapshots
 from hdr_nsff.training.train import Trainer
 
 SMALL = (
-    "--field.encoding.max-rows 512 --field.samples 6 --field.render-samples 8 "
+    "--field.samples 6 --field.render-samples 8 --set field.encoding.max_rows=512 "
     "--rays 32 --moving-rays 8"
 )
 
@@ -243,7 +243,7 @@ def test_killed_in_the_middle_the_same_command_goes_on(
     reached = Run.open(run).step
     assert 0 < reached < 300 and not (run / "metrics.json").exists()
     assert call(*command) == 0
-    assert f"going on at step {reached}," in (tmp_path / "out/logs/toy/a.log").read_text()
+    assert f"continuing at step {reached}," in (tmp_path / "out/logs/toy/a.log").read_text()
     assert Run.open(run).step == 300 and list(snapshots(run)) == [0.125, 0.25, 0.5]
 
 
@@ -260,10 +260,10 @@ def test_a_run_at_work_is_not_done_twice(scenes: Path, tmp_path: Path, capsys: C
     import fcntl
 
     command = on_both(scenes, tmp_path / "out", METHODS, "--only", "toy/a")
-    (tmp_path / "out/runs/toy/a").mkdir(parents=True)
+    (tmp_path / "out/runs/toy").mkdir(parents=True)
     note = {"settings": settings(command), "scenes": {}}
     (tmp_path / "out/bench.json").write_text(json.dumps(note))
-    with open(tmp_path / "out/runs/toy/a/.lock", "w") as file:
+    with open(tmp_path / "out/runs/toy/.a.lock", "w") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert "another hdr-nsff works in" in refused(capsys, *command)
     assert not (tmp_path / "out/runs/toy/a/config.json").exists()
@@ -289,7 +289,7 @@ def test_other_settings_in_the_same_folder_are_refused(
     before = snapshot(finished)
     longer = on_both(scenes, finished, METHODS, steps=5)
     assert "--steps 4, not 5" in refused(capsys, *longer)
-    weighted = on_both(scenes, finished, f"a=tiny {SMALL} --loss.cycle 0.123")
+    weighted = on_both(scenes, finished, f"a=tiny {SMALL} --loss.flow 0.123")
     assert "other settings" in refused(capsys, *weighted)
     moved = bench_words(finished, f"toy={scenes / 'three'}", METHODS)
     assert "another name" in refused(capsys, *moved)

@@ -77,7 +77,7 @@ def test_every_preset_explains_its_settings(preset: str, capsys: Capture) -> Non
     assert call("train", preset, "--help") == 0
     out = capsys.readouterr().out
     own_setting = "--field.bases" if preset.startswith("splat") else "--field.samples"
-    assert all(setting in out for setting in ("--scene", own_setting, "--loss.temporal"))
+    assert all(setting in out for setting in ("--scene", own_setting, "--loss.photometric"))
 
 
 def test_train_lists_methods_line_by_line_and_ablations_in_a_sentence(
@@ -154,7 +154,7 @@ def test_a_library_that_cannot_be_imported_is_one_sentence(
 ) -> None:
     monkeypatch.delitem(sys.modules, "hdr_nsff.synth.reexpose", raising=False)
     monkeypatch.setitem(sys.modules, "cv2", None)
-    monkeypatch.delitem(sys.modules, "hdr_nsff.core.io")
+    monkeypatch.delitem(sys.modules, "hdr_nsff.core.images", raising=False)
     assert call("reexpose", "clip", "out") == 2
     sentence = one_sentence(capsys.readouterr().err)
     assert "cv2" in sentence and "`hdr-nsff doctor`" in sentence
@@ -217,14 +217,15 @@ def test_what_the_parser_refuses_exits_with_2(arguments: tuple[str, ...]) -> Non
 
 
 def test_arguments_reach_the_verb(trained_with: list[TrainConfig]) -> None:
-    fields = ["--field.samples", "9", "--field.encoding.levels", "3", "--loss.cycle", "0.25"]
-    assert call("train", "grid", "--scene", "a b/é", "--steps", "7", *fields) == 0
+    changes = ["--field.samples", "9", "--loss.flow", "0.25", "--set", "field.encoding.levels=3"]
+    assert call("train", "grid", "--scene", "a b/é", "--steps", "7", *changes) == 0
     (config,) = trained_with
     default = PRESETS["grid"]
     assert config.scene == Path("a b/é")
-    assert (config.steps, config.rays) == (7, default.rays)
-    assert (config.field.samples, config.loss.cycle) == (9, 0.25)
-    assert config.field.encoding == replace(default.field.encoding, levels=3)
+    assert (config.budget.steps, config.rays) == (7, default.rays)
+    assert (config.field.samples, config.loss.flow) == (9, 0.25)
+    assert config.field.encoding == default.field.encoding
+    assert config.set == ("field.encoding.levels=3",)
 
 
 def test_bad_input_is_one_sentence_and_exit_code_2(act: Act, capsys: Capture) -> None:

@@ -291,7 +291,7 @@ def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(
 ) -> None:
     config = ExportConfig(scene, tmp_path / "out", layout="nerfstudio")
     for wrong in (replace(config, ply=True), replace(config, layout=None)):
-        with pytest.raises(InputError, match="say what to write"):
+        with pytest.raises(InputError, match="choose what to write"):
             export(wrong)
     for wrong in (
         replace(config, time=1.0),

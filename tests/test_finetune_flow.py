@@ -182,12 +182,12 @@ def test_damaged_measurements_are_made_again(
     before = verb.measured(network, pairs, kept)
     assert (
         verb.measured(network, pairs, kept) == before
-        and "taken for missing" not in capsys.readouterr().err
+        and "treated as missing" not in capsys.readouterr().err
     )
     kept.write_text(text)
     assert (
         verb.measured(network, pairs, kept) == before
-        and "taken for missing" in capsys.readouterr().err
+        and "treated as missing" in capsys.readouterr().err
     )
     assert verb.measured(network, [], kept) == before  # from the file
 

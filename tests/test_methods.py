@@ -41,13 +41,13 @@ def test_options_change_the_settings_of_a_preset() -> None:
 
 def test_without_a_budget_a_preset_keeps_its_own() -> None:
     for name in ("paper", "tiny"):
-        assert parse_method(name, CONFIG)[1].steps == PRESETS[name].steps
+        assert parse_method(name, CONFIG)[1].budget == PRESETS[name].budget
 
 
 def test_budget_and_seed_are_the_same_for_every_preset() -> None:
     config = replace(CONFIG, budget="90s", seed=5)
     methods = [parse_method(name, config)[1] for name in PRESETS]
-    assert {(m.minutes, m.steps, m.seed) for m in methods} == {(1.5, None, 5)}
+    assert {(m.budget.minutes, m.budget.steps, m.seed) for m in methods} == {(1.5, None, 5)}
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_every_option_of_prepare_reaches_it(tmp_path: Path) -> None:
 def test_the_options_of_train_reach_it(tmp_path: Path) -> None:
     config = RunConfig(tmp_path, tmp_path, preset="grid", minutes=3, refine_poses=True, seed=7)
     passed = train_settings(config)
-    assert (passed.minutes, passed.refine_poses, passed.seed) == (3, True, 7)
+    assert (passed.budget.minutes, passed.refine_poses, passed.seed) == (3, True, 7)
     assert passed == replace(
         PRESETS["grid"], budget=Budget(minutes=3), refine_poses=True, seed=7, out=tmp_path / "run"
     )

@@ -48,13 +48,13 @@ def test_names_of_the_command_line_never_leave_the_folder(toy_folder: Path, tmp_
 
 def test_a_preset_is_trained_as_train_does(toy_folder: Path, tmp_path: Path) -> None:
     (run,) = runs_of(tmp_path, toy_folder, "splat")
-    for name in ("loss", "field", "tonemap", "minutes", "steps", "seed"):
+    for name in ("loss", "field", "tonemap", "budget", "seed"):
         assert getattr(run.config, name) == getattr(PRESETS["splat"], name)
 
 
 def test_a_clip_is_prepared_once_for_all_methods(tmp_path: Path) -> None:
     folder = made(tmp_path / "room")
-    small = "--field.encoding.max-rows 512 --field.samples 6 --rays 32 --moving-rays 8"
+    small = "--set field.encoding.max_rows=512 --field.samples 6 --rays 32 --moving-rays 8"
     methods = f"a=tiny {small},b=tiny {small}"
     command = [*bench_words(tmp_path / "out", folder, methods), "--steps", 2, "--views", 0]
     assert call(*command, "--only", "room") == 0

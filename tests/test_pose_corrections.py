@@ -27,11 +27,12 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training import run_folder
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
-from hdr_nsff.training.train import Trainer, train
+from hdr_nsff.training.train import train
 
 
 def edited(
@@ -271,7 +272,7 @@ def test_without_it_no_camera_has_a_gradient_and_nothing_is_saved_of_it(
 def test_a_stopped_run_resumes_to_the_unbroken_ones_corrections(
     preset: str, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Trainer, "preview", lambda self: None)
+    monkeypatch.setattr(run_folder, "write_preview", lambda *_: None)
     straight = train(refining(toy_folder, tmp_path / "straight", preset))
     settings = replace(refining(toy_folder, tmp_path / "run", preset), checkpoint_seconds=0.0)
     for stop in (1, 13):  # before and after cameras start to move

@@ -10,8 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff import cli, fields
+from hdr_nsff import cli
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.fields import build
 from hdr_nsff.fields.build import device_for
 from hdr_nsff.fields.nsff.nsff import NSFFConfig
 from hdr_nsff.fields.splat import rasterize_gsplat
@@ -94,7 +95,7 @@ def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(rasterize_gsplat, "fault", lambda device="cuda": "gsplat cannot draw")
-    monkeypatch.setattr(fields, "say", said.append)
+    monkeypatch.setattr(build, "say", said.append)
     return said
 
 

@@ -16,10 +16,10 @@ from safetensors.torch import save_file
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, save_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.budget import Budget, Clock, Schedule
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
-from hdr_nsff.training.run_folder import Run, read_config, read_log, write_config
+from hdr_nsff.training.run_folder import Run, append_log, read_config, read_log, write_config
 from hdr_nsff.training.train import train
 
 
@@ -185,8 +185,9 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_scene_that_moved_away_is_named(run: Path) -> None:
-    change_config(run, lambda d: d.update(scene="/nowhere/scene"))
-    with pytest.raises(InputError, match=r"/nowhere/scene: no scene\.json here"):
+    nowhere = {"scene": "/nowhere/scene", "scene_from_run": "../nowhere"}
+    change_config(run, lambda d: d.update(nowhere))
+    with pytest.raises(InputError, match="its scene is not at /nowhere/scene any more"):
         Run.open(run)
 
 
@@ -201,12 +202,11 @@ def test_a_log_line_cut_short_is_left_out_and_the_next_one_is_whole(run: Path, t
     whole = '{"step": 25, "seconds": 1.0, "psnr": 10.0, "rays_per_second": 9.0, "losses": {}}'
     path.write_text(f"{whole}\n{whole[:40]}")
     assert [line.step for line in read_log(run)] == [25]
-    t = trainer(replace(read_config(run), budget=Budget(steps=2), out=run), toy)
-    t.log({"psnr": 20.0, "depth": 1.0})
-    t.clock = replace(t.clock, step=75)
-    t.log({"psnr": 30.0})
+    clock = Clock(Budget(steps=100), Schedule(), num_frames=6)
+    append_log(run, replace(clock, step=50, seconds=2.0), 64, {"psnr": 20.0, "depth": 1.0})
+    append_log(run, replace(clock, step=75, seconds=3.0), 64, {"psnr": 30.0})
     lines = read_log(run)
-    assert [line.step for line in lines] == [2, 25, 75] and lines[0].losses == {"depth": 1.0}
+    assert [line.step for line in lines] == [25, 50, 75] and lines[1].losses == {"depth": 1.0}
     assert path.read_text().count("\n") == 4
 
 
@@ -221,8 +221,21 @@ def test_without_a_log_there_are_no_lines(tmp_path: Path) -> None:
     assert read_log(tmp_path) == []
 
 
-def test_config_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
-    write_config(tmp_path, PRESETS["tiny"])
-    assert read_config(tmp_path) == PRESETS["tiny"] and [p.name for p in tmp_path.iterdir()] == [
-        "config.json"
-    ]
+def test_config_is_written_whole_or_not_at_all(tmp_path: Path, toy_folder: Path) -> None:
+    config = replace(PRESETS["tiny"], scene=toy_folder)
+    write_config(tmp_path, config)
+    assert read_config(tmp_path) == config
+    assert [p.name for p in tmp_path.iterdir()] == ["config.json"]
+
+
+def test_a_run_and_its_scene_that_moved_together_are_found(
+    finished: Path, toy_folder: Path, tmp_path: Path
+) -> None:
+    original, moved = tmp_path / "a", tmp_path / "b/c"
+    for place in (original, moved):
+        shutil.copytree(toy_folder, place / "scene")
+    shutil.copytree(finished, original / "run")
+    write_config(original / "run", replace(read_config(finished), scene=original / "scene"))
+    shutil.copytree(original / "run", moved / "run")
+    shutil.rmtree(original)
+    assert Run.open(moved / "run").scene.folder == moved / "scene"

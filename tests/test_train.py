@@ -22,8 +22,10 @@ from torch import Tensor
 from hdr_nsff.core import distributed
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_json
+from hdr_nsff.fields.base import recorded
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Budget, Clock, Schedule
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
@@ -81,7 +83,7 @@ def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
         if preset == "grid"
         else train(replace(settings, out=tmp_path / "straight", checkpoint_seconds=1e9))
     )
-    monkeypatch.setattr(Trainer, "preview", lambda self: None)
+    monkeypatch.setattr(run_folder, "write_preview", lambda *_: None)
     for stop in (3, 17):  # before and after culling starts and the tone mapper is anchored
         interrupted_at(stop, settings, monkeypatch)
         assert (
@@ -95,8 +97,8 @@ def command(settings: TrainConfig, *launcher: str) -> subprocess.Popen[bytes]:
     """`hdr-nsff train` in processes of its own."""
     script = settings.out.parent / "again.py"
     script.write_text(
-        "import json, sys\nfrom hdr_nsff.training.config import TrainConfig\nfrom hdr_nsff.training.train import Trainer, train\n"
-        "Trainer.preview = lambda self: None\n"
+        "import json, sys\nfrom hdr_nsff.training.config import TrainConfig\nfrom hdr_nsff.training import run_folder\nfrom hdr_nsff.training.train import train\n"
+        "run_folder.write_preview = lambda *_: None\n"
         "train(TrainConfig.from_json(json.loads(open(sys.argv[1]).read())))\n"
     )
     given = settings.out.parent / "given.json"
@@ -158,12 +160,27 @@ def test_more_processes_than_batches_is_said(
         train(config(toy_folder, tmp_path / "run"))
 
 
+@torch.no_grad()
+def squared_error(run: Run) -> float:
+    """Mean squared error of the pictures of all training frames."""
+    errors = []
+    for i, frame in enumerate(run.scene.train):
+        recorder = run.tonemapper.recorder(frame.bracket, frame.camera_id, i)
+        (rgb,) = recorded(run.field, frame.camera, frame.time, [recorder])
+        errors.append((rgb.view_as(frame.image) - frame.image).square().mean())
+    return float(torch.stack(errors).mean())
+
+
 def test_training_lowers_the_error(toy_folder: Path, tmp_path: Path) -> None:
     settings = replace(small("grid", toy_folder, tmp_path / "run", 75), rays=192, moving_rays=64)
-    run = Run.open(train(settings))
+    train(settings)
+    first, run = (
+        Run.open(settings.out, at=min(settings.out.glob("checkpoints/*"))),
+        Run.open(settings.out),
+    )
     log = run.log()
-    assert [line.step for line in log] == [25, 50, 75] and run.step == 75
-    assert log[-1].psnr > log[0].psnr + 1
+    assert [line.step for line in log] == [25, 50, 75] and (first.step, run.step) == (0, 75)
+    assert squared_error(run) < 0.5 * squared_error(first)
     assert {"photometric", "dynamic", "temporal", "cycle", "response_smoothness"} <= set(
         log[-1].losses
     )

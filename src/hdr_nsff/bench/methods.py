@@ -10,8 +10,9 @@ import tyro
 
 from hdr_nsff.bench.config import BenchConfig, safe_name
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.settings import check
 from hdr_nsff.training.budget import Budget
-from hdr_nsff.training.config import TrainConfig, check_config
+from hdr_nsff.training.config import HELP, TrainConfig, check_config
 from hdr_nsff.training.presets import PRESETS
 
 SAME_FOR_ALL = ("scene", "out", "steps", "minutes", "seed", "device")  # settings of `train`
@@ -28,12 +29,12 @@ def parse_method(text: str, config: BenchConfig) -> tuple[str, TrainConfig]:
     check_words(text, name, words)
     presets = {preset: ("", settings) for preset, settings in PRESETS.items()}
     settings = tyro.extras.overridable_config_cli(presets, prog="--methods", args=words)
-    settings = replace(settings, seed=config.seed, device=config.device)
+    settings = replace(check_config(settings), seed=config.seed, device=config.device)
     if config.budget is not None:
         settings = replace(settings, budget=Budget(minutes=minutes_of(config.budget)))
     if config.steps is not None:
         settings = replace(settings, budget=Budget(steps=config.steps, minutes=None))
-    check_config(settings)
+    check(settings, HELP)
     return safe_name(name or words[0], "--methods"), settings
 
 

@@ -104,7 +104,10 @@ class TrainConfig:
         if not isinstance(data, dict) or data.get("version") != VERSION:
             raise InputError(f"the run's config.json is of another version of hdr-nsff; {again}")
         values = {k: v for k, v in data.items() if k != "version"}
+        missing = {f.name for f in dataclasses.fields(TrainConfig)} - values.keys()
         try:
+            if missing:
+                raise InputError(f"no value for {', '.join(sorted(missing))}")
             return from_plain(TrainConfig, values, HELP)
         except InputError as error:
             raise InputError(
