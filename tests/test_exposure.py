@@ -15,6 +15,7 @@ from hdr_nsff.radiometry.exposure_cycle import (
     equalize,
     period,
     reference_bracket,
+    share_brackets,
     value_ranks,
 )
 
@@ -61,6 +62,26 @@ def test_cycle_and_order_are_found_from_brightness(evs):
     assert cycle.brackets[: len(evs) + 1] == [*range(len(evs)), 0]
 
 
+@pytest.mark.parametrize(
+    ("evs", "brackets", "order"),
+    [
+        ([-2, 0, 2, 0], [0, 1, 2, 1], [0, 1, 2]),
+        ([0, 2, 0, -2], [0, 1, 0, 2], [2, 0, 1]),
+        ([-1, 0.5, 2, 0.5], [0, 1, 2, 1], [0, 1, 2]),
+    ],
+)
+def test_positions_of_one_exposure_share_a_bracket(evs, brackets, order):
+    cycle = detect_cycle(clip(evs))
+    assert cycle.length == 4 and cycle.brackets[:8] == brackets * 2
+    assert cycle.order == order and len(cycle.ev) == 3
+    assert period(cycle.brackets) == 4
+
+
+def test_a_ramp_of_small_steps_is_not_one_bracket():
+    assert share_brackets(np.array([0.0, 0.2, 0.4, 0.6])).tolist() == [0, 0, 1, 1]
+    assert share_brackets(np.array([2.0, 0.0, 2.1, 4.0])).tolist() == [0, 1, 0, 2]
+
+
 def test_cycle_survives_a_pan_flicker_and_a_light_switched_on():
     assert detect_cycle(clip([-2, 0, 2], pan=3)).length == 3
     assert detect_cycle(clip([0, 2], flicker=0.15)).length == 2
@@ -93,6 +114,16 @@ def test_cameras_of_a_rig_that_start_elsewhere_in_the_cycle_share_brackets():
     first, second = common_brackets([a, b])
     assert first[:3] == [0, 1, 2]
     assert second[:3] == [1, 2, 0]
+
+
+def test_cameras_share_brackets_where_a_cycle_goes_up_and_down_again():
+    a, b = detect_cycle(clip([-2, 0, 2, 0])), detect_cycle(clip([0, 2, 0, -2]))
+    assert [brackets[:4] for brackets in common_brackets([a, b])] == [[0, 1, 2, 1], [1, 2, 1, 0]]
+
+
+def test_a_camera_without_a_cycle_takes_that_of_the_others():
+    a, b = detect_cycle(clip([-2, 0, 2, 0])), detect_cycle(clip([0]))
+    assert [brackets[:5] for brackets in common_brackets([a, a, b])] == [[0, 1, 2, 1, 0]] * 3
 
 
 @given(st.integers(1, 4), st.integers(2, 5))

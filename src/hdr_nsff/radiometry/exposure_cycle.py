@@ -14,7 +14,8 @@ import numpy as np
 
 MAX_CYCLE = 6
 LOW, HIGH = 0.012, 0.97  # a recorded value outside says only "darker than" or "brighter than"
-# EV between the darkest and brightest bracket below which brightness merely flickers
+# EV between the darkest and brightest bracket below which brightness merely flickers;
+# positions of a cycle that are closer than this share a bracket
 MIN_STEP = 0.3
 MIN_EXPLAINED = 0.6  # share of the brightness changes a cycle must explain
 NOISE = 0.1  # EV: changes of brightness smaller than this are never evidence
@@ -27,7 +28,9 @@ class Cycle:
     """An exposure cycle found in a clip."""
 
     length: int  # 1: no alternation
-    brackets: list[int]  # per frame: its position in the cycle
+    # per frame: positions of the cycle closer than `MIN_STEP` share a bracket, numbered
+    # as they appear
+    brackets: list[int]
     order: list[int]  # the brackets from the darkest to the brightest
     ev: list[
         float
@@ -104,13 +107,33 @@ def detect_cycle(video: np.ndarray, max_cycle: int = MAX_CYCLE) -> Cycle:
     length, cost, level = min(candidates, key=lambda c: 2 * n * np.log(c[1]) + c[0] * np.log(n))
     if level.max() < MIN_STEP or 1 - cost / still < MIN_EXPLAINED:
         length, cost, level = candidates[0]
+    positions = share_brackets(level)
+    ev = [level[positions == b].mean() for b in range(positions.max() + 1)]
     return Cycle(
         length=length,
-        brackets=[t % length for t in range(len(video))],
-        order=np.argsort(level, kind="stable").tolist(),
-        ev=level.tolist(),
+        brackets=[int(positions[t % length]) for t in range(len(video))],
+        order=np.argsort(ev, kind="stable").tolist(),
+        ev=[float(v) for v in ev],
         confidence=1 - cost / still,
     )
+
+
+def share_brackets(levels: np.ndarray) -> np.ndarray:
+    """The bracket (length,) of each position of a cycle with these `levels` (length,) in
+    EV, numbered as they appear.
+
+    A camera that goes up and down again (-2, 0, 2, 0 EV) shows one exposure at two
+    positions. From the darkest on, positions within `MIN_STEP` of a bracket's darkest
+    join it, so a ramp of small steps never becomes one bracket.
+    """
+    rank = np.zeros(len(levels), int)  # of each position's bracket, 0 the darkest
+    current, darkest = -1, -np.inf
+    for k in np.argsort(levels, kind="stable"):
+        if levels[k] - darkest >= MIN_STEP:
+            current, darkest = current + 1, levels[k]
+        rank[k] = current
+    appearance = list(dict.fromkeys(rank.tolist()))
+    return np.array([appearance.index(r) for r in rank])
 
 
 def period(brackets: list[int]) -> int:
@@ -136,16 +159,18 @@ def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
     """Per synchronized camera the bracket of each frame, such that equal brackets are
     equally bright in every camera.
     """
-    length = max({c.length for c in cycles}, key=[c.length for c in cycles].count)
-    lead = next(c for c in cycles if c.length == length)
-    same = [
-        {p: lead.order[c.order.index(p)] for p in range(length)} if c.length == length else None
-        for c in cycles
-    ]
-    return [
-        [m[t % length] if m else t % length for t in range(len(c.brackets))]
-        for c, m in zip(cycles, same, strict=True)
-    ]
+    kinds = [(c.length, len(c.order)) for c in cycles]
+    usual = max(sorted(set(kinds)), key=kinds.count)
+    lead = cycles[kinds.index(usual)]
+    result = []
+    for cycle, kind in zip(cycles, kinds, strict=True):
+        if kind == usual:
+            same = dict(zip(cycle.order, lead.order, strict=True))
+            result.append([same[b] for b in cycle.brackets])
+        else:  # a camera whose own cycle was not found takes that of the others
+            frames = range(len(cycle.brackets))
+            result.append([lead.brackets[t % lead.length] for t in frames])
+    return result
 
 
 def doubts(video: np.ndarray, ev: list[float]) -> list[str]:

@@ -230,8 +230,9 @@ def found_cycle(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
         change = float(np.abs(exposure.brightness_steps(work.video[frames])).mean())
         if cycle.length > 1:
             steps = ", ".join(f"{cycle.ev[b]:.1f}" for b in cycle.order)
+            first = [cycle.brackets.index(b) for b in cycle.order]
             notes.append(
-                f"{who}brightness repeats every {cycle.length} frames, from dark to bright frame {cycle.order} of the cycle, about {steps} EV "
+                f"{who}brightness repeats every {cycle.length} frames, from dark to bright frame {first} of the cycle, about {steps} EV "
                 f"(gamma 2.2); this explains {cycle.confidence:.0%} of its changes"
             )
         elif change > exposure.MIN_STEP:
