@@ -3,8 +3,10 @@ every convention a known point is where its picture shows it, in training pictur
 held-out ones.
 """
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import miniatures as mini
 import numpy as np
@@ -210,6 +212,77 @@ def test_cameras_of_real_hdr_nerf_scenes_that_make_no_sense_are_one_sentence(
     np.save(path, change(np.load(path)))
     with pytest.raises(InputError, match=words):
         recognize(tmp_path)
+
+
+def exported_nerfstudio(root: Path, names: dict[str, Any]) -> Path:
+    """nerfstudio's layout as `export` writes it, with these `names` of maps in each
+    entry under `hdr_nsff`, or at its top.
+    """
+    mini.nerfstudio(root)
+    document = json.loads((root / "transforms.json").read_text())
+    top = {"points": names.pop("points", None)}
+    frames = {
+        f["file_path"]: {"time": k, "disparity": "depth/0.npy", **names}
+        for k, f in enumerate(document["frames"])
+    }
+    document["hdr_nsff"] = {
+        "fps": 24, "reference_bracket": 0, "bracket_ev": [0.0], "exposure_given": True,
+        "near": 1.0, "far": 9.0, "depth_kind": "scene", "frames": frames, **top,
+    }  # fmt: skip
+    mini.write_json(root / "transforms.json", document)
+    return root
+
+
+def test_maps_of_an_export_are_found_by_their_names(tmp_path: Path) -> None:
+    names = {"confidence": "depth/1.npy", "points": "depth/2.npy", "flow": {"a": "depth/3.npy"}}
+    capture = read(exported_nerfstudio(tmp_path, names))
+    first = capture.pictures[0]
+    paths = [first.depth, first.confidence, first.flow["a"]]
+    assert paths == [tmp_path.resolve() / f"depth/{k}.npy" for k in (0, 1, 3)]
+    assert capture.points is not None and capture.points.shape == (mini.H, mini.W)
+
+
+@pytest.mark.parametrize("name", ["../secret.npy", "/etc/passwd", "link.npy"])
+@pytest.mark.parametrize("key", ["disparity", "confidence", "moving", "points", "flow"])
+def test_a_map_outside_the_data_set_is_refused(key: str, name: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "secret.npy", np.ones((2, 3)))
+    root = tmp_path / "set"
+    exported_nerfstudio(root, {key: {"a": name} if key == "flow" else name})
+    (root / "link.npy").symlink_to(tmp_path / "secret.npy")
+    with pytest.raises(InputError, match="points outside the data set"):
+        capture = read(root)
+        held_out.read(capture)
+
+
+def test_a_depth_map_outside_the_data_set_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "secret.npy", np.ones((2, 3)))
+    path = mini.nerfstudio(tmp_path / "set") / "transforms.json"
+    path.write_text(path.read_text().replace("depth/3.npy", "../secret.npy"))
+    with pytest.raises(InputError, match="points outside the data set"):
+        recognize(path.parent)
+
+
+@pytest.mark.parametrize("bad", ["\0", "a\0b", "\ud800", "x" * 5000, "a/" * 3000])
+@pytest.mark.parametrize("name", ["d-nerf", "hdr-nerf", "nerfstudio"])
+def test_a_name_that_no_file_can_have_is_one_short_sentence(
+    name: str, bad: str, tmp_path: Path
+) -> None:
+    SETS[name](tmp_path)
+    path = tmp_path / ("transforms.json" if name == "nerfstudio" else "transforms_train.json")
+    document = json.loads(path.read_text())
+    document["frames"][1]["file_path"] = bad
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match="cannot be the name of a file|missing|no exposure") as e:
+        recognize(tmp_path)
+    assert len(str(e.value)) < 500
+
+
+def test_pictures_may_be_links_to_other_places(tmp_path: Path) -> None:
+    root = mini.gopro(tmp_path / "set")
+    picture = root / "dense/images_48x32/00004.png"
+    picture.rename(tmp_path / "elsewhere.png")
+    picture.symlink_to(tmp_path / "elsewhere.png")
+    assert read(root).pictures[4].source == "dense/images_48x32/00004.png"
 
 
 def test_a_file_name_that_leaves_the_data_set_is_refused(tmp_path: Path) -> None:

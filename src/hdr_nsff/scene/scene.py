@@ -22,6 +22,7 @@ from torch.nn.functional import max_pool2d
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_image, read_json, read_mask, read_npy, write_json
+from hdr_nsff.core.names import resolve_name
 from hdr_nsff.core.notes import first_problem
 from hdr_nsff.geometry.cameras import Camera
 
@@ -440,19 +441,4 @@ def outline(mask: Tensor) -> Tensor:
 
 def inside(folder: Path, name: str) -> Path:
     """`folder / name`, refusing a name that leaves the folder or that no file can have."""
-    try:
-        path = (Path(folder) / name).resolve()
-        path.is_file()
-    except (
-        OSError,
-        ValueError,
-        RuntimeError,
-    ) as error:  # too long, NUL, half a character, links in a circle
-        raise InputError(
-            f"{folder}: {name[:60]!r} cannot be the name of a file; restore scene.json or truth.json"
-        ) from error
-    if not path.is_relative_to(Path(folder).resolve()):
-        raise InputError(
-            f"{folder}: the file name {name!r} points outside the scene folder; names must stay inside it"
-        )
-    return path
+    return resolve_name(folder, name, "scene folder")

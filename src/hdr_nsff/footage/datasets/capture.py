@@ -18,8 +18,9 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
+from hdr_nsff.core.names import resolve_name
 from hdr_nsff.footage.ingest import FRAMES, LINEAR, Footage
 from hdr_nsff.footage.pose_files import Given
 from hdr_nsff.scene.scene import Strict, bracket_problem, first_problem, is_intrinsic, is_matrix
@@ -246,21 +247,28 @@ def named_file(root: Path, name: str, purpose: str) -> Path:
     """The file that `name` means in a JSON of the set, with or without its ending;
     InputError that says what it is for.
     """
-    base = (root / name.replace("\\", "/")).resolve()
-    if not base.is_relative_to(root.resolve()):
-        raise InputError(
-            f"{root}: {name!r} ({purpose}) points outside the data set; names must stay inside it"
-        )
+    base = resolve_name(root, name.replace("\\", "/"), "data set")
     endings = ("", *sorted(FRAMES)) if base.suffix.lower() in FRAMES else (*sorted(FRAMES), "")
     found = next((p for e in endings if (p := base.with_name(base.name + e)).is_file()), None)
     if found is None:
-        raise InputError(f"{root / name}: missing; it is {purpose}, copy it again")
-    return root.resolve() / found.relative_to(root.resolve())
+        raise InputError(f"{root / shorten(name)}: missing; it is {purpose}, copy it again")
+    return resolve_name(root, str(found), "data set")
+
+
+def named_map(root: Path, name: str, purpose: str) -> Path:
+    """The map or mask that `name` means in a JSON of the set; InputError that says what
+    it is for.
+    """
+    path = resolve_name(root, name, "data set")
+    if not path.is_file():
+        raise InputError(f"{root / shorten(name)}: missing; it is {purpose}, copy it again")
+    return path
 
 
 def source_of(root: Path, path: Path) -> str:
-    """A file's name relative to the root."""
-    return path.resolve().relative_to(root.resolve()).as_posix()
+    """A file's name relative to the root; `path` is below it, resolved or as listed."""
+    base = root if path.is_relative_to(root) else root.resolve()
+    return path.relative_to(base).as_posix()
 
 
 def same_number(folder: Path, files: Sequence[Path], wanted: int, purpose: str) -> list[Path]:

@@ -39,6 +39,7 @@ from hdr_nsff.footage.datasets.capture import (
     Clock,
     Extra,
     named_file,
+    named_map,
     parse_extra,
     read_document,
     reorder,
@@ -173,9 +174,10 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
             continue
         own = extra.frames[names[k]]
         like: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
-        views.append(
-            HeldOut(name, own.time, [(file, like)], mask=root / own.moving if own.moving else None)
-        )
+        mask = None
+        if own.moving is not None:
+            mask = named_map(root, own.moving, f"the moving mask of held-out view {name}")
+        views.append(HeldOut(name, own.time, [(file, like)], mask=mask))
     return views, reorder(blender.poses(path, document), kept)
 
 

@@ -23,6 +23,7 @@ from hdr_nsff.footage.datasets.capture import (
     Extra,
     Picture,
     named_file,
+    named_map,
     number_of,
     parse_extra,
     read_document,
@@ -51,7 +52,15 @@ def recognized(folder: Path) -> bool:
         names = [f["file_path"] for f in read_json(folder / NAME)["frames"]]
     except (OSError, ValueError, TypeError, KeyError):
         return True
-    return not names or any(isinstance(n, str) and (folder / n).parent.is_dir() for n in names)
+    return not names or any(isinstance(n, str) and has_folder(folder, n) for n in names)
+
+
+def has_folder(folder: Path, name: str) -> bool:
+    """Whether the folder of a named picture is there."""
+    try:
+        return (folder / name).parent.is_dir()
+    except OSError:  # a name too long to be one
+        return False
 
 
 def read(folder: Path) -> Capture:
@@ -136,10 +145,14 @@ def named_depth(folder: Path, frame: dict[str, Any]) -> Path | None:
     """The depth map of a frame, if it names one."""
     if not isinstance(frame.get("depth_file_path"), str):
         return None
-    path = folder / frame["depth_file_path"]
-    if not path.is_file():
-        raise InputError(f"{path}: missing; it is the depth of {frame['file_path']}, copy it again")
-    return path
+    return named_map(folder, frame["depth_file_path"], f"the depth of {frame['file_path']}")
+
+
+def static_points(folder: Path, name: str | None) -> np.ndarray | None:
+    """The static points (P, 3) of an export, if it has them."""
+    if name is None:
+        return None
+    return np.array(read_npy(named_map(folder, name, "the static points")))
 
 
 def exported(
@@ -152,11 +165,7 @@ def exported(
     def path_of(name: str | None, purpose: str, frame: dict[str, Any]) -> Path | None:
         if name is None:
             return None
-        if not (folder / name).is_file():
-            raise InputError(
-                f"{folder / name}: missing; it is the {purpose} of {frame['file_path']}, export again"
-            )
-        return folder / name
+        return named_map(folder, name, f"the {purpose} of {frame['file_path']}")
 
     pictures = [
         Picture(
@@ -185,7 +194,7 @@ def exported(
         poses=Given(poses.names, poses.K, poses.c2w, poses.size, extra.near, extra.far),
         withheld=withheld,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
-        points=None if extra.points is None else np.array(read_npy(folder / extra.points)),
+        points=static_points(folder, extra.points),
         exposures=extra.exposures(),
         fps=extra.fps,
     )
