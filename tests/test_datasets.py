@@ -11,6 +11,7 @@ from typing import Any
 import miniatures as mini
 import numpy as np
 import pytest
+from mutations import check_json_reader, check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_image, write_png, write_video
@@ -235,11 +236,13 @@ def exported_nerfstudio(root: Path, names: dict[str, Any]) -> Path:
 
 def test_maps_of_an_export_are_found_by_their_names(tmp_path: Path) -> None:
     names = {"confidence": "depth/1.npy", "points": "depth/2.npy", "flow": {"a": "depth/3.npy"}}
-    capture = read(exported_nerfstudio(tmp_path, names))
+    root = exported_nerfstudio(tmp_path, names)
+    np.save(root / "depth/2.npy", [[1.0, 2.0, 3.0]])
+    capture = read(root)
     first = capture.pictures[0]
     paths = [first.depth, first.confidence, first.flow["a"]]
     assert paths == [tmp_path.resolve() / f"depth/{k}.npy" for k in (0, 1, 3)]
-    assert capture.points is not None and capture.points.shape == (mini.H, mini.W)
+    assert capture.points is not None and (capture.points == [[1, 2, 3]]).all()
 
 
 @pytest.mark.parametrize("name", ["../secret.npy", "/etc/passwd", "link.npy"])
@@ -283,6 +286,38 @@ def test_pictures_may_be_links_to_other_places(tmp_path: Path) -> None:
     picture.rename(tmp_path / "elsewhere.png")
     picture.symlink_to(tmp_path / "elsewhere.png")
     assert read(root).pictures[4].source == "dense/images_48x32/00004.png"
+
+
+def read_whole(root: Path) -> None:
+    """All that `prepare` asks of a data set before it makes anything of it."""
+    capture = recognize(root)
+    if capture is None:
+        return
+    capture.footage()
+    if capture.poses is not None:
+        placed(root, capture.poses, list(range(len(capture.pictures))), (mini.H, mini.W))
+    if capture.withheld:
+        held_out.read(capture)
+
+
+@pytest.mark.parametrize("name", [*SETS, "exported"])
+def test_damaged_data_sets_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    if name == "exported":
+        exported_nerfstudio(tmp_path, {"confidence": "depth/1.npy", "flow": {"a": "depth/3.npy"}})
+    else:
+        SETS[name](tmp_path)
+    for path in sorted(tmp_path.rglob("*.json")):
+        check_reader(path, lambda: read_whole(tmp_path), 20)
+        check_json_reader(path, lambda: read_whole(tmp_path), 60)
+    for path in sorted(tmp_path.rglob("poses_bounds*.npy")):
+        check_reader(path, lambda: read_whole(tmp_path), 60)
+
+
+@pytest.mark.parametrize("value", [[{"a": 1}], "all", [3], {}])
+@pytest.mark.parametrize("key", ["train_filenames", "val_filenames", "test_filenames"])
+def test_a_list_of_names_that_is_none_is_one_sentence(key: str, value: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"`{key}` is no list of file names"):
+        recognize(mini.nerfstudio(tmp_path, **{key: value}))
 
 
 def test_a_file_name_that_leaves_the_data_set_is_refused(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mutations import check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_exr, write_png
@@ -144,6 +145,13 @@ def test_files_cut_short_or_of_another_kind_are_refused(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no pairs with known flow"):
         flow_pairs(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("name", ["sintel", "things", "synth"])
+def test_damaged_flow_is_read_or_refused(name: str, tmp_path: Path):
+    make = {"sintel": sintel, "things": things, "synth": synth}[name]
+    pair = flow_pairs(make(tmp_path))[0]
+    check_reader(pair.forward, lambda: read_sample(pair), 150)
 
 
 def sample(height: int = 60, width: int = 80) -> Sample:

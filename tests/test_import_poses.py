@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from mutations import check_json_reader, check_reader
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
@@ -263,6 +264,48 @@ def test_poses_that_do_not_fit_are_refused_in_a_sentence(tmp_path, make, words):
     make(tmp_path)
     with pytest.raises(InputError, match=words):
         import_poses(tmp_path, NAMES, (H, W))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fl_x": 10**400},
+        {"w": 10**400},
+        {"k1": 10**400},
+        {"near": 10**400},
+        {"camera_angle_x": 0, "fl_x": None},
+        {"near": -1.0},
+        {"near": 5.0, "far": 1.0},
+        {"far": float("nan")},
+        {"cx": 1e300},
+    ],
+)
+def test_numbers_that_no_camera_has_are_one_short_sentence(tmp_path, change):
+    write(tmp_path / "transforms.json", transforms(**change))
+    with pytest.raises(InputError, match=r"transforms\.json") as error:
+        import_poses(tmp_path, NAMES, (H, W))
+    assert len(str(error.value)) < 400
+
+
+def test_damaged_poses_are_read_or_refused(tmp_path):
+    def read(folder):
+        return lambda: import_poses(folder, NAMES, (H, W))
+
+    (tmp_path / "llff").mkdir()
+    np.save(tmp_path / "llff/poses_bounds.npy", llff_table())
+    check_reader(tmp_path / "llff/poses_bounds.npy", read(tmp_path / "llff"), 150)
+    path = tmp_path / "transforms.json"
+    write(path, transforms(near=1.0, far=9.0, k1=0.0))
+    check_reader(path, read(tmp_path), 150)
+    check_json_reader(path, read(tmp_path), 300)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_damaged_colmap_models_are_read_or_refused(tmp_path, name):
+    for make, suffix in ((colmap_text, "txt"), (colmap_binary, "bin")):
+        make(tmp_path / suffix)
+        path = tmp_path / suffix / f"{name}.{suffix}"
+        check_reader(path, lambda p=path: import_poses(p.parent, NAMES, (H, W)), 150)
 
 
 def test_most_frames_must_have_a_pose(tmp_path):

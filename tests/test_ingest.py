@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from mutations import check_reader
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
@@ -22,6 +23,7 @@ from hdr_nsff.footage.ingest import (
     parse_exposures,
     read_exif_ev,
     read_exposure_csv,
+    read_frame,
     read_frames,
     shrink,
 )
@@ -194,6 +196,32 @@ def test_exif_exposure_counts_time_sensitivity_and_aperture(tmp_path):
     Image.new("RGB", (8, 8)).save(tmp_path / "b.jpg")
     assert read_exif_ev(tmp_path / "a.jpg") == pytest.approx(-6)
     assert read_exif_ev(tmp_path / "b.jpg") is None
+
+
+def test_damaged_exif_holds_no_exposure_or_one(tmp_path):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x829A: IFDRational(1, 64), 0x8827: 400})
+    path = tmp_path / "a.jpg"
+    Image.new("RGB", (8, 8)).save(path, exif=exif)
+    check_reader(path, lambda: read_exif_ev(path), 300)
+
+
+@pytest.mark.parametrize("value", [IFDRational(0, 1), IFDRational(1, 0), IFDRational(-1, 60)])
+def test_exif_of_an_impossible_exposure_holds_none(tmp_path, value):
+    exif = Image.Exif()
+    exif.get_ifd(0x8769).update({0x829A: value, 0x8827: 400})
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
+    assert read_exif_ev(tmp_path / "a.jpg") is None
+
+
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".exr"])
+def test_damaged_frames_are_read_or_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".exr":
+        write_exr(path, {"RGB": picture(0.5)})
+    else:
+        cv2.imwrite(str(path), (picture(0.5) * 255).astype(np.uint8))
+    check_reader(path, lambda: read_frame(path), 100)
 
 
 def test_held_out_frames_go_through_all_exposures():

@@ -102,6 +102,8 @@ def read_model(folder: Path | str) -> ColmapModel:
                 f"{path}: not a readable COLMAP file, or cut short ({error}); export the model again"
             ) from error
     cameras, images, (ids, points, errors, lengths) = parts
+    if not (np.isfinite(points).all() and np.isfinite(errors).all()):
+        raise InputError(f"{folder}: points3D holds NaN or Inf; export the model again")
     lost = next((i for i in images.values() if i.camera_id not in cameras), None)
     if lost is not None:
         raise InputError(

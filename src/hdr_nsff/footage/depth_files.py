@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, read_npy
+from hdr_nsff.core.io import read_exr, read_image
+from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.geometry.fill import fill
 
 DepthKind = Literal["metric", "disparity", "relative"]
@@ -58,9 +59,11 @@ def read_map(path: Path) -> np.ndarray:
     """
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        return np.squeeze(np.array(read_npy(path), np.float32))
+        return np.squeeze(read_array(path))
     if suffix == ".exr":
         channels = read_exr(path)
+        if not channels:
+            raise InputError(f"{path}: an EXR without channels; write depth as channel Z")
         values = channels["Z"] if "Z" in channels else next(iter(channels.values()))
         return values if values.ndim == 2 else values[..., 0]
     return read_image(path)[..., 0]

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask, read_npy
+from hdr_nsff.core.io import read_mask
 from hdr_nsff.core.progress import say
+from hdr_nsff.footage.arrays import read_array, read_arrays
 from hdr_nsff.geometry.round_trip import agreement
 
 
@@ -71,7 +71,7 @@ def read_pair(
     if path.suffix == ".npz":
         flow, mask = read_npz(path)
     else:
-        flow = np.array(read_npy(path), np.float32)
+        flow = read_array(path)
         if (picture := path.with_name(f"{path.stem}_valid.png")).is_file():
             mask = read_mask(picture)
     if flow.shape != (*size, 2):
@@ -91,10 +91,5 @@ def read_pair(
 
 def read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """`flow` and `mask` of a file in the public NSFF layout."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return np.array(arrays["flow"], np.float32), np.array(arrays["mask"]) > 0.5
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{path}: not a flow file with `flow` and `mask` ({error}); copy it again or make it anew"
-        ) from error
+    flow, mask = read_arrays(path, ("flow", "mask"), "flow file")
+    return flow, mask > 0.5

@@ -375,18 +375,20 @@ def read_exif_ev(path: Path) -> float | None:
     import exifread
 
     logging.getLogger("exifread").setLevel(logging.ERROR)  # it warns of every picture without EXIF
-    with open(path, "rb") as file:
-        tags = exifread.process_file(file, details=False)
+    try:
+        with open(path, "rb") as file:
+            tags = exifread.process_file(file, details=False)
+    except Exception:  # damaged EXIF: many unrelated types, and no exposure time
+        return None
 
     def value(name: str) -> float | None:
         tag = tags.get(name)
         try:
             return float(tag.values[0]) if tag is not None else None
-        except (ZeroDivisionError, ValueError, TypeError, IndexError):
+        except (ArithmeticError, ValueError, TypeError, IndexError):
             return None
 
-    seconds = value("EXIF ExposureTime")
-    if not seconds or seconds <= 0:
-        return None
+    seconds = value("EXIF ExposureTime") or 0.0
     iso, aperture = value("EXIF ISOSpeedRatings") or 100.0, value("EXIF FNumber") or 1.0
-    return math.log2(seconds * iso / 100 / aperture**2)
+    exposure = seconds * iso / 100 / aperture**2
+    return math.log2(exposure) if 0 < exposure < math.inf else None

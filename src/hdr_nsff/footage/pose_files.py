@@ -14,10 +14,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
+from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel, read_model
 from hdr_nsff.geometry.poses import LEAST, Poses, interpolate, project, ranges, trusted_points
+from hdr_nsff.scene.scene import LARGEST
 
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0])  # columns right, up, back -> right, down, forward
 FROM_LLFF = np.array(
@@ -26,6 +28,8 @@ FROM_LLFF = np.array(
 ROUNDING = 1e-6  # off which a rotation is made one again
 BENT = 2.0  # pixels of lens distortion at a corner that a pinhole may stand in for
 Parallax = Literal["full", "rotation", "none"]
+# what Python and numpy raise for JSON values of another shape or size than expected
+UNREADABLE = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
 NAMES = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "precomputed.json")
 
 
@@ -130,14 +134,14 @@ def check_lens(
     corner by more than `BENT` pixels.
     """
     k1, k2, p1, p2 = (float(v) for v in distortion)
-    worst = 0.0
-    for u, v in ((0, 0), (width, 0), (0, height), (width, height)):
-        x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)])
+    with np.errstate(all="ignore"):  # impossible numbers are refused later
+        x, y = ((corners - K[:2, 2]) / K[(0, 1), (0, 1)]).T
         r2 = x * x + y * y
         radial = k1 * r2 + k2 * r2 * r2
         dx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         dy = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        worst = max(worst, math.hypot(dx * K[0, 0], dy * K[1, 1]))
+        worst = np.hypot(dx * K[0, 0], dy * K[1, 1]).max()
     if worst > BENT:
         raise InputError(
             f"{path}: lens distortion moves corners by {worst:.0f} px; undistort the frames (colmap image_undistorter) and export again"
@@ -153,24 +157,19 @@ def from_llff(path: Path) -> Given:
 
 def llff_table(path: Path, columns: int) -> np.ndarray:
     """The numbers (N, columns) of a `.npy` in the way of LLFF."""
-    try:
-        table = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError, OSError) as error:
-        raise InputError(
-            f"{path}: not a readable .npy array ({error}); export the poses again"
-        ) from error
+    table = read_array(path, np.float64)
     if table.ndim != 2 or table.shape[1] != columns or not len(table):
         raise InputError(
             f"{path}: expected an array (frames, {columns}) as LLFF writes it, found {table.shape}"
         )
-    return np.asarray(table)
+    return table
 
 
 def llff_rows(table: np.ndarray) -> Given:
     """The poses of rows (N, 17) of `poses_bounds.npy`."""
     return llff(
-        table[:, :15].reshape(-1, 3, 5).astype(np.float64),
-        table[:, 15:].astype(np.float64),
+        table[:, :15].reshape(-1, 3, 5),
+        table[:, 15:],
         FROM_LLFF,
     )
 
@@ -211,35 +210,51 @@ def from_json(path: Path) -> Given:
             return llff(
                 poses, np.array(document["bds"], np.float64).reshape(len(poses), 2), FROM_OPENGL
             )
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path}: not readable as poses ({type(error).__name__}: {error}); export them again"
-        ) from error
+    except InputError:
+        raise
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
     raise InputError(
         f"{path}: neither `frames` (transforms.json) nor `poses` and `bds` in it; export the poses again"
     )
+
+
+def unreadable(path: Path, error: Exception) -> InputError:
+    """What to say of a JSON whose poses are of another shape than they should."""
+    problem = f"{type(error).__name__}: {shorten(error)}"
+    return InputError(f"{path}: not readable as poses ({problem}); export them again")
 
 
 def from_transforms(path: Path, document: dict[str, Any]) -> Given:
     """nerfstudio's and Blender's layout: `transform_matrix` c2w with OpenGL axes,
     intrinsics for all or per frame.
     """
+    try:
+        return parse_transforms(path, document)
+    except InputError:
+        raise
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
+
+
+def parse_transforms(path: Path, document: dict[str, Any]) -> Given:
+    """The same, with the exceptions `UNREADABLE` for values of another shape."""
     frames = document["frames"]
     if not frames:
         raise InputError(f"{path}: no frames in it; export the poses again")
     lenses = [lens(path, {**document, **frame}) for frame in frames]
     matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)[:, :3]
     c2w = np.concatenate([matrices[:, :, :3] @ FROM_OPENGL, matrices[:, :, 3:4]], 2)
-    near, far = document.get("near"), document.get("far")
+    near, far = (None if v is None else float(v) for v in map(document.get, ("near", "far")))
+    if not (near or 1 / LARGEST) <= (far or LARGEST) <= LARGEST or (near or 0) < 0:
+        raise InputError(f"{path}: near {near} and far {far} are no range of depths; correct them")
     return Given(
         names=[str(frame["file_path"]) for frame in frames],
         K=np.stack([K for K, _ in lenses]),
         c2w=c2w,
         size=np.array([size for _, size in lenses], np.float64),
-        near=None if near is None else float(near),
-        far=None if far is None else float(far),
+        near=near,
+        far=far,
     )
 
 
@@ -318,8 +333,12 @@ def path_key(parts: int) -> Any:
 
 def placed(path: Path, given: Given, chosen: list[int | None], size: tuple[int, int]) -> Poses:
     """The chosen poses, rescaled to frames of `size` (height, width)."""
-    if not (np.isfinite(given.K).all() and np.isfinite(given.c2w).all()):
-        raise InputError(f"{path}: poses hold NaN or Inf; export them again")
+    if not all(np.abs(v).max() <= LARGEST for v in (given.K, given.c2w, given.size)):
+        raise InputError(
+            f"{path}: poses hold NaN, Inf or numbers beyond {LARGEST:g}; export them again"
+        )
+    if given.size[:, 0].min() <= 0:
+        raise InputError(f"{path}: poses are for frames without width; export them again")
     height, width = size
     K, c2w = np.tile(np.eye(3), (len(chosen), 1, 1)), np.tile(np.eye(4)[:3], (len(chosen), 1, 1))
     for t, k in enumerate(chosen):

@@ -26,7 +26,7 @@ from hdr_nsff.footage.datasets.capture import (
     source_of,
     turns,
 )
-from hdr_nsff.footage.pose_files import Given, from_transforms
+from hdr_nsff.footage.pose_files import from_transforms
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 
@@ -66,7 +66,7 @@ def read(folder: Path) -> Capture:
         pictures=[
             Picture(source_of(folder, files[k]), clock(times[k]), cameras[k], evs[k]) for k in order
         ],
-        poses=reorder(poses(path, document), order),
+        poses=reorder(from_transforms(path, document), order),
         withheld=(folder / TEST).is_file(),
         over=1.0,
         still=not moves,
@@ -102,15 +102,3 @@ def exposure(path: Path, frame: dict[str, Any], kind: str) -> float | None:
             f"{path}: {frame['file_path']} has an exposure time of {value:g}; it must be above 0"
         )
     return math.log2(value)
-
-
-def poses(path: Path, document: dict[str, Any]) -> Given:
-    """The poses of a `transforms*.json`."""
-    try:
-        return from_transforms(path, document)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path}: its poses are not readable ({type(error).__name__}: {error}); copy it again"
-        ) from error

@@ -23,7 +23,14 @@ from hdr_nsff.core.io import read_json
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.footage.ingest import FRAMES, LINEAR, Footage
 from hdr_nsff.footage.pose_files import Given
-from hdr_nsff.scene.scene import Strict, bracket_problem, first_problem, is_intrinsic, is_matrix
+from hdr_nsff.scene.scene import (
+    LARGEST,
+    Strict,
+    bracket_problem,
+    first_problem,
+    is_intrinsic,
+    is_matrix,
+)
 
 # frames: a time this near to a whole number is one, since files store rounded fractions
 SNAP = 1e-3
@@ -234,12 +241,12 @@ def read_document(path: Path, purpose: str) -> dict[str, Any]:
 
 
 def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> float:
-    """A finite number of a frame; InputError that says what it is for."""
+    """A number of a frame, up to `LARGEST`; InputError that says what it is for."""
     value = frame.get(key)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise InputError(
-            f"{path}: {frame.get('file_path')} has no number `{key}`, {purpose}; copy the file again"
-        )
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or not abs(value) <= LARGEST:
+        name = shorten(frame.get("file_path"))
+        raise InputError(f"{path}: {name} has no number `{key}`, {purpose}; copy the file again")
     return float(value)
 
 

@@ -13,8 +13,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.datasets.blender import TEST, TRAIN, poses
+from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.footage.datasets.blender import TEST, TRAIN
 from hdr_nsff.footage.datasets.capture import (
     Capture,
     Picture,
@@ -23,6 +23,7 @@ from hdr_nsff.footage.datasets.capture import (
     read_object,
     source_of,
 )
+from hdr_nsff.footage.pose_files import from_transforms
 
 COUNT = 5
 TRAINED = (0, 2, 4)
@@ -57,7 +58,7 @@ def read(folder: Path) -> Capture:
         layout="HDR-NeRF (synthetic)",
         root=folder,
         pictures=pictures,
-        poses=poses(path, document),
+        poses=from_transforms(path, document),
         withheld=(folder / TEST).is_file(),
         over=1.0,
         still=True,
@@ -84,12 +85,12 @@ def ev_of(
     name = plain(f"{frame['file_path']}_{which}.png")
     try:
         seconds = float(table[name])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(
-            f"{folder / f'exposure_{split}.json'}: no exposure time for {name}; copy the file again"
+            f"{folder / f'exposure_{split}.json'}: no exposure time for {shorten(name)}; copy the file again"
         ) from error
     if not (math.isfinite(seconds) and seconds > 0):
         raise InputError(
-            f"{folder / f'exposure_{split}.json'}: an exposure time of {seconds:g} for {name}; it must be above 0"
+            f"{folder / f'exposure_{split}.json'}: an exposure time of {seconds:g} for {shorten(name)}; it must be above 0"
         )
     return math.log2(seconds)

@@ -45,7 +45,7 @@ from hdr_nsff.footage.datasets.capture import (
     reorder,
 )
 from hdr_nsff.footage.ingest import hash_file, shrink
-from hdr_nsff.footage.pose_files import Given, placed
+from hdr_nsff.footage.pose_files import Given, from_transforms, placed
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.scene.scene import FrameEntry, Manifest
 from hdr_nsff.scene.truth import Truth, TruthView
@@ -109,7 +109,7 @@ def from_blender(capture: Capture) -> tuple[list[HeldOut], Given]:
         )
         time = None if capture.still else clock(stored)
         views.append(HeldOut(f"{k:04d}", time, [(file, like)], radiance))
-    return views, blender.poses(path, document)
+    return views, from_transforms(path, document)
 
 
 def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
@@ -132,7 +132,7 @@ def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
         ]
         exr = root / "test_hdr" / f"hdr_{k:03d}.exr"
         views.append(HeldOut(f"{k:04d}", None, pictures, exr if exr.is_file() else None))
-    return views, blender.poses(path, document)
+    return views, from_transforms(path, document)
 
 
 def from_hdr_nerf_real(capture: Capture) -> tuple[list[HeldOut], Given]:
@@ -178,7 +178,7 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
         if own.moving is not None:
             mask = named_map(root, own.moving, f"the moving mask of held-out view {name}")
         views.append(HeldOut(name, own.time, [(file, like)], mask=mask))
-    return views, reorder(blender.poses(path, document), kept)
+    return views, reorder(from_transforms(path, document), kept)
 
 
 def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:

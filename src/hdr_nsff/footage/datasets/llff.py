@@ -33,7 +33,7 @@ from hdr_nsff.footage.datasets.capture import (
     source_of,
 )
 from hdr_nsff.footage.ingest import frame_files, natural
-from hdr_nsff.footage.pose_files import Given, from_llff
+from hdr_nsff.footage.pose_files import Given, llff_rows, llff_table
 
 FLOWS = ("semantic_flow_i1", "flow_i1")
 MULTI_VIEW = ("mv_images", "mv_images_time")
@@ -161,8 +161,8 @@ def poses(dense: Path) -> tuple[Given, np.ndarray]:
     path = dense / "poses_bounds.npy"
     if not path.is_file():
         raise InputError(f"{path}: missing; it holds the camera poses, copy it again")
-    given = from_llff(path)
-    return given, np.load(path, allow_pickle=False)[:, 15:].astype(np.float64)
+    table = llff_table(path, 17)
+    return llff_rows(table), table[:, 15:]
 
 
 def pictures(dense: Path) -> list[Path]:

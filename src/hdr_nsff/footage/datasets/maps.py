@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask, read_npy
+from hdr_nsff.core.io import read_mask
+from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.datasets.capture import Capture, Picture, Sighting
 from hdr_nsff.footage.depth_files import read_map
 from hdr_nsff.footage.flow_files import read_npz
@@ -53,10 +54,7 @@ def flow_map(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
     if path.suffix == ".npz":
         flow, valid = read_npz(path)
     else:
-        flow, valid = (
-            np.array(read_npy(path), np.float32),
-            read_mask(path.with_name(f"{path.stem}_valid.png")),
-        )
+        flow, valid = read_array(path), read_mask(path.with_name(f"{path.stem}_valid.png"))
     if flow.ndim != 3 or flow.shape[2] != 2 or valid.shape != flow.shape[:2]:
         raise InputError(
             f"{path}: expected flow (H, W, 2) with a mask (H, W), found {flow.shape} and {valid.shape}; copy it again"

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_json, read_npy
-from hdr_nsff.footage.datasets.blender import poses
+from hdr_nsff.core.io import read_json
+from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.datasets.capture import (
     Capture,
     Clock,
@@ -32,7 +32,7 @@ from hdr_nsff.footage.datasets.capture import (
     turns,
 )
 from hdr_nsff.footage.ingest import natural
-from hdr_nsff.footage.pose_files import Given
+from hdr_nsff.footage.pose_files import Given, from_transforms
 
 NAME = "transforms.json"
 HELD_OUT = ("val_filenames", "test_filenames")
@@ -74,7 +74,7 @@ def read(folder: Path) -> Capture:
             f"{path}: every picture is in {' or '.join(HELD_OUT)}; leave some to train on"
         )
     frames = [document["frames"][k] for k in kept]
-    given = reorder(poses(path, document), kept)
+    given = reorder(from_transforms(path, document), kept)
     extra = (
         parse_extra(path, document[EXTRA], [f["file_path"] for f in frames])
         if EXTRA in document
@@ -117,12 +117,20 @@ def held_out_names(path: Path, document: dict[str, Any]) -> set[str]:
                 f"{path}: `{key}` is no list of file names; it says which pictures are held out, mend it"
             )
         names |= set(listed)
+    trained = document.get("train_filenames")
+    if trained is not None and not is_names(trained):
+        raise InputError(f"{path}: `train_filenames` is no list of file names; correct it")
     known = {f["file_path"] for f in document["frames"]}
     if lost := names - known:
         raise InputError(
             f"{path}: {min(lost)} is listed as held out, but no frame has that `file_path`; mend the lists"
         )
-    return names - set(document.get("train_filenames", []))
+    return names - set(trained or ())
+
+
+def is_names(value: Any) -> bool:
+    """Whether a value of a JSON is a list of file names."""
+    return isinstance(value, list) and all(isinstance(n, str) for n in value)
 
 
 def stored_times(path: Path, frames: list[dict[str, Any]]) -> list[float]:
@@ -152,7 +160,13 @@ def static_points(folder: Path, name: str | None) -> np.ndarray | None:
     """The static points (P, 3) of an export, if it has them."""
     if name is None:
         return None
-    return np.array(read_npy(named_map(folder, name, "the static points")))
+    path = named_map(folder, name, "the static points")
+    points = read_array(path)
+    if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
+        raise InputError(
+            f"{path}: expected finite points of shape (P, 3), not {points.shape}; export again"
+        )
+    return points
 
 
 def exported(
