@@ -216,10 +216,38 @@ def test_a_csv_that_leaves_frames_out(tmp_path: Path, capsys: Capture) -> None:
 # Settings and maps
 
 
-def test_settings_out_of_range(tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize("verb", ["prepare", "reexpose"])
+def test_settings_out_of_range(verb: str, tmp_path: Path, capsys: Capture) -> None:
+    footage, out = clip(tmp_path / "clip"), tmp_path / "out"
+    for option, value, said in (
+        ("--hold-out", 1, "--hold-out 1"),
+        ("--hold-out", -5, "--hold-out -5"),
+        ("--max-size", 3, "--max-size 3"),
+        ("--stride", 0, "in steps of 0"),
+        ("--start", -1, "frames -1"),
+        ("--end", 0, "to 0"),
+        ("--ev", "0,1e308", "--ev 1e+308"),
+    ):
+        assert said in refused(capsys, verb, footage, out, f"{option}={value}")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "option", ["--noise=nan", "--noise=-inf", "--noise=1e300", "--noise=-1", "--seed=-1"]
+)
+def test_noise_that_no_sensor_has(option: str, tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
-    assert "--hold-out 1" in prepared(capsys, folder, "--hold-out", 1)
-    assert "--max-size 3" in prepared(capsys, folder, "--max-size", 3)
+    name = option.partition("=")[0]
+    assert name in refused(capsys, "reexpose", folder, tmp_path / "out", option)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_end_beyond_the_clip_is_the_end(tmp_path: Path, capsys: Capture) -> None:
+    """The frames are read, and the exposures found wrong after them."""
+    folder = clip(tmp_path / "clip", recorded(24))
+    said = prepared(capsys, folder, "--end", 10**30, "--stride", 1, "--ev=0,1")
+    assert "2 exposures listed" in said
+    assert "0 frames to use" in prepared(capsys, folder, "--start", 10**30, "--redo", "frames")
 
 
 def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capture) -> None:

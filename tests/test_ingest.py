@@ -58,6 +58,12 @@ def test_frames_come_in_the_order_of_their_numbers(tmp_path):
     assert np.allclose([f.rgb.mean() for f in frames[:5]], [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.01)
 
 
+def test_only_decimal_digits_are_numbers_in_names(tmp_path):
+    for name in ("1²2.png", "1²10.png", "0.png"):
+        write_png(tmp_path / name, picture(0.5))
+    assert [f.source for f in all_frames(tmp_path)] == ["0.png", "1²2.png", "1²10.png"]
+
+
 def test_range_and_stride_choose_frames_by_their_number(tmp_path):
     folder_of(tmp_path, [0.5] * 10)
     assert [f.number for f in all_frames(tmp_path, start=2, end=9, stride=3)] == [2, 5, 8]
@@ -177,14 +183,36 @@ def test_a_csv_beside_a_video_names_frames_by_number(tmp_path):
     [
         ("file,ev\nf1.png,1/0\n", "line 2"),
         ("name,value\n", "columns"),
-        ("file,ev\nf1.png\n", "line 2"),
+        ("", "columns"),
+        ("file;ev\nf1.png;1\n", "columns are file;ev"),
+        ("file,ev\nf1.png\n", "line 2: no value for column ev"),
+        ("exposure,frame\n1/100,0\n1/100\n", "line 3: no value for column frame"),
+        ("file,ev\n\nf1.png,\n", "line 3: '' is not a number"),
+        ("file,ev\nf1.png,0,5\n", "line 2: more values than columns"),
+        ("file,ev\n" + "x" * 140_000 + ",1\n", "line 2: no readable CSV"),
+        (b"file,ev\nf1.png,1\nf\xfc2.png,1\n", "line 3: not UTF-8"),
+        ("file,ev\nf1.png,1\n".encode("utf-16"), "line 1: not UTF-8"),
     ],
 )
 def test_a_csv_that_makes_no_sense_is_named(tmp_path, text, what):
     folder_of(tmp_path, [0.5])
-    (tmp_path / "exposures.csv").write_text(text)
+    data = text if isinstance(text, bytes) else text.encode()
+    (tmp_path / "exposures.csv").write_bytes(data)
     with pytest.raises(InputError, match=f"exposures.csv.*{what}"):
         read_exposure_csv(open_footage(tmp_path))
+
+
+def test_a_csv_may_end_its_lines_with_a_comma_and_leave_lines_empty(tmp_path):
+    folder_of(tmp_path, [0.5])
+    (tmp_path / "exposures.csv").write_text("file,ev,\r\n\r\nf1.png,1,\r\nf2.png,2,,\r\n")
+    assert read_exposure_csv(open_footage(tmp_path))[1] == {"f1.png": 1, "f2.png": 2}
+
+
+def test_damaged_exposure_lists_are_read_or_refused(tmp_path):
+    folder_of(tmp_path, [0.5])
+    path = tmp_path / "exposures.csv"
+    path.write_text('file, exposure\nf1.png, 1/4\nf2.png, 1/2\n"f3.png", 0.25\n')
+    check_reader(path, lambda: read_exposure_csv(open_footage(tmp_path)), 300)
 
 
 def test_exif_exposure_counts_time_sensitivity_and_aperture(tmp_path):

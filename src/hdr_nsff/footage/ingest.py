@@ -10,23 +10,27 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import logging
 import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_exr, read_image, read_video, video_info
+from hdr_nsff.scene.scene import LARGEST_EV
 
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
 FRAMES = RECORDED | LINEAR
 ACCEPTED = "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders (one per camera)"
+MIN_MAX_SIZE = 32  # pixels: least longest side that frames may be shrunk to
 
 
 @dataclass(frozen=True)
@@ -93,10 +97,39 @@ def open_footage(clip: Path) -> Footage:
     return Footage(clip, cameras, False, len(cameras[0]), 24.0, linear.pop())
 
 
+def check_choice(
+    start: int, end: int | None, stride: int, max_size: int, hold_out: int | None
+) -> None:
+    """InputError for a choice of frames that makes no sense whatever the footage is."""
+    if start < 0 or stride < 1 or (end is not None and end <= start):
+        last = "the end" if end is None else end
+        raise InputError(
+            f"frames {shorten(start)} to {shorten(last)} in steps of {shorten(stride)}: "
+            "nothing to read; correct --start, --end, --stride"
+        )
+    if max_size < MIN_MAX_SIZE:
+        raise InputError(
+            f"--max-size {shorten(max_size)}: too small to find anything in; "
+            f"use at least {MIN_MAX_SIZE}"
+        )
+    if hold_out is not None and (hold_out < 0 or hold_out == 1):
+        raise InputError(
+            f"--hold-out {shorten(hold_out)}: leaves nothing to train on; use 0, or 2 and more"
+        )
+
+
+def check_number(option: str, value: float, least: float, most: float) -> None:
+    """InputError for the value of an `option` that is not from `least` to `most`."""
+    if not least <= value <= most:
+        raise InputError(
+            f"{option} {shorten(value)}: it must be a number from {least:g} to {most:g}"
+        )
+
+
 def natural(path: Path) -> list[tuple[int, int, str]]:
     """A key that sorts frame2 before frame10."""
     return [
-        (0, int(p), "") if p.isdigit() else (1, 0, p.lower())
+        (0, int(p), "") if p.isdecimal() else (1, 0, p.lower())
         for p in re.split(r"(\d+)", path.name)
         if p
     ]
@@ -300,11 +333,12 @@ def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None
     (seconds) or `--ev -4,-2`, None for neither.
     """
     if exposures is None or exposures.strip() == "auto":
-        return (
-            None
-            if ev is None or ev.strip() == "auto"
-            else [number(v, "--ev") for v in ev.split(",")]
-        )
+        if ev is None or ev.strip() == "auto":
+            return None
+        cycle = [number(v, "--ev") for v in ev.split(",")]
+        for value in cycle:
+            check_number("--ev", value, -LARGEST_EV, LARGEST_EV)
+        return cycle
     if ev is not None:
         raise InputError("--exposures and --ev both given; leave one out")
     return [log2_seconds(v, "--exposures") for v in exposures.split(",")]
@@ -345,27 +379,61 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     where there is none.
 
     Columns: `file` (or `frame`, a number from 0), and `exposure` (seconds) or `ev`.
+    InputError that names the line of what is not understood.
     """
-    beside = footage.path.with_suffix(".csv") if footage.video else footage.path / "exposures.csv"
-    if not beside.is_file():
+    path = footage.path.with_suffix(".csv") if footage.video else footage.path / "exposures.csv"
+    if not path.is_file():
         return None
-    with open(beside, newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        columns = set(reader.fieldnames or [])
+    reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
+    try:
+        columns = reader.fieldnames or []
         name = next((c for c in ("file", "frame") if c in columns), None)
         value = next((c for c in ("exposure", "ev") if c in columns), None)
         if name is None or value is None:
+            found = shorten(", ".join(columns)) or "none"
             raise InputError(
-                f"{beside}: columns {sorted(columns)}; it needs `file` or `frame`, and `exposure` (seconds) or `ev`"
+                f"{path}: its columns are {found}; it needs `file` or `frame`, "
+                "and `exposure` (seconds) or `ev`, separated by commas"
             )
-        read = log2_seconds if value == "exposure" else number
         rows = {}
-        for line, row in enumerate(reader, start=2):
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            check_cells(row, (name, value), where)
             key = row[name].strip()
-            rows[f"#{key}" if name == "frame" else key] = read(
-                row[value] or "", f"{beside}, line {line}"
-            )
-    return beside, rows
+            read = log2_seconds if value == "exposure" else number
+            rows[f"#{key}" if name == "frame" else key] = read(row[value], where)
+    except csv.Error as error:
+        raise InputError(
+            f"{path}, line {reader.line_num + 1}: no readable CSV ({error}); correct the line"
+        ) from error
+    return path, rows
+
+
+def read_utf8(path: Path) -> str:
+    """A text file, with or without a byte order mark; InputError that names the line
+    where it is not UTF-8.
+    """
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise InputError(
+            f"{path}, line {line}: not UTF-8 text; save the list as CSV UTF-8"
+        ) from error
+
+
+def check_cells(row: dict[str | Any, Any], columns: Sequence[str], where: str) -> None:
+    """InputError where a row of a CSV has no cell in one of `columns`, or more cells than
+    there are columns; empty ones at its end are passed over.
+    """
+    lost = next((c for c in columns if row[c] is None), None)
+    if lost is not None:
+        raise InputError(f"{where}: no value for column {shorten(lost)}; complete the line")
+    if any(row.get(None, ())):
+        raise InputError(
+            f"{where}: more values than columns; separate values by commas, decimals by a point"
+        )
 
 
 def read_exif_ev(path: Path) -> float | None:

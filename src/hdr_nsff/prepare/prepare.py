@@ -168,22 +168,7 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
 
 def check_settings(config: PrepareConfig) -> None:
     """InputError for settings that make no sense whatever the footage is."""
-    if (
-        config.start < 0
-        or config.stride < 1
-        or (config.end is not None and config.end <= config.start)
-    ):
-        raise InputError(
-            f"frames {config.start} to {config.end} in steps of {config.stride}: nothing to read; mend --start, --end, --stride"
-        )
-    if config.max_size < 32:
-        raise InputError(
-            f"--max-size {config.max_size}: too small to find anything in; use at least 32"
-        )
-    if config.hold_out is not None and (config.hold_out < 0 or config.hold_out == 1):
-        raise InputError(
-            f"--hold-out {config.hold_out}: leaves nothing to train on; use 0, or 2 and more"
-        )
+    ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
     if config.protocol is not None and config.hold_out is not None:
         raise InputError(
             "--protocol and --hold-out both given, and each says what is kept out of training; leave one out"

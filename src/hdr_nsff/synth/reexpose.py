@@ -39,6 +39,9 @@ from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.recording import Curve, Noise, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
 
+MAX_NOISE = 100.0  # times that of a small sensor: nothing is left of the picture
+MAX_SEED = 2**63
+
 
 @dataclass(frozen=True)
 class ReexposeConfig:
@@ -105,6 +108,11 @@ def reexpose(config: ReexposeConfig) -> Path:
     where it was.
     """
     with writing_to(config.out):
+        ingest.check_choice(
+            config.start, config.end, config.stride, config.max_size, config.hold_out
+        )
+        ingest.check_number("--noise", config.noise, 0, MAX_NOISE)
+        ingest.check_number("--seed", config.seed, 0, MAX_SEED)
         evs = ingest.parse_exposures(None, config.ev)
         if evs is None:
             raise InputError(

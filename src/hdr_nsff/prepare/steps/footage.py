@@ -25,11 +25,10 @@ def frames_step(work: Work) -> Step:
     on them.
     """
     c, m = work.config, work.manifest
-    total = (
-        len(range(c.start, c.end or work.footage.count, c.stride)) * len(work.footage.cameras)
-        if work.footage.count
-        else None
-    )
+    total = None  # unknown, of a video whose header does not say
+    if count := work.footage.count:
+        chosen = range(c.start, min(c.end or count, count), c.stride)
+        total = len(chosen) * len(work.footage.cameras)
     entries: list[FrameEntry] = []
     extents = []
     for frame in track(
