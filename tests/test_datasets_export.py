@@ -177,7 +177,7 @@ def test_the_colmap_model_projects_points_onto_their_keypoints(scene: Path) -> N
 
 def test_hidden_points_are_not_seen() -> None:
     points = np.array([[0, 0, 4.0], [0, 0, 6.0], [0, 0, -4.0], [9, 0, 4.0]])
-    view = to_colmap.seen(points, mini.K, np.eye(4)[:3], np.full((mini.H, mini.W), 0.25))
+    view = to_colmap.visible_points(points, mini.K, np.eye(4)[:3], np.full((mini.H, mini.W), 0.25))
     assert (
         view.index.tolist() == [0]
         and view.depth.tolist() == [4]
@@ -265,14 +265,104 @@ def test_an_exported_folder_without_one_of_its_notes_is_refused(scene: Path) -> 
         recognize(out)
 
 
-def test_exporting_again_replaces_what_was_there_but_nothing_else(
-    scene: Path, tmp_path: Path
+def files_of(folder: Path) -> dict[str, bytes]:
+    """All files below `folder` with their contents."""
+    files = [p for p in folder.rglob("*") if p.is_file()]
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_exporting_again_leaves_the_files_of_others_alone(layout: str, scene: Path) -> None:
+    out = scene.with_name("out")
+    config = ExportConfig(scene, out, layout=layout)  # type: ignore[arg-type]
+    whole = files_of(export(config))
+    mine = {"logs/my_training.txt": b"a", "notes.md": b"b", "logs/old/c.txt": b"c"}
+    for name, data in mine.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(data)
+    export(config)
+    assert files_of(out) == whole | mine
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_files_of_an_earlier_export_do_not_stay(layout: str, scene: Path) -> None:
+    out = scene.with_name("out")
+    config = ExportConfig(scene, out, layout=layout)  # type: ignore[arg-type]
+    export(config)
+    (out / "images").mkdir(exist_ok=True)
+    (out / "images/mine.txt").write_text("mine")
+    m = Manifest.load(scene)
+    m.frames, m.points = m.frames[:4], None
+    m.frames[3].flow.pop(4)
+    m.save(scene)
+    export(config)
+    left = files_of(out)
+    assert left.pop("images/mine.txt") == b"mine"
+    assert left == files_of(export(replace(config, out=scene.with_name("new"))))
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "images", "depth/00002.npy", "depth"])
+def test_a_file_in_the_way_of_an_export_is_named_and_stays(name: str, scene: Path) -> None:
+    out = scene.with_name("out")
+    export(ExportConfig(scene, out, layout="hdr-gopro"))
+    mine = out / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    before = files_of(out)
+    with pytest.raises(InputError, match="did not write"):
+        export(ExportConfig(scene, out, layout="nerfstudio"))
+    assert files_of(out) == before and mine.read_text() == "mine"
+
+
+def test_a_folder_in_the_place_of_a_file_is_named_and_stays(scene: Path) -> None:
+    config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
+    export(config)
+    (config.out / "transforms.json").unlink()
+    (config.out / "transforms.json").mkdir()
+    with pytest.raises(InputError, match=r"transforms\.json: .* did not write"):
+        export(config)
+
+
+def test_an_export_that_was_killed_is_replaced_by_the_next(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
+    written = []
+
+    def stop(source: Path, target: Path) -> None:
+        if len(written) == 5:
+            raise KeyboardInterrupt
+        written.append(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(source.read_bytes())
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hdr_nsff.footage.layouts.nerfstudio.copy", stop)
+        with pytest.raises(KeyboardInterrupt):
+            export(config)
+    export(config)
+    new = replace(config, out=scene.with_name("new"))
+    assert files_of(config.out) == files_of(export(new))
+
+
+@pytest.mark.parametrize("name", ["../mine.txt", "/etc/hostname", "link/mine.txt"])
+def test_an_edited_note_removes_nothing_outside(name: str, scene: Path) -> None:
+    config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
+    note = export(config) / "hdr_nsff_export.json"
+    (scene.with_name("other")).mkdir()
+    for place in (scene.with_name("mine.txt"), scene.with_name("other") / "mine.txt"):
+        place.write_text("mine")
+    (config.out / "link").symlink_to(scene.with_name("other"))
+    content = json.loads(note.read_text())
+    note.write_text(json.dumps(content | {"files": [*content["files"], name]}))
+    with pytest.raises(InputError, match="points outside the export"):
+        export(config)
+    assert scene.with_name("mine.txt").is_file()
+    assert (scene.with_name("other") / "mine.txt").is_file()
+
+
+def test_an_export_goes_into_a_folder_of_exports_alone(scene: Path, tmp_path: Path) -> None:
     config = ExportConfig(scene, tmp_path / "out", layout="hdr-gopro")
-    export(config)
-    write_png(tmp_path / "out/dense/images/00099.png", np.zeros((4, 4, 3)))
-    export(config)
-    assert not (tmp_path / "out/dense/images/00099.png").exists()
     write_png(tmp_path / "mine/photo.png", np.zeros((4, 4, 3)))
     with pytest.raises(InputError, match="not made by export"):
         export(replace(config, out=tmp_path / "mine"))

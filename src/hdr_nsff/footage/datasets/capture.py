@@ -243,11 +243,10 @@ def read_document(path: Path, purpose: str) -> dict[str, Any]:
 def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> float:
     """A number of a frame, up to `LARGEST`; InputError that says what it is for."""
     value = frame.get(key)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or not abs(value) <= LARGEST:
-        name = shorten(frame.get("file_path"))
-        raise InputError(f"{path}: {name} has no number `{key}`, {purpose}; copy the file again")
-    return float(value)
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST:
+        return float(value)
+    name = shorten(frame.get("file_path"))
+    raise InputError(f"{path}: {name} has no number `{key}`, {purpose}; copy the file again")
 
 
 def named_file(root: Path, name: str, purpose: str) -> Path:
