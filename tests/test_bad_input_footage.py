@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,6 +71,13 @@ def exr_with(value: float) -> Callable[[Path], None]:
     return damage
 
 
+def claim_size(path: Path) -> None:
+    """Have a PNG claim 40000 x 30000 pixels in its header."""
+    data = path.read_bytes()
+    header = b"IHDR" + struct.pack(">II", 40000, 30000) + data[24:29]
+    path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
+
+
 def text_video(folder: Path) -> Path:
     folder.mkdir()
     (folder / "notes.mp4").write_text("not a film\n" * 100)
@@ -106,6 +115,10 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "frames of two sizes": (
         lambda p: one_bad(p, lambda f: io.write_png(f, np.full((30, 60, 3), 0.5))),
         "004.png: 60x30 pixels",
+    ),
+    "a PNG of a thousand megapixels": (
+        lambda p: one_bad(p, claim_size),
+        "004.png: 40000x30000 pixels, more than the 200 megapixels",
     ),
     "all black": (lambda p: clip(p, [np.zeros((34, 60, 3))] * FRAMES), "all frames are black"),
     "all white": (lambda p: clip(p, [np.ones((34, 60, 3))] * FRAMES), "all frames are white"),

@@ -22,6 +22,7 @@ import numpy as np
 import OpenEXR
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.picture_size import check_size, encoded_size
 
 SIDES = {
     1: "forward",
@@ -169,9 +170,12 @@ def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
         raise InputError(f"{path}: the PNG is cut short; copy it again")
     if path.suffix.lower() in {".jpg", ".jpeg"} and b"\xff\xd9" not in raw[-64:].tobytes():
         raise InputError(f"{path}: the JPEG is cut short; copy it again")
+    size = encoded_size(raw.tobytes())
+    if size is not None:
+        check_size(path, *size)
     try:
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH if over is None else cv2.IMREAD_UNCHANGED
-        image = cv2.imdecode(raw, flags) if len(raw) else None
+        image = cv2.imdecode(raw, flags) if size is not None else None
     except cv2.error:
         image = None
     if image is None:
@@ -253,6 +257,9 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
+        with silent(), OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = file.header()["dataWindow"]
+        check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
         with silent(), OpenEXR.File(str(path)) as file:
             if not file.parts:
                 raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")
@@ -344,9 +351,10 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
                     array.astype(np.float32) / np.float32(65535 if deep else 255),
                     float(frame.time or 0.0),
                 )
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:  # the last of its metadata
+        reason = getattr(error, "strerror", None) or type(error).__name__
         raise InputError(
-            f"{path}: not a readable video, or cut short ({error.strerror or type(error).__name__}); check that it plays, or copy it again"
+            f"{path}: not a readable video, or cut short ({reason}); check that it plays, or copy it again"
         ) from error
 
 
@@ -369,6 +377,7 @@ def video_info(path: Path | str) -> VideoInfo:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
             stream = container.streams.video[0]
+            check_size(path, stream.width, stream.height)
             end = max((entry.pos + entry.size for entry in stream.index_entries), default=0)
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")
@@ -381,9 +390,10 @@ def video_info(path: Path | str) -> VideoInfo:
             if not seconds and alone and container.duration:
                 seconds = container.duration / 1e6
             return VideoInfo(stream.frames, float(stream.average_rate or 24), seconds)
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or type(error).__name__
         raise InputError(
-            f"{path}: not a readable video, or cut short ({error.strerror or type(error).__name__}); check that it plays, or copy it again"
+            f"{path}: not a readable video, or cut short ({reason}); check that it plays, or copy it again"
         ) from error
 
 

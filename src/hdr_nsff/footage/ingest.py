@@ -24,6 +24,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_exr, read_image, read_video, video_info
+from hdr_nsff.core.picture_size import check_size
 from hdr_nsff.scene.scene import LARGEST_EV
 
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
@@ -253,6 +254,7 @@ def read_dng(path: Path) -> np.ndarray:
         ) from error
     try:
         with rawpy.imread(str(path)) as raw:
+            check_size(path, raw.sizes.width, raw.sizes.height)
             image = raw.postprocess(
                 gamma=(1, 1),
                 no_auto_bright=True,
