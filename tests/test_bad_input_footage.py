@@ -112,6 +112,18 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "one frame": (lambda p: clip(p, recorded(1)), "1 frame "),
     "two frames": (lambda p: clip(p, recorded(2)), "2 frames "),
+    "frames of one pixel": (
+        lambda p: clip(p, [np.full((1, 1, 3), 0.5)] * FRAMES),
+        "frames are 1x1 pixels, at least 11x11 are needed",
+    ),
+    "frames of one row": (
+        lambda p: clip(p, [np.full((1, 64, 3), 0.5)] * FRAMES),
+        "frames are 64x1 pixels",
+    ),
+    "frames of ten columns": (
+        lambda p: clip(p, [np.full((64, 10, 3), 0.5)] * FRAMES),
+        "frames are 10x64 pixels",
+    ),
     "frames of two sizes": (
         lambda p: one_bad(p, lambda f: io.write_png(f, np.full((30, 60, 3), 0.5))),
         "004.png: 60x30 pixels",

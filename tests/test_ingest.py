@@ -16,6 +16,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_exr, write_png, write_video
 from hdr_nsff.footage.ingest import (
     every_of,
+    hash_file,
     held_out,
     log2_seconds,
     number,
@@ -257,6 +258,12 @@ def test_held_out_frames_go_through_all_exposures():
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
     assert {k % 4 for k in chosen} == {0, 1, 2, 3}
     assert held_out(100, 0, 3) == [] and 0 not in held_out(9, 2, 1) and 8 not in held_out(9, 2, 1)
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="Linux alone has it")
+def test_a_file_that_cannot_be_read_is_named():
+    with pytest.raises(InputError, match="/proc/self/mem: cannot be read"):
+        hash_file(Path("/proc/self/mem"))
 
 
 def write_dng(path: Path, level: float) -> None:

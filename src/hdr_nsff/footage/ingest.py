@@ -31,6 +31,8 @@ RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
 FRAMES = RECORDED | LINEAR
 ACCEPTED = "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders (one per camera)"
+# pixels: SSIM compares windows of this size (Wang et al. 2004), optical flow needs 9
+MIN_SIDE = 11
 MIN_MAX_SIZE = 32  # pixels: least longest side that frames may be shrunk to
 
 
@@ -119,6 +121,15 @@ def check_choice(
         )
 
 
+def check_frame_size(clip: Path, width: int, height: int) -> None:
+    """InputError for frames that are too small to match or to compare."""
+    if min(width, height) < MIN_SIDE:
+        raise InputError(
+            f"{clip}: frames are {width}x{height} pixels, at least {MIN_SIDE}x{MIN_SIDE} are "
+            "needed; choose larger frames, or a larger --max-size"
+        )
+
+
 def check_number(option: str, value: float, least: float, most: float) -> None:
     """InputError for the value of an `option` that is not from `least` to `most`."""
     if not least <= value <= most:
@@ -154,9 +165,14 @@ def sorted_folders(folder: Path) -> list[Path]:
 
 
 def hash_file(path: Path) -> str:
-    """The sha256 of a file, in hexadecimal."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """The sha256 of a file, in hexadecimal; InputError where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions, or copy it again"
+        ) from error
 
 
 def read_frames(

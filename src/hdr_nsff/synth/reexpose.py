@@ -129,6 +129,7 @@ def reexpose(config: ReexposeConfig) -> Path:
             numbers.append(frame.number)
             extents.append(exposure.extent(frame.rgb))
             size = (frame.rgb.shape[0], frame.rgb.shape[1])
+            ingest.check_frame_size(config.clip, size[1], size[0])
         work = plan(len(numbers), len(evs), config.hold_out, remove=config.poses is not None)
         poses = (
             read_poses(config.poses, footage, numbers, size) if config.poses is not None else None

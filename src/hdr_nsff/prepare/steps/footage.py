@@ -50,6 +50,7 @@ def frames_step(work: Work) -> Step:
                 bits=8 if np.abs(frame.rgb - exact).max() < 1e-6 else 16,
             )
         m.height, m.width = frame.rgb.shape[:2]
+        ingest.check_frame_size(c.clip, m.width, m.height)
         extents.append(exposure.extent(frame.rgb))
         entries.append(entry)
     times = len({e.time for e in entries})
