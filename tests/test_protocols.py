@@ -16,7 +16,7 @@ from test_prepare import COUNT, footage, given
 from hdr_nsff.core import io
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.ingest import between
+from hdr_nsff.footage.ingest import frames_between
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.scene.scene import Manifest, Scene
 from hdr_nsff.scene.truth import Truth, TruthView
@@ -25,7 +25,7 @@ from hdr_nsff.training.train import train
 
 
 def kept(count: int, cycle: int) -> list[int]:
-    return sorted(set(range(count)) - set(between(count, cycle)))
+    return sorted(set(range(count)) - set(frames_between(count, cycle)))
 
 
 def test_every_second_frame_is_trained_on_and_so_is_the_last() -> None:

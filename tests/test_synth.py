@@ -11,7 +11,8 @@ import torch
 
 from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.ingest import open_footage, read_exposure_csv
+from hdr_nsff.footage.exposure_lists import read_exposure_csv
+from hdr_nsff.footage.ingest import open_footage
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures

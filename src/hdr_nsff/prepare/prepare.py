@@ -30,6 +30,7 @@ from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.capture import Picture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
+from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps import priors as on_priors
 from hdr_nsff.prepare.steps.neural import check_networks, weights_of
@@ -173,7 +174,7 @@ def check_settings(config: PrepareConfig) -> None:
         raise InputError(
             "--protocol and --hold-out both given, and each says what is kept out of training; leave one out"
         )
-    ingest.parse_exposures(config.exposures, config.ev)
+    parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside"

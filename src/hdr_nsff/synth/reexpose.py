@@ -33,6 +33,7 @@ from hdr_nsff.core.io import (
 )
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.radiometry import exposure_cycle as exposure
@@ -113,7 +114,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         )
         ingest.check_number("--noise", config.noise, 0, MAX_NOISE)
         ingest.check_number("--seed", config.seed, 0, MAX_SEED)
-        evs = ingest.parse_exposures(None, config.ev)
+        evs = parse_exposures(None, config.ev)
         if evs is None:
             raise InputError(
                 "--ev auto: nothing to find here; list the log2 exposures of one cycle, like -2,0,2"

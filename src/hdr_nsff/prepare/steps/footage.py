@@ -13,6 +13,11 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.exposure_lists import (
+    parse_exposures,
+    read_exif_ev,
+    read_exposure_csv,
+)
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.scene import FrameEntry, Protocol, Step
@@ -136,7 +141,9 @@ def kept_out(work: Work) -> set[int]:
         case "novel-view":
             return set()
         case "novel-view-time":
-            return {frames[k] for frames in cameras for k in ingest.between(len(frames), cycle)}
+            return {
+                frames[k] for frames in cameras for k in ingest.frames_between(len(frames), cycle)
+            }
         case None:
             return {
                 frames[k]
@@ -172,7 +179,7 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
     """
     c, footage, frames = work.config, work.footage, work.manifest.frames
     numbers = [c.start + int(f.time) * c.stride for f in frames]
-    cycle = ingest.parse_exposures(c.exposures, c.ev)
+    cycle = parse_exposures(c.exposures, c.ev)
     if cycle is not None:
         check_length(work, cycle, numbers)
         return "flags", [cycle[n % len(cycle)] for n in numbers]
@@ -181,7 +188,7 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
     if (capture := work.capture) is not None and capture.parts()["exposures"]:
         evs = [work.picture(f).ev for f in frames]
         return "data set", None if capture.exposures else [e for e in evs if e is not None]
-    if (table := ingest.read_exposure_csv(footage)) is not None:
+    if (table := read_exposure_csv(footage)) is not None:
         path, rows = table
         keys = [
             next((k for k in (f.source, Path(f.source).name, f"#{n}") if k in rows), None)
@@ -195,7 +202,7 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         return path.name, [rows[k] for k in keys if k is not None]
     if not footage.video:
         files = footage.files
-        found = [ingest.read_exif_ev(files[f.source]) for f in frames]
+        found = [read_exif_ev(files[f.source]) for f in frames]
         known = [v for v in found if v is not None]
         if len(known) == len(found) and max(known) - min(known) >= exposure.MIN_STEP:
             return "EXIF", known
