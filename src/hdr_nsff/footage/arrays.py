@@ -38,8 +38,9 @@ def read_array(path: Path, dtype: type = np.float32) -> np.ndarray:
 
 
 def read_arrays(path: Path, names: Sequence[str], kind: str) -> list[np.ndarray]:
-    """The arrays `names` of a `.npz` as float32, as `read_array` reads one; `kind` is
-    what messages call the file.
+    """The arrays `names` of a `.npz` as float32.
+
+    InputError as in `read_array`; `kind` is what it calls the file.
     """
     try:
         with zipfile.ZipFile(path) as archive:

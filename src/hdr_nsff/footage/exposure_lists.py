@@ -26,8 +26,10 @@ EXAMPLE = "write times like 1/250 and EV like -2"
 
 
 def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None:
-    """The EV of each frame of one cycle, from `--exposures 1/1000,1/250` (seconds) or
-    `--ev -4,-2`; None for neither, or where they are "auto".
+    """The EV of each frame of one cycle, from the command line.
+
+    `exposures` are times in seconds (1/1000,1/250), `ev` is -4,-2; None where neither
+    is given, or they are "auto".
     """
     times_given = exposures is not None and exposures.strip() != "auto"
     if times_given and ev is not None:
@@ -72,11 +74,11 @@ def log2_seconds(text: str, where: str) -> float:
 
 
 def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
-    """The CSV beside the frames and its EV by frame (file name or `#number`), None where
-    there is none.
+    """The CSV beside the frames and its EV by frame; None where there is none.
 
-    Columns: `file` (or `frame`, a number from 0), and `exposure` (seconds) or `ev`.
-    InputError that names the line of what is not understood.
+    Frames go by file name or `#number`. Columns: `file` (or `frame`, a number from 0),
+    and `exposure` (seconds) or `ev`. InputError that names the line of what is not
+    understood.
     """
     path = footage.path / "exposures.csv"
     if footage.video:
@@ -104,8 +106,9 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
 
 
 def read_utf8(path: Path) -> str:
-    """A text file, with or without a byte order mark; InputError that names the line
-    where it is not UTF-8.
+    """A text file, with or without a byte order mark.
+
+    InputError that names the line where it is not UTF-8.
     """
     data = path.read_bytes()
     try:
@@ -118,7 +121,7 @@ def read_utf8(path: Path) -> str:
 
 
 def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, str]:
-    """The columns that name the frame and hold its exposure; InputError without both."""
+    """The columns that name the frame and hold its exposure; InputError without."""
     name = next((c for c in ("file", "frame") if c in columns), None)
     value = next((c for c in ("exposure", "ev") if c in columns), None)
     if name is None or value is None:
@@ -131,8 +134,9 @@ def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, str]:
 
 
 def check_cells(row: Mapping[str | Any, Any], columns: Sequence[str], where: str) -> None:
-    """InputError where a row of a CSV has no cell in one of `columns`, or more cells than
-    there are columns; empty ones at its end are passed over.
+    """InputError where a row of a CSV has too few or too many cells.
+
+    Each of `columns` needs one; empty ones at the end of the row are passed over.
     """
     lost = next((c for c in columns if row[c] is None), None)
     if lost is not None:
@@ -147,8 +151,9 @@ def check_cells(row: Mapping[str | Any, Any], columns: Sequence[str], where: str
 
 
 def read_exif_ev(path: Path) -> float | None:
-    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF; None where it
-    has no exposure time, or is damaged.
+    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF.
+
+    None where it has no exposure time, or is damaged.
     """
     import exifread
 

@@ -75,8 +75,9 @@ class FootageFrame:
 
 
 def open_footage(clip: Path) -> Footage:
-    """The footage at `clip`; InputError where it is missing, empty, mixed or not
-    understood.
+    """The footage at `clip`.
+
+    InputError where it is missing, empty, mixed or not understood.
     """
     if clip.is_file():
         return open_video(clip)
@@ -196,8 +197,7 @@ def check_number(option: str, value: float, least: float, most: float) -> None:
 def read_frames(
     footage: Footage, start: int, end: int | None, stride: int, max_size: int
 ) -> Iterator[FootageFrame]:
-    """The chosen frames, camera by camera, shrunk so that the longest side is at most
-    `max_size` pixels.
+    """The chosen frames, camera by camera, at most `max_size` pixels on a side.
 
     InputError for unreadable or truncated files, frames of different sizes, and
     negative, NaN or infinite radiance.
@@ -237,8 +237,9 @@ def decode(
 
 
 def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames; InputError where the video
-    ends before its header says.
+    """(number, source, image (H, W, 3)) of the chosen frames of a video.
+
+    InputError where it ends before its header says.
     """
     info = video_info(path)
     last = 0.0  # seconds
@@ -256,8 +257,9 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
 
 
 def read_frame(path: Path, over: float | None = None) -> np.ndarray:
-    """One frame file as float32 (H, W, 3): recorded rgb (`over` the gray that shows
-    through it), or linear radiance for EXR and DNG.
+    """One frame file as float32 (H, W, 3): recorded rgb, or linear for EXR and DNG.
+
+    `over` is the gray that shows through transparent pixels.
     """
     suffix = path.suffix.lower()
     if suffix == ".dng":
@@ -268,7 +270,7 @@ def read_frame(path: Path, over: float | None = None) -> np.ndarray:
 
 
 def read_linear_exr(path: Path) -> np.ndarray:
-    """Linear radiance (H, W, 3) of an EXR, gray or rgb; InputError where it is negative."""
+    """Linear radiance (H, W, 3) of an EXR, gray or rgb; InputError below zero."""
     channels = read_exr(path)
     if "RGB" not in channels:
         if "Y" not in channels:
@@ -286,8 +288,9 @@ def read_linear_exr(path: Path) -> np.ndarray:
 
 
 def read_dng(path: Path) -> np.ndarray:
-    """A raw photograph as linear rgb (H, W, 3), 1 where the sensor saturates; daylight
-    white balance, the same for every frame.
+    """A raw photograph as linear rgb (H, W, 3), 1 where the sensor saturates.
+
+    Daylight white balance, the same for every frame.
     """
     try:
         import rawpy
@@ -310,11 +313,11 @@ def read_dng(path: Path) -> np.ndarray:
 
 
 def linear_scale(files: list[Path]) -> float:
-    """The constant that brings linear frames into [0, 1]: 1 where nothing is brighter
-    than 1, else 1 / the 99.9th percentile.
+    """The constant that brings linear frames into [0, 1].
 
-    The same for all frames, so that their exposures keep their ratios; what is brighter
-    is saturated, as on a sensor.
+    1 where nothing is brighter than 1, else 1 / the 99.9th percentile. The same for all
+    frames, so that their exposures keep their ratios; what is brighter is saturated, as
+    on a sensor.
     """
     images = [read_frame(f) for f in files]
     if not images or max(float(i.max()) for i in images) <= 1:
@@ -339,11 +342,10 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
 
 
 def held_out(count: int, every: int, cycle: int) -> list[int]:
-    """Which of `count` frames are held out of training: every `every`-th, never the
-    first or the last; none for 0.
+    """Which of `count` frames are held out of training: every `every`-th.
 
-    `every` grows until it has no common factor with the exposure cycle, so that all
-    exposures are held out in turn.
+    Never the first or the last; none for 0. `every` grows until it has no common factor
+    with the exposure cycle, so that all exposures are held out in turn.
     """
     if every <= 0:
         return []
@@ -353,8 +355,9 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
 
 
 def every_of(frames: Sequence[int]) -> int | None:
-    """The smallest `every` for which `held_out` gives just these `frames` of a clip that
-    ends soon after them; None where there is none.
+    """The smallest `every` for which `held_out` gives just these `frames`.
+
+    The clip ends soon after them. None where there is no such number.
     """
     for every in range(2, 2 * frames[0] + 2):
         if held_out(frames[-1] + 2, every, 1) == list(frames):
@@ -363,12 +366,11 @@ def every_of(frames: Sequence[int]) -> int | None:
 
 
 def frames_between(count: int, cycle: int) -> list[int]:
-    """Which of `count` frames are held out of training by the protocol novel-view-time:
-    every second one, never the first or the last.
+    """Which of `count` frames the protocol novel-view-time holds out of training.
 
-    With an even exposure cycle every second frame would always show the same exposures:
-    there, each cycle begins with the other half, so that of a cycle of 2 the frames 0,
-    3, 4, 7, 8, ... are trained on.
+    Every second one, never the first or the last. With an even exposure cycle every
+    second frame would always show the same exposures: there, each cycle begins with the
+    other half, so that of a cycle of 2 the frames 0, 3, 4, 7, 8, ... are trained on.
     """
     inner = range(1, count - 1)
     if cycle % 2:

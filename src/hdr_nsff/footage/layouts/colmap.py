@@ -34,8 +34,9 @@ class VisiblePoints:
 def visible_points(
     points: np.ndarray, K: np.ndarray, c2w: np.ndarray, disparity: np.ndarray
 ) -> VisiblePoints:
-    """Which `points` (P, 3) a camera with K (3, 3), c2w (3, 4) and `disparity` (H, W)
-    sees.
+    """The `points` (P, 3) that a camera with K (3, 3) and c2w (3, 4) sees.
+
+    A point is seen where the camera's `disparity` (H, W) agrees with its depth.
     """
     height, width = disparity.shape
     local = (points - c2w[:, 3]) @ c2w[:, :3]  # (P, 3) in the camera's axes
@@ -58,8 +59,10 @@ def model_files(
     points: np.ndarray,
     views: Sequence[VisiblePoints],
 ) -> dict[str, bytes]:
-    """cameras.bin, images.bin and points3D.bin of frames `names` (N) with K (N, 3, 3)
-    and c2w (N, 3, 4), of `size` (H, W), which see the `views` (N) of `points` (P, 3).
+    """cameras.bin, images.bin and points3D.bin of a model, by name.
+
+    Frames `names` (N) have K (N, 3, 3) and c2w (N, 3, 4), are of `size` (H, W), and see
+    the `views` (N) of `points` (P, 3).
     """
     camera_ids: dict[bytes, int] = {}  # intrinsics -> number, in order of appearance
     cameras = []

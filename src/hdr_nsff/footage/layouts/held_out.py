@@ -20,11 +20,10 @@ from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
 
 
 def views_of(source: Source, folder: Path) -> list[HeldOutPicture]:
-    """The views of the truth `folder` in the world of the scene, as `evaluate` carries
-    them over.
+    """The views of the truth `folder` in the world of the scene.
 
-    InputError where the truth is not of this scene; prints which views have no place in
-    it.
+    They are carried over as `evaluate` does it. InputError where the truth is not of
+    this scene; prints which views have no place in it.
     """
     truth = Truth.open(folder)
     frames = source.manifest.frames
@@ -60,8 +59,10 @@ def carry_view(
     brackets: dict[int, int],
     scale: float,
 ) -> HeldOutPicture:
-    """One view in the world of the scene; `scale` is scene units per unit of the truth,
-    `brackets` the bracket of the scene for each of the truth.
+    """One view in the world of the scene.
+
+    `scale` is scene units per unit of the truth, `brackets` the bracket of the scene
+    for each of the truth.
     """
     m = source.manifest
     anchor = next((f for f in m.frames if f.index == view.anchor), None)
@@ -95,10 +96,10 @@ def carry_view(
 def write_picture(
     folder: Path, truth: Truth, view: TruthView, size: tuple[int, int], path: Path
 ) -> None:
-    """Write what was recorded of a view at its bracket, as stored; otherwise what the
-    true camera records, in 8 bits.
+    """Write what was recorded of a view at its bracket, as stored.
 
-    InputError for pictures of another size than the scene's, (H, W).
+    Where nothing was: what the true camera records, in 8 bits. InputError for pictures
+    of another size than the scene's, (H, W).
     """
     rgb = true_pictures(truth, view, folder)[1][view.bracket]
     height, width = size

@@ -40,8 +40,9 @@ MIN_POINTS = 10  # visible points from which a frame's depth bounds are taken
 
 
 def write(source: Source, out: Path, held_out: Sequence[HeldOutPicture] = ()) -> Path:
-    """Write the layout into `out`/dense and `out`/masks. InputError for a scene that it
-    cannot hold.
+    """Write the layout into `out`/dense and `out`/masks.
+
+    InputError for a scene that it cannot hold.
     """
     m = source.manifest
     frames = sorted((f for f in m.frames if f.split == "train"), key=lambda f: f.time)
@@ -206,8 +207,10 @@ def depth_bounds(source: Source, view: VisiblePoints) -> tuple[float, float]:
 def llff_table(
     K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], bounds: np.ndarray
 ) -> np.ndarray:
-    """Rows (N, 17) of `poses_bounds.npy`: 3x5 (columns down, right, back, center,
-    (height, width, focal)), then the `bounds` (N, 2).
+    """Rows (N, 17) of `poses_bounds.npy`.
+
+    A 3x5 matrix with the columns down, right, back, center, (height, width, focal);
+    then the depth `bounds` (N, 2).
     """
     height, width = size
     rotation = c2w[:, :, :3] @ np.linalg.inv(FROM_LLFF)
@@ -230,10 +233,10 @@ def write_bytes(data: bytes, path: Path) -> None:
 def place_views(
     out: Path, frames: Sequence[FrameEntry], views: Sequence[HeldOutPicture]
 ) -> dict[str, tuple[int, HeldOutPicture]]:
-    """The held-out views that the layout has a place for, with their camera, by the
-    names of their pictures below `dense/`; prints which have none.
+    """The held-out views that the layout has a place for, with their camera.
 
-    `frames` are the training pictures in order.
+    They go by the names of their pictures below `dense/`; `frames` are the training
+    pictures in order. Prints which have no place.
     """
     placed: dict[str, tuple[int, HeldOutPicture]] = {}
     lost = []
@@ -256,8 +259,9 @@ def place_views(
 
 
 def camera_of(frames: Sequence[FrameEntry], view: HeldOutPicture) -> int | None:
-    """The first of the training pictures that has exactly the pose and intrinsics of a
-    view; in a rig that is its camera, from 0.
+    """The first training picture that has exactly the pose and intrinsics of a view.
+
+    In a rig that is its camera, from 0. None where there is none.
     """
     for number, frame in enumerate(frames):
         same_pose = np.array_equal(np.array(frame.c2w), view.c2w)
@@ -267,8 +271,9 @@ def camera_of(frames: Sequence[FrameEntry], view: HeldOutPicture) -> int | None:
 
 
 def step_of(frames: Sequence[FrameEntry], time: float) -> str | None:
-    """The folder of views at a `time`: that of a training picture, or half-way to the
-    next; None for other times.
+    """The folder of views at a `time`; None where there is none.
+
+    It is that of a training picture, or half-way to the next.
     """
     times = np.array([f.time for f in frames])
     between = (times[1:] + times[:-1]) / 2

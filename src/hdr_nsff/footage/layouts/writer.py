@@ -111,8 +111,9 @@ def write_files(out: Path, layout: str, scene: Path, files: LayoutFiles) -> None
 
 
 def earlier_files(out: Path) -> set[str]:
-    """The names of the files that an earlier export wrote into `out`; InputError where
-    it holds files and no export.
+    """The names of the files that an earlier export wrote into `out`.
+
+    InputError where it holds files and no export.
     """
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; --layout writes a folder, name another one")
@@ -131,8 +132,9 @@ def earlier_files(out: Path) -> set[str]:
 
 
 def check_places(out: Path, files: Iterable[str], earlier: set[str]) -> None:
-    """InputError where a file that the `earlier` export did not write stands at the
-    place of one of `files`, or of its folder.
+    """InputError where another file stands in the place of one of `files`.
+
+    Another is one that the `earlier` export did not write. Folders of files count too.
     """
     for name in files:
         resolve_name(out, name, "export")
