@@ -17,7 +17,8 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_image, write_png, write_video
 from hdr_nsff.footage.datasets import held_out, layout_of, recognize
 from hdr_nsff.footage.datasets.capture import Capture, Clock, turns
-from hdr_nsff.footage.pose_files import Given, placed
+from hdr_nsff.footage.pose_files import placed
+from hdr_nsff.footage.pose_formats import GivenPoses
 
 SETS = {
     "hdr-gopro": mini.gopro,
@@ -46,7 +47,7 @@ def read(root: Path) -> Capture:
 def misses(
     root: Path,
     files: list[Path],
-    given: Given,
+    given: GivenPoses,
     over: float | None,
     size: tuple[int, int] = (mini.H, mini.W),
 ) -> float:
@@ -115,7 +116,7 @@ def test_held_out_cameras_do_too(name: str, tmp_path: Path) -> None:
 def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
     capture = read(mini.blender(tmp_path))
     assert capture.poses is not None
-    flipped = Given(
+    flipped = GivenPoses(
         None, capture.poses.K, capture.poses.c2w * [[[1, -1, -1, 1]]], capture.poses.size
     )
     assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], flipped, 1.0) > 3

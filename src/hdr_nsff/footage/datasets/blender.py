@@ -26,7 +26,7 @@ from hdr_nsff.footage.datasets.capture import (
     source_of,
     turns,
 )
-from hdr_nsff.footage.pose_files import from_transforms
+from hdr_nsff.footage.pose_formats import from_transforms
 
 TRAIN, TEST = "transforms_train.json", "transforms_test.json"
 

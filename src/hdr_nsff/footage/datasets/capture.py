@@ -22,7 +22,7 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.footage.ingest import FRAMES, LINEAR, Footage
-from hdr_nsff.footage.pose_files import Given
+from hdr_nsff.footage.pose_formats import GivenPoses
 from hdr_nsff.scene.scene import (
     LARGEST,
     Strict,
@@ -79,7 +79,7 @@ class Capture:
     layout: str  # in words
     root: Path
     pictures: list[Picture]  # camera by camera, in time
-    poses: Given | None  # row by row those of `pictures`
+    poses: GivenPoses | None  # row by row those of `pictures`
     withheld: bool  # the set keeps views back, which `prepare` writes into a truth folder
     over: float | None = (
         # what shows through transparent pixels: 1 white, 0 black; None: no transparency
@@ -323,8 +323,10 @@ def turns(times: Sequence[float]) -> list[int]:
     return cameras
 
 
-def reorder(given: Given, order: Sequence[int]) -> Given:
+def reorder(given: GivenPoses, order: Sequence[int]) -> GivenPoses:
     """The same poses, picked in another order."""
     rows = list(order)
     names = None if given.names is None else [given.names[k] for k in rows]
-    return Given(names, given.K[rows], given.c2w[rows], given.size[rows], given.near, given.far)
+    return GivenPoses(
+        names, given.K[rows], given.c2w[rows], given.size[rows], given.near, given.far
+    )

@@ -23,7 +23,7 @@ from hdr_nsff.footage.datasets.capture import (
     read_object,
     source_of,
 )
-from hdr_nsff.footage.pose_files import from_transforms
+from hdr_nsff.footage.pose_formats import from_transforms
 
 COUNT = 5
 TRAINED = (0, 2, 4)

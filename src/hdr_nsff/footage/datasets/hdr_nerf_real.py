@@ -17,7 +17,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.datasets.capture import Capture, Picture, reorder, source_of
 from hdr_nsff.footage.datasets.hdr_nerf import COUNT, TRAINED
 from hdr_nsff.footage.ingest import frame_files
-from hdr_nsff.footage.pose_files import Given, llff_rows, llff_table
+from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
 
 NAME = "poses_bounds_exps.npy"
 PICTURES = "input_images"
@@ -54,7 +54,7 @@ def held_out_rows(count: int) -> list[range]:
     return [range(COUNT * pose, COUNT * (pose + 1)) for pose in range(1, count // COUNT, 2)]
 
 
-def rows(folder: Path) -> tuple[Given, list[float]]:
+def rows(folder: Path) -> tuple[GivenPoses, list[float]]:
     """Camera and EV of every picture."""
     path = folder / NAME
     table = llff_table(path, 18)

@@ -45,7 +45,8 @@ from hdr_nsff.footage.datasets.capture import (
     reorder,
 )
 from hdr_nsff.footage.ingest import hash_file, shrink
-from hdr_nsff.footage.pose_files import Given, from_transforms, placed
+from hdr_nsff.footage.pose_files import placed
+from hdr_nsff.footage.pose_formats import GivenPoses, from_transforms
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.scene.scene import FrameEntry, Manifest
 from hdr_nsff.scene.truth import Truth, TruthView
@@ -72,7 +73,7 @@ def truth_folder(place: Path) -> Path | None:
     return place if (place / "truth.json").is_file() and (place / NOTE).is_file() else None
 
 
-def read(capture: Capture) -> tuple[list[HeldOut], Given]:
+def read(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """The views that a set keeps back, and their poses, row by row. InputError where
     something is missing or short.
     """
@@ -88,7 +89,7 @@ def read(capture: Capture) -> tuple[list[HeldOut], Given]:
     return readers[name](capture)
 
 
-def from_blender(capture: Capture) -> tuple[list[HeldOut], Given]:
+def from_blender(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """`transforms_test.json`; radiance where `exr_file_path` names it."""
     root, path = capture.root, capture.root / blender.TEST
     train = read_document(root / blender.TRAIN, "the training pictures and their poses")["frames"]
@@ -112,7 +113,7 @@ def from_blender(capture: Capture) -> tuple[list[HeldOut], Given]:
     return views, from_transforms(path, document)
 
 
-def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
+def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """All five exposures of every test view, and its radiance where
     `test_hdr/hdr_<number>.exr` is there.
     """
@@ -135,7 +136,7 @@ def from_hdr_nerf(capture: Capture) -> tuple[list[HeldOut], Given]:
     return views, from_transforms(path, document)
 
 
-def from_hdr_nerf_real(capture: Capture) -> tuple[list[HeldOut], Given]:
+def from_hdr_nerf_real(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """All five exposures of every second pose."""
     given, ev = hdr_nerf_real.rows(capture.root)
     files = hdr_nerf_real.pictures(capture.root, len(ev))
@@ -147,7 +148,7 @@ def from_hdr_nerf_real(capture: Capture) -> tuple[list[HeldOut], Given]:
     return views, reorder(given, [rows[0] for rows in poses])
 
 
-def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
+def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """The frames that `val_filenames` and `test_filenames` name."""
     root, path = capture.root, capture.root / nerfstudio.NAME
     document = read_document(path, "the pictures and their poses")
@@ -181,7 +182,7 @@ def from_nerfstudio(capture: Capture) -> tuple[list[HeldOut], Given]:
     return views, reorder(from_transforms(path, document), kept)
 
 
-def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
+def from_llff(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """`mv_images/<time>/<camera>.png` of the cameras that no training picture of that
     time is from, `mv_images_time/` half a frame later, their masks in `mv_masks/` and
     `mv_masks_time/`. Of a set that `export` wrote, the ones that it noted.
@@ -208,7 +209,7 @@ def from_llff(capture: Capture) -> tuple[list[HeldOut], Given]:
     return views, reorder(capture_poses(capture), rows)
 
 
-def noted_views(capture: Capture, dense: Path, extra: Extra) -> tuple[list[HeldOut], Given]:
+def noted_views(capture: Capture, dense: Path, extra: Extra) -> tuple[list[HeldOut], GivenPoses]:
     """The views that `export --truth` wrote below `dense`: some times, some cameras."""
     views = []
     source = {Path(p.source).name: p.source for p in capture.pictures}
@@ -373,7 +374,7 @@ def truth_view(
     )
 
 
-def capture_poses(capture: Capture) -> Given:
+def capture_poses(capture: Capture) -> GivenPoses:
     """The poses of the training pictures."""
     assert capture.poses is not None, "every layout with held-out views has poses"
     return capture.poses
@@ -447,7 +448,7 @@ class Brackets:
 
 
 def key_of(
-    chosen: Sequence[tuple[HeldOut, dict[int, Path]]], m: Manifest, max_size: int, given: Given
+    chosen: Sequence[tuple[HeldOut, dict[int, Path]]], m: Manifest, max_size: int, given: GivenPoses
 ) -> str:
     """The hash of all that a truth folder depends on."""
 

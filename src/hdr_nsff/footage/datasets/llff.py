@@ -33,7 +33,7 @@ from hdr_nsff.footage.datasets.capture import (
     source_of,
 )
 from hdr_nsff.footage.ingest import frame_files, natural
-from hdr_nsff.footage.pose_files import Given, llff_rows, llff_table
+from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
 
 FLOWS = ("semantic_flow_i1", "flow_i1")
 MULTI_VIEW = ("mv_images", "mv_images_time")
@@ -156,7 +156,7 @@ def with_note(capture: Capture, extra: Extra, names: list[str]) -> Capture:
     )
 
 
-def poses(dense: Path) -> tuple[Given, np.ndarray]:
+def poses(dense: Path) -> tuple[GivenPoses, np.ndarray]:
     """The poses, and the near and far bounds (N, 2) of every picture."""
     path = dense / "poses_bounds.npy"
     if not path.is_file():

@@ -32,7 +32,7 @@ from hdr_nsff.footage.datasets.capture import (
     turns,
 )
 from hdr_nsff.footage.ingest import natural
-from hdr_nsff.footage.pose_files import Given, from_transforms
+from hdr_nsff.footage.pose_formats import GivenPoses, from_transforms
 
 NAME = "transforms.json"
 HELD_OUT = ("val_filenames", "test_filenames")
@@ -170,7 +170,7 @@ def static_points(folder: Path, name: str | None) -> np.ndarray | None:
 
 
 def exported(
-    folder: Path, frames: list[dict[str, Any]], given: Given, extra: Extra, withheld: bool
+    folder: Path, frames: list[dict[str, Any]], given: GivenPoses, extra: Extra, withheld: bool
 ) -> Capture:
     """A scene of ours, as `export` wrote it."""
     own = [extra.frames[f["file_path"]] for f in frames]
@@ -205,7 +205,7 @@ def exported(
         layout="nerfstudio, written by hdr-nsff",
         root=folder,
         pictures=pictures,
-        poses=Given(poses.names, poses.K, poses.c2w, poses.size, extra.near, extra.far),
+        poses=GivenPoses(poses.names, poses.K, poses.c2w, poses.size, extra.near, extra.far),
         withheld=withheld,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
         points=static_points(folder, extra.points),

@@ -31,7 +31,7 @@ from hdr_nsff.footage.layouts.writer import (
     write_files,
     z_depth,
 )
-from hdr_nsff.footage.pose_files import FROM_LLFF
+from hdr_nsff.footage.pose_formats import FROM_LLFF
 from hdr_nsff.scene.scene import FlowFiles, FrameEntry
 
 SAME_TIME = 1e-6  # frames: times closer than that are one
