@@ -15,8 +15,8 @@ from mutations import check_json_reader, check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_image, write_png, write_video
-from hdr_nsff.footage.datasets import held_out, layout_of, recognize
-from hdr_nsff.footage.datasets.capture import Capture, Clock, turns
+from hdr_nsff.footage.datasets import held_out_views, layout_of, recognize
+from hdr_nsff.footage.datasets.capture import Capture, Clock, number_cameras
 from hdr_nsff.footage.pose_files import placed
 from hdr_nsff.footage.pose_formats import GivenPoses
 
@@ -109,7 +109,7 @@ def test_training_cameras_see_the_dot_where_their_pictures_show_it(
 @pytest.mark.parametrize("name", SETS)
 def test_held_out_cameras_do_too(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
-    views, given = held_out.read(capture)
+    views, given = held_out_views.read_views(capture)
     assert views and misses(tmp_path, [v.recorded[0][0] for v in views], given, capture.over) < 0.6
 
 
@@ -131,7 +131,7 @@ def test_times_become_frames_whatever_their_unit() -> None:
 
 
 def test_pictures_of_one_time_are_of_several_cameras() -> None:
-    assert turns([0, 1, 0, 1, 2, 1]) == [0, 0, 1, 1, 0, 2]
+    assert number_cameras([0, 1, 0, 1, 2, 1]) == [0, 0, 1, 1, 0, 2]
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_a_missing_held_out_file_is_named_and_matters_to_the_truth_alone(
     (tmp_path / lost).unlink()
     capture = read(tmp_path)
     with pytest.raises(InputError, match=words):
-        held_out.read(capture)
+        held_out_views.read_views(capture)
 
 
 @pytest.mark.parametrize("name", ["d-nerf", "hdr-nerf", "nerfstudio"])
@@ -255,7 +255,7 @@ def test_a_map_outside_the_data_set_is_refused(key: str, name: str, tmp_path: Pa
     (root / "link.npy").symlink_to(tmp_path / "secret.npy")
     with pytest.raises(InputError, match="points outside the data set"):
         capture = read(root)
-        held_out.read(capture)
+        held_out_views.read_views(capture)
 
 
 def test_a_depth_map_outside_the_data_set_is_refused(tmp_path: Path) -> None:
@@ -298,7 +298,7 @@ def read_whole(root: Path) -> None:
     if capture.poses is not None:
         placed(root, capture.poses, list(range(len(capture.pictures))), (mini.H, mini.W))
     if capture.withheld:
-        held_out.read(capture)
+        held_out_views.read_views(capture)
 
 
 @pytest.mark.parametrize("name", [*SETS, "exported"])

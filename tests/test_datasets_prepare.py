@@ -18,6 +18,7 @@ from miniatures import EV, H, W
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_exr, read_image, read_mask, write_npy, write_png
 from hdr_nsff.footage.datasets import maps
+from hdr_nsff.footage.datasets.capture import SparseDepth
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.scene.scene import Manifest, Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
@@ -118,8 +119,10 @@ def test_disparity_up_to_scale_and_shift_is_fitted_to_the_points() -> None:
     rng = np.random.default_rng(0)
     y, x = rng.integers(0, H, 60), rng.integers(0, W, 60)
     xy = np.stack([(x + 0.5) / W, (y + 0.5) / H], 1)
-    seen = maps.Sighting(xy, depth[y, x], (0.0, 0.0))
-    fitted, note = maps.shifted(((1 / depth - 0.05) / 0.02)[None].astype(np.float32), [seen])
+    seen = SparseDepth(xy, depth[y, x], (0.0, 0.0))
+    fitted, note = maps.align_disparity(
+        ((1 / depth - 0.05) / 0.02)[None].astype(np.float32), [seen]
+    )
     assert np.allclose(fitted[0], 1 / depth, rtol=1e-3) and "1 of 1 maps by static points" in note
 
 

@@ -78,7 +78,11 @@ def pair_file(folder: Path, i: int, j: int) -> Path | None:
 def read_pair(
     folder: Path, i: int, j: int, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Flow (H, W, 2) px from frame `i` to frame `j`, and its mask (H, W) bool if any."""
+    """Flow (H, W, 2) px from frame `i` to frame `j`, and its mask (H, W) bool.
+
+    The mask is None where the folder has none for it. InputError where the flow is
+    missing or does not fit frames of `size` (H, W).
+    """
     path = pair_file(folder, i, j)
     if path is None:
         raise InputError(

@@ -20,7 +20,7 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, read_mask, read_npy, write_json, write_npy, write_png
 from hdr_nsff.core.progress import say
-from hdr_nsff.footage.datasets.capture import ExtraFrame, ExtraView
+from hdr_nsff.footage.datasets.extra import ExtraFrame, ExtraView
 from hdr_nsff.footage.datasets.llff import MULTI_VIEW, NOTE
 from hdr_nsff.footage.layouts.colmap import VisiblePoints, model_files, visible_points
 from hdr_nsff.footage.layouts.writer import (

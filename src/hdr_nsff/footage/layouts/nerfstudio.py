@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.io import write_json, write_npy
-from hdr_nsff.footage.datasets.capture import ExtraFrame
+from hdr_nsff.footage.datasets.extra import ExtraFrame
 from hdr_nsff.footage.datasets.nerfstudio import EXTRA, MILLIMETERS, NAME, VIEWS
 from hdr_nsff.footage.layouts.writer import (
     HeldOutPicture,

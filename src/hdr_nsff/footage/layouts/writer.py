@@ -23,7 +23,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, read_npy
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.core.progress import track
-from hdr_nsff.footage.datasets.capture import Extra, ExtraFrame
+from hdr_nsff.footage.datasets.extra import Extra, ExtraFrame
 from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene, inside
 
 NOTE = "hdr_nsff_export.json"
