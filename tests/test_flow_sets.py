@@ -11,7 +11,7 @@ from mutations import check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_exr, write_png
-from hdr_nsff.flow_training.flow_exposures import cropped, example, random_curve, recorded_pair
+from hdr_nsff.flow_training.flow_exposures import example, random_crop, random_curve, recorded_pair
 from hdr_nsff.flow_training.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
 
 H, W = 12, 16
@@ -186,7 +186,7 @@ def test_crops_scale_and_mirror_flow_with_the_pixels():
     """
     s = sample()
     for seed in range(8):
-        one = cropped(
+        one = random_crop(
             np.zeros((2, 60, 80, 3), np.float32), s, (96, 128), np.random.default_rng(seed)
         )
         assert one.images.shape == (2, 3, 96, 128) and one.known.all()
