@@ -449,7 +449,7 @@ def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimeters(
     )
     assert provenance(config.out)[
         "masks"
-    ] == "estimated" and "not what moves: not used" in " ".join(capsys.readouterr().err.split())
+    ] == "estimated" and "not moving ones: not used" in " ".join(capsys.readouterr().err.split())
     view = Truth.open(tmp_path / "scene_truth").views[0]
     assert (view.name, view.time) == ("images_frame_00004", 4.0)
 

@@ -1,6 +1,6 @@
 """`hdr-nsff finetune-flow`: a flow network learns to match across exposures.
 
-It sees pairs whose flow is known, recorded anew for every step with random EV pairs,
+It sees pairs whose flow is known, recorded again for every step with random EV pairs,
 clipping, noise and response curves (as the paper does for its ablation, with
 FlyingThings3D). The output folder then holds
 
@@ -336,8 +336,7 @@ def mean_weights(
 def measure_or_read(
     network: FlowNetwork, pairs: list[FlowPair], kept: Path
 ) -> dict[str, dict[str, float]]:
-    """`measure_errors`, or its result in the note `kept`, which is written otherwise.
-    """
+    """The result of `measure_errors`, read from the note `kept` or written there."""
     found = notes.read(kept, notes.FlowErrors)
     if found is not None:
         return {stops: error.model_dump() for stops, error in found.by_stops.items()}

@@ -32,7 +32,7 @@ def read_array(path: Path, dtype: type = np.float32) -> np.ndarray:
         raise InputError(f"{path}: missing; copy it again") from error
     except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
-            f"{path}: not a readable .npy array ({shorten(error)}); copy it again or write it anew"
+            f"{path}: not a readable .npy array ({shorten(error)}); copy it again"
         ) from error
     return convert_numbers(path, array, dtype)
 
@@ -50,7 +50,7 @@ def read_arrays(path: Path, names: Sequence[str], kind: str) -> list[np.ndarray]
     except Exception as error:  # of zipfile, zlib and numpy: many unrelated types
         wanted = " and ".join(f"`{name}`" for name in names)
         raise InputError(
-            f"{path}: not a {kind} with {wanted} ({shorten(error)}); copy it again or write it anew"
+            f"{path}: not a {kind} with {wanted} ({shorten(error)}); copy it again"
         ) from error
     return [convert_numbers(path, array, np.float32) for array in arrays]
 
@@ -67,8 +67,6 @@ def read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 def convert_numbers(path: Path, array: np.ndarray, dtype: type) -> np.ndarray:
     """A copy of `array` as `dtype`; InputError where it does not hold numbers."""
     if array.dtype.kind not in NUMBERS:
-        raise InputError(
-            f"{path}: holds {shorten(array.dtype)}, not numbers; copy it again or write it anew"
-        )
+        raise InputError(f"{path}: holds {shorten(array.dtype)}, not numbers; copy it again")
     with np.errstate(over="ignore"):
         return np.array(array, dtype)

@@ -46,7 +46,7 @@ def read_flow(
     if unchecked:
         say(
             f"{folder}: {unchecked} of {len(flows)} flow maps have neither a mask nor a "
-            "reverse: believed everywhere"
+            "reverse: trusted everywhere"
         )
     all_flows = np.array(flows, np.float32).reshape(-1, *size, 2)
     return all_flows, np.array(masks, bool).reshape(-1, *size)

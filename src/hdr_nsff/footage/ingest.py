@@ -31,12 +31,12 @@ ACCEPTED = (
 )
 GAMMA = 2.2  # linear footage is encoded as x^(1 / GAMMA)
 WHITE_PERCENTILE = 99.9  # of linear radiance, becomes 1 (hand-chosen)
-FOLDER_FPS = 24.0  # frames per second of a folder of frames, which does not say it
-MAX_FRAMES = 10**9  # more than any video has whose header does not say how many
+FOLDER_FPS = 24.0  # frames per second assumed for a folder of frames
+MAX_FRAMES = 10**9  # more than any video without a frame count in its header has
 # pixels: SSIM compares windows of this size (Wang et al. 2004), optical flow needs 9
 MIN_SIDE = 11
 MIN_MAX_SIZE = 32  # pixels: least longest side that frames may be shrunk to
-# frames by which a video may end before its header says so; containers round durations
+# frames that may be missing at the end of a video: containers round durations
 MAX_MISSING_FRAMES = 3
 HOLD_OUT = 8  # every this many frames are held out where nothing else is asked for
 
@@ -48,7 +48,7 @@ class Footage:
     path: Path
     cameras: list[list[Path]]  # per camera its frame files in order, or the one video file
     video: bool
-    count: int  # frames per camera; 0 where a video's header does not say
+    count: int  # frames per camera; 0 where a video's header has no count
     fps: float
     linear: bool  # EXR or DNG
     # gray that shows through transparent pixels; None: transparency is ignored
@@ -156,7 +156,7 @@ def hash_file(path: Path) -> str:
 def check_choice(
     start: int, end: int | None, stride: int, max_size: int, hold_out: int | None
 ) -> None:
-    """InputError for a choice of frames that makes no sense whatever the footage is."""
+    """InputError for a choice of frames that makes no sense for any footage."""
     if start < 0 or stride < 1 or (end is not None and end <= start):
         last = "the end" if end is None else end
         raise InputError(
@@ -239,7 +239,7 @@ def decode(
 def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
     """(number, source, image (H, W, 3)) of the chosen frames of a video.
 
-    InputError where it ends before its header says.
+    InputError where it ends before the duration in its header.
     """
     info = video_info(path)
     last = 0.0  # seconds

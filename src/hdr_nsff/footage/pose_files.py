@@ -22,7 +22,7 @@ from hdr_nsff.scene.scene import LARGEST
 
 # off which a rotation matrix counts as rounded, and is made exact again
 MAX_ROTATION_ERROR = 1e-6
-MAX_ASPECT_ERROR = 0.02  # by which the shape of the poses' frames may differ from ours
+MAX_ASPECT_ERROR = 0.02  # by which the shape of the poses' frames may differ from the frames used
 MIN_TURN = 1e-6  # entries of rotations, and centers over `near`: less is no motion
 MIN_TRACKED_POINTS = 10  # from which near and far are taken from the points
 Parallax = Literal["full", "rotation", "none"]
@@ -90,7 +90,7 @@ def match_frames(
 ) -> list[int | None]:
     """Which of `count` given poses belongs to each of the frames `sources`.
 
-    By the longest ending of the path that tells pictures apart, else in order.
+    By the longest ending of the path that distinguishes pictures, else in order.
     """
     for parts in (3, 2, 1) if names is not None else ():
         assert names is not None
@@ -115,7 +115,7 @@ def match_frames(
 def match_names(names: list[str], sources: list[str], parts: int) -> list[int | None] | None:
     """The row of each source among `names`, by the last `parts` parts of their paths.
 
-    None where these do not tell pictures apart, or no source is among them.
+    None where these do not distinguish pictures, or no source is among them.
     """
     given = [path_end(name, parts) for name in names]
     wanted = [path_end(source, parts) for source in sources]

@@ -1,7 +1,7 @@
 """Formats of poses: a COLMAP model, `transforms.json` (nerfstudio, Blender),
 `poses_bounds.npy` (LLFF), and the JSON of LLFF poses that non-rigid NeRF publishes.
 
-Every convention becomes ours here: c2w OpenCV (+x right, +y down, +z forward), pixels
+Every convention is converted here: c2w OpenCV (+x right, +y down, +z forward), pixels
 with centers at +0.5. The world and its units stay as they are.
 """
 

@@ -56,7 +56,7 @@ def read(folder: Path) -> Capture:
     evs = [exposure_of(path, frame, kind) for frame in frames]
     if any(ev is None for ev in evs) and any(ev is not None for ev in evs):
         raise InputError(
-            f"{path}: only some frames have `exposures`; they say how each was exposed, "
+            f"{path}: only some frames have `exposures`; they hold how each was exposed, "
             "copy the file again"
         )
     order = sorted(range(len(frames)), key=lambda k: (cameras[k], times[k]))
@@ -82,7 +82,7 @@ def stored_times(path: Path, frames: list[dict[str, Any]]) -> list[float]:
     """The times as stored; the number of the view where none is."""
     if not any("time" in frame for frame in frames):
         return [float(number) for number in range(len(frames))]
-    return [number_of(path, f, "time", "which says when it was taken") for f in frames]
+    return [number_of(path, f, "time", "the time it was taken at") for f in frames]
 
 
 def layout_name(frames: list[dict[str, Any]]) -> str:
@@ -100,7 +100,7 @@ def exposure_of(path: Path, frame: dict[str, Any], kind: str) -> float | None:
     """The EV of a frame: HDR-4D stores exposure times, HDR-HexPlane stops."""
     if "exposures" not in frame:
         return None
-    value = number_of(path, frame, "exposures", "which says how it was exposed")
+    value = number_of(path, frame, "exposures", "its exposure")
     name = shorten(frame["file_path"])
     if kind.startswith("HDR-4D"):
         if value <= 0:

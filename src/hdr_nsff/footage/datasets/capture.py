@@ -1,9 +1,9 @@
-"""What a public data set knows of its training pictures, whatever its layout: footage
-with times, exposures, poses and maps.
+"""The training pictures of a public data set in any layout: footage with times,
+exposures, poses and maps.
 
 A reader turns a folder into a `Capture` and opens nothing that the set holds out for
 testing; `held_out.py` does that, for `evaluate` alone. Times are in frames of the set,
-axes OpenCV, depth in units of the poses unless `depth_units` says otherwise.
+axes OpenCV, depth in units of the poses unless `depth_units` is "own".
 """
 
 from __future__ import annotations
@@ -124,7 +124,7 @@ class Capture:
 
 @dataclass(frozen=True)
 class Clock:
-    """Times as a set stores them, in whatever unit, to frames.
+    """Times as a set stores them, in any unit, to frames.
 
     The first training time is 0, the median gap between two is 1.
     """

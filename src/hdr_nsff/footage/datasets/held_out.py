@@ -68,7 +68,7 @@ def write_truth(
     brackets = Brackets.of(capture, manifest)
     rows = comparable_views(views, manifest, own_time, brackets)
     if not rows:
-        say("truth: no held-out view is left to compare with")
+        say("truth: no held-out view can be compared with")
         if truth_folder(out) is not None:  # of other settings
             (out / "truth.json").unlink()
         return None

@@ -9,7 +9,7 @@ The pictures are those of `images_<W>x<H>/` (the largest), else of `images/`. Ma
 another size are resampled. Flow is that of `semantic_flow_i1/` before `flow_i1/`; depth
 that of `depth-anything/` (metric) before `disp/` (disparity up to scale and shift),
 brought to the units of the poses by the points of `sparse/`. No exposure times are
-stored: brightness tells the exposures apart.
+stored: exposures are found by brightness.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ def moving_masks(folder: Path, dense: Path, count: int) -> tuple[list[Path] | No
 def depth_maps(dense: Path, count: int, extra: Extra | None) -> tuple[list[Path] | None, bool]:
     """The depth maps, and whether they are metric; else they hold disparity.
 
-    Of an export of ours the disparity, which is exactly what the scene had.
+    Of a folder that `export` wrote, the disparity, which is exactly the scene's.
     """
     metric = map_files(dense / "depth-anything", ".npy", count, "the metric depth of the pictures")
     disparity = map_files(dense / "disp", ".npy", count, "the disparity of the pictures")

@@ -90,7 +90,7 @@ def read(folder: Path) -> Capture:
     pictures = [read_picture(folder, frames[k], clock(times[k]), cameras[k]) for k in order]
     notes: tuple[str, ...] = ()
     if any("mask_path" in frame for frame in frames):
-        notes = ("its `mask_path` says what to leave out of training, not what moves: not used",)
+        notes = ("its `mask_path` masks pixels out of training, not moving ones: not used",)
     return Capture(
         layout="nerfstudio",
         root=folder,
@@ -119,7 +119,7 @@ def read_names(path: Path, document: dict[str, Any], key: str) -> list[str]:
     listed = document.get(key, [])
     if not isinstance(listed, list) or not all(isinstance(name, str) for name in listed):
         raise InputError(
-            f"{path}: `{key}` is no list of file names; it says which pictures are held out, "
+            f"{path}: `{key}` is no list of file names; it lists which pictures are held out, "
             "correct it"
         )
     return listed
@@ -128,7 +128,7 @@ def read_names(path: Path, document: dict[str, Any], key: str) -> list[str]:
 def stored_times(path: Path, frames: Sequence[dict[str, Any]]) -> list[float]:
     """`time` of the frames, else their order by file name."""
     if any("time" in frame for frame in frames):
-        return [number_of(path, f, "time", "which says when it was taken") for f in frames]
+        return [number_of(path, f, "time", "the time it was taken at") for f in frames]
     names = [Path(frame["file_path"]) for frame in frames]
     order = sorted(range(len(frames)), key=lambda k: natural(names[k]))
     times = [0.0] * len(frames)
@@ -153,7 +153,7 @@ def read_picture(folder: Path, frame: dict[str, Any], time: float, camera_id: in
 def exported(
     folder: Path, frames: list[dict[str, Any]], given: GivenPoses, extra: Extra, withheld: bool
 ) -> Capture:
-    """A scene of ours, as `export` wrote it."""
+    """A scene that `export` wrote in this layout."""
     own = [extra.frames[frame["file_path"]] for frame in frames]
     order = sorted(range(len(frames)), key=lambda k: (own[k].camera_id, own[k].time))
     poses = select_poses(given, order)

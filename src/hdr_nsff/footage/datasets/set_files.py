@@ -1,7 +1,7 @@
 """Files of a public data set: its JSON documents, and the files that these name.
 
-Every InputError says what the file is for, so that a set that was copied only in part
-can be completed.
+Every InputError names the purpose of the file, so that a set that was copied only in
+part can be completed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from hdr_nsff.scene.scene import LARGEST
 
 
 def read_object(path: Path, purpose: str) -> dict[str, Any]:
-    """A JSON object; InputError that says what the file is for."""
+    """A JSON object; `purpose` is what an InputError calls its content."""
     if not path.is_file():
         raise InputError(f"{path}: missing; it holds {purpose}, copy it again")
     try:
@@ -34,7 +34,7 @@ def read_object(path: Path, purpose: str) -> dict[str, Any]:
 
 
 def read_document(path: Path, purpose: str) -> dict[str, Any]:
-    """A `transforms*.json` with frames; InputError that says what the file is for."""
+    """A `transforms*.json` with frames; `purpose` is what an InputError names."""
     document = read_object(path, purpose)
     frames = document.get("frames")
     if not isinstance(frames, list) or not frames:
@@ -50,7 +50,7 @@ def read_document(path: Path, purpose: str) -> dict[str, Any]:
 
 
 def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> float:
-    """A number of a frame, up to `LARGEST`; InputError that says what it is for."""
+    """A number of a frame, up to `LARGEST`; `purpose` is what an InputError names."""
     value = frame.get(key)
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST:
         return float(value)
@@ -61,7 +61,7 @@ def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> f
 def picture_file(root: Path, name: str, purpose: str) -> Path:
     """The picture that `name` means in a JSON of the set, with or without its ending.
 
-    InputError that says what it is for.
+    InputError, which names its `purpose`, where it is missing.
     """
     base = resolve_name(root, name.replace("\\", "/"), "data set")
     endings = [*sorted(FRAMES), ""]
@@ -77,7 +77,7 @@ def picture_file(root: Path, name: str, purpose: str) -> Path:
 def map_file(root: Path, name: str, purpose: str) -> Path:
     """The map or mask that `name` means in a JSON of the set.
 
-    InputError that says what it is for.
+    InputError, which names its `purpose`, where it is missing.
     """
     path = resolve_name(root, name, "data set")
     if not path.is_file():

@@ -35,7 +35,7 @@ from hdr_nsff.footage.pose_formats import FROM_LLFF
 from hdr_nsff.scene.scene import FlowFiles, FrameEntry
 
 SAME_TIME = 1e-6  # frames: times closer than that are one
-MAX_OFFSET_PX = 0.5  # by which the intrinsics may differ from the layout's without a word
+MAX_OFFSET_PX = 0.5  # by which intrinsics may differ from the layout's unreported
 MIN_POINTS = 10  # visible points from which a frame's depth bounds are taken
 
 

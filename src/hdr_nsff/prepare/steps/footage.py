@@ -66,7 +66,7 @@ def frames_step(work: Work) -> Step:
 
 
 def expected_frames(work: Work) -> int | None:
-    """The number of frames to decode; None for a video whose header does not say it."""
+    """The number of frames to decode; None for a video without a count."""
     c = work.config
     count = work.footage.count
     if not count:
