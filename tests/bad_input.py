@@ -34,14 +34,12 @@ def refused(capsys: Capture, *arguments: object) -> str:
     capsys.readouterr()
     assert call(*arguments) == 2, arguments
     error = capsys.readouterr().err
-    said = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
-    assert (
-        "Traceback" not in error
-        and len(said) == 1
-        and error.strip().endswith(said[0])
-        and len(said[0]) < 600
-    ), error
-    return said[0]
+    sentences = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
+    assert "Traceback" not in error, error
+    assert len(sentences) == 1, error
+    assert error.strip().endswith(sentences[0]), error
+    assert len(sentences[0]) < 600, error
+    return sentences[0]
 
 
 def verbs_with(setting: str) -> list[str]:
@@ -170,9 +168,8 @@ def poses(path: Path, count: int = FRAMES) -> Path:
     s, rows = ToyScene(), []
     for t in range(count):
         x, y, z = camera_center(t)
-        pose = np.array(
-            [[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]]
-        )  # columns: down, right, back
+        # columns: down, right, back
+        pose = np.array([[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]])
         rows.append([*pose.ravel(), 1.8, 5.0])
     io.write_npy(path, np.array(rows))
     return path
@@ -193,7 +190,7 @@ def truth(folder: Path) -> Path:
                 "radiance": f"radiance/{t}.exr",
             }
         )
-    told = {
+    truth = {
         "bracket_ev": [2.0, 0.0, -2.0],
         "reference_bracket": 1,
         "response_x": x,
@@ -201,7 +198,7 @@ def truth(folder: Path) -> Path:
         "views": views,
     }
     centers = [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(6)]
-    io.write_json(folder / "truth.json", {**told, "K": scene.K.tolist(), "clip_c2w": centers})
+    io.write_json(folder / "truth.json", {**truth, "K": scene.K.tolist(), "clip_c2w": centers})
     return folder
 
 

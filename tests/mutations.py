@@ -1,5 +1,5 @@
-"""Damaged files for the tests of readers: seeded mutations of bytes and of JSON. Whatever
-a reader makes of them, it ends in a result or in one short InputError.
+"""Damaged files for the tests of readers: seeded mutations of bytes and of JSON.
+Whatever a reader makes of them, it ends in a result or in one short InputError.
 """
 
 from __future__ import annotations
@@ -23,7 +23,8 @@ ODD_BYTES = (b"\0", b"\xff" * 4, b"\x80", b"\xff\xff\xff\x7f", b"\0" * 8, b"\r",
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """`data` with one or a few damages: flipped, lost, repeated or odd bytes, or cut."""
+    """`data` with one or a few damages: flipped, lost, repeated or odd bytes, or cut.
+    """
     for _ in range(rng.integers(1, 4)):
         place = int(rng.integers(len(data) + 1))
         length = int(rng.integers(1, 9))

@@ -1,4 +1,5 @@
-"""Arrays of other programs: whatever their files hold ends in numbers or one sentence."""
+"""Arrays of other programs: whatever their files hold ends in numbers or one sentence.
+"""
 
 import io
 import zipfile
@@ -16,7 +17,8 @@ from hdr_nsff.footage.arrays import read_array, read_arrays
 def test_numbers_come_back_in_the_type_asked_for(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[1, 2], [3, 4]], np.int16))
     found = read_array(tmp_path / "a.npy", np.float64)
-    assert found.dtype == np.float64 and found.tolist() == [[1, 2], [3, 4]]
+    assert found.dtype == np.float64
+    assert found.tolist() == [[1, 2], [3, 4]]
 
 
 def test_numbers_too_large_for_single_precision_become_infinite(tmp_path: Path) -> None:

@@ -32,9 +32,9 @@ def prepared(capsys: Capture, clip: Path, *options: object) -> str:
         }
 
     before = rest()
-    said = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
+    sentence = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
     assert rest() == before
-    return said
+    return sentence
 
 
 @pytest.mark.parametrize("verb", FOOTAGE_VERBS)
@@ -147,9 +147,8 @@ def test_footage_that_cannot_be_is_named(
     before = snapshot(tmp_path)
     assert expected in refused(capsys, verb, footage, tmp_path / "out")
     after = snapshot(tmp_path)
-    assert all(after[p] == contents for p, contents in before.items()) and not list(
-        tmp_path.rglob(".partial-*")
-    )
+    assert all(after[p] == contents for p, contents in before.items())
+    assert not list(tmp_path.rglob(".partial-*"))
 
 
 def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
@@ -157,9 +156,8 @@ def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
 ) -> None:
     footage = one_bad(tmp_path / "clip", cut, ".exr")
     assert call("prepare", footage, tmp_path / "scene") == 2
-    assert (
-        len(capfd.readouterr().err.strip().splitlines()) == 1
-    )  # OpenEXR has words of its own for it
+    # OpenEXR has words of its own for it
+    assert len(capfd.readouterr().err.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
@@ -215,8 +213,9 @@ def test_exposures_that_cannot_be_made(value: str, tmp_path: Path, capsys: Captu
 def test_an_exposure_list_that_fits_no_cycle(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip", recorded(24))
     for given, count in (("--ev=-2,0", 2), ("--exposures=1/1000,1/500,1/250,1/125", 4)):
-        said = prepared(capsys, folder, given)
-        assert f"{count} exposures listed" in said and "repeats every 3" in said
+        sentence = prepared(capsys, folder, given)
+        assert f"{count} exposures listed" in sentence
+        assert "repeats every 3" in sentence
 
 
 def test_an_exposure_list_longer_than_the_clip(tmp_path: Path, capsys: Capture) -> None:
@@ -244,7 +243,7 @@ def test_a_csv_that_leaves_frames_out(tmp_path: Path, capsys: Capture) -> None:
 @pytest.mark.parametrize("verb", ["prepare", "reexpose"])
 def test_settings_out_of_range(verb: str, tmp_path: Path, capsys: Capture) -> None:
     footage, out = clip(tmp_path / "clip"), tmp_path / "out"
-    for option, value, said in (
+    for option, value, words in (
         ("--hold-out", 1, "--hold-out 1"),
         ("--hold-out", -5, "--hold-out -5"),
         ("--max-size", 3, "--max-size 3"),
@@ -253,7 +252,7 @@ def test_settings_out_of_range(verb: str, tmp_path: Path, capsys: Capture) -> No
         ("--end", 0, "to 0"),
         ("--ev", "0,1e308", "--ev 1e+308"),
     ):
-        assert said in refused(capsys, verb, footage, out, f"{option}={value}")
+        assert words in refused(capsys, verb, footage, out, f"{option}={value}")
     assert not out.exists()
 
 
@@ -270,8 +269,8 @@ def test_noise_that_no_sensor_has(option: str, tmp_path: Path, capsys: Capture) 
 def test_an_end_beyond_the_clip_is_the_end(tmp_path: Path, capsys: Capture) -> None:
     """The frames are read, and the exposures found wrong after them."""
     folder = clip(tmp_path / "clip", recorded(24))
-    said = prepared(capsys, folder, "--end", 10**30, "--stride", 1, "--ev=0,1")
-    assert "2 exposures listed" in said
+    sentence = prepared(capsys, folder, "--end", 10**30, "--stride", 1, "--ev=0,1")
+    assert "2 exposures listed" in sentence
     assert "0 frames to use" in prepared(capsys, folder, "--start", 10**30, "--redo", "frames")
 
 
@@ -300,12 +299,12 @@ def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capt
 
 
 def test_a_scene_of_other_footage_stays(tmp_path: Path, capsys: Capture) -> None:
-    prepared(
-        capsys, clip(tmp_path / "one", recorded(24)), "--ev=0,1"
-    )  # its frames are in the scene already
+    # its frames are in the scene already
+    prepared(capsys, clip(tmp_path / "one", recorded(24)), "--ev=0,1")
     before = snapshot(tmp_path / "scene")
     assert "holds the scene of other footage" in prepared(capsys, clip(tmp_path / "other"))
-    assert before and snapshot(tmp_path / "scene") == before
+    assert before
+    assert snapshot(tmp_path / "scene") == before
 
 
 def test_output_in_which_no_step_was_finished_is_free(tmp_path: Path, capsys: Capture) -> None:
@@ -332,9 +331,8 @@ def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> Non
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)
         assert (tmp_path / "scene/scene.json").read_text() == text
-    assert "at least 3" in prepared(
-        capsys, folder, "--redo", "frames"
-    )  # offered by the sentence: starts anew
+    # the sentence offers it: it starts from the frames
+    assert "at least 3" in prepared(capsys, folder, "--redo", "frames")
 
 
 def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
@@ -352,9 +350,9 @@ def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
         patch.setattr(os, "fsync", full)
         assert "the disk is full" in prepared(capsys, folder, "--ev=0,1")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "scene/images").glob("*.png")}
-    assert kept and not list((tmp_path / "scene").rglob(".partial-*"))
-    assert "2 exposures listed" in prepared(
-        capsys, folder, "--ev=0,1"
-    )  # as far as it goes: frames are done
+    assert kept
+    assert not list((tmp_path / "scene").rglob(".partial-*"))
+    # as far as it goes: frames are done
+    assert "2 exposures listed" in prepared(capsys, folder, "--ev=0,1")
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert len(list((tmp_path / "scene/images").glob("*.png"))) == 24

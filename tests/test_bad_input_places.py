@@ -27,7 +27,8 @@ from hdr_nsff.core import io
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
     assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
-    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS) and {
+    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS)
+    assert {
         "render",
         "export",
         "evaluate",
@@ -135,7 +136,7 @@ def test_files_of_the_users_own_are_not_replaced_by_gaussians(
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b'{"takes": 3}'}
 
 
-def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(
+def test_gaussians_of_another_run_are_exported_again_and_that_is_reported(
     run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     command = commands(run_folder, tmp_path, tmp_path / "out")["export"]
@@ -146,15 +147,15 @@ def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(
     assert call(*commands(run_folder.parent / "other", tmp_path, tmp_path / "out")["export"]) == 0
     assert "settings or checkpoint changed, exporting again" in capsys.readouterr().err
     second = snapshot(tmp_path / "out")
-    assert second.keys() == first.keys() and all(second[p] != first[p] for p in first)
+    assert second.keys() == first.keys()
+    assert all(second[p] != first[p] for p in first)
 
 
 def test_footage_is_not_prepared_over_another_scene(
     toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    scene = shutil.copytree(
-        toy_folder, tmp_path / "out/scene"
-    )  # it was not made by `prepare`: none of its steps is done
+    # it was not made by `prepare`: none of its steps is done
+    scene = shutil.copytree(toy_folder, tmp_path / "out/scene")
     before = snapshot(tmp_path / "out")
     footage = clip(tmp_path / "clip")
     assert "other footage" in refused(capsys, "prepare", footage, scene)

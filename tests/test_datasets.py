@@ -31,10 +31,15 @@ SETS = {
     "nerfstudio": mini.nerfstudio,
 }
 NAMES = {
-    "hdr-gopro": "HDR-GoPro / NSFF (LLFF)", "d-nerf": "D-NeRF (Blender)", "nerf": "NeRF synthetic (Blender)",
-    "hdr-hexplane": "HDR-HexPlane (Blender)", "hdr-4d": "HDR-4D (Blender)", "hdr-nerf": "HDR-NeRF (synthetic)",
-    "hdr-nerf-real": "HDR-NeRF (real)", "nerfstudio": "nerfstudio",
-}  # fmt: skip
+    "hdr-gopro": "HDR-GoPro / NSFF (LLFF)",
+    "d-nerf": "D-NeRF (Blender)",
+    "nerf": "NeRF synthetic (Blender)",
+    "hdr-hexplane": "HDR-HexPlane (Blender)",
+    "hdr-4d": "HDR-4D (Blender)",
+    "hdr-nerf": "HDR-NeRF (synthetic)",
+    "hdr-nerf-real": "HDR-NeRF (real)",
+    "nerfstudio": "nerfstudio",
+}
 
 
 def read(root: Path) -> Capture:
@@ -69,7 +74,8 @@ def misses(
 def test_a_layout_is_recognized_and_named(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
     assert capture.layout == NAMES[name]
-    assert capture.withheld and all((tmp_path / p.source).is_file() for p in capture.pictures)
+    assert capture.withheld
+    assert all((tmp_path / p.source).is_file() for p in capture.pictures)
 
 
 def test_footage_is_no_data_set(tmp_path: Path) -> None:
@@ -78,9 +84,8 @@ def test_footage_is_no_data_set(tmp_path: Path) -> None:
     write_video(tmp_path / "clip.mp4", [np.zeros((16, 16, 3))] * 3)
     np.save(tmp_path / "a/poses_bounds.npy", np.zeros((2, 17)))  # poses beside frames, for --poses
     elsewhere = {"frames": [{"file_path": "elsewhere/0.png", "transform_matrix": []}]}
-    mini.write_json(
-        tmp_path / "rig/transforms.json", elsewhere
-    )  # poses of other pictures, for --poses
+    # poses of other pictures, for --poses
+    mini.write_json(tmp_path / "rig/transforms.json", elsewhere)
     (tmp_path / "rig/dense").mkdir()
     (tmp_path / "empty").mkdir()
     for place in ("a", "rig", "rig/left", "clip.mp4", "empty", "missing"):
@@ -110,7 +115,8 @@ def test_training_cameras_see_the_dot_where_their_pictures_show_it(
 def test_held_out_cameras_do_too(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
     views, given = held_out_views.read_views(capture)
-    assert views and misses(tmp_path, [v.recorded[0][0] for v in views], given, capture.over) < 0.6
+    assert views
+    assert misses(tmp_path, [v.recorded[0][0] for v in views], given, capture.over) < 0.6
 
 
 def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
@@ -122,10 +128,11 @@ def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
     assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], flipped, 1.0) > 3
 
 
-def test_times_become_frames_whatever_their_unit() -> None:
+def test_times_in_any_unit_become_frames() -> None:
     clock = Clock.of([k / 149 for k in range(150) if k % 5])
     assert clock.step == pytest.approx(1 / 149)
-    assert [clock(t / 149) for t in (1, 2, 149)] == [0, 1, 148] and clock(5 / 149) == 4
+    assert [clock(t / 149) for t in (1, 2, 149)] == [0, 1, 148]
+    assert clock(5 / 149) == 4
     assert clock(2.5 / 149) == pytest.approx(1.5)
     assert Clock.of([7.0])(7.0) == 0
 
@@ -243,7 +250,8 @@ def test_maps_of_an_export_are_found_by_their_names(tmp_path: Path) -> None:
     first = capture.pictures[0]
     paths = [first.depth, first.confidence, first.flow["a"]]
     assert paths == [tmp_path.resolve() / f"depth/{k}.npy" for k in (0, 1, 3)]
-    assert capture.points is not None and (capture.points == [[1, 2, 3]]).all()
+    assert capture.points is not None
+    assert (capture.points == [[1, 2, 3]]).all()
 
 
 @pytest.mark.parametrize("name", ["../secret.npy", "/etc/passwd", "link.npy"])
@@ -276,9 +284,10 @@ def test_a_name_that_no_file_can_have_is_one_short_sentence(
     document = json.loads(path.read_text())
     document["frames"][1]["file_path"] = bad
     path.write_text(json.dumps(document))
-    with pytest.raises(InputError, match="cannot be the name of a file|missing|no exposure") as e:
+    refusals = "cannot be the name of a file|missing|no exposure"
+    with pytest.raises(InputError, match=refusals) as error:
         recognize(tmp_path)
-    assert len(str(e.value)) < 500
+    assert len(str(error.value)) < 500
 
 
 def test_pictures_may_be_links_to_other_places(tmp_path: Path) -> None:

@@ -35,7 +35,8 @@ def test_exposure_times_become_log2_seconds():
         parse_exposures("1/1000, 1/250,0.25", None), [-math.log2(1000), -math.log2(250), -2]
     )
     assert parse_exposures(None, "-4,-2,0") == [-4, -2, 0]
-    assert parse_exposures("auto", None) is None and parse_exposures(None, None) is None
+    assert parse_exposures("auto", None) is None
+    assert parse_exposures(None, None) is None
 
 
 @pytest.mark.parametrize(
@@ -113,9 +114,10 @@ def test_damaged_exposure_lists_are_read_or_refused(tmp_path):
 
 def test_exif_exposure_counts_time_sensitivity_and_aperture(tmp_path):
     exif = Image.Exif()
+    # 1/64 s, ISO 400, f/2: -6 + 2 - 2
     exif.get_ifd(0x8769).update(
         {0x829A: IFDRational(1, 64), 0x8827: 400, 0x829D: IFDRational(2, 1)}
-    )  # 1/64 s, ISO 400, f/2: -6 + 2 - 2
+    )
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
     Image.new("RGB", (8, 8)).save(tmp_path / "b.jpg")
     assert read_exif_ev(tmp_path / "a.jpg") == pytest.approx(-6)

@@ -49,18 +49,17 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FinetuneConfig:
 def test_weights_are_adapted_measured_and_loadable(config: FinetuneConfig):
     path = finetune_flow(config)
     note = json.loads(path.with_suffix(".json").read_text())
-    assert note["network"] == "gmflow" and note["steps"] == 4 and note["training_pairs"] == 3
-    assert (
-        set(note["before"]) == set(note["after"]) == {"0", "2", "4"}
-        and note["before"] != note["after"]
-    )
+    assert note["network"] == "gmflow"
+    assert note["steps"] == 4
+    assert note["training_pairs"] == 3
+    assert set(note["before"]) == set(note["after"]) == {"0", "2", "4"}
+    assert note["before"] != note["after"]
     start, end = (
         torch.load(config.weights, weights_only=True),
         flow_networks.load(None, config.out).state_dict(),
     )
-    assert set(start) == set(end) and not torch.equal(
-        start["backbone.conv1.weight"], end["backbone.conv1.weight"]
-    )
+    assert set(start) == set(end)
+    assert not torch.equal(start["backbone.conv1.weight"], end["backbone.conv1.weight"])
 
 
 def trained(config: FinetuneConfig) -> dict[str, torch.Tensor]:
@@ -136,27 +135,28 @@ def pair(scene: str, k: int) -> FlowPair:
 def test_scenes_are_held_out_whole_and_one_scene_at_its_end():
     scenes = [pair(s, k) for s in "abcdefghij" for k in range(2)]
     training, held_out = split_pairs(scenes, 0.2)
-    assert {p.scene for p in held_out} == {"i", "j"} and not {p.scene for p in training} & {
+    assert {p.scene for p in held_out} == {"i", "j"}
+    assert not {p.scene for p in training} & {
         "i",
         "j",
     }
     training, held_out = split_pairs([pair("a", k) for k in range(10)], 0.2)
-    assert [p.first.name for p in held_out] == ["a8", "a9"] and training[
-        -1
-    ].second.name == "a7"  # no frame in both
+    assert [p.first.name for p in held_out] == ["a8", "a9"]
+    assert training[-1].second.name == "a7"  # no frame in both
     with pytest.raises(InputError, match="too few"):
         split_pairs([pair("a", 0), pair("a", 1)], 0.5)
 
 
 def test_the_rate_rises_and_falls():
     shares = [rate_share(p) for p in np.linspace(0, 1, 21)]
-    assert (
-        shares[0] < 0.05 and max(shares) > 0.99 and shares[-1] == 0 and all(np.diff(shares[2:]) < 0)
-    )
+    assert shares[0] < 0.05
+    assert max(shares) > 0.99
+    assert shares[-1] == 0
+    assert all(np.diff(shares[2:]) < 0)
 
 
 def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneConfig):
-    for change, said in (
+    for change, words in (
         ({"data": ()}, "--data"),
         ({"size": "100x128"}, "--size"),
         ({"size": "9" * 5000 + "x128"}, "--size"),
@@ -166,7 +166,7 @@ def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneCon
         ({"data": (config.out.parent,)}, "no pairs"),
         ({"weights": config.out}, "no such weights"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=words):
             finetune_flow(replace(config, **change))
     config.out.mkdir()
     (config.out / "letter.txt").write_text("mine")
@@ -175,7 +175,7 @@ def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneCon
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"by_stops": {}}', '{"by_stops": {"0": 3}}'])
-def test_damaged_measurements_are_made_again(
+def test_damaged_measurements_are_repeated(
     text: str, config: FinetuneConfig, capsys: pytest.CaptureFixture[str]
 ):
     network, pairs, kept = (
@@ -184,15 +184,11 @@ def test_damaged_measurements_are_made_again(
         config.out / "before.json",
     )
     before = verb.measure_or_read(network, pairs, kept)
-    assert (
-        verb.measure_or_read(network, pairs, kept) == before
-        and "taken for missing" not in capsys.readouterr().err
-    )
+    assert verb.measure_or_read(network, pairs, kept) == before
+    assert "taken for missing" not in capsys.readouterr().err
     kept.write_text(text)
-    assert (
-        verb.measure_or_read(network, pairs, kept) == before
-        and "taken for missing" in capsys.readouterr().err
-    )
+    assert verb.measure_or_read(network, pairs, kept) == before
+    assert "taken for missing" in capsys.readouterr().err
     assert verb.measure_or_read(network, [], kept) == before  # from the file
 
 

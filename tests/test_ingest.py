@@ -142,7 +142,9 @@ def test_held_out_frames_go_through_all_exposures():
     chosen = held_out(100, 8, 4)
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
     assert {k % 4 for k in chosen} == {0, 1, 2, 3}
-    assert held_out(100, 0, 3) == [] and 0 not in held_out(9, 2, 1) and 8 not in held_out(9, 2, 1)
+    assert held_out(100, 0, 3) == []
+    assert 0 not in held_out(9, 2, 1)
+    assert 8 not in held_out(9, 2, 1)
 
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="Linux alone has it")
@@ -158,6 +160,7 @@ def write_dng(path: Path, level: float) -> None:
     tifffile = pytest.importorskip("tifffile")
     raw = np.full((64, 96), int(level * 65535), np.uint16)
     raw[:32] //= 2
+    # XYZ to the camera's own colors
     matrix = (
         3.1339,
         -1.6169,
@@ -168,7 +171,7 @@ def write_dng(path: Path, level: float) -> None:
         0.0720,
         -0.2290,
         1.4057,
-    )  # XYZ to the camera's own colors
+    )
 
     def ratios(values: tuple[float, ...]) -> tuple[int, ...]:
         return tuple(n for v in values for n in (round(v * 10000), 10000))
@@ -205,14 +208,17 @@ def test_a_broken_raw_photograph_is_named(tmp_path):
 
 @pytest.mark.parametrize("every", range(2, 12))
 @pytest.mark.parametrize("cycle", [1, 2, 3])
-def test_what_was_kept_out_tells_every_how_many(every: int, cycle: int) -> None:
-    """Whatever the clip's length, the number found keeps out the same frames."""
+def test_the_spacing_of_held_out_frames_is_found_again(every: int, cycle: int) -> None:
+    """For a clip of any length, the spacing found holds out the same frames."""
     for count in range(every + 2, 40):
         frames = held_out(count, every, cycle)
         if frames:
             found = every_of(frames)
-            assert found is not None and held_out(frames[-1] + 2, found, cycle) == frames
+            assert found is not None
+            assert held_out(frames[-1] + 2, found, cycle) == frames
 
 
-def test_frames_that_are_not_every_so_many_have_no_number() -> None:
-    assert every_of([0, 8]) is None and every_of([4, 8]) is None and every_of([1, 2, 4]) is None
+def test_unevenly_spaced_frames_have_no_spacing() -> None:
+    assert every_of([0, 8]) is None
+    assert every_of([4, 8]) is None
+    assert every_of([1, 2, 4]) is None
