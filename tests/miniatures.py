@@ -30,8 +30,7 @@ TEXTURE = cv2.GaussianBlur(
 
 
 def pose(x: float) -> np.ndarray:
-    """c2w (3, 4) OpenCV of a camera at (x, 0.1 x, 0), turned a little about all axes.
-    """
+    """c2w (3, 4) OpenCV of a camera at (x, 0.1 x, 0), turned a little."""
     turn = Rotation.from_euler("yxz", [-6 * x, 3 * x, 2 * x], degrees=True).as_matrix()
     return np.concatenate([turn, [[x], [0.1 * x], [0.0]]], 1)
 

@@ -23,8 +23,7 @@ ODD_BYTES = (b"\0", b"\xff" * 4, b"\x80", b"\xff\xff\xff\x7f", b"\0" * 8, b"\r",
 
 
 def mutate(data: bytes, rng: np.random.Generator) -> bytes:
-    """`data` with one or a few damages: flipped, lost, repeated or odd bytes, or cut.
-    """
+    """`data` with a few damages: flipped, lost, repeated or odd bytes, or cut."""
     for _ in range(rng.integers(1, 4)):
         place = int(rng.integers(len(data) + 1))
         length = int(rng.integers(1, 9))

@@ -138,6 +138,12 @@ def test_damaged_frames_are_read_or_refused(tmp_path, suffix):
     check_reader(path, lambda: read_frame(path), 100)
 
 
+def test_damaged_videos_are_read_or_refused(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_video(path, [picture(0.1 * k) for k in range(6)])
+    check_reader(path, lambda: all_frames(path), 60)
+
+
 def test_held_out_frames_go_through_all_exposures():
     chosen = held_out(100, 8, 4)
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)

@@ -377,7 +377,9 @@ def video_info(path: Path | str) -> VideoInfo:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
             stream = container.streams.video[0]
-            check_size(path, stream.width, stream.height)
+            if stream.codec_context is None:
+                raise InputError(f"{path}: a video in an unknown format; convert it to H.264")
+            check_size(path, stream.codec_context.width, stream.codec_context.height)
             end = max((entry.pos + entry.size for entry in stream.index_entries), default=0)
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")
