@@ -71,16 +71,22 @@ def tiff_size(data: bytes) -> tuple[int, int]:
     if b"+" in data[:4]:  # BigTIFF
         (place,) = struct.unpack_from(f"{order}Q", data, 8)
         (count,) = struct.unpack_from(f"{order}Q", data, place)
-        head, entry, value = 8, 20, 12  # bytes: before the entries, of one, before its value
+        first = place + 8
+        entry_bytes = 20
+        value_bytes = 8
     else:
         (place,) = struct.unpack_from(f"{order}I", data, 4)
         (count,) = struct.unpack_from(f"{order}H", data, place)
-        head, entry, value = 2, 12, 8
+        first = place + 2
+        entry_bytes = 12
+        value_bytes = 4
+    value_offset = entry_bytes - value_bytes  # the value ends an entry
     found = {}
-    for start in range(place + head, place + head + count * entry, entry):
+    for start in range(first, first + count * entry_bytes, entry_bytes):
         tag, kind = struct.unpack_from(f"{order}HH", data, start)
         if tag in (TIFF_WIDTH, TIFF_HEIGHT) and kind in TIFF_INTEGERS:
-            (found[tag],) = struct.unpack_from(order + TIFF_INTEGERS[kind], data, start + value)
+            value = struct.unpack_from(order + TIFF_INTEGERS[kind], data, start + value_offset)
+            found[tag] = value[0]
     if len(found) < 2:
         raise IndexError("no size in the first directory")
     return found[TIFF_WIDTH], found[TIFF_HEIGHT]

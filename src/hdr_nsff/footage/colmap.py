@@ -11,28 +11,36 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError, shorten
 
-# model number -> name, number of parameters, whether fx and fy are one number
-MODELS = {
-    0: ("SIMPLE_PINHOLE", 3, True),
-    1: ("PINHOLE", 4, False),
-    2: ("SIMPLE_RADIAL", 4, True),
-    3: ("RADIAL", 5, True),
-    4: ("OPENCV", 8, False),
-    5: ("OPENCV_FISHEYE", 8, False),
-    6: ("FULL_OPENCV", 12, False),
-    7: ("FOV", 5, False),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4, True),
-    9: ("RADIAL_FISHEYE", 5, True),
-    10: ("THIN_PRISM_FISHEYE", 12, False),
+
+class CameraModel(NamedTuple):
+    """One of COLMAP's camera models."""
+
+    name: str
+    num_params: int
+    single_focal: bool  # fx and fy are one number
+
+
+MODELS = {  # by the number that binary files have
+    0: CameraModel("SIMPLE_PINHOLE", 3, True),
+    1: CameraModel("PINHOLE", 4, False),
+    2: CameraModel("SIMPLE_RADIAL", 4, True),
+    3: CameraModel("RADIAL", 5, True),
+    4: CameraModel("OPENCV", 8, False),
+    5: CameraModel("OPENCV_FISHEYE", 8, False),
+    6: CameraModel("FULL_OPENCV", 12, False),
+    7: CameraModel("FOV", 5, False),
+    8: CameraModel("SIMPLE_RADIAL_FISHEYE", 4, True),
+    9: CameraModel("RADIAL_FISHEYE", 5, True),
+    10: CameraModel("THIN_PRISM_FISHEYE", 12, False),
 }
-NUMBERS = {name: number for number, (name, _, _) in MODELS.items()}
+MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
 # what the readers below raise for a file that is damaged or cut short
 UNREADABLE = (struct.error, ValueError, IndexError, KeyError, MemoryError, OverflowError)
 KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
@@ -132,24 +140,19 @@ def read_part(
         ) from error
 
 
-def make_camera(model: str, width: int, height: int, params: np.ndarray) -> ColmapCamera:
+def make_camera(model: CameraModel, width: int, height: int, params: np.ndarray) -> ColmapCamera:
     """A camera from its parameters in COLMAP's order.
 
     These are focal length(s), principal point, distortion. ValueError where their
     number is wrong.
     """
-    _, count, single = MODELS[NUMBERS[model]]
-    if len(params) != count:
-        raise ValueError(f"{model} has {count} parameters, found {len(params)}")
-    if single:
-        fx, cx, cy = params[:3]
-        fy = fx
-        distortion = params[3:]
-    else:
-        fx, fy, cx, cy = params[:4]
-        distortion = params[4:]
+    if len(params) != model.num_params:
+        raise ValueError(f"{model.name} has {model.num_params} parameters, found {len(params)}")
+    if model.single_focal:
+        params = np.concatenate([params[:1], params])  # fx, fy, cx, cy, distortion
+    fx, fy, cx, cy = params[:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return ColmapCamera(model, width, height, K, distortion)
+    return ColmapCamera(model.name, width, height, K, distortion=params[4:])
 
 
 def make_pose(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -181,9 +184,9 @@ def cameras_bin(file: BinaryIO) -> dict[int, ColmapCamera]:
     (count,) = unpack(file, "Q")
     for _ in range(count):
         key, number, width, height = unpack(file, "iiQQ")
-        name, param_count, _ = MODELS[number]
-        params = np.array(unpack(file, f"{param_count}d"))
-        cameras[key] = make_camera(name, width, height, params)
+        model = MODELS[number]
+        params = np.array(unpack(file, f"{model.num_params}d"))
+        cameras[key] = make_camera(model, width, height, params)
     return cameras
 
 
@@ -241,9 +244,11 @@ def cameras_txt(file: BinaryIO) -> dict[int, ColmapCamera]:
     cameras = {}
     for words in read_lines(file):
         if words:
-            key, width, height = int(words[0]), int(words[2]), int(words[3])
+            model = MODELS_BY_NAME[words[1]]
+            width = int(words[2])
+            height = int(words[3])
             params = np.array(words[4:], np.float64)
-            cameras[key] = make_camera(words[1], width, height, params)
+            cameras[int(words[0])] = make_camera(model, width, height, params)
     return cameras
 
 

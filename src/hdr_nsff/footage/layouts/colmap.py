@@ -95,10 +95,11 @@ def with_count(records: Sequence[bytes]) -> bytes:
 def camera_record(number: int, K: np.ndarray, size: tuple[int, int]) -> bytes:
     """One camera of cameras.bin."""
     height, width = size
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    fx, fy = K[0, 0], K[1, 1]
+    center = K[:2, 2]
     if fx == fy:
-        return struct.pack("<iiQQ3d", number, SIMPLE_PINHOLE, width, height, fx, cx, cy)
-    return struct.pack("<iiQQ4d", number, PINHOLE, width, height, fx, fy, cx, cy)
+        return struct.pack("<iiQQ3d", number, SIMPLE_PINHOLE, width, height, fx, *center)
+    return struct.pack("<iiQQ4d", number, PINHOLE, width, height, fx, fy, *center)
 
 
 def image_record(

@@ -190,7 +190,8 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
 
     The EVs are None where brightness has to show them, or a data set stores brackets.
     """
-    c, frames, capture = work.config, work.manifest.frames, work.capture
+    c, frames = work.config, work.manifest.frames
+    capture = work.capture
     numbers = [c.start + int(f.time) * c.stride for f in frames]
     cycle = parse_exposures(c.exposures, c.ev)
     if cycle is not None:
