@@ -1,5 +1,4 @@
-"""Arrays of other programs: whatever their files hold ends in numbers or one sentence.
-"""
+"""Arrays of other programs: whatever their files hold ends in numbers or one sentence."""
 
 import io
 import zipfile
