@@ -28,7 +28,7 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/hdr-nsff run demo/clip.mp4 demo/out --truth demo/truth
 
 test: $(VENV)/.ready-dev
-	$(ONE_THREAD) $(VENV)/bin/python -m pytest -n $(WORKERS) --dist loadfile
+	$(ONE_THREAD) $(VENV)/bin/python -m pytest -n $(WORKERS) --dist loadfile --durations=20
 
 docs: $(VENV)/.ready-docs
 	$(VENV)/bin/sphinx-build -W --keep-going -b html docs docs/_build/html
@@ -39,7 +39,7 @@ $(VENV)/bin/pip:
 	  echo "'$(PYTHON)' is not Python 3.11 or 3.12; install one of them, or say where it is: make PYTHON=/path/to/python3.12" >&2; exit 1; }
 	"$(PYTHON)" -m venv $(VENV)
 
-$(VENV)/.ready-demo: EXTRAS = prepare,eval
+$(VENV)/.ready-demo: EXTRAS = eval
 $(VENV)/.ready-dev: EXTRAS = dev
 $(VENV)/.ready-docs: EXTRAS = docs
 

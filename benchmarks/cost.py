@@ -29,10 +29,11 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.tensors import hold_threads
+from hdr_nsff.core.process import hold_threads, prepare_process
 from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
 MOVING = 0.2  # of all Gaussians
@@ -48,6 +49,7 @@ AXES: dict[str, tuple[str, list[int]]] = {
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -89,8 +91,7 @@ def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any
             field=field,
             scene=folder,
             out=Path(out),
-            steps=100 * steps,
-            minutes=None,
+            budget=Budget(steps=100 * steps, minutes=None),
         )
         trainer = Trainer(config, scene, torch.device("cpu"), distributed.Ranks())
         numba.set_num_threads(setting["cores"])

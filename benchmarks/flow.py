@@ -25,21 +25,31 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import torch
 
-from hdr_nsff.core.io import read_exr, read_mask, read_npy, write_json, write_png
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_json
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.geometry.round_trip import agreement
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
-from hdr_nsff.priors.flow.dense import checked, dense_inverse_search, flow, halfway, told
-from hdr_nsff.priors.flow.networks import both_ways, load, matched_flow
+from hdr_nsff.priors.flow.dense import (
+    average_with_reverse,
+    dense_flow,
+    dense_inverse_search,
+    match_pairs,
+)
+from hdr_nsff.priors.flow.local_motion import fill_uncertain_flow
+from hdr_nsff.priors.flow.networks import both_ways, load, network_flow
 from hdr_nsff.priors.flow.semantic import SemanticConfig, SemanticFlow, semantic_flow
 from hdr_nsff.radiometry.common_range import LUMA, common_gray, recorded_range
 from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import Noise, record, response_curve
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 
 FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -116,7 +126,7 @@ def prior(network, treated: str) -> Callable:
             a, b = (np.rint(255 * (video[k] @ LUMA)).astype(np.uint8) for k in (i, j))
             return dense_inverse_search(a, b), dense_inverse_search(b, a)
 
-        return checked(match, np.zeros(video.shape[:3], bool), pairs, None, threads=1)
+        return match_pairs(match, np.zeros(video.shape[:3], bool), pairs, threads=1)
 
     def on_equalized(
         video: np.ndarray, groups: list[int], pairs: np.ndarray
@@ -127,9 +137,9 @@ def prior(network, treated: str) -> Callable:
             found, valid = network(*frames, pairs)
         else:
             found, valid = (
-                flow(*frames, pairs, None)
+                dense_flow(*frames, pairs)
                 if network is None
-                else matched_flow(network, *frames, pairs)
+                else network_flow(network, *frames, pairs)
             )
         return completed(found, *frames, pairs), valid
 
@@ -165,12 +175,12 @@ def completed(
     one_way = {(int(i), int(j)): one for (i, j), one in zip(pairs, found, strict=True)}
     still = np.zeros(clipped.shape[1:], bool)
     ended = {
-        (i, j): told(
+        (i, j): fill_uncertain_flow(
             one, one_way[j, i], *common_gray(video, ranges, i, j), clipped[i], clipped[j], still
         )
         for (i, j), one in one_way.items()
     }
-    return np.stack([halfway(one, ended[j, i]) for (i, j), one in ended.items()])
+    return np.stack([average_with_reverse(one, ended[j, i]) for (i, j), one in ended.items()])
 
 
 def measure(

@@ -25,10 +25,12 @@ import numba
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.tensors import hold_threads, pick_device
+from hdr_nsff.core.process import hold_threads, prepare_process
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.base import Recordings, ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.build import build_tone_mapper
 from hdr_nsff.training.run_folder import Run
 
 MOVING = 0.2  # of all Gaussians
@@ -36,6 +38,7 @@ TIMES = 36  # training times of the made-up field
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -88,7 +91,11 @@ def subjects(
         height,
     )
     return [
-        (made_up(int(count), camera), ToneMapper(ToneMapConfig(), [0], [0], [0.0]), camera)
+        (
+            made_up(int(count), camera),
+            build_tone_mapper(ToneMapConfig(), Recordings((0,), (0,), (0.0,), 0, 1)),
+            camera,
+        )
         for count in args.counts.split(",")
     ]
 

@@ -19,20 +19,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core import io
+from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.geometry import intrinsics
-from hdr_nsff.synth.synth import (
-    SynthConfig,
-    claim,
-    clip_shots,
-    parse_ev,
-    parse_size,
-    render,
-    truth_shots,
-    write_truth,
-)
+from hdr_nsff.synth.settings import SynthConfig, parse_ev, parse_size
+from hdr_nsff.synth.synth import claim, render, write_truth
+from hdr_nsff.synth.views import clip_views, held_out_views
 from hdr_nsff.training.run_folder import Run
 
 SHOWN = ("psnr", "psnr_moving", "ssim", "mu5000", "mu5000_moving")
@@ -65,13 +58,15 @@ def make_truth(rig: Path, out: Path, spp: int | None) -> None:
     """OUT/truth of the half times' cameras, half a frame before, at, and half a frame
     after.
     """
-    settings = io.read_json(rig / "truth" / "truth.json")["settings"]
+    settings = read_json(rig / "truth" / "truth.json")["settings"]
     known = {f.name for f in fields(SynthConfig)}
     config = SynthConfig(out=out, **{k: v for k, v in settings.items() if k in known})
     config = replace(config, truth_spp=spp or config.truth_spp)
     scene, size, evs = SCENES[config.name], parse_size(config.size), parse_ev(str(config.ev))
     K, reference = intrinsics(*size), int(np.argsort(evs)[len(evs) // 2])
-    held = truth_shots(scene, config.frames, int(config.truth_spp or 0), config.seed, config.views)
+    held = held_out_views(
+        scene, config.frames, int(config.truth_spp or 0), config.seed, config.views
+    )
     halves = [s for s in held if s.time % 1]
     assert len(halves) % len(evs) == 0, (
         "exposures go round with the views: each camera must meet one exposure"
@@ -83,7 +78,7 @@ def make_truth(rig: Path, out: Path, spp: int | None) -> None:
     ]
     claim(config)
     render(shots, K, size, config)
-    clip = clip_shots(scene, config.frames, 1, config.seed, config.views)
+    clip = clip_views(scene, config.frames, 1, config.seed, config.views)
     write_truth(clip, shots, K, [e - evs[reference] for e in evs], reference, config)
 
 

@@ -21,7 +21,9 @@ import numba
 
 from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
@@ -39,7 +41,9 @@ def main() -> None:
     parser.add_argument("--only", help="these weights, by name; default: all that are not 0")
     parser.add_argument("--jobs", type=int, default=1, help="runs side by side, one thread each")
     args = parser.parse_args()
-    whole = replace(PRESETS[args.preset], scene=args.scene, steps=args.steps, minutes=None)
+    whole = replace(
+        PRESETS[args.preset], scene=args.scene, budget=Budget(steps=args.steps, minutes=None)
+    )
     names = [n for n, w in asdict(whole.loss).items() if w and n != "photometric"]
     names = args.only.split(",") if args.only else names
     runs = [("all", whole), ("all, another seed", replace(whole, seed=1))]

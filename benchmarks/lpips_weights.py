@@ -20,7 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff.core import io
+from hdr_nsff.core.images import read_image
+from hdr_nsff.core.io import atomic
 from hdr_nsff.maths.metrics import Lpips
 
 ARRAYS = {("numpy.core.multiarray", "_reconstruct"), ("numpy", "ndarray"), ("numpy", "dtype")}
@@ -73,11 +74,11 @@ def package_says(
 def main(checkpoint: str, out: str, *pictures: str) -> None:
     """Convert, and compare pictures."""
     params = read(Path(checkpoint))
-    with io.atomic(out) as temporary:
+    with atomic(out) as temporary:
         torch.save(convert(params), temporary)
     ours = Lpips(out)
     for a, b in itertools.pairwise(pictures):
-        x, y = io.read_image(a), io.read_image(b)
+        x, y = read_image(a), read_image(b)
         theirs = package_says(Path(checkpoint), params, x, y)
         said = "" if theirs is None else f", the package says {theirs:.6f}"
         print(

@@ -17,7 +17,7 @@ import numpy as np
 
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 
 
 def main() -> None:

@@ -19,9 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.images import read_mask
+from hdr_nsff.core.io import read_json, read_npy, write_json
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 
 
 def main() -> None:
@@ -48,15 +50,15 @@ def main() -> None:
             flush=True,
         )
     if args.json:
-        io.write_json(args.json, rows)
+        write_json(args.json, rows)
 
 
 def measure(scene: Path, clip: Path) -> dict[str, float]:
     """All numbers of one scene."""
     manifest = Manifest.load(scene)
     placed = [f for f in manifest.frames if f.c2w is not None]
-    exact = {f.index: io.read_exr(clip / "exact" / f"clip_{f.index:05d}.exr") for f in placed}
-    truth = io.read_json(clip / "truth" / "truth.json")
+    exact = {f.index: read_exr(clip / "exact" / f"clip_{f.index:05d}.exr") for f in placed}
+    truth = read_json(clip / "truth" / "truth.json")
     true, own = (
         np.array(truth["clip_c2w"])[[f.index for f in placed]],
         np.array([f.c2w for f in placed]),
@@ -78,7 +80,7 @@ def masks(
     scene: Path, frames: list[FrameEntry], exact: dict[int, dict[str, np.ndarray]]
 ) -> dict[str, float]:
     """Over all frames of the clip."""
-    found = np.stack([io.read_mask(scene / str(f.mask)) for f in frames])
+    found = np.stack([read_mask(scene / str(f.mask)) for f in frames])
     moving = np.stack([exact[f.index]["body"] > 0 for f in frames])
     both = float((found & moving).sum())
     return {
@@ -94,12 +96,12 @@ def depths(
     """Log errors; `scale`: scene units per true unit."""
     off, moving, known = [], [], []
     for f in frames:
-        disparity = io.read_npy(scene / str(f.disparity)).astype(np.float64)
+        disparity = read_npy(scene / str(f.disparity)).astype(np.float64)
         z = exact[f.index]["Z"]
         seen = np.isfinite(z) & (z > 0) & (disparity > 0)
         off.append(-np.log(disparity[seen] * z[seen] * scale))
         moving.append(exact[f.index]["body"][seen] > 0)
-        known.append(io.read_npy(scene / str(f.disparity_confidence))[seen] > 0.5)
+        known.append(read_npy(scene / str(f.disparity_confidence))[seen] > 0.5)
     log, moves, sure = np.concatenate(off), np.concatenate(moving), np.concatenate(known)
     told = {}
     for name, where in (("moving", moves), ("still", ~moves)):
@@ -121,16 +123,16 @@ def flows(
     error, moving, believed = [], [], []
     slow = {"matched": np.zeros(2), "flow": np.zeros(2)}
     for f in frames:
-        for side, name in io.SIDES.items():
+        for side, name in SIDES.items():
             if f.index + side not in f.flow:
                 continue
             files, there = f.flow[f.index + side], exact[f.index]
             true = np.stack([there[f"{name}.u"], there[f"{name}.v"]], -1)
             error.append(
-                np.linalg.norm(io.read_npy(scene / files.flow).astype(np.float32) - true, axis=-1)
+                np.linalg.norm(read_npy(scene / files.flow).astype(np.float32) - true, axis=-1)
             )
             moving.append(there["body"] > 0)
-            believed.append(io.read_mask(scene / files.valid))
+            believed.append(read_mask(scene / files.valid))
             for kind in slow:
                 slow[kind] += missed(
                     scene, getattr(f, kind).get(f.index + side, files), true, moving[-1]
@@ -157,8 +159,8 @@ def missed(scene: Path, files: FlowFiles, true: np.ndarray, moving: np.ndarray) 
     motion before what is at rest, and of that motion, squared.
     """
     found, believed = (
-        io.read_npy(scene / files.flow).astype(np.float32),
-        io.read_mask(scene / files.valid),
+        read_npy(scene / files.flow).astype(np.float32),
+        read_mask(scene / files.valid),
     )
     motion = true - np.median(true[~moving], axis=0)
     some = moving & believed

@@ -27,9 +27,11 @@ from scipy.spatial.transform import Rotation
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.scene import Frame, Manifest, Scene
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.pose_corrections import moved, similarities, typical_depth, visible_motion
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
@@ -66,8 +68,7 @@ def main() -> None:
                 PRESETS[args.preset],
                 scene=scene,
                 out=out,
-                steps=args.steps,
-                minutes=None,
+                budget=Budget(steps=args.steps, minutes=None),
                 refine_poses=refine,
                 device="cpu",
             )

@@ -18,9 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core import io
+from hdr_nsff.core.images import read_mask
+from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
 
 PRIORS = ("masks", "mover-depth", "depth", "flow")
 
@@ -72,15 +73,15 @@ def replace_depth(
     """The oracle's disparity (its units over ours: `scale`), fully trusted, where it
     moves or everywhere.
     """
-    where = np.ones(1, bool) if everywhere else io.read_mask(oracle / str(exact.mask))
-    disparity = io.read_npy(oracle / str(exact.disparity)).astype(np.float32) / scale
-    io.write_npy(
+    where = np.ones(1, bool) if everywhere else read_mask(oracle / str(exact.mask))
+    disparity = read_npy(oracle / str(exact.disparity)).astype(np.float32) / scale
+    write_npy(
         out / str(own.disparity),
-        np.where(where, disparity, io.read_npy(out / str(own.disparity))).astype(np.float16),
+        np.where(where, disparity, read_npy(out / str(own.disparity))).astype(np.float16),
     )
     if own.disparity_confidence:
         path = out / own.disparity_confidence
-        io.write_npy(path, np.where(where, 1, io.read_npy(path)).astype(np.float16))
+        write_npy(path, np.where(where, 1, read_npy(path)).astype(np.float16))
 
 
 if __name__ == "__main__":

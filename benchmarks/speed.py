@@ -20,13 +20,16 @@ from pathlib import Path
 import torch
 
 from hdr_nsff.core import distributed
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
 
 def main() -> None:
+    prepare_process()
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -52,8 +55,7 @@ def main() -> None:
             PRESETS[args.preset],
             scene=args.scene,
             out=Path(folder),
-            steps=2 * total,
-            minutes=None,
+            budget=Budget(steps=2 * total, minutes=None),
             bf16=args.bf16,
         )
         if args.rays is not None:

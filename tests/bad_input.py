@@ -14,7 +14,9 @@ import pytest
 from toy_scene import ToyScene, camera_center
 
 from hdr_nsff import cli
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_json, write_npy
 
 Capture = pytest.CaptureFixture[str]
 FRAMES = 9
@@ -34,26 +36,33 @@ def refused(capsys: Capture, *arguments: object) -> str:
     capsys.readouterr()
     assert call(*arguments) == 2, arguments
     error = capsys.readouterr().err
-    sentences = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
-    assert "Traceback" not in error, error
-    assert len(sentences) == 1, error
-    assert error.strip().endswith(sentences[0]), error
-    assert len(sentences[0]) < 600, error
-    return sentences[0]
+    said = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
+    assert (
+        "Traceback" not in error
+        and len(said) == 1
+        and error.strip().endswith(said[0])
+        and len(said[0]) < 600
+    ), error
+    return said[0]
 
 
 def verbs_with(setting: str) -> list[str]:
     """The verbs that have a setting of this name."""
-    return [
-        v
-        for v, it in cli.VERBS.items()
-        if is_dataclass(it.config) and setting in {f.name for f in fields(it.config)}
-    ]
+    verbs = []
+    for name, verb in cli.VERBS.items():
+        config = cli.load(verb.config) if verb.config is not None else None
+        if is_dataclass(config) and setting in {f.name for f in fields(config)}:
+            verbs.append(name)
+    return verbs
 
 
 FOOTAGE_VERBS = verbs_with("clip")  # that read footage
 RUN_VERBS = verbs_with("run")  # that read a run
-WORKING_VERBS = [v for v in cli.VERBS if v != "weights"]  # that write something
+# Verbs that write something.
+WORKING_VERBS = [v for v in cli.VERBS if v not in ("weights", "doctor")]
+
+
+CPU = ["--device", "cpu"]
 
 
 def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
@@ -61,62 +70,24 @@ def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
     `evaluate` write to `out`. `finetune-flow` wants the fixture `flow_data` beside the
     run.
     """
-    flow = [
-        "--data",
-        run.parent / "pairs",
-        "--weights",
-        run.parent / "flow.pkl",
-        "--size",
-        "128x128",
-        "--steps",
-        3,
-        "--batch",
-        1,
-    ]
+    scene = run.parent / "scene"
+    small = ["--path", "fixed", "--scale", 0.3]
+    flow = ["--data", run.parent / "pairs", "--weights", run.parent / "flow.pkl"]
+    short = ["--size", "128x128", "--steps", 3, "--batch", 1]
+    often = ["--measure", 1, "--checkpoint-steps", 1]
+    tiny = ["--methods", "tiny", "--steps", 1]
     return {
         "run": ["run", footage, out],
         "prepare": ["prepare", footage, out],
-        "train": training(run.parent / "scene", out, 1),
-        "render": [
-            "render",
-            run,
-            "--path",
-            "fixed",
-            "--scale",
-            0.3,
-            "--out",
-            out,
-            "--device",
-            "cpu",
-        ],
-        "export": ["export", run, out, "--ply-sequence", "--device", "cpu"],
-        "evaluate": ["evaluate", run, "--device", "cpu"],
+        "train": training(scene, out, 1),
+        "render": ["render", run, *small, "--out", out, *CPU],
+        "export": ["export", run, out, "--ply-sequence", *CPU],
+        "evaluate": ["evaluate", run, *CPU],
         "report": ["report", run, "--out", out / "report.html"],
         "reexpose": ["reexpose", footage, out],
         "synth": ["synth", "interior", out],
-        "finetune-flow": [
-            "finetune-flow",
-            out,
-            *flow,
-            "--measure",
-            1,
-            "--checkpoint-steps",
-            1,
-            "--device",
-            "cpu",
-        ],
-        "bench": [
-            "bench",
-            out,
-            "--scenes",
-            run.parent / "scene",
-            "--methods",
-            "tiny",
-            "--steps",
-            1,
-            "--device",
-            "cpu",
-        ],
+        "finetune-flow": ["finetune-flow", out, *flow, *short, *often, *CPU],
+        "bench": ["bench", out, "--scenes", scene, *tiny, *CPU],
     }
 
 
@@ -128,19 +99,7 @@ def reading(run: Path, out: Path) -> list[list[object]]:
 def training(scene: Path, out: Path, steps: int) -> list[object]:
     """The command that trains a small field."""
     few = ["--field.static", 300, "--field.moving", 100, "--field.bases", 2]
-    return [
-        "train",
-        "splat",
-        "--scene",
-        scene,
-        "--out",
-        out,
-        "--steps",
-        steps,
-        "--device",
-        "cpu",
-        *few,
-    ]
+    return ["train", "splat", "--scene", scene, "--out", out, "--steps", steps, *CPU, *few]
 
 
 def snapshot(folder: Path) -> dict[Path, bytes]:
@@ -151,54 +110,53 @@ def snapshot(folder: Path) -> dict[Path, bytes]:
 def recorded(count: int = FRAMES) -> list[np.ndarray]:
     """The toy scene in three exposures."""
     scene = ToyScene(frames=count)
-    return [
-        np.clip(scene.see(t)[0] * 2.0 ** (-1.5 * (t % 3)), 0, 1) ** (1 / 2.2) for t in range(count)
-    ]
+    pictures = []
+    for t in range(count):
+        radiance, _, _ = scene.see(t)
+        exposure = radiance * 2.0 ** (-1.5 * (t % 3))
+        pictures.append(np.clip(exposure, 0, 1) ** (1 / 2.2))
+    return pictures
 
 
 def clip(folder: Path, pictures: list[np.ndarray] | None = None) -> Path:
     """A folder of PNG frames."""
     for t, picture in enumerate(recorded() if pictures is None else pictures):
-        io.write_png(folder / f"{t:03d}.png", picture)
+        write_png(folder / f"{t:03d}.png", picture)
     return folder
 
 
 def poses(path: Path, count: int = FRAMES) -> Path:
     """The cameras of the toy scene as LLFF writes them."""
-    s, rows = ToyScene(), []
+    scene, rows = ToyScene(), []
     for t in range(count):
         x, y, z = camera_center(t)
-        # columns: down, right, back
-        pose = np.array([[0, 1, 0, x, s.height], [1, 0, 0, y, s.width], [0, 0, -1, z, s.f]])
-        rows.append([*pose.ravel(), 1.8, 5.0])
-    io.write_npy(path, np.array(rows))
+        # Columns: down, right, back, center, (height, width, focal length).
+        matrix = [[0, 1, 0, x, scene.height], [1, 0, 0, y, scene.width], [0, 0, -1, z, scene.f]]
+        rows.append([*np.ravel(matrix), 1.8, 5.0])
+    write_npy(path, np.array(rows))
     return path
 
 
 def truth(folder: Path) -> Path:
     """Truth of two frames of the toy scene."""
-    scene, x = ToyScene(), (np.linspace(0, 1, 64) ** 2.2).tolist()
+    scene = ToyScene()
+    x = (np.linspace(0, 1, 64) ** 2.2).tolist()
     views = []
     for t in (1, 3):
-        io.write_exr(folder / f"radiance/{t}.exr", {"RGB": scene.see(t)[0].astype(np.float32)})
-        views.append(
-            {
-                "name": f"{t:05d}",
-                "time": t,
-                "bracket": 1,
-                "anchor": t,
-                "radiance": f"radiance/{t}.exr",
-            }
-        )
-    truth = {
+        name = f"radiance/{t}.exr"
+        write_exr(folder / name, {"RGB": scene.see(t)[0].astype(np.float32)})
+        view = {"name": f"{t:05d}", "time": t, "bracket": 1, "anchor": t, "radiance": name}
+        views.append(view)
+    document = {
         "bracket_ev": [2.0, 0.0, -2.0],
         "reference_bracket": 1,
         "response_x": x,
         "response_y": [x] * 3,
         "views": views,
+        "K": scene.K.tolist(),
+        "clip_c2w": [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(6)],
     }
-    centers = [np.c_[np.eye(3), camera_center(t)].tolist() for t in range(6)]
-    io.write_json(folder / "truth.json", {**truth, "K": scene.K.tolist(), "clip_c2w": centers})
+    write_json(folder / "truth.json", document)
     return folder
 
 

@@ -6,11 +6,18 @@ from pathlib import Path
 
 import pytest
 import torch
+from synth_scene import Flat
 from toy_scene import ToyScene
 
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.priors.flow import networks as flow_networks
 from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.synth.pathtracer import Tracer
+from hdr_nsff.synth.scenes.interior import INTERIOR
+from hdr_nsff.synth.settings import SynthConfig
+
+prepare_process()  # as the command line does
 
 
 @pytest.fixture(scope="session")
@@ -57,3 +64,18 @@ def flow_data(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(flow_networks, "GMFlow", lambda bf16: GMFlow(8, 1))
     torch.save(GMFlow(8, 1).state_dict(), run_folder.parent / "flow.pkl")
     synth(run_folder.parent / "pairs", frames=6, size=(48, 64))
+
+
+@pytest.fixture
+def flat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SynthConfig:
+    """Settings of a tiny `synth`, which renders an even wall instead of its scene."""
+    monkeypatch.setattr("hdr_nsff.synth.synth.Tracer", Flat)
+    Flat.rendered = 0
+    return SynthConfig("interior", tmp_path / "room", size="16x16", frames=12, noise=0, oracle=True)
+
+
+@pytest.fixture(scope="session")
+def tracer() -> Tracer:
+    """The synthetic room, for Mitsuba's slow variant that is always there."""
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
+    return Tracer(INTERIOR, 0, "scalar_rgb")

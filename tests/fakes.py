@@ -7,13 +7,17 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from estimates import tone_mapper
 from torch import Tensor
 
 from hdr_nsff.fields.base import Layers, Render
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.scene import Frame, FrameEntry, Manifest, Scene, Step
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.radiometry.response import from_brightness
+from hdr_nsff.radiometry.static_samples import ResponseView
+from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
+from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.run_folder import Run
 
@@ -21,6 +25,14 @@ W, H, FOCAL = 48, 32, 40.0
 WALL, DISC = 4.0, 2.0  # z of the two planes
 SPEED = torch.tensor([0.4, 0.1, 0.0])  # scene units per frame: (8, 2) pixels at the disc
 EV = (-4.0, -2.0, 0.0)
+
+
+def views_of(frames: list[Frame]) -> list[ResponseView]:
+    """The frames as the response is estimated from them."""
+    return [
+        ResponseView(f.image.numpy(), f.bracket, f.time, np.eye(3), np.eye(3, 4), np.ones((H, W)))
+        for f in frames
+    ]
 
 
 def camera(x: float = 0.0) -> Camera:
@@ -105,8 +117,8 @@ def fake_run(
     """
     field = field or DiscBeforeWall(speed=SPEED / 4, red=3.0)
     spacing = 0.05 if parallax == "full" else 0.0
-    tonemapper = ToneMapper(
-        ToneMapConfig(residual=False), [i % 3 for i in range(num_frames)], [0] * num_frames, EV, 2
+    tonemapper = tone_mapper(
+        [i % 3 for i in range(num_frames)], [0] * num_frames, EV, reference=2, residual=False
     )
     frames = []
     for i in range(num_frames):
@@ -114,18 +126,20 @@ def fake_run(
         seen = field.render(c, float(i))
         rgb = tonemapper(seen.radiance, i % 3, 0, leaky=False).detach().reshape(H, W, 3)
         moving = seen.motion.reshape(H, W) > 0.5
-        frames.append(Frame(i, float(i), c, 0, i % 3, EV[i % 3], rgb, moving=moving))
+        frames.append(Frame(i, float(i), c, 0, i % 3, rgb, moving=moving))
     entries = [
         FrameEntry(
-            index=f.index, image=f"images/{f.index:05d}.png", source="made", time=f.time, bracket=f.bracket, ev=f.exposure,
+            index=f.index, image=f"images/{f.index:05d}.png", source="made", time=f.time, bracket=f.bracket, ev=EV[f.bracket],
             K=f.camera.K.tolist(), c2w=f.camera.c2w.tolist(), split="test" if f.index >= num_frames - held_out else "train",
         )
         for f in frames
     ]  # fmt: skip
     steps = {
-        "exposure": Step(done=True, provenance="given", note="EV -4, -2, 0 from --ev", seconds=0.1),
-        "poses": Step(done=True, note="6 of 6 frames registered", seconds=12.5),
-        "depth": Step(done=True, provenance="absent", note="no parallax"),
+        "exposure": StepRecord(
+            done=True, provenance="given", note="EV -4, -2, 0 from --ev", seconds=0.1
+        ),
+        "poses": StepRecord(done=True, note="6 of 6 frames registered", seconds=12.5),
+        "depth": StepRecord(done=True, provenance="absent", note="no parallax"),
     }
     manifest = Manifest(
         source="made up <clip>", width=W, height=H, fps=12, cycle=3, reference_bracket=2, bracket_ev=list(EV),
@@ -133,7 +147,15 @@ def fake_run(
     )  # fmt: skip
     cut = num_frames - held_out
     scene = Scene(
-        folder / "scene", frames[:cut], frames[cut:], 1.0, 8.0, torch.zeros(0, 3), manifest
+        folder=folder / "scene",
+        train=frames[:cut],
+        test=frames[cut:],
+        near=1.0,
+        far=8.0,
+        points=torch.zeros(0, 3),
+        response=from_brightness(views_of(frames), EV, 2, 1, "brightness", "made up"),
+        movers=(),
+        manifest=manifest,
     )
     return Run(
         folder,

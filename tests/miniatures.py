@@ -16,7 +16,9 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.core.io import write_exr, write_npy, write_png
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_npy
 
 W, H, FOCAL = 48, 32, 40.0
 WALL = 4.0

@@ -9,14 +9,17 @@ import pytest
 import torch
 
 from hdr_nsff.core import distributed
-from hdr_nsff.fields import AnyField, build_field, start_field
 from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
+from hdr_nsff.fields.build import AnyField, build_field, initialize_field
 from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpConfig
 from hdr_nsff.fields.nsff.two_branches import TwoBranches
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import PRESETS, TrainConfig
-from hdr_nsff.training.train import Trainer, open_folder, train
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
+from hdr_nsff.training.run_folder import open_folder
+from hdr_nsff.training.train import Trainer, train
 
 GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)
 MLP = MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2)
@@ -56,8 +59,7 @@ def small(
         field=field,
         scene=scene,
         out=out,
-        steps=steps,
-        minutes=None,
+        budget=Budget(steps=steps, minutes=None),
         checkpoint_seconds=1e9,
         device="cpu",
         **rays,
@@ -69,7 +71,7 @@ def random_field(preset: str, scene: Scene, seed: int = 0) -> AnyField:
     torch.manual_seed(seed)
     field = build_field(small(preset).field, scene)
     if isinstance(field, Splat):
-        start_field(field, scene, lambda rgb, i: rgb + 0.1, 0.0, True)
+        initialize_field(field, scene, lambda rgb, i: rgb + 0.1, 0.0, True)
         for p in field.trajectories.parameters():
             p.data.add_(0.02 * torch.randn_like(p))
         for p in (field.moving.offsets, field.static.offsets, field.mixture_logits):

@@ -7,12 +7,12 @@ import pytest
 import torch
 from presets import random_field, small, trainer
 
-from hdr_nsff.fields import build_field, start_field
-from hdr_nsff.fields.base import HIGHEST
+from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE
+from hdr_nsff.fields.build import build_field, initialize_field
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.scene.batch import whole_frame
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import ABLATIONS, METHODS, PRESETS, ablated
+from hdr_nsff.training.presets import ABLATIONS, METHODS, PRESETS, ablated
 from hdr_nsff.training.train import heeded
 
 NAMES = [name for name in PRESETS if name not in METHODS]
@@ -67,7 +67,7 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     assert isinstance(config, SplatConfig)
     field = build_field(replace(config, view_dependence=True), toy)
     assert isinstance(field, Splat)
-    start_field(
+    initialize_field(
         field, toy, lambda rgb, i: 3 * rgb, 0.5, True
     )  # brighter than 1, the background too
     for g in (field.static, field.moving):
@@ -94,7 +94,7 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
 ) -> None:
     fields = [build_field(small(name).field, toy) for name in ("splat-sigmoid", "splat")]
     for field in fields:
-        start_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)
+        initialize_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)
     bounded, free = fields
     assert isinstance(bounded, Splat) and isinstance(free, Splat)
     for share in (0.0, 0.3):
@@ -102,7 +102,7 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
             seeded = b.logits > -10
             torch.testing.assert_close(
                 a.radiance(share)[seeded],
-                b.radiance(share)[seeded].clamp_max(HIGHEST),
+                b.radiance(share)[seeded].clamp_max(MAX_SIGMOID_RADIANCE),
                 rtol=1e-4,
                 atol=1e-6,
             )

@@ -16,7 +16,10 @@ import OpenEXR
 import pytest
 from bad_input import FOOTAGE_VERBS, FRAMES, Capture, call, clip, cut, recorded, refused, snapshot
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import encode, write_png
+from hdr_nsff.core.io import write_npy, write_text
+from hdr_nsff.core.video import write_video
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:
@@ -25,11 +28,8 @@ def prepared(capsys: Capture, clip: Path, *options: object) -> str:
     """
 
     def rest() -> dict[Path, bytes]:
-        return {
-            p: b
-            for p, b in snapshot(clip.parent).items()
-            if "scene" not in p.relative_to(clip.parent).parts
-        }
+        files = snapshot(clip.parent)
+        return {p: b for p, b in files.items() if not p.is_relative_to(clip.parent / "scene")}
 
     before = rest()
     sentence = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
@@ -54,7 +54,7 @@ def one_bad(folder: Path, damage: Callable[[Path], object], suffix: str = ".png"
     """Frames, the fifth of them damaged."""
     for t, picture in enumerate(recorded()):
         name = folder / f"{t:03d}{suffix}"
-        io.write_png(name, picture) if suffix == ".png" else io.write_exr(name, {"RGB": picture})
+        write_png(name, picture) if suffix == ".png" else write_exr(name, {"RGB": picture})
     damage(folder / f"004{suffix}")
     return folder
 
@@ -63,9 +63,8 @@ def exr_with(value: float) -> Callable[[Path], None]:
     def damage(path: Path) -> None:
         pixels = np.full((34, 60, 3), 0.5, np.float32)
         pixels[3, 5, 1] = value
-        with OpenEXR.File(
-            {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {"RGB": pixels}
-        ) as file:
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, {"RGB": pixels}) as file:
             file.write(str(path))
 
     return damage
@@ -85,7 +84,7 @@ def text_video(folder: Path) -> Path:
 
 
 def cut_video(folder: Path) -> Path:
-    io.write_video(folder / "clip.mp4", recorded(20))
+    write_video(folder / "clip.mp4", recorded(20))
     cut(folder / "clip.mp4")
     return folder / "clip.mp4"
 
@@ -112,6 +111,10 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     ),
     "one frame": (lambda p: clip(p, recorded(1)), "1 frame "),
     "two frames": (lambda p: clip(p, recorded(2)), "2 frames "),
+    "frames of two sizes": (
+        lambda p: one_bad(p, lambda f: write_png(f, np.full((30, 60, 3), 0.5))),
+        "004.png: 60x30 pixels",
+    ),
     "frames of one pixel": (
         lambda p: clip(p, [np.full((1, 1, 3), 0.5)] * FRAMES),
         "frames are 1x1 pixels, at least 11x11 are needed",
@@ -123,10 +126,6 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "frames of ten columns": (
         lambda p: clip(p, [np.full((64, 10, 3), 0.5)] * FRAMES),
         "frames are 10x64 pixels",
-    ),
-    "frames of two sizes": (
-        lambda p: one_bad(p, lambda f: io.write_png(f, np.full((30, 60, 3), 0.5))),
-        "004.png: 60x30 pixels",
     ),
     "a PNG of a thousand megapixels": (
         lambda p: one_bad(p, claim_size),
@@ -156,8 +155,8 @@ def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
 ) -> None:
     footage = one_bad(tmp_path / "clip", cut, ".exr")
     assert call("prepare", footage, tmp_path / "scene") == 2
-    # OpenEXR has words of its own for it
-    assert len(capfd.readouterr().err.strip().splitlines()) == 1
+    printed = capfd.readouterr().err.strip()  # OpenEXR itself would print more
+    assert len(printed.splitlines()) == 1
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".avi"])
@@ -166,7 +165,7 @@ def test_a_video_cut_short_anywhere(
     suffix: str, share: float, tmp_path: Path, capsys: Capture
 ) -> None:
     path = tmp_path / f"clip{suffix}"
-    io.write_video(path, recorded(40))
+    write_video(path, recorded(40))
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
     assert "cut short" in prepared(capsys, path)
 
@@ -174,7 +173,7 @@ def test_a_video_cut_short_anywhere(
 def test_a_jpeg_cut_short(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     (folder / "004.png").unlink()
-    io.encode(folder / "004.jpg", (recorded()[4] * 255).astype(np.uint8))
+    encode(folder / "004.jpg", (recorded()[4] * 255).astype(np.uint8))
     cut(folder / "004.jpg")
     assert "004.jpg: the JPEG is cut short" in prepared(capsys, folder)
 
@@ -214,8 +213,7 @@ def test_an_exposure_list_that_fits_no_cycle(tmp_path: Path, capsys: Capture) ->
     folder = clip(tmp_path / "clip", recorded(24))
     for given, count in (("--ev=-2,0", 2), ("--exposures=1/1000,1/500,1/250,1/125", 4)):
         sentence = prepared(capsys, folder, given)
-        assert f"{count} exposures listed" in sentence
-        assert "repeats every 3" in sentence
+        assert f"{count} exposures listed" in sentence and "repeats every 3" in sentence
 
 
 def test_an_exposure_list_longer_than_the_clip(tmp_path: Path, capsys: Capture) -> None:
@@ -277,11 +275,11 @@ def test_an_end_beyond_the_clip_is_the_end(tmp_path: Path, capsys: Capture) -> N
 def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     for i in range(FRAMES):
-        io.write_png(tmp_path / f"masks/{i}.png", np.zeros((34, 59), bool))
-        io.write_png(tmp_path / f"few/{i // 2}.png", np.zeros((34, 60), bool))
+        write_png(tmp_path / f"masks/{i}.png", np.zeros((34, 59), bool))
+        write_png(tmp_path / f"few/{i // 2}.png", np.zeros((34, 60), bool))
         for j in range(FRAMES):
-            io.write_npy(tmp_path / f"small/{i:05d}_{j:05d}.npy", np.zeros((17, 30, 2), np.float32))
-            io.write_npy(tmp_path / f"flow/{i:05d}_{j:05d}.npy", np.zeros((34, 60, 2), np.float32))
+            write_npy(tmp_path / f"small/{i:05d}_{j:05d}.npy", np.zeros((17, 30, 2), np.float32))
+            write_npy(tmp_path / f"flow/{i:05d}_{j:05d}.npy", np.zeros((34, 60, 2), np.float32))
     flow = ["--flow", tmp_path / "flow"]
     assert "flow of shape (17, 30, 2)" in prepared(capsys, folder, "--flow", tmp_path / "small")
     assert "no flow from frame" in prepared(capsys, folder, "--flow", tmp_path / "few")
@@ -299,12 +297,11 @@ def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capt
 
 
 def test_a_scene_of_other_footage_stays(tmp_path: Path, capsys: Capture) -> None:
-    # its frames are in the scene already
-    prepared(capsys, clip(tmp_path / "one", recorded(24)), "--ev=0,1")
+    first = clip(tmp_path / "one", recorded(24))
+    prepared(capsys, first, "--ev=0,1")  # its frames are in the scene already
     before = snapshot(tmp_path / "scene")
     assert "holds the scene of other footage" in prepared(capsys, clip(tmp_path / "other"))
-    assert before
-    assert snapshot(tmp_path / "scene") == before
+    assert before and snapshot(tmp_path / "scene") == before
 
 
 def test_output_in_which_no_step_was_finished_is_free(tmp_path: Path, capsys: Capture) -> None:
@@ -319,7 +316,7 @@ def test_output_that_is_a_file_or_holds_something_else(tmp_path: Path, capsys: C
     (tmp_path / "scene").write_text("mine")
     assert "is a file" in prepared(capsys, folder)
     (tmp_path / "scene").unlink()
-    io.write_text(tmp_path / "scene/thesis.txt", "mine")
+    write_text(tmp_path / "scene/thesis.txt", "mine")
     assert "holds other files" in prepared(capsys, folder)
     assert (tmp_path / "scene/thesis.txt").read_text() == "mine"
 
@@ -331,7 +328,7 @@ def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> Non
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)
         assert (tmp_path / "scene/scene.json").read_text() == text
-    # the sentence offers it: it starts from the frames
+    # What the sentence offers starts anew.
     assert "at least 3" in prepared(capsys, folder, "--redo", "frames")
 
 
@@ -350,9 +347,8 @@ def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
         patch.setattr(os, "fsync", full)
         assert "the disk is full" in prepared(capsys, folder, "--ev=0,1")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "scene/images").glob("*.png")}
-    assert kept
-    assert not list((tmp_path / "scene").rglob(".partial-*"))
-    # as far as it goes: frames are done
-    assert "2 exposures listed" in prepared(capsys, folder, "--ev=0,1")
+    assert kept and not list((tmp_path / "scene").rglob(".partial-*"))
+    sentence = prepared(capsys, folder, "--ev=0,1")
+    assert "2 exposures listed" in sentence  # in the step after the frames
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert len(list((tmp_path / "scene/images").glob("*.png"))) == 24

@@ -1,4 +1,4 @@
-"""A full disk and Ctrl-C: what was complete stays, nothing is half-written, and the
+"""A full disk, Ctrl-C and kills: complete files stay, nothing is half-written, and the
 same command goes on.
 """
 
@@ -27,7 +27,8 @@ from bad_input import (
 )
 
 from hdr_nsff import cli
-from hdr_nsff.core import io
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import HOST, write_npy, writing_to
 
 # A full disk
 
@@ -53,11 +54,8 @@ def test_a_full_disk_is_one_sentence(
 def test_a_disk_that_fills_up_while_a_flow_network_learns_loses_no_checkpoint(
     run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command, out, sync = (
-        commands(run_folder, tmp_path, tmp_path / "out")["finetune-flow"],
-        tmp_path / "out",
-        os.fsync,
-    )
+    out, sync = tmp_path / "out", os.fsync
+    command = commands(run_folder, tmp_path, out)["finetune-flow"]
 
     def filled(handle: int) -> None:
         full(handle) if list(out.glob("checkpoints/step_*")) else sync(handle)
@@ -83,14 +81,12 @@ def test_a_full_disk_is_one_sentence_for_every_layout_of_a_scene(
 
 
 def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path: Path) -> None:
-    before, handler = (
-        resource.getrlimit(resource.RLIMIT_FSIZE),
-        signal.signal(signal.SIGXFSZ, signal.SIG_IGN),
-    )
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
-        with pytest.raises(io.InputError, match="the disk is full"), io.writing_to(tmp_path):
-            io.write_npy(tmp_path / "map.npy", np.zeros(500))
+        with pytest.raises(InputError, match="the disk is full"), writing_to(tmp_path):
+            write_npy(tmp_path / "map.npy", np.zeros(500))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
         signal.signal(signal.SIGXFSZ, handler)
@@ -100,7 +96,7 @@ def test_a_disk_that_fills_up_in_the_middle_of_a_map_is_said_to_be_full(tmp_path
 FAILING = """
 import gc, pathlib, sys
 import numpy as np
-from hdr_nsff.core import io
+
 
 def broken(self, data):
     view = memoryview(data)
@@ -109,9 +105,9 @@ def broken(self, data):
 gc.disable()
 pathlib.Path.write_bytes = broken
 try:
-    io.write_npy(sys.argv[1], np.zeros(50))
+    write_npy(sys.argv[1], np.zeros(50))
 except OSError as error:
-    error.itself = error  # a cycle: what the traceback holds is left to the collector
+    error.itself = error  # a cycle: the traceback is left to the collector
 gc.collect()
 """
 
@@ -128,7 +124,7 @@ def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_late
 
 
 @pytest.mark.parametrize("verb", ["prepare", "render", "export", "evaluate", "reexpose"])
-def test_ctrl_c_loses_nothing_and_the_same_command_goes_on(
+def test_ctrl_c_loses_nothing_and_the_same_command_continues(
     verb: str, run_folder: Path, tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     footage, out, sync = clip(tmp_path / "clip"), tmp_path / "out", os.fsync
@@ -147,25 +143,55 @@ def test_ctrl_c_loses_nothing_and_the_same_command_goes_on(
         patch.setattr(os, "fsync", interrupted)
         assert call(*command) == 130
     error = capsys.readouterr().err
-    assert "Traceback" not in error and "the same command goes on where it was" in error
-    kept = {
-        p: p.stat().st_mtime_ns
-        for p in tmp_path.rglob("*")
-        if p.suffix in (".png", ".exr", ".npy", ".ply")
-    }
-    assert not list(tmp_path.rglob(".partial-*"))
+    assert "Traceback" not in error and "the same command continues where it was" in error
+    suffixes = {".png", ".exr", ".npy", ".ply"}
+    if verb == "evaluate":
+        suffixes.remove(".png")  # it draws its comparisons anew
+    files = [p for p in tmp_path.rglob("*") if p.suffix in suffixes]
+    kept = {p: p.stat().st_mtime_ns for p in files}
+    assert kept and not list(tmp_path.rglob(".partial-*"))
     assert call(*command) == 0
-    pictures = [
-        p for p in kept if verb != "evaluate" or p.suffix != ".png"
-    ]  # which draws its comparisons anew
-    assert pictures and all(p.stat().st_mtime_ns == kept[p] for p in pictures)
+    assert all(p.stat().st_mtime_ns == kept[p] for p in kept)
 
 
 def test_ctrl_c_while_the_libraries_load_leaves_no_traceback(tmp_path: Path) -> None:
     (tmp_path / "tyro.py").write_text("raise KeyboardInterrupt\n")
     path = os.pathsep.join([str(tmp_path), str(Path(cli.__file__).parents[1])])
     command = [sys.executable, "-c", "from hdr_nsff.cli import main; main()", "prepare", "a", "b"]
-    result = subprocess.run(
-        command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True
-    )
+    environment = os.environ | {"PYTHONPATH": path}
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert result.returncode == 130 and result.stderr == ""
+
+
+# Kills
+
+LEFTOVER = f".partial-{HOST}-{2**22 + 1}-00000000-abcd_123.png"  # of no process
+
+
+@pytest.mark.parametrize(
+    ("verb", "folders"),
+    [
+        ("render", ["out", "out/fixed"]),
+        ("export", ["out"]),
+        ("evaluate", ["run", "run/evaluation"]),
+        ("report", ["out"]),
+        ("train", ["out", "out/checkpoints", "out/previews"]),
+        ("reexpose", ["out"]),
+    ],
+)
+def test_what_a_killed_process_left_is_removed_by_the_same_command(
+    verb: str, folders: list[str], run_folder: Path, tmp_path: Path
+) -> None:
+    places = {"out": tmp_path / "out", "run": run_folder}
+    command = commands(run_folder, clip(tmp_path / "clip", recorded(3)), tmp_path / "out")[verb]
+    paths = []
+    for name in folders:
+        first, _, rest = name.partition("/")
+        folder = places[first] / rest
+        folder.mkdir(parents=True, exist_ok=True)
+        paths.append(folder / LEFTOVER)
+        paths[-1].write_bytes(b"half")
+    mine = paths[0].with_name(".partial-mine.png")
+    mine.write_text("mine")
+    call(*command)
+    assert not any(path.exists() for path in paths) and mine.read_text() == "mine"

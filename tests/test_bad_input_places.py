@@ -22,18 +22,13 @@ from bad_input import (
     training,
 )
 
-from hdr_nsff.core import io
+from hdr_nsff.core.io import write_text
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
     assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
     assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS)
-    assert {
-        "render",
-        "export",
-        "evaluate",
-        "report",
-    } == set(RUN_VERBS)
+    assert {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
 
 
 # Missing and empty
@@ -43,9 +38,8 @@ def test_there_is_a_command_of_every_verb_to_try() -> None:
 def test_a_missing_and_an_empty_run(verb: str, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "empty").mkdir()
     for name in ("nowhere", "empty"):
-        assert "not a run folder" in refused(
-            capsys, *commands(tmp_path / name, tmp_path, tmp_path / "out")[verb]
-        )
+        command = commands(tmp_path / name, tmp_path, tmp_path / "out")[verb]
+        assert "not a run folder" in refused(capsys, *command)
     assert [p.name for p in tmp_path.rglob("*")] == ["empty"]
 
 
@@ -89,9 +83,8 @@ def test_a_place_that_cannot_be_written_is_named(
 ) -> None:
     (tmp_path / "file").write_text("mine")
     footage, out = clip(tmp_path / "clip", recorded(3)), tmp_path / place
-    assert place.partition("/")[0][:40] in refused(
-        capsys, *commands(run_folder, footage, out)[verb]
-    )
+    sentence = refused(capsys, *commands(run_folder, footage, out)[verb])
+    assert place.partition("/")[0][:40] in sentence
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -111,7 +104,7 @@ def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys
 def test_pictures_of_the_users_own_are_not_replaced(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    io.write_text(tmp_path / "mine" / name, "mine")
+    write_text(tmp_path / "mine" / name, "mine")
     assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["render"])
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b"mine"}
 
@@ -119,7 +112,7 @@ def test_pictures_of_the_users_own_are_not_replaced(
 def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
     run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    io.write_text(tmp_path / "mine/depth/00000.png", "mine")
+    write_text(tmp_path / "mine/depth/00000.png", "mine")
     assert "depth" in refused(
         capsys, "render", run_folder, "--out", tmp_path / "mine", "--device", "cpu"
     )
@@ -130,7 +123,7 @@ def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
 def test_files_of_the_users_own_are_not_replaced_by_gaussians(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    io.write_text(tmp_path / "mine" / name, '{"takes": 3}')
+    write_text(tmp_path / "mine" / name, '{"takes": 3}')
     assert name in refused(capsys, *commands(run_folder, tmp_path, tmp_path / "mine")["export"])
     assert name in refused(capsys, "export", run_folder, tmp_path / "mine" / name, "--ply")
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b'{"takes": 3}'}
@@ -147,15 +140,13 @@ def test_gaussians_of_another_run_are_exported_again_and_that_is_reported(
     assert call(*commands(run_folder.parent / "other", tmp_path, tmp_path / "out")["export"]) == 0
     assert "settings or checkpoint changed, exporting again" in capsys.readouterr().err
     second = snapshot(tmp_path / "out")
-    assert second.keys() == first.keys()
-    assert all(second[p] != first[p] for p in first)
+    assert second.keys() == first.keys() and all(second[p] != first[p] for p in first)
 
 
 def test_footage_is_not_prepared_over_another_scene(
     toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    # it was not made by `prepare`: none of its steps is done
-    scene = shutil.copytree(toy_folder, tmp_path / "out/scene")
+    scene = shutil.copytree(toy_folder, tmp_path / "out/scene")  # no step of it is done
     before = snapshot(tmp_path / "out")
     footage = clip(tmp_path / "clip")
     assert "other footage" in refused(capsys, "prepare", footage, scene)

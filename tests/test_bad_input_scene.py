@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 from bad_input import Capture, call, clip, edit, reading, refused, snapshot, training
+from estimates import forget_movers
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_npy, write_png
-from hdr_nsff.scene.scene import Manifest, Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_npy
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.tonemap.build import tone_mapper_for
 
 Change = Callable[[dict[str, Any]], object]
 
@@ -29,7 +32,7 @@ def folder(toy_folder: Path, tmp_path: Path) -> Path:
 def sentence(folder: Path) -> str:
     """What opening the scene, or making its tone mapper, says; one line."""
     with pytest.raises(InputError) as caught:
-        ToneMapper.for_scene(ToneMapConfig(), Scene.open(folder))
+        tone_mapper_for(ToneMapConfig(), Scene.open(folder))
     text = str(caught.value)
     assert "\n" not in text and len(text) < 400, text
     return text
@@ -252,6 +255,7 @@ def test_a_link_out_of_the_folder_is_refused(folder: Path, tmp_path: Path) -> No
 
 def test_a_scene_with_a_single_frame_opens(folder: Path) -> None:
     edit(folder / "scene.json", lambda d: d.update(frames=[{**d["frames"][1], "flow": {}}]))
+    forget_movers(folder)
     scene = Scene.open(folder)
     assert len(scene.train) == 1 and scene.train[0].neighbors == {}
 
@@ -323,7 +327,7 @@ def test_missing_maps_and_maps_of_the_wrong_size(
         ("raw_flow/00002_00003.npy", np.zeros((9, 60, 2))),
     ):
         kept = (scene / name).read_bytes()
-        (io.write_png if name.endswith("png") else io.write_npy)(scene / name, wrong)
+        (write_png if name.endswith("png") else write_npy)(scene / name, wrong)
         assert all(
             name in said and "shape (9, 60" in said
             for said in (refused(capsys, *c) for c in commands)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from bad_input import Capture, call, cut, edit, refused, snapshot, truth
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import write_exr
 
 
 def view(key: str, value: object) -> Callable[[dict], object]:
@@ -35,6 +35,14 @@ TRUTHS: dict[str, tuple[Callable[[dict], object], str]] = {
     "no response": (lambda d: d.update(response_x=[]), "response_x"),
     "two channels": (lambda d: d.update(response_y=d["response_y"][:2]), "response_y"),
     "a response that falls": (lambda d: d.update(response_x=d["response_x"][::-1]), "response_x"),
+    "a response beyond what is recorded": (
+        lambda d: d["response_y"][1].__setitem__(-1, 1e308),
+        "response_y leaves [0, 1]",
+    ),
+    "a white balance beyond all light": (
+        lambda d: d.update(white_balance=[1.0, 1e308, 1.0]),
+        "white_balance",
+    ),
     "a white balance of nothing": (lambda d: d.update(white_balance=[0.0] * 3), "white_balance"),
     "no focal length": (lambda d: d.update(K=[[0.0] * 3] * 3), "K is no"),
     "no views": (lambda d: d.update(views=[]), "lists none"),
@@ -62,7 +70,7 @@ def test_truth_of_impossible_radiance_is_named(
     command = ["evaluate", run_folder, "--truth", folder, "--device", "cpu"]
     for value, word in ((-1.0, "negative"), (0.0, "every view is 0")):
         for t in (1, 3):
-            io.write_exr(
+            write_exr(
                 folder / f"radiance/{t}.exr", {"RGB": np.full((34, 60, 3), value, np.float32)}
             )
         assert word in refused(capsys, *command)

@@ -1,5 +1,5 @@
-"""The command line: help, versions, exit codes; one sentence where the user can mend
-it, and nothing lost.
+"""The command line: help, versions, exit codes; one sentence where the user can fix it,
+and nothing lost.
 """
 
 import errno
@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,16 @@ import pytest
 
 from hdr_nsff import __version__, cli
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.training.config import ABLATIONS, METHODS, PRESETS, TrainConfig
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import ABLATIONS, METHODS, PRESETS
 from hdr_nsff.training.run_folder import Run
 
-COMMAND = [
-    sys.executable,
-    "-c",
-    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); from hdr_nsff.cli import main; main()",
-]
+Act = Callable[[Callable[[Any], Any]], None]
+Capture = pytest.CaptureFixture[str]
+MAIN = "from hdr_nsff.cli import main; main()"
+INTERRUPTIBLE = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
+COMMAND = [sys.executable, "-c", INTERRUPTIBLE + MAIN]
 
 
 def call(*arguments: str) -> int:
@@ -43,14 +46,20 @@ def one_sentence(error: str) -> str:
 
 
 @pytest.fixture
-def act(monkeypatch: pytest.MonkeyPatch) -> Any:
+def act(monkeypatch: pytest.MonkeyPatch) -> Act:
     """Replaces what `hdr-nsff evaluate` does."""
-    return lambda does: monkeypatch.setitem(
-        cli.VERBS, "evaluate", replace(cli.VERBS["evaluate"], act=does)
-    )
+    return lambda does: monkeypatch.setattr("hdr_nsff.evaluation.evaluate.evaluate", does)
 
 
-def raising(error: BaseException) -> Any:
+@pytest.fixture
+def trained_with(monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
+    """The configs that `hdr-nsff train` is called with, which trains nothing."""
+    configs: list[TrainConfig] = []
+    monkeypatch.setattr("hdr_nsff.training.train.train", configs.append)
+    return configs
+
+
+def raising(error: BaseException) -> Callable[[Any], Any]:
     def act(config: Any) -> None:
         raise error
 
@@ -58,64 +67,139 @@ def raising(error: BaseException) -> Any:
 
 
 @pytest.mark.parametrize("verb", list(cli.VERBS))
-def test_every_verb_explains_itself(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_verb_explains_itself(verb: str, capsys: Capture) -> None:
     assert call(verb, "--help") == 0
     assert f"usage: hdr-nsff {verb}" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("preset", list(PRESETS))
-def test_every_preset_explains_its_settings(
-    preset: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_preset_explains_its_settings(preset: str, capsys: Capture) -> None:
     assert call("train", preset, "--help") == 0
     out = capsys.readouterr().out
-    assert (
-        "--scene" in out
-        and ("--field.bases" if preset.startswith("splat") else "--field.samples") in out
-        and "--loss.temporal" in out
-    )
+    own_setting = "--field.bases" if preset.startswith("splat") else "--field.samples"
+    assert all(setting in out for setting in ("--scene", own_setting, "--loss.temporal"))
 
 
 def test_train_lists_methods_line_by_line_and_ablations_in_a_sentence(
-    capsys: pytest.CaptureFixture[str],
+    capsys: Capture,
 ) -> None:
     assert call("train", "--help") == 0
     out = capsys.readouterr().out
-    assert all(f" {name} " in out for name in METHODS) and not any(
-        f"grid-{name} " in out for name in ABLATIONS
-    )
-    assert all(name in out for name in ABLATIONS) and len(out.splitlines()) < 60
+    assert all(f" {name} " in out for name in METHODS)
+    assert all(name in out for name in ABLATIONS)
+    assert not any(f"grid-{name} " in out for name in ABLATIONS)
+    assert len(out.splitlines()) < 60
 
 
-def test_an_ablation_reaches_the_verb_by_its_name(
-    act: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[TrainConfig] = []
-    monkeypatch.setitem(cli.VERBS, "train", replace(cli.VERBS["train"], act=seen.append))
+def test_an_ablation_reaches_the_verb_by_its_name(trained_with: list[TrainConfig]) -> None:
     assert call("train", "splat-response-mlp", "--steps", "7") == 0
-    assert seen == [replace(PRESETS["splat-response-mlp"], steps=7)]
+    assert trained_with == [replace(PRESETS["splat-response-mlp"], budget=Budget(steps=7))]
 
 
-def test_help_lists_every_verb(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_preset_with_a_line_of_help_exists() -> None:
+    assert list(cli.PRESET_HELP) == list(METHODS)
+
+
+def test_help_lists_every_verb(capsys: Capture) -> None:
     assert call("--help") == 0
     out = capsys.readouterr().out
     assert all(f"\n  {verb} " in out for verb in cli.VERBS)
 
 
-def test_no_verb_prints_the_help_and_is_an_error(capsys: pytest.CaptureFixture[str]) -> None:
+def test_no_verb_prints_the_help_and_is_an_error(capsys: Capture) -> None:
     assert call() == 2 and "usage:" in capsys.readouterr().out
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+def test_version(capsys: Capture) -> None:
     assert call("--version") == 0 and capsys.readouterr().out == f"hdr-nsff {__version__}\n"
 
 
-def test_an_unknown_verb_is_one_sentence_with_the_known_ones(
-    capsys: pytest.CaptureFixture[str],
+def new_process(code: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """A Python process that has run `code`."""
+    command = [sys.executable, "-c", code, *arguments]
+    return subprocess.run(command, capture_output=True, text=True)
+
+
+def test_importing_the_command_line_imports_no_library() -> None:
+    loaded = "import sys, hdr_nsff.cli; print({name.partition('.')[0] for name in sys.modules})"
+    names = new_process(loaded).stdout
+    assert "'hdr_nsff'" in names
+    assert not any(f"'{name}'" in names for name in ("torch", "numpy", "numba", "cv2", "tyro"))
+
+
+@pytest.mark.parametrize("option", ["--version", "--help"])
+def test_version_and_help_answer_at_once(option: str) -> None:
+    seconds = []
+    for _ in range(5):
+        start = time.monotonic()
+        assert new_process(MAIN, option).returncode == 0
+        seconds.append(time.monotonic() - start)
+    assert min(seconds) < 0.3
+
+
+def test_an_unknown_verb_is_one_sentence_with_the_one_that_was_meant(capsys: Capture) -> None:
+    assert call("trian") == 2
+    sentence = one_sentence(capsys.readouterr().err)
+    assert "no verb 'trian'; did you mean train?" in sentence
+    assert all(verb in sentence for verb in cli.VERBS)
+
+
+def test_an_unknown_verb_like_no_other_gets_the_list_alone(capsys: Capture) -> None:
+    assert call("quux") == 2
+    assert "did you mean" not in one_sentence(capsys.readouterr().err)
+
+
+def test_a_library_that_cannot_be_imported_is_one_sentence(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert call("sparkle") == 2
-    said = one_sentence(capsys.readouterr().err)
-    assert "'sparkle'" in said and all(verb in said for verb in cli.VERBS)
+    monkeypatch.delitem(sys.modules, "hdr_nsff.synth.reexpose", raising=False)
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    monkeypatch.delitem(sys.modules, "hdr_nsff.core.io")
+    assert call("reexpose", "clip", "out") == 2
+    sentence = one_sentence(capsys.readouterr().err)
+    assert "cv2" in sentence and "`hdr-nsff doctor`" in sentence
+
+
+def test_a_broken_import_inside_the_package_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = replace(cli.VERBS["report"], function="hdr_nsff.no_such_room:report")
+    monkeypatch.setitem(cli.VERBS, "report", broken)
+    with pytest.raises(ModuleNotFoundError, match="no_such_room"):
+        call("report")
+
+
+def test_a_very_long_argument_is_not_repeated_whole(act: Act, capsys: Capture) -> None:
+    act(raising(InputError(f"--ev {'9' * 5000}: write stops")))
+    assert call("evaluate", "run") == 2
+    sentence = one_sentence(capsys.readouterr().err)
+    assert len(sentence) < 600 and sentence.endswith("9: write stops")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["prepare", "--help"], ["weights"]])
+def test_a_reader_that_has_gone_gets_silence(arguments: list[str]) -> None:
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, "-c", MAIN, *arguments]
+    process = subprocess.Popen(command, stdout=write_end, stderr=subprocess.PIPE, text=True)
+    os.close(write_end)
+    assert process.communicate(timeout=120)[1] == ""
+    assert process.returncode in (1, 141)  # 1: `rich` closes the pipe of a table itself
+
+
+def test_ctrl_c_while_libraries_are_imported_shows_no_traceback() -> None:
+    interrupted = """
+import signal, sys
+def interrupt(event, arguments):
+    if event == "import" and arguments[0] == sys.argv[1]:
+        signal.raise_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.addaudithook(interrupt)
+from hdr_nsff.cli import main
+main(["report", "--help"])
+"""
+    for module in ("hdr_nsff.core.process", "hdr_nsff.core.io", "cv2"):
+        ended = new_process(interrupted, module)
+        assert ended.returncode == 130, module
+        assert "Traceback" not in ended.stderr
 
 
 @pytest.mark.parametrize(
@@ -132,49 +216,31 @@ def test_what_the_parser_refuses_exits_with_2(arguments: tuple[str, ...]) -> Non
     assert call(*arguments) == 2
 
 
-def test_arguments_reach_the_verb(act: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[TrainConfig] = []
-    monkeypatch.setitem(cli.VERBS, "train", replace(cli.VERBS["train"], act=seen.append))
-    arguments = [
-        "--scene",
-        "a b/é",
-        "--steps",
-        "7",
-        "--field.samples",
-        "9",
-        "--field.encoding.levels",
-        "3",
-        "--loss.cycle",
-        "0.25",
-    ]
-    assert call("train", "grid", *arguments) == 0
-    got, default = seen[0], PRESETS["grid"]
-    assert (got.scene, got.steps, got.field.samples, got.loss.cycle) == (Path("a b/é"), 7, 9, 0.25)
-    assert (
-        got.field.encoding == replace(default.field.encoding, levels=3) and got.rays == default.rays
-    )
+def test_arguments_reach_the_verb(trained_with: list[TrainConfig]) -> None:
+    fields = ["--field.samples", "9", "--field.encoding.levels", "3", "--loss.cycle", "0.25"]
+    assert call("train", "grid", "--scene", "a b/é", "--steps", "7", *fields) == 0
+    (config,) = trained_with
+    default = PRESETS["grid"]
+    assert config.scene == Path("a b/é")
+    assert (config.steps, config.rays) == (7, default.rays)
+    assert (config.field.samples, config.loss.cycle) == (9, 0.25)
+    assert config.field.encoding == replace(default.field.encoding, levels=3)
 
 
-def test_bad_input_is_one_sentence_and_exit_code_2(
-    act: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_sentence_and_exit_code_2(act: Act, capsys: Capture) -> None:
     act(raising(InputError("x.png: cut short; copy it again")))
     assert call("evaluate", "run") == 2
     assert one_sentence(capsys.readouterr().err) == "hdr-nsff: x.png: cut short; copy it again"
 
 
-def test_ctrl_c_exits_with_130_and_says_how_to_go_on(
-    act: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ctrl_c_exits_with_130_and_says_how_to_continue(act: Act, capsys: Capture) -> None:
     act(raising(KeyboardInterrupt()))
     assert call("evaluate", "run") == 130
-    assert "the same command goes on" in one_sentence(capsys.readouterr().err)
+    assert "the same command continues" in one_sentence(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS])
-def test_a_disk_that_takes_nothing_is_one_sentence(
-    number: int, act: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_disk_that_takes_nothing_is_one_sentence(number: int, act: Act, capsys: Capture) -> None:
     act(raising(OSError(number, os.strerror(number), "out/a.exr")))
     assert call("evaluate", "run") == 2
     said = one_sentence(capsys.readouterr().err)
@@ -184,14 +250,14 @@ def test_a_disk_that_takes_nothing_is_one_sentence(
 @pytest.mark.parametrize(
     "error", [RuntimeError("ours"), OSError(errno.EBADF, "ours"), AssertionError("ours")]
 )
-def test_our_own_mistakes_are_not_hidden(error: Exception, act: Any) -> None:
+def test_our_own_mistakes_are_not_hidden(error: Exception, act: Act) -> None:
     act(raising(error))
     with pytest.raises(type(error), match="ours"):
         call("evaluate", "run")
 
 
 def test_training_from_a_folder_that_is_no_scene_is_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: Capture
 ) -> None:
     assert call("train", "tiny", "--scene", str(tmp_path), "--out", str(tmp_path / "run")) == 2
     assert "no scene.json here" in one_sentence(capsys.readouterr().err)
@@ -199,7 +265,7 @@ def test_training_from_a_folder_that_is_no_scene_is_one_sentence(
 
 
 def test_what_run_will_need_at_its_end_is_checked_at_its_start(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: Capture
 ) -> None:
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(b"")
@@ -265,9 +331,6 @@ def test_ctrl_c_while_training_keeps_the_last_checkpoint(toy_folder: Path, tmp_p
         time.sleep(0.02)
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=60)
-    assert (
-        process.returncode == 130
-        and "Traceback" not in error
-        and "the same command goes on" in error
-    )
+    assert process.returncode == 130
+    assert "Traceback" not in error and "the same command continues" in error
     assert 0 < Run.open(tmp_path / "run").step < 100_000

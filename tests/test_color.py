@@ -1,6 +1,4 @@
-"""Fixed curves: known points, inverses, and the display tone map's promises; numpy and
-torch give the same.
-"""
+"""Fixed curves: known points, inverses, the display tone map; numpy and torch agree."""
 
 import numpy as np
 import pytest
@@ -11,28 +9,15 @@ from hdr_nsff.maths import color
 LINEAR = np.linspace(0, 1, 101)
 
 
-@pytest.mark.parametrize("encode, decode", [
-    (color.srgb_encode, color.srgb_decode), (color.gamma_encode, color.gamma_decode), (color.hlg_encode, color.hlg_decode),
-])  # fmt: skip
-def test_decoding_undoes_encoding(encode, decode):
-    encoded = encode(LINEAR)
-    np.testing.assert_allclose(decode(encoded), LINEAR, atol=1e-6)
+def test_srgb_decoding_undoes_encoding():
+    encoded = color.srgb_encode(LINEAR)
+    np.testing.assert_allclose(color.srgb_decode(encoded), LINEAR, atol=1e-6)
     assert encoded[0] == pytest.approx(0, abs=1e-9) and encoded[-1] == pytest.approx(1, abs=1e-6)
     assert (np.diff(encoded) > 0).all()
 
 
-def test_pq_decoding_undoes_encoding():
-    nits = np.geomspace(0.01, 10000, 50)
-    np.testing.assert_allclose(color.pq_decode(color.pq_encode(nits)), nits, rtol=1e-6)
-
-
 def test_known_points_of_the_standards():
     assert color.srgb_encode(np.array(0.18)) == pytest.approx(0.4614, abs=1e-4)
-    assert color.pq_encode(np.array(100.0)) == pytest.approx(
-        0.5081, abs=1e-4
-    )  # BT.2100: 100 cd/m^2
-    assert color.pq_encode(np.array(10000.0)) == pytest.approx(1.0)
-    assert color.hlg_encode(np.array(1 / 12)) == pytest.approx(0.5)
     assert color.pu21_encode(np.array(100.0)) == pytest.approx(256, abs=1)
     assert color.mu_law(np.array(0.1), mu=50.0) == pytest.approx(np.log(6) / np.log(51))
 
@@ -42,24 +27,17 @@ def test_numpy_and_torch_agree():
     curves = (
         color.srgb_encode,
         color.mu_law,
-        color.pq_encode,
-        color.hlg_encode,
         color.pu21_encode,
         color.display,
         color.luminance,
     )
     for curve in curves:
-        np.testing.assert_allclose(
-            curve(torch.from_numpy(rgb)).numpy(), curve(rgb), rtol=1e-9, atol=1e-12
-        )
+        from_torch = curve(torch.from_numpy(rgb)).numpy()
+        np.testing.assert_allclose(from_torch, curve(rgb), rtol=1e-9, atol=1e-12)
     assert color.auto_exposure(torch.from_numpy(rgb)) == pytest.approx(color.auto_exposure(rgb))
 
 
-def test_one_stop_doubles():
-    np.testing.assert_allclose(color.scale_ev(LINEAR, 1.0), 2 * LINEAR)
-
-
-def test_auto_exposure_brings_gray_to_the_key_whatever_lamp_is_in_view():
+def test_auto_exposure_brings_gray_to_the_key_also_with_a_lamp_in_view():
     room = np.full((1000, 3), 0.02)
     lamp = room.copy()
     lamp[:15] = 500.0  # 1.5 % of the pixels
@@ -79,14 +57,10 @@ def test_bright_colors_lose_saturation_not_hue():
     red = np.array([[30.0, 3.0, 1.0]])
     shown = color.srgb_decode(color.display(red))[0]
     assert shown[0] == pytest.approx(1.0, abs=1e-6) and shown[0] > shown[1] > shown[2] > 0.1
-    y = color.luminance(red)[0]
-    assert color.luminance(shown) == pytest.approx(
-        y * (1 + y / 1600) / (1 + y), rel=1e-6
-    )  # the curve's luminance is kept
-    np.testing.assert_allclose(
-        (red[0] - y)[1] / (red[0] - y)[2],
-        (shown - color.luminance(shown))[1] / (shown - color.luminance(shown))[2],
-    )
+    y, y_shown = color.luminance(red)[0], color.luminance(shown)
+    assert y_shown == pytest.approx(y * (1 + y / 1600) / (1 + y), rel=1e-6)  # the curve's
+    chroma, chroma_shown = red[0] - y, shown - y_shown
+    np.testing.assert_allclose(chroma[1] / chroma[2], chroma_shown[1] / chroma_shown[2])
 
 
 def test_black_stays_black():

@@ -1,12 +1,19 @@
-"""Cosine cost volumes and their soft-argmax: a known shift comes back to a fraction of
-a cell.
+"""Cosine cost volumes and their soft-argmax: a known shift is found to a fraction of a
+cell.
 """
 
 import numpy as np
 import pytest
 import torch
 
-from hdr_nsff.priors.flow.correlation import cells, locate, motion, sample, soft_argmax
+from hdr_nsff.priors.flow.correlation import (
+    Search,
+    cell_positions,
+    feature_motion,
+    locate,
+    sample_features,
+    soft_argmax,
+)
 
 
 def shifted(
@@ -18,11 +25,8 @@ def shifted(
     rng = np.random.default_rng(0)
     fy, fx = np.fft.fftfreq(size[0])[:, None], np.fft.fftfreq(size[1])
     low = np.exp(-((fx**2 + fy**2) * (2 * np.pi * 1.0) ** 2) / 2)  # a blur of one cell
-    spectrum = (
-        np.fft.fft2(rng.normal(size=(channels, *size)))
-        * low
-        * np.exp(-2j * np.pi * (fx * dx + fy * dy))
-    )
+    phase = np.exp(-2j * np.pi * (fx * dx + fy * dy))
+    spectrum = np.fft.fft2(rng.normal(size=(channels, *size))) * low * phase
     return torch.from_numpy(np.fft.ifft2(spectrum).real.astype(np.float32))
 
 
@@ -30,47 +34,44 @@ def shifted(
     ("dx", "dy"), [(0.0, 0.0), (2.0, -1.0), (0.5, 0.0), (1.3, -0.7), (-2.25, 1.5)]
 )
 def test_a_shift_is_found_to_a_twentieth_of_a_cell(dx: float, dy: float):
-    found = motion(shifted(0, 0), shifted(dx, dy), reach=5, radius=3, temperature=0.12)[5:-5, 5:-5]
+    search = Search(reach=5, radius=3, temperature=0.12)
+    found = feature_motion(shifted(0, 0), shifted(dx, dy), search)[5:-5, 5:-5]
     assert (found.mean((0, 1)) - torch.tensor([dx, dy])).abs().max() < 0.05
 
 
-def test_a_gaussian_cost_gives_the_middle_of_the_gaussian():
-    """softmax(cost / temperature) of a parabola is a Gaussian, whose mean is the
+def test_the_maximum_of_a_parabola_is_found():
+    """softmax(similarity / temperature) of a parabola is a Gaussian, whose mean is the
     parabola's top.
     """
-    place, top = cells(15, 15), torch.tensor([7.3, 6.6])
-    cost = 1 - 0.02 * ((place - top) ** 2).sum(-1)[None]
-    assert torch.allclose(soft_argmax(cost, place, radius=5, temperature=0.04)[0], top, atol=1e-3)
+    positions, top = cell_positions(15, 15), torch.tensor([7.3, 6.6])
+    similarity = 1 - 0.02 * ((positions - top) ** 2).sum(-1)[None]
+    found = soft_argmax(similarity, positions, radius=5, temperature=0.04)[0]
+    assert torch.allclose(found, top, atol=1e-3)
 
 
 def test_nothing_is_found_beyond_reach():
-    a = shifted(0, 0)
-    near = motion(a, shifted(6, 0), reach=3, radius=0, temperature=0.03)
-    assert near.abs().max() <= 3
+    search = Search(reach=3, radius=0, temperature=0.03)
+    found = feature_motion(shifted(0, 0), shifted(6, 0), search)
+    assert found.abs().max() <= 3
 
 
 def test_sampling_at_a_cell_gives_the_cell_and_between_two_their_mean():
     maps = torch.rand(4, 5, 6)
-    found = sample(maps, torch.tensor([[2.0, 3.0], [2.5, 3.0]]))
+    found = sample_features(maps, torch.tensor([[2.0, 3.0], [2.5, 3.0]]))
     assert torch.allclose(found[0], maps[:, 3, 2], atol=1e-5)
     assert torch.allclose(found[1], (maps[:, 3, 2] + maps[:, 3, 3]) / 2, atol=1e-5)
 
 
 def test_positions_carry_a_gradient_to_the_features():
     a = shifted(0, 0).requires_grad_()
-    locate(
-        sample(a, torch.tensor([[8.0, 9.0]])),
-        torch.tensor([[8.0, 9.0]]),
-        shifted(0.4, 0),
-        4,
-        2,
-        0.05,
-    ).sum().backward()
+    start = torch.tensor([[8.0, 9.0]])
+    found = locate(sample_features(a, start), start, shifted(0.4, 0), Search(4, 2, 0.05))
+    found.sum().backward()
     assert a.grad is not None and a.grad.abs().sum() > 0
 
 
-def test_chunks_do_not_change_the_answer(monkeypatch):
-    a, b = shifted(0, 0), shifted(1.5, 0.5)
-    whole = motion(a, b, 4, 2, 0.05)
+def test_chunks_do_not_change_the_result(monkeypatch):
+    a, b, search = shifted(0, 0), shifted(1.5, 0.5), Search(4, 2, 0.05)
+    whole = feature_motion(a, b, search)
     monkeypatch.setattr("hdr_nsff.priors.flow.correlation.CHUNK", 37)
-    assert torch.allclose(motion(a, b, 4, 2, 0.05), whole, atol=1e-5)
+    assert torch.allclose(feature_motion(a, b, search), whole, atol=1e-5)

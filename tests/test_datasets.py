@@ -14,7 +14,8 @@ import pytest
 from mutations import check_json_reader, check_reader
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_image, write_png, write_video
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.datasets import held_out_views, layout_of, recognize
 from hdr_nsff.footage.datasets.capture import Capture, Clock, number_cameras
 from hdr_nsff.footage.pose_files import placed

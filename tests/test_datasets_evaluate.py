@@ -14,8 +14,10 @@ import torch
 from fakes import EV, DiscBeforeWall, H, W, camera, fake_run
 
 from hdr_nsff import pipeline as run_all
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.prepare.prepare import PrepareConfig
@@ -38,9 +40,9 @@ def write_truth(folder: Path, run: Run, radiance: str, **changes: Any) -> Path:
         if name == "a":
             recorded[3] = run.tonemapper.develop(exact, BRIGHTER, 0)
         for b, rgb in recorded.items():
-            io.write_png(folder / f"recorded/{name}_{b}.png", rgb.reshape(H, W, 3).numpy(), bits=16)
+            write_png(folder / f"recorded/{name}_{b}.png", rgb.reshape(H, W, 3).numpy(), bits=16)
         if name in radiance:
-            io.write_exr(
+            write_exr(
                 folder / f"radiance/{name}.exr", {"RGB": exact.reshape(H, W, 3).numpy()}, half=False
             )
         views.append(
@@ -62,7 +64,7 @@ def write_truth(folder: Path, run: Run, radiance: str, **changes: Any) -> Path:
         clip_c2w=[f.camera.c2w.tolist() for f in run.scene.train],
         views=views,
     )
-    io.write_json(folder / "truth.json", truth.model_copy(update=changes).model_dump())
+    write_json(folder / "truth.json", truth.model_copy(update=changes).model_dump())
     return folder
 
 
@@ -99,8 +101,8 @@ def test_views_without_radiance_do_not_count_in_its_scores(tmp_path: Path) -> No
     assert one["scale"] == pytest.approx(1, abs=1e-3)
     assert one["peak"] == pytest.approx(3)  # the disc's red
     assert (
-        io.read_image(run.folder / "evaluation/a.png").shape[0]
-        < io.read_image(run.folder / "evaluation/b.png").shape[0]
+        read_image(run.folder / "evaluation/a.png").shape[0]
+        < read_image(run.folder / "evaluation/b.png").shape[0]
     )
 
 
@@ -111,11 +113,11 @@ def test_moving_pixels_count_alone_at_all_exposures_of_a_view(tmp_path: Path) ->
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
     for path in (folder / "recorded").glob("*.png"):
-        io.write_png(path, io.read_image(path) * (np.arange(W) < W // 2)[None, :, None], bits=16)
-    io.write_png(folder / "left.png", np.arange(W)[None, :].repeat(H, 0) < W // 2)
-    truth = io.read_json(folder / "truth.json")
+        write_png(path, read_image(path) * (np.arange(W) < W // 2)[None, :, None], bits=16)
+    write_png(folder / "left.png", np.arange(W)[None, :].repeat(H, 0) < W // 2)
+    truth = read_json(folder / "truth.json")
     truth["views"][0]["mask"] = "left.png"
-    io.write_json(folder / "truth.json", truth)
+    write_json(folder / "truth.json", truth)
     view = evaluate_run(run, folder)["views"][0]
     for score in ("psnr", "psnr_all_exposures", "psnr_novel_exposures"):
         moving = score.replace("psnr", "psnr_moving")
@@ -128,7 +130,7 @@ def test_a_view_is_seen_through_a_lens_of_its_own(tmp_path: Path) -> None:
     """
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
-    truth, K = io.read_json(folder / "truth.json"), camera().K * torch.tensor([[2.0], [2.0], [1.0]])
+    truth, K = read_json(folder / "truth.json"), camera().K * torch.tensor([[2.0], [2.0], [1.0]])
     K[:2, 2] = camera().K[:2, 2]
     near = Camera(K, torch.tensor(truth["views"][0]["c2w"]), W, H)
     rgb = (
@@ -136,10 +138,10 @@ def test_a_view_is_seen_through_a_lens_of_its_own(tmp_path: Path) -> None:
         .detach()
         .reshape(H, W, 3)
     )
-    io.write_png(folder / "recorded/a_0.png", rgb.numpy(), bits=16)
+    write_png(folder / "recorded/a_0.png", rgb.numpy(), bits=16)
     assert evaluate_run(run, folder)["views"][0]["psnr"] < 40
     truth["views"][0]["K"] = K.tolist()
-    io.write_json(folder / "truth.json", truth)
+    write_json(folder / "truth.json", truth)
     result = evaluate_run(run, folder)
     assert result["views"][0]["psnr"] > 60
     assert result["poses"]["focal_error"] == pytest.approx(0, abs=1e-6)
@@ -216,9 +218,9 @@ def test_a_view_that_makes_no_sense_is_one_sentence(
 ) -> None:
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="")
-    truth = io.read_json(folder / "truth.json")
+    truth = read_json(folder / "truth.json")
     truth["views"][0] |= update
-    io.write_json(folder / "truth.json", truth)
+    write_json(folder / "truth.json", truth)
     with pytest.raises(InputError, match=words):
         Truth.open(folder)
 
@@ -226,7 +228,7 @@ def test_a_view_that_makes_no_sense_is_one_sentence(
 def test_pictures_of_several_sizes_are_refused(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     folder = write_truth(tmp_path / "truth", run, radiance="ab")
-    io.write_png(folder / "recorded/a_0.png", np.zeros((H // 2, W // 2, 3)))
+    write_png(folder / "recorded/a_0.png", np.zeros((H // 2, W // 2, 3)))
     with pytest.raises(InputError, match="several sizes"):
         evaluate_run(run, folder)
 
@@ -246,7 +248,7 @@ def test_run_measures_on_what_the_data_set_held_out(
 
     def prepare(config: PrepareConfig) -> Path:
         place = config.out.with_name("scene_truth")
-        io.write_json(place / "made_of.json", {"key": ""})
+        write_json(place / "made_of.json", {"key": ""})
         write_truth(place, run, radiance="")
         return config.out
 

@@ -13,25 +13,23 @@ from typing import Any, Literal
 import miniatures as mini
 import numpy as np
 import pytest
+from estimates import forget_movers
 from toy_scene import ToyScene
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import (
-    read_image,
-    read_mask,
-    read_npy,
-    write_exr,
-    write_json,
-    write_npy,
-    write_png,
-)
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_json, write_npy
 from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.layouts import colmap as to_colmap
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.radiometry.recording import response_curve
-from hdr_nsff.rendering.export import Coloring, ExportConfig, export
-from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene
+from hdr_nsff.rendering.export import ExportConfig, export
+from hdr_nsff.rendering.export_gaussians import ColorTransform
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
+from hdr_nsff.scene.response import read_response, write_response
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView, true_pictures
 
 LAYOUTS = ("hdr-gopro", "nerfstudio")
@@ -118,7 +116,8 @@ def test_a_round_trip_is_exact(layout: str, scene: Path) -> None:
     assert a.points
     assert b.points
     assert (read_npy(scene / a.points) == read_npy(again / b.points)).all()
-    steps = {n: s.provenance for n, s in b.steps.items() if n != "sheet"}
+    estimated = ("sheet", "response", "movers")
+    steps = {n: s.provenance for n, s in b.steps.items() if n not in estimated}
     assert set(steps.values()) == {"given"}
 
 
@@ -201,6 +200,7 @@ def test_held_out_frames_become_test_pictures_and_come_back_as_truth(scene: Path
     keep = [0, 1, 2, 4, 5]
     m.frames[2].flow[4], m.frames[4].flow[2] = m.frames[2].flow[3], m.frames[4].flow[3]
     m.save(scene)
+    forget_movers(scene)
     again = round_trip(scene, "nerfstudio")
     b = Manifest.load(again)
     assert [f.time for f in b.frames] == keep
@@ -226,6 +226,7 @@ def test_the_gopro_layout_has_no_place_for_held_out_frames_of_the_clip(
     m.frames[3].split, m.frames[3].disparity, m.frames[3].disparity_confidence = "test", None, None
     m.frames[2].flow[4], m.frames[4].flow[2] = m.frames[2].flow[3], m.frames[4].flow[3]
     m.save(scene)
+    forget_movers(scene)
     again = Manifest.load(round_trip(scene, "hdr-gopro"))
     assert [f.time for f in again.frames] == [0, 1, 2, 4, 5]
     assert "no place for the 1 frames" in " ".join(capsys.readouterr().err.split())
@@ -237,6 +238,10 @@ def test_cameras_that_record_at_once_fit_nerfstudio_alone(scene: Path) -> None:
         f.camera_id, f.time = divmod(f.index, 3)
         f.flow = {to: files for to, files in f.flow.items() if to // 3 == f.camera_id}
     m.save(scene)
+    forget_movers(scene)
+    response = read_response(scene / "response.json", num_cameras=1, num_brackets=3)
+    both = replace(response, y=np.repeat(response.y, 2, 0), white_balance=np.zeros((2, 3)))
+    write_response(scene / "response.json", both)
     with pytest.raises(InputError, match="one picture per time"):
         export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro"))
     again = Manifest.load(round_trip(scene, "nerfstudio"))
@@ -291,6 +296,7 @@ def test_files_of_an_earlier_export_do_not_stay(layout: str, scene: Path) -> Non
     m.frames, m.points = m.frames[:4], None
     m.frames[3].flow.pop(4)
     m.save(scene)
+    forget_movers(scene)
     export(config)
     left = files_of(out)
     assert left.pop("images/mine.txt") == b"mine"
@@ -373,12 +379,12 @@ def test_settings_that_make_no_sense_with_a_layout_are_one_sentence(
 ) -> None:
     config = ExportConfig(scene, tmp_path / "out", layout="nerfstudio")
     for wrong in (replace(config, ply=True), replace(config, layout=None)):
-        with pytest.raises(InputError, match="say what to write"):
+        with pytest.raises(InputError, match="choose what to write"):
             export(wrong)
     for wrong in (
         replace(config, time=1.0),
-        replace(config, coloring=Coloring(ev=1.0)),
-        replace(config, coloring=Coloring(linear=True)),
+        replace(config, colors=ColorTransform(ev=1.0)),
+        replace(config, colors=ColorTransform(linear=True)),
     ):
         with pytest.raises(InputError, match="are for Gaussians"):
             export(wrong)

@@ -16,11 +16,14 @@ import pytest
 from miniatures import EV, H, W
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, read_mask, write_npy, write_png
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.datasets.capture import SparseDepth
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
-from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 
 
@@ -59,7 +62,7 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
     assert expected in printed
     found = provenance(gopro.out)
     estimated = {step for step, how in found.items() if how == "estimated"}
-    assert estimated == {"exposure", "sheet"}
+    assert estimated == {"exposure", "response", "movers", "sheet"}
     assert set(found.values()) == {"estimated", "given"}
     assert [f.bracket for f in scene.train] == [0, 1, 2] * 3
     assert not scene.test
@@ -233,7 +236,7 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
     steps = Manifest.load(gopro.out).steps
     attempts = {name: step.details["attempt"] for name, step in steps.items()}
     repeated = {name for name, attempt in attempts.items() if attempt == 2}
-    assert repeated == {"masks", "refined_flow", "depth", "sheet"}
+    assert {"frames", "exposure", "flow", "poses"} == attempts.keys() - repeated
     assert max(attempts.values()) == 2
 
 

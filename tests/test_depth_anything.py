@@ -1,5 +1,5 @@
-"""Depth Anything's answers are laid onto static points: known scales and shifts come
-back, outliers and gaps are borne; a tiny network runs.
+"""Depth Anything's predictions are aligned to static points: known scales and shifts
+come back, in spite of outliers and gaps; a tiny network runs.
 """
 
 import numpy as np
@@ -8,7 +8,12 @@ import torch
 from tiny_networks import tiny_depth_anything
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.priors.depth.depth_anything import align, anchored_depth, network_disparity, picture
+from hdr_nsff.priors.depth.depth_anything import (
+    align,
+    anchored_depth,
+    network_disparity,
+    network_input,
+)
 from hdr_nsff.priors.pretrained import pretrained
 from hdr_nsff.scene.posed_video import PosedVideo
 
@@ -20,17 +25,15 @@ NONE = (np.zeros((0, H, W, 2), np.float32), np.zeros((0, H, W), bool), np.zeros(
 def frames_of(
     lines: np.ndarray, number: int = 200, outliers: float = 0.0, noise: float = 0.0
 ) -> list[np.ndarray]:
-    """Answers and the disparities that the lines (T, 2) make of them, some of them
-    anything.
-    """
+    """Predictions and their disparities by the lines (T, 2), some of them random."""
     rng = np.random.default_rng(3)
     seen = []
     for scale, shift in lines:
-        answers = rng.uniform(1, 9, number)
-        disparity = scale * answers + shift + noise * rng.normal(size=number)
+        predictions = rng.uniform(1, 9, number)
+        disparity = scale * predictions + shift + noise * rng.normal(size=number)
         wrong = rng.random(number) < outliers
         seen.append(
-            np.stack([answers, np.where(wrong, rng.uniform(0.05, 3, number), disparity)], 1)
+            np.stack([predictions, np.where(wrong, rng.uniform(0.05, 3, number), disparity)], 1)
         )
     return seen
 
@@ -39,13 +42,13 @@ CHANGING = np.stack([0.1 + 0.01 * np.arange(6), 0.05 + 0.02 * np.sin(np.arange(6
 
 
 def test_a_scale_and_shift_per_frame_come_back_exactly():
-    lines, errors = align(frames_of(CHANGING), shift=True)
+    lines, errors = align(frames_of(CHANGING), with_shift=True)
     np.testing.assert_allclose(lines, CHANGING, rtol=1e-6)
     assert errors.max() < 1e-6
 
 
 def test_thirty_percent_outliers_hardly_move_them():
-    lines, _ = align(frames_of(CHANGING, outliers=0.3, noise=0.005), shift=True)
+    lines, _ = align(frames_of(CHANGING, outliers=0.3, noise=0.005), with_shift=True)
     at = np.linspace(1, 9, 5)[:, None]
     made, true = (x[:, 0] * at + x[:, 1] for x in (lines, CHANGING))
     assert np.abs(made / true - 1).max() < 0.02
@@ -53,7 +56,7 @@ def test_thirty_percent_outliers_hardly_move_them():
 
 def test_a_metric_network_needs_one_scale_per_frame_and_gets_no_shift():
     scales = CHANGING * [1, 0]
-    lines, _ = align(frames_of(scales, outliers=0.3, noise=0.003), shift=False)
+    lines, _ = align(frames_of(scales, outliers=0.3, noise=0.003), with_shift=False)
     assert (lines[:, 1] == 0).all()
     np.testing.assert_allclose(lines[:, 0], scales[:, 0], rtol=0.01)
 
@@ -61,7 +64,7 @@ def test_a_metric_network_needs_one_scale_per_frame_and_gets_no_shift():
 def test_a_frame_without_points_takes_the_middle_of_its_neighbors():
     seen = frames_of(np.array([[0.1, 0.2], [0.1, 0.2], [0.14, 0.1]]))
     seen[1] = seen[1][:0]
-    lines, errors = align(seen, shift=True)
+    lines, errors = align(seen, with_shift=True)
     np.testing.assert_allclose(lines, [[0.1, 0.2], [0.12, 0.15], [0.14, 0.1]], rtol=1e-6)
     assert np.isfinite(errors).all()
 
@@ -69,19 +72,19 @@ def test_a_frame_without_points_takes_the_middle_of_its_neighbors():
 def test_a_frame_at_the_end_without_points_takes_that_of_the_frame_before():
     seen = frames_of(CHANGING[:3])
     seen[2] = seen[2][:0]
-    np.testing.assert_allclose(align(seen, shift=True)[0][2], CHANGING[1], rtol=1e-4)
+    np.testing.assert_allclose(align(seen, with_shift=True)[0][2], CHANGING[1], rtol=1e-4)
 
 
 def test_two_wrong_points_of_a_frame_are_overruled_by_its_neighbors():
     same = np.tile([0.1, 0.2], (3, 1))
     seen = frames_of(same, noise=0.002)
     seen[1] = np.array([[2.0, 2.5], [8.0, 0.1]])  # near is far
-    np.testing.assert_allclose(align(seen, shift=True)[0][1], same[1], rtol=0.05)
+    np.testing.assert_allclose(align(seen, with_shift=True)[0][1], same[1], rtol=0.05)
 
 
 def test_many_points_are_not_bent_towards_the_neighbors():
     own = np.array([[0.1, 0.0], [0.3, 0.5], [0.1, 0.0]])
-    np.testing.assert_allclose(align(frames_of(own, number=40), shift=True)[0], own, atol=1e-6)
+    np.testing.assert_allclose(align(frames_of(own, number=40), with_shift=True)[0], own, atol=1e-6)
 
 
 def slanted(count: int = 3) -> tuple[PosedVideo, np.ndarray, np.ndarray]:
@@ -107,31 +110,30 @@ def slanted(count: int = 3) -> tuple[PosedVideo, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
-def test_answers_of_a_wall_become_its_disparity_in_scene_units(kind):
+def test_predictions_of_a_wall_become_its_disparity_in_scene_units(kind):
     clip, true, points = slanted()
-    answered = 7 * true + (3 if kind == "relative" else 0)
-    disparity, confidence, near, far = anchored_depth(answered, kind, clip, points, *NONE)
+    predicted = 7 * true + (3 if kind == "relative" else 0)
+    disparity, confidence, near, far = anchored_depth(predicted, kind, clip, points, *NONE)
     np.testing.assert_allclose(disparity, true, rtol=2e-3)
     assert confidence.min() > 0.95 and near < 1 / true.max() and far > 1 / true.min()
 
 
-def test_points_behind_a_mover_have_no_say():
+def test_points_behind_a_mover_do_not_count():
     clip, true, points = slanted()
     clip.moving[:, :, : W // 2] = True
-    answered = np.where(clip.moving, 40, 7 * true + 3).astype(
-        np.float32
-    )  # something near in front of that half
-    disparity, _, _, _ = anchored_depth(answered, "relative", clip, points, *NONE)
+    # something near in front of that half
+    predicted = np.where(clip.moving, 40, 7 * true + 3).astype(np.float32)
+    disparity, _, _, _ = anchored_depth(predicted, "relative", clip, points, *NONE)
     np.testing.assert_allclose(disparity[~clip.moving], true[~clip.moving], rtol=2e-3)
     assert disparity[clip.moving].min() > 1.5 * true.max()
 
 
-def test_answers_that_do_not_fit_the_points_are_believed_less_and_never_negative():
+def test_predictions_that_do_not_fit_the_points_have_low_confidence_and_are_never_negative():
     clip, true, points = slanted()
     noise = np.random.default_rng(1).normal(size=true.shape).astype(np.float32)
-    answered = true + 0.3 * true * noise
-    answered[:, 0, 0] = -100
-    disparity, confidence, _, _ = anchored_depth(answered, "relative", clip, points, *NONE)
+    predicted = true + 0.3 * true * noise
+    predicted[:, 0, 0] = -100
+    disparity, confidence, _, _ = anchored_depth(predicted, "relative", clip, points, *NONE)
     assert disparity.min() > 0 and (confidence[:, 0, 0] == 0).all()
     assert confidence.max() < 0.6
 
@@ -148,27 +150,23 @@ def tiny(request, tmp_path_factory):
     return request.param, tiny_depth_anything(tmp_path_factory.mktemp("depth"), request.param)
 
 
-def test_a_tiny_network_answers_every_frame_at_its_size_and_its_kind_is_read(tiny):
+def test_a_tiny_network_predicts_every_frame_at_its_size_and_its_kind_is_read(tiny):
     kind, folder = tiny
     network = pretrained("DepthAnythingForDepthEstimation", str(folder))
     video = np.random.default_rng(0).random((2, H, W, 3)).astype(np.float32)
-    answered, found = network_disparity(network, video)
-    assert found == kind and answered.shape == (2, H, W) and np.isfinite(answered).all()
-    assert not np.array_equal(answered[0], answered[1])
+    predicted, found = network_disparity(network, video)
+    assert found == kind and predicted.shape == (2, H, W) and np.isfinite(predicted).all()
+    assert not np.array_equal(predicted[0], predicted[1])
     if kind == "metric":
-        assert (answered >= 1 / 20 - 1e-6).all()  # within max_depth
+        assert (predicted >= 1 / 20 - 1e-6).all()  # within max_depth
     again, _ = network_disparity(network, video[1:])
-    np.testing.assert_array_equal(again[0], answered[1])  # each frame by itself
+    np.testing.assert_array_equal(again[0], predicted[1])  # each frame by itself
 
 
-def test_the_network_sees_its_own_size_with_the_shape_of_the_frame_kept(tiny):
+def test_the_input_has_the_size_of_the_network_and_the_shape_of_the_frame(tiny):
     network = pretrained("DepthAnythingForDepthEstimation", str(tiny[1]))
-    shown = picture(network, np.full((90, 160, 3), 0.5, np.float32))
-    assert shown.shape == (
-        1,
-        3,
-        28,
-        56,
-    )  # shorter side 28, the longer 49.8 to the nearest multiple of 14
+    values = network_input(network, np.full((90, 160, 3), 0.5, np.float32))
+    # shorter side 28, the longer 49.8 to the nearest multiple of 14
+    assert values.shape == (1, 3, 28, 56)
     expected = (0.5 - torch.tensor([0.485, 0.456, 0.406])) / torch.tensor([0.229, 0.224, 0.225])
-    torch.testing.assert_close(shown[0, :, 3, 5], expected)
+    torch.testing.assert_close(values[0, :, 3, 5], expected)

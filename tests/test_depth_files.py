@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from mutations import check_reader
 
-from hdr_nsff.core.io import write_exr, write_png
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.depth_files import read_depth
 
 DEPTH = np.random.default_rng(0).uniform(1, 5, (6, 8)).astype(np.float32)

@@ -1,5 +1,5 @@
-"""Grids: the numba kernels against their plain-torch twin, hand-worked interpolation,
-the touched-only optimizer.
+"""Grids: the numba kernels against their plain-torch twin, interpolation worked by
+hand, and the optimizer of touched rows.
 """
 
 import numpy as np
@@ -17,9 +17,8 @@ def grid(max_rows: int = 2**10) -> AdditiveGrid:
 
 
 def coords(n: int = 500) -> torch.Tensor:
-    return (
-        torch.rand(n, 3, generator=torch.Generator().manual_seed(2)) * 1.2 - 0.1
-    )  # a tenth outside on every side
+    """Points of which a tenth lies outside of the cube on every side."""
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(2)) * 1.2 - 0.1
 
 
 def test_kernels_equal_plain_torch_in_values_and_gradients_dense_and_hashed() -> None:
@@ -30,7 +29,7 @@ def test_kernels_equal_plain_torch_in_values_and_gradients_dense_and_hashed() ->
         (out * weight).sum().backward()
         table, point = g.table.grad.clone(), x.grad.clone()
         g.table.grad = x.grad = None
-        twin = g.reference(x, *g.at(knot))
+        twin = g.reference(x, *g.time_slices(knot))
         (twin * weight).sum().backward()
         torch.testing.assert_close(out, twin, atol=1e-5, rtol=1e-5)
         torch.testing.assert_close(table, g.table.grad, atol=1e-4, rtol=1e-4)
@@ -42,7 +41,8 @@ def test_twin_gradient_agrees_with_finite_differences() -> None:
     x = torch.tensor(
         [[0.31, 0.42, 0.53], [0.11, 0.77, 0.64]], dtype=torch.float64, requires_grad=True
     )
-    assert torch.autograd.gradcheck(lambda p: g.reference(p, *g.at(1.3)), (x,), eps=1e-7, atol=1e-4)
+    slices = g.time_slices(1.3)
+    assert torch.autograd.gradcheck(lambda p: g.reference(p, *slices), (x,), eps=1e-7, atol=1e-4)
 
 
 def test_a_linear_ramp_is_reproduced_exactly() -> None:
@@ -57,7 +57,8 @@ def test_a_linear_ramp_is_reproduced_exactly() -> None:
 
 def test_time_blends_two_slices_linearly_and_a_knot_reads_one() -> None:
     g = AdditiveGrid([(4, 4, 4, 3)], num_knots=3)
-    g.table.data[:64], g.table.data[64:128], g.table.data[128:] = 1.0, 3.0, 7.0
+    for s, value in enumerate((1.0, 3.0, 7.0)):
+        g.table.data[64 * s : 64 * (s + 1)] = value
     point = torch.full((1, 3), 0.5)
     assert float(g(point, 1.0)[0, 0].detach()) == 3.0
     np.testing.assert_allclose(float(g(point, 1.25)[0, 0].detach()), 0.75 * 3 + 0.25 * 7)
@@ -76,15 +77,10 @@ def marked(rows: int) -> torch.Tensor:
 
 
 def test_touched_adam_is_adam_where_every_row_has_a_gradient() -> None:
-    a, b, marks = (
-        torch.ones(3, 4, requires_grad=True),
-        torch.ones(3, 4, requires_grad=True),
-        marked(3),
-    )
-    ours, theirs = (
-        TouchedAdam([{"params": [a], "touched": [marks]}], lr=0.1, eps=1e-8),
-        torch.optim.Adam([b], lr=0.1, betas=(0.9, 0.99), eps=1e-8),
-    )
+    a, b = torch.ones(3, 4, requires_grad=True), torch.ones(3, 4, requires_grad=True)
+    marks = marked(3)
+    ours = TouchedAdam([{"params": [a], "touched": [marks]}], lr=0.1, eps=1e-8)
+    theirs = torch.optim.Adam([b], lr=0.1, betas=(0.9, 0.99), eps=1e-8)
     for step in range(1, 4):
         marks.fill_(1)
         a.grad, b.grad = torch.full((3, 4), 0.5 * step), torch.full((3, 4), 0.5 * step)
@@ -103,8 +99,8 @@ def test_touched_adam_leaves_unmarked_rows_alone_and_clears_what_it_used() -> No
     p.grad[0] = 1.0
     marks[0] = 1
     optimizer.step()
-    assert torch.equal(p[1], before[1]) and torch.equal(optimizer.state[p]["exp_avg"][1], moment[1])
-    assert (p[0] < before[0]).all()
+    assert torch.equal(p[1], before[1]) and (p[0] < before[0]).all()
+    assert torch.equal(optimizer.state[p]["exp_avg"][1], moment[1])
 
 
 def test_backward_marks_every_row_with_a_gradient() -> None:
@@ -117,26 +113,12 @@ def test_backward_marks_every_row_with_a_gradient() -> None:
 def test_frequencies_hold_identity_sines_and_cosines() -> None:
     x = torch.tensor([[0.5, -1.0]])
     out = frequencies(x, 2)
-    expected = torch.tensor(
-        [
-            [
-                0.5,
-                -1.0,
-                np.sin(0.5),
-                np.sin(-1.0),
-                np.cos(0.5),
-                np.cos(-1.0),
-                np.sin(1.0),
-                np.sin(-2.0),
-                np.cos(1.0),
-                np.cos(-2.0),
-            ]
-        ]
-    )
-    torch.testing.assert_close(out, expected.float())
+    once, twice = np.array([0.5, -1.0]), np.array([1.0, -2.0])
+    expected = np.concatenate([once, np.sin(once), np.cos(once), np.sin(twice), np.cos(twice)])
+    torch.testing.assert_close(out[0], torch.from_numpy(expected).float())
 
 
-def test_marks_stay_the_grids_own_through_a_loaded_state() -> None:
+def test_loading_a_state_keeps_the_grids_own_marks() -> None:
     p, marks = torch.ones(1, 4, requires_grad=True), marked(1)
     optimizer = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
     optimizer.load_state_dict(optimizer.state_dict())

@@ -1,5 +1,5 @@
-"""Evaluation against closed forms: a perfect run scores perfectly, what LDR leaves free
-does not count, poses are carried over.
+"""Evaluation against closed forms: a perfect run scores perfectly, scales that LDR
+leaves free do not count, poses are carried over.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ import torch
 from fakes import EV, SPEED, DiscBeforeWall, H, W, camera, fake_run
 from torch import Tensor
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import write_json
 from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate, evaluate_run
 from hdr_nsff.fields.base import Render
 from hdr_nsff.geometry import alignment
@@ -24,15 +26,15 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.truth import Truth, TruthView, match_brackets
 from hdr_nsff.training.run_folder import Run
 
-TURN = torch.tensor(
-    [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]
-)  # the truth's world: turned, three times as large, elsewhere
+# The truth's world is turned, three times as large, and elsewhere.
+TURN = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
 SHIFT = torch.tensor([5.0, -2.0, 1.0])
 
 
 def true_pose(c2w: Tensor) -> list[list[float]]:
     """A pose of the scene in the truth's world."""
-    return torch.cat([TURN @ c2w[:, :3], (3 * TURN @ c2w[:, 3] + SHIFT)[:, None]], 1).tolist()
+    center = 3 * TURN @ c2w[:, 3] + SHIFT
+    return torch.cat([TURN @ c2w[:, :3], center[:, None]], 1).tolist()
 
 
 def write_truth(folder: Path, run: Run, field: DiscBeforeWall, **changes: Any) -> Path:
@@ -43,14 +45,10 @@ def write_truth(folder: Path, run: Run, field: DiscBeforeWall, **changes: Any) -
         ("b", 2.5, 4, None),
         ("c", 2.0, 2, camera(0.37)),
     ):
-        c = off or run.scene.train[anchor].camera
-        seen = field.render(c, time)
-        io.write_exr(
-            folder / f"radiance/{name}.exr",
-            {"RGB": seen.radiance.reshape(H, W, 3).numpy()},
-            half=False,
-        )
-        io.write_png(folder / f"masks/{name}.png", (seen.motion.reshape(H, W) > 0.5).numpy())
+        seen = field.render(off or run.scene.train[anchor].camera, time)
+        radiance = {"RGB": seen.radiance.reshape(H, W, 3).numpy()}
+        write_exr(folder / f"radiance/{name}.exr", radiance, half=False)
+        write_png(folder / f"masks/{name}.png", (seen.motion.reshape(H, W) > 0.5).numpy())
         pose = true_pose(off.c2w) if off else None
         views.append(
             TruthView(
@@ -66,10 +64,15 @@ def write_truth(folder: Path, run: Run, field: DiscBeforeWall, **changes: Any) -
     x = np.linspace(0, 1, 256) ** 2.2
     clip = [true_pose(f.camera.c2w) for f in run.scene.train]
     truth = Truth(
-        bracket_ev=list(EV), reference_bracket=2, response_x=x.tolist(), response_y=[(x ** (1 / 2.2)).tolist()] * 3,
-        K=camera().K.tolist(), clip_c2w=clip, views=views,
-    )  # fmt: skip
-    io.write_json(folder / "truth.json", truth.model_copy(update=changes).model_dump())
+        bracket_ev=list(EV),
+        reference_bracket=2,
+        response_x=x.tolist(),
+        response_y=[(x ** (1 / 2.2)).tolist()] * 3,
+        K=camera().K.tolist(),
+        clip_c2w=clip,
+        views=views,
+    )
+    write_json(folder / "truth.json", truth.model_copy(update=changes).model_dump())
     return folder
 
 
@@ -94,15 +97,11 @@ def test_a_perfect_run_is_perfect_and_off_path_poses_are_carried_over(tmp_path: 
     run = fake_run(tmp_path / "run")
     result = evaluate_run(run, write_truth(tmp_path / "truth", run, field_of(run)))
     views = {v["name"]: v for v in result["views"]}
-    assert {n: v["group"] for n, v in views.items()} == {
-        "a": "view",
-        "b": "view+time",
-        "c": "off-path",
-    }
+    groups = {name: view["group"] for name, view in views.items()}
+    assert groups == {"a": "view", "b": "view+time", "c": "off-path"}
     for name in ("a", "c"):  # b is splatted between two frames
-        assert (
-            views[name]["psnr"] > 55 and views[name]["ssim"] > 0.999 and views[name]["mu5000"] > 55
-        )
+        view = views[name]
+        assert view["psnr"] > 55 and view["ssim"] > 0.999 and view["mu5000"] > 55
     assert views["b"]["psnr"] > 22 and result["scale"] == pytest.approx(1, abs=1e-3)
     assert result["poses"]["ate"] < 1e-5 and result["poses"]["rotation_degrees"] < 0.1
     assert result["poses"]["focal_error"] == pytest.approx(0, abs=1e-6)
@@ -114,10 +113,9 @@ def test_metrics_and_pictures_are_written_and_a_restart_renders_nothing(tmp_path
     truth = write_truth(tmp_path / "truth", run, field_of(run))
     result = evaluate_run(run, truth)
     assert json.loads((run.folder / "metrics.json").read_text()) == result
-    picture = io.read_image(run.folder / "evaluation/a.png")
-    assert (
-        picture.shape[0] > 2 * H and picture.shape[1] > 3 * W
-    )  # two rows of prediction, truth, error
+    picture = read_image(run.folder / "evaluation/a.png")
+    # two rows of prediction, truth, error
+    assert picture.shape[0] > 2 * H and picture.shape[1] > 3 * W
     before = field_of(run).calls
     again = evaluate_run(run, truth)
     assert field_of(run).calls == before and again["headline"] == result["headline"]
@@ -129,23 +127,19 @@ def test_a_scale_of_the_radiance_is_aligned_away_and_reported(tmp_path: Path) ->
     truth = write_truth(tmp_path / "truth", run, DiscBeforeWall(speed=SPEED / 4, red=3.0))
     field.factor = torch.tensor([0.5, 0.5, 0.25])
     result = evaluate_run(run, truth)
-    assert result["scale"] == pytest.approx(2, rel=1e-3) and result[
-        "scale_per_channel"
-    ] == pytest.approx([2, 2, 4], rel=1e-3)
+    assert result["scale"] == pytest.approx(2, rel=1e-3)
+    assert result["scale_per_channel"] == pytest.approx([2, 2, 4], rel=1e-3)
     view = next(v for v in result["views"] if v["name"] == "a")
-    assert (
-        view["mu5000_per_channel"] > 55
-        and view["mu5000_per_channel"] > view["mu5000"] > view["mu5000_unaligned"]
-    )
+    assert view["mu5000_per_channel"] > 55
+    assert view["mu5000_per_channel"] > view["mu5000"] > view["mu5000_unaligned"]
     assert view["psnr"] < 25  # recorded rgb is not aligned
 
 
 def test_moving_only_numbers_see_the_mover_alone(tmp_path: Path) -> None:
     wrong = Scaled(speed=SPEED / 4, red=1.5)  # only the disc differs
     run = fake_run(tmp_path / "run", field=wrong)
-    result = evaluate_run(
-        run, write_truth(tmp_path / "truth", run, DiscBeforeWall(speed=SPEED / 4, red=3.0))
-    )
+    right = DiscBeforeWall(speed=SPEED / 4, red=3.0)
+    result = evaluate_run(run, write_truth(tmp_path / "truth", run, right))
     view = next(v for v in result["views"] if v["name"] == "a")
     assert view["psnr_moving"] < view["psnr"] - 5
     error = 0.75 ** (1 / 2.2) - 0.375 ** (1 / 2.2)  # red at EV -2, one channel of three
@@ -169,9 +163,8 @@ def test_training_views_are_named_as_such(tmp_path: Path) -> None:
 def test_tripod_views_off_the_path_are_left_out_by_name(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run", parallax="none")
     result = evaluate_run(run, write_truth(tmp_path / "truth", run, field_of(run)))
-    assert [v["name"] for v in result["views"]] == ["a", "b"] and "c: left out" in result["notes"][
-        0
-    ]
+    assert [v["name"] for v in result["views"]] == ["a", "b"]
+    assert "c: left out" in result["notes"][0]
     assert "ate" not in result["poses"]
 
 
@@ -191,79 +184,53 @@ def test_learned_exposures_are_known_up_to_a_power(tmp_path: Path) -> None:
 def test_umeyama_finds_the_similarity_and_refuses_points_in_one_place() -> None:
     points = np.random.default_rng(0).standard_normal((9, 3))
     fit = alignment.umeyama(points, 3 * points @ TURN.double().numpy().T + SHIFT.double().numpy())
-    assert (
-        fit is not None
-        and fit.scale == pytest.approx(3)
-        and np.allclose(fit.rotation, TURN)
-        and np.allclose(fit.translation, SHIFT)
-    )
+    assert fit is not None and fit.scale == pytest.approx(3)
+    assert np.allclose(fit.rotation, TURN) and np.allclose(fit.translation, SHIFT)
     assert alignment.umeyama(points, np.ones((9, 3))) is None
 
 
 def test_pose_errors_are_in_true_units(tmp_path: Path) -> None:
     poses = np.stack([np.c_[np.eye(3), [0.1 * i, np.sin(i), np.cos(2.0 * i)]] for i in range(40)])
     estimated = poses.copy()
-    estimated[:, :, 3] = 2 * poses[:, :, 3] + 0.02 * np.random.default_rng(0).standard_normal(
-        (40, 3)
-    )
+    noise = 0.02 * np.random.default_rng(0).standard_normal((40, 3))
+    estimated[:, :, 3] = 2 * poses[:, :, 3] + noise
     errors = alignment.pose_errors(poses, estimated)
-    assert (
-        errors["ate"] == pytest.approx(0.01 * 3**0.5, rel=0.2) and errors["rotation_degrees"] < 1e-5
-    )
+    assert errors["ate"] == pytest.approx(0.01 * 3**0.5, rel=0.2)
+    assert errors["rotation_degrees"] < 1e-5
 
 
-def test_bad_truth_is_refused_in_a_sentence(tmp_path: Path) -> None:
+def lone_view(**changes: Any) -> dict[str, Any]:
+    """A truth of one view."""
+    settings = {"name": "x", "time": 1, "bracket": 0, "anchor": 0, "radiance": "radiance/a.exr"}
+    return {"views": [TruthView(**(settings | changes))]}
+
+
+BAD_TRUTH: dict[str, dict[str, Any]] = {
+    "3 frames, the scene has 6": {"clip_c2w": [true_pose(camera().c2w)] * 3},
+    "clip_c2w is missing": {"clip_c2w": None},
+    "no view of this truth": {"views": []},
+    "anchored at frame 77": lone_view(anchor=77),
+    "has bracket 5": lone_view(bracket=5),
+    "outside the scene folder": lone_view(radiance="../a.exr"),
+    "no such file": lone_view(radiance="radiance/z.exr"),
+    "outside the training frames": lone_view(time=9),
+}
+
+
+@pytest.mark.parametrize("sentence", BAD_TRUTH)
+def test_bad_truth_is_refused_in_a_sentence(sentence: str, tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
-    poses = [true_pose(camera().c2w)] * 3
-    cases: list[tuple[str, dict[str, Any]]] = [
-        ("3 frames, the scene has 6", {"clip_c2w": poses}),
-        ("clip_c2w is missing", {"clip_c2w": None}),
-        ("no view of this truth", {"views": []}),
-        (
-            "anchored at frame 77",
-            {
-                "views": [
-                    TruthView(name="x", time=1, bracket=0, anchor=77, radiance="radiance/a.exr")
-                ]
-            },
-        ),
-        (
-            "has bracket 5",
-            {
-                "views": [
-                    TruthView(name="x", time=1, bracket=5, anchor=0, radiance="radiance/a.exr")
-                ]
-            },
-        ),
-        (
-            "outside the scene folder",
-            {"views": [TruthView(name="x", time=1, bracket=0, anchor=0, radiance="../a.exr")]},
-        ),
-        (
-            "no such file",
-            {
-                "views": [
-                    TruthView(name="x", time=1, bracket=0, anchor=0, radiance="radiance/z.exr")
-                ]
-            },
-        ),
-        (
-            "outside the training frames",
-            {
-                "views": [
-                    TruthView(name="x", time=9, bracket=0, anchor=0, radiance="radiance/a.exr")
-                ]
-            },
-        ),
-    ]
-    for sentence, changes in cases:
-        with pytest.raises(InputError, match=sentence):
-            evaluate_run(run, write_truth(tmp_path / "truth", run, field_of(run), **changes))
-    io.write_png(
-        write_truth(tmp_path / "truth", run, field_of(run)) / "masks/a.png", np.zeros((4, 4), bool)
-    )
+    truth = write_truth(tmp_path / "truth", run, field_of(run), **BAD_TRUTH[sentence])
+    with pytest.raises(InputError, match=sentence):
+        evaluate_run(run, truth)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
+    run = fake_run(tmp_path / "run")
+    truth = write_truth(tmp_path / "truth", run, field_of(run))
+    write_png(truth / "masks/a.png", np.zeros((4, 4), bool))
     with pytest.raises(InputError, match="a mask of"):
-        evaluate_run(run, tmp_path / "truth")
+        evaluate_run(run, truth)
 
 
 def test_the_verb_opens_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,8 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_png, write_video
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.exposure_lists import (
     log2_seconds,
     parse_exposures,

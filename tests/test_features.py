@@ -1,23 +1,23 @@
-"""Dense features: XFeat with weights made up here, DINOv2 as a tiny network in a
-folder; the published weights where they are found.
+"""Dense features: XFeat with random weights, DINOv2 as a tiny network in a folder; the
+published weights where they are found.
 """
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.flow.correlation import cosines
 from hdr_nsff.priors.flow.features import (
     BLOCKS,
-    DINO_DEPTH,
-    IMAGENET_MEAN,
-    IMAGENET_STD,
     LINEAR,
+    FeatureTuning,
     XFeat,
     dinov2_features,
     feature_source,
     load_xfeat,
-    tokens,
+    patch_tokens,
     xfeat_features,
 )
 
@@ -27,16 +27,16 @@ def random_state(seed: int = 0) -> dict[str, torch.Tensor]:
     rng = torch.Generator().manual_seed(seed)
     state = {}
     for block, layers in BLOCKS.items():
-        for i, (inside, outside, kernel, _) in enumerate(layers):
+        for i, (channels_in, channels_out, kernel, _) in enumerate(layers):
             name = f"{block}.{i}.layer"
-            state[f"{name}.0.weight"] = torch.randn(
-                outside, inside, kernel, kernel, generator=rng
-            ) / (inside**0.5 * kernel)
-            state[f"{name}.1.running_mean"] = 0.1 * torch.randn(outside, generator=rng)
-            state[f"{name}.1.running_var"] = 0.5 + torch.rand(outside, generator=rng)
-    for name, (inside, outside) in LINEAR.items():
-        state[f"{name}.weight"] = torch.randn(outside, inside, 1, 1, generator=rng) / inside**0.5
-        state[f"{name}.bias"] = 0.1 * torch.randn(outside, generator=rng)
+            weight = torch.randn(channels_out, channels_in, kernel, kernel, generator=rng)
+            state[f"{name}.0.weight"] = weight / (channels_in**0.5 * kernel)
+            state[f"{name}.1.running_mean"] = 0.1 * torch.randn(channels_out, generator=rng)
+            state[f"{name}.1.running_var"] = 0.5 + torch.rand(channels_out, generator=rng)
+    for name, (channels_in, channels_out) in LINEAR.items():
+        weight = torch.randn(channels_out, channels_in, 1, 1, generator=rng)
+        state[f"{name}.weight"] = weight / channels_in**0.5
+        state[f"{name}.bias"] = 0.1 * torch.randn(channels_out, generator=rng)
     return state
 
 
@@ -74,7 +74,7 @@ def test_a_folded_normalization_is_convolution_then_batch_norm():
     assert torch.allclose(network.convolve(x, "block1_0"), expected, atol=1e-5)
 
 
-def test_xfeat_sees_no_gain_and_no_offset():
+def test_xfeat_is_invariant_to_gain_and_offset():
     network, rgb = XFeat(random_state()), torch.from_numpy(noise(1, 3, 64, 64))
     with torch.no_grad():
         assert torch.allclose(network(rgb), network(0.25 * rgb + 0.1), atol=2e-2)
@@ -87,9 +87,10 @@ def test_small_frames_are_doubled_so_cells_are_four_pixels():
     assert found.maps.shape == (2, 64, 12, 20)  # 96 is 3 times 32, 140 becomes 160
 
 
-def test_features_move_with_the_picture():
+def test_features_move_with_the_frame():
     """A shift by 32 pixels is one by 8 cells of 4 pixels (32 doubled is 64, a whole
-    number of the coarsest cells).
+    number of the coarsest cells). What is left is from edges and the frames' different
+    means.
     """
     wide = noise(1, 160, 320, 3)
     network = XFeat(random_state())
@@ -97,9 +98,7 @@ def test_features_move_with_the_picture():
         xfeat_features(network, x).maps[0, :, 16:24] for x in (wide[:, :, 32:288], wide[:, :, :256])
     )
     a, b = (torch.nn.functional.normalize(x, dim=0) for x in (a, b))
-    assert (
-        a[:, :, 24:32] - b[:, :, 32:40]
-    ).abs().max() < 0.01  # edges and the pictures' different means are all there is
+    assert (a[:, :, 24:32] - b[:, :, 32:40]).abs().max() < 0.01
     assert (a[:, :, 24:32] - b[:, :, 24:32]).abs().max() > 0.05
 
 
@@ -118,40 +117,41 @@ def test_dinov2_tokens_are_those_of_transformers_where_patches_do_not_overlap(di
     transformers = pytest.importorskip("transformers")
     network = transformers.Dinov2Model.from_pretrained(dino).eval()
     rgb = torch.from_numpy(noise(1, 3, 56, 56))
-    mean, std = (torch.tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
+    mean = torch.tensor((0.485, 0.456, 0.406)).view(1, 3, 1, 1)
+    std = torch.tensor((0.229, 0.224, 0.225)).view(1, 3, 1, 1)
     with torch.no_grad():
         expected = network((rgb - mean) / std, output_hidden_states=True).hidden_states[3][:, 1:]
-        assert torch.allclose(tokens(network, 3, 14, rgb).flatten(2).mT, expected, atol=1e-5)
+        found = patch_tokens(network, 3, 14, rgb).flatten(2).mT
+    assert torch.allclose(found, expected, atol=1e-5)
 
 
 def test_a_smaller_stride_gives_more_dinov2_tokens(dino):
-    """56 pixels, patches of 14: 4 side by side, (56 - 14) / 7 + 1 = 7 with a stride of
-    7.
+    """In 56 pixels, patches of 14 fit 4 side by side, and (56 - 14) / 7 + 1 = 7 times
+    with a stride of 7. Frames are doubled, so tokens are 3.5 of their pixels apart, and
+    the first one's center is at 3.5.
     """
-    source = feature_source("dinov2-small", dino, layer=2, stride=7)
-    found = source.func(*source.args, noise(2, 28, 28, 3), **source.keywords, side=56)
+    tuning = FeatureTuning(dino_longer_side_px=56)
+    source = feature_source("dinov2-small", dino, layer=2, stride=7, tuning=tuning)
+    found = source(noise(2, 28, 28, 3))
     assert found.maps.shape == (2, 16, 7, 7) and not found.maps.requires_grad
-    assert (
-        found.stride == 3.5 and found.origin == 3.5
-    )  # twice enlarged: 7 pixels of that from token to token, the first's middle at 7
+    assert found.stride == 3.5 and found.origin == 3.5
 
 
 def test_the_layer_is_the_papers_share_of_the_depth(dino):
+    """Of 4 layers, 15 / 24 are round(2.5) = 2."""
     network = feature_source("dinov2-small", dino).args[0]
-    video = noise(1, 28, 28, 3)
-    named = dinov2_features(
-        network, video, round(DINO_DEPTH * 4), 7, 56
-    ).maps  # round(15 / 24 * 4) = 2
-    assert torch.equal(dinov2_features(network, video, side=56).maps, named)
-    assert not torch.equal(dinov2_features(network, video, 3, 7, 56).maps, named)
+    video, tuning = noise(1, 28, 28, 3), FeatureTuning(dino_longer_side_px=56)
+    by_default = dinov2_features(network, video, tuning=tuning).maps
+    assert torch.equal(by_default, dinov2_features(network, video, 2, 7, tuning).maps)
+    assert not torch.equal(by_default, dinov2_features(network, video, 3, 7, tuning).maps)
 
 
 @pytest.mark.parametrize(
-    ("layer", "stride", "said"), [(9, None, "has 4 layers"), (None, 15, "14 pixels wide")]
+    ("layer", "stride", "words"), [(9, None, "has 4 layers"), (None, 15, "14 pixels wide")]
 )
-def test_a_layer_or_stride_that_is_not_there_is_refused(dino, layer, stride, said):
+def test_a_layer_or_stride_that_is_not_there_is_refused(dino, layer, stride, words):
     source = feature_source("dinov2-small", dino, layer, stride)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=words):
         source(noise(1, 28, 28, 3))
 
 
@@ -161,18 +161,15 @@ def test_xfeat_has_no_layer_to_choose():
 
 
 def test_published_weights_match_across_four_ev():
-    """The same textured picture, 16 times darker and clipped: most cells are still
-    nearest to themselves.
+    """The same texture, 16 times darker and clipped: most cells are still nearest to
+    themselves.
     """
-    from hdr_nsff.priors.flow.correlation import costs
-
     try:
         source = feature_source("xfeat")
     except InputError as error:
         pytest.skip(str(error))
-    cv2 = pytest.importorskip("cv2")
     picture = cv2.resize(noise(24, 32, 3), (256, 192), interpolation=cv2.INTER_CUBIC).clip(0, 1)
     bright, dark = (2 * picture).clip(0, 1) ** (1 / 2.2), (picture / 8).clip(0, 1) ** (1 / 2.2)
     maps = source(np.stack([bright, np.rint(dark * 255) / 255]).astype(np.float32)).maps
-    nearest = costs(maps[0].flatten(1).T, maps[1]).argmax(1)
+    nearest = cosines(maps[0].flatten(1).T, maps[1]).argmax(1)
     assert (nearest == torch.arange(len(nearest))).float().mean() > 0.7

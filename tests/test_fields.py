@@ -7,15 +7,15 @@ import pytest
 import torch
 from presets import NETWORKS, random_field, small, trainer
 
-from hdr_nsff.fields import AnyField
 from hdr_nsff.fields.base import RadianceField, RecordingField, recorded
 from hdr_nsff.fields.baselines.hexplane import HexPlane
+from hdr_nsff.fields.build import AnyField
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths.volume import transmittance, weighted_sum
 from hdr_nsff.scene.batch import Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.training.config import METHODS, PRESETS
+from hdr_nsff.training.presets import METHODS, PRESETS
 
 LOOK = Recorder(lambda radiance: (radiance / 2).clamp(0, 1), (1, 4))
 

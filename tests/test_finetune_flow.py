@@ -185,10 +185,10 @@ def test_damaged_measurements_are_repeated(
     )
     before = verb.measure_or_read(network, pairs, kept)
     assert verb.measure_or_read(network, pairs, kept) == before
-    assert "taken for missing" not in capsys.readouterr().err
+    assert "treated as missing" not in capsys.readouterr().err
     kept.write_text(text)
     assert verb.measure_or_read(network, pairs, kept) == before
-    assert "taken for missing" in capsys.readouterr().err
+    assert "treated as missing" in capsys.readouterr().err
     assert verb.measure_or_read(network, [], kept) == before  # from the file
 
 

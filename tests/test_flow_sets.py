@@ -10,7 +10,8 @@ import pytest
 from mutations import check_reader
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_exr, write_png
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
 from hdr_nsff.flow_training.flow_exposures import example, random_crop, random_curve, recorded_pair
 from hdr_nsff.flow_training.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
 

@@ -1,6 +1,4 @@
-"""HDR-HexPlane: features in closed form, recording before compositing, growth, and the
-verbs that open its runs.
-"""
+"""HDR-HexPlane: recording before compositing, growth, and verbs that open its runs."""
 
 import math
 from dataclasses import replace
@@ -11,12 +9,12 @@ import torch
 from presets import HEXPLANE, random_field, small
 from torch import nn
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image
 from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
 from hdr_nsff.fields.base import recorded
-from hdr_nsff.fields.baselines.hexplane import GROWTHS, HexPlane
-from hdr_nsff.fields.baselines.planes import AXES, Planes
+from hdr_nsff.fields.baselines.hexplane import NUM_GROWTHS, HexPlane
 from hdr_nsff.rendering.export import ExportConfig, export
 from hdr_nsff.rendering.render import RenderConfig, render
 from hdr_nsff.rendering.shots import Output
@@ -26,51 +24,6 @@ from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
 
-def test_features_are_products_of_the_planes_in_closed_form() -> None:
-    planes = Planes(1, coarsest=5, finest=5, slices=3)
-    u, t = torch.linspace(0, 1, 5), torch.linspace(0, 1, 3)
-    planes.space.data[:, 0] = (
-        2 * u[None, :] + 3 * u[:, None]
-    )  # 2 first axis + 3 second axis: bilinear is exact
-    planes.time.data[:, 0] = 1 + u[None, :] * t[:, None]  # 1 + third axis * time
-    point, share = torch.tensor([[0.3, 0.55, 0.81]]), 0.4
-    wanted = [(2 * point[0, a] + 3 * point[0, b]) * (1 + point[0, c] * share) for a, b, c in AXES]
-    torch.testing.assert_close(planes(point, share)[0], torch.stack(wanted))
-    assert {frozenset(pair) for pair in AXES} == {
-        frozenset((0, 1, 2))
-    }  # every product spans all of space and time
-
-
-def test_total_variation_is_the_mean_square_step_along_each_axis() -> None:
-    planes = Planes(2, coarsest=4, finest=9, slices=3)
-    planes.space.data.zero_()
-    planes.space.data[..., :4, :4] = 0.5 * torch.arange(4.0)  # steps of 0.5 along one of two axes
-    planes.time.data[..., :4] = torch.arange(3.0)[:, None]  # of 1 along time
-    assert float(planes.total_variation().detach()) == pytest.approx(0.25 + 1.0)
-
-
-def test_growing_keeps_what_the_planes_hold() -> None:
-    planes = Planes(2, coarsest=5, finest=9, slices=2)
-    planes.time.data.normal_()
-    points = torch.rand(50, 3)
-    before = planes(points, 0.3)
-    planes.grow(9)  # every old grid point is a new one
-    torch.testing.assert_close(planes(points, 0.3), before, atol=1e-5, rtol=1e-4)
-    assert planes.used[0].shape == (3, 2, 9, 9)
-
-
-def test_only_what_is_in_use_of_the_planes_learns() -> None:
-    planes = Planes(2, coarsest=4, finest=9, slices=2)
-    planes(torch.rand(80, 3), 0.5).sum().backward()
-    grad = planes.space.grad
-    assert (
-        grad is not None
-        and bool((grad[..., :4, :4] != 0).any())
-        and not grad[..., 4:, :].any()
-        and not grad[..., 4:].any()
-    )
-
-
 def test_the_grid_grows_three_times_to_its_finest(toy: Scene) -> None:
     field = random_field("hdr-hexplane", toy)
     assert isinstance(field, HexPlane)
@@ -78,13 +31,13 @@ def test_the_grid_grows_three_times_to_its_finest(toy: Scene) -> None:
     for step in range(1, 5 * HEXPLANE.grow_every):
         field.after_step(step, None)
         sizes.append(int(field.density_planes.cells))
-    assert sorted(set(sizes)) == [8, 10, 13, 16] and len(set(sizes)) == GROWTHS + 1  # 8 * 2^(k/3)
+    assert (
+        sorted(set(sizes)) == [8, 10, 13, 16] and len(set(sizes)) == NUM_GROWTHS + 1
+    )  # 8 * 2^(k/3)
 
 
 class Slab(nn.Module):
-    """Density features by depth in the cube: a veil that stops half of the light in
-    front of a wall.
-    """
+    """Density features by depth in the cube, such as a veil in front of a wall."""
 
     def __init__(self, densities: dict[float, float]) -> None:
         super().__init__()
@@ -100,57 +53,56 @@ class Slab(nn.Module):
         return torch.zeros(())
 
 
-def see_through(toy: Scene, bright: float, dark: float) -> tuple[HexPlane, PixelBatch]:
-    """A field of a dark veil before a bright wall, and a batch of one ray's
-    neighborhood.
+def veil_and_wall(toy: Scene, bright: float, dark: float) -> tuple[HexPlane, PixelBatch]:
+    """A field of a dark veil that stops half of the light before a bright wall, and a
+    batch of pixels.
     """
+
+    def radiance(coords: torch.Tensor, directions: torch.Tensor, share: float) -> torch.Tensor:
+        return torch.where(coords[:, 2:] > 0.5, dark, bright).expand(-1, 3)
+
     field = random_field("hdr-hexplane", toy)
     assert isinstance(field, HexPlane)
     field.config = replace(field.config, samples=200, cull_after=0)
-    field.density_planes, field.to_density = Slab({0.7: 8.2, 0.3: 30.0}), nn.Identity()  # type: ignore[assignment]
-    field.radiance = lambda coords, directions, share: torch.where(
-        coords[:, 2:] > 0.5, dark, bright
-    ).expand(-1, 3)  # type: ignore[method-assign]
+    field.density_planes = Slab({0.7: 8.2, 0.3: 30.0})  # type: ignore[assignment]
+    field.to_density = nn.Identity()  # type: ignore[assignment]
+    field.radiance = radiance  # type: ignore[method-assign]
     return field, draw_pixels(toy, 2, 30, 0, torch.Generator().manual_seed(0))
 
 
 def test_recording_samples_and_then_compositing_is_not_recording_the_composite(toy: Scene) -> None:
     bright, dark = 8.0, 0.05
-    field, batch = see_through(toy, bright, dark)
+    field, batch = veil_and_wall(toy, bright, dark)
     sigmoid = Recorder(lambda e: e / (1 + e), (0,))
-    seen = field(replace(batch, recorder=sigmoid))[0]
-    assert seen.rgb is not None
-    seen_through = (seen.radiance - dark * seen.opacity[:, None]) / (
-        bright - dark
-    )  # weight of the wall, from the linear radiance
-    veil = seen.opacity[:, None] - seen_through
+    render = field(replace(batch, recorder=sigmoid))[0]
+    assert render.rgb is not None
+    opacity = render.opacity[:, None]
+    wall = (render.radiance - dark * opacity) / (bright - dark)  # weight, from the radiance
+    veil = opacity - wall
     assert 0.05 < float(veil.mean()) < 0.95
-    torch.testing.assert_close(
-        seen.rgb,
-        veil * dark / (1 + dark) + seen_through * bright / (1 + bright),
-        atol=1e-4,
-        rtol=1e-3,
-    )
-    after = sigmoid.rgb(seen.radiance)
-    assert bool((seen.rgb < after - 0.01).all())  # Jensen: the response is concave
-    straight = field(replace(batch, recorder=Recorder(lambda e: e, (0,))))[0]
-    torch.testing.assert_close(
-        straight.rgb, straight.radiance
-    )  # a straight response commutes with compositing
+    expected = veil * dark / (1 + dark) + wall * bright / (1 + bright)
+    torch.testing.assert_close(render.rgb, expected, atol=1e-4, rtol=1e-3)
+    after = sigmoid.rgb(render.radiance)
+    assert bool((render.rgb < after - 0.01).all())  # Jensen: the response is concave
 
 
-def test_one_radiance_along_an_opaque_ray_is_recorded_alike_both_ways(toy: Scene) -> None:
-    field, batch = see_through(toy, 2.0, 2.0)
+def test_a_linear_response_commutes_with_compositing(toy: Scene) -> None:
+    field, batch = veil_and_wall(toy, 8.0, 0.05)
+    render = field(replace(batch, recorder=Recorder(lambda e: e, (0,))))[0]
+    torch.testing.assert_close(render.rgb, render.radiance)
+
+
+def test_a_single_radiance_along_an_opaque_ray_is_recorded_alike_both_ways(toy: Scene) -> None:
+    field, batch = veil_and_wall(toy, 2.0, 2.0)
     seen = field(replace(batch, recorder=Recorder(lambda e: e / (1 + e), (0,))))[0]
     torch.testing.assert_close(seen.rgb, torch.full_like(seen.rgb, 2 / 3), atol=2e-3, rtol=0)
 
 
-def test_the_recording_teaches_planes_networks_and_exposure(toy: Scene) -> None:
+def test_the_recording_trains_planes_networks_and_exposure(toy: Scene) -> None:
     field, gain = random_field("hdr-hexplane", toy), torch.zeros(1, requires_grad=True)
     batch = draw_pixels(toy, 2, 60, 0, torch.Generator().manual_seed(0))
-    render, own = field(
-        replace(batch, recorder=Recorder(lambda e: e * gain.exp() / (1 + e * gain.exp()), (2,)))
-    )
+    recorder = Recorder(lambda e: e * gain.exp() / (1 + e * gain.exp()), (2,))
+    render, own = field(replace(batch, recorder=recorder))
     assert render.rgb is not None and set(own) == {"total_variation"}
     (render.rgb - batch.rgb).square().mean().backward()
     assert gain.grad is not None and float(gain.grad.abs()) > 0
@@ -158,15 +110,13 @@ def test_the_recording_teaches_planes_networks_and_exposure(toy: Scene) -> None:
 
 
 def test_density_is_the_published_softplus_of_a_shifted_number(toy: Scene) -> None:
-    field, batch = see_through(toy, 1.0, 1.0)
+    field, batch = veil_and_wall(toy, 1.0, 1.0)
     field.density_planes = Slab({0.5: 9.0})  # type: ignore[assignment]
     render = field(replace(batch, recorder=Recorder(lambda e: e, (0,))))[0]
-    thickness = (
-        75 * math.log(1 + math.exp(-1)) * 0.06
-    )  # softplus(9 - 10) = log(1 + 1 / e), over a slab of 0.06, at a right angle
-    assert float(render.opacity.mean()) == pytest.approx(
-        1 - math.exp(-thickness), rel=0.12
-    )  # rays are slanted, samples coarse
+    # softplus(9 - 10) = log(1 + 1 / e), over a slab of 0.06, at a right angle
+    thickness = 75 * math.log(1 + math.exp(-1)) * 0.06
+    opacity = float(render.opacity.mean())  # rays are slanted, samples coarse
+    assert opacity == pytest.approx(1 - math.exp(-thickness), rel=0.12)
 
 
 @pytest.fixture(scope="module", params=["hdr-hexplane", "nerf-wt"])
@@ -174,9 +124,8 @@ def run_of(
     request: pytest.FixtureRequest, toy_folder: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     """A run of a few steps of a baseline that records by itself."""
-    return train(
-        small(request.param, toy_folder, tmp_path_factory.mktemp(request.param) / "run", steps=6)
-    )
+    out = tmp_path_factory.mktemp(request.param) / "run"
+    return train(small(request.param, toy_folder, out, steps=6))
 
 
 def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(
@@ -184,32 +133,26 @@ def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(
 ) -> None:
     render(RenderConfig(run_of, "fixed", tmp_path, output=Output(ev=2.0, video=False, exr="float")))
     run = Run.open(run_of)
-    exr = torch.from_numpy(io.read_exr(tmp_path / "fixed/00002.exr")["RGB"]).reshape(-1, 3)
+    exr = torch.from_numpy(read_exr(tmp_path / "fixed/00002.exr")["RGB"]).reshape(-1, 3)
     camera = run.scene.train[3].camera  # the middle frame's
     torch.testing.assert_close(exr, run.field.render(camera, 2.0).radiance, atol=1e-5, rtol=1e-4)
-    png = torch.from_numpy(io.read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
-    torch.testing.assert_close(
-        png,
-        recorded(run.field, camera, 2.0, [run.tonemapper.recorder_at(2.0)])[0],
-        atol=0.003,
-        rtol=0,
-    )
+    png = torch.from_numpy(read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
+    (rgb,) = recorded(run.field, camera, 2.0, [run.tonemapper.recorder_at(2.0)])
+    torch.testing.assert_close(png, rgb, atol=0.003, rtol=0)
 
 
 def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(
     run_of: Path, tmp_path: Path
 ) -> None:
     result = evaluate(EvaluateConfig(run_of))
-    assert all(
-        math.isfinite(result["headline"][name])
-        for name in ("psnr", "psnr_moving", "psnr_all_exposures")
-    )
+    for name in ("psnr", "psnr_moving", "psnr_all_exposures"):
+        assert math.isfinite(result["headline"][name])
     run = Run.open(run_of)
     f = run.scene.train[1]
-    rgb = recorded(run.field, f.camera, f.time, [run.tonemapper.recorder(f.bracket, f.camera_id)])[
-        0
-    ].view_as(f.image)
+    recorder = run.tonemapper.recorder(f.bracket, f.camera_id)
+    (rgb,) = recorded(run.field, f.camera, f.time, [recorder])
+    mse = float((rgb.view_as(f.image) - f.image).square().mean())
     psnr = next(v["psnr"] for v in result["views"] if v["time"] == f.time)
-    assert psnr == pytest.approx(-10 * math.log10(float((rgb - f.image).square().mean())), abs=0.05)
+    assert psnr == pytest.approx(-10 * math.log10(mse), abs=0.05)
     with pytest.raises(InputError, match="Gaussian"):
         export(ExportConfig(run_of, tmp_path / "a.ply", ply=True))

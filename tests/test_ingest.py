@@ -11,7 +11,9 @@ from mutations import check_reader
 from PIL import Image
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_exr, write_png, write_video
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.ingest import (
     every_of,
     hash_file,

@@ -13,13 +13,13 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import Layers
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.rendering.interpolate import Picture, neighbors, render_at, splat
+from hdr_nsff.rendering.interpolate import Mode, Picture, neighbors, render_at, splat
 
 CAMERA = camera()
 
 
 def red_center(radiance: Tensor) -> Tensor:
-    """The centroid (x, y) in pixels of what is redder than the wall."""
+    """The centroid (x, y) in pixels of the pixels redder than the wall."""
     weight = (radiance[:, 0] - radiance[:, 1]).clamp_min(0)[:, None]
     return (CAMERA.pixel_grid() * weight).sum(0) / weight.sum()
 
@@ -30,25 +30,23 @@ def test_a_disc_at_constant_velocity_lands_at_the_closed_form_place(
     fraction: float, empty_moves: bool
 ) -> None:
     field = DiscBeforeWall(empty_moves=empty_moves)
-    start, step = red_center(field.render(CAMERA, 0.0).radiance), torch.tensor([8.0, 2.0])
+    start = red_center(field.render(CAMERA, 0.0).radiance)
+    step = torch.tensor([8.0, 2.0])
     seen = render_at(field, CAMERA, fraction, [0.0, 1.0])
     assert torch.allclose(red_center(seen.radiance), start + fraction * step, atol=0.2)
     truth = field.render(CAMERA, fraction)
-    assert (
-        seen.radiance - truth.radiance
-    ).abs().mean() < 2.0  # 100 x half of the disc's edge (31 of 1536 pixels)
+    # 100 x half of the disc's edge (31 of 1536 pixels)
+    assert (seen.radiance - truth.radiance).abs().mean() < 2.0
     assert abs(seen.motion.sum() - truth.motion.sum()) < 9  # the disc keeps its 79 pixels
 
 
 def test_unmoved_wall_is_exact_and_nothing_tears_open() -> None:
     seen = render_at(DiscBeforeWall(), CAMERA, 0.5, [0.0, 1.0])
     wall = DiscBeforeWall().layers(CAMERA, 0.0).radiance[:, 1]
-    far = (CAMERA.pixel_grid() - torch.tensor([20.0, 13.0])).norm(
-        dim=-1
-    ) > 16  # away from both places of the disc
-    assert torch.allclose(seen.radiance[far], wall[far], atol=1e-5) and torch.allclose(
-        seen.depth[far], torch.tensor(WALL)
-    )
+    offset = CAMERA.pixel_grid() - torch.tensor([20.0, 13.0])
+    far = offset.norm(dim=-1) > 16  # away from both places of the disc
+    assert torch.allclose(seen.radiance[far], wall[far], atol=1e-5)
+    assert torch.allclose(seen.depth[far], torch.tensor(WALL))
     assert torch.allclose(seen.opacity, torch.ones(W * H), atol=1e-5)
 
 
@@ -66,54 +64,43 @@ def one_layer(alpha: Tensor, value: Tensor, shift: Tensor) -> Picture:
 
 def test_whole_pixels_of_flow_shift_the_picture_and_zero_flow_leaves_it() -> None:
     generator = torch.Generator().manual_seed(0)
-    alpha, value = (
-        0.1 + 0.9 * torch.rand(W * H, generator=generator),
-        torch.rand(W * H, generator=generator),
-    )
+    alpha = 0.1 + 0.9 * torch.rand(W * H, generator=generator)
+    value = torch.rand(W * H, generator=generator)
+    inside = slice(2, H - 2), slice(3, W)  # pixels from beyond the border are not known
     for dx, dy in ((0, 0), (3, -2)):
         moved = one_layer(alpha, value, torch.tensor([float(dx), float(dy)]).expand(W * H, 2))
-        inside = slice(2, H - 2), slice(3, W)  # what came in from beyond the border is not known
-        expected = (
-            alpha.view(H, W).roll((dy, dx), (0, 1)),
-            (alpha * value).view(H, W).roll((dy, dx), (0, 1)),
-        )
-        assert torch.allclose(moved.opacity.view(H, W)[inside], expected[0][inside], atol=1e-4)
-        assert torch.allclose(moved.color[:, 0].view(H, W)[inside], expected[1][inside], atol=1e-4)
+        opacity = alpha.view(H, W).roll((dy, dx), (0, 1))
+        color = (alpha * value).view(H, W).roll((dy, dx), (0, 1))
+        assert torch.allclose(moved.opacity.view(H, W)[inside], opacity[inside], atol=1e-4)
+        assert torch.allclose(moved.color[:, 0].view(H, W)[inside], color[inside], atol=1e-4)
 
 
-def test_splatting_keeps_the_energy_of_what_moves() -> None:
+def test_splatting_keeps_the_energy_of_moving_samples() -> None:
     alpha = torch.zeros(H, W)
-    # 16 pixels, over empty samples; they move by a quarter and three quarters of a
-    # pixel
-    alpha[10:14, 10:14] = 0.5
-    moved = one_layer(
-        alpha.view(-1), torch.full((W * H,), 3.0), torch.tensor([0.25, 0.75]).expand(W * H, 2)
-    )
-    assert moved.opacity.sum().item() == pytest.approx(8.0, rel=0.06) and moved.color[
-        :, 0
-    ].sum().item() == pytest.approx(24.0, rel=0.06)
+    alpha[10:14, 10:14] = 0.5  # 16 pixels, over empty samples
+    shift = torch.tensor([0.25, 0.75]).expand(W * H, 2)
+    moved = one_layer(alpha.view(-1), torch.full((W * H,), 3.0), shift)
+    assert moved.opacity.sum().item() == pytest.approx(8.0, rel=0.06)
+    assert moved.color[:, 0].sum().item() == pytest.approx(24.0, rel=0.06)
 
 
 def test_spreading_samples_leave_no_cracks() -> None:
     center = torch.tensor([W / 2, H / 2])
     moved = one_layer(torch.ones(W * H), torch.ones(W * H), (CAMERA.pixel_grid() - center) * 0.1)
-    assert moved.opacity.min() > 0.95 and torch.allclose(
-        moved.color[:, 0], moved.opacity[:, 0], atol=1e-5
-    )
+    assert moved.opacity.min() > 0.95
+    assert torch.allclose(moved.color[:, 0], moved.opacity[:, 0], atol=1e-5)
 
 
 def test_a_mover_over_empty_samples_stays_opaque_and_leaves_nothing_behind() -> None:
     inside = torch.zeros(H, W)
     inside[8:16, 8:16] = 1
-    alpha = one_layer(
-        inside.view(-1), torch.ones(W * H), inside.view(-1, 1) * torch.tensor([4.0, 0.0])
-    ).opacity.view(H, W)
-    assert torch.allclose(
-        alpha[8:16, 12:20], torch.ones(8, 8), atol=1e-4
-    ) and alpha.sum().item() == pytest.approx(64, abs=0.01)
+    shift = inside.view(-1, 1) * torch.tensor([4.0, 0.0])
+    alpha = one_layer(inside.view(-1), torch.ones(W * H), shift).opacity.view(H, W)
+    assert torch.allclose(alpha[8:16, 12:20], torch.ones(8, 8), atol=1e-4)
+    assert alpha.sum().item() == pytest.approx(64, abs=0.01)
 
 
-def test_where_neither_time_shows_anything_the_nearer_one_stands() -> None:
+def test_where_both_times_are_empty_the_nearer_one_is_shown_unmoved() -> None:
     class Fleeing(DiscBeforeWall):
         """One opaque layer whose right half leaves the picture from either side."""
 
@@ -140,10 +127,8 @@ def test_neighbors_of_uneven_times() -> None:
     assert neighbors(9.0, [0.0, 1.0, 4.0]) == (4.0, 4.0, 0.0)
 
 
-def test_direct_query_and_training_times_ask_the_field_itself() -> None:
+@pytest.mark.parametrize(("mode", "time"), [("direct", 0.3), ("splat", 1.0)])
+def test_direct_mode_and_training_times_render_the_field_itself(mode: Mode, time: float) -> None:
     field = DiscBeforeWall()
-    for mode, time in (("direct", 0.3), ("splat", 1.0)):
-        assert torch.equal(
-            render_at(field, CAMERA, time, [0.0, 1.0], mode).radiance,
-            field.render(CAMERA, time).radiance,
-        )
+    seen = render_at(field, CAMERA, time, [0.0, 1.0], mode)
+    assert torch.equal(seen.radiance, field.render(CAMERA, time).radiance)

@@ -1,5 +1,5 @@
-"""Time as knots: where a time lies among the training times, and the curves through
-what is kept there.
+"""Time as knots: where a time lies among the training times, and curves through values
+at knots.
 """
 
 from collections.abc import Callable
@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.knots import catmull_rom, knot_of, linear
+from hdr_nsff.fields.knots import catmull_rom, interpolate_linear, knot_of
 
-every_curve = pytest.mark.parametrize("curve", [linear, catmull_rom])
+every_curve = pytest.mark.parametrize("curve", [interpolate_linear, catmull_rom])
 Curve = Callable[[Tensor, float], Tensor]
 
 
@@ -25,7 +25,7 @@ def test_a_time_is_a_position_among_uneven_training_times() -> None:
     assert (knot_of(times, -1.0), knot_of(times, 9.0)) == (0, 3)
 
 
-def test_the_only_training_time_is_knot_0_whatever_the_time() -> None:
+def test_a_single_training_time_is_knot_0() -> None:
     assert knot_of(torch.tensor([4.0]), 9.0) == 0
 
 
@@ -51,17 +51,16 @@ def test_a_single_value_stands_still(curve: Curve) -> None:
     assert torch.equal(curve(v, 0.0), v[0])
 
 
-def test_linear_is_the_mean_half_way() -> None:
+def test_linear_interpolation_half_way_is_the_mean() -> None:
     v = values()
-    torch.testing.assert_close(linear(v, 3.5), (v[3] + v[4]) / 2)
+    torch.testing.assert_close(interpolate_linear(v, 3.5), (v[3] + v[4]) / 2)
 
 
 def test_a_parabola_is_reproduced_by_the_cubic_away_from_the_ends() -> None:
     v = torch.arange(6, dtype=torch.float64)[:, None] ** 2
     for position in (1.2, 2.5, 3.9):
-        torch.testing.assert_close(
-            catmull_rom(v, position), torch.tensor([position**2], dtype=torch.float64)
-        )
+        expected = torch.tensor([position**2], dtype=torch.float64)
+        torch.testing.assert_close(catmull_rom(v, position), expected)
 
 
 def test_the_cubics_velocity_is_continuous_and_that_of_the_neighbors() -> None:

@@ -1,4 +1,4 @@
-"""The paper's terms, worked by hand."""
+"""The objective's terms, worked by hand."""
 
 import math
 
@@ -10,9 +10,8 @@ from hdr_nsff.maths import losses
 def test_photometric_is_the_mean_absolute_or_squared_difference() -> None:
     a, b = torch.tensor([[0.5, 0.5, 0.5]]), torch.tensor([[0.3, 0.5, 0.9]])
     assert math.isclose(float(losses.photometric(a, b)), 0.6 / 3, rel_tol=1e-5)
-    assert math.isclose(
-        float(losses.photometric(a, b, squared=True)), (0.04 + 0.16) / 3, rel_tol=1e-5
-    )
+    squared = float(losses.photometric(a, b, squared=True))
+    assert math.isclose(squared, (0.04 + 0.16) / 3, rel_tol=1e-5)
 
 
 def test_photometric_ignores_pixels_of_weight_zero() -> None:
@@ -33,18 +32,18 @@ def test_opposite_flows_close_the_cycle_and_cost_no_kinetic_energy() -> None:
 
 
 def test_kinetic_energy_of_a_bend() -> None:
-    assert math.isclose(
-        float(losses.kinetic(torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 1.0, 0]]))), 0.5 * 2
-    )
+    forward, backward = torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 1.0, 0]])
+    assert math.isclose(float(losses.kinetic(forward, backward)), 0.5 * 2)
 
 
 def test_flow_magnitude_does_not_cancel_between_axes() -> None:
     assert float(losses.flow_magnitude(torch.tensor([[1.0, -1.0, 0.0]]))) > 0.6
 
 
-def test_entropy_is_zero_for_certain_shares() -> None:
-    assert float(losses.entropy(torch.tensor([0.0, 1.0]))) == 0
-    assert math.isclose(float(losses.entropy(torch.tensor([0.5]))), 0.5 * math.log(2), rel_tol=1e-5)
+def test_blend_entropy_is_zero_for_certain_shares() -> None:
+    assert float(losses.blend_entropy(torch.tensor([0.0, 1.0]))) == 0
+    half = float(losses.blend_entropy(torch.tensor([0.5])))
+    assert math.isclose(half, 0.5 * math.log(2), rel_tol=1e-5)
 
 
 def test_relative_depth_ignores_scale_and_shift_of_the_prior() -> None:
@@ -53,13 +52,10 @@ def test_relative_depth_ignores_scale_and_shift_of_the_prior() -> None:
     assert float(losses.depth_scene(depth, 1 / depth, torch.ones(50), 1.0)) < 1e-7
 
 
-def test_scene_depth_trusts_the_confidence() -> None:
+def test_scene_depth_is_weighted_by_the_confidence() -> None:
     depth, prior = torch.tensor([1.0, 1.0]), torch.tensor([0.5, 0.9])
-    assert math.isclose(
-        float(losses.depth_scene(depth, prior, torch.tensor([0.0, 1.0]), 2.0)),
-        0.1 / 2 * 2,
-        rel_tol=1e-5,
-    )
+    loss = losses.depth_scene(depth, prior, torch.tensor([0.0, 1.0]), near=2.0)
+    assert math.isclose(float(loss), 0.1 / 2 * 2, rel_tol=1e-5)
 
 
 def test_optical_flow_counts_valid_pixels_only_and_caps_outliers() -> None:
@@ -68,16 +64,14 @@ def test_optical_flow_counts_valid_pixels_only_and_caps_outliers() -> None:
     assert float(losses.optical_flow(flow, target, valid, limit=20.0)) == (2 + 20) / 2
 
 
-def test_a_right_motion_mask_costs_next_to_nothing() -> None:
+def test_a_correct_motion_mask_costs_next_to_nothing() -> None:
     moving = torch.tensor([True, False])
-    assert (
-        float(losses.motion_mask(torch.tensor([1.0, 0.0]), moving))
-        < 1e-3
-        < float(losses.motion_mask(torch.tensor([0.0, 1.0]), moving))
-    )
+    correct = losses.motion_mask(torch.tensor([1.0, 0.0]), moving)
+    wrong = losses.motion_mask(torch.tensor([0.0, 1.0]), moving)
+    assert float(correct) < 1e-3 < float(wrong)
 
 
-def test_untrusted_pixels_of_the_motion_mask_have_no_pull() -> None:
+def test_untrusted_pixels_of_the_motion_mask_get_no_gradient() -> None:
     motion = torch.tensor([0.3, 0.3], requires_grad=True)
     losses.motion_mask(motion, torch.tensor([True, True]), torch.tensor([1.0, 0.0])).backward()
     assert motion.grad is not None and motion.grad[0] < 0 and motion.grad[1] == 0

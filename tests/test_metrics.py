@@ -1,5 +1,5 @@
-"""Metrics against closed forms and slow oracles (scikit-image, flip's own defaults, a
-plain-numpy AlexNet).
+"""Metrics against closed forms and slow oracles (scikit-image, FLIP's own defaults, an
+AlexNet written out).
 """
 
 import importlib.util
@@ -64,42 +64,39 @@ def test_ssim_of_equal_pictures_is_one_and_a_mask_averages_the_map():
     mixed[:, 30:] = a[:, 30:]
     left = torch.zeros(40, 50, dtype=torch.bool)
     left[:, :24] = True  # six columns away from what differs
-    assert (
-        metrics.ssim(mixed, b, left) == pytest.approx(1.0) and metrics.ssim(mixed, b, ~left) < 0.9
-    )
+    assert metrics.ssim(mixed, b, left) == pytest.approx(1.0)
+    assert metrics.ssim(mixed, b, ~left) < 0.9
 
 
-def test_alignment_is_not_led_by_what_no_exposure_records():
+def test_alignment_ignores_pixels_that_no_exposure_records():
     rng = torch.Generator().manual_seed(0)
     truth = torch.rand(1000, 3, generator=rng) + 0.1
     radiance = truth / torch.tensor([2.0, 4.0, 8.0])
     truth[:100] *= 500.0  # a lamp, predicted far too dark
     recordable = torch.arange(1000) >= 100
-    torch.testing.assert_close(
-        metrics.align(radiance, truth, recordable, per_channel=True), torch.tensor([2.0, 4.0, 8.0])
-    )
+    scales = metrics.align(radiance, truth, recordable, per_channel=True)
+    torch.testing.assert_close(scales, torch.tensor([2.0, 4.0, 8.0]))
     assert metrics.align(radiance, truth, recordable).item() == pytest.approx(4.0)
     least_squares = float((radiance * truth).sum() / radiance.square().sum())
-    assert least_squares > 20  # what the lamp would do
+    assert least_squares > 20  # led astray by the lamp
 
 
 def test_alignment_without_common_pixels_is_one():
-    assert (
-        metrics.align(torch.zeros(5, 3), torch.ones(5, 3), torch.ones(5, dtype=torch.bool)).item()
-        == 1.0
-    )
+    every = torch.ones(5, dtype=torch.bool)
+    assert metrics.align(torch.zeros(5, 3), torch.ones(5, 3), every).item() == 1.0
 
 
 def test_mu_law_psnr_worked_by_hand():
     truth = torch.full((2, 2, 3), 8.0)  # at the peak: 1 after the mu-law
     radiance = torch.full((2, 2, 3), 8.0 / 50)  # log(2) / log(51)
     expected = -20 * math.log10(1 - math.log(2) / math.log(51))
-    assert metrics.mu_law_psnr(radiance, truth, peak=8.0, mu=50.0) == pytest.approx(
-        expected, rel=1e-6
-    )
-    assert metrics.mu_law_psnr(truth * 3, truth, peak=8.0) == pytest.approx(
-        100.0
-    )  # beyond the peak nothing is told apart
+    psnr = metrics.mu_law_psnr(radiance, truth, peak=8.0, mu=50.0)
+    assert psnr == pytest.approx(expected, rel=1e-6)
+
+
+def test_mu_law_psnr_clips_at_the_peak():
+    truth = torch.full((2, 2, 3), 8.0)
+    assert metrics.mu_law_psnr(truth * 3, truth, peak=8.0) == pytest.approx(100.0)
 
 
 def pu21_code(nits):
@@ -117,41 +114,38 @@ def pu21_code(nits):
 
 
 def test_pu21_psnr_worked_by_hand():
-    """White is 1000 cd/m^2: half of it is 500, and the codes of the two are compared
-    with a peak of 256, that of 100 cd/m^2.
+    """White is 1000 cd/m^2, half of it 500; their codes are compared with a peak of
+    256, the code of 100 cd/m^2.
     """
     truth = torch.full((2, 2, 3), 8.0)
-    assert (
-        pu21_code(100) == pytest.approx(256, abs=0.5)
-        and 300 < pu21_code(500) < pu21_code(1000) < 500
-    )
+    assert pu21_code(100) == pytest.approx(256, abs=0.5)
+    assert 300 < pu21_code(500) < pu21_code(1000) < 500
     expected = 20 * math.log10(256 / (pu21_code(1000) - pu21_code(500)))
     assert metrics.pu21_psnr(truth / 2, truth, white=8.0) == pytest.approx(expected, abs=1e-6)
-    assert metrics.pu21_psnr(truth * 20, truth * 10, white=8.0) == pytest.approx(
-        100
-    )  # 10,000 cd/m^2 is as bright as it tells
+
+
+def test_pu21_psnr_clips_at_10000_nits():
+    truth = torch.full((2, 2, 3), 80.0)
+    assert metrics.pu21_psnr(truth * 2, truth, white=8.0) == pytest.approx(100)
 
 
 def test_pu21_psnr_on_a_mask_sees_only_the_mask():
     truth, mask = torch.full((4, 4, 3), 1.0), torch.zeros(4, 4, dtype=torch.bool)
     radiance = truth.clone()
     radiance[1, 2], mask[1, 2] = 0.5, True
-    whole, part = (
-        metrics.pu21_psnr(radiance, truth, 1.0),
-        metrics.pu21_psnr(radiance, truth, 1.0, mask),
-    )
+    whole = metrics.pu21_psnr(radiance, truth, 1.0)
+    part = metrics.pu21_psnr(radiance, truth, 1.0, mask)
     assert whole - part == pytest.approx(10 * math.log10(16))
 
 
-def test_pu21_white_is_not_that_of_a_lamp_of_few_pixels():
+def test_pu21_white_ignores_a_lamp_of_few_pixels():
     truth = torch.full((100, 100, 3), 2.0)
     truth[:5, :8] = 700.0  # 0.4 % of the sequence
     assert metrics.pu21_white([truth]) == pytest.approx(2.0)
     truth[:10, :10] = 700.0  # 1 %
     assert metrics.pu21_white([truth]) == pytest.approx(700.0)
-    assert metrics.pu21_white([truth, torch.full((100, 200, 3), 2.0)]) == pytest.approx(
-        2.0
-    )  # one white for all views
+    other = torch.full((100, 200, 3), 2.0)
+    assert metrics.pu21_white([truth, other]) == pytest.approx(2.0)  # one white for all views
 
 
 def hdr():
@@ -169,23 +163,22 @@ def test_the_flip_range_of_one_picture_is_flips_own():
     )
     start, stop = metrics.flip_exposures([truth])
     assert (start, stop) == pytest.approx((used["startExposure"], used["stopExposure"]), abs=1e-3)
-    assert float(metrics.hdr_flip_map(radiance, truth, (start, stop)).mean()) == pytest.approx(
-        mean, abs=2e-4
-    )
+    errors = metrics.hdr_flip_map(radiance, truth, (start, stop))
+    assert float(errors.mean()) == pytest.approx(mean, abs=2e-4)
 
 
-def test_flip_of_equal_pictures_is_zero_and_differences_stay_where_they_are():
+def test_flip_of_equal_pictures_is_zero_and_differences_stay_local():
     pytest.importorskip("flip_evaluator")
     radiance, truth = hdr()
     mask = torch.zeros(48, 64, dtype=torch.bool)
     mask[20:30] = True
-    assert float(metrics.hdr_flip_map(truth, truth, (-5.0, 2.0)).max()) == pytest.approx(
-        0.0, abs=1e-6
-    )
-    seen = metrics.hdr_flip_map(torch.where(mask[..., None], radiance, truth), truth, (-5.0, 2.0))
-    assert (
-        seen.shape == mask.shape and seen[mask].mean() > 2 * seen.mean() and float(seen.max()) <= 1
-    )
+    exposures = (-5.0, 2.0)
+    equal = metrics.hdr_flip_map(truth, truth, exposures)
+    assert float(equal.max()) == pytest.approx(0.0, abs=1e-6)
+    mixed = torch.where(mask[..., None], radiance, truth)
+    errors = metrics.hdr_flip_map(mixed, truth, exposures)
+    assert errors.shape == mask.shape and float(errors.max()) <= 1
+    assert errors[mask].mean() > 2 * errors.mean()
 
 
 def test_flip_is_none_where_it_is_not_installed(monkeypatch):
@@ -206,34 +199,29 @@ def everywhere(picture):
 
 def test_hdr_tae_of_two_constants_worked_by_hand():
     one, rest = torch.ones(4, 5, 3), torch.zeros(4, 5, 2)
-    assert metrics.hdr_tae(one, 3 * one, rest, everywhere(one)) == (pytest.approx(2 / 4), 20)
-    assert metrics.hdr_tae(one, one, rest, everywhere(one)) == (0, 20)
-    assert metrics.hdr_tae(0 * one, 0 * one, rest, everywhere(one)) == (0, 20)  # black stays black
-    assert metrics.hdr_tae(one, 0 * one, rest, everywhere(one)) == (
-        pytest.approx(1),
-        20,
-    )  # the most there is
+    every = everywhere(one)
+    assert metrics.hdr_tae(one, 3 * one, rest, every) == (pytest.approx(2 / 4), 20)
+    assert metrics.hdr_tae(one, one, rest, every) == (0, 20)
+    assert metrics.hdr_tae(0 * one, 0 * one, rest, every) == (0, 20)  # black stays black
+    assert metrics.hdr_tae(one, 0 * one, rest, every) == (pytest.approx(1), 20)  # the maximum
     colored = one * torch.tensor([1.0, 3.0, 9.0])
-    assert metrics.hdr_tae(one, colored, rest, everywhere(one))[0] == pytest.approx(
-        (0 + 2 / 4 + 8 / 10) / 3
-    )
+    error, _ = metrics.hdr_tae(one, colored, rest, every)
+    assert error == pytest.approx((0 + 2 / 4 + 8 / 10) / 3)
 
 
-def test_hdr_tae_follows_the_flow_between_pixels_and_leaves_out_what_leaves_the_picture():
-    """What is at column x + 1.5, row y + 1 has 1.5 + 10 more; the last two columns and
-    the last row of 6 x 9 flow out.
+def test_hdr_tae_follows_the_flow_and_leaves_out_pixels_that_leave_the_picture():
+    """The pixel at column x + 1.5, row y + 1 is brighter by 1.5 + 10; the last two
+    columns and the last row of 6 x 9 flow out.
     """
     here, there = ramp() + 11.5, ramp()
     flow = torch.tensor([1.5, 1.0]).expand(6, 9, 2)
-    assert metrics.hdr_tae(here, there, flow, everywhere(here)) == (
-        pytest.approx(0, abs=1e-12),
-        5 * 7,
-    )
+    error, count = metrics.hdr_tae(here, there, flow, everywhere(here))
+    assert error == pytest.approx(0, abs=1e-12) and count == 5 * 7
     wrong, _ = metrics.hdr_tae(here, there, torch.zeros(6, 9, 2), everywhere(here))
     assert wrong > 0.1
 
 
-def test_hdr_tae_is_over_the_mask_and_no_scale_changes_it():
+def test_hdr_tae_counts_the_mask_alone_and_no_scale_changes_it():
     one, rest = torch.ones(4, 5, 3), torch.zeros(4, 5, 2)
     other, mask = one.clone(), torch.zeros(4, 5, dtype=torch.bool)
     other[1, 1], mask[1, 1:3] = 3.0, True
@@ -250,7 +238,7 @@ def test_depth_errors_worked_by_hand():
     assert metrics.depth_errors(truth, truth, truth > 0) == (0, 0)
 
 
-def test_the_median_ratio_ignores_what_is_unknown_and_what_is_far_off():
+def test_the_median_ratio_ignores_unknown_values_and_outliers():
     truth = torch.tensor([2.0, 4.0, 6.0, 8.0, 900.0, 0.0, 5.0])
     values = torch.tensor([1.0, 2.0, 3.0, 4.0, 1.0, 5.0, 0.0])
     assert metrics.median_ratio(values, truth) == pytest.approx(2)
@@ -302,30 +290,30 @@ def test_lpips_agrees_with_a_network_written_out(tmp_path):
     """torchvision's AlexNet, written as nn.Sequential, tapped after each ReLU."""
     net, linear = alexnet_weights()
     torch.save(net | linear, tmp_path / "w.pth")
-    c, r, p = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
+    conv, relu, pool = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
     layers = torch.nn.Sequential(
-        c(3, 64, 11, 4, 2), r(), p(3, 2), c(64, 192, 5, padding=2), r(), p(3, 2), c(192, 384, 3, padding=1), r(),
-        c(384, 256, 3, padding=1), r(), c(256, 256, 3, padding=1), r(),
-    )  # fmt: skip
-    layers.load_state_dict(
-        {k.removeprefix("features."): v for k, v in net.items() if k.startswith("features")}
+        *(conv(3, 64, 11, 4, 2), relu(), pool(3, 2)),
+        *(conv(64, 192, 5, padding=2), relu(), pool(3, 2)),
+        *(conv(192, 384, 3, padding=1), relu()),
+        *(conv(384, 256, 3, padding=1), relu()),
+        *(conv(256, 256, 3, padding=1), relu()),
     )
+    features = {k.removeprefix("features."): v for k, v in net.items() if k.startswith("features")}
+    layers.load_state_dict(features)
     a, b = (p.float() for p in pictures(80, 96))
-    seen = []
-    for x in (a, b):
-        x = (2 * x - 1 - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor(
-            [0.458, 0.448, 0.450]
-        )
-        x, taps = x.permute(2, 0, 1)[None], []
+    shift, scale = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
+    activations = []
+    for picture in (a, b):
+        x = ((2 * picture - 1 - shift) / scale).permute(2, 0, 1)[None]
+        taps = []
         for i, layer in enumerate(layers):
             x = layer(x)
             if i in (1, 4, 7, 9, 11):
                 taps.append(x / x.square().sum(1, keepdim=True).sqrt())
-        seen.append(taps)
-    slow = sum(
-        ((x - y) ** 2 * linear[f"lin{k}.model.1.weight"]).sum(1).mean()
-        for k, (x, y) in enumerate(zip(*seen, strict=True))
-    )
+        activations.append(taps)
+    slow = 0.0
+    for k, (x, y) in enumerate(zip(*activations, strict=True)):
+        slow += ((x - y) ** 2 * linear[f"lin{k}.model.1.weight"]).sum(1).mean()
     assert metrics.Lpips(tmp_path / "w.pth")(a, b) == pytest.approx(slow.item(), rel=1e-5)
 
 
@@ -343,24 +331,17 @@ def test_weights_as_flax_lays_them_out_give_the_same_distance(tmp_path):
     torch.save(net | linear, tmp_path / "theirs.pth")
     params = {"AlexNet_0": {}}
     for i, at in enumerate(metrics.Lpips.LAYERS):
-        kernel = (
-            net[f"features.{at}.weight"].permute(2, 3, 1, 0).numpy()
-        )  # out, in, h, w -> h, w, in, out
-        params["AlexNet_0"][f"Conv_{i}"] = {
-            "kernel": kernel,
-            "bias": net[f"features.{at}.bias"].numpy(),
-        }
-        params[f"NetLinLayer_{i}"] = {
-            "Conv_0": {"kernel": linear[f"lin{i}.model.1.weight"].permute(2, 3, 1, 0).numpy()}
-        }
+        # out, in, h, w -> h, w, in, out
+        kernel = net[f"features.{at}.weight"].permute(2, 3, 1, 0).numpy()
+        importance = linear[f"lin{i}.model.1.weight"].permute(2, 3, 1, 0).numpy()
+        bias = net[f"features.{at}.bias"].numpy()
+        params["AlexNet_0"][f"Conv_{i}"] = {"kernel": kernel, "bias": bias}
+        params[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": importance}}
     (tmp_path / "flax.ckpt").write_bytes(pickle.dumps(params))
     lpips_weights().main(str(tmp_path / "flax.ckpt"), str(tmp_path / "ours.pth"))
     a, b = (p.float() for p in pictures(80, 96))
-    assert (
-        metrics.Lpips(tmp_path / "ours.pth")(a, b)
-        == metrics.Lpips(tmp_path / "theirs.pth")(a, b)
-        > 0
-    )
+    ours, theirs = metrics.Lpips(tmp_path / "ours.pth"), metrics.Lpips(tmp_path / "theirs.pth")
+    assert ours(a, b) == theirs(a, b) > 0
 
 
 def test_nothing_but_arrays_is_unpickled(tmp_path):
@@ -375,7 +356,8 @@ def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):
     """
     net, linear = alexnet_weights()
     torch.save(net | linear, tmp_path / "w.pth")
-    model, (a, b) = metrics.Lpips(tmp_path / "w.pth"), (p.float() for p in pictures(80, 96))
+    model = metrics.Lpips(tmp_path / "w.pth")
+    a, b = (p.float() for p in pictures(80, 96))
     mask = torch.zeros(80, 96, dtype=torch.bool)
     mask[10:50, 20:33] = True
 
@@ -391,13 +373,13 @@ def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):
         weights(80, d.shape[0]) @ d.numpy() @ weights(96, d.shape[1]).T
         for d in model.distances(a, b)
     )
-    assert model.on_mask(a, b, mask) == pytest.approx(slow[mask.numpy()].mean(), rel=1e-4)
-    assert model.on_mask(a, a, mask) == 0 and model.on_mask(a, b, mask) != pytest.approx(
-        model(a, b), rel=1e-3
-    )
+    masked = model.on_mask(a, b, mask)
+    assert masked == pytest.approx(slow[mask.numpy()].mean(), rel=1e-4)
+    assert masked != pytest.approx(model(a, b), rel=1e-3)
+    assert model.on_mask(a, a, mask) == 0
 
 
-def test_lpips_without_its_linear_layers_is_refused_in_a_sentence(tmp_path):
+def test_lpips_names_what_is_wrong_with_its_weights(tmp_path):
     net, _ = alexnet_weights()
     torch.save(net, tmp_path / "half.pth")
     with pytest.raises(InputError, match=r"importance\.0 is missing"):

@@ -1,4 +1,4 @@
-"""NeRF-W with time: what an image's code may change, and what it may not."""
+"""NeRF-W with time: what an appearance code may change, and what it may not."""
 
 from dataclasses import replace
 
@@ -7,8 +7,9 @@ import torch
 from presets import random_field, small
 from torch import Tensor
 
-from hdr_nsff.fields import build_field
 from hdr_nsff.fields.baselines.nerf_wt import NerfWT
+from hdr_nsff.fields.build import build_field
+from hdr_nsff.fields.nsff.samples import BranchOutput, RaySamples
 from hdr_nsff.scene.batch import Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
 
@@ -28,16 +29,17 @@ def test_a_code_changes_colors_and_nothing_else(field: NerfWT, toy: Scene) -> No
     camera = toy.train[2].camera
     a, b = (field.render(camera, 2.0, recorder=recorder(i)) for i in (0, 4))
     assert float((a.radiance - b.radiance).abs().max()) > 1e-3
-    assert all(
-        torch.equal(getattr(a, name), getattr(b, name)) for name in ("depth", "opacity", "motion")
-    )
+    for name in ("depth", "opacity", "motion"):
+        assert torch.equal(getattr(a, name), getattr(b, name))
 
 
-def test_movers_do_not_know_the_code(field: NerfWT, toy: Scene) -> None:
+def test_movers_do_not_depend_on_the_code(field: NerfWT, toy: Scene) -> None:
+    def query_nothing(samples: RaySamples, keep: Tensor) -> BranchOutput:
+        none = torch.zeros(0, dtype=torch.long)
+        return field.scatter(torch.zeros(0, 5), none, keep.shape, 0.0)
+
     camera = toy.train[2].camera
-    field.static_content = lambda m, keep: field.spread(  # type: ignore[method-assign]
-        m.coords.new_full((0, 5), 0.0), torch.zeros(0, dtype=torch.long), keep.shape, 0.0
-    )  # nothing stands
+    field.query_static = query_nothing  # type: ignore[method-assign]
     a, b = (field.render(camera, 2.0, recorder=recorder(i)) for i in (0, 4))
     assert float(a.motion.max()) > 0.01 and torch.equal(a.radiance, b.radiance)
 
@@ -49,7 +51,7 @@ def test_another_view_borrows_the_mean_code_of_its_exposure(field: NerfWT, toy: 
     torch.testing.assert_close(field.render(camera, 2.0, recorder=recorder(0)).radiance, mean)
 
 
-def test_radiance_without_a_look_is_that_of_the_reference_exposure(
+def test_radiance_is_rendered_at_the_reference_exposure_by_default(
     field: NerfWT, toy: Scene
 ) -> None:
     camera = toy.train[2].camera
@@ -57,11 +59,9 @@ def test_radiance_without_a_look_is_that_of_the_reference_exposure(
         i for i, f in enumerate(toy.train) if f.bracket == toy.manifest.reference_bracket
     )
     assert reference == (1, 4)
-    field.render(camera, 2.0, recorder=recorder(3))  # leaves nothing behind
-    torch.testing.assert_close(
-        field.render(camera, 2.0).radiance,
-        field.render(camera, 2.0, recorder=recorder(*reference)).radiance,
-    )
+    field.render(camera, 2.0, recorder=recorder(3))  # must leave nothing behind
+    expected = field.render(camera, 2.0, recorder=recorder(*reference)).radiance
+    torch.testing.assert_close(field.render(camera, 2.0).radiance, expected)
 
 
 def touched(table: Tensor) -> list[int]:
@@ -69,17 +69,15 @@ def touched(table: Tensor) -> list[int]:
     return table.grad.any(-1).nonzero()[:, 0].tolist()
 
 
-def test_a_recording_teaches_the_code_of_its_image_alone(field: NerfWT, toy: Scene) -> None:
-    batch = replace(
-        draw_pixels(toy, 3, 60, 0, torch.Generator().manual_seed(0)), recorder=recorder(3)
-    )
-    render, own = field(batch)
+def test_a_recording_trains_the_code_of_its_image_alone(field: NerfWT, toy: Scene) -> None:
+    batch = draw_pixels(toy, 3, 60, 0, torch.Generator().manual_seed(0))
+    render, own = field(replace(batch, recorder=recorder(3)))
     (render.radiance - batch.rgb).square().mean().backward()
     assert touched(field.codes.table) == [3] and render.warps == () and render.scene_flow == {}
     assert set(own) == {"transient"} and float(own["transient"].detach()) > 0
 
 
-def test_beside_grids_the_color_network_starts_by_changing_nothing(toy: Scene) -> None:
+def test_with_grids_the_color_network_changes_nothing_at_the_start(toy: Scene) -> None:
     field = build_field(small("nerf-wt").field, toy)
     coords = torch.rand(20, 3)
     field.branches.static_grid.table.data.normal_()

@@ -10,12 +10,13 @@ import pytest
 from tiny_networks import tiny_depth_anything, tiny_sam2
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask, read_npy, write_npy, write_png, write_text
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_npy, write_text
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.prepare.steps.neural import weights_of
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.weights import KNOWN
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 
 COUNT, H, W, FOCAL, SIDE = 9, 64, 96, 80.0, 20
 
@@ -93,7 +94,7 @@ def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it
         inside = np.zeros((H, W), bool)
         inside[square(p["frame"])] = True
         assert inside[int(p["y"]), int(p["x"])] == bool(p["label"])
-    assert "unlike what moves there" in capsys.readouterr().err  # random weights outline anything
+    assert "the motion mask is kept" in capsys.readouterr().err  # random weights outline anything
     for t in train:
         assert (masks(scene)[t] == before[t]).mean() > 0.98  # the same thing, without specks
 
@@ -164,6 +165,9 @@ def changed(weights: Path) -> None:
     save_file(tensors | {name: tensors[name] + 1}, weights, metadata={"format": "pt"})
 
 
+CHANGED = ("static_depth", "response", "refined_flow", "movers", "depth", "sheet")
+
+
 def test_a_step_is_done_again_where_its_weights_changed_under_their_name(
     clip, motion, tmp_path, monkeypatch
 ):
@@ -177,7 +181,7 @@ def test_a_step_is_done_again_where_its_weights_changed_under_their_name(
     before = attempts()
     assert attempts() == before
     changed(network / "model.safetensors")
-    assert attempts() == before | {n: before[n] + 1 for n in ("depth", "sheet")}
+    assert attempts() == before | {n: before[n] + 1 for n in CHANGED}
 
 
 def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
@@ -194,7 +198,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         "gmflow": ("flow", {"flow": "gmflow"}), "raft": ("flow", {"flow": "raft"}), "xfeat": ("flow", {"flow": "semantic"}),
         "dinov2-small": ("flow", {"flow": "semantic", "semantic": SemanticConfig(features="dinov2-small")}), "tuned": ("flow", tuned),
         "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("masks", {"masks": "sam2"}),
-        "depth-anything": ("depth", {"depth": "depth-anything"}),
+        "depth-anything": ("static_depth", {"depth": "depth-anything"}),
     }  # fmt: skip
     for name, (step, chosen) in read.items():
         config = replace(clip, **chosen)
@@ -206,7 +210,7 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         assert not any(weights_of(config, other) for other in ("frames", "exposure", "sheet"))
     assert not any(
         weights_of(replace(clip, flow="dis", depth=None, poses=None), s)
-        for s in ("flow", "poses", "masks", "depth")
+        for s in ("flow", "poses", "masks", "static_depth")
     )
 
 

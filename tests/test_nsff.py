@@ -21,13 +21,14 @@ W, H, FOCAL = 48, 32, 40.0
 NEAR, FAR = 1.0, 8.0
 VELOCITY = torch.tensor([0.08, 0.04, 0.0])  # cube per knot
 START = torch.tensor([0.35, 0.4, 0.7])  # cube, of the blob at knot 0
-RADIUS, WALL = 0.12, 0.2  # cube; the wall is everything beyond (disparity below) WALL
+RADIUS = 0.12  # cube, of the blob
+WALL = 0.2  # cube; the wall is everything beyond, that is of less disparity
 EMPTY, SOLID = -30.0, 9.0  # raw densities
 
 
 class Blob(nn.Module):
-    """Branches in closed form, instead of grids: a wall that stands, and a blob (or
-    none) with constant scene flow both ways.
+    """Branches in closed form, instead of grids: a static wall, and a blob (or none)
+    with constant scene flow both ways.
     """
 
     def __init__(
@@ -42,38 +43,20 @@ class Blob(nn.Module):
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         inside = (coords[:, 2] < WALL) & self.wall
-        return torch.cat(
-            [
-                2 * coords[:, :1],
-                1 - coords[:, 1:2],
-                coords[:, :1] * 0,
-                self.density(inside),
-                coords[:, :1] * 0,
-            ],
-            -1,
-        )
+        x, y = coords[:, :1], coords[:, 1:2]
+        return torch.cat([2 * x, 1 - y, 0 * x, self.density(inside), 0 * x], -1)
 
     def dynamic(
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
         local = coords - START - knot * self.velocity
         inside = (local.norm(dim=-1) < RADIUS) & self.blob
-        brightness_drift = torch.cat([3 * local[:, :1], 2 + local[:, 1:2], 0 * local[:, :1]], -1)
-        raw = torch.cat(
-            [brightness_drift, self.density(inside), torch.where(inside, 30.0, -30.0)[:, None]], -1
-        )
-        both = torch.cat(
-            [
-                self.velocity,
-                torch.tensor([self.disocclusion]),
-                -self.velocity,
-                torch.tensor([self.disocclusion]),
-            ]
-        )
-        scale = torch.tensor(
-            [20.0, 20, 20, 1, 20, 20, 20, 1]
-        )  # raw flow is in units of `flow_scale`, 0.05
-        return raw, (both * scale).expand(len(coords), 8) if motion else None
+        x, y = local[:, :1], local[:, 1:2]
+        blend = torch.where(inside, 30.0, -30.0)[:, None]
+        raw = torch.cat([3 * x, 2 + y, 0 * x, self.density(inside), blend], -1)
+        if not motion:
+            return raw, None
+        return raw, raw_motion(self.velocity, self.disocclusion).expand(len(coords), 8)
 
     @staticmethod
     def density(inside: Tensor) -> Tensor:
@@ -81,6 +64,12 @@ class Blob(nn.Module):
 
     def param_groups(self) -> list[dict[str, Any]]:
         return []
+
+
+def raw_motion(velocity: Tensor, disocclusion: float) -> Tensor:
+    """Raw motion (8,) of a constant velocity (3,), in units of `flow_scale`, 0.05."""
+    last = torch.tensor([disocclusion])
+    return torch.cat([20 * velocity, last, -20 * velocity, last])
 
 
 def camera(x: float = 0.0) -> Camera:
@@ -106,11 +95,9 @@ def batch(
     """
     c = camera(x)
     pixels = c.pixel_grid()
-    n = len(pixels)
+    rgb, uniform = torch.zeros(len(pixels), 3), torch.ones(len(pixels), dtype=torch.bool)
     around = {-1: camera(neighbors[0]), 1: camera(neighbors[1])}
-    return PixelBatch(
-        0, time, c, 0, 0, around, pixels, torch.zeros(n, 3), torch.ones(n, dtype=torch.bool)
-    )
+    return PixelBatch(0, time, c, 0, 0, around, pixels, rgb, uniform)
 
 
 def centroid(motion: Tensor) -> Tensor:
@@ -120,16 +107,8 @@ def centroid(motion: Tensor) -> Tensor:
 
 def test_knots_count_training_times_however_uneven() -> None:
     field = blob_field(Blob(), times=(0.0, 1.0, 3.0, 4.0))
-    for time, knot in (
-        (-1.0, 0.0),
-        (0.0, 0.0),
-        (0.5, 0.5),
-        (1.0, 1.0),
-        (2.0, 1.5),
-        (3.5, 2.5),
-        (4.0, 3.0),
-        (9.0, 3.0),
-    ):
+    inside = {0.0: 0.0, 0.5: 0.5, 1.0: 1.0, 2.0: 1.5, 3.5: 2.5, 4.0: 3.0}
+    for time, knot in (inside | {-1.0: 0.0, 9.0: 3.0}).items():
         assert math.isclose(field.knot(time), knot)
     assert blob_field(Blob(), times=(5.0,)).knot(7.0) == 0.0
 
@@ -145,9 +124,8 @@ def test_wall_and_blob_are_rendered_where_they_are(compositing: str) -> None:
     torch.testing.assert_close(centroid(r.motion), camera().project(middle)[0], atol=0.5, rtol=0)
     assert float(r.depth[blob].mean()) == pytest.approx(float(camera().project(middle)[1]), rel=0.2)
     face = float(space.decode(torch.tensor([0.5, 0.5, WALL]))[2])
-    torch.testing.assert_close(
-        r.depth[wall], torch.full_like(r.depth[wall], face), rtol=0.05, atol=0
-    )
+    expected = torch.full_like(r.depth[wall], face)
+    torch.testing.assert_close(r.depth[wall], expected, rtol=0.05, atol=0)
     assert float(r.opacity.min()) > 0.99
     assert float(r.radiance[blob].mean(0)[1]) == pytest.approx(math.exp(2), rel=0.1)
 
@@ -170,25 +148,21 @@ def test_a_static_scene_flows_as_the_camera_moves() -> None:
     render, _ = field(b)
     forward, backward = render.warps
     assert (forward.offset, backward.offset) == (1, -1)
-    for warp, shift in (
-        (forward, 0.1),
-        (backward, -0.1),
-    ):  # the camera goes right by `shift`, the wall goes left
-        torch.testing.assert_close(
-            warp.flow[:, 0], -FOCAL * shift / render.depth, atol=1e-3, rtol=1e-3
-        )
+    # the camera goes right by `shift`, so the wall goes left
+    for warp, shift in ((forward, 0.1), (backward, -0.1)):
+        expected = -FOCAL * shift / render.depth
+        torch.testing.assert_close(warp.flow[:, 0], expected, atol=1e-3, rtol=1e-3)
         assert float(warp.flow[:, 1].abs().max()) < 1e-3
     assert float(render.motion.max()) < 1e-3
 
 
 def test_flow_into_the_neighbors_camera_adds_motion_and_parallax() -> None:
     field = blob_field(Blob())
-    render, _ = field(batch(neighbors=(0.1, 0.1)))  # nobody moves but the blob
+    render, _ = field(batch(neighbors=(0.1, 0.1)))  # nothing moves but the blob
     blob = render.motion > 0.99
-    ends = [camera(0.1).project(field.space.decode(START + k * VELOCITY))[0] for k in (1, 2)]
-    torch.testing.assert_close(
-        render.warps[0].flow[blob].mean(0), ends[1] - ends[0], atol=0.3, rtol=0
-    )
+    start, end = (camera(0.1).project(field.space.decode(START + k * VELOCITY))[0] for k in (1, 2))
+    mean_flow = render.warps[0].flow[blob].mean(0)
+    torch.testing.assert_close(mean_flow, end - start, atol=0.3, rtol=0)
     assert float(render.warps[0].flow[render.motion < 1e-3].abs().max()) < 1e-2
 
 
@@ -208,50 +182,51 @@ def test_content_that_follows_its_flow_looks_the_same_through_both_neighbors(
 
 def test_two_steps_along_the_flow_see_the_same_too() -> None:
     render, _ = blob_field(Blob())(replace(batch(time=0.0), chain=1))
-    chained = [w for w in render.warps if w.offset == 2]
+    (chained,) = (w for w in render.warps if w.offset == 2)
     blob = render.motion > 0.99
-    torch.testing.assert_close(
-        chained[0].radiance[blob], render.radiance[blob], atol=0.02, rtol=0.02
-    )
+    torch.testing.assert_close(chained.radiance[blob], render.radiance[blob], atol=0.02, rtol=0.02)
 
 
 def test_content_that_ignores_its_flow_looks_different() -> None:
-    lying = Blob()
-    dynamic = lying.dynamic
-    lying.dynamic = lambda c, k, d, motion: (
-        dynamic(c, 1.0, d, False)[0],
-        dynamic(c, k, d, motion)[1],
-    )  # type: ignore[method-assign]
-    render, _ = blob_field(lying)(batch())  # stands still, but says it moves
+    branches = Blob()
+    dynamic = branches.dynamic
+
+    def at_rest(c: Tensor, k: float, d: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
+        return dynamic(c, 1.0, d, False)[0], dynamic(c, k, d, motion)[1]
+
+    branches.dynamic = at_rest  # type: ignore[method-assign]
+    render, _ = blob_field(branches)(batch())  # at rest, with a scene flow all the same
     blob = render.motion > 0.99
     assert float((render.warps[0].radiance[blob] - render.radiance[blob]).abs().mean()) > 0.1
 
 
 def test_confidence_is_one_minus_the_rendered_disocclusion() -> None:
     render, own = blob_field(Blob(disocclusion=0.0))(batch())  # sigmoid(0) = a half
-    torch.testing.assert_close(
-        render.warps[0].confidence, 1 - 0.5 * render.motion, atol=1e-4, rtol=0
-    )
+    confidence = render.warps[0].confidence
+    torch.testing.assert_close(confidence, 1 - 0.5 * render.motion, atol=1e-4, rtol=0)
     assert float(own["disocclusion"]) == 0.5
 
 
-def test_steady_flow_in_a_frustum_costs_little_kinetic_energy_and_a_bend_costs_more() -> None:
+def test_steady_flow_costs_little_kinetic_energy_and_a_turn_costs_more() -> None:
     steady = blob_field(Blob())(batch())[1]["kinetic"]
     bent = Blob()
     dynamic = bent.dynamic
 
-    def back_is_forth(c: Tensor, k: float, d: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
+    def turn_back(c: Tensor, k: float, d: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
         raw, flows = dynamic(c, k, d, motion)
         return raw, None if flows is None else torch.cat([flows[:, :4], flows[:, :4]], -1)
 
-    bent.dynamic = back_is_forth  # type: ignore[method-assign]
+    bent.dynamic = turn_back  # type: ignore[method-assign]
     assert float(steady) < 0.01 * float(blob_field(bent)(batch())[1]["kinetic"])
 
 
 # Gradients, on grids
 
 
-def pass_of(field: NSFF, toy: Scene, frame: int = 3) -> tuple[Any, dict[str, Tensor], PixelBatch]:
+def train_pass(
+    field: NSFF, toy: Scene, frame: int = 3
+) -> tuple[Any, dict[str, Tensor], PixelBatch]:
+    """A training render of some pixels of a frame, its regularizers, and the batch."""
     b = replace(draw_pixels(toy, frame, 150, 60, torch.Generator().manual_seed(0)), seed=1)
     field.train()
     render, own = field(b)
@@ -259,68 +234,62 @@ def pass_of(field: NSFF, toy: Scene, frame: int = 3) -> tuple[Any, dict[str, Ten
 
 
 def size(t: nn.Parameter) -> float:
+    """Sum of the absolute gradients."""
     return 0.0 if t.grad is None else float(t.grad.abs().sum())
 
 
-def test_the_picture_teaches_both_branches_but_not_the_flow(toy: Scene) -> None:
+def test_the_picture_trains_both_branches_but_not_the_flow(toy: Scene) -> None:
     field = random_field("grid", toy)
-    render, _, b = pass_of(field, toy)
+    render, _, b = train_pass(field, toy)
     (render.radiance - b.rgb).abs().mean().backward()
-    assert (
-        size(field.branches.static_grid.table) > 0 and size(field.branches.dynamic_grid.table) > 0
-    )
+    assert size(field.branches.static_grid.table) > 0
+    assert size(field.branches.dynamic_grid.table) > 0
     assert all(size(g.table) == 0 for g in field.branches.motion_grids)
 
 
-def test_the_warped_picture_teaches_scene_flow_and_the_neighbors_content(toy: Scene) -> None:
+def test_the_warped_picture_trains_scene_flow_and_the_neighbors_content(toy: Scene) -> None:
     field = random_field("grid", toy)
-    render, _, b = pass_of(field, toy)
+    render, _, b = train_pass(field, toy)
     (render.warps[0].radiance - b.rgb).abs().mean().backward()
     forward = field.branches.motion_grids[0].table.grad.abs().sum(0)
-    assert (
-        bool((forward[:3] > 0).all()) and float(forward[3]) == 0
-    )  # the flow itself, not the disocclusion
-    assert size(field.branches.motion_grids[1].table) == 0  # the way back has no part in it
+    assert bool((forward[:3] > 0).all())
+    assert float(forward[3]) == 0  # the disocclusion
+    assert size(field.branches.motion_grids[1].table) == 0  # backward flow takes no part
     grid = field.branches.dynamic_grid
-    per_slice = (
-        grid.table.grad[: int(grid.size[0])].abs().sum(-1).view(6, -1).sum(1)
-    )  # the coarsest level, frame by frame
+    coarsest = grid.table.grad[: int(grid.size[0])].abs().sum(-1)
+    per_slice = coarsest.view(6, -1).sum(1)  # frame by frame
     assert float(per_slice[4]) > 0 and float(per_slice[[0, 1, 2, 3, 5]].sum()) == 0
 
 
-def test_rendered_flow_teaches_scene_flow_and_depth(toy: Scene) -> None:
+def test_rendered_flow_trains_scene_flow_and_depth(toy: Scene) -> None:
     field = random_field("grid", toy)
-    render, _, b = pass_of(field, toy)
+    render, _, b = train_pass(field, toy)
     (render.warps[0].flow - b.flow[1]).abs().mean().backward()
-    assert (
-        size(field.branches.motion_grids[0].table) > 0
-        and size(field.branches.static_grid.table) > 0
-    )
+    assert size(field.branches.motion_grids[0].table) > 0
+    assert size(field.branches.static_grid.table) > 0
 
 
-def test_disocclusion_is_taught_by_the_confidence_only(toy: Scene) -> None:
+def test_disocclusion_is_trained_by_the_confidence_only(toy: Scene) -> None:
     field = random_field("grid", toy)
-    render, _, _ = pass_of(field, toy)
+    render, _, _ = train_pass(field, toy)
     render.warps[0].confidence.sum().backward()
     grad = field.branches.motion_grids[0].table.grad
     assert float(grad[:, 3].abs().sum()) > 0 and float(grad[:, :3].abs().sum()) == 0
-    assert size(field.branches.dynamic_grid.table) == 0  # rendered weights take part as numbers
+    assert size(field.branches.dynamic_grid.table) == 0  # rendered weights are detached
 
 
-def test_a_field_learns_the_way_things_went_from_warped_pictures_alone() -> None:
+def test_a_field_learns_scene_flow_from_warped_pictures_alone() -> None:
     branches = Blob()
     truth, wrong = branches.velocity.clone(), VELOCITY * 0.6
     learned = nn.Parameter(wrong.clone())
     content = branches.dynamic
 
     def dynamic(c: Tensor, k: float, d: Tensor, motion: bool) -> tuple[Tensor, Tensor | None]:
-        both = torch.cat(
-            [learned * 20, torch.tensor([-30.0]), -learned * 20, torch.tensor([-30.0])]
-        )
-        return content(c, k, d, False)[0], both.expand(len(c), 8) if motion else None
+        return content(c, k, d, False)[0], raw_motion(learned, -30.0).expand(len(c), 8)
 
     branches.dynamic = dynamic  # type: ignore[method-assign]
-    field, optimizer, b = blob_field(branches), torch.optim.Adam([learned], lr=4e-3), batch()
+    field, b = blob_field(branches), batch()
+    optimizer = torch.optim.Adam([learned], lr=4e-3)
     core = field(b)[0].motion > 0.99
     b = replace(b, pixels=b.pixels[core], uniform=b.uniform[core])
     for _ in range(25):
@@ -329,15 +298,16 @@ def test_a_field_learns_the_way_things_went_from_warped_pictures_alone() -> None
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
-    assert float((learned.detach() - truth)[:2].norm()) < 0.3 * float((wrong - truth)[:2].norm())
+    error, error_before = learned.detach() - truth, wrong - truth
+    assert float(error[:2].norm()) < 0.3 * float(error_before[:2].norm())
 
 
-def test_culled_samples_get_no_gradient_and_nothing_is_seen_there(toy: Scene) -> None:
+def test_culled_samples_get_no_gradient_and_render_nothing(toy: Scene) -> None:
     field = random_field("grid", toy)
     field.config = replace(field.config, explore=0.0)  # type: ignore[misc]
     field.static_cells.mask[..., field.static_cells.resolution[0] // 2 :] = False  # the right half
     field.dynamic_cells.mask.zero_()
-    render, own, b = pass_of(field, toy)
+    render, own, b = train_pass(field, toy)
     render.radiance.sum().backward()
     assert own == {} and size(field.branches.dynamic_grid.table) == 0
     grid = field.branches.static_grid
@@ -345,28 +315,25 @@ def test_culled_samples_get_no_gradient_and_nothing_is_seen_there(toy: Scene) ->
     columns = grid.table.grad[int(grid.offset[-1]) :].abs().sum(-1).view(nz, ny, nx).sum((0, 1))
     assert float(columns[: nx // 2].sum()) > 0 and float(columns[nx // 2 + 1 :].sum()) == 0
     right = b.pixels[:, 0] > 45
-    assert (
-        float(render.opacity.detach()[right].max()) == 0
-        and float(render.depth.detach()[right].min()) > 4.9
-    )  # far
+    assert float(render.opacity.detach()[right].max()) == 0
+    assert float(render.depth.detach()[right].min()) > 4.9  # far
 
 
-def test_masks_say_where_motion_may_be(toy: Scene) -> None:
+def test_motion_lies_in_the_dilated_moving_masks(toy: Scene) -> None:
     field = random_field("tiny", toy)
     f = toy.train[2]
     motion = field.render(f.camera, f.time).motion.view(f.moving.shape)
     rows, columns = f.moving.nonzero().unbind(1)
+    top, left = max(rows.min() - 18, 0), max(columns.min() - 22, 0)
     far = torch.ones_like(f.moving)
-    far[
-        max(rows.min() - 18, 0) : rows.max() + 18, max(columns.min() - 22, 0) : columns.max() + 22
-    ] = False
+    far[top : rows.max() + 18, left : columns.max() + 22] = False
     assert float(motion[f.moving].mean()) > 0.02 and float(motion[far].max()) == 0
 
 
 def test_a_clip_in_which_nothing_moves_trains(toy: Scene) -> None:
     still = replace(toy, train=[replace(f, moving=torch.zeros_like(f.moving)) for f in toy.train])
     field = random_field("grid", still)
-    render, own, _ = pass_of(field, still)
+    render, own, _ = train_pass(field, still)
     assert own == {} and not render.motion.any()
     assert bool(torch.isfinite(render.radiance).all())
     torch.testing.assert_close(render.warps[0].radiance, render.radiance.detach())
@@ -374,18 +341,14 @@ def test_a_clip_in_which_nothing_moves_trains(toy: Scene) -> None:
 
 def test_one_frame_alone_trains(toy: Scene) -> None:
     alone = replace(toy, train=[replace(toy.train[0], neighbors={}, flow={}, flow_valid={})])
-    render, own, _ = pass_of(random_field("grid", alone), alone, frame=0)
+    render, own, _ = train_pass(random_field("grid", alone), alone, frame=0)
     assert render.warps == () and render.scene_flow == {} and set(own) == {"disocclusion"}
 
 
 def test_radiance_is_unbounded_above_and_extreme_numbers_stay_finite(toy: Scene) -> None:
     field = random_field("grid", toy)
     raw = torch.tensor([[-1e4, 0.0, 1e4]])
-    assert float(field.to_radiance(raw)[0, 2]) > 1e6 and bool(
-        torch.isfinite(field.to_radiance(raw)).all()
-    )
-    assert (
-        bool(torch.isfinite(field.to_density(raw, 0.0)).all())
-        and float(field.to_density(raw, 0.0).min()) >= 0
-    )
+    radiance, density = field.to_radiance(raw), field.to_density(raw, 0.0)
+    assert float(radiance[0, 2]) > 1e6 and bool(torch.isfinite(radiance).all())
+    assert float(density.min()) >= 0 and bool(torch.isfinite(density).all())
     assert float(random_field("paper", toy).to_radiance(raw).max()) == 1.0

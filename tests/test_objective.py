@@ -3,25 +3,30 @@ go.
 """
 
 import math
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import pytest
 import torch
+from presets import small, trainer
 
 from hdr_nsff.fields.base import Render, Warp
+from hdr_nsff.fields.nsff.nsff import SceneFlowLosses
 from hdr_nsff.scene.batch import PixelBatch, draw_pixels
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig, ToneMapper
-from hdr_nsff.training.config import PRESETS
-from hdr_nsff.training.objective import LossWeights, Objective
+from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapLosses, ToneMapper
+from hdr_nsff.tonemap.build import tone_mapper_for
+from hdr_nsff.training.objective import LossWeights, Objective, merge_weights
+from hdr_nsff.training.presets import PRESETS
 
 N = 20
-OBJECTIVE = Objective(LossWeights(), "scene", near=1.8)
+WEIGHTS = merge_weights(LossWeights(), asdict(SceneFlowLosses()), asdict(ToneMapLosses()))
+OBJECTIVE = Objective(WEIGHTS, "scene", near=1.8)
 
 
 @pytest.fixture
 def tonemap(toy: Scene) -> ToneMapper:
-    return ToneMapper.for_scene(ToneMapConfig(kind="none"), toy)
+    return tone_mapper_for(ToneMapConfig(kind="none"), toy)
 
 
 @pytest.fixture
@@ -65,18 +70,24 @@ def test_a_term_without_a_weight_is_an_error() -> None:
 
 def test_the_total_is_the_weighted_sum_and_weight_zero_lets_no_gradient_through() -> None:
     a, b, c = (torch.tensor(v, requires_grad=True) for v in (2.0, 3.0, math.inf))
-    objective = replace(OBJECTIVE, weights=LossWeights(photometric=1.0, depth=0.5, mask=0.0))
+    objective = replace(OBJECTIVE, weights={"photometric": 1.0, "depth": 0.5, "mask": 0.0})
     total = objective.total({"photometric": a, "depth": b, "mask": c})
     total.backward()
     assert float(total.detach()) == 3.5 and float(b.grad) == 0.5 and c.grad is None
 
 
-def test_every_term_of_every_preset_has_a_weight(batch: PixelBatch, toy: Scene) -> None:
-    names = {f.name for f in fields(LossWeights)}
-    for config in PRESETS.values():
-        tonemap = ToneMapper.for_scene(config.tonemap, toy)
-        terms = OBJECTIVE.terms(perfect(batch), batch, tonemap, 2.0) | tonemap.regularizers()
-        assert set(terms) <= names
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_term_of_every_preset_has_a_weight(
+    preset: str, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    t = trainer(small(preset, toy_folder, tmp_path / "run"), toy)
+    values = t.step()  # `total` asserts that each term has a weight
+    assert set(values) - {"psnr"} <= set(t.objective.weights)
+
+
+def test_a_weight_is_made_in_one_place() -> None:
+    with pytest.raises(AssertionError, match="depth"):
+        merge_weights(LossWeights(), {"depth": 1.0})
 
 
 def test_depth_and_flow_fade_by_a_tenth_every_phase(batch: PixelBatch, tonemap: ToneMapper) -> None:
@@ -193,7 +204,7 @@ def test_photometric_gradients_reach_radiance_response_and_exposures(
     batch: PixelBatch, toy: Scene
 ) -> None:
     learned = toy.manifest.model_copy(update={"bracket_ev": [None, 0.0, None]})
-    tonemap = ToneMapper.for_scene(ToneMapConfig(), replace(toy, manifest=learned))
+    tonemap = tone_mapper_for(ToneMapConfig(), replace(toy, manifest=learned))
     two = draw_pixels(
         toy, 2, N, 0, torch.Generator().manual_seed(0)
     )  # bracket 2: not the reference

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image
 from hdr_nsff.core.picture_size import MAX_MEGAPIXELS, check_size, encoded_size
 
 

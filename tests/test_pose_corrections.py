@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from estimates import forget_movers
 from presets import interrupted_at, random_field, small, trainer
 from safetensors.torch import load_file
 from torch import Tensor
@@ -24,9 +25,11 @@ from hdr_nsff.fields.splat.rasterize import dense
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame
-from hdr_nsff.scene.scene import Manifest, Scene
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import Trainer, train
 
@@ -41,6 +44,7 @@ def edited(
         for i, value in values.items():
             setattr(manifest.frames[i], name, value)
     manifest.save(folder)
+    forget_movers(folder)
     return folder
 
 

@@ -14,12 +14,14 @@ import cv2
 import numpy as np
 import pytest
 
-from hdr_nsff.core.io import read_image, read_mask, write_npy, write_png
+from hdr_nsff.core.images import read_image, read_mask, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.geometry.round_trip import round_trip
-from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, begin, do, prepare
-from hdr_nsff.prepare.steps.priors import through_response
-from hdr_nsff.priors.flow.dense import MISSED, halfway
-from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare
+from hdr_nsff.priors.flow.dense import average_with_reverse
+from hdr_nsff.priors.flow.local_motion import LOCAL_MOTION_TUNING
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
 
 COUNT, H, W, FOCAL = 12, 32, 48, 40.0
 EVS = (-2.0, 0.0, 2.0)
@@ -104,9 +106,18 @@ def test_footage_becomes_a_scene_that_opens(config):
 def test_the_manifest_says_where_everything_came_from(config):
     m = Manifest.load(prepare(config))
     assert {name: step.provenance for name, step in m.steps.items()} == {
-        "frames": "given", "exposure": "estimated", "flow": "given", "poses": "given", "masks": "given", "refined_flow": "given",
-        "depth": "given", "sheet": "estimated",
-    }  # fmt: skip
+        "frames": "given",
+        "exposure": "estimated",
+        "flow": "given",
+        "poses": "given",
+        "masks": "given",
+        "static_depth": "given",
+        "response": "estimated",
+        "refined_flow": "given",
+        "movers": "estimated",
+        "depth": "given",
+        "sheet": "estimated",
+    }
     assert m.inputs.keys() == {f"{t:03d}.png" for t in range(COUNT)} and all(
         len(h) == 64 for h in m.inputs.values()
     )
@@ -135,43 +146,29 @@ def test_redo_does_a_step_and_what_builds_on_it(config):
     prepare(config)
     prepare(replace(config, redo=("poses",)))
     assert attempts(config.out) == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 2, "masks": 2, "refined_flow": 2, "depth": 2, "sheet": 2,
-    }  # fmt: skip
+        "frames": 1,
+        "exposure": 1,
+        "flow": 1,
+        "poses": 2,
+        "masks": 2,
+        "static_depth": 2,
+        "response": 2,
+        "refined_flow": 2,
+        "movers": 2,
+        "depth": 2,
+        "sheet": 2,
+    }
 
 
-def test_frames_are_matched_again_through_the_response_that_flow_tells(config):
+def test_flow_is_refined_at_one_exposure_through_the_response(config):
     footage(config.clip, blur=2.0)
-    work = begin(replace(config, flow="dis"))
-    for name in STEPS:
-        do(work, name)
-    assert (
-        "at one exposure through the response that flow tells (misfit 0."
-        in work.manifest.steps["refined_flow"].note
-    )
-    level, _ = through_response(work, np.zeros((COUNT, H, W), bool))
-    dark, bright = level[0, :, 8:-8], level[1, :, 6:-10]  # the wall has gone two pixels to the left
-    recorded = [work.video[0, :, 8:-8], work.video[1, :, 6:-10]]
-    both = ((recorded[0] > 0.1) & (recorded[1] < 0.9)).all(-1)
-    assert both.sum() > 100
-    assert (
-        np.abs(dark - bright)[both].mean()
-        < 0.02
-        < 0.1
-        < np.abs(recorded[0] - recorded[1])[both].mean()
-    )
-
-    first, moving = COUNT - 3, np.zeros((COUNT, H, W), bool)
-    moving[first:] = True  # nothing at rest to ask
-    for f in work.manifest.frames[first:]:
-        f.camera_id = 1
-    level, how = through_response(work, moving)
-    assert "in 1 of 2 cameras, else by brightness" in how
-    assert np.array_equal(level[first:], work.equalized[0][first:]) and not np.array_equal(
-        level[:first], work.equalized[0][:first]
-    )
+    prepare(replace(config, flow="dis"))
+    steps = Manifest.load(config.out).steps
+    assert steps["response"].note.startswith("779 static points, misfit 0.001")
+    assert "at one exposure through the response" in steps["refined_flow"].note
 
 
-def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(config):
+def test_flow_of_movers_is_refined_and_what_was_matched_stays(config):
     estimated = replace(config, flow="dis")
     m = Manifest.load(prepare(estimated))
     f = m.frames[4]
@@ -188,15 +185,16 @@ def test_flow_of_movers_is_told_by_movers_alone_and_what_was_matched_stays(confi
         np.load(config.out / files[5].flow).astype(np.float32) for files in (f.raw_flow, f.flow)
     )
     back = np.load(config.out / m.frames[5].raw_flow[4].flow).astype(np.float32)
-    sure = read_mask(config.out / f.raw_flow[5].valid) & (round_trip(before, back) < MISSED - 0.02)
-    changed = np.abs(halfway(before, back) - after).max(-1)
+    trusted_px = LOCAL_MOTION_TUNING.trusted_round_trip_px
+    sure = read_mask(config.out / f.raw_flow[5].valid) & (
+        round_trip(before, back) < trusted_px - 0.02
+    )
+    changed = np.abs(average_with_reverse(before, back) - after).max(-1)
     assert (
         changed[:, :4].max() > 0.05 and sure[:, 7:].mean() > 0.5
     )  # 4 columns move, and others go there
     assert np.quantile(changed[:, 7:][sure[:, 7:]], 0.95) < 0.01  # the way back meets it halfway
-    assert m.steps["refined_flow"].note.endswith(
-        "equalized by brightness: too few pixels at rest in several exposures"
-    )
+    assert m.steps["refined_flow"].note.endswith("on frames equalized by brightness")
 
     (config.out / "refined_flow/00004_00005.npy").unlink()
     prepare(estimated)
@@ -215,8 +213,18 @@ def test_a_changed_setting_redoes_what_depends_on_it(config):
     )  # the contents of a given folder count
     prepare(config)
     assert attempts(config.out) == {
-        "frames": 1, "exposure": 1, "flow": 1, "poses": 1, "masks": 1, "refined_flow": 1, "depth": 2, "sheet": 2,
-    }  # fmt: skip
+        "frames": 1,
+        "exposure": 1,
+        "flow": 1,
+        "poses": 1,
+        "masks": 1,
+        "static_depth": 2,
+        "response": 2,
+        "refined_flow": 2,
+        "movers": 2,
+        "depth": 2,
+        "sheet": 2,
+    }
     prepare(replace(config, ev="-2,0,2"))
     assert (
         attempts(config.out)["frames"] == 1

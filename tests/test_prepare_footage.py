@@ -4,15 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_exposure import clip
+from test_exposure_cycle import clip
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_png
+from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.ingest import open_footage
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.scene.manifest import Manifest
 
 
 def work_on(folder: Path, video: np.ndarray, **settings: object) -> Work:

@@ -13,14 +13,18 @@ import numpy as np
 import pytest
 from test_prepare import COUNT, footage, given
 
-from hdr_nsff.core import io
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import write_json
 from hdr_nsff.footage.ingest import frames_between
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
-from hdr_nsff.scene.scene import Manifest, Scene
+from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
-from hdr_nsff.training.config import PRESETS
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import train
 
 
@@ -119,8 +123,8 @@ def made(root: Path) -> Path:
     """Footage with its truth beside it, as `synth` leaves them."""
     footage(root / "clip")
     wall = np.ones((32, 48, 3), np.float32)
-    io.write_exr(root / "truth/radiance/a.exr", {"RGB": wall})
-    io.write_png(root / "truth/masks/a.png", wall[..., 0] > 2)
+    write_exr(root / "truth/radiance/a.exr", {"RGB": wall})
+    write_png(root / "truth/masks/a.png", wall[..., 0] > 2)
     view = TruthView(
         name="a", time=2.5, bracket=0, anchor=2, radiance="radiance/a.exr", mask="masks/a.png"
     )
@@ -131,7 +135,7 @@ def made(root: Path) -> Path:
         response_y=[[0.0, 1.0]] * 3,
         views=[view],
     )
-    io.write_json(root / "truth/truth.json", truth.model_dump())
+    write_json(root / "truth/truth.json", truth.model_dump())
     return root
 
 
@@ -149,7 +153,13 @@ def trained(root: Path, maps: dict[str, Path]) -> dict[str, np.ndarray | dict[st
         PrepareConfig(root / "clip", root / "scene", protocol="novel-view-time", **maps)
     )
     run = train(
-        replace(PRESETS["tiny"], scene=scene, out=root / "run", steps=6, minutes=None, device="cpu")
+        replace(
+            PRESETS["tiny"],
+            scene=scene,
+            out=root / "run",
+            budget=Budget(steps=6, minutes=None),
+            device="cpu",
+        )
     )
     manifest = Manifest.load(scene).model_dump(exclude={"source"})
     steps = {

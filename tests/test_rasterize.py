@@ -1,9 +1,9 @@
-"""The rasterizer: numba kernels against the plain-torch twin in float64, that one
-against finite differences, closed forms, and what no scene should hold but some day one
-does.
+"""The rasterizer: numba kernels against the plain-torch twin in float64, the twin
+against finite differences, closed forms, and degenerate Gaussians.
 """
 
 import hashlib
+import math
 import os
 import subprocess
 import sys
@@ -21,7 +21,7 @@ from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
 from hdr_nsff.fields.splat.rasterize import (
     Maps,
     dense,
-    front_to_back,
+    depth_order,
     project,
     rasterize,
     rotation_matrices,
@@ -33,14 +33,11 @@ NAMES = ("means", "quaternions", "scales", "opacities", "features", "c2w", "foca
 
 
 def camera(width: int = 41, height: int = 27) -> Camera:
-    """A camera that stands aside and looks askew, its center off the middle of the
-    picture.
-    """
+    """An oblique camera whose principal point is off the middle of the picture."""
     turn = rotation_matrices(torch.tensor([[1.0, 0.05, -0.1, 0.2]], dtype=torch.float64))[0]
     c2w = torch.cat([turn, torch.tensor([[0.1], [-0.2], [0.3]], dtype=torch.float64)], 1)
-    K = torch.tensor(
-        [[FOCAL, 0, 0.45 * width], [0, 1.1 * FOCAL, 0.6 * height], [0, 0, 1]], dtype=torch.float64
-    )
+    rows = [[FOCAL, 0, 0.45 * width], [0, 1.1 * FOCAL, 0.6 * height], [0, 0, 1]]
+    K = torch.tensor(rows, dtype=torch.float64)
     return Camera(K, c2w, width, height)
 
 
@@ -51,14 +48,16 @@ def ahead(view: Camera, local: Tensor) -> Tensor:
 
 def scene(seed: int, view: Camera, count: int = 60, channels: int = 4) -> list[Tensor]:
     """Random Gaussians in front of a camera, some beyond its frame: means, quaternions,
-    scales, opacities, features. Float32 numbers in float64, so that both twins see the
-    same ones.
+    scales, opacities, features.
+
+    Float32 numbers in float64, so that both twins see the same ones.
     """
     g = torch.Generator().manual_seed(seed)
     z = 1.5 + 3 * torch.rand(count, 1, generator=g)
     size = torch.tensor([view.width, view.height])
     pixels = (1.4 * torch.rand(count, 2, generator=g) - 0.2) * size
-    local = torch.cat([(pixels - view.K[:2, 2].float()) / view.K[[0, 1], [0, 1]].float() * z, z], 1)
+    focal, center = view.K[[0, 1], [0, 1]].float(), view.K[:2, 2].float()
+    local = torch.cat([(pixels - center) / focal * z, z], 1)
     parts = [
         ahead(view, local),
         torch.randn(count, 4, generator=g),
@@ -76,56 +75,46 @@ def everything(maps: Maps) -> Tensor:
 
 def lens(view: Camera, focal: Tensor) -> Camera:
     """The camera with other focal lengths (2,), differentiable in them."""
-    return replace(
-        view,
-        K=torch.diag(torch.cat([focal, focal.new_ones(1)]))
-        + view.K
-        - torch.diag(view.K.diagonal()),
-    )
+    diagonal = torch.diag(torch.cat([focal, focal.new_ones(1)]))
+    return replace(view, K=diagonal + view.K - torch.diag(view.K.diagonal()))
 
 
 def drawn(
     twin: Callable[..., Maps], gaussians: list[Tensor], view: Camera, weight: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
-    """Maps (H, W, D + 2) and the gradients of their sum with `weight`, of everything in
-    NAMES.
-    """
+    """Maps (H, W, D + 2), and the gradients of all NAMES of their sum with `weight`."""
     kind = torch.float32 if twin is rasterize else torch.float64
     leaves = [t.to(kind, copy=True).requires_grad_() for t in gaussians]
     pose, focal = view.c2w.clone().requires_grad_(), view.K[[0, 1], [0, 1]].clone().requires_grad_()
     seen = everything(twin(*leaves, lens(view, focal).moved(pose)))
     (seen * weight).sum().backward()
-    return seen.detach(), [
-        torch.zeros_like(t) if t.grad is None else t.grad.double() for t in (*leaves, pose, focal)
-    ]
+    inputs = (*leaves, pose, focal)
+    gradients = [torch.zeros_like(t) if t.grad is None else t.grad.double() for t in inputs]
+    return seen.detach(), gradients
 
 
-def sure(gaussians: list[Tensor], view: Camera) -> Tensor:
-    """(H, W) pixels where no alpha is so close to the cut or to the largest one that
-    rounding decides.
-    """
+def clear_pixels(gaussians: list[Tensor], view: Camera) -> Tensor:
+    """Pixels (H, W) where no alpha is so close to a cut that rounding decides."""
     centers, covariance, z = project(*gaussians[:3], view)
     d = view.pixel_grid()[:, None] - centers
-    alpha = gaussians[3] * torch.exp(
-        -0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0]
-    )
-    unsure = ((alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01) | (
-        (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
-    )
-    return ~(unsure & (z > projection.NEAREST)).any(1).unflatten(0, (view.height, view.width))
+    exponent = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0]
+    alpha = gaussians[3] * torch.exp(-exponent)
+    near_min = (alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01
+    near_max = (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
+    doubtful = (near_min | near_max) & (z > projection.NEAREST)
+    return ~doubtful.any(1).unflatten(0, (view.height, view.width))
 
 
 def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> Tensor:
-    """Both twins show the same, and have the same gradients up to a share of the
-    largest ones. What they show, (H, W, D + 2).
+    """The maps (H, W, D + 2), after both twins were found to give the same ones.
+
+    Gradients are the same up to the share `gradients` of the largest ones.
     """
-    clear = sure(gaussians, view)
+    clear = clear_pixels(gaussians, view)
     assert clear.double().mean() > 0.8
     shape = (view.height, view.width, gaussians[4].shape[1] + 2)
-    weight = (
-        torch.randn(shape, generator=torch.Generator().manual_seed(99), dtype=torch.float64)
-        * clear[..., None]
-    )
+    generator = torch.Generator().manual_seed(99)
+    weight = torch.randn(shape, generator=generator, dtype=torch.float64) * clear[..., None]
     ours, theirs = (drawn(twin, gaussians, view, weight) for twin in (rasterize, dense))
     top = theirs[0].abs().amax((0, 1)).clamp_min(1.0)
     assert float(((ours[0] - theirs[0]).abs() / top)[clear].max()) < 2e-4
@@ -149,42 +138,38 @@ def test_kernels_equal_plain_torch_in_values_and_gradients(
     assert float(compare(scene(seed, view, channels=channels), view)[..., -1].max()) > 0.5
 
 
-def placed(view: Camera, z: tuple[float, float], wide: float, size: float = 1.0) -> list[Tensor]:
+def at_depths(view: Camera, z: tuple[float, float], wide: float, size: float = 1.0) -> list[Tensor]:
     """Random Gaussians whose z-depths lie in a range, within `wide` of the optical axis
-    at z = 1, sizes multiplied.
+    at z = 1; `size` multiplies their scales.
     """
-    gaussians, g = scene(5, view), torch.Generator().manual_seed(7)
+    _, quaternions, scales, opacities, features = scene(5, view)
+    g = torch.Generator().manual_seed(7)
     depth = z[0] + (z[1] - z[0]) * torch.rand(60, 1, generator=g)
     local = torch.cat([wide * (torch.rand(60, 2, generator=g) - 0.5) * depth, depth], 1)
-    return [
-        ahead(view, local).float().double(),
-        gaussians[1],
-        (gaussians[2] * size).float().double(),
-        *gaussians[3:],
-    ]
+    means, scales = (t.float().double() for t in (ahead(view, local), scales * size))
+    return [means, quaternions, scales, opacities, features]
 
 
 def test_nothing_behind_the_camera_is_seen_or_has_a_gradient() -> None:
     view = camera()
-    seen = compare(placed(view, (-2.0, 0.0), 1.0), view)
-    assert float(seen.abs().max()) == 0  # and so are the gradients: the largest of plain torch is 0
+    seen = compare(at_depths(view, (-2.0, 0.0), 1.0), view)
+    assert float(seen.abs().max()) == 0  # and so is the largest gradient of plain torch
 
 
 @pytest.mark.parametrize("size", [0.01, 1.0])
 def test_kernels_equal_plain_torch_across_the_near_plane(size: float) -> None:
     view = camera()
-    gaussians = placed(view, (0.0, 3 * projection.NEAREST), 1.0, size)
+    gaussians = at_depths(view, (0.0, 3 * projection.NEAREST), 1.0, size)
     assert float(compare(gaussians, view, gradients=5e-3)[..., -1].max()) > 0.5
 
 
 def test_kernels_equal_plain_torch_at_the_frames_edge_and_beyond_it() -> None:
     view = camera()
-    gaussians = placed(view, (1.0, 2.0), 3.0)
+    gaussians = at_depths(view, (1.0, 2.0), 3.0)
     centers = project(*gaussians[:3], view)[0]
+    # there the projection is linearized at the edge, not at the mean
     outside = ((centers < -0.3 * 0.5 * 41) | (centers > 1.3 * 41)).any(1)
-    assert (
-        10 < int(outside.sum()) < 50
-    )  # there the projection is linearized at the edge, not at the mean
+    assert 10 < int(outside.sum()) < 50
     gradients = drawn(dense, gaussians, view, torch.ones(27, 41, 6, dtype=torch.float64))[1]
     assert int((gradients[0][outside] != 0).any(1).sum()) > 5
     compare(gaussians, view)
@@ -198,22 +183,18 @@ def test_kernels_equal_plain_torch_on_needles(length: float) -> None:
     assert float(compare(gaussians, view)[..., -1].max()) > 0.1
 
 
-def test_kernels_show_needles_whose_center_is_far_outside_as_plain_torch_does() -> None:
-    view, g = (
-        camera().moved(torch.eye(4, dtype=torch.float64)[:3]),
-        torch.Generator().manual_seed(7),
-    )
+def test_kernels_equal_plain_torch_on_needles_whose_center_is_far_outside() -> None:
+    view = camera().moved(torch.eye(4, dtype=torch.float64)[:3])
+    g = torch.Generator().manual_seed(7)
     angle, z = 6.28 * torch.rand(60, generator=g), 2 + torch.rand(60, 1, generator=g)
-    through = (
-        torch.rand(60, 2, generator=g) - 0.5
-    ) * z  # a point in the frame that the needle passes, 30 units from its center
+    # a point in the frame that the needle passes, 30 units from its center
+    through = (torch.rand(60, 2, generator=g) - 0.5) * z
     gaussians = scene(5, view)
     gaussians[0] = torch.cat([through + 30 * torch.stack([angle.cos(), angle.sin()], 1), z], 1)
     gaussians[1] = torch.stack([(angle / 2).cos(), 0 * angle, 0 * angle, (angle / 2).sin()], 1)
     gaussians[2] = torch.tensor([30, 1e-3, 1e-3]).expand(60, 3)
-    seen = compare(
-        [t.float().double() for t in gaussians], view, gradients=0.1
-    )  # moments of gradients still cancel
+    gaussians = [t.float().double() for t in gaussians]
+    seen = compare(gaussians, view, gradients=0.1)  # moments of gradients still cancel
     assert float(seen[..., -1].mean()) > 0.2
 
 
@@ -229,13 +210,9 @@ def test_kernels_equal_plain_torch_at_opacities_0_and_1() -> None:
     view = camera()
     gaussians = scene(5, view)
     gaussians[3] = (gaussians[3] > 0.5).double()
-    for size in (
-        1.0,
-        1e5,
-    ):  # alphas above the largest one, whose gradients stop there, fill the picture
-        seen = compare(
-            [*gaussians[:2], (gaussians[2] * size).float().double(), *gaussians[3:]], view
-        )
+    for size in (1.0, 1e5):  # giants fill the picture with alphas at the largest one
+        scales = (gaussians[2] * size).float().double()
+        seen = compare([*gaussians[:2], scales, *gaussians[3:]], view)
         assert float(seen[..., -1].max()) > 0.9
 
 
@@ -276,12 +253,9 @@ def test_alpha_at_the_center_is_the_opacity_and_depth_is_z(twin: Callable[..., M
     seen = twin(*gaussians, view)
     assert float(seen.alpha.max()) == float(seen.alpha[3, 4]) == pytest.approx(0.7)
     assert float(seen.depth[3, 4] / seen.alpha[3, 4]) == pytest.approx(2.5)
-    variance = (
-        20 / 2.5 * 0.05
-    ) ** 2 + 0.3  # pixels^2: one pixel aside it is exp(-1 / 2 variance) of that
-    assert float(seen.alpha[3, 5]) == pytest.approx(
-        0.7 * torch.tensor(-0.5 / variance).exp().item(), rel=1e-4
-    )
+    variance = (20 / 2.5 * 0.05) ** 2 + 0.3  # pixels^2
+    one_pixel_aside = 0.7 * math.exp(-0.5 / variance)
+    assert float(seen.alpha[3, 5]) == pytest.approx(one_pixel_aside, rel=1e-4)
 
 
 @both
@@ -304,23 +278,17 @@ def test_of_coincident_gaussians_the_first_is_in_front(twin: Callable[..., Maps]
 
 def test_the_depth_order_is_a_stable_sort_of_all_that_is_drawn() -> None:
     g = np.random.default_rng(0)
-    depths = np.concatenate(
-        [
-            g.random(500),
-            g.integers(1, 9, 500),
-            10.0 ** g.uniform(-2, 30, 200),
-            [-1.0, 0.0, np.nan, np.inf],
-        ]
-    )
+    parts = [g.random(500), g.integers(1, 9, 500), 10.0 ** g.uniform(-2, 30, 200)]
+    depths = np.concatenate([*parts, [-1.0, 0.0, np.nan, np.inf]])
     depths = g.permutation(depths).astype(np.float32)
-    order = front_to_back(depths)
+    order = depth_order(depths)
     assert sorted(order.tolist()) == list(range(len(depths)))
     drawn = order[depths[order] > projection.NEAREST]
     expected = np.argsort(depths, kind="stable")
     assert drawn.tolist() == expected[depths[expected] > projection.NEAREST].tolist()
 
 
-def test_opacity_never_exceeds_1_however_many_there_are() -> None:
+def test_opacity_never_exceeds_1_however_many_gaussians_there_are() -> None:
     view = camera()
     gaussians = [t.float() for t in scene(0, view, count=500)]
     gaussians[3][:] = 1.0
@@ -331,16 +299,9 @@ def test_opacity_never_exceeds_1_however_many_there_are() -> None:
 @both
 @pytest.mark.parametrize(
     ("part", "bad"),
-    [
-        (0, float("nan")),
-        (1, float("nan")),
-        (2, float("nan")),
-        (3, float("nan")),
-        (0, float("inf")),
-        (2, float("inf")),
-    ],
+    [*((part, math.nan) for part in range(4)), (0, math.inf), (2, math.inf)],
 )
-def test_a_gaussian_that_is_no_number_is_not_drawn_and_harms_no_other(
+def test_a_gaussian_that_is_not_finite_is_not_drawn_and_harms_no_other(
     twin: Callable[..., Maps], part: int, bad: float
 ) -> None:
     view = camera()
@@ -348,10 +309,8 @@ def test_a_gaussian_that_is_no_number_is_not_drawn_and_harms_no_other(
     rest = [torch.cat([t[:7], t[8:]]) for t in gaussians]
     gaussians[part].view(60, -1)[7, -1] = bad
     weight = torch.ones(27, 41, 6, dtype=torch.float64)
-    (seen, gradients), (expected, theirs) = (
-        drawn(twin, gaussians, view, weight),
-        drawn(twin, rest, view, weight),
-    )
+    seen, gradients = drawn(twin, gaussians, view, weight)
+    expected, theirs = drawn(twin, rest, view, weight)
     assert torch.equal(seen, expected)
     for a, b in zip(gradients[:5], theirs[:5], strict=True):
         assert float(a[7].abs().max()) == 0
@@ -380,20 +339,21 @@ def fingerprints() -> None:
 def test_the_result_is_the_same_to_the_bit_for_any_number_of_threads() -> None:
     environment = {**os.environ, "NUMBA_NUM_THREADS": "2", "PYTHONPATH": os.pathsep.join(sys.path)}
     code = "import test_rasterize; test_rasterize.fingerprints()"
-    said = subprocess.run(
-        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
-    )
-    hashes = said.stdout.split()
+    command = [sys.executable, "-c", code]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    hashes = result.stdout.split()
     assert len(hashes) == 4 and len(set(hashes)) == 1
 
 
-def test_a_missing_gsplat_is_said_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    said: list[str] = []
+def test_a_missing_gsplat_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    messages: list[str] = []
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    monkeypatch.setattr(rasterize_cuda, "say", said.append)
+    monkeypatch.setattr(rasterize_cuda, "say", messages.append)
+    rasterize_cuda.fault.cache_clear()
     rasterize_cuda.available.cache_clear()
     assert not rasterize_cuda.available() and not rasterize_cuda.available()
-    assert len(said) == 1 and "hdr-nsff[gpu]" in said[0]
+    assert len(messages) == 1 and "hdr-nsff[gpu]" in messages[0]
+    rasterize_cuda.fault.cache_clear()
     rasterize_cuda.available.cache_clear()
 
 
@@ -408,17 +368,16 @@ def test_cuda_equals_plain_torch(
     monkeypatch.setattr(rasterize_cuda, "available", lambda: installed)
     view = camera()
     gaussians = scene(0, view, channels=channels)
-    weight = (
-        torch.randn(27, 41, channels + 2, generator=torch.Generator().manual_seed(99)).double()
-        * sure(gaussians, view)[..., None]
-    )
+    clear = clear_pixels(gaussians, view)[..., None]
+    generator = torch.Generator().manual_seed(99)
+    weight = torch.randn(27, 41, channels + 2, generator=generator).double() * clear
     leaves = [t.float().cuda().requires_grad_() for t in gaussians]
     pose, focal = (t.float().cuda().requires_grad_() for t in (view.c2w, view.K[[0, 1], [0, 1]]))
     there = Camera(view.K.float().cuda(), pose, view.width, view.height)
     seen = everything(rasterize(*leaves, lens(there, focal)))
     (seen * weight.cuda()).sum().backward()
     expected, gradients = drawn(dense, gaussians, view, weight)
-    off = (seen.detach().cpu() - expected).abs() * sure(gaussians, view)[..., None]
+    off = (seen.detach().cpu() - expected).abs() * clear
     assert float(off.max()) < 1e-3 * float(expected.abs().max())
     for a, b in zip((*leaves, pose, focal), gradients, strict=True):
         assert float((a.grad.cpu() - b).abs().max()) < 5e-3 * float(b.abs().max())

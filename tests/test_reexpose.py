@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, write_npy, write_png
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.scene.truth import Truth
-from hdr_nsff.synth.reexpose import ReexposeConfig, plan, reexpose
+from hdr_nsff.synth.reexpose import ReexposeConfig, plan_frames, reexpose
 
 
 def ordinary_clip(folder: Path, count: int = 20, width: int = 40) -> Path:
@@ -63,9 +65,8 @@ def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbors(tmp
     assert truth.views[0].c2w == [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert [pose[0][3] for pose in truth.clip_c2w] == [t for t in range(20) if t not in (4, 12)]
     assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
-    again = import_poses(
-        out / "poses_bounds.npy", [f"{k}.png" for k in range(18)], (24, 40)
-    )  # what `prepare --poses` will read
+    names = [f"{k}.png" for k in range(18)]
+    again = import_poses(out / "poses_bounds.npy", names, (24, 40))  # as `prepare --poses` does
     assert np.allclose(again.c2w, truth.clip_c2w) and np.allclose(again.K, truth.K)
 
 
@@ -73,9 +74,7 @@ def test_recordings_follow_the_response_and_truth_is_the_clip(tmp_path):
     out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out", noise=0))
     radiance = read_exr(out / "truth/radiance/00004.exr")["RGB"]
     assert np.allclose(radiance, read_image(tmp_path / "in/004.png") ** 2.2, rtol=2e-3)
-    expected = response_curve("film").apply(
-        np.clip(radiance * 2.0**0, 0, 1)
-    )  # frame 4 is in bracket 1: EV 0
+    expected = response_curve("film").apply(np.clip(radiance, 0, 1))  # frame 4 is taken at EV 0
     assert np.abs(read_image(out / "clip/00004.png") - expected).max() < 1.5 / 255
 
 
@@ -87,7 +86,7 @@ def test_exposures_of_a_reexposed_clip_are_found_again(tmp_path):
 
 
 def test_the_cycle_runs_unbroken_over_the_recorded_frames():
-    work = plan(20, 3, 8, remove=True)
+    work = plan_frames(20, 3, 8, remove=True)
     assert [work.bracket[k] for k in work.kept] == [n % 3 for n in range(18)]
 
 
@@ -126,11 +125,12 @@ def test_poses_shrink_with_the_frames(tmp_path):
     assert np.allclose(Truth.open(out / "truth").K, K)
 
 
-def test_an_interrupted_run_goes_on_and_a_finished_one_is_left_alone(tmp_path):
+def test_an_interrupted_run_continues_and_a_finished_one_is_left_alone(tmp_path):
     config = ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out")
     out = reexpose(config)
     before = {f: f.read_bytes() for f in out.rglob("*") if f.is_file()}
-    (out / "clip/00007.png").unlink(), (out / "truth/truth.json").unlink()
+    (out / "clip/00007.png").unlink()
+    (out / "truth/truth.json").unlink()
     untouched = (out / "clip/00003.png").stat().st_mtime_ns
     reexpose(config)
     assert {f: f.read_bytes() for f in out.rglob("*") if f.is_file()} == before
@@ -139,16 +139,15 @@ def test_an_interrupted_run_goes_on_and_a_finished_one_is_left_alone(tmp_path):
 
 def test_output_of_another_clip_is_not_touched(tmp_path):
     reexpose(ReexposeConfig(ordinary_clip(tmp_path / "a"), tmp_path / "out"))
-    told = (tmp_path / "out/reexpose.json").read_text()
+    note = (tmp_path / "out/reexpose.json").read_text()
     with pytest.raises(InputError, match="other settings"):
         reexpose(ReexposeConfig(tmp_path / "a", tmp_path / "out", ev="-1,1"))
     with pytest.raises(InputError, match="another clip"):
         reexpose(ReexposeConfig(ordinary_clip(tmp_path / "b", 19), tmp_path / "out"))
     with pytest.raises(InputError, match="not made by reexpose"):
         reexpose(ReexposeConfig(tmp_path / "a", tmp_path / "b"))
-    assert (tmp_path / "out/reexpose.json").read_text() == told and json.loads(told)[
-        "ev"
-    ] == "-2,0,2"
+    assert (tmp_path / "out/reexpose.json").read_text() == note
+    assert json.loads(note)["ev"] == "-2,0,2"
 
 
 @pytest.mark.parametrize(
@@ -160,6 +159,12 @@ def test_output_of_another_clip_is_not_touched(tmp_path):
         ({"poses": Path("nowhere.npy")}, "no such file"),
         ({"masks": Path("nowhere")}, "0 masks"),
         ({"end": 2}, "at least 3"),
+        ({"end": 0}, "nothing to read"),
+        ({"stride": 0}, "nothing to read"),
+        ({"noise": float("nan")}, "--noise nan"),
+        ({"noise": float("-inf")}, "--noise -inf"),
+        ({"hold_out": -1}, "--hold-out -1"),
+        ({"seed": -1}, "--seed -1"),
     ],
 )
 def test_bad_settings_are_named(tmp_path, change, what):

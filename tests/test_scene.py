@@ -9,7 +9,10 @@ import pytest
 import torch
 from toy_scene import CARD, EV, WALL, ToyScene
 
-from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene, Step, neighbors, outline
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
+from hdr_nsff.scene.movers import write_movers
+from hdr_nsff.scene.scene import Scene, neighbors, outline
 
 
 def entry(index: int, time: float, camera: int = 0) -> FrameEntry:
@@ -53,8 +56,8 @@ def test_a_scene_holds_what_was_written(toy: Scene) -> None:
     assert len(toy.train) == 6 and toy.test == [] and toy.times.tolist() == [0, 1, 2, 3, 4, 5]
     for f in toy.train:
         radiance, moving, _ = truth.see(f.time)
-        assert f.exposure == EV[f.bracket] and f.moving is not None and f.disparity is not None
-        recorded = np.clip(radiance * 2.0**f.exposure, 0, 1) ** (1 / 2.2)
+        assert f.moving is not None and f.disparity is not None
+        recorded = np.clip(radiance * 2.0 ** EV[f.bracket], 0, 1) ** (1 / 2.2)
         assert float(np.abs(f.image.numpy() - recorded).max()) <= 0.5 / 255 + 1e-6
         assert torch.equal(f.moving, torch.from_numpy(moving))
         assert sorted({round(1 / v, 2) for v in f.disparity.unique().tolist()}) == pytest.approx(
@@ -78,7 +81,7 @@ def test_only_an_estimated_mask_has_a_doubtful_outline(
 ) -> None:
     folder = shutil.copytree(toy_folder, tmp_path / "scene")
     manifest = Manifest.load(folder)
-    manifest.steps["masks"] = Step(done=True, provenance=provenance)
+    manifest.steps["masks"] = StepRecord(done=True, provenance=provenance)
     manifest.save(folder)
     f = Scene.open(folder).train[0]
     assert f.moving is not None and (f.outline is None) == (provenance == "given")
@@ -90,6 +93,9 @@ def test_held_out_frames_lend_no_map_to_training(toy_folder: Path, tmp_path: Pat
     data = json.loads((folder / "scene.json").read_text())
     data["frames"][2]["split"] = "test"
     (folder / "scene.json").write_text(json.dumps(data))
+    with pytest.raises(InputError, match="--redo movers"):
+        Scene.open(folder)
+    write_movers(folder / "movers.npz", [])
     scene = Scene.open(folder)
     assert [f.index for f in scene.train] == [0, 1, 3, 4, 5] and [f.index for f in scene.test] == [
         2

@@ -1,4 +1,4 @@
-"""The cube a field lives in: invertible, inside its bounds, cells of a pixel."""
+"""The cube a field lives in: invertible, bounded, with cells of a pixel."""
 
 import math
 
@@ -32,7 +32,7 @@ def all_round() -> list[Camera]:
     return [camera(0.2 * k, 2 * math.pi * k / 5) for k in range(5)]
 
 
-def test_cameras_side_by_side_make_a_frustum_and_cameras_all_round_a_ball() -> None:
+def test_cameras_side_by_side_get_a_frustum_and_cameras_all_round_a_ball() -> None:
     assert isinstance(build_space(forward_facing(), 1.0, 20.0), FrustumSpace)
     assert isinstance(build_space(all_round(), 1.0, 20.0), ContractedSpace)
 
@@ -48,12 +48,10 @@ def test_decode_inverts_encode_for_everything_the_cameras_see(cameras: list[Came
 
 def test_frustum_cells_are_even_in_pixels_and_in_disparity() -> None:
     space = build_space([camera()], 1.0, 20.0)
-    near, far = (
-        space.encode(torch.tensor([[z * 0.1, 0.0, z], [z * 0.2, 0.0, z]])) for z in (1.5, 15.0)
-    )
-    torch.testing.assert_close(
-        near[1, 0] - near[0, 0], far[1, 0] - far[0, 0]
-    )  # 5 pixels are 5 pixels at every depth
+    near = space.encode(torch.tensor([[0.15, 0.0, 1.5], [0.3, 0.0, 1.5]]))
+    far = space.encode(torch.tensor([[1.5, 0.0, 15.0], [3.0, 0.0, 15.0]]))
+    # 5 pixels are as wide at both depths
+    torch.testing.assert_close(near[1, 0] - near[0, 0], far[1, 0] - far[0, 0])
     z = 1 / torch.tensor([0.2, 0.4, 0.6])
     third = space.encode(torch.stack([0 * z, 0 * z, z], -1))[:, 2]
     torch.testing.assert_close(third[2] - third[1], third[1] - third[0])
@@ -67,13 +65,11 @@ def test_frustum_of_one_camera_spans_its_picture_with_a_small_margin() -> None:
 
 def test_contraction_is_linear_inside_and_bounded_outside() -> None:
     space = ContractedSpace(torch.tensor([1.0, 0, 0]), torch.tensor(2.0))
-    torch.testing.assert_close(
-        space.encode(torch.tensor([[2.0, 0, 0]])), torch.tensor([[0.5 + 0.5 / 4, 0.5, 0.5]])
-    )
-    torch.testing.assert_close(
-        space.encode(torch.tensor([[1.0, 4.0, 0]])), torch.tensor([[0.5, 0.5 + 1.5 / 4, 0.5]])
-    )  # (2 - 1/2)
-    assert float(space.encode(torch.tensor([[1e9, 0, 0]])).max()) <= 1.0
+    inside, outside, far = space.encode(torch.tensor([[2.0, 0, 0], [1, 4, 0], [1e9, 0, 0]]))
+    torch.testing.assert_close(inside, torch.tensor([0.5 + 0.5 / 4, 0.5, 0.5]))
+    # at twice the radius: 2 - 1/2
+    torch.testing.assert_close(outside, torch.tensor([0.5, 0.5 + 1.5 / 4, 0.5]))
+    assert float(far.max()) <= 1.0
 
 
 def test_mean_pose_is_a_rotation_at_the_mean_center() -> None:

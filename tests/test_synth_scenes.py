@@ -14,7 +14,7 @@ from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at, project
 from hdr_nsff.synth.scenes.night import DROP, bulb_pose
 from hdr_nsff.synth.scenes.shapes import Builder
-from hdr_nsff.synth.synth import SynthConfig
+from hdr_nsff.synth.settings import SynthConfig
 
 NAMES = sorted(SCENES)
 SIZE = (48, 27)
@@ -154,7 +154,8 @@ def test_what_is_carried_over_a_half_time_arrives_where_it_does_at_once(name: st
 @pytest.mark.parametrize("name", NAMES)
 def test_the_seed_repeats_a_scene_and_another_paints_it_otherwise(name: str) -> None:
     a, b, other = (SCENES[name].build(seed) for seed in (1, 1, 2))
-    assert len({p.name for p in a}) == len(a) and {p.body for p in a} == {
+    assert len({p.name for p in a}) == len(a)
+    assert {p.body for p in a} == {
         "room",
         *(m.name for m in SCENES[name].bodies),
     }
@@ -173,7 +174,7 @@ def test_a_rig_is_two_rows_of_nine_aimed_at_one_place(name: str) -> None:
     eyes = np.array(scene.rig)
     assert sorted(np.unique(eyes[:, 1], return_counts=True)[1]) == [4, 5]
     width, beside = np.ptp(eyes[:, 0]), np.linalg.norm(eyes - np.roll(eyes, 1, axis=0), axis=1)
-    assert beside.max() < 0.36 * width  # whoever records next stands beside, also after the last
+    assert beside.max() < 0.36 * width  # the next to record stands beside
     for k in range(9):
         np.testing.assert_allclose(
             project(np.array(scene.rig_target), K, scene.pose("rig", k))[0], [24, 13.5], atol=1e-9
@@ -292,7 +293,8 @@ def test_light_from_all_around_comes_from_above() -> None:
 def test_the_interior_is_the_one_that_measurements_rest_on() -> None:
     """Counted and summed when the demo clip was made."""
     parts = SCENES["interior"].build(0)
-    assert len(parts) == 52 and [p.name for p in parts if p.emits] == [
+    assert len(parts) == 52
+    assert [p.name for p in parts if p.emits] == [
         "light47",
         "light48",
         "bulb49",

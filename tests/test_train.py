@@ -23,10 +23,12 @@ from hdr_nsff.core import distributed
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_json
 from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapConfig
-from hdr_nsff.training.config import PRESETS, TrainConfig
+from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.training.budget import Budget, Clock, Schedule
+from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_log, snapshots
-from hdr_nsff.training.train import Clock, Trainer, train
+from hdr_nsff.training.train import Trainer, train
 
 STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
 
@@ -181,11 +183,11 @@ def test_a_finished_run_stays_finished(unbroken: Path, toy_folder: Path) -> None
 
 def test_neither_steps_nor_minutes_is_refused(toy_folder: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--steps"):
-        train(replace(config(toy_folder, tmp_path / "run"), steps=None))
+        train(replace(config(toy_folder, tmp_path / "run"), budget=Budget(minutes=None)))
 
 
 def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:
-    settings = replace(config(toy_folder, tmp_path / "run"), steps=None, minutes=1.5 / 60)
+    settings = replace(config(toy_folder, tmp_path / "run"), budget=Budget(minutes=1.5 / 60))
     run = Run.open(train(settings))
     assert run.step > 3 and 1.5 <= run.seconds < 10
 
@@ -256,8 +258,9 @@ def test_nan_names_the_step_and_the_term(toy: Scene, toy_folder: Path, tmp_path:
         t.step()
 
 
-def at(preset: str, step: int, frames: int = 24, **changes: float) -> Clock:
-    return Clock(replace(PRESETS[preset], **changes), frames, step, 0.0)
+def at(preset: str, step: int, frames: int = 24, budget: Budget | None = None) -> Clock:
+    config = PRESETS[preset]
+    return Clock(budget or config.budget, config.schedule, frames, step)
 
 
 def test_the_published_period_is_a_thousand_steps_per_frame_between_30_and_250_frames() -> None:
@@ -272,12 +275,16 @@ def test_the_published_learning_rate_falls_by_a_tenth_in_300_000_steps() -> None
 
 
 def test_grid_schedules_follow_the_share_of_the_run() -> None:
-    clock = at("grid", 50, steps=100, period=0.25, lr_final=0.05)
-    assert clock.progress == 0.5 and clock.phase == 2.0 and math.isclose(clock.lr_share, 0.05**0.5)
+    clock = at("grid", 45, budget=Budget(steps=90))
+    assert (
+        clock.progress == 0.5
+        and math.isclose(clock.phase, 0.5 / 0.45)
+        and math.isclose(clock.lr_share, 0.05**0.5)
+    )
 
 
 def test_without_steps_the_clock_counts_minutes() -> None:
-    clock = Clock(replace(PRESETS["grid"], steps=None, minutes=5.0, period=0.5), 24, 10**6, 75.0)
+    clock = Clock(Budget(minutes=5.0), Schedule(period=0.5), 24, 10**6, 75.0)
     assert clock.progress == 0.25 and clock.phase == 0.5
     assert replace(clock, seconds=1e6).progress == 1.0
 
@@ -287,5 +294,5 @@ def test_every_kind_of_tone_mapper_trains(
     kind: Literal["none", "fixed", "per_image", "mlp", "sigmoid"], toy_folder: Path, tmp_path: Path
 ) -> None:
     settings = replace(config(toy_folder, tmp_path / "run"), tonemap=ToneMapConfig(kind=kind))
-    log = read_log(train(replace(settings, steps=25)))
+    log = read_log(train(replace(settings, budget=Budget(steps=25))))
     assert log[-1].step == 25 and log[-1].psnr > 5

@@ -1,6 +1,4 @@
-"""Shared rigid motions: rotations about a center, mixtures of shifts, quaternions
-against rotation matrices.
-"""
+"""Shared rigid motions: rotations about a center, mixtures of shifts, quaternions."""
 
 import math
 
@@ -18,9 +16,7 @@ def random(*shape: int, seed: int = 0) -> Tensor:
 
 
 def turning(angle: float) -> Trajectories:
-    """One basis that turns by `angle` (radians) per knot about the z axis through its
-    center.
-    """
+    """One basis that turns about a z axis by `angle` (radians) per knot."""
     t = Trajectories(1, KNOTS)
     t.centers[:] = torch.tensor([1.0, 2.0, 3.0])
     half = 0.5 * angle * torch.arange(KNOTS)
@@ -52,12 +48,10 @@ def test_a_pure_rotation_turns_about_its_center() -> None:
 def test_between_knots_a_rotation_stays_rigid_and_nearly_even() -> None:
     t, points = turning(0.3), random(20, 3)
     moved = t.move(points, torch.ones(1, 20), t.pose(4.5))
-    torch.testing.assert_close(
-        torch.cdist(moved, moved), torch.cdist(points, points), atol=1e-4, rtol=1e-4
-    )
-    torch.testing.assert_close(
-        moved, (points - t.centers) @ about_z(0.3 * 4.5).T + t.centers, atol=1e-4, rtol=1e-3
-    )
+    distances, before = torch.cdist(moved, moved), torch.cdist(points, points)
+    torch.testing.assert_close(distances, before, atol=1e-4, rtol=1e-4)
+    expected = (points - t.centers) @ about_z(0.3 * 4.5).T + t.centers
+    torch.testing.assert_close(moved, expected, atol=1e-4, rtol=1e-3)
 
 
 def test_a_gaussian_turns_as_its_place_does() -> None:
@@ -78,12 +72,9 @@ def test_a_mixture_of_two_shifts_is_their_weighted_mean() -> None:
 
 def test_quaternions_multiply_as_rotation_matrices_do() -> None:
     a, b = random(20, 4), random(20, 4, seed=1)
-    torch.testing.assert_close(
-        rotation_matrices(quaternion_product(a, b)),
-        rotation_matrices(a) @ rotation_matrices(b),
-        atol=1e-5,
-        rtol=1e-4,
-    )
+    product = rotation_matrices(quaternion_product(a, b))
+    expected = rotation_matrices(a) @ rotation_matrices(b)
+    torch.testing.assert_close(product, expected, atol=1e-5, rtol=1e-4)
 
 
 def test_rotation_matrices_turn_and_do_not_mirror() -> None:
@@ -99,9 +90,7 @@ def test_constant_acceleration_is_smooth_and_a_jump_is_not() -> None:
     assert float(t.roughness(4.0, 1.0).detach()) == 0
     shifts[5, 1, 2] = 1.0
     assert float(t.roughness(4.0, 1.0).detach()) > 0.1
-    assert (
-        float(t.roughness(0.0, 1.0).detach()) == 0
-    )  # the jump is too far away to be seen from there
+    assert float(t.roughness(0.0, 1.0).detach()) == 0  # the jump is outside of the window
 
 
 def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
@@ -110,14 +99,11 @@ def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
     mixture = random(2, 5, seed=1).softmax(0)
     knot = 9.3
     t.mark(knot)
-    (
-        t.move(random(5, 3), mixture, t.pose(knot)).square().sum()
-        + t.turn(random(5, 4), mixture, t.pose(knot))[:, 1].sum()
-        + t.roughness(knot, 1.0)
-    ).backward()
+    moved = t.move(random(5, 3), mixture, t.pose(knot))
+    turned = t.turn(random(5, 4), mixture, t.pose(knot))
+    (moved.square().sum() + turned[:, 1].sum() + t.roughness(knot, 1.0)).backward()
     for values, touched in ((t.turns, t.turns_touched), (t.shifts, t.shifts_touched)):
         has = (values.grad != 0).any(1)
         assert bool(has.any()) and bool((touched[has] == 1).all())
-    assert t.turns_touched.view(20, 2)[:, 0].nonzero()[:, 0].tolist() == list(
-        range(9 - WINDOW, 10 + WINDOW)
-    )
+    marked = t.turns_touched.view(20, 2)[:, 0].nonzero()[:, 0].tolist()
+    assert marked == list(range(9 - WINDOW, 10 + WINDOW))

@@ -5,10 +5,10 @@ bends no camera.
 import numpy as np
 import pytest
 
-from hdr_nsff.core.io import encode
+from hdr_nsff.core.images import encode
 from hdr_nsff.footage.colmap import read_model
 from hdr_nsff.priors.poses import sfm
-from hdr_nsff.priors.poses.trimming import NEEDED
+from hdr_nsff.priors.poses.trimming import TrimmingTuning
 from hdr_nsff.synth.scenes.geometry import look_at
 
 pytest.importorskip("pycolmap")
@@ -66,7 +66,7 @@ def test_a_waving_cloth_bends_no_camera(tmp_path):
         focal=1.2 * FOCAL,
         mapping="incremental",
         threads=1,
-        given=True,
+        matches_given=True,
     )
 
     model = read_model(sfm.run(job)[0])
@@ -75,5 +75,5 @@ def test_a_waving_cloth_bends_no_camera(tmp_path):
     assert next(iter(model.cameras.values())).K[0, 0] == pytest.approx(FOCAL, rel=0.015)
     for image in model.images.values():
         kept = np.flatnonzero(image.point_ids >= 0)
-        assert len(kept) >= NEEDED
+        assert len(kept) >= TrimmingTuning().min_image_points
         assert np.mean(kept >= STATIC) < 0.1  # of 0.37

@@ -1,4 +1,4 @@
-"""Compositing: closed forms and laws."""
+"""Volume rendering: closed forms, a slow loop, and what must add up."""
 
 import math
 
@@ -29,22 +29,24 @@ def test_constant_density_gives_the_beer_lambert_opacity() -> None:
     assert math.isclose(float(w.sum()), 1 - math.exp(-0.7 * 5), rel_tol=1e-4)
 
 
-def test_weights_and_what_passes_add_up_to_one() -> None:
-    s, d, deltas = random(20, 16) * 5, random(20, 16, seed=1) * 5, random(20, 16, seed=2) * 0.3
-    w = volume.add(s, d, deltas)
-    passes = torch.exp(-((s + d) * deltas).sum(-1))
-    torch.testing.assert_close((w.static + w.dynamic).sum(-1), 1 - passes, atol=1e-5, rtol=1e-5)
+def test_weights_and_transmitted_light_add_up_to_one() -> None:
+    static, dynamic = random(20, 16) * 5, random(20, 16, seed=1) * 5
+    deltas = random(20, 16, seed=2) * 0.3
+    w = volume.add(static, dynamic, deltas)
+    transmitted = torch.exp(-((static + dynamic) * deltas).sum(-1))
+    total = (w.static + w.dynamic).sum(-1)
+    torch.testing.assert_close(total, 1 - transmitted, atol=1e-5, rtol=1e-5)
 
 
 def test_blend_share_zero_is_static_alone_and_one_is_dynamic_alone() -> None:
-    s, d, deltas = random(4, 9), random(4, 9, seed=1), random(4, 9, seed=2)
-    none, all_ = (
-        volume.blend(s, d, torch.zeros(4, 9), deltas),
-        volume.blend(s, d, torch.ones(4, 9), deltas),
-    )
-    torch.testing.assert_close(none.static, volume.single(s, deltas))
-    assert float(none.dynamic.abs().max()) == 0 and float(all_.static.abs().max()) == 0
-    torch.testing.assert_close(all_.dynamic, volume.single(d, deltas))
+    s, d = random(4, 9), random(4, 9, seed=1)
+    deltas = random(4, 9, seed=2)
+    static_only = volume.blend(s, d, torch.zeros(4, 9), deltas)
+    dynamic_only = volume.blend(s, d, torch.ones(4, 9), deltas)
+    torch.testing.assert_close(static_only.static, volume.single(s, deltas))
+    torch.testing.assert_close(dynamic_only.dynamic, volume.single(d, deltas))
+    assert float(static_only.dynamic.abs().max()) == 0
+    assert float(dynamic_only.static.abs().max()) == 0
 
 
 def test_blend_agrees_with_a_slow_loop() -> None:
@@ -53,9 +55,8 @@ def test_blend_agrees_with_a_slow_loop() -> None:
     for i in range(5):
         a_dy = (1 - math.exp(-d[0, i] * deltas[0, i])) * b[0, i]
         a_st = (1 - math.exp(-s[0, i] * deltas[0, i])) * (1 - b[0, i])
-        assert math.isclose(float(w.dynamic[0, i]), t * a_dy, rel_tol=1e-4) and math.isclose(
-            float(w.static[0, i]), t * a_st, rel_tol=1e-4
-        )
+        assert math.isclose(float(w.dynamic[0, i]), t * a_dy, rel_tol=1e-4)
+        assert math.isclose(float(w.static[0, i]), t * a_st, rel_tol=1e-4)
         t *= (1 - a_dy) * (1 - a_st)
 
 
@@ -67,10 +68,7 @@ def test_without_dynamic_density_adding_is_the_static_render() -> None:
 
 
 def test_an_opaque_sample_gives_its_depth_and_an_empty_ray_the_far_plane() -> None:
-    weights, depths = (
-        torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]]),
-        torch.tensor([[1.0, 2.0, 3.0]] * 2),
-    )
-    torch.testing.assert_close(
-        volume.expected_depth(weights, depths, 9.0), torch.tensor([2.0, 9.0])
-    )
+    weights = torch.tensor([[0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    depths = torch.tensor([[1.0, 2.0, 3.0]] * 2)
+    expected = volume.expected_depth(weights, depths, far=9.0)
+    torch.testing.assert_close(expected, torch.tensor([2.0, 9.0]))

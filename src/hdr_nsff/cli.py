@@ -1,185 +1,291 @@
 """The command line: one verb, one function, one config. Bad input is one sentence and
 exit code 2.
+
+The table of verbs is plain text. A verb's module, and with it torch and its relatives,
+is imported when the verb is called, so `hdr-nsff --help` answers at once.
 """
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
-
 try:
-    import tyro
+    import os
+    import sys
+    from collections.abc import Sequence
+    from dataclasses import dataclass
+    from importlib import import_module
+    from typing import Any, NoReturn
 
     from hdr_nsff import __version__
-    from hdr_nsff.bench.bench import BenchConfig, bench
     from hdr_nsff.core.errors import InputError
-    from hdr_nsff.core.io import writing_to
-    from hdr_nsff.core.progress import say
-    from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
-    from hdr_nsff.evaluation.report import ReportConfig, report
-    from hdr_nsff.flow_training.finetune_flow import FinetuneConfig, finetune_flow
-    from hdr_nsff.pipeline import RunConfig, run_all
-    from hdr_nsff.prepare.prepare import PrepareConfig, prepare
-    from hdr_nsff.prepare.weights import WeightsConfig, weights
-    from hdr_nsff.rendering.export import ExportConfig, export
-    from hdr_nsff.rendering.render import RenderConfig, render
-    from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
-    from hdr_nsff.synth.synth import SynthConfig, synth
-    from hdr_nsff.training.config import ABLATIONS, PRESETS, TrainConfig
-    from hdr_nsff.training.train import train
-except KeyboardInterrupt:  # while the libraries load, which takes seconds
+    from hdr_nsff.core.process import prepare_process
+except KeyboardInterrupt:  # Ctrl-C before `main` is reached
     raise SystemExit(130) from None
+
+INTERRUPTED = 130  # exit code by convention: 128 + SIGINT
+CLOSED_PIPE = 141  # 128 + SIGPIPE
+MAX_MESSAGE = 560  # characters of a sentence about bad input
 
 
 @dataclass(frozen=True)
 class Verb:
-    """What a word on the command line does."""
+    """A word on the command line."""
 
-    act: Callable[[Any], Any]
-    config: Any  # a config dataclass, or {preset name: default config}
+    function: str  # place of what it does, as in "package.module:name"
+    config: str | None  # of a dataclass or {preset: default config}; None: no options
     summary: str
 
 
 VERBS = {
     "run": Verb(
-        run_all, RunConfig, "Footage to HDR in one go: prepare, train, render, evaluate, report."
+        "hdr_nsff.pipeline:run_all",
+        "hdr_nsff.pipeline:RunConfig",
+        "Footage to HDR in one go: prepare, train, render, evaluate, report.",
     ),
     "prepare": Verb(
-        prepare, PrepareConfig, "Footage to a scene folder: exposures, poses, flow, masks, depth."
+        "hdr_nsff.prepare.prepare:prepare",
+        "hdr_nsff.prepare.prepare:PrepareConfig",
+        "Turn footage into a scene folder: exposures, poses, flow, masks, depth.",
     ),
     "train": Verb(
-        train,
-        PRESETS,
-        "Train a radiance field from a scene folder: `train splat`, `train grid`, ...; `train --help` lists the presets.",
+        "hdr_nsff.training.train:train",
+        "hdr_nsff.training.presets:PRESETS",
+        "Train a radiance field from a scene folder; `train --help` lists the presets.",
     ),
     "render": Verb(
-        render,
-        RenderConfig,
-        "Views of a trained run: EXR, PNG, video; any path, time and exposure.",
+        "hdr_nsff.rendering.render:render",
+        "hdr_nsff.rendering.render:RenderConfig",
+        "Render views of a trained run: EXR, PNG, video; any path, time and exposure.",
     ),
     "export": Verb(
-        export,
-        ExportConfig,
-        "For other programs: a splat run's Gaussians as PLY, or a scene in a public data layout.",
+        "hdr_nsff.rendering.export:export",
+        "hdr_nsff.rendering.export:ExportConfig",
+        "Write Gaussians as PLY, or a scene in a public data layout, for other programs.",
     ),
-    "evaluate": Verb(evaluate, EvaluateConfig, "Measure a trained run on held-out views."),
+    "evaluate": Verb(
+        "hdr_nsff.evaluation.evaluate:evaluate",
+        "hdr_nsff.evaluation.evaluate:EvaluateConfig",
+        "Measure a trained run on held-out views.",
+    ),
     "report": Verb(
-        report,
-        ReportConfig,
-        "One HTML page about a run: pictures, curves, losses, metrics, what was given.",
+        "hdr_nsff.evaluation.report:report",
+        "hdr_nsff.evaluation.report:ReportConfig",
+        "Write one HTML page about a run: pictures, curves, losses, metrics, inputs.",
     ),
     "bench": Verb(
-        bench, BenchConfig, "Methods x scenes in one table: trained, measured, side by side."
+        "hdr_nsff.bench.bench:bench",
+        "hdr_nsff.bench.bench:BenchConfig",
+        "Train and measure methods on scenes, side by side in one table.",
     ),
     "synth": Verb(
-        synth,
-        SynthConfig,
+        "hdr_nsff.synth.synth:synth",
+        "hdr_nsff.synth.synth:SynthConfig",
         "Path-trace a scene with exact truth, recorded in alternating exposures.",
     ),
     "finetune-flow": Verb(
-        finetune_flow,
-        FinetuneConfig,
-        "Adapt a flow network to pairs of different exposure, for `prepare --flow raft-finetuned`.",
+        "hdr_nsff.flow_training.finetune_flow:finetune_flow",
+        "hdr_nsff.flow_training.finetune_flow:FinetuneConfig",
+        "Adapt a flow network to pairs of different exposure.",
     ),
     "reexpose": Verb(
-        reexpose, ReexposeConfig, "Make an alternating-exposure problem of any ordinary clip."
+        "hdr_nsff.synth.reexpose:reexpose",
+        "hdr_nsff.synth.reexpose:ReexposeConfig",
+        "Make an alternating-exposure problem of any ordinary clip.",
     ),
     "weights": Verb(
-        weights,
-        WeightsConfig,
-        "List the networks that can help, whether their weights are here, how to get them.",
+        "hdr_nsff.prepare.weights:weights",
+        "hdr_nsff.prepare.weights:WeightsConfig",
+        "List the networks that can help, and where their weights are.",
+    ),
+    "doctor": Verb(
+        "hdr_nsff.doctor:doctor",
+        None,
+        "Describe this installation, for a bug report; say what is missing.",
     ),
 }
+
 PRESET_HELP = {
-    "splat": "4D Gaussians, minutes on a CPU, tens of small frames a second; the default of `run`.",
-    "grid": "A scene flow field on additive grids, minutes on a CPU.",
-    "paper": "The published network, losses and schedules; hours on a GPU.",
+    "splat": "4D Gaussians: minutes on a CPU, tens of small frames a second; the default of `run`.",
+    "grid": "A scene flow field on additive grids: minutes on a CPU.",
+    "paper": "The published network, losses and schedules: hours on a GPU.",
     "tiny": "Seconds on a CPU, to try things out.",
     "nsff": "Baseline: NSFF, which knows one exposure, on the grids of `grid`.",
     "nsff-paper": "Baseline: NSFF at its published size, for a GPU.",
-    "nerf-wt": "Baseline: NeRF-W with time, a code per image instead of a tone mapper, on the grids of `grid`.",
-    "nerf-wt-paper": "Baseline: the same at its published size, for a GPU.",
+    "nerf-wt": "Baseline: NeRF-W with time on the grids of `grid`; it learns a code per image "
+    "instead of a tone mapper.",
+    "nerf-wt-paper": "Baseline: NeRF-W with time at its published size, for a GPU.",
     "hdr-hexplane": "Baseline: HDR-HexPlane, tone-mapped sample by sample, small enough for a CPU.",
-    "hdr-hexplane-paper": "Baseline: the same at its published size, for a GPU.",
+    "hdr-hexplane-paper": "Baseline: HDR-HexPlane at its published size, for a GPU.",
 }
-MORE_PRESETS = (
-    f"Ablations of ours: `grid-NAME` and `splat-NAME` with NAME one of {', '.join(ABLATIONS)} (no-saturation of `grid` alone); "
-    "docs/baselines.md says what each is."
-)
-
-
-def usage() -> str:
-    """What `hdr-nsff --help` prints."""
-    lines = [f"  {name:<13} {verb.summary}" for name, verb in VERBS.items()]
-    tail = "`hdr-nsff VERB --help` explains a verb; `hdr-nsff VERB --tyro-print-completion bash` prints its shell completion."
-    return "\n".join(
-        [
-            "usage: hdr-nsff [--version] VERB ...",
-            "",
-            "Alternating-exposure footage in, dynamic HDR radiance field out.",
-            "",
-            *lines,
-            "",
-            tail,
-        ]
-    )
-
-
-def parse(verb: Verb, name: str, arguments: Sequence[str]) -> Any:
-    """The config of a verb from its arguments; tyro prints help and typos itself and
-    exits.
-    """
-    if isinstance(verb.config, dict):
-        asked = arguments[0] if arguments else ""
-        shown = (
-            {asked: f"Ablation: `{asked}`."}
-            if asked in verb.config and asked not in PRESET_HELP
-            else PRESET_HELP
-        )
-        presets = {k: (words, verb.config[k]) for k, words in shown.items()}
-        about = f"{TrainConfig.__doc__} {MORE_PRESETS}"
-        config = tyro.extras.overridable_config_cli(
-            presets, prog=f"hdr-nsff {name}", description=about, args=arguments
-        )
-        assert isinstance(config, TrainConfig)
-        return config
-    return tyro.cli(
-        verb.config,
-        prog=f"hdr-nsff {name}",
-        args=arguments,
-        config=(tyro.conf.OmitSubcommandPrefixes,),
-    )
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one verb; exits with 0, 1 (a run of `bench` failed), 2 (bad input) or 130
-    (Ctrl-C).
+    """Run one verb. Exits with 0, 1 (a run of `bench` failed, or `doctor` found
+    something missing), 2 (bad input), 130 (Ctrl-C) or 141 (the reader of the output has
+    gone).
     """
-    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        try:
+            call(list(sys.argv[1:] if arguments is None else arguments))
+        finally:
+            sys.stdout.flush()  # a closed pipe shows here, not at the interpreter's exit
+    except BrokenPipeError:
+        silence_stdout()
+        raise SystemExit(CLOSED_PIPE) from None
+    except KeyboardInterrupt:  # before the verb has begun
+        raise SystemExit(INTERRUPTED) from None
+
+
+def call(arguments: list[str]) -> None:
+    """Answer `--version` and `--help`, or run the verb that is named first."""
     if arguments[:1] == ["--version"]:
         print(f"hdr-nsff {__version__}")
         return
     if not arguments or arguments[0] in ("-h", "--help"):
         print(usage())
         raise SystemExit(0 if arguments else 2)
-    if arguments[0] not in VERBS:
-        fail(f"no verb {arguments[0]!r}; there are {', '.join(VERBS)}")
-    verb = VERBS[arguments[0]]
-    if foreign := next((a for a in arguments if a.encode(errors="ignore").decode() != a), None):
-        fail(f"{foreign!r}: a name that is no UTF-8 text; rename the file or folder")
+    for argument in arguments:
+        if not is_text(argument):
+            fail(f"{argument!r}: a name that is not UTF-8 text; rename the file or folder")
+    name, options = arguments[0], arguments[1:]
+    if name not in VERBS:
+        fail(unknown_verb(name))
+    run_verb(name, VERBS[name], options)
+
+
+def run_verb(name: str, verb: Verb, options: list[str]) -> None:
+    """Import a verb, read its options and call it."""
+    prepare_process()
+    if verb.config is None:
+        refuse_options(name, verb, options)
+        load(verb.function)()
+        return
+    function, config = load(verb.function), load(verb.config)
+    from hdr_nsff.core.io import writing_to
+
     try:
+        settings = parse(name, config, options)
         with writing_to("output"):
-            verb.act(parse(verb, arguments[0], arguments[1:]))
+            function(settings)
     except InputError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        say("stopped; the same command goes on where it was")
-        raise SystemExit(130) from None
+        print("hdr-nsff: stopped; the same command continues where it was", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
 
 
-def fail(message: str) -> None:
-    """Print one sentence and exit with code 2."""
-    print(f"hdr-nsff: {' '.join(message.splitlines())}", file=sys.stderr)
+def load(place: str) -> Any:
+    """The object at a place such as "package.module:name". A library that cannot be
+    imported is one sentence.
+    """
+    module, _, name = place.partition(":")
+    try:
+        return getattr(import_module(module), name)
+    except ImportError as error:
+        if (error.name or "").partition(".")[0] == __package__:
+            raise  # a fault of this package
+        fail(f"{error}; `hdr-nsff doctor` lists what is missing and how to get it")
+
+
+def parse(name: str, config: Any, options: Sequence[str]) -> Any:
+    """The config of a verb from its options. tyro prints help and typos itself and
+    exits.
+    """
+    import tyro
+
+    if isinstance(config, dict):
+        return parse_preset(name, config, options)
+    return tyro.cli(
+        config,
+        prog=f"hdr-nsff {name}",
+        args=options,
+        config=(tyro.conf.OmitSubcommandPrefixes,),
+    )
+
+
+def parse_preset(name: str, presets: dict[str, Any], options: Sequence[str]) -> Any:
+    """The config of `train`: a preset, with some of its settings replaced. Ablations
+    are named in a sentence instead of a line each; one is listed where it is asked for.
+    """
+    import inspect
+
+    import tyro
+
+    from hdr_nsff.training.config import TrainConfig
+    from hdr_nsff.training.presets import ABLATIONS
+
+    shown = PRESET_HELP
+    if options and options[0] in presets and options[0] not in PRESET_HELP:
+        shown = {options[0]: f"Ablation: `{options[0]}`."}
+    about = (
+        f"{inspect.getdoc(TrainConfig)} Ablations of ours: `grid-NAME` and `splat-NAME` with NAME "
+        f"one of {', '.join(ABLATIONS)} (no-saturation of `grid` alone); docs/baselines.md "
+        "describes them."
+    )
+    return tyro.extras.overridable_config_cli(
+        {preset: (text, presets[preset]) for preset, text in shown.items()},
+        prog=f"hdr-nsff {name}",
+        description=about,
+        args=options,
+    )
+
+
+def refuse_options(name: str, verb: Verb, options: Sequence[str]) -> None:
+    """Help and errors of a verb without options, which needs no library."""
+    import argparse
+
+    argparse.ArgumentParser(f"hdr-nsff {name}", description=verb.summary).parse_args(options)
+
+
+def usage() -> str:
+    """What `hdr-nsff --help` prints."""
+    lines = [
+        "usage: hdr-nsff [--version] VERB ...",
+        "",
+        "Alternating-exposure footage in, dynamic HDR radiance field out.",
+        "",
+        *(f"  {name:<13} {verb.summary}" for name, verb in VERBS.items()),
+        "",
+        "`hdr-nsff VERB --help` explains a verb. "
+        "`hdr-nsff VERB --tyro-print-completion bash` prints its shell completion.",
+    ]
+    return "\n".join(lines)
+
+
+def unknown_verb(name: str) -> str:
+    """A sentence with the verb that was probably meant and all that exist."""
+    import difflib
+
+    similar = difflib.get_close_matches(name, VERBS, n=1)
+    suggestion = f"did you mean {similar[0]}? " if similar else ""
+    return f"no verb {name!r:.60}; {suggestion}The verbs are {', '.join(VERBS)}"
+
+
+def is_text(argument: str) -> bool:
+    """Whether an argument is valid UTF-8: the bytes of other names arrive as lone
+    surrogates.
+    """
+    try:
+        argument.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def fail(message: str) -> NoReturn:
+    """Print one sentence and exit with code 2. Where the input makes it very long, its
+    middle is left out.
+    """
+    sentence = " ".join(message.splitlines())
+    if len(sentence) > MAX_MESSAGE:
+        half = MAX_MESSAGE // 2
+        sentence = f"{sentence[:half]} ... {sentence[-half:]}"
+    print(f"hdr-nsff: {sentence}", file=sys.stderr)
     raise SystemExit(2)
+
+
+def silence_stdout() -> None:
+    """Send what is left in stdout's buffer nowhere, so that Python does not complain of
+    the closed pipe at its exit.
+    """
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, sys.stdout.fileno())

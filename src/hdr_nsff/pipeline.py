@@ -1,52 +1,50 @@
 """Video to HDR in one go: prepare, train, render, evaluate, report. Each part keeps
-what it has done, so a killed run goes on.
+what it has done, so a killed run continues with the same command.
 """
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say
-from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.evaluation.evaluate import evaluate_run, views_of_clip
 from hdr_nsff.evaluation.report import check_place, write_report
+from hdr_nsff.fields.build import device_for
 from hdr_nsff.footage.ingest import every_of
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.rendering.render import render_all
-from hdr_nsff.scene.scene import Protocol
-from hdr_nsff.training.config import PRESETS, check
+from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig, check_config
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
 
 @dataclass(frozen=True)
-class RunConfig:
+class RunConfig(PrepareConfig):
     """Alternating-exposure footage in; linear HDR novel views at novel times out.
 
     Does everything: exposures, poses, flow, masks and depth (`prepare`), training
     (`train`), EXR sequence, videos and LDR views (`render`), held-out quality
-    (`evaluate`), report.html. Killed? The same command goes on where it was.
+    (`evaluate`), report.html. Killed? The same command continues where it was. Every
+    option of `prepare` works here too.
     """
 
-    clip: Positional[Path]
-    """Footage: a video, a folder of frames, or a folder of such folders (one per
-    synchronized camera); or a public data set, see `prepare --help`.
-    """
     out: Positional[Path]
     """Folder for everything: scene/, run/, render/, report.html."""
-    exposures: str | None = None
-    """Exposure times of one cycle in seconds, e.g. 1/1000,1/250,1/60. Default: CSV
-    beside the clip, EXIF, else learned.
+    hold_out: int | None = None
+    """Keep every this many frames for `evaluate`. Default: 8; with a truth folder, or
+    where a data set brings held-out views, 0, or those frames of the clip that are the
+    truth's views.
     """
-    ev: str | None = None
-    """The same as log2 exposures, e.g. -4,-2,0."""
     preset: Literal["splat", "grid", "paper", "tiny"] = "splat"
     """splat: 4D Gaussians, minutes on a CPU; grid: a scene flow field on grids,
     likewise; paper: the published network (hours on a GPU); tiny: seconds, to try
@@ -54,26 +52,14 @@ class RunConfig:
     """
     minutes: float | None = None
     """Training time instead of the preset's."""
+    refine_poses: bool = False
+    """Correct the training cameras (poses and focal length) a little, by the picture.
+    """
     truth: Path | None = None
     """Truth folder (from `synth` or `reexpose`) for `evaluate`; then all frames of the
     clip are trained on but those that are the truth's views. A public data set with
     held-out views brings its own.
     """
-    poses: Path | None = None
-    """Given poses (COLMAP model, transforms.json, poses_bounds.npy) instead of
-    structure from motion.
-    """
-    protocol: Protocol | None = None
-    """Split the clip as the published tables do, see `prepare --help`; instead of
-    --hold-out, and with held-out views to be evaluated on.
-    """
-    hold_out: int | None = None
-    """Keep every this many frames for `evaluate`. Default: 8; with a truth folder, or
-    where a data set brings held-out views, 0, or those frames of the clip that are the
-    truth's views.
-    """
-    max_size: int = 640
-    """Longest side in pixels; larger frames are shrunk."""
     seed: int = 0
     device: str = "auto"
     """auto, cpu or cuda."""
@@ -82,26 +68,17 @@ class RunConfig:
 def run_all(config: RunConfig) -> None:
     """The whole way from footage to report; prints where the results are."""
     start = time.monotonic()
-    pick_device(config.device)
-    if config.truth is not None and not config.truth.is_dir():
-        raise InputError(
-            f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, or leave the option out"
-        )
+    settings = train_settings(config)
+    device = str(device_for(settings.field, config.device))
+    check_truth(config)
     check_place(config.out / "report.html")
-    settings = replace(
-        PRESETS[config.preset], out=config.out / "run", seed=config.seed, device=config.device
-    )
-    if config.minutes is not None:
-        settings = replace(settings, minutes=config.minutes, steps=None)
-    check(settings)
-    footage = PrepareConfig(
-        clip=config.clip, out=config.out / "scene", exposures=config.exposures, ev=config.ev, max_size=config.max_size,
-        hold_out=held_out_every(config), protocol=config.protocol, poses=config.poses,
-    )  # fmt: skip
-    scene = prepare(footage)
-    truth = config.truth or held_out_truth(footage)
-    with writing_to(config.out):
-        run = Run.open(train(replace(settings, scene=scene)), config.device)
+    check_config(settings)
+    footage = prepare_settings(config)
+    with writing_to(config.out), lock_output(config.out):
+        scene = prepare(footage)
+        truth = config.truth or held_out_truth(footage)
+        folder = train(replace(settings, scene=scene, device=device))
+        run = Run.open(folder, device)
         results = render_all(run, config.out / "render")
         evaluate_run(run, truth)
         results["report"] = write_report(run, config.out / "report.html", config.out / "render")
@@ -110,11 +87,45 @@ def run_all(config: RunConfig) -> None:
         say(f"  {name:<16} {path}")
 
 
+def train_settings(config: RunConfig) -> TrainConfig:
+    """The settings of `train`, but for the scene."""
+    preset = PRESETS[config.preset]
+    settings = replace(
+        preset, out=config.out / "run", seed=config.seed, refine_poses=config.refine_poses
+    )
+    if config.minutes is not None:
+        settings = replace(settings, budget=Budget(minutes=config.minutes))
+    return settings
+
+
+def prepare_settings(config: RunConfig) -> PrepareConfig:
+    """The settings of `prepare`: those of the same names here."""
+    shared: dict[str, Any] = {f.name: getattr(config, f.name) for f in fields(PrepareConfig)}
+    shared |= {"out": config.out / "scene", "hold_out": held_out_every(config)}
+    return PrepareConfig(**shared)
+
+
+def check_truth(config: RunConfig) -> None:
+    """InputError where the truth is not there, or counts other frames than training."""
+    if config.truth is None:
+        return
+    if not config.truth.is_dir():
+        raise InputError(
+            f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, "
+            "or leave the option out"
+        )
+    if config.start != 0 or config.stride != 1:
+        raise InputError(
+            f"--truth {config.truth}: its times count all frames of the clip; "
+            "leave --start and --stride out"
+        )
+
+
 def held_out_every(config: RunConfig) -> int | None:
     """`--hold-out` for `prepare`, so that no frame is trained on that the truth is made
-    of: beside a truth of other places or times nothing is kept out, beside one of the
-    clip's own frames these are. None leaves it to `prepare`. InputError where the truth
-    cannot be followed.
+    of. Beside a truth of other places or times nothing is held out; beside a truth of
+    the clip's own frames these are. None leaves the choice to `prepare`. InputError
+    where no `--hold-out` keeps out those frames.
     """
     frames = views_of_clip(config.truth) if config.truth is not None else []
     if config.hold_out is not None or config.protocol is not None or config.truth is None:
@@ -123,9 +134,10 @@ def held_out_every(config: RunConfig) -> int | None:
         return 0
     every = every_of(frames)
     if every is None:
-        named = ", ".join(map(str, frames[:4])) + ", ..." * (len(frames) > 4)
+        first = ", ".join(str(frame) for frame in frames[:4])
+        more = ", ..." if len(frames) > 4 else ""
         raise InputError(
-            f"--truth {config.truth}: its views are frames {named} of the clip, which are not every so many; choose with --hold-out what is kept "
-            "out of training"
+            f"--truth {config.truth}: its views are frames {first}{more} of the clip, which are "
+            "not evenly spaced; choose with --hold-out which frames are kept out of training"
         )
     return every

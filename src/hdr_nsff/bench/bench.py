@@ -1,22 +1,26 @@
-"""Methods x scenes -> one table: every pair is trained and measured in a process of its
-own, what is done is kept, what fails is shown.
+"""The verb `bench`: methods x scenes in one table.
+
+Every pair is trained and measured in a process of its own. Finished runs are kept,
+failed ones are shown.
 """
 
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
 
+from hdr_nsff.bench.config import BenchConfig, BenchPlan, BenchRun, arguments
 from hdr_nsff.bench.gallery import write_page
-from hdr_nsff.bench.plan import BenchConfig, BenchRun, Plan, arguments, claim, introduce, make_plan
-from hdr_nsff.bench.pool import Job, end_with_parent, last_words, run_jobs, shell_line, slots
-from hdr_nsff.bench.run import LOG, complete, get_ready, run_cell
-from hdr_nsff.bench.tables import row_of, write_tables
+from hdr_nsff.bench.plan import claim, describe_scenes, make_plan
+from hdr_nsff.bench.pool import Job, end_with_parent, failure_reason, run_jobs, shell_line, slots
+from hdr_nsff.bench.run import LOG, do_run, is_complete, prepare_scene
+from hdr_nsff.bench.tables import Row, row_of, write_tables
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import bar, say
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.maths.metrics import Lpips
@@ -24,7 +28,8 @@ from hdr_nsff.training.run_folder import last_logged
 
 __all__ = ["BenchConfig", "bench"]
 
-MEASURING = 0.1  # share of a run's bar that measuring has
+MEASURING_SHARE = 0.1  # of a run's progress bar
+MIN_TIME_LEFT_S = 90  # a shorter time left is not printed
 
 
 def bench(config: BenchConfig) -> None:
@@ -32,156 +37,160 @@ def bench(config: BenchConfig) -> None:
     end_with_parent()
     plan = make_plan(config)
     if config.list:
-        for cell in plan.cells:
-            print(shell_line(arguments(config, cell.name)))
+        for run in plan.runs:
+            print(shell_line(arguments(config, run.name)))
         return
     if config.lpips is not None:
-        Lpips(config.lpips)  # refuses what it cannot read, before anything is trained
+        Lpips(config.lpips)  # refuses unreadable weights before anything is trained
     if config.devices is None:
         pick_device(config.device)
-    with writing_to(config.out):
+    # `--only` is part of a benchmark that may hold the lock; its run has one of its own.
+    lock = lock_output(config.out) if config.only is None else nullcontext()
+    with writing_to(config.out), lock:
         claim(plan)
         if config.only is not None:
             do_one(plan, config.only)
             return
-        introduce(plan)
+        describe_scenes(plan)
         if not config.collect:
             prepare_scenes(plan)
-            do_all(plan)
+            do_runs(plan)
         unfinished = write_results(plan)
     if unfinished:
         raise SystemExit(1)
 
 
-def do_one(plan: Plan, only: str) -> None:
+def do_one(plan: BenchPlan, name: str) -> None:
     """One run, or one scene, by name."""
     for scene in plan.scenes:
-        if scene.name == only:
-            return get_ready(scene)
-    cell = next((c for c in plan.cells if c.name == only), None)
-    if cell is None:
-        raise InputError(
-            f"--only {only!r:.100}: no such run; there are {', '.join(c.name for c in plan.cells)}"
-        )
-    run_cell(cell, plan.config.views, plan.config.lpips)
+        if scene.name == name:
+            return prepare_scene(scene)
+    for run in plan.runs:
+        if run.name == name:
+            return do_run(run, plan.config.views, plan.config.lpips)
+    names = ", ".join(run.name for run in plan.runs)
+    raise InputError(f"--only {name!r:.100}: no such run; there are {names}")
 
 
-def prepare_scenes(plan: Plan) -> None:
-    """Prepare the scenes that are not there yet, side by side; where one cannot be, its
-    runs fail with the reason.
+def prepare_scenes(plan: BenchPlan) -> None:
+    """Prepare the scenes that are not there yet, in parallel.
+
+    Where one fails, so do its runs, with the reason.
     """
-    waiting = [s for s in plan.scenes if not s.ready]
-    jobs = [job(plan, s.name, plan.config.out / "logs" / f"{s.name}.log") for s in waiting]
-
-    def ended(done: Job, code: int) -> None:
-        if code == 0:
-            say(f"{done.name}: prepared")
-            return
-        reason = last_words(done.log, code)
-        say(f"{done.name}: could not be prepared: {reason} (log: {done.log})")
-        for cell in plan.cells:
-            if cell.scene.name == done.name:
-                notes.write(
-                    cell.folder / "failure.json",
-                    notes.Failure(reason=f"preparing: {reason}", log=str(done.log)),
-                )
-
-    places = slots(plan.config.jobs, plan.config.devices)
-    if jobs:
-        say(f"preparing {', '.join(s.name for s in waiting)}")
-        run_jobs(jobs, places, ended, lambda running: None)
-
-
-def job(plan: Plan, only: str, log: Path) -> Job:
-    """The process of one run or scene."""
-    return Job(only, arguments(plan.config, only), log, {LOG: str(log)})
-
-
-def do_all(plan: Plan) -> None:
-    """All runs that are not done and whose scenes are there, as many at once as asked
-    for.
-    """
-    config = plan.config
-    todo = [c for c in plan.cells if c.scene.ready and not complete(c, config.views, config.lpips)]
-    jobs = [job(plan, c.name, c.log) for c in todo]
-    if not jobs:
+    waiting = [scene.name for scene in plan.scenes if not scene.ready]
+    if not waiting:
         return
-    cells = {c.name: c for c in todo}
+
+    def ended(job: Job, code: int) -> None:
+        if code == 0:
+            say(f"{job.name}: prepared")
+            return
+        reason = failure_reason(job.log, code)
+        say(f"{job.name}: could not be prepared: {reason} (log: {job.log})")
+        failure = notes.Failure(reason=f"preparing: {reason}", log=str(job.log))
+        for run in plan.runs:
+            if run.scene.name == job.name:
+                notes.write(run.failure, failure)
+
+    say(f"preparing {', '.join(waiting)}")
+    jobs = [job_of(plan, name) for name in waiting]
+    run_jobs(jobs, slots(plan.config.jobs, plan.config.devices), ended, lambda running: None)
+
+
+def job_of(plan: BenchPlan, name: str) -> Job:
+    """The process of one run or scene."""
+    log = plan.config.out / "logs" / f"{name}.log"
+    return Job(name, arguments(plan.config, name), log, {LOG: str(log)})
+
+
+def do_runs(plan: BenchPlan) -> None:
+    """All runs that are not done and whose scenes are there, a few at a time."""
+    config = plan.config
+    waiting = {}
+    for run in plan.runs:
+        if run.scene.ready and not is_complete(run, config.views, config.lpips):
+            waiting[run.name] = run
+    if not waiting:
+        return
+    jobs = [job_of(plan, name) for name in waiting]
     with bar() as progress:
-        task = progress.add_task("bench", total=len(todo), note="")
-        state = Standing(plan, cells)
-        ended = partial(state.ended)
+        task = progress.add_task("bench", total=len(waiting), note="")
+        state = Progress(plan, waiting)
 
-        def look(running: set[str]) -> None:
-            progress.update(
-                task,
-                completed=state.done + state.on_the_way(running),
-                note=", ".join(sorted(running)),
-            )
+        def update(running: set[str]) -> None:
+            completed = state.num_ended + state.work_done(running)
+            progress.update(task, completed=completed, note=", ".join(sorted(running)))
 
-        run_jobs(jobs, slots(config.jobs, config.devices), ended, look)
+        run_jobs(jobs, slots(config.jobs, config.devices), partial(report_end, state), update)
 
 
 @dataclass
-class Standing:
-    """How far the runs are."""
+class Progress:
+    """The progress of the runs."""
 
-    plan: Plan
-    cells: dict[str, BenchRun]
-    done: int = 0
+    plan: BenchPlan
+    runs: dict[str, BenchRun]
+    num_ended: int = 0
     start: float = field(default_factory=time.monotonic)
 
-    def ended(self, which: Job, code: int) -> None:
-        """Say how a run ended; where it failed without a word, note why."""
-        self.done += 1
-        cell = self.cells[which.name]
-        if code != 0 and not (cell.folder / "failure.json").is_file():
-            notes.write(
-                cell.folder / "failure.json",
-                notes.Failure(reason=last_words(which.log, code), log=str(which.log)),
-            )
-        row = row_of(cell, self.plan)
-        values = row.values
-        numbers = [
-            f"{values[k]:.2f} dB{word}"
-            for k, word in (("psnr", ""), ("psnr_moving", " moving"))
-            if k in values
-        ]
-        told = (
-            f"{', '.join(numbers)}; {values['steps']:,} steps in {values['train_seconds']:.0f} s"
-            if values
-            else f"{row.status}: {row.reason}"
-        )
-        left = (time.monotonic() - self.start) / self.done * (len(self.cells) - self.done)
-        say(
-            f"{cell.name}: {told}  ({self.done} of {len(self.cells)}{f', about {left / 60:.0f} min left' if left > 90 else ''})"
-        )
+    def work_done(self, running: set[str]) -> float:
+        """The sum of the shares that are done of the runs at work."""
+        return sum(share_done(self.runs[name]) for name in running)
 
-    def on_the_way(self, running: set[str]) -> float:
-        """What part of the runs at work is done, together."""
-        total = 0.0
-        for name in running:
-            config = self.cells[name].config
-            line = last_logged(config.out)
-            if line is not None:
-                share = (
-                    line.step / config.steps
-                    if config.steps
-                    else line.seconds / 60 / (config.minutes or 1)
-                )
-                total += (1 - MEASURING) * min(share, 1.0)
-        return total
+    def time_left(self) -> float:
+        """Estimated seconds until all runs have ended."""
+        seconds = time.monotonic() - self.start
+        return seconds / self.num_ended * (len(self.runs) - self.num_ended)
 
 
-def write_results(plan: Plan) -> int:
-    """The tables and the page; how many runs have no result."""
-    rows = [row_of(cell, plan) for cell in plan.cells]
+def share_done(run: BenchRun) -> float:
+    """The share of a run at work that is done, by the last line of its log."""
+    line = last_logged(run.folder)
+    if line is None:
+        return 0.0
+    share = run.config.budget.progress(line.step, line.seconds)
+    return (1 - MEASURING_SHARE) * min(share, 1.0)
+
+
+def report_end(state: Progress, job: Job, code: int) -> None:
+    """Print the result of a run that has ended.
+
+    Where it failed without a note, write one.
+    """
+    state.num_ended += 1
+    run = state.runs[job.name]
+    if code != 0 and not run.failure.is_file():
+        reason = failure_reason(job.log, code)
+        notes.write(run.failure, notes.Failure(reason=reason, log=str(job.log)))
+    position = f"{state.num_ended} of {len(state.runs)}"
+    left = state.time_left()
+    if left > MIN_TIME_LEFT_S:
+        position += f", about {left / 60:.0f} min left"
+    say(f"{run.name}: {result_in_words(row_of(run, state.plan))}  ({position})")
+
+
+def result_in_words(row: Row) -> str:
+    """Quality and cost of a run, or why it has none."""
+    values = row.values
+    if not values:
+        return f"{row.status}: {row.reason}"
+    scores = []
+    if "psnr" in values:
+        scores.append(f"{values['psnr']:.2f} dB")
+    if "psnr_moving" in values:
+        scores.append(f"{values['psnr_moving']:.2f} dB moving")
+    cost = f"{values['steps']:,} steps in {values['train_seconds']:.0f} s"
+    return f"{', '.join(scores)}; {cost}"
+
+
+def write_results(plan: BenchPlan) -> int:
+    """The tables and the page; the number of runs without a result."""
+    rows = [row_of(run, plan) for run in plan.runs]
     write_tables(plan, rows)
     write_page(plan, rows)
-    unfinished = [r for r in rows if r.status != "done"]
+    unfinished = [row for row in rows if row.status != "done"]
     for row in unfinished:
-        say(f"{row.cell.name}: {row.status}: {row.reason}")
-    say(
-        f"{len(rows) - len(unfinished)} of {len(rows)} runs done; results: {plan.config.out / 'index.html'}, results.md, results.csv, results.json"
-    )
+        say(f"{row.run.name}: {row.status}: {row.reason}")
+    files = f"{plan.config.out / 'index.html'}, results.md, results.csv, results.json"
+    say(f"{len(rows) - len(unfinished)} of {len(rows)} runs done; results: {files}")
     return len(unfinished)

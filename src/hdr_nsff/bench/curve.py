@@ -1,8 +1,8 @@
-"""Quality over training time: what a run was after a part of its training, on a few of
-the held-out views, and pictures of those views.
+"""Quality over training time, on a few of the held-out views.
 
-The views are spread evenly over those that the headline is of, so every method on a
-scene is asked for the same ones.
+The snapshots of a run are scored, and pictures of the views are kept. The views are
+spread evenly over those of the headline, so every method on a scene is measured on the
+same ones.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import Tensor
 
-from hdr_nsff.core import io
+from hdr_nsff.core.images import write_png
 from hdr_nsff.core.notes import CurvePoint, ShownView
 from hdr_nsff.evaluation.evaluate import headline_targets, mean_of
 from hdr_nsff.evaluation.predictions import predict, radiance_of, recordings
@@ -23,83 +24,95 @@ from hdr_nsff.evaluation.scores.rgb import score_rgb
 from hdr_nsff.evaluation.targets import Target, moving_of
 from hdr_nsff.training.run_folder import Run, snapshots
 
-SHARES = (0.125, 0.25, 0.5)  # of the training; the end is measured anyway
-SCORES = ("psnr", "psnr_moving", "ssim", "ssim_moving", "mu5000", "mu5000_moving")
+SHARES = (0.125, 0.25, 0.5)  # of the training; its end is measured anyway
+CURVE_SCORES = ("psnr", "psnr_moving", "ssim", "ssim_moving", "mu5000", "mu5000_moving")
+
+Scores = dict[str, Any]
 
 
 def curve_of(run: Run, truth: Path | None, count: int) -> tuple[list[CurvePoint], list[ShownView]]:
-    """The curve of a trained and evaluated run over `count` views, and those views;
-    pictures of them go to RUN/shown.
+    """The curve of a trained and evaluated run over `count` views, and those views.
+
+    Pictures of the views go to RUN/shown.
     """
     targets = spread(headline_targets(run, truth), count)
     curve = []
     for share, file in snapshots(run.folder).items():
-        then = Run.open(run.folder, run.config.device, at=file)
-        place = run.folder / "snapshots" / file.stem
-        files = predict(
-            then,
-            {t.name: t.view for t in targets},
-            place,
-            f"views after {share:.0%} of the training",
-            False,
-        )
-        curve.append(point(then, share, scores(then, targets, files)))
-    final = scores(run, targets, [run.folder / "evaluation" / f"{t.name}.exr" for t in targets])
-    curve.append(point(run, 1.0, final))
-    for target in targets:
-        show(run, target)
-    names = zip(targets, final, strict=True)
-    return curve, [
-        ShownView(name=t.name, time=t.view.time, scores=kept(of_view)) for t, of_view in names
-    ]
+        snapshot = Run.open(run.folder, run.config.device, at=file)
+        scores = score_views(snapshot, targets, predict_snapshot(snapshot, targets, share, file))
+        curve.append(curve_point(snapshot, share, scores))
+    radiance = [radiance_of(evaluation_file(run, target)) for target in targets]
+    final = score_views(run, targets, radiance)
+    curve.append(curve_point(run, 1.0, final))
+    shown = []
+    for target, scores_of_view in zip(targets, final, strict=True):
+        write_shown(run, target)
+        scores_shown = curve_scores(scores_of_view)
+        shown.append(ShownView(name=target.name, time=target.view.time, scores=scores_shown))
+    return curve, shown
 
 
 def spread(targets: Sequence[Target], count: int) -> list[Target]:
     """At most `count` of them, evenly from the first to the last."""
-    places = np.linspace(0, len(targets) - 1, min(count, len(targets))).round().astype(int)
-    return [targets[i] for i in places]
+    positions = np.linspace(0, len(targets) - 1, min(count, len(targets)))
+    return [targets[i] for i in positions.round().astype(int)]
 
 
-def scores(run: Run, targets: Sequence[Target], files: Sequence[Path]) -> list[dict[str, Any]]:
-    """The scores of predictions, view by view; radiance after one scale for these
-    views.
-    """
-    radiance = [radiance_of(f) for f in files]
+def predict_snapshot(
+    snapshot: Run, targets: Sequence[Target], share: float, file: Path
+) -> list[Tensor]:
+    """Radiance (H, W, 3) of every view as the snapshot in `file` renders it."""
+    views = {target.name: target.view for target in targets}
+    folder = snapshot.folder / "snapshots" / file.stem
+    description = f"views after {share:.0%} of the training"
+    files = predict(snapshot, views, folder, description, motion=False)
+    return [radiance_of(f) for f in files]
+
+
+def evaluation_file(run: Run, target: Target) -> Path:
+    """The prediction that `evaluate` has kept."""
+    return run.folder / "evaluation" / f"{target.name}.exr"
+
+
+def score_views(run: Run, targets: Sequence[Target], radiance: Sequence[Tensor]) -> list[Scores]:
+    """The scores of predictions, view by view; radiance takes one scale for all."""
     gauge = find_gauge(targets, radiance)
-    found = []
-    for target, predicted in zip(map(of_its_exposure, targets), radiance, strict=True):
-        of_view = score_rgb(run, target, predicted, recordings(run, target, predicted), None)
-        found.append(of_view | (score_radiance(target, predicted, gauge) if gauge else {}))
-    return found
+    scores = []
+    for target, predicted in zip(targets, radiance, strict=True):
+        own = at_own_exposure(target)
+        of_view: Scores = score_rgb(run, own, predicted, recordings(run, own, predicted), None)
+        if gauge is not None:
+            of_view |= score_radiance(own, predicted, gauge)
+        scores.append(of_view)
+    return scores
 
 
-def of_its_exposure(target: Target) -> Target:
-    """The target at its own exposure alone, which is all that is shown."""
+def at_own_exposure(target: Target) -> Target:
+    """The target at its own exposure alone, which is the one that is shown."""
     return replace(target, rgb={target.bracket: target.rgb[target.bracket]}, novel={})
 
 
-def kept(of_view: dict[str, Any]) -> dict[str, float]:
-    """Of all scores those that are shown."""
-    return {k: of_view[k] for k in SCORES if of_view.get(k) is not None}
+def curve_scores(scores: Scores) -> dict[str, float]:
+    """Of all scores those that the page shows."""
+    return {name: scores[name] for name in CURVE_SCORES if scores.get(name) is not None}
 
 
-def point(run: Run, share: float, views: Sequence[dict[str, Any]]) -> CurvePoint:
+def curve_point(run: Run, share: float, views: Sequence[Scores]) -> CurvePoint:
     """A point of the curve: means over the views."""
-    return CurvePoint(
-        share=share, step=run.step, seconds=round(run.seconds, 3), scores=kept(mean_of(views))
-    )
+    scores = curve_scores(mean_of(views))
+    return CurvePoint(share=share, step=run.step, seconds=round(run.seconds, 3), scores=scores)
 
 
-def show(run: Run, target: Target) -> None:
-    """Write RUN/shown/NAME_run.png, NAME_truth.png and, where something moves,
-    NAME_moving.png, as recorded at the view's own exposure.
+def write_shown(run: Run, target: Target) -> None:
+    """Write pictures of a view, as recorded at its own exposure, into RUN/shown.
+
+    NAME_run.png, NAME_truth.png and, where some pixels move, NAME_moving.png.
     """
-    folder, moving = run.folder / "shown", moving_of(target)
-    predicted = radiance_of(run.folder / "evaluation" / f"{target.name}.exr")
-    io.write_png(
-        folder / f"{target.name}_run.png",
-        recordings(run, of_its_exposure(target), predicted)[target.bracket].numpy(),
-    )
-    io.write_png(folder / f"{target.name}_truth.png", target.rgb[target.bracket].numpy())
+    folder = run.folder / "shown"
+    radiance = radiance_of(evaluation_file(run, target))
+    own = recordings(run, at_own_exposure(target), radiance)[target.bracket]
+    write_png(folder / f"{target.name}_run.png", own.numpy())
+    write_png(folder / f"{target.name}_truth.png", target.rgb[target.bracket].numpy())
+    moving = moving_of(target)
     if moving is not None:
-        io.write_png(folder / f"{target.name}_moving.png", moving.numpy())
+        write_png(folder / f"{target.name}_moving.png", moving.numpy())

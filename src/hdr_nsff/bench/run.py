@@ -1,8 +1,7 @@
-"""One run of a benchmark: its scene prepared, trained, measured. Each part keeps what
-it has done, so a killed run goes on.
+"""One run of a benchmark: its scene prepared, the method trained, the result measured.
+Each part keeps its results, so a killed run goes on.
 
-The clock of the training stands still while snapshots are written, and measuring comes
-after it.
+The training clock pauses while snapshots are written, and measuring comes after it.
 """
 
 from __future__ import annotations
@@ -10,166 +9,158 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import resource
-import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 
+from hdr_nsff.bench.config import BenchRun, BenchScene
 from hdr_nsff.bench.curve import SHARES, curve_of
-from hdr_nsff.bench.plan import BenchRun, BenchScene
+from hdr_nsff.bench.machine import this_machine
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.notes import RunRecord, Trained
+from hdr_nsff.core.process import peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.prepare.prepare import prepare
 from hdr_nsff.rendering.shots import device_of
+from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
-FRAMES = 5  # rendered to time it
-ENOUGH = 10.0  # seconds after which no further one is
+LOG = "HDR_NSFF_BENCH_LOG"  # environment: the log file of this process
+TIMED_FRAMES = 5  # rendered to time a frame (hand-chosen)
+MAX_TIMING_S = 10.0  # seconds of rendering after which no further frame is timed (hand-chosen)
 
 
-@contextmanager
-def alone(place: Path, wait: bool) -> Iterator[None]:
-    """No other process is in here with the same `place`. Where one is: wait for it, or
-    InputError.
-    """
-    import fcntl  # not on every system, and needed nowhere else
-
-    place.parent.mkdir(parents=True, exist_ok=True)
-    with open(place, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-        except BlockingIOError as error:
-            raise InputError(
-                f"{place.parent}: another process is at work on this run; wait for it, or end it"
-            ) from error
-        yield
-
-
-def get_ready(scene: BenchScene) -> None:
+def prepare_scene(scene: BenchScene) -> None:
     """Prepare a scene, once however many processes ask for it."""
     if scene.footage is None or scene.ready:
         return
-    with alone(scene.folder.parent / f".{scene.folder.name}.lock", wait=True):
+    with lock_output(scene.folder, wait=True):
         prepare(scene.footage)
 
 
-def run_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
-    """All of a run that is not done yet. What makes it fail is kept in `failure.json`,
-    and raised.
+def do_run(run: BenchRun, views: int, lpips: str | None) -> None:
+    """All parts of a run that are not done yet.
+
+    The reason of a failure is kept in `failure.json`, and the error raised.
     """
-    with alone(cell.folder / ".lock", wait=False):
-        (cell.folder / "failure.json").unlink(missing_ok=True)
+    with lock_output(run.folder):
+        run.failure.unlink(missing_ok=True)
         try:
-            get_ready(cell.scene)
-            train_cell(cell, views)
-            measure_cell(cell, views, lpips)
+            prepare_scene(run.scene)
+            train_run(run, views)
+            measure_run(run, views, lpips)
         except Exception as error:
-            told = str(error).strip().splitlines()[-1:] or [""]
-            reason = (
-                told[0] if isinstance(error, InputError) else f"{type(error).__name__}: {told[0]}"
-            )
-            notes.write(
-                cell.folder / "failure.json", notes.Failure(reason=reason, log=os.environ.get(LOG))
-            )
+            failure = notes.Failure(reason=reason_of(error), log=os.environ.get(LOG))
+            notes.write(run.failure, failure)
             raise
 
 
-LOG = "HDR_NSFF_BENCH_LOG"  # environment: where what this process says is written
+def reason_of(error: Exception) -> str:
+    """The last line of an error, with its kind where it is not the user's."""
+    lines = str(error).strip().splitlines()
+    words = lines[-1] if lines else ""
+    return words if isinstance(error, InputError) else f"{type(error).__name__}: {words}"
 
 
-def read_trial(cell: BenchRun) -> RunRecord:
-    """What is known of a run."""
-    return notes.read(cell.folder / "trial.json", RunRecord) or RunRecord(scene_key=cell.scene.key)
+def read_record(run: BenchRun) -> RunRecord:
+    """The record of a run, a new one where there is none."""
+    return notes.read(run.record, RunRecord) or RunRecord(scene_key=run.scene.key)
 
 
-def measure_key(cell: BenchRun, views: int, lpips: str | None) -> str:
-    """A hash of what a run is measured on, and how."""
-    truth = cell.scene.truth
-    told = hashlib.sha256((truth / "truth.json").read_bytes()).hexdigest() if truth else None
-    return hashlib.sha256(json.dumps([told, lpips, views]).encode()).hexdigest()[:16]
+def measure_key(run: BenchRun, views: int, lpips: str | None) -> str:
+    """A hash of the truth that a run is measured on, and of the settings."""
+    truth = run.scene.truth
+    digest = None
+    if truth is not None:
+        digest = hashlib.sha256((truth / "truth.json").read_bytes()).hexdigest()
+    return hashlib.sha256(json.dumps([digest, lpips, views]).encode()).hexdigest()[:16]
 
 
-def complete(cell: BenchRun, views: int, lpips: str | None) -> bool:
+def is_complete(run: BenchRun, views: int, lpips: str | None) -> bool:
     """Whether nothing is left to do."""
-    if not cell.scene.ready or not (cell.folder / "metrics.json").is_file():
+    if not run.scene.ready or not (run.folder / "metrics.json").is_file():
         return False
-    return read_trial(cell).measured == measure_key(cell, views, lpips)
+    return read_record(run).measured == measure_key(run, views, lpips)
 
 
-def train_cell(cell: BenchRun, views: int) -> None:
-    """Train, and note what it took."""
-    trial = read_trial(cell)
-    if trial.trained is not None:
+def train_run(run: BenchRun, views: int) -> None:
+    """Train, and note the cost."""
+    record = read_record(run)
+    if record.trained is not None:
         return
-    notes.write(cell.folder / "trial.json", trial)  # what it is trained on
+    notes.write(run.record, record)  # which holds the scene it is trained on
     start = time.monotonic()
-    found = latest_checkpoint(cell.folder)
-    train(cell.config, keep_at=SHARES if views else (), previews=False)
-    wall = time.monotonic() - start
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
-        1 if sys.platform == "darwin" else 1024
-    )
-    run = Run.open(cell.folder, cell.config.device)
-    device = device_of(run)
-    cuda = device.type == "cuda"
-    trained = Trained(
-        steps=run.step,
-        seconds=round(run.seconds, 3),
-        start_seconds=round(max(wall - (run.seconds - (found.seconds if found else 0.0)), 0.0), 3),
+    found = latest_checkpoint(run.folder)
+    train(run.config, keep_at=SHARES if views else (), previews=False)
+    wall_seconds = time.monotonic() - start
+    memory = peak_memory()
+    trained = Run.open(run.folder, run.config.device)
+    seconds_here = trained.seconds - (found.seconds if found else 0.0)
+    device = device_of(trained)
+    on_gpu = device.type == "cuda"
+    cost = Trained(
+        steps=trained.step,
+        seconds=round(trained.seconds, 3),
+        start_seconds=round(max(wall_seconds - seconds_here, 0.0), 3),
         memory=memory,
-        gpu_memory=torch.cuda.max_memory_allocated(device) if cuda else None,
-        device=torch.cuda.get_device_name(device) if cuda else "cpu",
+        gpu_memory=torch.cuda.max_memory_allocated(device) if on_gpu else None,
+        device=torch.cuda.get_device_name(device) if on_gpu else "cpu",
         threads=int(os.environ.get("OMP_NUM_THREADS") or torch.get_num_threads()),
-        frame_seconds=frame_seconds(run),
+        frame_seconds=frame_seconds(trained),
+        seed=run.config.seed,
+        machine=this_machine(),
     )
-    notes.write(cell.folder / "trial.json", trial.model_copy(update={"trained": trained}))
+    notes.write(run.record, record.model_copy(update={"trained": cost}))
 
 
-def measure_cell(cell: BenchRun, views: int, lpips: str | None) -> None:
-    """Evaluate the run, and on a few views what it was on the way."""
-    key, trial, start = measure_key(cell, views, lpips), read_trial(cell), time.monotonic()
-    if trial.measured == key and (cell.folder / "metrics.json").is_file():
+def measure_run(run: BenchRun, views: int, lpips: str | None) -> None:
+    """Evaluate the run, and its snapshots on a few views."""
+    key = measure_key(run, views, lpips)
+    record = read_record(run)
+    if record.measured == key and (run.folder / "metrics.json").is_file():
         return
-    run, truth = Run.open(cell.folder, cell.config.device), cell.scene.truth
-    evaluate_run(run, truth, lpips)
-    curve, shown = curve_of(run, truth, views) if views else ([], [])
+    start = time.monotonic()
+    trained = Run.open(run.folder, run.config.device)
+    truth = run.scene.truth
+    evaluate_run(trained, truth, lpips)
+    curve, shown = curve_of(trained, truth, views) if views else ([], [])
     seconds = round(time.monotonic() - start, 2)
     update = {"measured": key, "seconds": seconds, "curve": curve, "shown": shown}
-    notes.write(cell.folder / "trial.json", trial.model_copy(update=update))
+    notes.write(run.record, record.model_copy(update=update))
 
 
 @torch.no_grad()
 def frame_seconds(run: Run) -> float:
-    """Median seconds to render a frame of the scene: radiance, depth and motion,
-    nothing written.
+    """Median seconds to render a frame of the scene, without writing it.
+
+    Radiance, depth and motion are rendered.
     """
-    frames = run.scene.train[:: max(1, len(run.scene.train) // FRAMES)][:FRAMES]
-    small = replace(
-        frames[0],
-        camera=frames[0].camera.resized(frames[0].camera.width // 4, frames[0].camera.height // 4),
-    )
-    taken: list[float] = []
-    for warm, frame in (
-        (True, small),
-        *((False, f) for f in frames),
-    ):  # the first compiles the kernels
-        camera, start = to_device(frame.camera, device_of(run)), time.perf_counter()
-        seen = run.field.render(camera, frame.time)
-        float(seen.radiance[0, 0])  # a GPU has finished by then
-        taken += [] if warm else [time.perf_counter() - start]
-        if sum(taken) > ENOUGH:
+    frames = run.scene.train[:: max(1, len(run.scene.train) // TIMED_FRAMES)][:TIMED_FRAMES]
+    camera = frames[0].camera
+    small = replace(frames[0], camera=camera.resized(camera.width // 4, camera.height // 4))
+    time_frame(run, small)  # compiles the kernels
+    seconds: list[float] = []
+    for frame in frames:
+        seconds.append(time_frame(run, frame))
+        if sum(seconds) > MAX_TIMING_S:
             break
-    say(f"{np.median(taken):.3g} s a frame")
-    return float(np.median(taken))
+    median = float(np.median(seconds))
+    say(f"{median:.3g} s a frame")
+    return median
+
+
+def time_frame(run: Run, frame: Frame) -> float:
+    """Seconds to render one frame."""
+    camera = to_device(frame.camera, device_of(run))
+    start = time.perf_counter()
+    seen = run.field.render(camera, frame.time)
+    float(seen.radiance[0, 0])  # a GPU has finished by then
+    return time.perf_counter() - start

@@ -1,9 +1,12 @@
 """Checkpoints of modules and optimizers: safetensors files, written atomically, the
 newest two kept. Nothing is unpickled.
+
+Tensors are named `MODULE.PARAMETER` and `optimizer.NAME.INDEX.FIELD`, in one flat dict.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,14 +20,12 @@ from hdr_nsff.core.io import atomic
 from hdr_nsff.core.progress import say
 
 FORMAT = "hdr-nsff checkpoint 1"
-
-
-KEEP = 2
+MAX_CHECKPOINTS = 2  # kept in a folder: the newest, and one to fall back on
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What one checkpoint file holds."""
+    """The content of one checkpoint file."""
 
     step: int
     seconds: float  # of training so far
@@ -35,55 +36,58 @@ def save_checkpoint(folder: Path, step: int, seconds: float, tensors: dict[str, 
     """Write checkpoints/step_XXXXXXXX.safetensors and drop all but the newest two."""
     path = Path(folder) / "checkpoints" / f"step_{step:08d}.safetensors"
     write_checkpoint(path, step, seconds, tensors)
-    for old in sorted(path.parent.glob("step_*.safetensors"))[:-KEEP]:
+    for old in checkpoint_files(folder)[MAX_CHECKPOINTS:]:
         old.unlink()
     return path
 
 
+def checkpoint_files(folder: Path) -> list[Path]:
+    """The checkpoint files of a run folder, the newest first."""
+    return sorted((Path(folder) / "checkpoints").glob("step_*.safetensors"), reverse=True)
+
+
 def write_checkpoint(path: Path, step: int, seconds: float, tensors: dict[str, Tensor]) -> None:
-    """One checkpoint file."""
+    """Write one checkpoint file."""
+    metadata = {"format": FORMAT, "step": str(step), "seconds": repr(seconds)}
+    on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with atomic(path) as temporary:
-        cpu = {k: v.detach().cpu().contiguous() for k, v in tensors.items()}
-        save_file(
-            cpu, temporary, metadata={"format": FORMAT, "step": str(step), "seconds": repr(seconds)}
-        )
+        save_file(on_cpu, temporary, metadata=metadata)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """One checkpoint file. InputError where it is cut short or from another version."""
+    """Read one checkpoint file. InputError where it is cut short or from another
+    version.
+    """
     try:
         with safe_open(str(path), framework="pt") as file:
-            meta = file.metadata() or {}
-            if meta.get("format") != FORMAT:
-                raise InputError(
-                    f"{path}: written by another version ({meta.get('format', 'unknown format')})"
-                )
-            return Checkpoint(
-                int(meta["step"]),
-                float(meta["seconds"]),
-                {k: file.get_tensor(k) for k in file.keys()},  # noqa: SIM118
-            )
+            metadata = file.metadata() or {}
+            version = metadata.get("format", "unknown format")
+            if version != FORMAT:
+                raise InputError(f"{path}: written by another version ({version})")
+            names = file.keys()
+            tensors = {name: file.get_tensor(name) for name in names}
+        return Checkpoint(int(metadata["step"]), float(metadata["seconds"]), tensors)
+    except InputError:
+        raise
     except (SafetensorError, OSError, KeyError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             f"{path}: the checkpoint is cut short or damaged ({type(error).__name__})"
         ) from error
 
 
 def latest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest readable checkpoint, saying so where a newer one could not be read;
-    None where there is none at all.
+    """The newest readable checkpoint of a run folder; None where there is none at all.
+    Newer ones that cannot be read are reported. InputError where none can be read.
     """
     problems = []
-    for path in sorted((Path(folder) / "checkpoints").glob("step_*.safetensors"), reverse=True):
+    for path in checkpoint_files(folder):
         try:
             found = read_checkpoint(path)
         except InputError as error:
             problems.append(str(error))
             continue
         for problem in problems:
-            say(f"{problem}; going on from the one before, step {found.step}")
+            say(f"{problem}; using the one before, of step {found.step}")
         return found
     if problems:
         raise InputError(
@@ -96,14 +100,14 @@ def pack(
     modules: dict[str, torch.nn.Module], optimizers: dict[str, torch.optim.Optimizer]
 ) -> dict[str, Tensor]:
     """State of modules and optimizers as one flat dict of tensors."""
-    tensors = {
-        f"{name}.{k}": v for name, module in modules.items() for k, v in module.state_dict().items()
-    }
+    tensors: dict[str, Tensor] = {}
+    for name, module in modules.items():
+        for key, value in module.state_dict().items():
+            tensors[f"{name}.{key}"] = value
     for name, optimizer in optimizers.items():
         for index, state in optimizer.state_dict()["state"].items():
-            tensors |= {
-                f"optimizer.{name}.{index}.{k}": torch.as_tensor(v) for k, v in state.items()
-            }
+            for field, value in state.items():
+                tensors[f"optimizer.{name}.{index}.{field}"] = torch.as_tensor(value)
     return tensors
 
 
@@ -112,23 +116,24 @@ def unpack(
     modules: dict[str, torch.nn.Module],
     optimizers: dict[str, torch.optim.Optimizer],
 ) -> None:
-    """Put a packed state back."""
+    """Put a packed state back. InputError where it does not fit a module."""
     for name, module in modules.items():
-        own = {
-            k.removeprefix(f"{name}."): v for k, v in tensors.items() if k.startswith(f"{name}.")
-        }
         try:
-            module.load_state_dict(own)
+            module.load_state_dict(with_prefix(tensors, f"{name}."))
         except RuntimeError as error:
             raise InputError(
-                f"the checkpoint does not fit this run's {name}; its scene or config was changed, train again into a new folder"
+                f"the checkpoint does not fit this run's {name}; its scene or config was "
+                "changed, train again into a new folder"
             ) from error
     for name, optimizer in optimizers.items():
-        state: dict[int, dict[str, Tensor]] = {}
-        for key, value in tensors.items():
-            if key.startswith(f"optimizer.{name}."):
-                index, field = key.removeprefix(f"optimizer.{name}.").split(".", 1)
-                state.setdefault(int(index), {})[field] = value
-        optimizer.load_state_dict(
-            {"state": state, "param_groups": optimizer.state_dict()["param_groups"]}
-        )
+        states: dict[int, dict[str, Tensor]] = defaultdict(dict)
+        for key, value in with_prefix(tensors, f"optimizer.{name}.").items():
+            index, field = key.split(".", 1)
+            states[int(index)][field] = value
+        groups = optimizer.state_dict()["param_groups"]
+        optimizer.load_state_dict({"state": dict(states), "param_groups": groups})
+
+
+def with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """The tensors whose names begin with `prefix`, which is cut off."""
+    return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}

@@ -1,7 +1,7 @@
 """Data parallelism under `torchrun`: every process holds the whole model and its share
-of a step's batches; gradients are summed.
+of a step's batches; gradients are summed. With one process, nothing here does anything.
 
-Nothing here when there is one process. Sums instead of `DistributedDataParallel`'s
+Gradients are summed after the backward pass and not by `DistributedDataParallel`'s
 hooks, because the grids add to their gradients in place.
 """
 
@@ -22,8 +22,8 @@ from torch import Tensor
 class Ranks:
     """This process among the others."""
 
-    rank: int = 0
-    world: int = 1
+    rank: int = 0  # 0 to world - 1
+    world: int = 1  # number of processes
 
     @property
     def main(self) -> bool:
@@ -34,16 +34,17 @@ class Ranks:
         """Every parameter's gradient becomes the sum over all processes."""
         if self.world == 1:
             return
-        for p in parameters:
-            if p.grad is None:
-                p.grad = torch.zeros_like(p)
-            dist.all_reduce(p.grad)
+        for parameter in parameters:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            dist.all_reduce(parameter.grad)
 
     def max_buffers(self, buffers: Iterable[Tensor]) -> None:
         """Every buffer becomes the maximum over all processes."""
-        if self.world > 1:
-            for b in buffers:
-                dist.all_reduce(b, dist.ReduceOp.MAX)
+        if self.world == 1:
+            return
+        for buffer in buffers:
+            dist.all_reduce(buffer, dist.ReduceOp.MAX)
 
     def agree(self, seconds: float) -> float:
         """The first process's number, for all."""
@@ -56,16 +57,18 @@ class Ranks:
 
 @contextmanager
 def group() -> Iterator[Ranks]:
-    """Join the other processes where `torchrun` started several; leave in order at the
-    end.
+    """Join the other processes where `torchrun` started several, and leave in order at
+    the end.
     """
     world = int(os.environ.get("WORLD_SIZE", "1"))
     if world == 1:
         yield Ranks()
         return
-    dist.init_process_group("gloo" if not torch.cuda.is_available() else "cpu:gloo,cuda:nccl")
     if torch.cuda.is_available():
+        dist.init_process_group("cpu:gloo,cuda:nccl")
         torch.cuda.set_device(int(os.environ.get("LOCAL_RANK", "0")))
+    else:
+        dist.init_process_group("gloo")
     try:
         yield Ranks(dist.get_rank(), world)
         gc.collect()  # gloo may abort at exit where tensors outlive the group

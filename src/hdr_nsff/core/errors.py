@@ -1,11 +1,11 @@
-"""The one exception that is the user's to mend: the command line prints its sentence
-and exits with code 2.
+"""The one exception that the user can fix: the command line prints its sentence and
+exits with code 2.
 """
 
 
 class InputError(ValueError):
-    """Bad input. The message says what is wrong, where, and how to mend it, in one
-    sentence without a traceback.
+    """Bad input. The message says in one sentence what is wrong, where, and how to fix
+    it.
     """
 
 

@@ -1,9 +1,9 @@
-"""Notes: JSON files of fixed shape that verbs leave beside what they make, so that a
-restart goes on and `report` can tell.
+"""Notes: JSON files of fixed shape that verbs leave beside their results.
 
-A note that was cut short, or edited into another shape, counts as missing, and that is
-said: whoever needs it makes it again. A JSON file of the same name that no verb has
-written is somebody else's, and is left alone.
+A restart and the report read them. A note that was cut short or edited into another
+shape counts as missing. The user reads a message about it, and the verb that needs it
+makes it again. A JSON file of the same name that no verb has written belongs to the
+user and stays as it is.
 """
 
 from __future__ import annotations
@@ -25,30 +25,29 @@ class Note(BaseModel):
     """What all notes have in common."""
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
-    marks: ClassVar[
-        tuple[str, ...]
-    ] = ()  # keys that tell a note of this kind from other people's files
+    # keys that distinguish a note of this kind from files of other programs
+    marks: ClassVar[tuple[str, ...]] = ()
 
 
 N = TypeVar("N", bound=Note)
 
 
-class Share(Note):
-    """How much of a shot fits into the time there is."""
+class ShotShare(Note):
+    """The part of a shot that fits into its time budget."""
 
     scale: float = Field(ge=0.05, le=1)
     views: list[Count] = Field(min_length=1)  # positions in the shot
 
 
-class Plan(Note):
+class RenderPlan(Note):
     """`plan.json`: how the standard set spends its time budget."""
 
     marks = ("key", "shots")
     key: str
-    seconds_at_a_time: float
-    seconds_between: float
-    refused: list[str]  # sentences about what the clip does not allow
-    shots: dict[str, Share]
+    seconds_at_a_time: float  # for one picture of the clip's size, at a training time
+    seconds_between: float  # the same between training times
+    refused: list[str]  # sentences about shots that the clip does not allow
+    shots: dict[str, ShotShare]
 
 
 class SequenceView(Note):
@@ -71,7 +70,7 @@ class Sequence(Note):
     complete: bool = False
 
 
-class Exported(Note):
+class ExportedSequence(Note):
     """`sequence.json` of exported Gaussians."""
 
     marks = ("key", "times")
@@ -82,7 +81,7 @@ class Exported(Note):
 
 
 class Made(Note):
-    """`made_of.json`: what a truth folder was made of."""
+    """`made_of.json`: a hash of the files that a truth folder was made from."""
 
     marks = ("key",)
     key: str
@@ -97,14 +96,14 @@ class Layout(Note):
     files: list[str] = []  # that the export wrote, below its folder
 
 
-class Colored(Note):
+class PictureRanges(Note):
     """`views.json`: the ranges of the colored pictures of the standard set."""
 
     marks = ("key", "depth_range")
     key: str
     depth_range: tuple[Brightness, Brightness]  # z-depth, scene units
     fastest: Brightness  # motion until the next frame, pixels
-    moves: bool
+    moves: bool  # whether the field has scene flow
     exposures: list[float]  # EV
 
 
@@ -116,8 +115,9 @@ class FlowError(Note):
 
 
 class FlowErrors(Note):
-    """`before.json` of `finetune-flow`: what the network it starts from does to the
-    pairs kept out of training.
+    """`before.json` of `finetune-flow`: errors of the network that it starts from.
+
+    On the pairs kept out of training.
     """
 
     by_stops: dict[str, FlowError] = Field(min_length=1)  # EV between the two pictures -> error
@@ -134,26 +134,41 @@ class LogLine(Note):
 
 
 class Bench(Note):
-    """`bench.json`: what all runs of a benchmark have in common."""
+    """`bench.json`: the settings that all runs of a benchmark share."""
 
     marks = ("settings", "scenes")
     settings: dict[str, str | int | float | bool | None]
-    scenes: dict[str, str]  # name -> where it was found
+    scenes: dict[str, str]  # name -> folder
+
+
+class Machine(Note):
+    """The machine and the program that a run was trained with."""
+
+    cpu: str  # name
+    cores: Count  # logical ones of the machine
+    memory: Count | None  # bytes; None where the system does not say
+    system: str  # such as Linux-6.1-x86_64
+    python: str  # version
+    torch: str  # version
+    version: str  # of hdr-nsff
+    commit: str | None  # of the checkout it was run from, "-dirty" with changes; None: installed
 
 
 class Trained(Note):
-    """What training a run of a benchmark took."""
+    """The training of a benchmark's run: its cost, and where it ran."""
 
     steps: Count
     seconds: float  # of training
     # from reading the scene to the first step, and writing; in the process that
     # finished the training
     start_seconds: float
-    memory: Count  # bytes, the most that process held
-    gpu_memory: Count | None = None
-    device: str
+    memory: Count  # bytes, the peak of that process
+    gpu_memory: Count | None = None  # bytes
+    device: str  # "cpu", or the name of the GPU
     threads: Count
     frame_seconds: float  # to render a frame of the scene
+    seed: int
+    machine: Machine
 
 
 class CurvePoint(Note):
@@ -174,12 +189,12 @@ class ShownView(Note):
 
 
 class RunRecord(Note):
-    """`trial.json`: a run of a benchmark."""
+    """`run_record.json`: the state of a benchmark's run."""
 
     marks = ("scene_key", "trained")
     scene_key: str  # of the scene folder it was trained on
     trained: Trained | None = None
-    measured: str | None = None  # key of what was measured, and how
+    measured: str | None = None  # hash of the truth and the settings it was measured with
     seconds: float = 0.0  # of measuring
     curve: list[CurvePoint] = []
     shown: list[ShownView] = []
@@ -234,13 +249,12 @@ class Pu21(Note):
     nits: float
 
 
-Names = dict[
-    str, tuple[str, Annotated[int, Field(ge=0, le=9)]]
-]  # of scores: what they are called, and digits to show
+Digits = Annotated[int, Field(ge=0, le=9)]
+Labels = dict[str, tuple[str, Digits]]  # score -> its label, and the digits to show
 
 
 class Metrics(Note):
-    """`metrics.json`: what `evaluate` found."""
+    """`metrics.json`: the results of `evaluate`."""
 
     kind: str
     notes: list[str]
@@ -251,13 +265,13 @@ class Metrics(Note):
     views: list[ViewScores]
     lpips: str
     seconds: float
-    hdr_scores: Names | None = None
+    hdr_scores: Labels | None = None
     peak: float | None = None
     recordable_peak: float | None = None
     scale: float | None = None
     scale_per_channel: list[float] | None = None
     pu21: Pu21 | None = None
-    geometry_scores: Names | None = None
+    geometry_scores: Labels | None = None
     depth_scale: float | None = None
     world_scale: float | None = None
     camera: dict[str, int | float | list[float] | TrueResponse] | None = None
@@ -268,12 +282,8 @@ class Metrics(Note):
     def fits(self) -> Self:
         if empty := set(self.groups) - {v.group for v in self.views}:
             raise ValueError(f"no view is of the group {min(empty)}")
-        if self.hdr_scores is not None and None in (
-            self.peak,
-            self.recordable_peak,
-            self.scale,
-            self.scale_per_channel,
-        ):
+        gauge = (self.peak, self.recordable_peak, self.scale, self.scale_per_channel)
+        if self.hdr_scores is not None and None in gauge:
             raise ValueError("hdr_scores without their scale")
         if self.geometry_scores is not None and self.depth_scale is None:
             raise ValueError("geometry_scores without their scale")
@@ -283,22 +293,23 @@ class Metrics(Note):
 
 
 def read(path: Path, kind: type[N]) -> N | None:
-    """The note at `path`; None where there is none, or, which is said, none that makes
-    sense. InputError where it is no note of ours.
+    """The note at `path`; None where there is none.
+
+    None, with a message, also where it is damaged. InputError where the file is not a
+    note of this kind.
     """
     if not path.is_file():
         return None
     try:
         data = read_json(path)
         if kind.marks and not (isinstance(data, dict) and set(kind.marks) <= data.keys()):
-            raise InputError(
-                f"{path}: is there already and was not made by hdr-nsff; move it away, or choose another place"
-            )
+            problem = "is there already and was not made by hdr-nsff"
+            raise InputError(f"{path}: {problem}; move it away, or choose another place")
         return kind.model_validate(data)
     except InputError:
         raise
     except ValueError as error:
-        say(f"{path}: cut short or edited, and taken for missing ({first_problem(error)})")
+        say(f"{path}: cut short or edited, treated as missing ({first_problem(error)})")
         return None
 
 
@@ -310,11 +321,12 @@ def write(path: Path, note: Note) -> None:
 def first_problem(error: Exception) -> str:
     """The first thing pydantic or json complained about, in a few words."""
     if isinstance(error, ValidationError):
-        e = error.errors()[0]
-        return f"{'.'.join(str(p) for p in e['loc']) or 'top level'}: {e['msg']}"
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        return f"{place or 'top level'}: {first['msg']}"
     return str(error)
 
 
-def plain(note: Note) -> dict[str, Any]:
-    """What a note holds, without what it leaves open."""
+def to_dict(note: Note) -> dict[str, Any]:
+    """A note as plain data, without the fields that are None."""
     return note.model_dump(exclude_none=True)

@@ -1,120 +1,109 @@
-"""Pieces of one self-contained HTML page, readable on light and dark: the frame,
-tables, embedded pictures and videos, plots.
+"""Self-contained HTML pages.
+
+Files are embedded as data URIs, plots as inline SVG, and the Jinja templates here are
+those that all pages share. A page is one file that opens offline and reads on light and
+dark, at desktop and phone width. Templates escape every value (autoescape); SVG is the
+only markup that Python makes, and matplotlib escapes its text.
 """
 
 from __future__ import annotations
 
 import base64
-import io as memory
-from collections.abc import Collection, Sequence
-from html import escape
+import functools
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
+import jinja2
 import numpy as np
+from markupsafe import Markup
 
 GRAY = "#808891"  # reads on light and dark
-COLORS = ("#d1495b", "#3c9d6b", "#3d7fc4")  # red, green, blue channel
+CHANNEL_COLORS = {"red": "#d1495b", "green": "#3c9d6b", "blue": "#3d7fc4"}
+FIGURE_WIDTH = 640  # pixels: wider pictures are shrunk
+JPEG_QUALITY = 92
 
 
-def document(title: str, facts: str, body: str) -> str:
-    """The whole document."""
-    return f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{escape(title)} – HDR-NSFF report</title><style>{STYLE}</style></head>
-<body><header><h1>{escape(title)}</h1><p class="facts">{escape(facts)}</p></header>
-<main>{body}</main></body></html>
-"""
+@dataclass(frozen=True)
+class Figure:
+    """A picture or video with its caption."""
+
+    source: str  # data URI
+    caption: str
 
 
-STYLE = """
-:root{color-scheme:light dark;--ink:#1b1f24;--soft:#5b6570;--line:#d8dde3;--card:#f6f7f9;--page:#fff;--mark:#2f6fb0}
-@media(prefers-color-scheme:dark){:root{--ink:#e6e9ed;--soft:#98a2ad;--line:#333a42;--card:#1d2126;--page:#14171a;--mark:#7fb2e5}}
-*{box-sizing:border-box}
-body{margin:0;background:var(--page);color:var(--ink);font:15px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
-header,main{max-width:1180px;margin:0 auto;padding:0 24px}
-header{padding-top:36px}h1{margin:0;font-size:26px}h2{font-size:18px;margin:40px 0 12px;padding-bottom:6px;border-bottom:1px solid var(--line)}
-h3{font-size:14px;margin:18px 0 6px;color:var(--soft);font-weight:600}
-.facts,.note,figcaption,td.note{color:var(--soft)}p{margin:8px 0}
-.tiles{display:flex;flex-wrap:wrap;gap:12px}.tile{background:var(--card);border:1px solid var(--line);border-radius:8px;padding:12px 18px;min-width:150px}
-.tile b{display:block;font-size:24px;font-weight:600}.tile span{color:var(--soft);font-size:13px}
-.grid{display:grid;gap:10px;margin-bottom:20px;grid-template-columns:repeat(auto-fill,minmax(260px,1fr))}.pairs{display:grid;gap:10px;grid-template-columns:repeat(auto-fill,minmax(520px,1fr))}
-figure{margin:0;min-width:0}
-figure img,figure video{width:100%;display:block;border-radius:4px;background:#000}
-figcaption{font-size:12px;padding:3px 0 6px;overflow-wrap:anywhere}
-.plots{display:flex;flex-wrap:wrap;gap:16px}.plots svg{max-width:100%;height:auto}
-table{border-collapse:collapse;font-variant-numeric:tabular-nums}td,th{padding:4px 14px 4px 0;border-bottom:1px solid var(--line);text-align:left;vertical-align:top}
-th{color:var(--soft);font-weight:600;font-size:13px}td.n,th.n{text-align:right}.wide{overflow-x:auto}
-.missing{background:var(--card);border-left:3px solid var(--mark);padding:8px 14px;border-radius:0 6px 6px 0}
-code,pre{font:13px/1.45 ui-monospace,Menlo,Consolas,monospace}pre{overflow-x:auto;background:var(--card);padding:12px;border-radius:6px}
-summary{cursor:pointer;color:var(--mark)}
-"""
+@dataclass(frozen=True)
+class Table:
+    """A table of plain texts. All columns but the first `num_labels` are numbers."""
+
+    header: Sequence[str]  # empty texts: no header
+    rows: Sequence[Sequence[str]]
+    num_labels: int = 1
+    bold: frozenset[tuple[int, int]] = frozenset()  # (row, column) of the best numbers
 
 
-def missing(sentence: str) -> str:
-    """A visible note that something is not there."""
-    return f'<p class="missing">{escape(sentence)}</p>'
+@functools.cache
+def environment() -> jinja2.Environment:
+    """The templates of this package, named by their paths in it."""
+    package = Path(__file__).parents[1]
+    return jinja2.Environment(
+        loader=jinja2.FileSystemLoader(package),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
 
 
-def details(summary: str, content: str) -> str:
-    """Something to unfold."""
-    return f"<details><summary>{escape(summary)}</summary>{content}</details>"
+def render_page(template: str, **values: Any) -> str:
+    """The page of a template, such as `bench/gallery.html`."""
+    return environment().get_template(template).render(values)
 
 
-def table(
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    numeric: bool = True,
-    words: int = 1,
-    bold: Collection[tuple[int, int]] = (),
-) -> str:
-    """An HTML table of plain texts; all columns but the first `words` are numbers if
-    `numeric`. `bold`: cells as (row, column).
-    """
-
-    def cell(text: str, tag: str, row: int, column: int) -> str:
-        inner = f"<b>{escape(text)}</b>" if (row, column) in bold else escape(text)
-        return f"<{tag}{' class=n' if numeric and column >= words else ''}>{inner}</{tag}>"
-
-    def line(cells: Sequence[str], tag: str, row: int = -1) -> str:
-        return f"<tr>{''.join(cell(c, tag, row, i) for i, c in enumerate(cells))}</tr>"
-
-    top = line(header, "th") if any(header) else ""
-    return f'<div class="wide"><table>{top}{"".join(line(r, "td", i) for i, r in enumerate(rows))}</table></div>'
-
-
-def figure(rgb: np.ndarray, caption: str, widest: int = 640) -> str:
-    """An embedded JPEG of rgb (H, W, 3) in [0, 1], no wider than `widest` pixels."""
-    if rgb.shape[1] > widest:
-        rgb = cv2.resize(
-            rgb, (widest, round(rgb.shape[0] * widest / rgb.shape[1])), interpolation=cv2.INTER_AREA
-        )
-    data = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
-    ok, buffer = cv2.imencode(".jpg", np.ascontiguousarray(data), [cv2.IMWRITE_JPEG_QUALITY, 92])
+def figure(rgb: np.ndarray, caption: str, width: int = FIGURE_WIDTH) -> Figure:
+    """An embedded JPEG of rgb (H, W, 3) in [0, 1], at most `width` pixels wide."""
+    if rgb.shape[1] > width:
+        height = round(rgb.shape[0] * width / rgb.shape[1])
+        rgb = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
+    bgr = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    ok, buffer = cv2.imencode(".jpg", np.ascontiguousarray(bgr), options)
     assert ok
-    source = "data:image/jpeg;base64," + base64.b64encode(buffer.tobytes()).decode()
-    return f'<figure><img src="{source}" alt="{escape(caption)}"><figcaption>{escape(caption)}</figcaption></figure>'
+    return Figure(data_uri("image/jpeg", buffer.tobytes()), caption)
 
 
-def video(data: bytes, caption: str) -> str:
-    """An embedded MP4 that plays in a loop."""
-    source = "data:video/mp4;base64," + base64.b64encode(data).decode()
-    player = f'<video src="{source}" controls loop muted autoplay playsinline></video>'
-    return f"<figure>{player}<figcaption>{escape(caption)}</figcaption></figure>"
+def video(path: Path, caption: str) -> Figure:
+    """An embedded MP4."""
+    return Figure(data_uri("video/mp4", path.read_bytes()), caption)
 
 
-def number(value: Any, digits: int = 2, unit: str = "") -> str:
+def data_uri(kind: str, data: bytes) -> str:
+    """A file of a MIME `kind` as an address that holds it."""
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
+def number(value: float | None, digits: int = 2, unit: str = "") -> str:
     """A number for people; a dash where there is none."""
     return "–" if value is None else f"{value:.{digits}f}{unit}"
 
 
-def plot(width: float, height: float) -> tuple[Any, Any]:
-    """An empty matplotlib figure in inches, transparent, in grays that can be read on
-    light and dark.
-    """
-    from matplotlib.figure import Figure
+def plural(count: int, noun: str) -> str:
+    """A count with its noun: "1 scene", "2 scenes"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
-    drawing = Figure(figsize=(width, height), layout="constrained")
+
+def plot(width: float, height: float) -> tuple[Any, Any]:
+    """An empty matplotlib figure of `width` x `height` inches, and its axes.
+
+    Transparent, in grays that read on light and dark.
+    """
+    from matplotlib.figure import Figure as Drawing
+
+    drawing = Drawing(figsize=(width, height), layout="constrained")
     drawing.patch.set_alpha(0)
     axes = drawing.add_subplot()
     axes.patch.set_alpha(0)
@@ -130,14 +119,15 @@ def legend(axes: Any, **place: Any) -> None:
     axes.legend(fontsize=8, frameon=False, labelcolor=GRAY, **place)
 
 
-def svg(drawing: Any) -> str:
-    """A drawing as inline SVG."""
+def svg(drawing: Any) -> Markup:
+    """A drawing as inline SVG that knows its own width, for the style sheet."""
     import matplotlib
 
     for axes in drawing.axes:
         for item in (axes.xaxis.label, axes.yaxis.label, axes.title):
             item.set(color=GRAY, fontsize=9)
-    text = memory.StringIO()
+    text = io.StringIO()
     with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "report"}):
         drawing.savefig(text, format="svg", transparent=True, metadata={"Date": None})
-    return text.getvalue()[text.getvalue().index("<svg") :]
+    _, opening, rest = text.getvalue().partition("<svg ")
+    return Markup(f'{opening}style="--width: {drawing.get_figwidth():g}in" {rest}')

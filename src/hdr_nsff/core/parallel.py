@@ -2,26 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import cv2
 
 from hdr_nsff.core.progress import track
 
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
-def in_threads(work: Callable, items: list, report: str | None, threads: int = 2) -> list:
-    """`work` of every item, in order, on a few threads with OpenCV's own threads off
-    (its results depend on their number).
+
+def in_threads(
+    work: Callable[[Item], Result],
+    items: Sequence[Item],
+    report: str | None,
+    threads: int = 2,
+) -> list[Result]:
+    """`work` of every item, in order, on a few threads. `report` names the progress
+    bar; None shows none.
+
+    OpenCV's own threads are off meanwhile: its results depend on their number.
     """
-    before = cv2.getNumThreads()
+    opencv_threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     pool = ThreadPoolExecutor(threads)
     try:
         results = pool.map(work, items)
-        return list(results if report is None else track(results, report, total=len(items)))
+        if report is None:
+            return list(results)
+        return list(track(results, report, total=len(items)))
     finally:
-        pool.shutdown(
-            cancel_futures=True
-        )  # Ctrl-C waits for what is under way, not for what is to come
-        cv2.setNumThreads(before)
+        # After Ctrl-C, items that have begun are finished, and the others are dropped.
+        pool.shutdown(cancel_futures=True)
+        cv2.setNumThreads(opencv_threads)

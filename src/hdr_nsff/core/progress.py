@@ -1,5 +1,5 @@
-"""Progress bars with time left, for anything that takes more than two seconds; plain
-lines where no one watches a terminal.
+"""Progress bars with the time left, for anything that takes more than two seconds;
+plain lines where no terminal shows them.
 """
 
 from __future__ import annotations
@@ -18,6 +18,8 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+
+LINE_SECONDS = 10.0  # between two lines where there is no terminal
 
 T = TypeVar("T")
 console = Console(stderr=True, highlight=False)
@@ -40,29 +42,31 @@ def bar() -> Progress:
 
 
 def track(items: Iterable[T], description: str, total: int | None = None) -> Iterator[T]:
-    """`items`, with a bar on a terminal or a line every ten seconds elsewhere."""
-    total = len(items) if total is None and isinstance(items, Sized) else total
-    start = last = time.monotonic()
+    """Yield `items`, with a bar on a terminal or a line every ten seconds elsewhere."""
+    if total is None and isinstance(items, Sized):
+        total = len(items)
+    start = time.monotonic()
+    last_line = start
     with bar() as progress:
         task = progress.add_task(description, total=total, note="")
-        for done, item in enumerate(items):
+        for done, item in enumerate(items, 1):
             yield item
             progress.advance(task)
             now = time.monotonic()
-            if progress.disable and now - last > 10:
-                last = now
-                left = (
-                    f", {(now - start) / (done + 1) * (total - done - 1):.0f} s left"
-                    if total
-                    else ""
-                )
-                print(
-                    f"{description}: {done + 1}{f' of {total}' if total else ''}{left}",
-                    file=sys.stderr,
-                    flush=True,
-                )
+            if progress.disable and now - last_line > LINE_SECONDS:
+                last_line = now
+                line = f"{description}: {done}{progress_of(done, total, now - start)}"
+                print(line, file=sys.stderr, flush=True)
+
+
+def progress_of(done: int, total: int | None, seconds: float) -> str:
+    """The rest of a progress line: the total and the time left, where known."""
+    if not total:
+        return ""
+    seconds_left = seconds / done * (total - done)
+    return f" of {total}, {seconds_left:.0f} s left"
 
 
 def say(message: str) -> None:
-    """One line for the person at the terminal."""
+    """Print one line for the person at the terminal."""
     console.print(message, markup=False, soft_wrap=True)

@@ -1,10 +1,11 @@
-"""Map a function over the tensors of a frozen dataclass, so that moving or slicing one
-is a single call.
+"""A function mapped over the tensors of a frozen dataclass, so that moving or slicing
+one is a single call; devices by name.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -17,22 +18,21 @@ T = TypeVar("T")
 
 
 def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
-    """`value` with `function` applied to every tensor in it: dataclasses, dicts, lists
-    and tuples are entered.
+    """`value` with `function` applied to every tensor in it. Dataclasses, dicts, lists
+    and tuples are entered; anything else stays as it is.
     """
 
-    def walk(v: Any) -> Any:
-        if isinstance(v, Tensor):
-            return function(v)
-        if dataclasses.is_dataclass(v) and not isinstance(v, type):
-            return dataclasses.replace(
-                v, **{f.name: walk(getattr(v, f.name)) for f in dataclasses.fields(v)}
-            )
-        if isinstance(v, dict):
-            return {k: walk(x) for k, x in v.items()}
-        if isinstance(v, (list, tuple)):
-            return type(v)(walk(x) for x in v)
-        return v
+    def walk(node: Any) -> Any:
+        if isinstance(node, Tensor):
+            return function(node)
+        if dataclasses.is_dataclass(node) and not isinstance(node, type):
+            names = [f.name for f in dataclasses.fields(node)]
+            return dataclasses.replace(node, **{name: walk(getattr(node, name)) for name in names})
+        if isinstance(node, dict):
+            return {key: walk(child) for key, child in node.items()}
+        if isinstance(node, list | tuple):
+            return type(node)(walk(child) for child in node)
+        return node
 
     return walk(value)
 
@@ -42,23 +42,24 @@ def to_device(value: T, device: torch.device | str) -> T:
     return tree_map(lambda t: t.to(device), value)
 
 
-def hold_threads(count: int) -> None:
-    """Let torch use `count` threads (0: as it is). Before every step or frame: numba's
-    kernels set the count of the OpenMP library that both share.
-    """
-    if count:
-        torch.set_num_threads(count)
-
-
 def pick_device(name: str) -> torch.device:
-    """The device of a `--device` flag; InputError where CUDA is asked for and missing."""
+    """The device of a `--device` flag: auto, cpu, cuda or cuda:N. InputError for any
+    other name, and for a CUDA device that is not there.
+    """
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    if name.startswith("cuda") and not torch.cuda.is_available():
+    if name == "cpu":
+        return torch.device("cpu")
+    match = re.fullmatch(r"cuda(?::(\d{1,3}))?", name, re.ASCII)
+    if match is None:
+        raise InputError(f"--device {name:.40}: no such device; choose auto, cpu, cuda or cuda:N")
+    if not torch.cuda.is_available():
         raise InputError(
-            "--device cuda: this torch sees no CUDA device; leave the flag out to use the CPU"
+            f"--device {name}: this torch sees no CUDA device; leave the flag out to use the CPU"
         )
-    try:
-        return torch.device(name)
-    except RuntimeError as error:
-        raise InputError(f"--device {name}: no such device; choose auto, cpu or cuda") from error
+    count = torch.cuda.device_count()
+    if match[1] is not None and int(match[1]) >= count:
+        raise InputError(
+            f"--device {name}: no such CUDA device; there are {count}, counted from cuda:0"
+        )
+    return torch.device(name)

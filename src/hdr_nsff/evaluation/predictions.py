@@ -1,4 +1,7 @@
-"""What a run shows of the views it is held against."""
+"""Predictions of a run for the views it is compared with.
+
+Maps are rendered once, kept as EXR files, and developed at any exposure.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff.core import io
+from hdr_nsff.core.exr import SIDES, read_exr, write_exr
+from hdr_nsff.core.io import write_text
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.targets import Target
@@ -27,41 +31,47 @@ from hdr_nsff.training.run_folder import Run
 class Geometry:
     """Where the surfaces of a view are and how they move."""
 
-    depth: Tensor  # (H, W) z-depth; of the truth 0 where nothing is hit
-    flow: dict[
-        int, Tensor
-    ]  # {+-1: (H, W, 2)} pixels per frame in the view's own camera, standing still, to later and earlier times
+    depth: Tensor  # (H, W) z-depth; 0 where a true ray hits nothing
+    # {+-1: (H, W, 2)} pixels per frame in the view's own camera at rest, to later and
+    # earlier times
+    flow: dict[int, Tensor]
     scene_flow: dict[int, Tensor]  # {+-1: (H, W, 3)} units per frame, axes of the scene
 
 
 def predict(
     run: Run, views: Mapping[str, View], folder: Path, description: str, motion: bool
 ) -> list[Path]:
-    """An EXR per named view, `folder`/NAME.exr: radiance, depth and, with `motion`,
-    scene flow per frame in channels like `forward.x`. What is there of the same run is
-    kept, so that a killed evaluation goes on where it was.
+    """Render an EXR per named view, `folder`/NAME.exr: radiance and depth.
+
+    With `motion` also scene flow per frame in channels like `forward.x`. Files of the
+    same run are kept, so that a killed evaluation goes on where it was.
     """
     key = json.dumps(fingerprint(run, motion, list(views.items())))
-    note = folder / "predictions.json"
-    if not note.is_file() or note.read_text(encoding="utf-8", errors="replace") != key:
+    path = folder / "predictions.json"
+    if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != key:
         for old in [*folder.glob("*.exr"), *folder.glob("*.png")]:
             old.unlink()
-        io.write_text(note, key)
+        write_text(path, key)
+    files = {name: folder / f"{name}.exr" for name in views}
     for name, view in track(list(views.items()), description):
-        if not (folder / f"{name}.exr").exists():
-            io.write_exr(folder / f"{name}.exr", maps_of(run, view, motion), half=False)
-    return [folder / f"{name}.exr" for name in views]
+        if not files[name].exists():
+            write_exr(files[name], render_maps(run, view, motion), half=False)
+    return list(files.values())
 
 
-def maps_of(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
-    """The channels of one view. Where a time between frames is splatted, the field
-    itself is asked for its scene flow there.
+def render_maps(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
+    """The EXR channels of one view.
+
+    Where a time between frames is splatted, the scene flow is that of the field at
+    this time.
     """
-    camera, times = to_device(view.camera, device_of(run)), run.scene.times.tolist()
+    camera = to_device(view.camera, device_of(run))
+    times = run.scene.times.tolist()
     with torch.no_grad():
         seen = render_at(run.field, camera, view.time, times, scene_flow=motion)
-        again = motion and not seen.scene_flow and isinstance(run.field, LayeredField)
-        flows = run.field.render(camera, view.time).scene_flow if again else seen.scene_flow
+        flows = seen.scene_flow
+        if motion and not flows and isinstance(run.field, LayeredField):
+            flows = run.field.render(camera, view.time).scene_flow
 
     def image(values: Tensor) -> np.ndarray:
         return values.reshape(camera.height, camera.width, *values.shape[1:]).float().cpu().numpy()
@@ -70,75 +80,74 @@ def maps_of(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
     for side, frames in intervals(view.time, times).items():
         if side in flows:
             flow = image(flows[side]) / frames
-            channels |= {f"{io.SIDES[side]}.{axis}": flow[..., k] for k, axis in enumerate("xyz")}
+            channels |= {f"{SIDES[side]}.{axis}": flow[..., k] for k, axis in enumerate("xyz")}
     return channels
 
 
 def intervals(time: float, times: Sequence[float]) -> dict[int, float]:
-    """How many frames a field's scene flow at `time` reaches forward and backward: it
-    is told from one of the training `times` to the next; between two of them what it
-    reaches is interpolated as well. Without a side where the clip ends: nothing was
+    """The frames that a field's scene flow at `time` spans, {+-1: forward, backward}.
+
+    At one of the training `times` it reaches the next one; between two of them its end
+    is interpolated as well. A side beyond the clip is left out, because nothing was
     learned there.
     """
-    places = np.arange(len(times))
-    knot = float(np.interp(time, times, places))
-    reached = {
-        side: float(np.interp(knot + side, places, times))
-        for side in io.SIDES
-        if 0 <= knot + side <= len(times) - 1
-    }
-    return {side: abs(end - time) for side, end in reached.items()}
+    positions = np.arange(len(times))
+    knot = float(np.interp(time, times, positions))
+    spans = {}
+    for side in SIDES:
+        if 0 <= knot + side <= len(times) - 1:
+            end = float(np.interp(knot + side, positions, times))
+            spans[side] = abs(end - time)
+    return spans
 
 
 def radiance_of(path: Path) -> Tensor:
     """Radiance (H, W, 3) of a prediction."""
-    return torch.from_numpy(io.read_exr(path)["RGB"])
+    return torch.from_numpy(read_exr(path)["RGB"])
 
 
 def geometry_of(path: Path, view: View) -> Geometry:
     """Depth and motion of a prediction, in scene units."""
-    channels = {name: torch.from_numpy(array) for name, array in io.read_exr(path).items()}
-    depth, pixels = channels["Z"], view.camera.pixel_grid()
-    scene_flow = {
-        s: torch.stack([channels[f"{n}.{a}"] for a in "xyz"], -1)
-        for s, n in io.SIDES.items()
-        if f"{n}.x" in channels
-    }
+    channels = {name: torch.from_numpy(array) for name, array in read_exr(path).items()}
+    depth = channels["Z"]
+    pixels = view.camera.pixel_grid()
     rays = view.camera.rays(pixels)
     points = rays.origins + depth.reshape(-1, 1) * rays.directions
-    flow = {
-        s: (view.camera.project(points + f.reshape(-1, 3))[0] - pixels).view(*depth.shape, 2)
-        for s, f in scene_flow.items()
-    }
+    flow, scene_flow = {}, {}
+    for side, name in SIDES.items():
+        if f"{name}.x" in channels:
+            vectors = torch.stack([channels[f"{name}.{axis}"] for axis in "xyz"], -1)
+            landing = view.camera.project(points + vectors.reshape(-1, 3))[0]
+            scene_flow[side] = vectors
+            flow[side] = (landing - pixels).view(*depth.shape, 2)
     return Geometry(depth, flow, scene_flow)
 
 
 def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
-    """What the learned camera records (H, W, 3) of `radiance` (H, W, 3), which the run
-    rendered of the target, at every bracket at which the target is known.
+    """Recordings {bracket: (H, W, 3)} in [0, 1] of predicted `radiance` (H, W, 3).
+
+    By the learned camera, at every bracket that the target has.
     """
     brackets = list(target.rgb)
     recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]
-    return dict(zip(brackets, seen_by(run, target, radiance, recorders), strict=True))
+    return dict(zip(brackets, record(run, target, radiance, recorders), strict=True))
 
 
-def developed(run: Run, target: Target, radiance: Tensor, evs: Sequence[float]) -> list[Tensor]:
+def recordings_at(run: Run, target: Target, radiance: Tensor, evs: Sequence[float]) -> list[Tensor]:
     """The same at any exposures, `evs` relative to the reference bracket."""
-    return (
-        seen_by(
-            run, target, radiance, [run.tonemapper.recorder_at(ev, target.camera_id) for ev in evs]
-        )
-        if evs
-        else []
-    )
+    if not evs:
+        return []
+    recorders = [run.tonemapper.recorder_at(ev, target.camera_id) for ev in evs]
+    return record(run, target, radiance, recorders)
 
 
-def seen_by(
+def record(
     run: Run, target: Target, radiance: Tensor, recorders: Sequence[Recorder]
 ) -> list[Tensor]:
-    """The same as given recordings look."""
+    """The same by given recorders."""
     device = device_of(run)
+    camera = to_device(target.view.camera, device)
+    flat = radiance.reshape(-1, 3).to(device)
     with torch.no_grad():
-        camera, flat = to_device(target.view.camera, device), radiance.reshape(-1, 3).to(device)
         pictures = base.recorded(run.field, camera, target.view.time, recorders, flat)
-    return [p.cpu().reshape(radiance.shape) for p in pictures]
+    return [picture.cpu().reshape(radiance.shape) for picture in pictures]

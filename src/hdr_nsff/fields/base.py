@@ -1,25 +1,25 @@
 """What every radiance field answers: what does this camera see, at this time, at these
-pixels, in linear HDR radiance.
+pixels, in linear HDR radiance. Everything that training asks of a field stands here.
 
 Fields know nothing of exposure, white balance or response curves: tone mapping happens
-outside. `S` is the number of pixels asked for. Camera, time and pixels are the
-currency, not rays: an NSFF casts rays through the pixels, a splat field rasterizes the
-frame and reads them off. Two published baselines cannot be told without what was
-recorded (`RecordingField`): they are handed a `Recorder` from outside.
+outside. `S` is the number of pixels asked for. Camera, time and pixels are the currency,
+not rays: an NSFF casts rays through the pixels, a splat field rasterizes the frame and
+reads them off. Two published baselines need to know what was recorded
+(`RecordingField`): they are handed a `Recorder` from outside.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, Recorder
 
-HIGHEST = 0.999  # radiance below 1 that a sigmoid is asked to start from at most
+MAX_SIGMOID_RADIANCE = 0.999  # that a sigmoid is asked to start from at most
 
 
 @dataclass(frozen=True)
@@ -27,11 +27,9 @@ class Warp:
     """The same pixels rendered through the content of a neighboring frame (eq. 2-3)."""
 
     offset: int  # which neighbor: -1, +1, and -2, +2 for the two-step chain
-    # (S, 2) pixels: where the content goes in the neighbor's camera, minus where it is
-    # here
-    flow: Tensor
+    flow: Tensor  # (S, 2) px: where the content goes in the neighbor's camera, minus here
     confidence: Tensor  # (S,) in [0, 1]: 1 - rendered disocclusion
-    radiance: Tensor | None  # (S, 3) linear HDR, None where the field offers no warped render
+    radiance: Tensor | None  # (S, 3) linear HDR, None where the field warps no radiance
 
 
 @dataclass(frozen=True)
@@ -45,40 +43,23 @@ class Render:
     # {+-1: (S, 3)} scene units to the next / previous training time
     scene_flow: dict[int, Tensor] = field(default_factory=dict)
     warps: tuple[Warp, ...] = ()  # while training
-    dynamic_radiance: Tensor | None = None  # (S, 3) the dynamic branch alone, while training
-    dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch alone, while training
-    rgb: Tensor | None = (
-        # (S, 3) recorded, of a field that composites recordings; None: tone mapping
-        # makes it from `radiance`
-        None
-    )
+    dynamic_radiance: Tensor | None = None  # (S, 3) the dynamic branch alone, in training
+    dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch, in training
+    rgb: Tensor | None = None  # (S, 3) already recorded, of a field that composites rgb
 
 
 @dataclass(frozen=True)
 class Layers:
-    """A view as L translucent layers, front to back. A layer holds one kind of content:
-    a field with two branches interleaves them (static, dynamic, static, ...), so that
-    the static share stays where it is.
+    """A view as L translucent layers, front to back. A layer holds one kind of content: a
+    field with two branches interleaves them (static, dynamic, static, ...).
     """
 
     positions: Tensor  # (S, L, 3) scene units; S = height * width, row by row
     alpha: Tensor  # (S, L) in [0, 1]
     radiance: Tensor  # (S, L, 3) linear HDR
-    scene_flow: dict[
-        int, Tensor
-    ]  # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
+    # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
+    scene_flow: dict[int, Tensor]
     motion: Tensor  # (S, L) in [0, 1]: share of dynamic content
-
-
-@dataclass(frozen=True)
-class FrameError:
-    """How wrong a picture of one training frame is."""
-
-    camera: Camera
-    time: float  # in frames
-    error: Callable[
-        [Tensor], Tensor
-    ]  # of its radiance (S, 3): (S,) mean absolute difference of recorded values
 
 
 @dataclass(frozen=True)
@@ -93,36 +74,68 @@ class GaussianCloud:
     motion: Tensor  # (G,) in [0, 1]: share of dynamic content
 
 
+@dataclass(frozen=True)
+class FrameError:
+    """How wrong a picture of one training frame is."""
+
+    camera: Camera
+    time: float  # in frames
+    # radiance (S, 3) of its picture to (S,) mean absolute difference of recorded values
+    error: Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class ParamGroup:
+    """Parameters that share their learning rate.
+
+    With `row_marks`, one (rows,) uint8 tensor per parameter (rows, 4), only marked rows
+    are moved (`TouchedAdam`), and the optimizer clears the marks.
+    """
+
+    params: Sequence[Tensor]
+    lr: float
+    betas: tuple[float, float] | None = None  # the optimizer's default where None
+    eps: float | None = None
+    row_marks: list[Tensor] | None = None
+    start: float = 0.0  # share of the run before which the rate is 0
+
+
 @runtime_checkable
 class RadianceField(Protocol):
-    """A dynamic scene in linear HDR radiance. Nothing registers: `build_field` chooses
-    by type.
+    """A dynamic scene in linear HDR radiance: a `torch.nn.Module` with these methods.
+    Nothing registers: `build_field` chooses by type.
     """
 
     def render(
         self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
     ) -> Render:
-        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients;
-        chunks itself. `time` in frames, may be fractional. Whoever does not need the
-        scene flow has the picture sooner.
+        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks
+        itself. `time` in frames, may be fractional. Without `scene_flow` it is faster.
         """
         ...
 
     def __call__(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A training render with warps, and the field's own per-sample regularizers by
-        their `LossWeights` name.
-        """
+        """A training render with warps, and the field's own terms by name."""
         ...
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Parameter groups with their learning rates, for the optimizer."""
+    def loss_weights(self) -> dict[str, float]:
+        """Weights of all terms that only this field makes possible, by name."""
+        ...
+
+    def param_groups(self) -> list[ParamGroup]:
+        """Parameters with their learning rates."""
         ...
 
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
-        """Housekeeping between optimizer steps (culling grids, schedules).
-        `frame_errors(n)` says of n training frames how wrong their pictures are; None
+        """Housekeeping between optimizer steps (culling grids, relocation).
+
+        `frame_errors(n)` measures how wrong the pictures of n training frames are; None
         late in a run, when nothing is to be rearranged any more.
         """
+        ...
+
+    def shared_maxima(self) -> list[Tensor]:
+        """Buffers of which several processes must all hold the maximum."""
         ...
 
 
@@ -151,5 +164,6 @@ def recorded(
     """
     if isinstance(field, RecordingField):
         return field.record(camera, time, recorders)
-    seen = field.render(camera, time, scene_flow=False).radiance if radiance is None else radiance
-    return [recorder.rgb(seen) for recorder in recorders]
+    if radiance is None:
+        radiance = field.render(camera, time, scene_flow=False).radiance
+    return [recorder.rgb(radiance) for recorder in recorders]

@@ -1,5 +1,5 @@
-"""Time as knots: a knot is a position on the sorted list of training times; what varies
-in time lives on it and is interpolated.
+"""Time as knots: a knot is a position on the sorted list of training times, 0 at the
+first and T - 1 at the last. What varies in time is kept at knots and interpolated.
 """
 
 from __future__ import annotations
@@ -9,53 +9,58 @@ from torch import Tensor
 
 
 def knot_of(times: Tensor, time: float) -> float:
-    """Position of a time (in frames) on the sorted training times (T,), clamped to
-    their range.
+    """Position of a time (in frames) on the sorted training times (T,).
+
+    It is clamped to their range.
     """
     if len(times) == 1:
         return 0.0
-    i = int(
-        torch.searchsorted(times, torch.tensor(time, dtype=times.dtype, device=times.device)).clamp(
-            1, len(times) - 1
-        )
-    )
-    return float(i - 1 + ((time - times[i - 1]) / (times[i] - times[i - 1])).clamp(0, 1))
+    wanted = torch.tensor(time, dtype=times.dtype, device=times.device)
+    after = int(torch.searchsorted(times, wanted).clamp(1, len(times) - 1))
+    before = after - 1
+    fraction = (time - times[before]) / (times[after] - times[before])
+    return float(before + fraction.clamp(0, 1))
 
 
-def linear(values: Tensor, position: float) -> Tensor:
-    """`values` (K, ...) between two of them, at `position` in [0, K - 1]."""
+def interpolate_linear(values: Tensor, position: float) -> Tensor:
+    """`values` (K, ...) at `position` in [0, K - 1], linear in between: (...)."""
     if len(values) == 1:
         return values[0]
     low = min(int(position), len(values) - 2)
-    u = position - low
-    return weighted(values[low : low + 2], [1 - u, u])
+    fraction = position - low
+    return weighted_rows(values[low : low + 2], [1 - fraction, fraction])
 
 
 def catmull_rom(values: Tensor, position: float) -> Tensor:
-    """`values` (K, ...) by the cubic through them with continuous velocity (Catmull &
-    Rom 1974); ends are extended straight on.
+    """`values` (K, ...) at `position` in [0, K - 1], by a cubic through them: (...).
+
+    The cubic has continuous velocity (Catmull and Rom 1974). Both ends are extended in
+    a straight line, so that linear motion is reproduced everywhere.
     """
     last = len(values) - 1
     if last == 0:
         return values[0]
     low = min(max(int(position), 0), last - 1)
     u = position - low
-    a, b, c, d = (
-        0.5 * u * (u * (2 - u) - 1),
-        1 + 0.5 * u * u * (3 * u - 5),
-        0.5 * u * (u * (4 - 3 * u) + 1),
-        0.5 * u * u * (u - 1),
-    )
-    if low == 0:
-        a, b, c = 0.0, b + 2 * a, c - a
-    if low + 2 > last:
-        b, c, d = b - d, c + 2 * d, 0.0
-    first, end = max(low - 1, 0), min(low + 3, last + 1)
-    return weighted(values[first:end], [a, b, c, d][first - low + 1 : end - low + 1])
+    # weights of the rows low - 1, low, low + 1, low + 2
+    before = 0.5 * u * (u * (2 - u) - 1)
+    start = 1 + 0.5 * u * u * (3 * u - 5)
+    end = 0.5 * u * (u * (4 - 3 * u) + 1)
+    after = 0.5 * u * u * (u - 1)
+    if low == 0:  # row -1 is 2 * row 0 - row 1
+        start, end = start + 2 * before, end - before
+        before = 0.0
+    if low + 2 > last:  # row K is 2 * row K - 1 - row K - 2
+        start, end = start - after, end + 2 * after
+        after = 0.0
+    first_row, end_row = max(low - 1, 0), min(low + 3, last + 1)
+    weights = [before, start, end, after][first_row - low + 1 : end_row - low + 1]
+    return weighted_rows(values[first_row:end_row], weights)
 
 
-def weighted(values: Tensor, weights: list[float]) -> Tensor:
-    """The sum of `values` (K, ...) times `weights` (K): one product, where gradients of
-    single rows would each fill the whole of them.
+def weighted_rows(values: Tensor, weights: list[float]) -> Tensor:
+    """The sum of the rows of `values` (K, ...) times `weights` (K): (...).
+
+    One product and not a sum of rows, whose gradients would each fill all of `values`.
     """
     return (values.new_tensor(weights) @ values.flatten(1)).view(values.shape[1:])

@@ -32,6 +32,7 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, unpack
 from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import atomic, read_json, write_json, writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.flow_training.flow_exposures import Example, example, recorded_pair
@@ -109,7 +110,7 @@ def finetune_flow(config: FinetuneConfig) -> Path:
     held_out = [held_out[k] for k in chosen]
     network = load(config.network, config.weights, device)
     start = {k: v.clone() for k, v in network.state_dict().items()}
-    with writing_to(config.out):
+    with writing_to(config.out), lock_output(config.out):
         claim_folder(config)
         say(
             f"finetune-flow: {len(training)} pairs to train on, "

@@ -23,7 +23,8 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import SIDES, read_exr, read_image, read_mask
+from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.images import read_image, read_mask
 from hdr_nsff.radiometry.recording import response_curve
 
 FLO_MAGIC = 202021.25  # the first four bytes of a .flo, "PIEH", as a float

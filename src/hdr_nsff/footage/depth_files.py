@@ -8,7 +8,8 @@ from typing import Literal
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.geometry.fill import fill
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.footage.ingest import Footage, check_number
-from hdr_nsff.scene.scene import LARGEST_EV
+from hdr_nsff.scene.manifest import MAX_EV
 
 EXAMPLE = "write times like 1/250 and EV like -2"
 
@@ -41,7 +41,7 @@ def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None
         return None
     cycle = [parse_number(text, "--ev") for text in ev.split(",")]
     for value in cycle:
-        check_number("--ev", value, -LARGEST_EV, LARGEST_EV)
+        check_number("--ev", value, -MAX_EV, MAX_EV)
     return cycle
 
 

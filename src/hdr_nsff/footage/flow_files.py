@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask
+from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.arrays import read_array, read_arrays
 from hdr_nsff.geometry.round_trip import agreement

@@ -19,8 +19,10 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError, shorten
-from hdr_nsff.core.io import read_exr, read_image, read_video, video_info
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.images import read_image
 from hdr_nsff.core.picture_size import check_size
+from hdr_nsff.core.video import read_video, video_info
 
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
@@ -296,7 +298,7 @@ def read_dng(path: Path) -> np.ndarray:
         import rawpy
     except ImportError as error:
         raise InputError(
-            f"{path}: DNG frames need rawpy; install it with `pip install 'hdr-nsff[prepare]'`"
+            f"{path}: DNG frames need rawpy; install it with `pip install rawpy`"
         ) from error
     try:
         with rawpy.imread(str(path)) as raw:

@@ -18,7 +18,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapModel, read_model
 from hdr_nsff.footage.pose_formats import GivenPoses, from_colmap, from_json, from_llff
 from hdr_nsff.geometry.poses import LEAST, Poses, interpolate, project, ranges, trusted_points
-from hdr_nsff.scene.scene import LARGEST
+from hdr_nsff.scene.manifest import MAX_NUMBER
 
 # off which a rotation matrix counts as rounded, and is made exact again
 MAX_ROTATION_ERROR = 1e-6
@@ -174,9 +174,9 @@ def placed(
 
 def check_given(path: Path, given: GivenPoses) -> None:
     """InputError for poses with numbers that cannot be."""
-    if not all(np.abs(v).max() <= LARGEST for v in (given.K, given.c2w, given.size)):
+    if not all(np.abs(v).max() <= MAX_NUMBER for v in (given.K, given.c2w, given.size)):
         raise InputError(
-            f"{path}: poses hold NaN, Inf or numbers beyond {LARGEST:g}; export them again"
+            f"{path}: poses hold NaN, Inf or numbers beyond {MAX_NUMBER:g}; export them again"
         )
     if given.size[:, 0].min() <= 0:
         raise InputError(f"{path}: poses are for frames without width; export them again")

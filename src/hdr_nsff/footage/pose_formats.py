@@ -19,7 +19,7 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
-from hdr_nsff.scene.scene import LARGEST
+from hdr_nsff.scene.manifest import MAX_NUMBER
 
 # columns right, up, back -> right, down, forward
 FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -225,9 +225,9 @@ def parse_range(path: Path, document: Mapping[str, Any]) -> tuple[float | None, 
     """
     near = float(document.get("near") or 0)
     far = float(document.get("far") or 0)
-    least = near if near else 1 / LARGEST
-    most = far if far else LARGEST
-    if not (1 / LARGEST <= least < most <= LARGEST):
+    least = near if near else 1 / MAX_NUMBER
+    most = far if far else MAX_NUMBER
+    if not (1 / MAX_NUMBER <= least < most <= MAX_NUMBER):
         raise InputError(
             f"{path}: near {near:g} and far {far:g} are no range of depths; correct them"
         )

@@ -1,6 +1,7 @@
-"""Cameras and rays. OpenCV axes everywhere (+x right, +y down, +z forward); pixels are
-(x, y) with centers at +0.5; depth is z-depth (distance along the optical axis, scene
-units), never distance along the ray.
+"""Cameras and rays in torch. OpenCV axes everywhere (+x right, +y down, +z forward);
+pixels are (x, y) with centers at +0.5; depth is z-depth (distance along the optical
+axis, scene units), never distance along the ray. `geometry/pinhole.py` is the numpy
+twin.
 """
 
 from __future__ import annotations
@@ -10,15 +11,18 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from hdr_nsff.geometry.pinhole import MIN_DEPTH
+
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays whose direction advances one unit of z-depth: `origins + depth * directions`
-    is the point at z-depth `depth`.
+    """Rays whose directions advance one unit of z-depth.
+
+    `origins + depth * directions` is the point at z-depth `depth`.
     """
 
     origins: Tensor  # (S, 3) scene units
-    directions: Tensor  # (S, 3) z-depth 1 per unit
+    directions: Tensor  # (S, 3) scene units, per unit of z-depth
 
 
 @dataclass(frozen=True)
@@ -41,10 +45,11 @@ class Camera:
         """World `points` (..., 3) in camera coordinates (..., 3)."""
         return (points - self.c2w[:, 3]) @ self.c2w[:, :3]
 
-    def project(self, points: Tensor, min_depth: float = 1e-6) -> tuple[Tensor, Tensor]:
-        """Pixels (..., 2) and z-depths (...) of world `points` (..., 3). Points behind
-        the camera project through `min_depth`; test the returned depth before using
-        their pixels.
+    def project(self, points: Tensor, min_depth: float = MIN_DEPTH) -> tuple[Tensor, Tensor]:
+        """Pixels (..., 2) and z-depths (...) of world `points` (..., 3).
+
+        Points behind the camera project through `min_depth`; test the returned depth
+        before using their pixels.
         """
         local = self.to_camera(points)
         depth = local[..., 2]
@@ -64,5 +69,5 @@ class Camera:
         return replace(self, K=self.K * scale, width=width, height=height)
 
     def moved(self, c2w: Tensor) -> Camera:
-        """The same camera elsewhere."""
+        """The same camera at another pose `c2w` (3, 4)."""
         return replace(self, c2w=c2w)

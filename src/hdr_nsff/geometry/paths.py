@@ -1,11 +1,12 @@
-"""Camera paths: lists of views (camera, time, optional EV). Poses are OpenCV camera to
-world in scene units, times are in frames of the clip. Nothing here knows a scene or a
-field: callers hand in cameras and times.
+"""Camera paths: lists of views (camera, time, optional EV).
+
+Poses are OpenCV camera to world in scene units, times are in frames of the clip.
+Nothing here knows a scene or a field: callers pass cameras and times.
 
 A path file is JSON, a list with one object per view:
 
-    [{"time": 3.5, "c2w": [[r, r, r, x], [r, r, r, y], [r, r, r, z]], "K": [[fx, 0, cx],
-    [0, fy, cy], [0, 0, 1]], "ev": -2.0}, ...]
+    [{"time": 3.5, "c2w": [[r, r, r, x], [r, r, r, y], [r, r, r, z]],
+      "K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], "ev": -2.0}, ...]
 
 `K` (pixels of the clip's frame size) and `ev` (relative to the reference exposure) may
 be left out.
@@ -22,24 +23,31 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_json
 from hdr_nsff.geometry.cameras import Camera
 
+REQUIRED_KEYS = {"time", "c2w"}
+KNOWN_KEYS = REQUIRED_KEYS | {"K", "ev"}
+REACH_QUANTILES = (0.1, 0.9)  # hand-chosen: single outliers among the poses do not count
+ROTATION_TOLERANCE = 1e-3  # per entry of R R^T: poses may be written with few digits
+
 
 @dataclass(frozen=True)
 class View:
-    """One picture to be made."""
+    """One picture to be rendered."""
 
     camera: Camera
     time: float  # in frames, may be fractional
-    ev: float | None = None  # develop at this EV; None: as the caller chooses
+    ev: float | None = None  # develop at this EV; None: the caller chooses
 
     def resized(self, scale: float) -> View:
         """The same view with `scale` times the pixels along each side (at least 1)."""
-        width, height = (max(1, round(n * scale)) for n in (self.camera.width, self.camera.height))
+        width = max(1, round(self.camera.width * scale))
+        height = max(1, round(self.camera.height * scale))
         return replace(self, camera=self.camera.resized(width, height))
 
 
@@ -54,13 +62,14 @@ def fixed(camera: Camera, times: Sequence[float]) -> list[View]:
 
 
 def reach(cameras: Sequence[Camera], camera: Camera) -> Tensor:
-    """How far the clip's cameras spread around their middle along the axes of `camera`:
-    (3,) scene units, half of the range between the 10th and the 90th percentile.
+    """How far the clip's cameras spread around their middle along the axes of `camera`.
+
+    (3,) scene units right, down and forward: half of the range between the 10th and the
+    90th percentile.
     """
-    centers = (
-        torch.stack([c.c2w[:, 3] for c in cameras]) @ camera.c2w[:, :3]
-    )  # (T, 3) right, down, forward
-    low, high = centers.quantile(torch.tensor([0.1, 0.9]).to(centers), dim=0)
+    centers = torch.stack([c.c2w[:, 3] for c in cameras])
+    local = centers @ camera.c2w[:, :3]  # (T, 3)
+    low, high = local.quantile(torch.tensor(REACH_QUANTILES).to(local), dim=0)
     return (high - low) / 2
 
 
@@ -81,73 +90,62 @@ def bullet_time(
     num_views: int = 24,
     turns: float = 2.0,
 ) -> list[View]:
-    """Time stands still while the camera spirals out of `camera` and back into it,
-    always looking at the point `focus_depth` in front of `camera`. `radius` (3,):
-    largest offset right, down and forward, scene units. First view = `camera`; loops.
+    """Time stands still while the camera spirals out of `camera` and back into it.
+
+    It always looks at the point `focus_depth` in front of `camera`. `radius` (3,):
+    largest offset right, down and forward, scene units. The first view is `camera`, and
+    the path is a loop.
     """
-    c2w = camera.c2w
-    target = c2w[:, 3] + focus_depth * c2w[:, 2]
+    rotation, center = camera.c2w[:, :3], camera.c2w[:, 3]
+    down, forward = rotation[:, 1], rotation[:, 2]
+    target = center + focus_depth * forward
     views = []
-    for share in torch.arange(num_views) / num_views:
-        angle, envelope = 2 * math.pi * turns * float(share), math.sin(math.pi * float(share))
-        spiral = (
-            torch.tensor([math.cos(angle), math.sin(angle), math.sin(angle / 2)]).to(radius)
-            * envelope
-        )
-        views.append(
-            View(
-                camera.moved(
-                    look_at(c2w[:, 3] + c2w[:, :3] @ (radius * spiral), target, c2w[:, 1])
-                ),
-                float(time),
-            )
-        )
+    for share in (torch.arange(num_views) / num_views).tolist():
+        angle = 2 * math.pi * turns * share
+        envelope = math.sin(math.pi * share)
+        circle = torch.tensor([math.cos(angle), math.sin(angle), math.sin(angle / 2)])
+        offset = radius * (circle.to(radius) * envelope)
+        pose = look_at(center + rotation @ offset, target, down)
+        views.append(View(camera.moved(pose), float(time)))
     return views
 
 
 def slow_motion(cameras: Sequence[Camera], times: Sequence[float], factor: int) -> list[View]:
-    """`factor` views per recorded frame: times between the recorded ones (which need
-    not be evenly spaced), the camera gliding between its neighbors (center linearly,
-    rotation along the shortest arc). `times` rise strictly.
+    """`factor` views per recorded frame, the camera interpolated between its neighbors.
+
+    `times` rise strictly and need not be evenly spaced. Centers are interpolated
+    linearly, rotations along the shortest arc.
     """
-    assert (
-        factor >= 1
-        and len(cameras) == len(times)
-        and all(a < b for a, b in itertools.pairwise(times))
-    ), list(times)
+    assert factor >= 1, factor
+    assert len(cameras) == len(times), (len(cameras), len(times))
+    assert all(a < b for a, b in itertools.pairwise(times)), list(times)
     views = []
     for i in range(len(times) - 1):
+        interval = times[i + 1] - times[i]
         for k in range(factor):
-            f = k / factor
-            views.append(
-                View(
-                    between(cameras[i], cameras[i + 1], f), times[i] + f * (times[i + 1] - times[i])
-                )
-            )
+            fraction = k / factor
+            camera = interpolate_camera(cameras[i], cameras[i + 1], fraction)
+            views.append(View(camera, times[i] + fraction * interval))
     return [*views, View(cameras[-1], float(times[-1]))]
 
 
-def between(a: Camera, b: Camera, fraction: float) -> Camera:
+def interpolate_camera(a: Camera, b: Camera, fraction: float) -> Camera:
     """The camera `fraction` of the way from `a` to `b`; `a` itself at 0."""
     if fraction == 0:
         return a
-    from scipy.spatial.transform import Rotation, Slerp
-
-    turn = Slerp(
-        [0, 1],
-        Rotation.from_matrix(torch.stack([a.c2w[:, :3], b.c2w[:, :3]]).double().cpu().numpy()),
-    )
-    rotation = torch.from_numpy(turn(fraction).as_matrix()).to(a.c2w)
+    ends = torch.stack([a.c2w[:, :3], b.c2w[:, :3]]).double().cpu().numpy()
+    shortest_arc = Slerp([0, 1], Rotation.from_matrix(ends))
+    rotation = torch.from_numpy(shortest_arc(fraction).as_matrix()).to(a.c2w)
     center = torch.lerp(a.c2w[:, 3], b.c2w[:, 3], fraction)
-    return replace(
-        a, K=torch.lerp(a.K, b.K, fraction), c2w=torch.cat([rotation, center[:, None]], 1)
-    )
+    c2w = torch.cat([rotation, center[:, None]], 1)
+    return replace(a, K=torch.lerp(a.K, b.K, fraction), c2w=c2w)
 
 
 def from_json(path: Path | str, like: Camera) -> list[View]:
-    """The views of a path file (format above); `like` gives the frame size, and `K`
-    where a view names none. InputError in one sentence for anything that is not such a
-    file.
+    """The views of a path file (format above).
+
+    `like` gives the frame size, and `K` for views without one. InputError in one
+    sentence for anything that is not such a file.
     """
     try:
         entries = read_json(path)
@@ -161,45 +159,61 @@ def from_json(path: Path | str, like: Camera) -> list[View]:
         ) from error
     if not isinstance(entries, list) or not entries:
         raise InputError(
-            f"{path}: a camera path is a list with at least one {{time, c2w}} object; this holds none"
+            f"{path}: a camera path is a list with at least one {{time, c2w}} object; "
+            "this file holds none"
         )
-    return [parse(entry, f"{path}: view {i}", like) for i, entry in enumerate(entries)]
+    return [parse_view(entry, f"{path}: view {i}", like) for i, entry in enumerate(entries)]
 
 
-def parse(entry: Any, where: str, like: Camera) -> View:
+def parse_view(entry: Any, where: str, like: Camera) -> View:
     """One view of a path file; `where` names it in error messages."""
     if not isinstance(entry, dict):
         raise InputError(f"{where} is not an object with `time` and `c2w`")
-    if unknown := set(entry) - {"time", "c2w", "K", "ev"}:
+    unknown = sorted(set(entry) - KNOWN_KEYS)
+    if unknown:
         raise InputError(
-            f"{where} has the unknown key {sorted(unknown)[0]!r}; known are time, c2w, K and ev"
+            f"{where} has the unknown key {unknown[0]!r}; known are time, c2w, K and ev"
         )
-    if missing := {"time", "c2w"} - set(entry):
-        raise InputError(f"{where} has no {sorted(missing)[0]!r}; each view needs time and c2w")
-    c2w = numbers(entry["c2w"], (3, 4), f"{where}: c2w")
-    if (
-        not np.allclose(c2w[:, :3] @ c2w[:, :3].T, np.eye(3), atol=1e-3)
-        or np.linalg.det(c2w[:, :3]) < 0
-    ):
-        raise InputError(
-            f"{where}: the left 3x3 of c2w is not a rotation; write OpenCV camera-to-world poses without scale"
-        )
-    K = numbers(entry["K"], (3, 3), f"{where}: K") if entry.get("K") is not None else None
-    if K is not None and not (K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], [0, 0, 1])):
-        raise InputError(
-            f"{where}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with positive focal lengths in pixels"
-        )
-    camera = replace(
-        like,
-        c2w=torch.from_numpy(c2w).to(like.c2w),
-        K=like.K if K is None else torch.from_numpy(K).to(like.K),
-    )
-    ev = float(numbers(entry["ev"], (), f"{where}: ev")) if entry.get("ev") is not None else None
-    return View(camera, float(numbers(entry["time"], (), f"{where}: time")), ev)
+    missing = sorted(REQUIRED_KEYS - set(entry))
+    if missing:
+        raise InputError(f"{where} has no {missing[0]!r}; each view needs time and c2w")
+    c2w = parse_pose(entry["c2w"], where)
+    K = like.K
+    if entry.get("K") is not None:
+        K = torch.from_numpy(parse_intrinsics(entry["K"], where)).to(like.K)
+    ev = None
+    if entry.get("ev") is not None:
+        ev = float(parse_numbers(entry["ev"], (), f"{where}: ev"))
+    time = float(parse_numbers(entry["time"], (), f"{where}: time"))
+    return View(replace(like, c2w=torch.from_numpy(c2w).to(like.c2w), K=K), time, ev)
 
 
-def numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """`value` as finite float64 of `shape`, or an InputError that says `what` is wrong."""
+def parse_pose(value: Any, where: str) -> np.ndarray:
+    """A pose (3, 4) with a proper rotation, or an InputError."""
+    c2w = parse_numbers(value, (3, 4), f"{where}: c2w")
+    rotation = c2w[:, :3]
+    orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
+    if not orthonormal or np.linalg.det(rotation) < 0:
+        raise InputError(
+            f"{where}: the left 3x3 of c2w is not a rotation; "
+            "write OpenCV camera-to-world poses without scale"
+        )
+    return c2w
+
+
+def parse_intrinsics(value: Any, where: str) -> np.ndarray:
+    """A matrix K (3, 3) of a pinhole camera, or an InputError."""
+    K = parse_numbers(value, (3, 3), f"{where}: K")
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], [0, 0, 1])):
+        raise InputError(
+            f"{where}: K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] "
+            "with positive focal lengths in pixels"
+        )
+    return K
+
+
+def parse_numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    """`value` as finite float64 of `shape`, or an InputError that `what` is wrong."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):

@@ -1,4 +1,6 @@
-"""Camera poses of a clip, and what follows from them."""
+"""Camera poses of a clip and the static points they were estimated from: checks,
+interpolation of frames that did not register, and the words that report them.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +11,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry import pinhole
+
+ADVICE = (
+    "film with the camera moving sideways past textured, static surfaces, give masks of the "
+    "moving objects (--mask FOLDER), or import poses (--poses FOLDER or FILE)"
+)
+# share of frames with poses of their own below which poses have failed (hand-chosen)
+LEAST = 0.6
+MAX_LISTED_RANGES = 8  # in a message
 
 
 @dataclass(frozen=True)
@@ -23,18 +34,13 @@ class Poses:
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     # (P,) mean reprojection error, pixels
     point_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    # (O, 4) one view of a point: frame, point, x, y in pixels
+    # (O, 4) one observation of a point: frame, point, x, y in pixels
     tracks: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     # (T,) median reprojection error in pixels, NaN = none
     frame_errors: np.ndarray = field(default_factory=lambda: np.zeros(0))
     near: float | None = None  # z-depth, scene units
     far: float | None = None
-    notes: tuple[str, ...] = ()  # sentences for people
-
-
-def intrinsics(focal: float, width: int, height: int) -> np.ndarray:
-    """K (3, 3) with the principal point in the middle."""
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    notes: tuple[str, ...] = ()  # sentences for the user
 
 
 def ranges(numbers: list[int]) -> str:
@@ -45,49 +51,61 @@ def ranges(numbers: list[int]) -> str:
             runs[-1] = [runs[-1][0], n]
         else:
             runs.append([n, n])
-    words = [str(a) if a == b else f"{a}-{b}" for a, b in runs]
-    return ", ".join(words[:8]) + (", ..." if len(words) > 8 else "")
+    words = [str(first) if first == last else f"{first}-{last}" for first, last in runs]
+    shortened = ", ".join(words[:MAX_LISTED_RANGES])
+    return shortened if len(words) <= MAX_LISTED_RANGES else f"{shortened}, ..."
 
 
 def project(poses: Poses, frames: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) and z-depths (N,) of world `points` (N, 3), each in its own one of
-    `frames` (N,).
+    """Pixels (N, 2) and z-depths (N,) of world `points` (N, 3), the n-th point seen by
+    the n-th of `frames` (N,).
     """
-    local = np.einsum("nji,nj->ni", poses.c2w[frames, :, :3], points - poses.c2w[frames, :, 3])
-    pixels = np.einsum("nij,nj->ni", poses.K[frames], local)
-    return pixels[:, :2] / np.maximum(pixels[:, 2:], 1e-9), local[:, 2]
+    return pinhole.project(points, poses.K[frames], poses.c2w[frames])
 
 
 def trusted_points(poses: Poses, views: int = 3, error: float = 2.0) -> Poses:
-    """Without points of fewer than `views` views, of a larger mean `error` (pixels) or
-    behind a camera; with every frame's error.
+    """Poses with only their reliable points, and every frame's median error.
+
+    Points of fewer than `views` observations, with a mean reprojection error of `error`
+    pixels or more, or behind a camera are dropped.
     """
     frames, rows = poses.tracks[:, 0].astype(int), poses.tracks[:, 1].astype(int)
     pixels, depth = project(poses, frames, poses.points[rows])
     residual = np.linalg.norm(pixels - poses.tracks[:, 2:], axis=1)
-    size = len(poses.points)
-    good = (np.bincount(rows, minlength=size) >= views) & (poses.point_errors < error)
-    good &= np.bincount(rows, weights=depth <= 0, minlength=size) == 0
-    kept = good[rows]
-    errors = np.full(len(poses.c2w), np.nan)
-    for t in np.unique(frames[kept]):
-        errors[t] = np.median(residual[kept & (frames == t)])
+    count = len(poses.points)
+    num_observations = np.bincount(rows, minlength=count)
+    num_behind = np.bincount(rows, weights=depth <= 0, minlength=count)
+    trusted = (num_observations >= views) & (poses.point_errors < error) & (num_behind == 0)
+    kept = trusted[rows]
     tracks = poses.tracks[kept]
-    tracks[:, 1] = (np.cumsum(good) - 1)[rows[kept]]
+    new_rows = np.cumsum(trusted) - 1
+    tracks[:, 1] = new_rows[rows[kept]]
     return replace(
         poses,
-        points=poses.points[good],
-        point_errors=poses.point_errors[good],
+        points=poses.points[trusted],
+        point_errors=poses.point_errors[trusted],
         tracks=tracks,
-        frame_errors=errors,
+        frame_errors=median_per_frame(residual[kept], frames[kept], len(poses.c2w)),
     )
 
 
+def median_per_frame(values: np.ndarray, frames: np.ndarray, count: int) -> np.ndarray:
+    """The median (count,) of `values` (N,) over each of `frames` (N,), NaN for none."""
+    medians = np.full(count, np.nan)
+    for t in np.unique(frames):
+        medians[t] = np.median(values[frames == t])
+    return medians
+
+
 def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
-    """Poses of frames that did not register, between their registered neighbors of the
-    same camera (held at the ends of the clip).
+    """Poses with frames that did not register placed between their neighbors.
+
+    `groups` holds the frames of each physical camera in order; neighbors are registered
+    frames of the same camera. Poses are held constant at the ends of the clip.
+    InputError where a camera has no registered frame.
     """
-    c2w, lost = poses.c2w.copy(), []
+    c2w = poses.c2w.copy()
+    filled: list[int] = []
     for group in groups:
         known = [t for t in group if poses.registered[t]]
         missing = [t for t in group if not poses.registered[t]]
@@ -95,27 +113,31 @@ def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
             continue
         if not known:
             raise InputError(
-                f"poses failed: none of the frames of one camera could be placed (frames {ranges(missing)}); {ADVICE}"
+                f"poses failed: none of the frames of one camera could be registered "
+                f"(frames {ranges(missing)}); {ADVICE}"
             )
-        when = np.clip(missing, known[0], known[-1])
-        c2w[missing, :, 3] = np.stack(
-            [np.interp(when, known, c2w[known, k, 3]) for k in range(3)], -1
-        )
-        turn = Rotation.from_matrix(c2w[known, :, :3])
-        c2w[missing, :, :3] = (
-            Slerp(known, turn)(when).as_matrix() if len(known) > 1 else c2w[known[0], :, :3]
-        )
-        lost += missing
-    if not lost:
+        c2w[missing] = interpolated_c2w(c2w[known], known, missing)
+        filled += missing
+    if not filled:
         return poses
-    note = f"{len(lost)} of {len(c2w)} frames did not register; their poses are interpolated (frames {ranges(sorted(lost))})"
+    note = (
+        f"{len(filled)} of {len(c2w)} frames did not register; "
+        f"their poses are interpolated (frames {ranges(sorted(filled))})"
+    )
     return replace(poses, c2w=c2w, notes=(*poses.notes, note))
 
 
-ADVICE = (
-    "film with the camera moving sideways past textured, unmoving things, give masks of the moving objects (--mask FOLDER), "
-    "or import poses (--poses FOLDER or FILE)"
-)
+def interpolated_c2w(c2w: np.ndarray, known: list[int], missing: list[int]) -> np.ndarray:
+    """Poses (M, 3, 4) of frames `missing` (M) from `c2w` (N, 3, 4) of frames `known`
+    (N).
 
-
-ENOUGH, LEAST = 0.9, 0.6  # share of frames to be content with, and below which poses have failed
+    Centers linearly, rotations along the shortest arc; constant beyond the first and
+    last known frame.
+    """
+    frames = np.clip(missing, known[0], known[-1])
+    centers = np.stack([np.interp(frames, known, c2w[:, k, 3]) for k in range(3)], -1)
+    if len(known) > 1:
+        rotations = Slerp(known, Rotation.from_matrix(c2w[:, :, :3]))(frames).as_matrix()
+    else:
+        rotations = np.repeat(c2w[:1, :, :3], len(missing), 0)
+    return np.concatenate([rotations, centers[:, :, None]], 2)

@@ -1,17 +1,25 @@
-"""Maps read where flow leads, and whether flow there and back returns to where it
-started.
+"""Maps read where flow leads, and the forward-backward check of flow: whether a pixel
+returns to where it started (Sundaram, Brox and Keutzer 2010).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-TOLERANCE = 0.5  # pixels forward and backward flow may disagree by ...
 
+@dataclass(frozen=True)
+class RoundTripTuning:
+    """How far a round trip may miss its start: `max_error_px` plus
+    `max_error_share` of the flow's length.
+    """
 
-# ... plus this share of the flow's length (METHOD.md 5: the reference allows 50 %)
-RELATIVE_TOLERANCE = 0.01
+    max_error_px: float = 0.5  # hand-chosen on rendered scenes
+    max_error_share: float = 0.01  # METHOD.md 5; the reference allows 0.5
+    # share of clipped neighbors that bilinear reading tolerates: rounding only
+    max_clipped_weight: float = 0.01
 
 
 def follow(
@@ -21,15 +29,14 @@ def follow(
     interpolation: int = cv2.INTER_LINEAR,
 ) -> np.ndarray:
     """`field` (H, W) or (H, W, C) of the other frame, read where `flow` (H, W, 2) px
-    leads; outside is `fill`, or the edge.
+    leads. Outside the frame it is `fill`, or the edge's value without one.
     """
-    h, w = flow.shape[:2]
-    x = np.arange(w, dtype=np.float32) + flow[..., 0]
-    y = np.arange(h, dtype=np.float32)[:, None] + flow[..., 1]
-    mode = cv2.BORDER_REPLICATE if fill is None else cv2.BORDER_CONSTANT
-    return cv2.remap(
-        field, x, y, interpolation, borderMode=mode, borderValue=0.0 if fill is None else fill
-    )
+    height, width = flow.shape[:2]
+    x = np.arange(width, dtype=np.float32) + flow[..., 0]
+    y = np.arange(height, dtype=np.float32)[:, None] + flow[..., 1]
+    if fill is None:
+        return cv2.remap(field, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return cv2.remap(field, x, y, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=fill)
 
 
 def round_trip(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
@@ -38,17 +45,26 @@ def round_trip(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
 
 
 def agreement(
-    forward: np.ndarray, backward: np.ndarray, clipped_from: np.ndarray, clipped_to: np.ndarray
+    forward: np.ndarray,
+    backward: np.ndarray,
+    clipped_from: np.ndarray,
+    clipped_to: np.ndarray,
+    tuning: RoundTripTuning = RoundTripTuning(),
 ) -> np.ndarray:
-    """Where flow can be believed (H, W) bool: round trip within tolerance, target
-    inside the frame, neither end clipped.
+    """Where flow is valid (H, W) bool: its round trip is within tolerance, its target
+    inside the frame, and neither end clipped.
+
+    `forward`, `backward` (H, W, 2) px; `clipped_from`, `clipped_to` (H, W) bool.
     """
-    blocked = follow(clipped_to.astype(np.float32), forward, fill=1.0)  # also 1 outside the frame
-    return (round_trip(forward, backward) < allowed(forward)) & (blocked < 0.01) & ~clipped_from
+    # 1 outside the frame too
+    clipped_weight = follow(clipped_to.astype(np.float32), forward, fill=1.0)
+    target_recorded = clipped_weight < tuning.max_clipped_weight
+    returns = round_trip(forward, backward) < allowed(forward, tuning)
+    return returns & target_recorded & ~clipped_from
 
 
-def allowed(flow: np.ndarray) -> np.ndarray:
-    """By how many pixels (H, W) a round trip that begins with `flow` (H, W, 2) px may
-    miss.
+def allowed(flow: np.ndarray, tuning: RoundTripTuning = RoundTripTuning()) -> np.ndarray:
+    """How many pixels (H, W) a round trip that begins with `flow` (H, W, 2) px may miss
+    its start by.
     """
-    return TOLERANCE + RELATIVE_TOLERANCE * np.linalg.norm(flow, axis=-1)
+    return tuning.max_error_px + tuning.max_error_share * np.linalg.norm(flow, axis=-1)

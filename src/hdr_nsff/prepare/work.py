@@ -10,14 +10,16 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from hdr_nsff.core.io import read_image, read_mask, read_npy
+from hdr_nsff.core.images import read_image, read_mask
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Capture, Picture
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.flow.sources import FlowName
 from hdr_nsff.priors.poses.lightglue import Matcher
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest, Protocol
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, Protocol
+from hdr_nsff.scene.posed_video import PosedVideo
 
 MaskName = Literal["motion", "sam2"]
 DepthName = Literal["geometric", "depth-anything"]
@@ -25,7 +27,19 @@ Part = Literal["poses", "flow", "masks", "depth"]
 # flow (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices
 # (from, to)
 Flows = tuple[np.ndarray, np.ndarray, np.ndarray]
-StepName = Literal["frames", "exposure", "flow", "poses", "masks", "refined_flow", "depth", "sheet"]
+StepName = Literal[
+    "frames",
+    "exposure",
+    "flow",
+    "poses",
+    "masks",
+    "static_depth",
+    "response",
+    "refined_flow",
+    "movers",
+    "depth",
+    "sheet",
+]
 
 
 @dataclass(frozen=True)
@@ -229,11 +243,64 @@ class Work:
         valid = np.stack([read_mask(self.folder / names.valid) for _, _, names in files])
         return found, valid, np.array([(i, j) for i, j, _ in files])
 
-    def cameras(self) -> tuple[np.ndarray, np.ndarray]:
-        """K (T, 3, 3) pixels and c2w (T, 3, 4) of all frames."""
-        return np.array([f.K for f in self.manifest.frames]), np.array(
-            [f.c2w for f in self.manifest.frames]
+    def forget(self, names: tuple[str, ...]) -> None:
+        """Drop cached properties that a step has changed, or that nobody needs again."""
+        for name in names:
+            vars(self).pop(name, None)
+
+    @property
+    def train(self) -> list[FrameEntry]:
+        """The training frames, in order."""
+        return [f for f in self.manifest.frames if f.split == "train"]
+
+    @cached_property
+    def masks(self) -> np.ndarray:
+        """Moving pixels (T, H, W) of all frames."""
+        return np.stack([read_mask(self.folder / str(f.mask)) for f in self.manifest.frames])
+
+    def training_masks(self) -> np.ndarray:
+        """Moving pixels (T, H, W) of the training frames."""
+        return self.masks[[f.index for f in self.train]]
+
+    def training_clip(self) -> PosedVideo:
+        """The training frames with their cameras, equalized, and their moving masks."""
+        index = [f.index for f in self.train]
+        video, clipped = self.equalized
+        K, c2w = self.cameras()
+        times = np.array([f.time for f in self.train], np.float64)
+        return PosedVideo(
+            K[index], c2w[index], times, video[index], clipped[index], self.masks[index]
         )
+
+    def training_flows(self, flows: Flows) -> Flows:
+        """Those of `flows` between training frames, with pairs that count these only."""
+        index = np.array([f.index for f in self.train])
+        flow, valid, pairs = flows
+        among = np.isin(pairs, index).all(1)
+        return flow[among], valid[among], np.searchsorted(index, pairs[among])
+
+    def static_depth(self) -> tuple[np.ndarray, np.ndarray]:
+        """Disparity and confidence (T, H, W) of the training frames before movers."""
+        disparity = [read_npy(self.folder / str(f.static_disparity)) for f in self.train]
+        confidence = [read_npy(self.folder / str(f.static_confidence)) for f in self.train]
+        return np.stack(disparity).astype(np.float32), np.stack(confidence).astype(np.float32)
+
+    def still(self) -> np.ndarray | None:
+        """Pixels (T, H, W) of the moving masks that stand still after all; None where
+        depth is given, or the same everywhere: movers are then part of it.
+        """
+        names = [f.still for f in self.train]
+        known = [read_mask(self.folder / name) for name in names if name is not None]
+        return np.stack(known) if known else None
+
+    def camera(self, f: FrameEntry) -> tuple[np.ndarray, np.ndarray]:
+        """K (3, 3) px and c2w (3, 4) of a frame."""
+        return np.array(f.K, np.float64), np.array(f.c2w, np.float64)
+
+    def cameras(self) -> tuple[np.ndarray, np.ndarray]:
+        """K (T, 3, 3) px and c2w (T, 3, 4) of all frames."""
+        cameras = [self.camera(f) for f in self.manifest.frames]
+        return np.stack([K for K, _ in cameras]), np.stack([c2w for _, c2w in cameras])
 
     def camera_frames(self) -> list[list[int]]:
         """Per camera the indices of its frames in time."""

@@ -1,9 +1,9 @@
 """Exposures from brightness alone: which frames share an exposure, and all frames
 brought to one common brightness.
 
-Nothing here knows the camera. "EV" in this file is `2.2 log2(recorded)`, the exposure
-under the guess that the response is a plain gamma: good enough to find a cycle and its
-order, and to doubt a user's list; the true values are learned later.
+No camera model is used. "EV" in this file is `2.2 log2(recorded)`: the exposure under
+the assumption that the response is a plain gamma of 2.2. That is good enough to find a
+cycle and its order, and to question a user's list; the true values are learned later.
 """
 
 from __future__ import annotations
@@ -12,31 +12,54 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_CYCLE = 6
-LOW, HIGH = 0.012, 0.97  # a recorded value outside says only "darker than" or "brighter than"
+MAX_CYCLE = 6  # frames: the longest cycle looked for, two more than cameras offer
 # EV between the darkest and brightest bracket below which brightness merely flickers;
-# positions of a cycle that are closer than this share a bracket
+# positions of a cycle that are closer than this share a bracket (hand-chosen on
+# recorded clips: cameras step by 1/3 EV at least)
 MIN_STEP = 0.3
-MIN_EXPLAINED = 0.6  # share of the brightness changes a cycle must explain
-NOISE = 0.1  # EV: changes of brightness smaller than this are never evidence
-LEVELS = np.linspace(0.05, 0.95, 37)  # quantiles that stand for a frame's brightness
-BINS = 1024
+GAMMA = 2.2  # of the assumed response
+BINS = 1024  # of the histograms; 8-bit codes fall four bins apart
+QUANTILES = np.linspace(0.05, 0.95, 37)  # they stand for a frame's brightness
+
+
+@dataclass(frozen=True)
+class ExposureCycleTuning:
+    """What counts as a step of exposure, and which recorded values carry information.
+
+    All values are hand-chosen on recorded and rendered clips.
+    """
+
+    max_cycle: int = MAX_CYCLE  # frames
+    min_step_ev: float = MIN_STEP
+    min_explained: float = 0.6  # share of the brightness changes a cycle must explain
+    noise_ev: float = 0.1  # smaller changes of brightness are never evidence
+    # recorded values outside [low, high] are only "darker than" or "brighter than"
+    low: float = 0.012
+    high: float = 0.97
+    sampled_pixels: int = 20000  # of a frame, for its quantiles
+    min_common_quantiles: int = 3  # away from black and white in both of two frames
+    # a list of exposures is questioned when fewer of its steps have the sign of the
+    # measured ones, or when it is off by more than this factor
+    min_same_sign: float = 0.8
+    max_ev_ratio: float = 2.0
+    well_exposed_low: float = 0.05  # recorded value, for the choice of the reference
+    # share of the darkest pixels that is the black of a camera with a pedestal
+    pedestal_quantile: float = 0.001
 
 
 @dataclass(frozen=True)
 class Cycle:
     """An exposure cycle found in a clip."""
 
-    length: int  # 1: no alternation
-    # per frame: positions of the cycle closer than `MIN_STEP` share a bracket, numbered
-    # as they appear
+    length: int  # frames; 1: no alternation
+    # per frame: positions of the cycle closer than `min_step_ev` share a bracket,
+    # numbered in the order of appearance
     brackets: list[int]
     order: list[int]  # the brackets from the darkest to the brightest
-    ev: list[
-        float
-    ]  # per bracket: EV relative to the darkest, under a gamma of 2.2 (a rough measurement)
-    # in [0, 1]: the share of the brightness changes between frames that the cycle
-    # explains
+    # per bracket: EV relative to the darkest, under a gamma of 2.2 (a rough
+    # measurement)
+    ev: list[float]
+    # share of the brightness changes between frames that the cycle explains, in [0, 1]
     confidence: float
 
 
@@ -46,91 +69,111 @@ def extent(rgb: np.ndarray) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def all_clipped(extents: list[tuple[float, float]]) -> str | None:
+def all_clipped(
+    extents: list[tuple[float, float]], tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> str | None:
     """ "black" or "white" where every frame is that and nothing else, else None;
     `extents` as of `extent`, one per frame.
     """
-    if max(high for _, high in extents) < LOW:
+    if max(high for _, high in extents) < tuning.low:
         return "black"
-    return "white" if min(low for low, _ in extents) > HIGH else None
+    if min(low for low, _ in extents) > tuning.high:
+        return "white"
+    return None
 
 
-def brightness_steps(video: np.ndarray) -> np.ndarray:
+def brightness_steps(
+    video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> np.ndarray:
     """EV from each frame of `video` (T, H, W, 3) recorded to the next, (T-1,).
 
-    Compares the same quantiles of both histograms (motion moves pixels, not quantiles)
-    and takes the median over those that are neither black nor saturated in either
-    frame, so one lamp or one passing car does not count.
+    The same quantiles of both histograms are compared: motion moves pixels, not
+    quantiles. The median is taken over those that are neither black nor saturated in
+    either frame, so one lamp or one passing car does not count.
     """
-    stride = max(1, int(np.sqrt(video.shape[1] * video.shape[2] / 20000)))
-    luminance = video[:, ::stride, ::stride].mean(-1).reshape(len(video), -1)
-    q = np.quantile(luminance, LEVELS, axis=1).T  # (T, levels)
-    ev = 2.2 * np.log2(np.maximum(q, 1 / 512))
-    known = (q > LOW) & (q < HIGH)
-    both = known[1:] & known[:-1]
-    steps = np.diff(ev, axis=0)
-    enough = both.sum(1) >= 3
-    return np.array(
-        [np.median(s[b] if e else s) for s, b, e in zip(steps, both, enough, strict=True)]
-    )
+    num_frames, height, width = video.shape[:3]
+    stride = max(1, int(np.sqrt(height * width / tuning.sampled_pixels)))
+    luminance = video[:, ::stride, ::stride].mean(-1).reshape(num_frames, -1)
+    quantiles = np.quantile(luminance, QUANTILES, axis=1).T  # (T, quantiles)
+    ev = GAMMA * np.log2(np.maximum(quantiles, 1 / 512))
+    informative = (quantiles > tuning.low) & (quantiles < tuning.high)
+    common = informative[1:] & informative[:-1]
+    medians = []
+    for steps, use in zip(np.diff(ev, axis=0), common, strict=True):
+        enough = use.sum() >= tuning.min_common_quantiles
+        medians.append(np.median(steps[use] if enough else steps))
+    return np.array(medians)
 
 
-def fit_cycle(steps: np.ndarray, length: int) -> tuple[float, np.ndarray]:
-    """How badly a cycle of `length` explains the EV `steps` (mean absolute EV, at least
-    `NOISE`), and its levels (length,) in EV.
+def fit_cycle(
+    steps: np.ndarray, length: int, tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> tuple[float, np.ndarray]:
+    """How badly a cycle of `length` explains the EV `steps` (T-1,), and its levels.
 
-    One median step per phase; what they sum to over a cycle is taken off, since a cycle
-    comes back to where it began.
+    The misfit is the mean absolute EV, at least `noise_ev`; the levels (length,) are EV
+    above the darkest. Every phase takes its median step; their mean is subtracted,
+    since a cycle returns to where it began.
     """
     phase = np.arange(len(steps)) % length
-    fit = np.array([np.median(steps[phase == k]) for k in range(length)])
-    fit -= fit.mean()
-    level = np.concatenate([[0.0], np.cumsum(fit[:-1])])
-    return max(float(np.abs(steps - fit[phase]).mean()), NOISE), level - level.min()
+    fitted = np.array([np.median(steps[phase == k]) for k in range(length)])
+    fitted -= fitted.mean()
+    levels = np.concatenate([[0.0], np.cumsum(fitted[:-1])])
+    misfit = float(np.abs(steps - fitted[phase]).mean())
+    return max(misfit, tuning.noise_ev), levels - levels.min()
 
 
-def detect_cycle(video: np.ndarray, max_cycle: int = MAX_CYCLE) -> Cycle:
+def detect_cycle(video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()) -> Cycle:
     """The exposure cycle of `video` (T, H, W, 3) recorded in [0, 1], or a cycle of
     length 1 where there is none.
 
-    The steps of brightness between frames repeat with the cycle; of all lengths the one
-    with the best Bayesian information criterion under Laplace noise wins, so a multiple
-    of the true length, which fits no better, loses.
+    The steps of brightness between frames repeat with the cycle. Of all lengths the one
+    with the best Bayesian information criterion (Schwarz 1978) under Laplace noise
+    wins, so a multiple of the true length, which fits no better, loses.
     """
-    steps = brightness_steps(video)
-    n = len(steps)
-    candidates = [
-        (length, *fit_cycle(steps, length))
-        for length in range(1, max(1, min(max_cycle, (n + 1) // 2)) + 1)
-    ]
-    still = candidates[0][1]
-    length, cost, level = min(candidates, key=lambda c: 2 * n * np.log(c[1]) + c[0] * np.log(n))
-    if level.max() < MIN_STEP or 1 - cost / still < MIN_EXPLAINED:
-        length, cost, level = candidates[0]
-    positions = share_brackets(level)
-    ev = [level[positions == b].mean() for b in range(positions.max() + 1)]
+    steps = brightness_steps(video, tuning)
+    count = len(steps)
+    longest = min(tuning.max_cycle, (count + 1) // 2)
+    lengths = range(1, max(1, longest) + 1)
+    fits = {length: fit_cycle(steps, length, tuning) for length in lengths}
+
+    def information_criterion(length: int) -> float:
+        misfit = fits[length][0]
+        return 2 * count * np.log(misfit) + length * np.log(count)
+
+    length = min(lengths, key=information_criterion)
+    misfit, levels = fits[length]
+    misfit_without = fits[1][0]
+    too_small = levels.max() < tuning.min_step_ev
+    if too_small or 1 - misfit / misfit_without < tuning.min_explained:
+        length = 1
+        misfit, levels = fits[1]
+    bracket_of_phase = share_brackets(levels, tuning)
+    ev = [float(levels[bracket_of_phase == b].mean()) for b in range(bracket_of_phase.max() + 1)]
     return Cycle(
         length=length,
-        brackets=[int(positions[t % length]) for t in range(len(video))],
+        brackets=[int(bracket_of_phase[t % length]) for t in range(len(video))],
         order=np.argsort(ev, kind="stable").tolist(),
-        ev=[float(v) for v in ev],
-        confidence=1 - cost / still,
+        ev=ev,
+        confidence=1 - misfit / misfit_without,
     )
 
 
-def share_brackets(levels: np.ndarray) -> np.ndarray:
-    """The bracket (length,) of each position of a cycle with these `levels` (length,) in
-    EV, numbered as they appear.
+def share_brackets(
+    levels: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> np.ndarray:
+    """The bracket (length,) of each position of a cycle with these `levels` (length,)
+    in EV, numbered in the order of appearance.
 
     A camera that goes up and down again (-2, 0, 2, 0 EV) shows one exposure at two
-    positions. From the darkest on, positions within `MIN_STEP` of a bracket's darkest
-    join it, so a ramp of small steps never becomes one bracket.
+    positions. From the darkest on, positions within `min_step_ev` of a bracket's
+    darkest join it, so a ramp of small steps never becomes one bracket.
     """
     rank = np.zeros(len(levels), int)  # of each position's bracket, 0 the darkest
     current, darkest = -1, -np.inf
     for k in np.argsort(levels, kind="stable"):
-        if levels[k] - darkest >= MIN_STEP:
-            current, darkest = current + 1, levels[k]
+        if levels[k] - darkest >= tuning.min_step_ev:
+            current += 1
+            darkest = levels[k]
         rank[k] = current
     appearance = list(dict.fromkeys(rank.tolist()))
     return np.array([appearance.index(r) for r in rank])
@@ -138,133 +181,160 @@ def share_brackets(levels: np.ndarray) -> np.ndarray:
 
 def period(brackets: list[int]) -> int:
     """The smallest p with `brackets[t] == brackets[t + p]` throughout and seen at least
-    twice, else the number of brackets.
+    twice, else the number of different brackets.
     """
-    n = len(brackets)
-    return next(
-        (p for p in range(1, n // 2 + 1) if brackets[p:] == brackets[: n - p]), len(set(brackets))
-    )
+    count = len(brackets)
+    for p in range(1, count // 2 + 1):
+        if brackets[p:] == brackets[: count - p]:
+            return p
+    return len(set(brackets))
 
 
 def by_value(ev: list[float]) -> tuple[list[int], list[float]]:
-    """Frames with the same EV (to 0.01) share a bracket, numbered as they appear:
-    (bracket per frame, EV per bracket).
+    """Brackets from the EV of every frame: (bracket per frame, EV per bracket).
+
+    Frames with the same EV (to 0.01) share a bracket; brackets are numbered in the
+    order of their first frames.
     """
-    keys = [round(v, 2) for v in ev]
-    order = list(dict.fromkeys(keys))
-    return [order.index(k) for k in keys], [ev[keys.index(k)] for k in order]
+    rounded = [round(v, 2) for v in ev]
+    occurring = list(dict.fromkeys(rounded))
+    brackets = [occurring.index(v) for v in rounded]
+    return brackets, [ev[rounded.index(v)] for v in occurring]
 
 
 def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
     """Per synchronized camera the bracket of each frame, such that equal brackets are
     equally bright in every camera.
+
+    The most frequent cycle (its length and number of brackets) wins, and the first
+    camera with it numbers the brackets. A camera with another cycle, whose own was not
+    found, takes that of the others.
     """
     kinds = [(c.length, len(c.order)) for c in cycles]
     usual = max(sorted(set(kinds)), key=kinds.count)
-    lead = cycles[kinds.index(usual)]
-    result = []
+    reference = cycles[kinds.index(usual)]
+    brackets = []
     for cycle, kind in zip(cycles, kinds, strict=True):
         if kind == usual:
-            same = dict(zip(cycle.order, lead.order, strict=True))
-            result.append([same[b] for b in cycle.brackets])
-        else:  # a camera whose own cycle was not found takes that of the others
+            same_rank = dict(zip(cycle.order, reference.order, strict=True))
+            brackets.append([same_rank[b] for b in cycle.brackets])
+        else:
             frames = range(len(cycle.brackets))
-            result.append([lead.brackets[t % lead.length] for t in frames])
-    return result
+            brackets.append([reference.brackets[t % reference.length] for t in frames])
+    return brackets
 
 
-def doubts(video: np.ndarray, ev: list[float]) -> list[str]:
+def doubts(
+    video: np.ndarray, ev: list[float], tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> list[str]:
     """What in `video` (T, H, W, 3), recorded, contradicts the given `ev` per frame:
     sentences, none where they agree.
     """
-    steps, given = brightness_steps(video), np.diff(ev)
-    alternates = np.abs(given) >= MIN_STEP
+    measured = brightness_steps(video, tuning)
+    given = np.diff(ev)
+    alternates = np.abs(given) >= tuning.min_step_ev
     if not alternates.any():
-        cycle = detect_cycle(video)
-        return (
-            []
-            if cycle.length == 1
-            else [f"one exposure is given, but the brightness repeats every {cycle.length} frames"]
-        )
-    if np.abs(steps).mean() < MIN_STEP:
+        length = detect_cycle(video, tuning).length
+        if length == 1:
+            return []
+        return [f"one exposure is given, but the brightness repeats every {length} frames"]
+    if np.abs(measured).mean() < tuning.min_step_ev:
         return [
-            f"exposure steps of {np.abs(given).mean():.1f} EV are given, but all frames are about equally bright"
+            f"exposure steps of {np.abs(given).mean():.1f} EV are given, "
+            "but all frames are about equally bright"
         ]
-    sign = np.mean(np.sign(steps[alternates]) == np.sign(given[alternates]))
-    if sign < 0.8:
-        cycle = detect_cycle(video)
-        seen = (
-            f"; the brightness repeats every {cycle.length} frames, order from dark to bright {cycle.order}"
-            if cycle.length > 1
-            else ""
-        )
-        return [f"only {sign:.0%} of the exposure steps go the way the brightness goes{seen}"]
-    ratio = float(np.median(steps[alternates] / given[alternates]))
-    if not 0.5 < ratio < 2:
+    same_sign = np.mean(np.sign(measured[alternates]) == np.sign(given[alternates]))
+    if same_sign < tuning.min_same_sign:
+        sentence = f"only {same_sign:.0%} of the exposure steps go the way the brightness goes"
+        cycle = detect_cycle(video, tuning)
+        if cycle.length > 1:
+            sentence += (
+                f"; the brightness repeats every {cycle.length} frames, "
+                f"order from dark to bright {cycle.order}"
+            )
+        return [sentence]
+    ratio = float(np.median(measured[alternates] / given[alternates]))
+    if not 1 / tuning.max_ev_ratio < ratio < tuning.max_ev_ratio:
         return [
-            f"a step of 1 EV as given changes the brightness like {ratio:.1f} EV (measured with a gamma of 2.2)"
+            f"a given step of 1 EV changes the brightness like {ratio:.1f} EV "
+            "(measured with a gamma of 2.2)"
         ]
     return []
 
 
-def reference_bracket(video: np.ndarray, brackets: list[int]) -> int:
-    """The bracket of `video` (T, H, W, 3) whose pixels are best exposed: the largest
-    share between 0.05 and `HIGH` in recorded value.
+def reference_bracket(
+    video: np.ndarray,
+    brackets: list[int],
+    tuning: ExposureCycleTuning = ExposureCycleTuning(),
+) -> int:
+    """The best-exposed bracket of `video` (T, H, W, 3): the one with the largest share
+    of recorded values between `well_exposed_low` and `high`.
     """
-    good = ((video > 0.05) & (video < HIGH)).mean((1, 2, 3))  # (T,)
-    group = np.array(brackets)
-    return int(
-        np.argmax(
-            [good[group == b].mean() if (group == b).any() else 0.0 for b in range(group.max() + 1)]
-        )
-    )
+    well_exposed = (video > tuning.well_exposed_low) & (video < tuning.high)
+    share = well_exposed.mean((1, 2, 3))  # (T,)
+    bracket = np.array(brackets)
+    shares = np.zeros(bracket.max() + 1)
+    for b in np.unique(bracket):
+        shares[b] = share[bracket == b].mean()
+    return int(np.argmax(shares))
 
 
 def equalize(
-    video: np.ndarray, groups: list[int], pool: np.ndarray | None = None
+    video: np.ndarray,
+    groups: list[int],
+    pool: np.ndarray | None = None,
+    tuning: ExposureCycleTuning = ExposureCycleTuning(),
 ) -> tuple[np.ndarray, np.ndarray]:
-    """All frames at one common brightness, for matching only: (equalized (T, H, W, 3)
-    in [0, 1], clipped (T, H, W) bool).
+    """All frames at one common brightness, for matching only.
 
-    `groups` says which frames of `video` (T, H, W, 3) share an exposure (and a camera);
-    `pool` (T,) bool which frames the histograms are taken from (all). Each group shows
-    about the same content, so the value of rank r in one histogram is the value of rank
-    r in another: a monotone map per channel between any two exposures, with no response
-    curve or exposure time assumed. A pixel becomes the mean of its images in all
-    groups, which keeps contrast wherever any exposure has some. `clipped`: at least two
-    channels say only "darker than" or "brighter than".
+    Returns the equalized frames (T, H, W, 3) in [0, 1] and where they are clipped (T,
+    H, W) bool: at least two channels are only "darker than" or "brighter than".
+
+    `groups` gives the exposure (and camera) of each frame of `video` (T, H, W, 3);
+    `pool` (T,) bool the frames that the histograms are taken from (all). Each group
+    shows about the same content, so the value of rank r in one histogram corresponds to
+    that of rank r in another: a monotone map per channel between any two exposures,
+    without a response curve or exposure times (histogram specification, Grossberg and
+    Nayar 2003). A pixel becomes the mean of its images in all groups, which keeps
+    contrast wherever any exposure has some.
     """
     group = np.array(groups)
     pool = np.ones(len(group), bool) if pool is None else pool
-    equalized, outside = np.empty(video.shape, np.float32), np.empty(video.shape, bool)
+    equalized = np.empty(video.shape, np.float32)
+    outside = np.empty(video.shape, bool)
     ranks = np.linspace(0, 1, 4 * BINS)
     for channel in range(3):
-        curves = {}
+        recorded = video[..., channel]
+        histograms = {}
         for g in np.unique(group):
             frames = (group == g) & pool
-            curves[g] = value_ranks(video[frames if frames.any() else group == g][..., channel])
-        common = np.mean(
-            [np.interp(ranks, rank, value) for value, rank in curves.values()], axis=0
-        )  # (ranks,)
+            if not frames.any():
+                frames = group == g
+            histograms[g] = value_ranks(recorded[frames], tuning)
+        values_at_ranks = [np.interp(ranks, rank, value) for value, rank in histograms.values()]
+        common = np.mean(values_at_ranks, axis=0)  # (ranks,)
         for t, g in enumerate(group):
-            value, rank = curves[g]
-            recorded = video[t, ..., channel]
-            equalized[t, ..., channel] = np.interp(recorded, value, np.interp(rank, ranks, common))
-            black = LOW + np.interp(0.001, rank, value)  # some cameras add a pedestal
-            outside[t, ..., channel] = (recorded < black) | (recorded > HIGH)
+            value, rank = histograms[g]
+            image_of_value = np.interp(rank, ranks, common)
+            equalized[t, ..., channel] = np.interp(recorded[t], value, image_of_value)
+            black = tuning.low + np.interp(tuning.pedestal_quantile, rank, value)
+            outside[t, ..., channel] = (recorded[t] < black) | (recorded[t] > tuning.high)
     return equalized, outside.sum(-1) >= 2
 
 
-def value_ranks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The values in [0, 1] that occur (in `BINS` steps, increasing) and the share of
-    `values` below each, ties counted half.
+def value_ranks(
+    values: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> tuple[np.ndarray, np.ndarray]:
+    """The values in [0, 1] that occur, and the share of `values` below each.
 
-    All that is saturated is one tie: codes 250 to 255 of a burnt sky are not worth half
-    the contrast.
+    Values come in `BINS` steps, increasing; ties count half. All saturated values are
+    one tie, or codes 250 to 255 of a burnt sky would take half of the contrast.
     """
-    count = np.bincount(np.rint(values.ravel() * (BINS - 1)).astype(np.int64), minlength=BINS)
-    white = round(HIGH * (BINS - 1))
-    count[white:] = [count[white:].sum(), *[0] * (BINS - 1 - white)]
+    codes = np.rint(values.ravel() * (BINS - 1)).astype(np.int64)
+    count = np.bincount(codes, minlength=BINS)
+    white = round(tuning.high * (BINS - 1))
+    count[white] = count[white:].sum()
+    count[white + 1 :] = 0
     share = count / count.sum()
     rank = np.cumsum(share) - share / 2
     return np.flatnonzero(count) / (BINS - 1), rank[count > 0]

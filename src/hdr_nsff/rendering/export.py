@@ -1,65 +1,40 @@
-"""Files for other programs: the Gaussians of a splat run at any time as a PLY, or one
-PLY per training time; or a scene, for other methods, in a public data layout (the
-writers are in `datasets/`).
+"""The verb `export`: Gaussians as PLY files, or a scene in a public data layout.
 
-Coordinates are the scene's: OpenCV axes (+x right, +y down, +z forward of the first
-cameras), the units of its poses. A PLY knows neither background nor tone curve, so
-every Gaussian gets a color of its own, developed as `render` develops pixels, or its
-linear radiance. The background is left out.
+Both are for other programs. The writers of layouts are in `footage/layouts/`.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Protocol, runtime_checkable
+from typing import Annotated, Literal
 
-import numpy as np
-import torch
 import tyro
 
-from hdr_nsff.core import io, notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.progress import say, track
-from hdr_nsff.fields.base import GaussianCloud, RadianceField
-from hdr_nsff.footage.layouts import held_out as to_held_out
-from hdr_nsff.footage.layouts import llff as to_llff
-from hdr_nsff.footage.layouts import nerfstudio as to_nerfstudio
+from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.lock import lock_output
+from hdr_nsff.core.progress import say
+from hdr_nsff.footage.layouts import held_out, llff, nerfstudio
 from hdr_nsff.footage.layouts.writer import Source
-from hdr_nsff.geometry.paths import training_path
-from hdr_nsff.rendering import ply
-from hdr_nsff.rendering.shots import develop, display_exposure, fingerprint
+from hdr_nsff.rendering.export_gaussians import ColorTransform, export_one, export_sequence
 from hdr_nsff.training.run_folder import Run, read_config
 
-
-@dataclass(frozen=True)
-class Coloring:
-    """How radiance becomes the color of a Gaussian."""
-
-    ev: float | None = None
-    """Develop colors at this exposure, relative to the reference; default: tone-map for
-    a display.
-    """
-    linear: bool = False
-    """Linear radiance instead of developed colors, unbounded."""
-    camera_id: int = 0
-    """Whose learned response and white balance develop the colors (with --ev)."""
+Layout = Literal["hdr-gopro", "nerfstudio"]
+MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
 
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """The Gaussians of a splat run for viewers, or a scene in a public data layout for
-    other methods.
+    """Gaussians of a splat run for viewers, or a scene in a public data layout.
 
     Gaussians at a time: hdr-nsff export out/run frame.ply --ply --time 12.5
 
     Images, poses_bounds.npy, masks, depth, flow and a COLMAP model: hdr-nsff export
     out/scene out/gopro --layout hdr-gopro
 
-    transforms.json, images and depth: hdr-nsff export out/scene out/ns --layout
-    nerfstudio
+    transforms.json, images and depth: hdr-nsff export out/scene out/ns
+    --layout nerfstudio
 
     With held-out views, as recorded: hdr-nsff export out/scene out/ns --layout
     nerfstudio --truth truth
@@ -71,10 +46,10 @@ class ExportConfig:
     """Run folder; for --layout a scene folder, or a run folder, whose scene is meant.
     """
     out: tyro.conf.Positional[Path]
-    """What to write: a file NAME.ply with --ply, a folder with --ply-sequence and
+    """The output: a file NAME.ply with --ply, a folder with --ply-sequence and
     --layout.
     """
-    layout: Literal["hdr-gopro", "nerfstudio"] | None = None
+    layout: Layout | None = None
     """The scene's frames, poses, masks, depth and flow as HDR-GoPro / NSFF (LLFF), one
     picture per time, or as nerfstudio's.
     """
@@ -90,19 +65,9 @@ class ExportConfig:
     """In frames of the clip, may be fractional; default: the middle one."""
     device: str = "auto"
     """auto, cpu or cuda."""
-    coloring: Annotated[Coloring, tyro.conf.arg(name="")] = field(default_factory=Coloring)
-
-
-@runtime_checkable
-class GaussianField(RadianceField, Protocol):
-    """A field made of Gaussians."""
-
-    def gaussians(self, time: float) -> GaussianCloud:
-        """All visible ones at `time` in frames, without gradients."""
-        ...
-
-
-Colors = Callable[[np.ndarray], np.ndarray]  # radiance (G, 3) to what is written (G, 3)
+    colors: Annotated[ColorTransform, tyro.conf.arg(name="")] = field(
+        default_factory=ColorTransform
+    )
 
 
 def export(config: ExportConfig) -> Path:
@@ -111,196 +76,92 @@ def export(config: ExportConfig) -> Path:
     if config.layout is not None:
         return export_scene(config.run, config.out, config.layout, config.truth)
     run = Run.open(config.run, config.device)
-    with io.writing_to(config.out):
+    with writing_to(config.out), lock_output(config.out):
         if config.ply_sequence:
-            return export_sequence(run, config.out, config.coloring)
-        times = sorted({f.time for f in run.scene.train})
-        time = times[len(times) // 2] if config.time is None else config.time
-        return export_one(run, config.out, time, config.coloring)
+            return export_sequence(run, config.out, config.colors)
+        time = config.time
+        if time is None:
+            times = sorted({f.time for f in run.scene.train})
+            time = times[len(times) // 2]
+        return export_one(run, config.out, time, config.colors)
 
 
 def check_settings(config: ExportConfig) -> None:
-    """InputError for settings that make no sense whatever the run is."""
-    coloring = config.coloring
+    """InputError for settings that make no sense, whatever the run is."""
     if config.ply + config.ply_sequence + (config.layout is not None) != 1:
-        raise InputError(
-            "export: say what to write, one of --ply (a file), --ply-sequence and --layout NAME (a folder)"
-        )
-    if config.layout is not None and (config.time is not None or coloring != Coloring()):
-        raise InputError(
-            "--layout: writes the recorded frames; --time, --ev, --linear and --camera-id are for Gaussians"
-        )
-    if config.layout is None and config.truth is not None:
-        raise InputError(
-            "--truth: held-out views are pictures, and Gaussians have none; use it with --layout NAME"
-        )
-    if config.ply and (config.out.suffix.lower() != ".ply" or config.out.is_dir()):
-        raise InputError(f"{config.out}: --ply writes one file; give it a name that ends in .ply")
-    if config.ply_sequence and config.out.is_file():
-        raise InputError(
-            f"{config.out}: is a file; --ply-sequence writes a folder, name another one"
-        )
+        choices = "one of --ply (a file), --ply-sequence and --layout NAME (a folder)"
+        raise InputError(f"export: choose what to write, {choices}")
+    check_output(config)
+    check_colors(config.colors)
+    if config.layout is not None:
+        if config.time is not None or config.colors != ColorTransform():
+            options = "--time, --ev, --linear and --camera-id are for Gaussians"
+            raise InputError(f"--layout: writes the recorded frames; {options}")
+    elif config.truth is not None:
+        problem = "held-out views are pictures, and Gaussians have none"
+        raise InputError(f"--truth: {problem}; use it with --layout NAME")
     if config.ply_sequence and config.time is not None:
-        raise InputError(
-            "--time: --ply-sequence writes every training time; use --ply for one time"
-        )
-    if coloring.linear and coloring.ev is not None:
-        raise InputError("--linear --ev: linear radiance is not developed; leave one of them out")
-    if coloring.ev is not None and not abs(coloring.ev) < 60:
-        raise InputError(
-            f"--ev {coloring.ev:g}: an exposure in stops relative to the reference, like -2 or 1.5"
-        )
+        advice = "use --ply for one time"
+        raise InputError(f"--time: --ply-sequence writes every training time; {advice}")
 
 
-def export_scene(
-    folder: Path, out: Path, layout: Literal["hdr-gopro", "nerfstudio"], truth: Path | None = None
-) -> Path:
-    """Write the scene of a scene or run folder in a public layout, with the views of a
-    `truth` folder; the folder that was written.
+def check_output(config: ExportConfig) -> None:
+    """InputError where the output is a folder instead of a file, or the reverse."""
+    out = config.out
+    if config.ply and (out.suffix.lower() != ".ply" or out.is_dir()):
+        raise InputError(f"{out}: --ply writes one file; give it a name that ends in .ply")
+    if config.ply_sequence and out.is_file():
+        advice = "--ply-sequence writes a folder, name another one"
+        raise InputError(f"{out}: is a file; {advice}")
+
+
+def check_colors(colors: ColorTransform) -> None:
+    """InputError for a color transform that makes no sense."""
+    if colors.linear and colors.ev is not None:
+        problem = "linear radiance is not developed"
+        raise InputError(f"--linear --ev: {problem}; leave one of them out")
+    if colors.ev is not None and not abs(colors.ev) < MAX_EV:
+        meaning = "an exposure in stops relative to the reference, like -2 or 1.5"
+        raise InputError(f"--ev {colors.ev:g}: {meaning}")
+
+
+def export_scene(folder: Path, out: Path, layout: Layout, truth: Path | None = None) -> Path:
+    """Write the scene of a scene or run folder in a public layout; the folder written.
+
+    The views of a `truth` folder become held-out pictures.
     """
-    if not (folder / "scene.json").is_file():
-        if not (folder / "config.json").is_file():
-            raise InputError(
-                f"{folder}: neither a scene folder nor a run folder; make a scene with `hdr-nsff prepare`"
-            )
-        folder = read_config(folder).scene
-    for what, kept in (("scene", folder), ("truth", truth)):
-        if kept is not None and (
-            out.resolve().is_relative_to(kept.resolve())
-            or kept.resolve().is_relative_to(out.resolve())
-        ):
-            raise InputError(
-                f"{out}: overlaps the {what} folder {kept}; name a folder outside of it"
-            )
-    source = Source.open(folder)
-    views = to_held_out.views_of(source, truth) if truth is not None else []
-    with io.writing_to(out):
+    scene = scene_folder(folder)
+    check_apart(out, scene, "scene")
+    if truth is not None:
+        check_apart(out, truth, "truth")
+    source = Source.open(scene)
+    views = held_out.views_of(source, truth) if truth is not None else []
+    with writing_to(out), lock_output(out):
         match layout:
             case "hdr-gopro":
-                to_llff.write(source, out, views)
+                llff.write(source, out, views)
             case "nerfstudio":
-                to_nerfstudio.write(source, out, views)
+                nerfstudio.write(source, out, views)
     say(f"{out}: the scene in the {layout} layout; `hdr-nsff prepare {out} SCENE` reads it back")
     return out
 
 
-def export_one(run: Run, path: Path, time: float, coloring: Coloring) -> Path:
-    """Write the Gaussians at `time` in frames to `path`; what it was called."""
-    source = gaussian_field(run, coloring)
-    times = [f.time for f in run.scene.train]
-    if not (math.isfinite(time) and min(times) <= time <= max(times)):
-        raise InputError(
-            f"--time {time:g}: outside the clip ({min(times):g} to {max(times):g} frames)"
-        )
-    if path.exists() and not ply.is_ours(path):
-        raise InputError(
-            f"{path}: is there already and was not made by export; choose another name"
-        )
-    colors = colors_of(run, coloring, exposure_of(run, coloring))
-    count = write_time(source, path, time, colors, coloring)
-    say(f"{path}: {count} Gaussians at time {time:g}")
-    return path
+def scene_folder(folder: Path) -> Path:
+    """`folder` itself where it is a scene folder, the scene of a run folder.
 
-
-def export_sequence(run: Run, folder: Path, coloring: Coloring) -> Path:
-    """Write `folder/00000.ply`, ... at the training times, in order; files already
-    there with the same fingerprint are kept.
+    InputError for any other.
     """
-    source = gaussian_field(run, coloring)
-    times = sorted({f.time for f in run.scene.train})
-    note = open_folder(run, folder, times, coloring)
-    colors = colors_of(run, coloring, note.display_exposure)
-    for i, time in enumerate(track(times, "exporting")):
-        if not (path := folder / f"{i:05d}.ply").exists():
-            write_time(source, path, time, colors, coloring)
-    say(f"{folder}: {len(times)} files, one per training time")
-    return folder
+    if (folder / "scene.json").is_file():
+        return folder
+    if (folder / "config.json").is_file():
+        return read_config(folder).scene
+    advice = "make a scene with `hdr-nsff prepare`"
+    raise InputError(f"{folder}: neither a scene folder nor a run folder; {advice}")
 
 
-def open_folder(run: Run, folder: Path, times: list[float], coloring: Coloring) -> notes.Exported:
-    """The sidecar of a sequence. Where the one on disk is of other settings or of
-    another checkpoint, its files are removed.
-    """
-    key, sidecar = fingerprint(run, times, coloring), folder / "sequence.json"
-    there = sorted(folder.glob("[0-9]*.ply"))
-    foreign = next((p for p in there if not ply.is_ours(p)), None)
-    if foreign is not None:
-        raise InputError(
-            f"{foreign}: is there already and was not made by export; choose another folder"
-        )
-    found = notes.read(sidecar, notes.Exported)
-    if found is not None and found.key == key:
-        return found
-    if there:
-        say(f"{folder}: settings or checkpoint changed, exporting again")
-    for path in there:
-        path.unlink()
-    note = notes.Exported(
-        key=key, step=run.step, times=times, display_exposure=exposure_of(run, coloring)
-    )
-    notes.write(sidecar, note)
-    return note
-
-
-def gaussian_field(run: Run, coloring: Coloring) -> GaussianField:
-    """The run's field; InputError where it is not made of Gaussians, or for a camera
-    that the run has not learned.
-    """
-    if not isinstance(run.field, GaussianField):
-        raise InputError(
-            f"{run.folder}: its field is not made of Gaussians, so there are none to export; train one with `train splat`"
-        )
-    if not 0 <= coloring.camera_id < run.tonemapper.num_cameras:
-        raise InputError(
-            f"camera {coloring.camera_id}: the run has learned cameras 0 to {run.tonemapper.num_cameras - 1}"
-        )
-    return run.field
-
-
-def exposure_of(run: Run, coloring: Coloring) -> float:
-    """The display exposure of the clip as filmed, one for all times; 1 where it is not
-    asked for.
-    """
-    if coloring.linear or coloring.ev is not None:
-        return 1.0
-    frames = sorted(run.scene.train, key=lambda f: f.time)
-    return display_exposure(
-        run, training_path([f.camera for f in frames], [f.time for f in frames])
-    )
-
-
-def colors_of(run: Run, coloring: Coloring, exposure: float) -> Colors:
-    """How radiance becomes color."""
-    if coloring.linear:
-        return lambda radiance: radiance
-    return lambda radiance: develop(run, radiance, coloring.ev, coloring.camera_id, exposure)
-
-
-def write_time(
-    source: GaussianField, path: Path, time: float, colors: Colors, coloring: Coloring
-) -> int:
-    """Write the visible Gaussians at `time` in frames; how many there are."""
-    cloud = source.gaussians(time)
-    whole = (
-        torch.cat([cloud.means, cloud.quaternions, cloud.scales, cloud.radiance], 1)
-        .isfinite()
-        .all(1)
-    )
-
-    def array(values: torch.Tensor) -> np.ndarray:
-        return values[whole].float().cpu().numpy()
-
-    splats = ply.Splats(
-        array(cloud.means),
-        array(cloud.quaternions),
-        array(cloud.scales),
-        array(cloud.opacities),
-        colors(array(cloud.radiance)),
-    )
-    comments = [
-        f"time {time:g} frames",
-        "axes OpenCV: +x right, +y down, +z forward",
-        "color linear radiance" if coloring.linear else "color developed rgb",
-    ]
-    ply.write(path, splats, comments)
-    return int(whole.sum())
+def check_apart(out: Path, folder: Path, name: str) -> None:
+    """InputError where `out` and `folder` overlap, so that `out` would change it."""
+    target, kept = out.resolve(), folder.resolve()
+    if target.is_relative_to(kept) or kept.is_relative_to(target):
+        advice = "name a folder outside of it"
+        raise InputError(f"{out}: overlaps the {name} folder {folder}; {advice}")

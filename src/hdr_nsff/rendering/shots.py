@@ -1,6 +1,8 @@
-"""One shot: a named list of views, and the files made of it. Each shot gets a folder of
-numbered files and a `sequence.json` that holds the hash of everything the pictures
-depend on: frames that are already there are kept, another hash starts over.
+"""A shot: a named list of views, and the files made of it.
+
+Each shot gets a folder of numbered files and a `sequence.json` with a hash of
+everything the pictures depend on. A restart keeps the pictures of the same hash;
+another hash starts over.
 
 Radiance is written in units of the reference exposure (1 = where it saturates).
 Pictures are developed at an EV by a learned camera, or, with no EV asked for,
@@ -14,17 +16,21 @@ import hashlib
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from hdr_nsff.core import io, notes
+from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import SIDES, write_exr
+from hdr_nsff.core.images import contact_sheet, read_image, write_png
+from hdr_nsff.core.process import hold_threads
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.core.tensors import hold_threads, to_device
+from hdr_nsff.core.tensors import to_device
+from hdr_nsff.core.video import write_video
 from hdr_nsff.fields.base import Render, recorded
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import View
@@ -32,10 +38,14 @@ from hdr_nsff.maths import color
 from hdr_nsff.rendering.interpolate import Mode, render_at
 from hdr_nsff.training.run_folder import Run
 
+PROBE_SCALE = 0.25  # size of the pictures that set the display exposure (hand-chosen: it is fast)
+SHEET_VIEWS = 12  # on a contact sheet
+SHEET_COLUMNS = 4
+
 
 @dataclass(frozen=True)
 class Output:
-    """What is written for every view, and how it is developed."""
+    """Which files are written for every view, and how pictures are developed."""
 
     exr: Literal["half", "float", "none"] = "half"
     """EXR: radiance, depth Z, motion, motion vectors."""
@@ -57,7 +67,7 @@ class Output:
 
 @dataclass(frozen=True)
 class Shot:
-    """A named list of views and the speed it is played at."""
+    """A named list of views and its speed."""
 
     name: str
     views: list[View]
@@ -71,219 +81,249 @@ class Still:
     radiance: np.ndarray  # (H, W, 3) linear HDR
     depth: np.ndarray  # (H, W) z-depth, scene units
     motion: np.ndarray  # (H, W) in [0, 1]: share of dynamic content
-    flow: dict[
-        int, np.ndarray
-    ]  # {+-1: (H, W, 2)} pixels: where the content moves until the next / previous frame, camera at rest
+    # {+-1: (H, W, 2)} pixels: motion of the content until the next / previous frame, in
+    # a camera at rest
+    flow: dict[int, np.ndarray]
 
 
 def device_of(run: Run) -> torch.device:
-    """Where the run computes."""
+    """The device of the run's field and tone mapper."""
     return run.tonemapper.knots.device
 
 
-def take(run: Run, view: View, between: Mode = "auto", motion: bool = True) -> Still:
-    """The picture of one view; without `motion` vectors it is there sooner."""
+def render_still(run: Run, view: View, between: Mode = "auto", motion: bool = True) -> Still:
+    """Render one view; without `motion` vectors it takes less time."""
     hold_threads(run.config.torch_threads)
     camera = to_device(view.camera, device_of(run))
+    times = run.scene.times.tolist()
     with torch.no_grad():
-        seen = render_at(run.field, camera, view.time, run.scene.times.tolist(), between, motion)
+        seen = render_at(run.field, camera, view.time, times, between, motion)
         flow = motion_vectors(seen, camera)
 
     def image(values: torch.Tensor) -> np.ndarray:
         return values.reshape(camera.height, camera.width, *values.shape[1:]).float().cpu().numpy()
 
-    return Still(
-        image(seen.radiance),
-        image(seen.depth),
-        image(seen.motion),
-        {o: image(f) for o, f in flow.items()},
-    )
+    flow_images = {offset: image(vectors) for offset, vectors in flow.items()}
+    return Still(image(seen.radiance), image(seen.depth), image(seen.motion), flow_images)
 
 
 def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
-    """The scene flow of a picture as pixels (S, 2) in the same camera: the motion of
-    the content, not of the camera.
+    """The scene flow of a picture as pixels (S, 2) in the same camera.
+
+    It is the motion of the content, not of the camera.
     """
     pixels = camera.pixel_grid()
     rays = camera.rays(pixels)
     points = rays.origins + seen.depth[:, None] * rays.directions
-    return {o: camera.project(points + f)[0] - pixels for o, f in seen.scene_flow.items()}
+    return {
+        offset: camera.project(points + flow)[0] - pixels
+        for offset, flow in seen.scene_flow.items()
+    }
 
 
 def develop(
     run: Run, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float
 ) -> np.ndarray:
-    """An rgb picture (..., 3) in [0, 1] of `radiance`: recorded by a learned camera at
-    `ev`, or (None) tone-mapped for a display.
+    """Radiance (..., 3) as an rgb picture in [0, 1].
+
+    Recorded by a learned camera at `ev`, or (None) tone-mapped for a display
+    at `exposure`.
     """
     if ev is None:
-        return color.display(radiance * run.tonemapper.neutral(camera_id).cpu().numpy(), exposure)
-    return (
-        run.tonemapper.develop(torch.from_numpy(radiance).to(device_of(run)), ev, camera_id)
-        .cpu()
-        .numpy()
-    )
+        neutral = run.tonemapper.neutral(camera_id).cpu().numpy()
+        return color.display(radiance * neutral, exposure)
+    values = torch.from_numpy(radiance).to(device_of(run))
+    return run.tonemapper.develop(values, ev, camera_id).cpu().numpy()
 
 
-def picture_of(
+def develop_view(
     run: Run, view: View, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float
 ) -> np.ndarray:
-    """The same of a view of which the run rendered `radiance` (H, W, 3); fields that
-    record before they composite are asked again.
+    """The same for a view of which the run rendered `radiance` (H, W, 3).
+
+    Fields that record before they composite are rendered again.
     """
     if ev is None:
         return develop(run, radiance, ev, camera_id, exposure)
     flat = torch.from_numpy(radiance.reshape(-1, 3)).to(device_of(run))
     camera = to_device(view.camera, device_of(run))
-    return (
-        recorded(run.field, camera, view.time, [run.tonemapper.recorder_at(ev, camera_id)], flat)[0]
-        .cpu()
-        .numpy()
-        .reshape(radiance.shape)
-    )
+    recorder = run.tonemapper.recorder_at(ev, camera_id)
+    picture = recorded(run.field, camera, view.time, [recorder], flat)[0]
+    return picture.cpu().numpy().reshape(radiance.shape)
 
 
 def display_exposure(run: Run, views: Sequence[View]) -> float:
-    """One display exposure for a whole shot, from three small pictures of it."""
+    """One display exposure for a whole shot.
+
+    It is that of small pictures of its first, middle and last view.
+    """
     probes = [views[i] for i in sorted({0, len(views) // 2, len(views) - 1})]
-    seen = [
-        take(run, v.resized(0.25), "direct", motion=False).radiance.reshape(-1, 3) for v in probes
-    ]
-    return color.auto_exposure(np.concatenate(seen))
+    radiance = []
+    for probe in probes:
+        still = render_still(run, probe.resized(PROBE_SCALE), "direct", motion=False)
+        radiance.append(still.radiance.reshape(-1, 3))
+    return color.auto_exposure(np.concatenate(radiance))
 
 
 def write_still(path: Path, still: Still, view: View, half: bool, header: dict[str, Any]) -> None:
-    """One EXR: RGB radiance, `Z`, `motion`, and motion vectors `forward.u`, `.v`,
-    `backward.u`, `.v` in pixels where known.
+    """One EXR: RGB radiance, `Z`, `motion`, and motion vectors where known.
+
+    The vectors are `forward.u`, `.v`, `backward.u`, `.v` in pixels.
     """
     channels = {"RGB": still.radiance, "Z": still.depth, "motion": still.motion}
-    for offset, name in io.SIDES.items():
-        if offset in still.flow:
-            channels |= {
-                f"{name}.u": still.flow[offset][..., 0],
-                f"{name}.v": still.flow[offset][..., 1],
-            }
+    for offset, flow in still.flow.items():
+        channels[f"{SIDES[offset]}.u"] = flow[..., 0]
+        channels[f"{SIDES[offset]}.v"] = flow[..., 1]
     pose = json.dumps([[round(float(x), 6) for x in row] for row in view.camera.c2w])
-    io.write_exr(path, channels, {**header, "time": float(view.time), "cameraToWorld": pose}, half)
+    write_exr(path, channels, {**header, "time": float(view.time), "cameraToWorld": pose}, half)
 
 
 # One shot
 
 
 def fingerprint(run: Run, *parts: Any) -> str:
-    """A hash of the checkpoint and of everything else given: pictures of one hash are
-    the same.
+    """A hash of the checkpoint, the config and `parts`: equal hashes, equal pictures.
+
+    Where the folders of the run and of its scene are does not count, so a moved run
+    keeps its pictures. The seconds of training distinguish runs of equal configs.
     """
-    text = json.dumps([run.step, repr(run.config), *parts], default=plain, sort_keys=True)
+    config = replace(run.config, scene=Path(), out=Path())
+    values = [run.step, run.seconds, repr(config), *parts]
+    text = json.dumps(values, default=to_plain, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def plain(value: Any) -> Any:
-    """Tensors, paths and dataclasses for JSON."""
-    return (
-        value.tolist()
-        if isinstance(value, torch.Tensor)
-        else vars(value)
-        if hasattr(value, "__dict__")
-        else str(value)
-    )
+def to_plain(value: Any) -> Any:
+    """Tensors, dataclasses and paths as values that JSON knows."""
+    if isinstance(value, torch.Tensor):
+        return value.tolist()
+    if hasattr(value, "__dict__"):
+        return vars(value)
+    return str(value)
 
 
 def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
-    """Write the shot's stills to `out/<name>/`, its video and contact sheet beside it;
-    the video's path (or the folder's).
+    """Write the shot's stills to `out/<name>/`, its video and contact sheet beside it.
+
+    Returns the path of the video; without one, of the folder.
     """
-    if not 0 <= output.camera_id < run.tonemapper.num_cameras:
-        raise InputError(
-            f"camera {output.camera_id}: the run has learned cameras 0 to {run.tonemapper.num_cameras - 1}"
-        )
+    cameras = run.tonemapper.num_cameras
+    if not 0 <= output.camera_id < cameras:
+        problem = f"the run has learned cameras 0 to {cameras - 1}"
+        raise InputError(f"camera {output.camera_id}: {problem}")
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
     sheet = out / f"{shot.name}_sheet.png"
     note = open_sequence(run, shot, folder, output, [video, sheet])
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
-    wanted = (
-        [p.with_suffix(".exr") for p in pictures] * (output.exr != "none")
-        + pictures * output.png
-        + [video] * output.video
-    )
-    if note.complete and all(p.exists() for p in wanted):
+    if note.complete and all(p.exists() for p in wanted_files(pictures, video, output)):
         say(f"{shot.name}: all {len(shot.views)} views are there already ({folder})")
         return result
     start = time.monotonic()
     for picture, view in zip(pictures, track(shot.views, f"rendering {shot.name}"), strict=True):
         write_view(run, view, picture, output, note.display_exposure)
     if output.video:
-        io.write_video(video, (io.read_image(p) for p in pictures), shot.fps)
-    chosen = sorted({round(i) for i in np.linspace(0, len(pictures) - 1, min(12, len(pictures)))})
-    cells = [io.read_image(pictures[i]) for i in chosen]
-    io.write_png(sheet, io.contact_sheet([cells[i : i + 4] for i in range(0, len(cells), 4)]))
+        write_video(video, (read_image(p) for p in pictures), shot.fps)
+    write_sheet(sheet, pictures)
     if not output.png:
         for picture in pictures:
             picture.unlink(missing_ok=True)
     seconds = round(note.seconds + time.monotonic() - start, 2)
-    notes.write(
-        folder / "sequence.json", note.model_copy(update={"complete": True, "seconds": seconds})
-    )
+    done = note.model_copy(update={"complete": True, "seconds": seconds})
+    notes.write(folder / "sequence.json", done)
     return result
+
+
+def wanted_files(pictures: Sequence[Path], video: Path, output: Output) -> list[Path]:
+    """The files that a complete shot consists of."""
+    wanted: list[Path] = []
+    if output.exr != "none":
+        wanted += [p.with_suffix(".exr") for p in pictures]
+    if output.png:
+        wanted += pictures
+    if output.video:
+        wanted.append(video)
+    return wanted
+
+
+def write_sheet(path: Path, pictures: Sequence[Path]) -> None:
+    """A contact sheet of up to `SHEET_VIEWS` pictures, spread evenly over the shot."""
+    count = min(SHEET_VIEWS, len(pictures))
+    chosen = sorted({round(i) for i in np.linspace(0, len(pictures) - 1, count)})
+    cells = [read_image(pictures[i]) for i in chosen]
+    rows = [cells[i : i + SHEET_COLUMNS] for i in range(0, len(cells), SHEET_COLUMNS)]
+    write_png(path, contact_sheet(rows))
 
 
 def open_sequence(
     run: Run, shot: Shot, folder: Path, output: Output, products: Sequence[Path]
 ) -> notes.Sequence:
-    """The sidecar of a shot. Where the one on disk is of other settings or of another
-    checkpoint, its files are removed.
+    """The note of a shot, new or as it was left.
+
+    Pictures and `products` of other settings or of another checkpoint are removed.
+    InputError for files that no `render` has written.
     """
     key = fingerprint(run, shot.views, shot.fps, output)
-    sidecar = folder / "sequence.json"
-    found = notes.read(sidecar, notes.Sequence)
+    path = folder / "sequence.json"
+    found = notes.read(path, notes.Sequence)
     if found is not None and found.key == key:
         return found
     if found is not None:
         say(f"{shot.name}: settings or checkpoint changed, rendering again")
-    stale = (
-        [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}]
-        if folder.is_dir()
-        else []
-    )
-    if not sidecar.is_file() and (foreign := [p for p in [*stale, *products] if p.exists()]):
-        raise InputError(
-            f"{foreign[0]}: is there already and was not made by render; choose another --out"
-        )
-    for path in [*stale, *products]:
-        path.unlink(missing_ok=True)
-    exposure = display_exposure(run, shot.views)
-    views = [
-        notes.SequenceView(time=v.time, ev=v.ev if v.ev is not None else output.ev)
-        for v in shot.views
-    ]
+    old = [*numbered_pictures(folder), *(p for p in products if p.exists())]
+    if old and not path.is_file():
+        problem = "is there already and was not made by render"
+        raise InputError(f"{old[0]}: {problem}; choose another --out")
+    for file in old:
+        file.unlink()
     note = notes.Sequence(
-        key=key, step=run.step, fps=shot.fps, display_exposure=exposure, views=views, seconds=0.0
+        key=key,
+        step=run.step,
+        fps=shot.fps,
+        display_exposure=display_exposure(run, shot.views),
+        views=[notes.SequenceView(time=v.time, ev=ev_of(v, output)) for v in shot.views],
+        seconds=0.0,
     )
-    notes.write(sidecar, note)
+    notes.write(path, note)
     return note
 
 
+def numbered_pictures(folder: Path) -> list[Path]:
+    """PNG and EXR files in `folder` whose names begin with a digit."""
+    return [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}]
+
+
+def ev_of(view: View, output: Output) -> float | None:
+    """The EV at which a view is developed; None: tone-mapped for a display."""
+    return output.ev if view.ev is None else view.ev
+
+
 def write_view(run: Run, view: View, picture: Path, output: Output, exposure: float) -> None:
-    """Make `picture` and the EXR beside it where one of them is missing; `exposure` is
-    that of the display.
+    """Write `picture` and the EXR beside it where one of them is missing.
+
+    `exposure` is that of the display.
     """
     exr = picture.with_suffix(".exr")
-    if picture.exists() and (output.exr == "none" or exr.exists()):
+    with_exr = output.exr != "none"
+    if picture.exists() and (exr.exists() or not with_exr):
         return
-    still = take(run, view, output.between, motion=output.exr != "none")
-    ev = view.ev if view.ev is not None else output.ev
-    if output.exr != "none":
-        shown = {"developedEV": float(ev)} if ev is not None else {"displayExposure": exposure}
-        write_still(exr, still, view, output.exr == "half", {**exposure_header(run), **shown})
-    io.write_png(picture, picture_of(run, view, still.radiance, ev, output.camera_id, exposure))
+    still = render_still(run, view, output.between, motion=with_exr)
+    ev = ev_of(view, output)
+    if with_exr:
+        header = exposure_header(run)
+        if ev is None:
+            header["displayExposure"] = exposure
+        else:
+            header["developedEV"] = float(ev)
+        write_still(exr, still, view, output.exr == "half", header)
+    write_png(picture, develop_view(run, view, still.radiance, ev, output.camera_id, exposure))
 
 
 def exposure_header(run: Run) -> dict[str, Any]:
     """EXR attributes that say what a radiance of 1 means."""
     brackets = " ".join(f"{ev:+.3f}" for ev in run.tonemapper.exposures().tolist())
-    return {
-        "exposure": 0.0,
-        "bracketEV": brackets,
-        "comments": "linear radiance; `exposure` is its EV relative to the reference bracket, where 1 saturates; bracketEV: the clip's",
-    }
+    meaning = (
+        "linear radiance; `exposure` is its EV relative to the reference bracket, where 1 "
+        "saturates; bracketEV: the clip's"
+    )
+    return {"exposure": 0.0, "bracketEV": brackets, "comments": meaning}

@@ -1,5 +1,5 @@
-"""Frames with known poses: pixels to world points and back, and from one frame to
-another.
+"""Frames with known poses in numpy: what the priors of depth and of movers work on.
+Points and pixels go from frame to frame by `geometry/pinhole.py`.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.radiometry.common_range import recorded_range
 
 
@@ -38,27 +39,21 @@ class PosedVideo:
 
     def project(self, i: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """World `points` (P, 3) in frame `i`: pixels (P, 2) with centers at +0.5,
-        z-depth (P,), which are inside the frame (P,).
+        z-depth (P,), and whether they lie inside the frame (P,).
         """
-        local = (points - self.c2w[i, :, 3]) @ self.c2w[i, :, :3]
-        z = local[:, 2]
-        homogeneous = local @ self.K[i].T
-        pixels = homogeneous[:, :2] / np.where(np.abs(z) < 1e-9, 1e-9, z)[:, None]
-        inside = (z > 1e-6) & (pixels >= 0).all(-1) & (pixels <= self.size[::-1]).all(-1)
-        return pixels, z, inside
+        pixels, depth = pinhole.project(points, self.K[i], self.c2w[i])
+        in_front = depth > pinhole.MIN_DEPTH
+        in_frame = (pixels >= 0).all(-1) & (pixels <= self.size[::-1]).all(-1)
+        return pixels, depth, in_front & in_frame
 
     def unproject(self, i: int, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """World points (P, 3) of `pixels` (P, 2) of frame `i` at `disparity` (P,)."""
-        local = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ np.linalg.inv(self.K[i]).T
-        return local / disparity[:, None] @ self.c2w[i, :, :3].T + self.c2w[i, :, 3]
+        return pinhole.unproject(pixels, 1 / disparity, self.K[i], self.c2w[i])
 
     def transfer(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """`A` (3, 3) and `b` (3,) float32: pixel (x, y) of frame `i` at disparity d
         falls on the homogeneous `A (x, y, 1) + d b` of frame `j`, whose third entry is
-        z-depth in `j` times d.
+        the z-depth in `j` times d.
         """
-        to_j = self.K[j] @ self.c2w[j, :, :3].T
-        turn = to_j @ self.c2w[i, :, :3] @ np.linalg.inv(self.K[i])
-        return turn.astype(np.float32), (to_j @ (self.c2w[i, :, 3] - self.c2w[j, :, 3])).astype(
-            np.float32
-        )
+        rotation, shift = pinhole.transfer(self.K[i], self.c2w[i], self.K[j], self.c2w[j])
+        return rotation.astype(np.float32), shift.astype(np.float32)

@@ -19,11 +19,13 @@ import numpy as np
 from pydantic import Field
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import SIDES, read_exr, read_image, read_json
+from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.images import read_image
+from hdr_nsff.core.io import read_json
 from hdr_nsff.core.notes import first_problem
 from hdr_nsff.radiometry.recording import Curve, vignette
-from hdr_nsff.scene.scene import (
-    LARGEST_EV,
+from hdr_nsff.scene.manifest import (
+    MAX_EV,
     FrameEntry,
     Strict,
     inside,
@@ -32,6 +34,8 @@ from hdr_nsff.scene.scene import (
     is_pose,
 )
 
+RESPONSE_MARGIN = 1e-3  # of a recorded value: how far rounding may take it out of [0, 1]
+LARGEST_GAIN = 1e6  # of a white balance
 # Channels of a view's geometry, of the ray through each pixel's center: z-depth in true
 # units (0 where it hits nothing); pixels that the surface moves in this camera,
 # standing still, until one frame later and one frame earlier; the same in the truth's
@@ -136,7 +140,7 @@ class Truth(Strict):
         """What makes no sense together; None where all does."""
         num = len(self.bracket_ev)
         if not 0 <= self.reference_bracket < num or any(
-            ev is not None and abs(ev) > LARGEST_EV for ev in self.bracket_ev
+            ev is not None and abs(ev) > MAX_EV for ev in self.bracket_ev
         ):
             return f"bracket_ev {self.bracket_ev} and reference_bracket {self.reference_bracket} are no exposures in stops"
         if self.bracket_frame is None and None in self.bracket_ev:
@@ -149,7 +153,9 @@ class Truth(Strict):
             )
         if problem := self.response_problem():
             return problem
-        if len(self.white_balance) != 3 or min(self.white_balance) <= 0:
+        if len(self.white_balance) != 3 or not all(
+            0 < gain <= LARGEST_GAIN for gain in self.white_balance
+        ):
             return f"white_balance {self.white_balance} is not three gains above 0"
         if self.K is not None and not is_matrix(self.K, (3, 3), is_intrinsic):
             return "K is no 3x3 camera matrix"
@@ -183,6 +189,8 @@ class Truth(Strict):
             return "response_x and response_y are not three curves over the same exposures"
         if any(b <= a for a, b in itertools.pairwise(x)):
             return "response_x does not rise"
+        if any(not -RESPONSE_MARGIN <= v <= 1 + RESPONSE_MARGIN for c in y for v in c):
+            return "response_y leaves [0, 1], the range of a recorded value"
         return (
             "bracket_ev has an unknown exposure beside a known response"
             if None in self.bracket_ev

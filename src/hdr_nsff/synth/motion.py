@@ -1,29 +1,27 @@
-"""Exact motion of what a rendered picture shows, from the depth, the body and the place
-on it at every pixel's center, and how the bodies move.
+"""Exact motion of a rendered picture, from the depth, the body and the texture
+coordinates at every pixel's center, and from how the bodies move.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from hdr_nsff.core.io import SIDES
+from hdr_nsff.core.exr import SIDES
 from hdr_nsff.synth.scenes.base import SynthScene
-from hdr_nsff.synth.scenes.geometry import back_project, project
+from hdr_nsff.synth.scenes.geometry import back_project, pixel_centers, project
 
-UV = (
-    "surface.u",
-    "surface.v",
-)  # channels: texture coordinates, where the scene has bodies that deform
+# Channels of the texture coordinates, in scenes with bodies that deform.
+UV = ("surface.u", "surface.v")
 
 
-def place(channels: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def surface_points(channels: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """The body (H, W) int and the texture coordinates (H, W, 2) at every pixel's
     center, from the channels of a rendered picture.
     """
     bodies = channels["body"].astype(int)
-    return bodies, np.stack([channels.get(name, np.zeros(bodies.shape)) for name in UV], -1).astype(
-        np.float64
-    )
+    nowhere = np.zeros(bodies.shape)
+    uv = np.stack([channels.get(name, nowhere) for name in UV], -1)
+    return bodies, uv.astype(np.float64)
 
 
 def exact_flow(there: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
@@ -31,8 +29,8 @@ def exact_flow(there: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
     `there` (H, W, 3) at another time, seen then by a camera `c2w` (3, 4).
     """
     height, width = there.shape[:2]
-    pixels = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), -1)
-    return project(there, K, c2w)[0] - pixels
+    seen_at, _ = project(there, K, c2w)
+    return seen_at - pixel_centers(height, width)
 
 
 def depth_there(
@@ -43,28 +41,32 @@ def depth_there(
     i: int,
     j: int,
 ) -> np.ndarray:
-    """Z-depth (H, W) of what frame `i` shows, where it is at the time of frame `j` and
-    in the camera of frame `j`.
+    """Z-depth (H, W) in the camera of frame `j` of the surface that frame `i` shows,
+    moved to the time of frame `j`.
     """
-    points = scene.moved(back_project(channels["Z"], K, c2w[i]), *place(channels), i, j)
-    return project(points, K, c2w[j])[1]
+    here = back_project(channels["Z"], K, c2w[i])
+    bodies, uv = surface_points(channels)
+    _, depth = project(scene.moved(here, bodies, uv, i, j), K, c2w[j])
+    return depth
 
 
 def view_geometry(
     scene: SynthScene, channels: dict[str, np.ndarray], time: float, K: np.ndarray, c2w: np.ndarray
 ) -> dict[str, np.ndarray]:
     """The channels of `truth.GEOMETRY` for a rendered view at `time`: z-depth; flow
-    over one frame in the view's own camera, standing still; scene flow over one frame
-    in the world.
+    over one frame in the view's own camera, held still; scene flow over one frame in
+    the world.
     """
     points = back_project(channels["Z"].astype(np.float64), K, c2w)
-    bodies, uv = place(channels)
+    bodies, uv = surface_points(channels)
+    moving = (bodies > 0)[..., None]
     geometry = {"Z": channels["Z"]}
     for side, name in SIDES.items():
         there = scene.moved(points, bodies, uv, time, time + side)
-        flow = (
-            exact_flow(there, K, c2w) * (bodies > 0)[..., None]
-        )  # rounding moves nothing that stands still
-        geometry |= {f"{name}.{axis}": flow[..., k] for k, axis in enumerate("uv")}
-        geometry |= {f"{name}.{axis}": (there - points)[..., k] for k, axis in enumerate("xyz")}
+        flow = exact_flow(there, K, c2w) * moving  # exactly zero where nothing moves
+        scene_flow = there - points
+        for k, axis in enumerate("uv"):
+            geometry[f"{name}.{axis}"] = flow[..., k]
+        for k, axis in enumerate("xyz"):
+            geometry[f"{name}.{axis}"] = scene_flow[..., k]
     return geometry

@@ -2,10 +2,10 @@
 are exact up to a little noise.
 
 It measures a field and its training apart from the priors. It is made from the truth,
-says so in every step of its manifest, and is no input a user could have. Flow goes from
-a frame to the ones before and after, whichever cameras they are of: `scene.neighbors`
-links consecutive times of one `camera_id`, so the cameras of a rig that take turns
-share id 0.
+says so in every step of its manifest, and is no input that a user could have. Flow goes
+from a frame to the ones before and after, whichever cameras they are of:
+`scene.neighbors` links consecutive times of one `camera_id`, so the cameras of a rig
+that take turns share id 0.
 """
 
 from __future__ import annotations
@@ -16,14 +16,24 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff.core import io
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry, Manifest, Step
+from hdr_nsff.core.exr import SIDES
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_npy, write_npy
+from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.radiometry.response import estimate_response
+from hdr_nsff.radiometry.static_samples import ResponseView
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, StepRecord
+from hdr_nsff.scene.movers import write_movers
+from hdr_nsff.scene.posed_video import PosedVideo
+from hdr_nsff.scene.response import write_response
 from hdr_nsff.synth.motion import depth_there
 from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.geometry import back_project
 
-NOTE = "oracle: from truth"
-SAME = 0.02  # relative depth: how far apart two views of one surface may be
+ORACLE_NOTE = "oracle: from truth"
+MAX_DEPTH_GAP = 0.02  # relative: two views of one surface differ less (hand-chosen)
+POINTS_PER_FRAME = 200  # about as many as structure from motion finds
+DEPTH_MARGIN = 0.05  # relative: near and far are this much beyond the depths
 
 
 @dataclass(frozen=True)
@@ -47,34 +57,30 @@ def write_oracle(
     reference: int,
     noise: OracleNoise,
 ) -> None:
-    """`out`/oracle from the rendered channels of every frame, the recorded `video` (T,
-    H, W, 3), poses and bracket exposures.
+    """Write `out`/oracle from the rendered channels of every frame (`exact`), the
+    recorded `video` (T, H, W, 3), poses (3, 4) and the exposures of the brackets.
     """
-    folder, rng = out / "oracle", np.random.default_rng(noise.seed)
+    folder = out / "oracle"
+    rng = np.random.default_rng(noise.seed)
     count, height, width = video.shape[:3]
-    depths = np.stack([e["Z"] for e in exact])
+    depths = np.stack([channels["Z"] for channels in exact])
     entries = [frame_entry(i, count, K, c2w[i], ev) for i in range(count)]
+    certain = np.ones((height, width), np.float16)
     for i, (channels, entry) in enumerate(zip(exact, entries, strict=True)):
         error = depth_error(noise, (height, width), rng, i)
-        io.write_png(folder / entry.image, video[i])
-        io.write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
-        io.write_npy(
-            folder / f"disparity/{i:05d}.npy", (np.exp(error) / depths[i]).astype(np.float16)
-        )
-        io.write_npy(
-            folder / f"disparity_confidence/{i:05d}.npy", np.ones((height, width), np.float16)
-        )
+        disparity = np.exp(error) / depths[i]
+        write_png(folder / entry.image, video[i])
+        write_png(folder / f"masks/{i:05d}.png", channels["body"] > 0)
+        write_npy(folder / f"disparity/{i:05d}.npy", disparity.astype(np.float16))
+        write_npy(folder / f"disparity_confidence/{i:05d}.npy", certain)
         for j, files in entry.flow.items():
             flow = rendered_flow(channels, j - i)
-            io.write_png(
-                folder / files.valid,
-                visible(flow, depth_there(scene, channels, K, c2w, i, j), depths[j]),
-            )
-            io.write_npy(
-                folder / files.flow,
-                (flow + noise.flow * rng.normal(size=flow.shape)).astype(np.float16),
-            )
-    io.write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
+            valid = visible(flow, depth_there(scene, channels, K, c2w, i, j), depths[j])
+            noisy = flow + noise.flow * rng.normal(size=flow.shape)
+            write_png(folder / files.valid, valid)
+            write_npy(folder / files.flow, noisy.astype(np.float16))
+    write_npy(folder / "points.npy", static_points(exact, K, c2w, rng))
+    steps = ("frames", "exposure", "poses", "masks", "flow", "depth")
     manifest = Manifest(
         source="clip",
         width=width,
@@ -83,20 +89,54 @@ def write_oracle(
         reference_bracket=reference,
         bracket_ev=list(ev),
         exposure_given=True,
-        near=0.95 * float(depths.min()),
-        far=1.05 * float(depths.max()),
+        near=(1 - DEPTH_MARGIN) * float(depths.min()),
+        far=(1 + DEPTH_MARGIN) * float(depths.max()),
         points="points.npy",
+        response="response.json",
+        movers="movers.npz",
         frames=entries,
-        steps={
-            name: Step(done=True, provenance="given", note=NOTE)
-            for name in ("frames", "exposure", "poses", "masks", "flow", "depth")
-        },
+        steps={name: StepRecord(done=True, provenance="given", note=ORACLE_NOTE) for name in steps},
     )
+    write_estimates(folder, manifest, video)
     manifest.save(folder)
 
 
+def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None:
+    """What `prepare` would estimate from the other parts: the response and the movers."""
+    frames = manifest.frames
+    disparity = read_maps(folder, [str(f.disparity) for f in frames])
+    moving = np.stack([read_mask(folder / str(f.mask)) for f in frames])
+    K, c2w = np.array([f.K for f in frames]), np.array([f.c2w for f in frames])
+    views = [
+        ResponseView(video[i], f.bracket, f.time, K[i], c2w[i], disparity[i], None, moving[i])
+        for i, f in enumerate(frames)
+    ]
+    known, reference = manifest.known_ev, manifest.reference_bracket
+    response = estimate_response(views, [0] * len(frames), known, reference, num_cameras=1)
+    write_response(folder / "response.json", response)
+    times = np.array([f.time for f in frames])
+    clip = PosedVideo(K, c2w, times, video, np.zeros(moving.shape, bool), moving)
+    pairs = [(f.index, j) for f in frames for j in f.flow]
+    files = [frames[i].flow[j] for i, j in pairs]
+    flow = read_maps(folder, [f.flow for f in files])
+    valid = np.stack([read_mask(folder / f.valid) for f in files])
+    confidence = np.ones_like(disparity)
+    movers = estimate_movers(clip, flow, valid, np.array(pairs), disparity, confidence)
+    write_movers(folder / "movers.npz", movers)
+
+
+def read_maps(folder: Path, names: list[str]) -> np.ndarray:
+    """Maps of one size, stacked, in single precision."""
+    return np.stack([read_npy(folder / name).astype(np.float32) for name in names])
+
+
 def frame_entry(i: int, count: int, K: np.ndarray, c2w: np.ndarray, ev: list[float]) -> FrameEntry:
-    """Frame `i` of `count` in the manifest: what it is and where its maps are."""
+    """Frame `i` of `count` in the manifest, with the places of its maps."""
+    flow = {}
+    for j in (i - 1, i + 1):
+        if 0 <= j < count:
+            pair = f"flow/{i:05d}_{j:05d}"
+            flow[j] = FlowFiles(flow=f"{pair}.npy", valid=f"{pair}_valid.png")
     return FrameEntry(
         index=i,
         image=f"images/{i:05d}.png",
@@ -109,45 +149,43 @@ def frame_entry(i: int, count: int, K: np.ndarray, c2w: np.ndarray, ev: list[flo
         mask=f"masks/{i:05d}.png",
         disparity=f"disparity/{i:05d}.npy",
         disparity_confidence=f"disparity_confidence/{i:05d}.npy",
-        flow={
-            j: FlowFiles(flow=f"flow/{i:05d}_{j:05d}.npy", valid=f"flow/{i:05d}_{j:05d}_valid.png")
-            for j in (i - 1, i + 1)
-            if 0 <= j < count
-        },
+        flow=flow,
     )
 
 
 def depth_error(
     noise: OracleNoise, size: tuple[int, int], rng: np.random.Generator, frame: int
 ) -> np.ndarray:
-    """The error (H, W) of a frame's log disparity: smooth, and grain from a generator
-    of its own.
+    """The error (H, W) of a frame's log disparity: a smooth part, and grain from a
+    generator of its own.
     """
-    smooth = cv2.resize(
-        rng.normal(size=(8, 8)).astype(np.float32), size[::-1], interpolation=cv2.INTER_CUBIC
-    )
-    return noise.depth * smooth + noise.grain * np.random.default_rng(
-        [noise.seed, frame, 1]
-    ).normal(size=size)
+    coarse = rng.normal(size=(8, 8)).astype(np.float32)
+    smooth = cv2.resize(coarse, size[::-1], interpolation=cv2.INTER_CUBIC)
+    grain = np.random.default_rng([noise.seed, frame, 1]).normal(size=size)
+    return noise.depth * smooth + noise.grain * grain
 
 
 def rendered_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
     """The rendered flow (H, W, 2) px to the next (+1) or previous (-1) frame."""
-    return np.stack([channels[f"{io.SIDES[side]}.u"], channels[f"{io.SIDES[side]}.v"]], -1)
+    name = SIDES[side]
+    return np.stack([channels[f"{name}.u"], channels[f"{name}.v"]], -1)
 
 
 def visible(flow: np.ndarray, expected: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Where the surface is still in the frame and not hidden in the other one, (H, W)
-    bool: the depth `expected` (H, W) of it there agrees with the other frame's `depth`
-    (H, W) at one of the four pixels around.
+    """Where a surface is inside the other frame and not hidden there, (H, W) bool: its
+    `expected` depth (H, W) agrees with the other frame's `depth` (H, W) at one of the
+    four pixels around.
     """
     height, width = depth.shape
     x, y = np.meshgrid(np.arange(width), np.arange(height))
-    left, top = np.floor(x + flow[..., 0]).astype(int), np.floor(y + flow[..., 1]).astype(int)
+    left = np.floor(x + flow[..., 0]).astype(int)
+    top = np.floor(y + flow[..., 1]).astype(int)
     inside = (left >= 0) & (top >= 0) & (left < width - 1) & (top < height - 1)
-    left, top = left.clip(0, width - 2), top.clip(0, height - 2)
-    around = np.stack([depth[top + dy, left + dx] for dy in (0, 1) for dx in (0, 1)])
-    return inside & (np.abs(around / expected - 1).min(0) < SAME)
+    left = left.clip(0, width - 2)
+    top = top.clip(0, height - 2)
+    around = np.stack([depth[top + dy, left + dx] for dy in (0, 1) for dx in (0, 1)])  # (4, H, W)
+    gap = np.abs(around / expected - 1).min(0)
+    return inside & (gap < MAX_DEPTH_GAP)
 
 
 def static_points(
@@ -156,12 +194,12 @@ def static_points(
     c2w: list[np.ndarray],
     rng: np.random.Generator,
 ) -> np.ndarray:
-    """Points (P, 3) of what stands still, 200 from each frame, as structure from motion
-    would give.
+    """Static points (P, 3), up to 200 of each frame, as structure from motion would
+    give.
     """
     points = []
     for channels, pose in zip(exact, c2w, strict=True):
         y, x = np.nonzero(channels["body"] == 0)
-        chosen = rng.choice(len(x), min(200, len(x)), replace=False)
+        chosen = rng.choice(len(x), min(POINTS_PER_FRAME, len(x)), replace=False)
         points.append(back_project(channels["Z"], K, pose)[y[chosen], x[chosen]])
     return np.concatenate(points).astype(np.float32)

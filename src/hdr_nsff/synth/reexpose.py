@@ -1,14 +1,15 @@
-"""Any ordinary clip -> an alternating-exposure problem whose truth is the clip itself.
+"""`hdr-nsff reexpose`: an alternating-exposure problem made of any ordinary clip, whose
+truth is the clip itself.
 
-The clip is linearized (gamma 2.2) and taken for the scene's radiance; a camera with
-another response records it again with alternating exposures, noise and 8 bits. Into
-`OUT`: `clip/` (the footage), `truth/` (radiance of the held-out frames, for
-`evaluate`), `poses_bounds.npy` (where poses are given: those of the footage, for
-`prepare --poses`), `reexpose.json` (what was done).
+The clip is linearized (gamma 2.2) and taken for the scene's radiance. A camera with
+another response records it again with alternating exposures, noise and 8 bits. The
+output folder holds `clip/` (the footage), `truth/` (radiance of the held-out frames,
+for `evaluate`), `poses_bounds.npy` (where poses are given: those of the footage, for
+`prepare --poses`) and `reexpose.json` (the settings).
 
 With poses, held-out frames are missing from the footage, and their time lies between
-their neighbors'. Without, nobody could say where a missing frame was seen from, so they
-stay in the footage and `prepare --hold-out`, or `run --truth`, keeps them out of
+their neighbors'. Without poses, the place of a missing frame's camera would be unknown,
+so they stay in the footage, and `prepare --hold-out` or `run --truth` keeps them out of
 training.
 """
 
@@ -17,30 +18,26 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import (
-    read_json,
-    read_mask,
-    write_exr,
-    write_json,
-    write_npy,
-    write_png,
-    writing_to,
-)
+from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import read_json, write_json, write_npy, writing_to
+from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.radiometry.recording import Curve, Noise, record, response_curve
+from hdr_nsff.radiometry.recording import Curve, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
+from hdr_nsff.synth.settings import MAX_NOISE, sensor_noise
 
-MAX_NOISE = 100.0  # times that of a small sensor: nothing is left of the picture
 MAX_SEED = 2**63
 
 
@@ -84,17 +81,21 @@ class ReexposeConfig:
     """Seed of the noise."""
 
 
-@dataclass(frozen=True)
-class Plan:
-    """Which frame becomes what. `N` frames of the chosen footage."""
+GAMMA = 2.2  # by which the clip is linearized
+MIN_FRAMES = 3  # of the footage
 
-    bracket: list[int]  # per frame: its place in the cycle, as recorded or as it would have been
+
+@dataclass(frozen=True)
+class FramePlan:
+    """The role of every frame of the chosen footage."""
+
+    bracket: list[int]  # per frame: its place in the cycle, also of frames left out
     test: list[int]  # frames that are the truth
     kept: list[int]  # frames of the new footage
 
     def time(self, frame: int) -> float:
-        """The time of a frame in frames of the new footage; half-way where it is
-        missing from it.
+        """The time of a frame in frames of the new footage; half-way between its
+        neighbors where it is missing from it.
         """
         before = sum(k < frame for k in self.kept)
         return float(before) if frame in self.kept else before - 0.5
@@ -105,58 +106,78 @@ class Plan:
 
 
 def reexpose(config: ReexposeConfig) -> Path:
-    """Write the new footage and its truth; the output folder. A killed run goes on
+    """Write the new footage and its truth; the output folder. A killed run continues
     where it was.
     """
-    with writing_to(config.out):
-        ingest.check_choice(
-            config.start, config.end, config.stride, config.max_size, config.hold_out
-        )
-        ingest.check_number("--noise", config.noise, 0, MAX_NOISE)
-        ingest.check_number("--seed", config.seed, 0, MAX_SEED)
-        evs = parse_exposures(None, config.ev)
-        if evs is None:
-            raise InputError(
-                "--ev auto: nothing to find here; list the log2 exposures of one cycle, like -2,0,2"
-            )
+    with writing_to(config.out), lock_output(config.out):
+        evs = check(config)
+        response = response_curve(config.response)
         footage = ingest.open_footage(config.clip)
         if len(footage.cameras) > 1:
             raise InputError(
-                f"{config.clip}: {len(footage.cameras)} cameras; re-expose one camera's folder at a time"
+                f"{config.clip}: {len(footage.cameras)} cameras; "
+                "re-expose one camera's folder at a time"
             )
-        response = response_curve(config.response)
-        numbers, extents, size = [], [], (0, 0)
-        for frame in track(chosen(config, footage), "reading"):
-            numbers.append(frame.number)
-            extents.append(exposure.extent(frame.rgb))
-            size = (frame.rgb.shape[0], frame.rgb.shape[1])
-            ingest.check_frame_size(config.clip, size[1], size[0])
-        work = plan(len(numbers), len(evs), config.hold_out, remove=config.poses is not None)
-        poses = (
-            read_poses(config.poses, footage, numbers, size) if config.poses is not None else None
-        )
-        if (color := exposure.all_clipped(extents)) is not None:
+        numbers, extents, size = look_through(config, footage)
+        plan = plan_frames(len(numbers), len(evs), config.hold_out, config.poses is not None)
+        poses = None
+        if config.poses is not None:
+            poses = read_poses(config.poses, footage, numbers, size)
+        color = exposure.all_clipped(extents)
+        if color is not None:
             raise InputError(
-                f"{config.clip}: all frames are {color}; re-exposed they stay so, choose another clip"
+                f"{config.clip}: all frames are {color}, and re-exposing does not change that; "
+                "choose another clip"
             )
-        masks = (
-            frame_masks(config.masks, work.test, numbers, size) if config.masks is not None else {}
-        )
+        masks = {}
+        if config.masks is not None:
+            masks = frame_masks(config.masks, plan.test, numbers, size)
         claim(config, footage)  # once nothing can be wrong with the settings any more
-        write_frames(config, footage, work, evs, response)
-        write_truth(config.out, work, evs, response, poses, masks)
+        write_frames(config, footage, plan, evs, response)
+        write_truth(config.out, plan, evs, response, poses, masks)
+        given = f"--hold-out {config.hold_out}"
         if poses is not None:
-            write_npy(config.out / "poses_bounds.npy", llff_rows(poses, size)[work.kept])
+            path = config.out / "poses_bounds.npy"
+            write_npy(path, llff_rows(poses, size)[plan.kept])
+            given = f"--poses {path} --hold-out 0"
     say(
-        f"{len(work.kept)} frames in {config.out / 'clip'}, {len(work.test)} true views in {config.out / 'truth'}"
-    )
-    given = (
-        f"--poses {config.out / 'poses_bounds.npy'} --hold-out 0"
-        if poses
-        else f"--hold-out {config.hold_out}"
+        f"{len(plan.kept)} frames in {config.out / 'clip'}, "
+        f"{len(plan.test)} true views in {config.out / 'truth'}"
     )
     say(f"next: hdr-nsff prepare {config.out / 'clip'} SCENE --ev={config.ev} {given}")
     return config.out
+
+
+def check(config: ReexposeConfig) -> list[float]:
+    """The exposures of a cycle, log2. InputError for settings that make no sense
+    whatever the footage is.
+    """
+    evs = parse_exposures(None, config.ev)
+    if evs is None:
+        raise InputError(
+            "--ev auto: there is nothing to detect; list the log2 exposures of one cycle, "
+            "like -2,0,2"
+        )
+    ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
+    ingest.check_number("--noise", config.noise, 0, MAX_NOISE)
+    ingest.check_number("--seed", config.seed, 0, MAX_SEED)
+    return evs
+
+
+def look_through(
+    config: ReexposeConfig, footage: ingest.Footage
+) -> tuple[list[int], list[tuple[float, float]], tuple[int, int]]:
+    """The numbers of the chosen frames in the footage, the extents of their values, and
+    their size (H, W).
+    """
+    numbers, extents = [], []
+    size = (0, 0)
+    for frame in track(chosen(config, footage), "reading"):
+        numbers.append(frame.number)
+        extents.append(exposure.extent(frame.rgb))
+        size = (frame.rgb.shape[0], frame.rgb.shape[1])
+        ingest.check_frame_size(config.clip, size[1], size[0])
+    return numbers, extents, size
 
 
 def chosen(config: ReexposeConfig, footage: ingest.Footage) -> Iterator[ingest.FootageFrame]:
@@ -165,106 +186,120 @@ def chosen(config: ReexposeConfig, footage: ingest.Footage) -> Iterator[ingest.F
 
 
 def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
-    """Write `reexpose.json`; InputError where the output folder holds something else."""
-    given = {
-        name: str(value) if isinstance(value, Path) else value
-        for name, value in asdict(config).items()
-        if name not in ("clip", "out")
-    }
-    told = {
-        "clip": str(config.clip),
-        **given,
-        "inputs": {n: ingest.hash_file(f) for n, f in footage.files.items()},
-    }
+    """Write `reexpose.json`; InputError where the output holds something else."""
+    settings: dict[str, Any] = {"clip": str(config.clip)}
+    for name, value in asdict(config).items():
+        if name not in ("clip", "out"):
+            settings[name] = str(value) if isinstance(value, Path) else value
+    settings["inputs"] = {name: ingest.hash_file(file) for name, file in footage.files.items()}
     path = config.out / "reexpose.json"
     if path.is_file():
-        try:
-            same = {**read_json(path), "clip": ""} == {**told, "clip": ""}
-        except (ValueError, TypeError):
-            same = False
-        if not same:
+        if not same_problem(path, settings):
             raise InputError(
-                f"{config.out}: holds another clip, or one made with other settings; choose another folder"
+                f"{config.out}: holds another clip, or one made with other settings; "
+                "choose another folder"
             )
-    elif config.out.exists() and (
-        not config.out.is_dir()
-        or any(not p.name.startswith(".partial-") for p in config.out.iterdir())
-    ):
+    elif config.out.exists() and not is_empty_folder(config.out):
         raise InputError(
-            f"{config.out}: is there already and was not made by reexpose; choose an empty or new folder"
+            f"{config.out}: is there already and was not made by reexpose; "
+            "choose an empty or new folder"
         )
-    write_json(path, told)
+    write_json(path, settings)
 
 
-def plan(count: int, cycle: int, hold_out: int, remove: bool) -> Plan:
+def same_problem(path: Path, settings: dict[str, Any]) -> bool:
+    """Whether an earlier `reexpose.json` is of the same frames and settings, wherever
+    the clip lay.
+    """
+    try:
+        return {**read_json(path), "clip": ""} == {**settings, "clip": ""}
+    except (ValueError, TypeError):
+        return False
+
+
+def is_empty_folder(path: Path) -> bool:
+    """Whether a folder holds nothing but unfinished files of a killed run."""
+    return path.is_dir() and all(p.name.startswith(".partial-") for p in path.iterdir())
+
+
+def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePlan:
     """Which of `count` frames are recorded, in which bracket, and which are the truth;
-    those missing from the footage if `remove`.
+    with `remove`, those are missing from the footage. InputError where too few remain.
 
     The cycle runs over the recorded frames without a break.
     """
     test = ingest.held_out(count, hold_out, cycle)
-    kept = [k for k in range(count) if not (remove and k in test)]
-    if len(kept) < 3:
+    missing = set(test) if remove else set()
+    kept = [k for k in range(count) if k not in missing]
+    if len(kept) < MIN_FRAMES:
+        frames = "1 frame" if len(kept) == 1 else f"{len(kept)} frames"
         raise InputError(
-            f"{len(kept)} frame{'s' * (len(kept) != 1)} left for the footage; at least 3 are needed, so give a longer clip or another --hold-out"
+            f"{frames} left for the footage; at least {MIN_FRAMES} are needed, "
+            "so give a longer clip or another --hold-out"
         )
     bracket = [sum(j < k for j in kept) % cycle for k in range(count)]
-    return Plan(bracket, test, kept)
+    return FramePlan(bracket, test, kept)
 
 
 def write_frames(
-    config: ReexposeConfig, footage: ingest.Footage, work: Plan, evs: list[float], response: Curve
+    config: ReexposeConfig,
+    footage: ingest.Footage,
+    plan: FramePlan,
+    evs: list[float],
+    response: Curve,
 ) -> None:
-    """Write the recorded frames and the radiance of the held-out ones, those not there
-    yet.
+    """Write the recorded frames and the radiance of the held-out ones, as far as they
+    are not there yet.
     """
-    noise = Noise(1e-3 * config.noise, config.noise**2 / 6000) if config.noise else None
-    total = len(work.bracket)
-    for k, frame in enumerate(track(chosen(config, footage), "frames", total)):
-        radiance = frame.rgb.astype(np.float64) ** 2.2
-        if (
-            k in work.kept
-            and not (image := config.out / f"clip/{work.kept.index(k):05d}.png").is_file()
-        ):
-            rng = np.random.default_rng([config.seed, k])
-            write_png(
-                image, record(radiance, evs[work.bracket[k]], (1, 1, 1), response, noise, rng)
-            )
-        if k in work.test and not (exr := config.out / f"truth/radiance/{k:05d}.exr").is_file():
-            write_exr(exr, {"RGB": radiance.astype(np.float32)})
+    noise = sensor_noise(config.noise)
+    places = {k: place for place, k in enumerate(plan.kept)}
+    white_balance = (1, 1, 1)
+    for k, frame in enumerate(track(chosen(config, footage), "frames", len(plan.bracket))):
+        radiance = frame.rgb.astype(np.float64) ** GAMMA
+        if k in places:
+            image = config.out / f"clip/{places[k]:05d}.png"
+            if not image.is_file():
+                rng = np.random.default_rng([config.seed, k])
+                ev = evs[plan.bracket[k]]
+                write_png(image, record(radiance, ev, white_balance, response, noise, rng))
+        if k in plan.test:
+            exr = config.out / f"truth/radiance/{k:05d}.exr"
+            if not exr.is_file():
+                write_exr(exr, {"RGB": radiance.astype(np.float32)})
 
 
 def write_truth(
     out: Path,
-    work: Plan,
+    plan: FramePlan,
     evs: list[float],
     response: Curve,
     poses: Poses | None,
     masks: dict[int, np.ndarray],
 ) -> None:
-    """Write `truth.json` with the masks it names."""
+    """Write `truth.json` with the masks (H, W) bool that it names, by frame."""
     for k, mask in masks.items():
         write_png(out / f"truth/masks/{k:05d}.png", mask)
+    K = poses.K[0].tolist() if poses is not None else None
     c2w = poses.c2w.tolist() if poses is not None else None
     views = [
         TruthView(
             name=f"{k:05d}",
-            time=work.time(k),
-            bracket=work.bracket[k],
-            anchor=work.anchor(k),
+            time=plan.time(k),
+            bracket=plan.bracket[k],
+            anchor=plan.anchor(k),
             c2w=c2w[k] if c2w else None,
             radiance=f"radiance/{k:05d}.exr",
             mask=f"masks/{k:05d}.png" if k in masks else None,
         )
-        for k in work.test
+        for k in plan.test
     ]
     truth = Truth(
         bracket_ev=evs,
         reference_bracket=int(np.argmin(np.abs(evs))),
         response_x=response.x.tolist(),
         response_y=response.y.tolist(),
-        K=poses.K[0].tolist() if poses is not None else None,
-        clip_c2w=[c2w[k] for k in work.kept] if c2w else None,
+        K=K,
+        clip_c2w=[c2w[k] for k in plan.kept] if c2w else None,
         views=views,
     )
     write_json(out / "truth/truth.json", truth.model_dump())
@@ -274,32 +309,38 @@ def frame_masks(
     folder: Path, frames: list[int], numbers: list[int], size: tuple[int, int]
 ) -> dict[int, np.ndarray]:
     """The masks of `size` (H, W) bool of the held-out `frames`, from a folder with one
-    image for every frame of the clip.
+    image for every frame of the clip. `numbers` are the frames' places in the clip.
     """
     files = ingest.frame_files(folder) if folder.is_dir() else []
-    if len(files) <= max(numbers):
+    needed = max(numbers) + 1
+    if len(files) < needed:
         raise InputError(
-            f"--masks {folder}: {len(files)} masks for a clip of at least {max(numbers) + 1} frames; one per frame, in order"
+            f"--masks {folder}: {len(files)} masks for a clip of at least {needed} frames; "
+            "give one per frame, in order"
         )
-    masks = {k: read_mask(files[numbers[k]]) for k in frames}
-    for k, mask in masks.items():
+    masks = {}
+    for k in frames:
+        file = files[numbers[k]]
+        mask = read_mask(file)
         if mask.shape != size:
             raise InputError(
-                f"{files[numbers[k]]}: the mask is {mask.shape[1]}x{mask.shape[0]}, the frames are {size[1]}x{size[0]}; make it that size"
+                f"{file}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
+                f"the frames are {size[1]}x{size[0]}; make it that size"
             )
+        masks[k] = mask
     return masks
 
 
 def read_poses(
     path: Path, footage: ingest.Footage, numbers: list[int], size: tuple[int, int]
 ) -> Poses:
-    """The poses of frames `numbers` of the clip, for frames of `size` (height, width)."""
+    """The poses of the frames at places `numbers` of the clip, for frames of `size`
+    (H, W).
+    """
     names = list(footage.files)
     if footage.video:
-        names = [
-            f"{footage.path.name}#{n}"
-            for n in range(max(footage.count, max(numbers, default=0) + 1))
-        ]
+        count = max(footage.count, max(numbers, default=0) + 1)
+        names = [f"{footage.path.name}#{n}" for n in range(count)]
     given = import_poses(path, names, size)
     return replace(
         given, K=given.K[numbers], c2w=given.c2w[numbers], registered=given.registered[numbers]
@@ -310,9 +351,10 @@ def llff_rows(poses: Poses, size: tuple[int, int]) -> np.ndarray:
     """(N, 17) as in poses_bounds.npy: 3x5 (columns down, right, back, center, (height,
     width, focal)), then near and far (0: unknown).
     """
-    c = poses.c2w
-    last = np.stack([np.full(len(c), size[0]), np.full(len(c), size[1]), poses.K[:, 0, 0]], -1)
-    matrices = np.stack([c[..., 1], c[..., 0], -c[..., 2], c[..., 3], last], -1)  # (N, 3, 5)
-    return np.concatenate(
-        [matrices.reshape(-1, 15), np.tile([poses.near or 0.0, poses.far or 0.0], (len(c), 1))], 1
-    )
+    c2w = poses.c2w  # (N, 3, 4), columns right, down, forward, center
+    count = len(c2w)
+    camera = np.stack([np.full(count, size[0]), np.full(count, size[1]), poses.K[:, 0, 0]], -1)
+    columns = [c2w[..., 1], c2w[..., 0], -c2w[..., 2], c2w[..., 3], camera]
+    matrices = np.stack(columns, -1)  # (N, 3, 5)
+    bounds = np.tile([poses.near or 0.0, poses.far or 0.0], (count, 1))
+    return np.concatenate([matrices.reshape(-1, 15), bounds], 1)

@@ -19,6 +19,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from hdr_nsff.core.jit import jit
+
 CHUNKS = 16
 CELLS = 0x3F80 + 1  # upper halves of the floats from 0 to 1
 F0, F1 = np.float32(0), np.float32(1)
@@ -37,7 +39,7 @@ def bin_table(knots: Tensor) -> Tensor:
     return bins.to(torch.int16)
 
 
-@numba.njit(inline="always")
+@jit(inline="always")
 def bin_of(x, knots, table):
     """Bin with knots[bin] < x <= knots[bin + 1], the first one for 0; x in [0, 1]."""
     cell = (np.float32(x).view(np.uint32) >> HALF_BITS) & NO_SIGN  # -0 is 0
@@ -45,7 +47,7 @@ def bin_of(x, knots, table):
     return low + np.uint32(x > knots[low + NEXT])
 
 
-@numba.njit(parallel=True, nogil=True, cache=True)
+@jit(parallel=True, nogil=True)
 def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
     """Fill `out` (3, N) with what is recorded of `radiance` (3, N) through `gain` (3,)
     and a curve `values` (3, K) at `knots` (K,).
@@ -72,7 +74,7 @@ def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
                     told[i] = x  # NaN
 
 
-@numba.njit(parallel=True, nogil=True, cache=True)
+@jit(parallel=True, nogil=True)
 def backward(
     radiance,
     gain,

@@ -1,141 +1,92 @@
-"""The paper's objective (eq. 16, METHOD.md 3), term by term, for any field: everything
-here needs a `Render` and a tone mapper only.
+"""The paper's objective (eq. 16), term by term, for any field: everything here needs a
+`Render` and a tone mapper only. docs/method.md lists the terms beside the paper's.
 
-The field's own per-sample regularizers and the tone mapper's come in by name. Keys are
-the field names of `LossWeights`; a term without a weight is an error. `phase` is the
-time since the start in units of the schedule's period K.
+Terms that only some fields make possible, and the tone mapper's, carry weights of their
+own; `total` sums all of them by name. `phase` is the time since the start in units of
+the schedule's period K.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor
 
+from hdr_nsff.core.settings import Weight
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.maths import losses
 from hdr_nsff.scene.batch import PixelBatch
-from hdr_nsff.tonemap.tonemapper import ToneMapper
+from hdr_nsff.tonemap.base import ToneMapper
 
 
 @dataclass(frozen=True)
 class LossWeights:
-    """Weights of the terms; 0 turns one off. Defaults are the `grid` preset's."""
+    """Weights of the terms of every field; 0 turns one off."""
 
-    photometric: float = 1.0
-    """Eq. 12: blended render against the recording, uniformly drawn pixels."""
-    dynamic: float = 1.0
-    """The dynamic branch alone (eq. 7) or the moving pixels again (densities that add
-    up), saturation-weighted.
-    """
-    temporal: float = 0.3
-    """Eq. 13: renders warped from the neighboring times."""
-    chain: float = 0.1
-    """The same through two steps, from phase 2 on."""
-    cycle: float = 0.5
-    flow_magnitude: float = 0.01
-    smoothness: float = 0.1
-    kinetic: float = 0.1
-    disocclusion: float = 0.02
-    blend_entropy: float = 0.0
-    depth: float = 0.5
-    """Depth prior; fades, see `prior_fade`."""
-    flow: float = 0.01
-    """Optical-flow prior, in pixels; fades, see `prior_fade`."""
-    mask: float = 0.2
-    """Cross-entropy between rendered motion and the moving mask."""
-    opacity: float = 0.01
-    """Mean opacity of Gaussians: what is not needed fades and is used elsewhere."""
-    scale: float = 0.01
-    """Mean scale of Gaussians, in units of the near depth."""
-    trajectory: float = 30.0
-    """Square of third differences of the shared motions, in units of the near depth."""
-    brightness_drift: float = 0.01
-    """Square of static Gaussians' changes of log radiance in time."""
-    opacity_offsets: float = 1e-3
-    """Square of moving Gaussians' changes of opacity logit from one knot to the next.
-    """
-    color_change: float = 0.01
-    """Square of moving Gaussians' changes of log radiance from one color knot to the
-    next.
-    """
-    rigidity: float = 1.0
-    """Square of the differences in how neighboring moving Gaussians mix the shared
-    motions.
-    """
-    sh1: float = 0.01
-    """Square of Gaussians' changes of log radiance with the direction of view."""
-    transient: float = 0.01
-    """Mean optical thickness of a sample of NeRF-W's transient branch."""
-    total_variation: float = 1e-4
-    """Mean square differences of neighbors in HexPlane's planes."""
-    pose: float = 1e-4
-    """What the drawn camera's corrections cost: of its pose by a Cauchy prior, of its
-    focal length squared (`refine_poses`).
-    """
-    response_smoothness: float = 1e-3
-    unit_exposure: float = 0.5
-    """Distance of a network response from mid gray at the unit exposure."""
-    gain_residual: float = 1.0
-    response_anchor: float = 100.0
+    photometric: Weight = 1.0
+    """Eq. 12: the picture against the recording, uniformly drawn pixels."""
+    dynamic: Weight = 1.0
+    """The dynamic branch alone (eq. 7), or --moving-rays again; by trust in the rgb."""
+    depth: Weight = 0.5
+    """Depth prior."""
+    flow: Weight = 0.01
+    """Optical flow prior, in pixels."""
+    mask: Weight = 0.2
+    """Cross-entropy of rendered motion and moving mask."""
 
 
 @dataclass(frozen=True)
 class Objective:
     """How the terms are formed."""
 
-    weights: LossWeights
-    depth_kind: str  # "scene": disparity in scene units; "relative": known up to scale and shift
+    weights: dict[str, float]  # of every term that this run can form
+    depth_kind: str  # "scene": disparity in scene units; "relative": up to scale and shift
     near: float  # z-depth, scene units
     squared: bool = False  # eq. 12-13 as printed; False: absolute, as the reference does
-    saturation: bool = True  # trust recorded values near 0 and 1 less in the dynamic terms
+    saturation: bool = True  # trust rgb near 0 and 1 less in the dynamic terms
     fade: float = 0.1  # of the depth and flow terms, every phase
-    flow_limit: float | None = 20.0  # pixels: an outlier of the flow prior costs no more than this
+    flow_limit: float | None = 20.0  # px: no outlier of the flow prior costs more
 
     def terms(
         self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
         """All terms that need only the render, unweighted."""
-        rgb = self.recorded(render.radiance, batch, tonemap) if render.rgb is None else render.rgb
+        rgb = render.rgb
+        if rgb is None:
+            rgb = record(render.radiance, batch, tonemap)
         uniform = None if batch.uniform.all() else batch.uniform[:, None].to(rgb)
         terms = {"photometric": losses.photometric(rgb, batch.rgb, uniform, self.squared)}
         terms |= self.dynamic(render, rgb, batch, tonemap, phase)
         terms |= self.warped(render, batch, tonemap, phase)
         terms |= self.priors(render, batch, phase)
         if render.scene_flow:
-            terms["flow_magnitude"] = torch.stack(
-                [losses.flow_magnitude(f) for f in render.scene_flow.values()]
-            ).mean()
+            lengths = [losses.flow_magnitude(flow) for flow in render.scene_flow.values()]
+            terms["flow_magnitude"] = torch.stack(lengths).mean()
         return terms
 
-    def recorded(self, radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
-        """What the batch's camera would have recorded of `radiance` (N, 3)."""
-        return tonemap(radiance, batch.bracket, batch.camera_id, batch.frame, leaky=True)
-
     def trust(self, batch: PixelBatch) -> Tensor:
-        """Trust (N, 3) in the recorded values where what is compared to them is the
-        dynamic content.
-        """
-        return (
-            losses.saturation_weight(batch.rgb) if self.saturation else torch.ones_like(batch.rgb)
-        )
+        """Trust (N, 3) in recorded values where the dynamic content is compared to them."""
+        if self.saturation:
+            return losses.saturation_weight(batch.rgb)
+        return torch.ones_like(batch.rgb)
 
     def dynamic(
         self, render: Render, rgb: Tensor, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
-        """The dynamic branch against the recording: everywhere in the first phase,
-        later by its share of the ray.
+        """The dynamic branch against the recording: everywhere in the first phase, later
+        by its share of the ray. Without such a branch, the extra moving pixels.
         """
-        if render.dynamic_radiance is None and batch.uniform.all():
-            return {}
-        trust = self.trust(batch)
         if render.dynamic_radiance is not None:
-            alone = self.recorded(render.dynamic_radiance, batch, tonemap)
-            share = render.motion.detach()[:, None] if phase >= 1 else torch.ones_like(trust)
-            return {"dynamic": losses.photometric(alone, batch.rgb, trust * share, self.squared)}
-        extra = (~batch.uniform)[:, None].to(trust)
-        return {"dynamic": losses.photometric(rgb, batch.rgb, trust * extra, self.squared)}
+            rgb = record(render.dynamic_radiance, batch, tonemap)
+            weight = self.trust(batch)
+            if phase >= 1:
+                weight = weight * render.motion.detach()[:, None]
+        elif batch.uniform.all():
+            return {}
+        else:
+            weight = self.trust(batch) * (~batch.uniform)[:, None]
+        return {"dynamic": losses.photometric(rgb, batch.rgb, weight, self.squared)}
 
     def warped(
         self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float
@@ -143,65 +94,73 @@ class Objective:
         """Eq. 13 for the neighbors, and through two steps from phase 2 on; weighted by
         what is not disoccluded.
         """
-        seen = [w for w in render.warps if w.radiance is not None]
-        if not seen:
-            return {}
-        trust = self.trust(batch)
-        share = render.motion.detach() if phase >= 1 else torch.ones_like(render.motion)
 
-        def term(w: Warp) -> Tensor:
-            assert w.radiance is not None
-            rgb = self.recorded(w.radiance, batch, tonemap)
-            return losses.photometric(
-                rgb, batch.rgb, trust * (w.confidence * share)[:, None], self.squared
-            )
+        def term(warp: Warp) -> Tensor:
+            assert warp.radiance is not None
+            rgb = record(warp.radiance, batch, tonemap)
+            share = warp.confidence
+            if phase >= 1:
+                share = share * render.motion.detach()
+            weight = self.trust(batch) * share[:, None]
+            return losses.photometric(rgb, batch.rgb, weight, self.squared)
 
-        single = [term(w) for w in seen if abs(w.offset) == 1]
-        double = [term(w) for w in seen if abs(w.offset) == 2 and phase >= 2]
-        terms = {"temporal": torch.stack(single).mean()} if single else {}
-        return terms | ({"chain": torch.stack(double).mean()} if double else {})
+        warps = [warp for warp in render.warps if warp.radiance is not None]
+        single = [term(warp) for warp in warps if abs(warp.offset) == 1]
+        double = [term(warp) for warp in warps if abs(warp.offset) == 2 and phase >= 2]
+        terms = {}
+        if single:
+            terms["temporal"] = torch.stack(single).mean()
+        if double:
+            terms["chain"] = torch.stack(double).mean()
+        return terms
 
     def priors(self, render: Render, batch: PixelBatch, phase: float) -> dict[str, Tensor]:
         """Depth, optical flow and moving mask; depth and flow are multiplied by `fade`
         every phase.
         """
-        terms, fade = {}, self.fade ** int(phase)
+        terms = {}
+        fade = self.fade ** int(phase)
         depth = render.depth if render.dynamic_depth is None else render.dynamic_depth
-        if batch.disparity is not None:
-            confidence = (
-                torch.ones_like(batch.disparity)
-                if batch.disparity_confidence is None
-                else batch.disparity_confidence
+        if batch.disparity is not None and self.depth_kind == "relative":
+            terms["depth"] = fade * losses.depth_relative(depth, batch.disparity)
+        elif batch.disparity is not None:
+            confidence = batch.disparity_confidence
+            if confidence is None:
+                confidence = torch.ones_like(batch.disparity)
+            terms["depth"] = fade * losses.depth_scene(
+                depth, batch.disparity, confidence, self.near
             )
-            if self.depth_kind == "scene":
-                terms["depth"] = fade * losses.depth_scene(
-                    depth, batch.disparity, confidence, self.near
-                )
-            else:
-                terms["depth"] = fade * losses.depth_relative(depth, batch.disparity)
-        flows = [
-            losses.optical_flow(
-                w.flow, batch.flow[w.offset], batch.flow_valid[w.offset], self.flow_limit
-            )
-            for w in render.warps
-            if w.offset in batch.flow
-        ]
+        flows = []
+        for warp in render.warps:
+            if warp.offset in batch.flow:
+                target, valid = batch.flow[warp.offset], batch.flow_valid[warp.offset]
+                flows.append(losses.optical_flow(warp.flow, target, valid, self.flow_limit))
         if flows:
             terms["flow"] = fade * torch.stack(flows).mean()
         if batch.moving is not None:
-            terms["mask"] = losses.motion_mask(
-                render.motion,
-                batch.moving,
-                None if batch.outline is None else (~batch.outline).float(),
-            )
+            certain = None if batch.outline is None else (~batch.outline).float()
+            terms["mask"] = losses.motion_mask(render.motion, batch.moving, certain)
         return terms
 
     def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """The weighted sum. KeyError-like AssertionError for a term without a weight."""
-        known = {f.name: getattr(self.weights, f.name) for f in fields(self.weights)}
-        unknown = set(terms) - set(known)
-        assert not unknown, f"terms without a weight in LossWeights: {sorted(unknown)}"
-        counting = torch.stack([value for name, value in terms.items() if known[name]])
-        return (
-            counting * torch.tensor([known[name] for name in terms if known[name]]).to(counting)
-        ).sum()
+        """The weighted sum; a term without a weight is an error."""
+        unknown = set(terms) - set(self.weights)
+        assert not unknown, f"terms without a weight: {sorted(unknown)}"
+        counting = {name: value for name, value in terms.items() if self.weights[name]}
+        values = torch.stack(list(counting.values()))
+        return (values * torch.tensor([self.weights[name] for name in counting]).to(values)).sum()
+
+
+def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
+    """What the batch's camera would have recorded of `radiance` (N, 3)."""
+    return tonemap(radiance, batch.bracket, batch.camera_id, batch.frame, leaky=True)
+
+
+def merge_weights(shared: LossWeights, *others: dict[str, float]) -> dict[str, float]:
+    """All weights of a run by the names of their terms, each made in one place."""
+    merged = asdict(shared)
+    for weights in others:
+        twice = set(merged) & set(weights)
+        assert not twice, f"weights of one name in two places: {sorted(twice)}"
+        merged |= weights
+    return merged

@@ -25,6 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Frame, Scene
@@ -62,7 +63,8 @@ class PoseCorrections(nn.Module):
         super().__init__()
         if scene.manifest.parallax == "none":
             raise InputError(
-                f"{scene.folder}: the camera stands still, there are no poses to refine; train without --refine-poses"
+                f"{scene.folder}: the camera stands still, there are no poses to refine; "
+                "train without --refine-poses"
             )
         self.unit = typical_depth(scene)
         self.links = [f.neighbors for f in scene.train]
@@ -129,13 +131,10 @@ class PoseCorrections(nn.Module):
         size = (twist[:3] / DEGREE).square().sum() + (twist[3:] / SHIFT).square().sum()
         return {"pose": (size / DOUBT**2).log1p() + zoom.square()}
 
-    def param_groups(self, lr: float) -> list[dict[str, Any]]:
+    def param_groups(self, lr: float) -> list[ParamGroup]:
         """Poses and focal lengths; `lr` in shares of the picture's width."""
-        common = {"betas": BETAS, "eps": 1e-15, "start": START}
-        return [
-            {"params": [self.moves], "lr": lr, **common},
-            {"params": [self.zooms], "lr": ZOOM_RATE * lr, **common},
-        ]
+        rates = [(self.moves, lr), (self.zooms, ZOOM_RATE * lr)]
+        return [ParamGroup([p], rate, BETAS, eps=1e-15, start=START) for p, rate in rates]
 
     @torch.no_grad()
     def fix_gauge(self) -> None:
@@ -145,11 +144,14 @@ class PoseCorrections(nn.Module):
         self.moves.copy_(torch.einsum("cij,cj->ci", self.judge, twists))
 
     @torch.no_grad()
-    def told(self) -> str:
+    def describe(self) -> str:
         """How far the cameras have come, in words."""
         turn, shift = (t.square().sum(-1).mean().sqrt() for t in self.twists().split(3, -1))
         zoom = (ZOOM * self.zooms).expm1().square().mean().sqrt()
-        return f"cameras: turned by {turn / DEGREE:.2f} degrees, shifted by {shift:.2%} of the depth, focal length by {zoom:.2%} (rms)"
+        return (
+            f"cameras: turned by {turn / DEGREE:.2f} degrees, shifted by {shift:.2%} of the depth, "
+            f"focal length by {zoom:.2%} (rms)"
+        )
 
     @torch.no_grad()
     def applied(self, scene: Scene) -> Scene:

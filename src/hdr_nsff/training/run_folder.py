@@ -5,7 +5,9 @@ mapper from it alone. Nothing is unpickled; every write is atomic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+import os
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -13,15 +15,20 @@ from torch import Tensor
 
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, unpack, write_checkpoint
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.notes import LogLine
-from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.fields import build_field
-from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.scene.scene import Scene
-from hdr_nsff.tonemap.tonemapper import ToneMapper
+from hdr_nsff.fields.base import RadianceField, recorded
+from hdr_nsff.fields.build import build_field, device_for
+from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.tonemap.base import ToneMapper
+from hdr_nsff.tonemap.build import tone_mapper_for
+from hdr_nsff.training.budget import Clock
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import PoseCorrections
+
+CONFIG = "config.json"
+SCENE_FROM_RUN = "scene_from_run"  # key of config.json: the scene's path from the run folder
 
 
 def keep_snapshot(
@@ -64,23 +71,22 @@ class Run:
         found = read_checkpoint(at) if at is not None else latest_checkpoint(folder)
         if found is None:
             raise InputError(f"{folder}: no checkpoint yet; run `hdr-nsff train` to the first one")
-        field, tonemapper = (
-            build_field(config.field, scene),
-            ToneMapper.for_scene(config.tonemap, scene),
-        )
+        field = build_field(config.field, scene)
+        tonemapper = tone_mapper_for(config.tonemap, scene)
         modules: dict[str, torch.nn.Module] = {"field": field, "tonemapper": tonemapper}
         poses = PoseCorrections(scene) if config.refine_poses else None
-        unpack(found.tensors, modules if poses is None else {**modules, "poses": poses}, {})
-        scene = scene if poses is None else poses.applied(scene)
-        target = pick_device(device)
+        if poses is not None:
+            modules["poses"] = poses
+        unpack(found.tensors, modules, {})
+        target = device_for(config.field, device)
         return Run(
-            folder,
-            config,
-            scene,
-            field.to(target).eval(),
-            tonemapper.to(target).eval(),
-            found.step,
-            found.seconds,
+            folder=folder,
+            config=config,
+            scene=scene if poses is None else poses.applied(scene),
+            field=field.to(target).eval(),
+            tonemapper=tonemapper.to(target).eval(),
+            step=found.step,
+            seconds=found.seconds,
         )
 
     def log(self) -> list[LogLine]:
@@ -88,26 +94,99 @@ class Run:
         return read_log(self.folder)
 
 
+def open_folder(config: TrainConfig) -> None:
+    """Start a run folder, or make sure an existing one was started with the same
+    settings; a scene that has moved is written down.
+    """
+    out = config.out
+    if (out / CONFIG).exists():
+        before = read_config(out)
+        before = replace(before, scene=config.scene, out=out, device=config.device)
+        if before != config:
+            raise InputError(
+                f"{out}: holds a run with other settings; "
+                "choose another --out, or delete it to start over"
+            )
+    elif any((out / "checkpoints").glob("step_*.safetensors")):
+        raise InputError(
+            f"{out}: holds checkpoints but no {CONFIG}; "
+            "choose another --out, or delete it to start over"
+        )
+    write_config(out, config)
+
+
 def read_config(folder: Path) -> TrainConfig:
-    """The config of a run folder."""
-    path = Path(folder) / "config.json"
+    """The config of a run folder, with its scene where it now is.
+
+    The scene is looked for beside the run first, as far from it as when it was trained,
+    so that a folder that holds both can be moved or copied; then where it was.
+    """
+    path = Path(folder) / CONFIG
     if not path.is_file():
         raise InputError(
-            f"{folder}: no config.json here; this is not a run folder, make one with `hdr-nsff train`"
+            f"{folder}: no {CONFIG} here; this is not a run folder, make one with `hdr-nsff train`"
         )
     try:
-        return TrainConfig.from_json(read_json(path))
-    except InputError:
-        raise
+        data = read_json(path)
     except ValueError as error:
         raise InputError(
             f"{path}: not readable JSON; restore it or train again into a new folder"
         ) from error
+    beside = data.pop(SCENE_FROM_RUN, None) if isinstance(data, dict) else None
+    config = TrainConfig.from_json(data)
+    candidates = [config.scene]
+    if isinstance(beside, str):
+        candidates.insert(0, (Path(folder).resolve() / beside).resolve())
+    for scene in candidates:
+        if (scene / "scene.json").is_file():
+            return replace(config, scene=scene)
+    raise InputError(
+        f"{folder}: its scene is not at {config.scene} any more; put it back, or say where it is: "
+        f"`hdr-nsff train` with the same settings, --scene and --out {folder}"
+    )
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:
-    """Save the config of a run."""
-    write_json(Path(folder) / "config.json", config.to_json())
+    """Save the config of a run, and where its scene is as seen from there."""
+    data = config.to_json()
+    try:
+        data[SCENE_FROM_RUN] = os.path.relpath(config.scene, folder.resolve())
+    except ValueError:  # another drive of Windows
+        data[SCENE_FROM_RUN] = None
+    write_json(Path(folder) / CONFIG, data)
+
+
+def write_preview(
+    folder: Path,
+    step: int,
+    field: RadianceField,
+    tonemapper: ToneMapper,
+    frame: Frame,
+    position: int,
+) -> None:
+    """previews/: a training frame as recorded and as rendered, side by side."""
+    recorder = tonemapper.recorder(frame.bracket, frame.camera_id, position)
+    with torch.no_grad():
+        rgb = recorded(field, frame.camera, frame.time, [recorder])[0].view_as(frame.image)
+    pair = torch.cat([frame.image, rgb], 1).cpu().numpy()
+    write_png(folder / "previews" / f"step_{step:08d}.png", pair)
+
+
+def append_log(folder: Path, clock: Clock, num_rays: int, values: dict[str, float]) -> None:
+    """Add a line to log.jsonl: the `values` of a step, which compared `num_rays` pixels."""
+    line = {
+        "step": clock.step,
+        "seconds": round(clock.seconds, 3),
+        "psnr": values["psnr"],
+        "rays_per_second": num_rays * clock.step / clock.seconds,
+        "losses": {name: value for name, value in values.items() if name != "psnr"},
+    }
+    with open(folder / "log.jsonl", "ab+") as file:
+        end = file.seek(0, os.SEEK_END)
+        file.seek(max(end - 1, 0))
+        whole = file.read() in (b"", b"\n")  # a kill may have cut the last line short
+        separator = b"" if whole else b"\n"
+        file.write(separator + json.dumps(line).encode() + b"\n")
 
 
 def last_logged(folder: Path) -> LogLine | None:

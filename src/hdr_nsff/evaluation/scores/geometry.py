@@ -1,6 +1,8 @@
-"""Depth and motion against the exact ones. A scene's scale is its own: depth takes one
-scale for all views, the median ratio, and scene flow that of the similarity between
-estimated and true camera centers. Motion is per frame, to later and to earlier times.
+"""Depth and motion against the exact ones.
+
+The scale of an estimated scene is arbitrary. Depth therefore takes one scale for all
+views, the median ratio; scene flow takes that of the similarity between estimated and
+true camera centers. Motion is per frame, to later and to earlier times.
 """
 
 from __future__ import annotations
@@ -13,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff.core import io
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.exr import SIDES, read_exr
 from hdr_nsff.evaluation.predictions import Geometry, geometry_of
 from hdr_nsff.evaluation.targets import GeometryFile, Target, moving_of
 from hdr_nsff.maths import metrics
 from hdr_nsff.scene.truth import GEOMETRY
 
-GEOMETRY_SCORES = {  # what they are called, and digits after the point
+GEOMETRY_SCORES = {  # label, and digits after the point
     "depth_abs_rel": ["depth, AbsRel", 4],
     "depth_abs_rel_moving": ["depth, AbsRel moving", 4],
     "depth_rmse": ["depth, RMSE, true units", 4],
@@ -38,35 +40,29 @@ GEOMETRY_SCORES = {  # what they are called, and digits after the point
 class Units:
     """True units per scene unit."""
 
-    # by which predicted depth is multiplied, for all views: the median of truth /
-    # prediction
-    depth: float
-    world: (
-        float | None
-    )  # of the similarity between the camera paths; None where the cameras do not spread
+    depth: float  # factor of predicted depth, for all views: the median of truth / prediction
+    # of the similarity between the camera paths; None where the cameras do not spread
+    world: float | None
 
 
 def true_geometry(file: GeometryFile) -> Geometry:
     """Depth and motion of a truth file, in true units along the axes of the scene."""
-    channels = io.read_exr(file.path)
-    if lost := [n for n in GEOMETRY if n not in channels]:
-        raise InputError(
-            f"{file.path}: no channel {lost[0]} in this truth file; make the truth anew"
-        )
+    channels = read_exr(file.path)
+    missing = [name for name in GEOMETRY if name not in channels]
+    if missing:
+        problem = f"no channel {missing[0]} in this truth file"
+        raise InputError(f"{file.path}: {problem}; make the truth again")
     if channels["Z"].shape != file.size:
-        raise InputError(
-            f"{file.path}: depth of {channels['Z'].shape}, but the pictures of that view are {file.size}"
-        )
+        problem = f"but the pictures of that view are {file.size}"
+        raise InputError(f"{file.path}: depth of {channels['Z'].shape}, {problem}")
 
     def stacked(name: str, axes: str) -> Tensor:
         return torch.from_numpy(np.stack([channels[f"{name}.{a}"] for a in axes], -1))
 
-    turn = torch.from_numpy(file.turn).float()
-    return Geometry(
-        torch.from_numpy(channels["Z"]),
-        {s: stacked(n, "uv") for s, n in io.SIDES.items()},
-        {s: stacked(n, "xyz") @ turn.T for s, n in io.SIDES.items()},
-    )
+    rotation = torch.from_numpy(file.rotation).float()
+    flow = {side: stacked(name, "uv") for side, name in SIDES.items()}
+    scene_flow = {side: stacked(name, "xyz") @ rotation.T for side, name in SIDES.items()}
+    return Geometry(torch.from_numpy(channels["Z"]), flow, scene_flow)
 
 
 def find_units(
@@ -75,53 +71,61 @@ def find_units(
     """One set of units for all views; None where no view has a true depth.
     `world_scale`: scene units per true unit.
     """
-    pairs = [
-        (geometry_of(path, t.view).depth.flatten(), true_geometry(t.geometry).depth.flatten())
-        for t, path in zip(targets, predictions, strict=True)
-        if t.geometry is not None
-    ]
-    if not pairs:
+    predicted, true = [], []
+    for target, path in zip(targets, predictions, strict=True):
+        if target.geometry is not None:
+            predicted.append(geometry_of(path, target.view).depth.flatten())
+            true.append(true_geometry(target.geometry).depth.flatten())
+    if not true:
         return None
-    predicted, true = (torch.cat(maps) for maps in zip(*pairs, strict=True))
-    return Units(metrics.median_ratio(predicted, true), 1 / world_scale if world_scale else None)
+    depth = metrics.median_ratio(torch.cat(predicted), torch.cat(true))
+    return Units(depth, 1 / world_scale if world_scale else None)
 
 
 def score_geometry(target: Target, prediction: Path, units: Units) -> dict[str, float]:
-    """Depth and motion of a view; names as in `GEOMETRY_SCORES`. Only where the true
-    ray hits something; moving-only where that moves.
+    """Depth and motion of a view; names as in `GEOMETRY_SCORES`.
+
+    Over pixels whose true ray hits a surface, moving-only where that moves.
     """
     if target.geometry is None:
         return {}
-    seen, true = geometry_of(prediction, target.view), true_geometry(target.geometry)
-    known, moving = true.depth > 0, moving_of(target)
-    regions = {"": known} | ({} if moving is None else {"_moving": known & moving})
+    predicted = geometry_of(prediction, target.view)
+    true = true_geometry(target.geometry)
+    moving = moving_of(target)
+    regions = {"": true.depth > 0}  # (H, W)
+    if moving is not None:
+        regions["_moving"] = (true.depth > 0) & moving
     scores: dict[str, float] = {}
-    for name, region in regions.items():
+    for suffix, region in regions.items():
         if region.any():
-            scores[f"depth_abs_rel{name}"], scores[f"depth_rmse{name}"] = metrics.depth_errors(
-                seen.depth * units.depth, true.depth, region
-            )
-            scores |= {f"{k}{name}": v for k, v in motion_errors(seen, true, region, units).items()}
+            depth = predicted.depth * units.depth
+            abs_rel, rmse = metrics.depth_errors(depth, true.depth, region)
+            scores[f"depth_abs_rel{suffix}"] = abs_rel
+            scores[f"depth_rmse{suffix}"] = rmse
+            for name, error in motion_errors(predicted, true, region, units).items():
+                scores[f"{name}{suffix}"] = error
     return scores
 
 
-def motion_errors(seen: Geometry, true: Geometry, region: Tensor, units: Units) -> dict[str, float]:
-    """End-point errors over a region (H, W), mean of both directions (or of the one
-    that the run tells); empty where it tells neither.
+def motion_errors(
+    predicted: Geometry, true: Geometry, region: Tensor, units: Units
+) -> dict[str, float]:
+    """End-point errors over a region (H, W); empty where the run has no motion.
+
+    The mean of both directions, or the one that the run has.
     """
-    sides = list(seen.flow)
+    sides = list(predicted.flow)
     if not sides:
         return {}
-    errors = {
-        "flow_epe": [metrics.end_point_error(seen.flow[s], true.flow[s], region) for s in sides],
-        "flow_epe_of_rest": [
-            metrics.end_point_error(torch.zeros_like(true.flow[s]), true.flow[s], region)
-            for s in sides
-        ],
-    }
-    if (world := units.world) is not None:
-        errors["scene_flow_epe"] = [
-            metrics.end_point_error(seen.scene_flow[s] * world, true.scene_flow[s], region)
-            for s in sides
-        ]
+    errors: dict[str, list[float]] = {"flow_epe": [], "flow_epe_of_rest": []}
+    if units.world is not None:
+        errors["scene_flow_epe"] = []
+    for side in sides:
+        flow, at_rest = true.flow[side], torch.zeros_like(true.flow[side])
+        errors["flow_epe"].append(metrics.end_point_error(predicted.flow[side], flow, region))
+        errors["flow_epe_of_rest"].append(metrics.end_point_error(at_rest, flow, region))
+        if units.world is not None:
+            scene_flow = predicted.scene_flow[side] * units.world
+            error = metrics.end_point_error(scene_flow, true.scene_flow[side], region)
+            errors["scene_flow_epe"].append(error)
     return {name: float(np.mean(values)) for name, values in errors.items()}

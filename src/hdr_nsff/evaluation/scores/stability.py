@@ -1,13 +1,17 @@
-"""How steady the radiance is along the clip's own path: flicker that no single held-out
-view shows. Consecutive training frames are rendered and compared along the clip's
-optical flow, which every method trained on one scene folder shares.
+"""Stability of the radiance along the clip's own path.
+
+That is flicker, which no single held-out view shows. Consecutive training frames are
+rendered and compared along the clip's optical flow, which every method trained on one
+scene folder shares.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from torch import Tensor
 
 from hdr_nsff.evaluation.predictions import predict, radiance_of
 from hdr_nsff.geometry.paths import View
@@ -15,54 +19,64 @@ from hdr_nsff.maths import metrics
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 
-MOST_PAIRS = 12
-
-
-def chosen_pairs(run: Run) -> list[tuple[Frame, Frame]]:
-    """Training frames with flow to their neighbor, and that neighbor: all, or
-    `MOST_PAIRS` spread evenly over the clip.
-    """
-    frames = run.scene.train
-    pairs = [
-        (f, frames[f.neighbors[1]])
-        for f in frames
-        if 1 in f.neighbors and 1 in f.flow and 1 in f.flow_valid
-    ]
-    return [pairs[round(k)] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), MOST_PAIRS))]
+MAX_PAIRS = 12  # of frames: enough for a mean, seconds to render (hand-chosen)
 
 
 def stability(run: Run, folder: Path) -> dict[str, float]:
-    """`hdr_tae` (see `metrics.hdr_tae`) of the run along its training path, mean over
-    all pixels where forward and backward flow agree, over moving ones `hdr_tae_moving`,
-    and the number of `pairs`; empty where the scene has no flow. Renders are kept in
-    `folder`.
+    """HDR-TAE of the run along its training path; empty where the scene has no flow.
+
+    `hdr_tae` (see `metrics.hdr_tae`) is the mean over all pixels where forward and
+    backward flow agree, `hdr_tae_moving` over those that move; `pairs` is the number of
+    pairs of frames. Renders are kept in `folder`.
     """
-    pairs = chosen_pairs(run)
-    frames = {f"{f.index:05d}": f for pair in pairs for f in pair}
-    views = {name: View(f.camera, f.time) for name, f in sorted(frames.items())}
-    files = (
-        dict(
-            zip(
-                views,
-                predict(run, views, folder, "rendering the training path", motion=False),
-                strict=True,
-            )
-        )
-        if pairs
-        else {}
-    )
-    sums = {"hdr_tae": [0.0, 0.0], "hdr_tae_moving": [0.0, 0.0]}
-    for a, b in pairs:
-        here, there = (radiance_of(files[f"{f.index:05d}"]) for f in (a, b))
-        regions = {"hdr_tae": a.flow_valid[1].cpu()} | (
-            {} if a.moving is None else {"hdr_tae_moving": (a.flow_valid[1] & a.moving).cpu()}
-        )
-        for name, region in regions.items():
-            error, pixels = metrics.hdr_tae(here, there, a.flow[1].cpu(), region)
+    pairs = choose_pairs(run)
+    if not pairs:
+        return {}
+    files = render_pairs(run, pairs, folder)
+    errors: dict[str, list[float]] = {"hdr_tae": [], "hdr_tae_moving": []}
+    counts: dict[str, list[int]] = {"hdr_tae": [], "hdr_tae_moving": []}
+    for first, second in pairs:
+        here, there = radiance_of(files[first.index]), radiance_of(files[second.index])
+        flow = first.flow[1].cpu()
+        for name, region in regions_of(first).items():
+            error, pixels = metrics.hdr_tae(here, there, flow, region)
             if pixels:
-                sums[name][0] += error * pixels
-                sums[name][1] += pixels
-    found: dict[str, float] = {
-        name: total / pixels for name, (total, pixels) in sums.items() if pixels
-    }
+                errors[name].append(error * pixels)
+                counts[name].append(pixels)
+    found: dict[str, float] = {}
+    for name, values in errors.items():
+        if values:
+            found[name] = sum(values) / sum(counts[name])
     return found | {"pairs": len(pairs)} if found else {}
+
+
+def choose_pairs(run: Run) -> list[tuple[Frame, Frame]]:
+    """Training frames with flow to the next frame, each with that frame.
+
+    All, or `MAX_PAIRS` spread evenly over the clip.
+    """
+    frames = run.scene.train
+    pairs = []
+    for frame in frames:
+        if 1 in frame.neighbors and 1 in frame.flow and 1 in frame.flow_valid:
+            pairs.append((frame, frames[frame.neighbors[1]]))
+    positions = np.linspace(0, len(pairs) - 1, min(len(pairs), MAX_PAIRS))
+    return [pairs[round(position)] for position in positions]
+
+
+def render_pairs(run: Run, pairs: Sequence[tuple[Frame, Frame]], folder: Path) -> dict[int, Path]:
+    """Predictions of all frames of the pairs, {index of the frame: EXR}."""
+    frames = {frame.index: frame for pair in pairs for frame in pair}
+    indices = sorted(frames)
+    views = {f"{i:05d}": View(frames[i].camera, frames[i].time) for i in indices}
+    files = predict(run, views, folder, "rendering the training path", motion=False)
+    return dict(zip(indices, files, strict=True))
+
+
+def regions_of(frame: Frame) -> dict[str, Tensor]:
+    """Pixels (H, W) whose flow to the next frame passes the round trip, by score."""
+    valid = frame.flow_valid[1]
+    regions = {"hdr_tae": valid.cpu()}
+    if frame.moving is not None:
+        regions["hdr_tae_moving"] = (valid & frame.moving).cpu()
+    return regions

@@ -1,26 +1,36 @@
-"""NeRF-W with time (METHOD.md 6): what changes from image to image with the camera is a
-code of numbers per image that the colors of the static branch know (Martin-Brualla et
-al. 2021); what moves is the transient branch, whose density adds up with the static one
-and which knows the time. No scene flow and no tone mapper: "radiance" is recorded rgb.
+"""NeRF-W with time (NeRF in the Wild, Martin-Brualla et al. 2021).
 
-A picture of another image than those of training borrows the mean code of the training
-images of its exposure (`Recorder.images`); asked for radiance, the field shows the look
-of the reference exposure. As published, only the static branch knows the code: what
-moves keeps the exposure of the frames that show it.
+An appearance code per image, which the colors of the static branch depend on, explains
+what changes with the camera from image to image. Moving content is in the transient
+branch, which depends on time and whose density adds up with the static one. There is no
+scene flow and no tone mapper: "radiance" is recorded rgb.
+
+A picture other than the training images borrows the mean code of the training images of
+its exposure (`Recorder.images`); radiance is rendered as the reference exposure looks.
+As published, only the static branch depends on the code: movers keep the exposure of
+the frames that show them. docs/baselines.md lists the differences.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import Render
-from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpBranches, MlpConfig, Trunk
-from hdr_nsff.fields.nsff.samples import Content, in_chunks
+from hdr_nsff.core.settings import Advanced, Count, Rate, Weight
+from hdr_nsff.fields.base import ParamGroup, Render
+from hdr_nsff.fields.nsff.branches import (
+    GridBranches,
+    GridConfig,
+    MlpBranches,
+    MlpConfig,
+    Trunk,
+    table_group,
+)
+from hdr_nsff.fields.nsff.samples import BranchOutput, render_in_chunks
 from hdr_nsff.fields.nsff.two_branches import BranchesConfig, TwoBranches
 from hdr_nsff.fields.space import Space
 from hdr_nsff.geometry.cameras import Camera
@@ -32,17 +42,25 @@ from hdr_nsff.scene.batch import PixelBatch, Recorder
 class NerfWTConfig(BranchesConfig):
     """NeRF-W with time."""
 
+    type: Advanced[Literal["nerf-wt"]] = "nerf-wt"
+    transient: Weight = 0.01
+    """Loss: mean optical thickness of a sample of the transient branch."""
     radiance: Literal["exp", "sigmoid"] = "sigmoid"
-    code_size: int = 48
+    """Unbounded radiance, or the published one below 1."""
+    code_size: Count = 48
     """Numbers of an image's appearance code."""
-    head_width: int = 128
-    """Width of the network that makes colors of a grid's values and the code."""
-    head_lr: float = 5e-3
-    """Of the codes and of that network, beside grids."""
+    head_width: Advanced[Count] = 128
+    """Width of the network that turns a grid's values and the code into colors."""
+    head_lr: Advanced[Rate] = 5e-3
+    """Learning rate of the codes and of that network, where grids are used."""
 
 
 class Codes(nn.Module):
-    """An appearance code per training image, and the one in force."""
+    """An appearance code per training image.
+
+    `images` are the positions of the training images whose mean code is in use;
+    `reference` those of the reference exposure, which it starts with.
+    """
 
     def __init__(self, num_images: int, size: int, reference: tuple[int, ...]) -> None:
         super().__init__()
@@ -50,13 +68,14 @@ class Codes(nn.Module):
         self.reference = self.images = reference
 
     def forward(self) -> Tensor:
-        """The mean code (size,) of the images in force."""
+        """The mean code (size,) of the images in use."""
         return self.table[list(self.images)].mean(0)
 
 
 class CodedGrids(GridBranches):
-    """Grids whose static colors pass a small network that knows the code; at the start
-    it changes nothing.
+    """Grids whose static colors pass a small network that takes the code too.
+
+    At the start the network changes nothing.
     """
 
     def __init__(
@@ -66,49 +85,46 @@ class CodedGrids(GridBranches):
         height: int,
         num_knots: int,
         codes: Codes,
-        wt: NerfWTConfig,
+        field_config: NerfWTConfig,
     ) -> None:
         super().__init__(config, width, height, num_knots)
         del self.motion_grids
-        self.codes, self.head_lr = codes, wt.head_lr
-        self.own, self.of_code = (
-            nn.Linear(3, wt.head_width),
-            nn.Linear(wt.code_size, wt.head_width, bias=False),
-        )
-        self.out = nn.Linear(wt.head_width, 3)
-        nn.init.zeros_(self.out.weight)
-        nn.init.zeros_(self.out.bias)
+        self.codes, self.head_lr = codes, field_config.head_lr
+        head_width = field_config.head_width
+        self.from_color = nn.Linear(3, head_width)
+        self.from_code = nn.Linear(field_config.code_size, head_width, bias=False)
+        self.to_color = nn.Linear(head_width, 3)
+        nn.init.zeros_(self.to_color.weight)
+        nn.init.zeros_(self.to_color.bias)
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         raw = super().static(coords, directions)
-        rgb = raw[:, :3] + self.out((self.own(raw[:, :3]) + self.of_code(self.codes())).relu())
-        return torch.cat([rgb, raw[:, 3:]], -1)
+        color, rest = raw[:, :3], raw[:, 3:]
+        hidden = (self.from_color(color) + self.from_code(self.codes())).relu()
+        return torch.cat([color + self.to_color(hidden), rest], -1)
 
     def dynamic(
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
-        assert not motion, "NeRF-W knows no scene flow"
+        assert not motion, "NeRF-W has no scene flow"
         return nn.functional.pad(self.dynamic_grid(coords, knot), (0, 1)), None
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        grids = [self.static_grid, self.dynamic_grid]
+    def param_groups(self) -> list[ParamGroup]:
         head = [
             *self.codes.parameters(),
-            *self.own.parameters(),
-            *self.of_code.parameters(),
-            *self.out.parameters(),
+            *self.from_color.parameters(),
+            *self.from_code.parameters(),
+            *self.to_color.parameters(),
         ]
-        tables = {
-            "params": [g.table for g in grids],
-            "touched": [g.touched for g in grids],
-            "lr": self.config.lr,
-        }
-        return [tables, {"params": head, "lr": self.head_lr}]
+        tables = table_group([self.static_grid, self.dynamic_grid], self.config.lr)
+        return [tables, ParamGroup(head, self.head_lr)]
 
 
 class CodedMlp(MlpBranches):
-    """The published network; the static color head has the code as further inputs, the
-    dynamic trunk only the time.
+    """The published network.
+
+    The static color head takes the code as further inputs, the dynamic trunk only the
+    time.
     """
 
     def __init__(self, config: MlpConfig, num_knots: int, codes: Codes) -> None:
@@ -118,17 +134,22 @@ class CodedMlp(MlpBranches):
         self.dynamic_trunk = Trunk(config, 4, 1)
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
-        return super().static(
-            coords, torch.cat([directions, self.codes().expand(len(coords), -1)], -1)
-        )
+        code = self.codes().expand(len(coords), -1)
+        return super().static(coords, torch.cat([directions, code], -1))
 
 
 class NerfWT(TwoBranches):
-    """See the module. Frames are of `size` (width, height); `reference` are the
-    positions of the training images of the reference exposure.
+    """NeRF-W with time.
+
+    Frames are of `size` (width, height); `reference` are the positions of the training
+    images of the reference exposure.
     """
 
     config: NerfWTConfig
+
+    def loss_weights(self) -> dict[str, float]:
+        """Of the transient branch's thickness."""
+        return {"transient": self.config.transient}
 
     def __init__(
         self,
@@ -156,24 +177,27 @@ class NerfWT(TwoBranches):
         return self.branches.codes
 
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
-        """A render of the batch's pixels in the look of its recording, and the mean
-        optical thickness of the transient branch.
+        """A render of the batch's pixels as they were recorded, and `transient`.
+
+        That is the mean optical thickness of a sample of the transient branch.
         """
         assert batch.recorder is not None
         self.codes.images = batch.recorder.images
-        p = self.ask(batch, motion=False)
-        render = self.compose(p.static, p.dynamic, p.w, p.m.depths)
-        return render, {"transient": (p.dynamic.density * p.m.deltas).mean()}
+        base = self.query(batch, motion=False)
+        render = self.compose(base.static, base.dynamic, base.weights, base.samples.depths)
+        return render, {"transient": (base.dynamic.density * base.samples.deltas).mean()}
 
     def compose(
-        self, static: Content, dynamic: Content, w: volume.Weights, depths: Tensor
+        self, static: BranchOutput, dynamic: BranchOutput, weights: volume.Weights, depths: Tensor
     ) -> Render:
-        """Both branches along rays of `depths` (N, S)."""
-        radiance = volume.weighted_sum(w.static, static.radiance) + volume.weighted_sum(
-            w.dynamic, dynamic.radiance
+        """The render of both branches along rays with samples at `depths` (N, S)."""
+        both = weights.static + weights.dynamic
+        return Render(
+            radiance=volume.composite(weights, static.radiance, dynamic.radiance),
+            depth=volume.expected_depth(both, depths, self.far),
+            opacity=weights.opacity,
+            motion=weights.dynamic.sum(-1),
         )
-        depth = volume.expected_depth(w.static + w.dynamic, depths, self.far)
-        return Render(radiance, depth, w.opacity, w.dynamic.sum(-1))
 
     @torch.no_grad()
     def render(
@@ -184,33 +208,41 @@ class NerfWT(TwoBranches):
         scene_flow: bool = True,
         recorder: Recorder | None = None,
     ) -> Render:
-        """Every pixel of `camera` (row by row) or `pixels` (S, 2) at `time` in frames,
-        in the given look or that of the reference exposure.
+        """Every pixel of `camera` (row by row) or `pixels` (S, 2) at `time` in frames.
+
+        It looks as `recorder` records it, by default as the reference exposure does.
         """
         self.codes.images = self.codes.reference if recorder is None else recorder.images
-        return in_chunks(self, camera, pixels, lambda chunk: self.render_chunk(camera, time, chunk))
+        knot = self.knot(time)
+        return render_in_chunks(
+            self, camera, pixels, lambda chunk: self.render_chunk(camera, knot, chunk)
+        )
 
     def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
-        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by
-        row.
+        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel.
+
+        Row by row, one render for each.
         """
+        renders = [self.render(camera, time, recorder=recorder) for recorder in recorders]
         return [
-            recorder.rgb(self.render(camera, time, recorder=recorder).radiance)
-            for recorder in recorders
+            recorder.rgb(render.radiance)
+            for recorder, render in zip(recorders, renders, strict=True)
         ]
 
-    def render_chunk(self, camera: Camera, time: float, pixels: Tensor) -> Render:
-        """A few thousand pixels at once."""
-        knot = self.knot(time)
-        m = self.march(camera, pixels, self.config.render_samples, None)
-        keep_static, keep_dynamic = self.kept(m, knot, 0.0, None)
-        if knot % 1:  # between two times, what either of them asks for
-            for k in (int(knot), int(knot) + 1):
-                keep_dynamic = keep_dynamic | self.kept(m, k, 0.0, None)[1]
-        static = self.static_content(m, keep_static)
+    def render_chunk(self, camera: Camera, knot: float, pixels: Tensor) -> Render:
+        """The render of a few thousand `pixels` (N, 2) at a knot."""
+        samples = self.sample(camera, pixels, self.config.render_samples, None)
+        keep_static, keep_dynamic = self.select_samples(samples, knot, 0.0, None)
+        if knot % 1:  # between two times: what either of them selects
+            for neighbor in (int(knot), int(knot) + 1):
+                _, selected = self.select_samples(samples, neighbor, 0.0, None)
+                keep_dynamic = keep_dynamic | selected
+        static = self.query_static(samples, keep_static)
         index = keep_dynamic.reshape(-1).nonzero()[:, 0]
-        coords = m.coords.reshape(-1, 3)[index]
-        dynamic, _ = self.dynamic_content(
-            coords, index, keep_dynamic.shape, knot, self.views(m, index), motion=False
+        coords = samples.coords.reshape(-1, 3)[index]
+        directions = self.view_directions(samples, index)
+        dynamic, _ = self.query_dynamic(
+            coords, index, keep_dynamic.shape, knot, directions, motion=False
         )
-        return self.compose(static, dynamic, self.weights(static, dynamic, m.deltas), m.depths)
+        weights = self.composite_weights(static, dynamic, samples.deltas)
+        return self.compose(static, dynamic, weights, samples.depths)

@@ -1,18 +1,23 @@
 """Numba kernels of the Gaussian rasterizer on the CPU: projected Gaussians to pictures,
 and back by hand.
 
-Every tile keeps a flat list of those that touch it, front to back. Alpha below 1/255
-counts as nothing, above 0.999 as 0.999 (Kerbl et al. 2023). The backward pass goes
-front to back too, with one scalar per pixel: what is still to come behind. Each
-(Gaussian, tile) pair owns its place for gradients and a Gaussian's pairs are added up
+Alpha compositing front to back as in 3D Gaussian splatting (Kerbl et al. 2023); as in
+gsplat (Ye et al. 2024), alpha below 1/255 counts as 0 and above 0.999 as 0.999. Every
+tile keeps a flat list of the Gaussians that touch it, front to back. The backward pass
+goes front to back too, with one scalar per pixel: what is still to come behind. Each
+(Gaussian, tile) pair owns its place for gradients, and a Gaussian's pairs are added up
 in a fixed order: no atomics, and the same result whatever the number of threads. The
 plain-torch twin is `rasterize.dense`.
+
+Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channels (a multiple of
+`BLOCK`), C <= D map channels, pictures of (H, W). A tile's working memory is a flat
+float32 array of planes, each with one number for every pixel of the tile.
 
 Loops over the pixels of a tile are written so that LLVM vectorizes them: one flat
 array, unsigned ranges, no library call, no maximum carried along, no error for a
 division by zero. `FAST` lets it reorder sums; NaN and Inf stay what they are. What a
-pixel's BLOCK of channels does stands in `mixed`, `poured` and `gathered`, written out,
-for a loop inside would not be vectorized over pixels.
+pixel does to its BLOCK of channels is written out in `add_to_block`, `dot_block` and
+`gather_block`: a loop inside would not be vectorized over pixels.
 """
 
 from __future__ import annotations
@@ -20,210 +25,249 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from hdr_nsff.fields.kernels.projection import ALPHA_MIN, F0, MOMENTS, TILE_X, TILE_Y
+from hdr_nsff.core.jit import jit
+from hdr_nsff.fields.kernels.projection import ALPHA_MIN, MOMENTS, TILE_X, TILE_Y, ZERO
 
-PIXELS = TILE_X * TILE_Y
-BLOCK = 8  # channels that one pass over a Gaussian's pixels takes; features come in multiples of it
-X, Y, LEFT, WEIGHT, VALUE, GRAD_ALPHA, BEHIND, SUMS = (
-    np.uint64(i * PIXELS) for i in range(8)
-)  # a tile's planes of pixels
-N1, N2, N3, N4, N5, N6, N7 = (np.uint64(i * PIXELS) for i in range(1, BLOCK))
-OWN = 7  # planes before SUMS
-TWO_ROWS = np.uint64(2 * TILE_X)  # as wide as a vector
-LINE = 16  # float32 in a cache line
-F1, HALF = np.float32(1), np.float32(0.5)
-ALPHA_MAX = np.float32(0.999)
-SPENT = np.float32(1e-4)  # transmittance below which a tile is finished
-DEEPEST = np.float32(6.0)  # exponents beyond this are below the cut for every opacity <= 1
+PIXELS = TILE_X * TILE_Y  # of a tile
+BLOCK = 8  # channels that one pass over a Gaussian's pixels takes
+
+# where a tile's planes begin in its working memory
+X = np.uint64(0 * PIXELS)  # pixel centers, in pixels
+Y = np.uint64(1 * PIXELS)
+LEFT = np.uint64(2 * PIXELS)  # transmittance that is left
+WEIGHT = np.uint64(3 * PIXELS)  # alpha * transmittance of the Gaussian at hand
+VALUE = np.uint64(4 * PIXELS)  # its features' dot product with the maps' gradients
+GRAD_ALPHA = np.uint64(5 * PIXELS)  # gradient of the alpha map
+BEHIND = np.uint64(6 * PIXELS)  # weight * value of all Gaussians behind
+SUMS = np.uint64(7 * PIXELS)  # from here on: channels of the maps, or their gradients
+PLANES = 7  # before SUMS
+# from a channel's plane to the planes of the next channels of its block
+PLANE_1, PLANE_2, PLANE_3, PLANE_4, PLANE_5, PLANE_6, PLANE_7 = (
+    np.uint64(i * PIXELS) for i in range(1, BLOCK)
+)
+TWO_ROWS = np.uint64(2 * TILE_X)  # as many pixels as a vector has lanes
+CACHE_LINE = 16  # float32
+CHECK_EVERY = 16  # Gaussians after which a tile is tested for being opaque
+
+ONE = np.float32(1)
+HALF = np.float32(0.5)
 EIGHTH = np.float32(0.125)
-E2, E3, E4, E5 = (np.float32(1 / n) for n in (2, 6, 24, 120))
+ALPHA_MAX = np.float32(0.999)  # alpha above counts as this
+MIN_TRANSMITTANCE = np.float32(1e-4)  # a tile with less is finished (Kerbl et al. 2023)
+# exp(-s) is cut to 0 here: exp(-6) < 1/255, so alpha is below the cut for opacities <=
+# 1
+MAX_EXPONENT = np.float32(6.0)
+# coefficients 1 / n! of the exponential's Taylor series
+TAYLOR_2, TAYLOR_3, TAYLOR_4, TAYLOR_5 = (np.float32(1 / n) for n in (2, 6, 24, 120))
 FAST = {"contract", "reassoc", "nsz"}
-NOTHING = (F0, F0, F0, F0, F0, F0, F0, F0)
+NO_GRADIENT = (ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO, ZERO)  # of a block of channels
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@jit(inline="always", fastmath=FAST)
 def exp_minus(s):
-    """exp(-s) for s in [0, DEEPEST], to 1e-5: a polynomial of s / 8, squared three
-    times; vectorizes, unlike a library call.
+    """exp(-s) for s in [0, MAX_EXPONENT], to 1e-5.
+
+    A polynomial of s / 8, squared three times: it vectorizes, unlike a library call.
     """
     x = -s * EIGHTH
-    y = F1 + x * (F1 + x * (E2 + x * (E3 + x * (E4 + x * E5))))
+    y = ONE + x * (ONE + x * (TAYLOR_2 + x * (TAYLOR_3 + x * (TAYLOR_4 + x * TAYLOR_5))))
     y = y * y
     y = y * y
     return y * y
 
 
-@numba.njit(cache=True, nogil=True)
+@jit(nogil=True)
 def bin_tiles(boxes, order, tiles_x, tiles_y):
-    """Lists of Gaussians per tile, front to back as `order` (G,) says.
+    """List the Gaussians that touch each tile, front to back.
 
-    Returns `starts` (tiles + 1,), `members` (P,) the Gaussian of every list entry,
-    `places` (P,) the entry's own place for gradients, and `owned` (G + 1,) where each
-    Gaussian's places begin.
+    `boxes` (G, 4) are tile boxes of `projection.project`, `order` (G,) is front to
+    back. Returns `starts` (tiles + 1,), where each tile's list begins; `members` (P,),
+    the Gaussian of every list entry; `places` (P,), the entry's own place for
+    gradients; and `owned` (G + 1,), where each Gaussian's places begin.
     """
     count = boxes.shape[0]
     owned = np.zeros(count + 1, np.int64)
     starts = np.zeros(tiles_x * tiles_y + 1, np.int64)
     for g in range(count):
-        owned[g + 1] = owned[g] + (boxes[g, 2] - boxes[g, 0]) * (boxes[g, 3] - boxes[g, 1])
+        columns, rows = boxes[g, 2] - boxes[g, 0], boxes[g, 3] - boxes[g, 1]
+        owned[g + 1] = owned[g] + columns * rows
         for ty in range(boxes[g, 1], boxes[g, 3]):
             for tx in range(boxes[g, 0], boxes[g, 2]):
                 starts[ty * tiles_x + tx + 1] += 1
     for t in range(tiles_x * tiles_y):
         starts[t + 1] += starts[t]
-    at = starts[:-1].copy()
-    members, places = np.empty(owned[count], np.int32), np.empty(owned[count], np.int32)
+    end = starts[:-1].copy()  # of each tile's list so far
+    members = np.empty(owned[count], np.int32)
+    places = np.empty(owned[count], np.int32)
     for g in order:
         place = owned[g]
         for ty in range(boxes[g, 1], boxes[g, 3]):
             for tx in range(boxes[g, 0], boxes[g, 2]):
                 t = ty * tiles_x + tx
-                members[at[t]], places[at[t]] = g, place
-                at[t] += 1
+                members[end[t]] = g
+                places[end[t]] = place
+                end[t] += 1
                 place += 1
     return starts, members, places, owned
 
 
-@numba.njit(cache=True)
-def planes(count, tile, tiles_x):
-    """A tile's first column and row, and `count` planes of PIXELS numbers in one flat
-    array at the start of a cache line: X, Y and LEFT are filled, the others 0. One
-    array with constant distances, for then LLVM need not ask before every loop whether
-    two planes overlap.
+@jit()
+def tile_planes(count, tile, tiles_x):
+    """A tile's first column and row, and its working memory of `count` planes.
+
+    X, Y and LEFT are filled, the others are 0. One flat array that starts at a cache
+    line, with constant distances between planes: LLVM then need not test before every
+    loop whether two planes overlap.
     """
-    room = np.zeros(count * PIXELS + LINE, np.float32)
-    first = (LINE - room.ctypes.data // 4 % LINE) % LINE
+    room = np.zeros(count * PIXELS + CACHE_LINE, np.float32)
+    first = (CACHE_LINE - room.ctypes.data // 4 % CACHE_LINE) % CACHE_LINE
     z = room[first : first + count * PIXELS]
     x0, y0 = (tile % tiles_x) * TILE_X, (tile // tiles_x) * TILE_Y
     for i in range(PIXELS):
         p = np.uint64(i)
-        z[X + p], z[Y + p], z[LEFT + p] = (
-            np.float32(x0 + i % TILE_X) + HALF,
-            np.float32(y0 + i // TILE_X) + HALF,
-            F1,
-        )
+        z[X + p] = np.float32(x0 + i % TILE_X) + HALF
+        z[Y + p] = np.float32(y0 + i // TILE_X) + HALF
+        z[LEFT + p] = ONE
     return x0, y0, z
 
 
-@numba.njit(cache=True)
-def span(rows, g, y0):
-    """The flat pixels of a tile that a Gaussian's rows cover, in pairs of rows:
-    unsigned, or LLVM would not vectorize over them, and in a way that it sees whole
-    vectors, or it would look for what is left over.
+@jit()
+def pixel_span(rows, g, y0):
+    """First and last + 1 of a tile's flat pixels that Gaussian g's rows cover.
+
+    `rows` are (G, 2). The span goes in pairs of rows: in unsigned numbers, or LLVM
+    would not vectorize over them, and in whole vectors that it can recognize, or it
+    would add a loop for what is left over.
     """
-    first, last = max(rows[g, 0] - y0, 0) // 2, (min(rows[g, 1] - y0, TILE_Y) + 1) // 2
+    first = max(rows[g, 0] - y0, 0) // 2
+    last = (min(rows[g, 1] - y0, TILE_Y) + 1) // 2
     start = np.uint64(first) * TWO_ROWS
     return start, start + np.uint64(max(last - first, 0)) * TWO_ROWS
 
 
-@numba.njit(inline="always", fastmath=FAST)
-def spent(z):
-    """Whether nothing behind can be seen any more."""
-    most = F0
+@jit(inline="always", fastmath=FAST)
+def is_opaque(z):
+    """Whether nothing behind can be seen in any pixel of a tile."""
+    most = ZERO
     for p in range(PIXELS):
         most = max(most, z[LEFT + np.uint64(p)])
-    return most < SPENT
+    return most < MIN_TRANSMITTANCE
 
 
-@numba.njit(cache=True)
-def block(features, g, d):
-    """BLOCK features of Gaussian `g` from channel `d` on."""
+@jit()
+def load_block(features, g, d):
+    """BLOCK features of Gaussian `g` from channel `d` on, of `features` (G, D)."""
     first = features[g, d], features[g, d + 1], features[g, d + 2], features[g, d + 3]
     return (*first, features[g, d + 4], features[g, d + 5], features[g, d + 6], features[g, d + 7])
 
 
-@numba.njit(inline="always")
-def plane(d):
+@jit(inline="always")
+def channel_plane(d):
     """Where the plane of channel `d` begins."""
     return SUMS + np.uint64(d * PIXELS)
 
 
-@numba.njit(inline="always")
-def poured(z, p, v, f):
-    """Add `v` times the features `f` to the BLOCK planes from the one on in which `p`
-    is the pixel.
+@jit(inline="always")
+def add_to_block(z, p, v, f):
+    """Add `v` times the features `f` to a block of planes at pixel `p`.
+
+    `p` lies in the block's first plane.
     """
     z[p] += f[0] * v
-    z[p + N1] += f[1] * v
-    z[p + N2] += f[2] * v
-    z[p + N3] += f[3] * v
-    z[p + N4] += f[4] * v
-    z[p + N5] += f[5] * v
-    z[p + N6] += f[6] * v
-    z[p + N7] += f[7] * v
+    z[p + PLANE_1] += f[1] * v
+    z[p + PLANE_2] += f[2] * v
+    z[p + PLANE_3] += f[3] * v
+    z[p + PLANE_4] += f[4] * v
+    z[p + PLANE_5] += f[5] * v
+    z[p + PLANE_6] += f[6] * v
+    z[p + PLANE_7] += f[7] * v
 
 
-@numba.njit(inline="always")
-def mixed(z, p, f):
-    """Sum of the features `f` times those planes at the pixel."""
-    first = f[0] * z[p] + f[1] * z[p + N1] + f[2] * z[p + N2] + f[3] * z[p + N3]
-    return first + f[4] * z[p + N4] + f[5] * z[p + N5] + f[6] * z[p + N6] + f[7] * z[p + N7]
-
-
-@numba.njit(inline="always")
-def gathered(t, z, p, v):
-    """The sums `t` plus `v` times those planes at the pixel."""
-    first = t[0] + z[p] * v, t[1] + z[p + N1] * v, t[2] + z[p + N2] * v, t[3] + z[p + N3] * v
+@jit(inline="always")
+def dot_block(z, p, f):
+    """Sum of the features `f` times a block of planes at the pixel."""
+    first = f[0] * z[p] + f[1] * z[p + PLANE_1] + f[2] * z[p + PLANE_2] + f[3] * z[p + PLANE_3]
     return (
-        *first,
-        t[4] + z[p + N4] * v,
-        t[5] + z[p + N5] * v,
-        t[6] + z[p + N6] * v,
-        t[7] + z[p + N7] * v,
+        first
+        + f[4] * z[p + PLANE_4]
+        + f[5] * z[p + PLANE_5]
+        + f[6] * z[p + PLANE_6]
+        + f[7] * z[p + PLANE_7]
     )
 
 
-@numba.njit(inline="always")
-def moved(m, u, dx, dy):
+@jit(inline="always")
+def gather_block(t, z, p, v):
+    """The sums `t` plus `v` times a block of planes at the pixel."""
+    return (
+        t[0] + z[p] * v,
+        t[1] + z[p + PLANE_1] * v,
+        t[2] + z[p + PLANE_2] * v,
+        t[3] + z[p + PLANE_3] * v,
+        t[4] + z[p + PLANE_4] * v,
+        t[5] + z[p + PLANE_5] * v,
+        t[6] + z[p + PLANE_6] * v,
+        t[7] + z[p + PLANE_7] * v,
+    )
+
+
+@jit(inline="always")
+def add_moments(m, u, dx, dy):
     """The moments `m` plus those of `u` at an offset from the center."""
     ux, uy = u * dx, u * dy
     return m[0] + u, m[1] + ux, m[2] + uy, m[3] + ux * dx, m[4] + ux * dy, m[5] + uy * dy
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def forward(starts, members, centers, conics, opacities, features, rows, maps, alpha):
-    """Composite features (G, D), D a multiple of BLOCK, into `maps` (C, H, W), the
-    first C of them, and `alpha` (H, W).
+    """Composite Gaussians front to back into `maps` and `alpha`.
+
+    `maps` (C, H, W) take the first C channels of `features` (G, D); `alpha` is (H, W).
+    `starts` and `members` come from `bin_tiles`; pixel `centers` (G, 2), `conics` (G,
+    3) and pixel `rows` (G, 2) from `projection.project`; `opacities` are (G,).
     """
     height, width = alpha.shape
     channels = features.shape[1]
     tiles_x = (width + TILE_X - 1) // TILE_X
     for tile in numba.prange(len(starts) - 1):
-        x0, y0, z = planes(OWN + channels, tile, tiles_x)
+        x0, y0, z = tile_planes(PLANES + channels, tile, tiles_x)
         for i in range(starts[tile], starts[tile + 1]):
             g = members[i]
-            cx, cy, o = centers[g, 0], centers[g, 1], opacities[g]
+            o = opacities[g]
+            cx, cy = centers[g, 0], centers[g, 1]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
-            first, last = span(rows, g, y0)
-            f = block(features, g, 0)
+            first, last = pixel_span(rows, g, y0)
+            f = load_block(features, g, 0)
             for p in range(first, last):
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
                 e0, e1 = a * dx, b * dx + c * dy
-                s = min(e0 * e0 + e1 * e1, DEEPEST)
+                s = min(e0 * e0 + e1 * e1, MAX_EXPONENT)
                 q = min(o * exp_minus(s), ALPHA_MAX)
-                q = q if q >= ALPHA_MIN else F0
+                q = q if q >= ALPHA_MIN else ZERO
                 v = q * z[LEFT + p]
                 z[WEIGHT + p] = v
                 z[LEFT + p] -= v
-                poured(z, SUMS + p, v, f)
+                add_to_block(z, SUMS + p, v, f)
             for d in range(BLOCK, channels, BLOCK):
-                at, f = plane(d), block(features, g, d)
+                plane, f = channel_plane(d), load_block(features, g, d)
                 for p in range(first, last):
-                    poured(z, at + p, z[WEIGHT + p], f)
-            if i % 16 == 0 and spent(z):
+                    add_to_block(z, plane + p, z[WEIGHT + p], f)
+            if i % CHECK_EVERY == 0 and is_opaque(z):
                 break
         for y in range(min(TILE_Y, height - y0)):
             for x in range(min(TILE_X, width - x0)):
                 here = np.uint64(y * TILE_X + x)
-                alpha[y0 + y, x0 + x] = F1 - z[LEFT + here]
+                alpha[y0 + y, x0 + x] = ONE - z[LEFT + here]
                 for d in range(len(maps)):
-                    maps[d, y0 + y, x0 + x] = z[plane(d) + here]
+                    maps[d, y0 + y, x0 + x] = z[channel_plane(d) + here]
 
 
-@numba.njit(inline="always", fastmath=FAST)
+@jit(inline="always", fastmath=FAST)
 def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
-    """Fill a tile's planes: gradients of its maps (SUMS), of alpha (GRAD_ALPHA), and
-    the sum of weight * value (BEHIND).
+    """Fill a tile's planes for the backward pass.
+
+    These are the gradients of its maps (SUMS) and of alpha (GRAD_ALPHA), and the sum of
+    weight * value over all Gaussians (BEHIND).
     """
     height, width = alpha.shape
     for y in range(min(TILE_Y, height - y0)):
@@ -233,27 +277,25 @@ def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
             z[BEHIND + p] = z[GRAD_ALPHA + p] * alpha[y0 + y, x0 + x]
             for d in range(len(maps)):
                 grad = grad_maps[d, y0 + y, x0 + x]
-                z[plane(d) + p] = grad
+                z[channel_plane(d) + p] = grad
                 z[BEHIND + p] += grad * maps[d, y0 + y, x0 + x]
 
 
-@numba.njit(cache=True)
-def tell(grad, d, t):
-    """Write down the gradients `t` of the BLOCK channels from `d` on."""
-    d += MOMENTS
-    (
-        grad[d],
-        grad[d + 1],
-        grad[d + 2],
-        grad[d + 3],
-        grad[d + 4],
-        grad[d + 5],
-        grad[d + 6],
-        grad[d + 7],
-    ) = t
+@jit()
+def store_block(grad, d, t):
+    """Store gradients `t` of BLOCK channels from `d` on in `grad` (MOMENTS + D,)."""
+    first = MOMENTS + d
+    grad[first] = t[0]
+    grad[first + 1] = t[1]
+    grad[first + 2] = t[2]
+    grad[first + 3] = t[3]
+    grad[first + 4] = t[4]
+    grad[first + 5] = t[5]
+    grad[first + 6] = t[6]
+    grad[first + 7] = t[7]
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def backward(
     starts,
     members,
@@ -269,52 +311,61 @@ def backward(
     grad_alpha,
     out,
 ):
-    """Gradients `out` (P, MOMENTS + D) of every pair: moments of u = dL / ds over its
-    pixels, then its features.
+    """Fill `out` (P, MOMENTS + D), the gradients of every (Gaussian, tile) pair.
+
+    They are moments of u = dL / ds over the pair's pixels, then its features. With
+    alpha = opacity * exp(-s), weights w_i = alpha_i T_i, and v_i what one unit of
+    weight of Gaussian i adds to the loss, dL / d alpha_i = T_i v_i - (sum of w_j v_j
+    behind i) / (1 - alpha_i). Arguments are those of `forward`, its results, their
+    gradients, and `places` of `bin_tiles`.
     """
     channels = features.shape[1]
     tiles_x = (alpha.shape[1] + TILE_X - 1) // TILE_X
     for tile in numba.prange(len(starts) - 1):
-        x0, y0, z = planes(OWN + channels, tile, tiles_x)
+        x0, y0, z = tile_planes(PLANES + channels, tile, tiles_x)
         read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z)
         done = False
         for i in range(starts[tile], starts[tile + 1]):
             g, grad = members[i], out[places[i]]
             if done:
-                grad[:] = F0
+                grad[:] = ZERO
                 continue
-            cx, cy, o = centers[g, 0], centers[g, 1], opacities[g]
+            o = opacities[g]
+            cx, cy = centers[g, 0], centers[g, 1]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
-            first, last = span(rows, g, y0)
+            first, last = pixel_span(rows, g, y0)
             if channels > BLOCK:
                 for p in range(first, last):
-                    z[VALUE + p] = F0
+                    z[VALUE + p] = ZERO
             for d in range(BLOCK, channels, BLOCK):
-                at, f = plane(d), block(features, g, d)
+                plane, f = channel_plane(d), load_block(features, g, d)
                 for p in range(first, last):
-                    z[VALUE + p] += mixed(z, at + p, f)
-            f, t, m = block(features, g, 0), NOTHING, NOTHING[:MOMENTS]
+                    z[VALUE + p] += dot_block(z, plane + p, f)
+            f = load_block(features, g, 0)
+            t, m = NO_GRADIENT, NO_GRADIENT[:MOMENTS]
             for p in range(first, last):
-                value = z[GRAD_ALPHA + p] + z[VALUE + p] + mixed(z, SUMS + p, f)
+                value = z[GRAD_ALPHA + p] + z[VALUE + p] + dot_block(z, SUMS + p, f)
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
                 e0, e1 = a * dx, b * dx + c * dy
-                s = min(e0 * e0 + e1 * e1, DEEPEST)
+                s = min(e0 * e0 + e1 * e1, MAX_EXPONENT)
                 full = o * exp_minus(s)
                 q = min(full, ALPHA_MAX)
-                q = q if q >= ALPHA_MIN else F0
+                q = q if q >= ALPHA_MIN else ZERO
                 left = z[LEFT + p]
                 v = q * left
                 behind = z[BEHIND + p] - v * value
-                slope = left * value - behind / (F1 - q)  # dL / d alpha
-                u = -slope * (q if full <= ALPHA_MAX else F0)
-                z[WEIGHT + p], z[BEHIND + p], z[LEFT + p] = v, behind, left - v
-                m, t = moved(m, u, dx, dy), gathered(t, z, SUMS + p, v)
+                slope = left * value - behind / (ONE - q)  # dL / d alpha
+                u = -slope * (q if full <= ALPHA_MAX else ZERO)
+                z[WEIGHT + p] = v
+                z[BEHIND + p] = behind
+                z[LEFT + p] = left - v
+                m, t = add_moments(m, u, dx, dy), gather_block(t, z, SUMS + p, v)
             grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = m
-            tell(grad, 0, t)
+            store_block(grad, 0, t)
             for d in range(BLOCK, channels, BLOCK):
-                at, t = plane(d), NOTHING
+                plane, t = channel_plane(d), NO_GRADIENT
                 for p in range(first, last):
-                    t = gathered(t, z, at + p, z[WEIGHT + p])
-                tell(grad, d, t)
-            if i % 16 == 0:
-                done = spent(z)
+                    t = gather_block(t, z, plane + p, z[WEIGHT + p])
+                store_block(grad, d, t)
+            if i % CHECK_EVERY == 0:
+                done = is_opaque(z)

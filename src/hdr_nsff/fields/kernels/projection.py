@@ -1,10 +1,16 @@
 """Numba kernels of the Gaussian rasterizer on the CPU: world Gaussians to projected
 ones and the tiles that they touch, and all of it backwards by hand.
 
-A projected Gaussian is a pixel center, a conic, a z-depth, an opacity and D features.
-The conic is the inverse 2D covariance in factors, alpha = opacity * exp(-(a dx)^2 - (b
-dx + c dy)^2): multiplied out, float32 would lose needles whose center is far away. The
-plain-torch twin is `rasterize.project`; `compositing.py` draws what comes out.
+EWA splatting (Zwicker et al. 2001; Kerbl et al. 2023): a Gaussian of rotation R and
+scales S, seen by a camera of rotation W, has the 2D covariance V V^T + blur with V = J
+W R S, where J linearizes the projection at its mean. A projected Gaussian is a pixel
+center, a conic, a z-depth, an opacity and D features. The conic (a, b, c) is the
+inverse 2D covariance in factors: alpha = opacity * exp(-s) with s = (a dx)^2 + (b dx +
+c dy)^2. Multiplied out, float32 would lose needles whose center is far away.
+
+Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channels. Everything about one
+Gaussian is computed in float64 and in plain tuples. The plain-torch twin is
+`rasterize.project`; `compositing.py` draws what comes out.
 """
 
 from __future__ import annotations
@@ -14,31 +20,33 @@ import math
 import numba
 import numpy as np
 
+from hdr_nsff.core.jit import jit
+
 TILE_X, TILE_Y = 8, 32  # pixels
-# gradients of a pair before its features: sums of u, u dx, u dy, u dx^2, u dx dy, u
-# dy^2
+# gradients of a pair before its features: sums over its pixels of u = dL / ds, u dx, u
+# dy, u dx^2, u dx dy and u dy^2
 MOMENTS = 6
-F0 = np.float32(0)
-ALPHA_MIN = np.float32(1 / 255)  # alpha below this counts as nothing
-NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn
-BLUR = 0.3  # pixels^2 added to 2D variances, so that no Gaussian falls between pixels
-FAST = {
-    "contract",
-    "reassoc",
-    "nsz",
-    "arcp",
-}  # sums may be reordered, division be multiplication; NaN and Inf stay what they are
-# of half the picture: how far outside it the projection is still linearized where the
-# Gaussian is
+ZERO = np.float32(0)
+ALPHA_MIN = np.float32(1 / 255)  # alpha below this counts as 0
+NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn (gsplat's default)
+# pixels^2 added to 2D variances, so that no Gaussian falls between pixels (Kerbl et al.
+# 2023)
+BLUR = 0.3
+# of half the picture: how far outside of it the projection is still linearized at the
+# mean, and not at the edge (as in gsplat)
 MARGIN = 0.3
+MIN_LENGTH = 1e-12  # added to a quaternion's length, which may be 0
+# sums may be reordered, division be multiplication; NaN and Inf stay what they are
+FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def rotation(q):
-    """Unit quaternion (w, x, y, z), its rotation matrix row by row, and the length it
-    had.
+    """The unit quaternion (w, x, y, z) of `q`, its rotation matrix, and q's length.
+
+    The matrix is given row by row.
     """
-    n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) + 1e-12
+    n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) + MIN_LENGTH
     w, x, y, z = q[0] / n, q[1] / n, q[2] / n, q[3] / n
     r = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
@@ -48,9 +56,9 @@ def rotation(q):
     return (w, x, y, z), r, n
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
-def limited(x, z, low, high):
-    """x moved so that x / z lies within [low, high], and whether it had to be."""
+@jit(fastmath=FAST, error_model="numpy")
+def clamp_ratio(x, z, low, high):
+    """x, moved so that x / z lies within [low, high], and whether it was moved."""
     ratio = x / z
     if ratio < low:
         return z * low, True
@@ -59,41 +67,41 @@ def limited(x, z, low, high):
     return x, False
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def dot(a, b):
-    """Of two triples."""
+    """Dot product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def gaussian(means, quaternions, scales, g):
     """Mean (3,), quaternion (4,) and scales (3,) of Gaussian `g` in float64."""
-    return (
-        (float(means[g, 0]), float(means[g, 1]), float(means[g, 2])),
-        (
-            float(quaternions[g, 0]),
-            float(quaternions[g, 1]),
-            float(quaternions[g, 2]),
-            float(quaternions[g, 3]),
-        ),
-        (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2])),
-    )
+    mean = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+    w, x = float(quaternions[g, 0]), float(quaternions[g, 1])
+    y, z = float(quaternions[g, 2]), float(quaternions[g, 3])
+    scale = (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+    return mean, (w, x, y, z), scale
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def jacobian(k, held):
-    """The entries 00, 02, 11, 12 of J (2, 3), the projection linearized at the point
-    `held`; the others are 0.
+    """Entries 00, 02, 11 and 12 of J (2, 3), the linearized projection.
+
+    It has intrinsics k and is linearized at the point of `held`; the other entries are
+    0.
     """
     x, y, z, _, _ = held
     return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def footprint(m, q, s, v, k, width, height):
-    """A Gaussian in the picture: camera point t, the point where the projection is
-    linearized and whether x and y are held there, T = J W (2, 3), the rotation R of
-    `rotation`, V = T R S (2, 3), and the 2D covariance V V^T + blur (xx, xy, yy).
+    """A Gaussian of mean m, quaternion q and scales s in a camera's picture.
+
+    The camera has world-to-camera matrix v (3, 4) and intrinsics k = (fx, fy, cx, cy).
+    Returns the camera point t (3,); `held`, the point where the projection is
+    linearized and whether its x and y are clamped; T = J W (2, 3); the triple of
+    `rotation`; V = T R S (2, 3); and the 2D covariance V V^T + blur (xx, xy, yy).
     """
     t = (
         v[0, 0] * m[0] + v[0, 1] * m[1] + v[0, 2] * m[2] + v[0, 3],
@@ -103,8 +111,8 @@ def footprint(m, q, s, v, k, width, height):
     z = t[2] if t[2] > NEAREST else NEAREST
     fx, fy, cx, cy = k[0], k[1], k[2], k[3]
     edge_x, edge_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
-    x, held_x = limited(t[0], z, -cx / fx - edge_x, (width - cx) / fx + edge_x)
-    y, held_y = limited(t[1], z, -cy / fy - edge_y, (height - cy) / fy + edge_y)
+    x, held_x = clamp_ratio(t[0], z, -cx / fx - edge_x, (width - cx) / fx + edge_x)
+    y, held_y = clamp_ratio(t[1], z, -cy / fy - edge_y, (height - cy) / fy + edge_y)
     held = (x, y, z, held_x, held_y)
     j00, j02, j11, j12 = jacobian(k, held)
     t0 = (
@@ -118,24 +126,16 @@ def footprint(m, q, s, v, k, width, height):
         j11 * v[1, 2] + j12 * v[2, 2],
     )
     unit, r, n = rotation(q)
-    c0, c1, c2 = (
-        (r[0][0], r[1][0], r[2][0]),
-        (r[0][1], r[1][1], r[2][1]),
-        (r[0][2], r[1][2], r[2][2]),
-    )  # columns
-    v0 = (dot(t0, c0) * s[0], dot(t0, c1) * s[1], dot(t0, c2) * s[2])
-    v1 = (dot(t1, c0) * s[0], dot(t1, c1) * s[1], dot(t1, c2) * s[2])
-    return (
-        t,
-        held,
-        (t0, t1),
-        (unit, r, n),
-        (v0, v1),
-        (dot(v0, v0) + BLUR, dot(v0, v1), dot(v1, v1) + BLUR),
-    )
+    column0 = (r[0][0], r[1][0], r[2][0])
+    column1 = (r[0][1], r[1][1], r[2][1])
+    column2 = (r[0][2], r[1][2], r[2][2])
+    v0 = (dot(t0, column0) * s[0], dot(t0, column1) * s[1], dot(t0, column2) * s[2])
+    v1 = (dot(t1, column0) * s[0], dot(t1, column1) * s[1], dot(t1, column2) * s[2])
+    covariance = (dot(v0, v0) + BLUR, dot(v0, v1), dot(v1, v1) + BLUR)
+    return t, held, (t0, t1), (unit, r, n), (v0, v1), covariance
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def project(
     means,
     quaternions,
@@ -151,10 +151,13 @@ def project(
     rows,
     boxes,
 ):
-    """Fill pixel `centers` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G,
-    2) and tile `boxes` (G, 4: x0, y0, x1, y1, ends excluded; empty where nothing shows)
-    of world Gaussians seen by `w2c` (3, 4) and `k` = (fx, fy, cx, cy). Lengths in scene
-    units.
+    """Project world Gaussians into the picture of a camera.
+
+    `w2c` is (3, 4), `k` = (fx, fy, cx, cy). `means` (G, 3) and `scales` (G, 3) are in
+    scene units, `quaternions` (G, 4) w x y z of any length, `opacities` (G,) in [0, 1].
+    Fills pixel `centers` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G, 2)
+    and tile `boxes` (G, 4: x0, y0, x1, y1). Rows and boxes exclude their ends, and are
+    empty where nothing shows.
     """
     tiles_x, tiles_y = (width + TILE_X - 1) // TILE_X, (height + TILE_Y - 1) // TILE_Y
     for g in numba.prange(means.shape[0]):
@@ -163,11 +166,13 @@ def project(
         depths[g] = t[2]
         boxes[g, 0] = boxes[g, 1] = boxes[g, 2] = boxes[g, 3] = 0
         rows[g, 0] = rows[g, 1] = 0
-        centers[g, 0] = centers[g, 1] = conics[g, 0] = conics[g, 1] = conics[g, 2] = F0
+        centers[g, 0] = centers[g, 1] = ZERO
+        conics[g, 0] = conics[g, 1] = conics[g, 2] = ZERO
         o = float(opacities[g])
         if not (t[2] > NEAREST and o >= ALPHA_MIN):
             continue  # behind, too faint, or not a number
         x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
+        # standard deviations at which alpha falls below 1/255
         reach = math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
         rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
         if not (x + rx > 0 and y + ry > 0 and x - rx < width and y - ry < height):
@@ -178,48 +183,46 @@ def project(
         centers[g, 0], centers[g, 1] = x, y
         across = math.sqrt(0.5 * xx / det)
         conics[g, 0], conics[g, 1], conics[g, 2] = math.sqrt(0.5 / xx), -xy / xx * across, across
-        left, right, top, bottom = (
-            max(x - rx, 0.0),
-            min(x + rx, float(width)),
-            max(y - ry, 0.0),
-            min(y + ry, float(height)),
-        )
+        left, right = max(x - rx, 0.0), min(x + rx, float(width))
+        top, bottom = max(y - ry, 0.0), min(y + ry, float(height))
         rows[g, 0], rows[g, 1] = int(top), math.ceil(bottom)
         boxes[g, 0], boxes[g, 1] = int(left) // TILE_X, int(top) // TILE_Y
         boxes[g, 2] = min(int(right) // TILE_X + 1, tiles_x)
         boxes[g, 3] = min(int(bottom) // TILE_Y + 1, tiles_y)
 
 
-@numba.njit(parallel=True, cache=True, nogil=True, fastmath=FAST, error_model="numpy")
+@jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
 def project_backward(
     means, quaternions, scales, opacities, w2c, k, width, height, owned, pairs,
     grad_means, grad_quaternions, grad_scales, grad_opacities, grad_features, grad_pose,
 ):  # fmt: skip
-    """Add up the pairs' gradients and carry them to the world: everything `(G, ...)`;
-    `grad_pose` (G, 12) per Gaussian, or (0, 12) if not wanted. The last feature is the
-    z-depth.
+    """Add up the pairs' gradients and carry them back to the world.
+
+    Arguments as in `project`; `owned` (G + 1,) are each Gaussian's pairs, `pairs` (P,
+    MOMENTS + D) their gradients from `compositing.backward`. Fills the `grad_...` of
+    means, quaternions, scales, opacities and features, shaped like those. The last
+    feature is the z-depth. `grad_pose` is (G, 12), the gradient of `w2c` per Gaussian,
+    or (0, 12) if it is not wanted.
     """
     channels = grad_features.shape[1]
     for g in numba.prange(means.shape[0]):
         first, last = owned[g], owned[g + 1]
         if first == last:
-            grad_means[g, :], grad_quaternions[g, :], grad_scales[g, :], grad_features[g, :] = (
-                F0,
-                F0,
-                F0,
-                F0,
-            )
-            grad_opacities[g] = F0
+            grad_means[g, :] = ZERO
+            grad_quaternions[g, :] = ZERO
+            grad_scales[g, :] = ZERO
+            grad_opacities[g] = ZERO
+            grad_features[g, :] = ZERO
             if len(grad_pose):
-                grad_pose[g, :] = F0
+                grad_pose[g, :] = ZERO
             continue
         for d in range(channels):
-            total = F0
+            total = ZERO
             for i in range(first, last):
                 total += pairs[i, MOMENTS + d]
             grad_features[g, d] = total
         sums = sum_moments(pairs, first, last)
-        grad_opacities[g] = -sums[0] / opacities[g]
+        grad_opacities[g] = -sums[0] / opacities[g]  # dL / do = dL / dalpha * alpha / o
         m, q, s = gaussian(means, quaternions, scales, g)
         t, held, projection, (unit, r, n), spread, covariance = footprint(
             m, q, s, w2c, k, width, height
@@ -236,9 +239,9 @@ def project_backward(
             pose_gradient((dx, dy, dz), d_projection, m, jacobian(k, held), grad_pose[g])
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def sum_moments(pairs, first, last):
-    """The moments of a Gaussian's pairs, added up in float64."""
+    """The MOMENTS of a Gaussian's pairs from `first` to `last`, added up in float64."""
     u0 = u1 = u2 = u3 = u4 = u5 = 0.0
     for i in range(first, last):
         u0 += pairs[i, 0]
@@ -250,31 +253,35 @@ def sum_moments(pairs, first, last):
     return u0, u1, u2, u3, u4, u5
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def picture_gradient(covariance, u):
-    """From the moments `u` to dL / d pixel center (2,) and dL / d 2D covariance (xx,
-    xy, yy), with Q its inverse: -Q (dL / dQ) Q.
+    """dL / d pixel center (2,) and dL / d covariance (xx, xy, yy), of the moments `u`.
+
+    With Q the inverse of the 2D covariance, s = d^T Q d / 2 of an offset d: dL / dQ is
+    half the second moments, and dL / d covariance = -Q (dL / dQ) Q.
     """
     xx, xy, yy = covariance
     det = xx * yy - xy * xy
-    a, b, c = yy / det, -xy / det, xx / det  # in float64: needles thousands of pixels long need it
-    p0, p1, p2, p3 = (
-        a * u[3] + b * u[4],
-        a * u[4] + b * u[5],
-        b * u[3] + c * u[4],
-        b * u[4] + c * u[5],
-    )  # dL / dQ: half the moments
-    inner = (-0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c))
-    return (-(a * u[1] + b * u[2]), -(b * u[1] + c * u[2])), inner
+    # Q = (a, b; b, c) in float64: needles thousands of pixels long need it
+    a, b, c = yy / det, -xy / det, xx / det
+    # rows of Q times the second moments
+    p0, p1 = a * u[3] + b * u[4], a * u[4] + b * u[5]
+    p2, p3 = b * u[3] + c * u[4], b * u[4] + c * u[5]
+    d_covariance = (-0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c))
+    d_center = (-(a * u[1] + b * u[2]), -(b * u[1] + c * u[2]))
+    return d_center, d_covariance
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def shape_gradient(g, projection, spread, r, s):
-    """From G = dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3).
-    The covariance is V V^T + blur with V = T M and M = R S, so dV = 2 G V, dM = T^T dV,
-    dT = dV M^T.
+    """From dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3).
+
+    `g` is G = dL / d covariance (xx, xy, yy). The covariance is V V^T + blur with V = T
+    M and M = R S, so that dV = 2 G V, dM = T^T dV and dT = dV M^T.
     """
-    (t0, t1), (v0, v1), (g00, g01, g11) = projection, spread, g
+    t0, t1 = projection
+    v0, v1 = spread
+    g00, g01, g11 = g
     d0 = (
         2 * (g00 * v0[0] + g01 * v1[0]),
         2 * (g00 * v0[1] + g01 * v1[1]),
@@ -310,7 +317,8 @@ def shape_gradient(g, projection, spread, r, s):
         (m1[0] * s[0], m1[1] * s[1], m1[2] * s[2]),
         (m2[0] * s[0], m2[1] * s[1], m2[2] * s[2]),
     )
-    e0, e1 = (d0[0] * s[0], d0[1] * s[1], d0[2] * s[2]), (d1[0] * s[0], d1[1] * s[1], d1[2] * s[2])
+    e0 = (d0[0] * s[0], d0[1] * s[1], d0[2] * s[2])
+    e1 = (d1[0] * s[0], d1[1] * s[1], d1[2] * s[2])
     d_projection = (
         (dot(e0, r[0]), dot(e0, r[1]), dot(e0, r[2])),
         (dot(e1, r[0]), dot(e1, r[1]), dot(e1, r[2])),
@@ -318,38 +326,40 @@ def shape_gradient(g, projection, spread, r, s):
     return d_scales, d_rotation, d_projection
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def point_gradient(center, d_projection, t, held, w2c, k):
-    """dL / d camera point (3,), through the pixel center and through J in T = J W,
-    which does not see x or y where they are held.
+    """dL / d camera point t (3,), through the pixel center and through J in T = J W.
+
+    Given are dL / d pixel `center` (2,) and dL / dT (2, 3). J does not depend on x or y
+    where they are held at the edge: there x / z is constant.
     """
-    (gx, gy), (dt0, dt1), (x, y, z, held_x, held_y), (fx, fy) = (
-        center,
-        d_projection,
-        held,
-        (k[0], k[1]),
-    )
-    w0, w1, w2 = (
-        (w2c[0, 0], w2c[0, 1], w2c[0, 2]),
-        (w2c[1, 0], w2c[1, 1], w2c[1, 2]),
-        (w2c[2, 0], w2c[2, 1], w2c[2, 2]),
-    )
-    dj00, dj02, dj11, dj12 = dot(dt0, w0), dot(dt0, w2), dot(dt1, w1), dot(dt1, w2)
+    gx, gy = center
+    dt0, dt1 = d_projection
+    x, y, z, held_x, held_y = held
+    fx, fy = k[0], k[1]
+    w0 = (w2c[0, 0], w2c[0, 1], w2c[0, 2])
+    w1 = (w2c[1, 0], w2c[1, 1], w2c[1, 2])
+    w2 = (w2c[2, 0], w2c[2, 1], w2c[2, 2])
+    # dL / dJ = dL / dT W^T
+    dj00, dj02 = dot(dt0, w0), dot(dt0, w2)
+    dj11, dj12 = dot(dt1, w1), dot(dt1, w2)
+    slope_x, slope_y = 1.0 if held_x else 2.0, 1.0 if held_y else 2.0
     dz = -(fx * dj00 + fy * dj11) / (z * z) - (fx * t[0] * gx + fy * t[1] * gy) / (z * z)
-    dz += (fx * x * dj02 / (z * z * z)) * (1.0 if held_x else 2.0) + (
-        fy * y * dj12 / (z * z * z)
-    ) * (1.0 if held_y else 2.0)
+    dz += (fx * x * dj02 / (z * z * z)) * slope_x + (fy * y * dj12 / (z * z * z)) * slope_y
     dx = fx / z * gx - (0.0 if held_x else fx * dj02 / (z * z))
     dy = fy / z * gy - (0.0 if held_y else fy * dj12 / (z * z))
     return dx, dy, dz
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def pose_gradient(point, d_projection, m, j, out):
-    """dL / d world-to-camera `out` (12,), row by row: through the camera point `W m +
-    t`, and through W in T = J W.
+    """Fill `out` (12,), dL / d world-to-camera matrix row by row.
+
+    It flows through the camera point `W m + t`, and through W in T = J W.
     """
-    (dx, dy, dz), (dt0, dt1), (j00, j02, j11, j12) = point, d_projection, j
+    dx, dy, dz = point
+    dt0, dt1 = d_projection
+    j00, j02, j11, j12 = j
     for i in range(3):
         out[i] = dx * m[i] + j00 * dt0[i]
         out[4 + i] = dy * m[i] + j11 * dt1[i]
@@ -357,9 +367,12 @@ def pose_gradient(point, d_projection, m, j, out):
     out[3], out[7], out[11] = dx, dy, dz
 
 
-@numba.njit(cache=True, fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy")
 def quaternion_gradient(unit, n, dr, out):
-    """From dL / dR (3, 3) to the quaternion before it was made a unit one."""
+    """Fill `out` (4,), dL / d quaternion before it was normalized, from dL / dR (3, 3).
+
+    That is the unit quaternion's gradient without its part along it, over the length n.
+    """
     w, x, y, z = unit
     gw = 2 * (x * (dr[2][1] - dr[1][2]) + y * (dr[0][2] - dr[2][0]) + z * (dr[1][0] - dr[0][1]))
     gx = 2 * (
@@ -381,9 +394,7 @@ def quaternion_gradient(unit, n, dr, out):
         + w * (dr[1][0] - dr[0][1])
     )
     along = gw * w + gx * x + gy * y + gz * z
-    out[0], out[1], out[2], out[3] = (
-        (gw - along * w) / n,
-        (gx - along * x) / n,
-        (gy - along * y) / n,
-        (gz - along * z) / n,
-    )
+    out[0] = (gw - along * w) / n
+    out[1] = (gx - along * x) / n
+    out[2] = (gy - along * y) / n
+    out[3] = (gz - along * z) / n

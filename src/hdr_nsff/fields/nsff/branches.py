@@ -1,106 +1,123 @@
-"""The two ways to store a field's branches: additive grids (ours) and the published
-network. Both answer with raw numbers; `nsff.py` turns them into radiance, density and
-flow.
+"""The two ways to store a field's static and dynamic branch: additive grids (ours), and
+the published network (NSFF, Li et al. 2021; HDR-NSFF, eq. 1 and 5).
+
+Both answer with raw numbers at M points of the cube; `two_branches.py` and `nsff.py`
+turn them into radiance, density and scene flow.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Annotated, Any, Literal, Protocol
 
 import torch
+from annotated_types import Ge, Le
 from torch import Tensor, nn
 
+from hdr_nsff.core.settings import Advanced, Count, Number, Positive, Rate
+from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.fields.nsff.encodings import AdditiveGrid, Shape, frequencies
 
-APPEARANCE = 5  # raw radiance (3), raw density, raw blend share (read from the dynamic branch)
-MOTION = 8  # raw scene flow forward (3), raw disocclusion forward, the same backward
+APPEARANCE = 5  # raw radiance (3), raw density, raw blend share (used of the dynamic branch)
+MOTION = 8  # raw scene flow forward (3), raw disocclusion forward; the same backward
+
+MIN_GRID_POINTS = 4  # of a level along each axis of space
+MOTION_LEVELS = 2  # of the scene-flow grids: smooth by construction
+MOTION_DEPTH_SHARE = 8  # times fewer grid points of scene flow than `depth_cells`
 
 
 @dataclass(frozen=True)
 class GridConfig:
     """Additive multiresolution grids without a network behind them."""
 
-    finest: float = 1.0
-    """Finest cell across the image, in pixels of the training frames."""
-    depth_cells: int = 96
+    type: Advanced[Literal["grids"]] = "grids"
+    finest: Positive = 1.0
+    """Size of the finest cell across the image, in pixels of the training frames."""
+    depth_cells: Count = 96
     """Grid points along the third axis at the finest level."""
-    levels: int = 4
+    levels: Advanced[Count] = 4
     """Levels of the appearance grids, each twice as fine as the one before."""
-    max_rows: int = 2**20
+    max_rows: Advanced[Annotated[int, Ge(1), Le(10**9)]] = 2**20
     """Rows of a hashed level (a power of two)."""
-    motion_cell: float = 8.0
-    """BenchRun of the finer of the two scene-flow grids, in pixels: scene flow is
-    smooth by construction.
-    """
-    lr: float = 0.1
-    motion_lr: float = 0.01
+    motion_cell: Advanced[Positive] = 8.0
+    """Cell size of the finer of the two scene-flow grids, in pixels."""
+    lr: Advanced[Rate] = 0.1
+    """Learning rate of the appearance grids."""
+    motion_lr: Advanced[Rate] = 0.01
+    """Learning rate of the scene-flow grids."""
 
 
 @dataclass(frozen=True)
 class MlpConfig:
-    """The published network (METHOD.md 2): `layers` x `width`, skip, position encoding,
-    a view-dependent head.
-    """
+    """The published network: a skip connection, position encoding, view dependence."""
 
-    layers: int = 8
-    width: int = 256
-    skip_after: int = 5
-    octaves: int = 10
-    direction_octaves: int = 4
-    lr: float = 5e-4
+    type: Advanced[Literal["network"]] = "network"
+    layers: Count = 8
+    """Hidden layers of each branch."""
+    width: Count = 256
+    """Width of a hidden layer."""
+    skip_after: Advanced[Number] = 5
+    """Layers before the encoded position is fed in again."""
+    octaves: Advanced[Number] = 10
+    """Octaves of the position encoding."""
+    direction_octaves: Advanced[Number] = 4
+    """Octaves of the encoding of view directions."""
+    lr: Advanced[Rate] = 5e-4
+    """Learning rate."""
 
 
 class Branches(Protocol):
     """Static and dynamic branch of a field, in cube coordinates."""
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
-        """Raw radiance (3), density and an unused fifth number: (M, 5), at `coords` (M,
-        3) in [0, 1], unit view `directions` (M, 3).
+        """Raw radiance (3), density and an unused fifth number: (M, 5).
+
+        `coords` (M, 3) are in [0, 1], `directions` (M, 3) unit view directions.
         """
         ...
 
     def dynamic(
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
-        """Raw radiance (3), density, blend share: (M, 5) at time `knot`; with `motion`
-        also raw motion (M, 8).
+        """Raw radiance (3), density and blend share (M, 5) at time `knot`.
+
+        With `motion` also raw motion (M, 8), else None.
         """
         ...
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        """Parameter groups with learning rates; `touched` (row marks) comes with tables
-        of which only marked rows should move.
-        """
+    def param_groups(self) -> list[ParamGroup]:
+        """Parameters with their learning rates."""
         ...
 
 
 def pyramid(finest: tuple[float, float, float], levels: int, slices: int) -> list[Shape]:
-    """Grid shapes from coarse to fine, each level half of the next."""
-    x, y, z = finest
-    size = [2**k for k in reversed(range(levels))]
-    return [
-        (max(4, round(x / s)), max(4, round(y / s)), max(4, round(z / s)), slices) for s in size
-    ]
+    """Grid shapes from coarse to fine, each level half as fine as the next."""
+    shapes = []
+    for level in reversed(range(levels)):
+        x, y, z = (max(MIN_GRID_POINTS, round(points / 2**level)) for points in finest)
+        shapes.append((x, y, z, slices))
+    return shapes
 
 
 class GridBranches(nn.Module):
-    """Grids in the space of the cube; every training time has its own slice of the
-    dynamic ones.
-    """
+    """Grids over the cube; each training time has a slice of the dynamic ones."""
 
     def __init__(self, config: GridConfig, width: int, height: int, num_knots: int) -> None:
         super().__init__()
         self.config = config
         fine = (width / config.finest, height / config.finest, float(config.depth_cells))
-        coarse = (width / config.motion_cell, height / config.motion_cell, config.depth_cells / 8)
-        self.static_grid = AdditiveGrid(pyramid(fine, config.levels, 1), 1, config.max_rows)
-        self.dynamic_grid = AdditiveGrid(
-            pyramid(fine, config.levels, num_knots), num_knots, config.max_rows
+        coarse = (
+            width / config.motion_cell,
+            height / config.motion_cell,
+            config.depth_cells / MOTION_DEPTH_SHARE,
         )
-        self.motion_grids = nn.ModuleList(
-            AdditiveGrid(pyramid(coarse, 2, num_knots), num_knots, config.max_rows)
-            for _ in range(2)
+        static_shapes = pyramid(fine, config.levels, 1)
+        dynamic_shapes = pyramid(fine, config.levels, num_knots)
+        motion_shapes = pyramid(coarse, MOTION_LEVELS, num_knots)
+        self.static_grid = AdditiveGrid(static_shapes, 1, config.max_rows)
+        self.dynamic_grid = AdditiveGrid(dynamic_shapes, num_knots, config.max_rows)
+        self.motion_grids = nn.ModuleList(  # forward and backward
+            AdditiveGrid(motion_shapes, num_knots, config.max_rows) for _ in range(2)
         )
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
@@ -110,58 +127,66 @@ class GridBranches(nn.Module):
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
         appearance = nn.functional.pad(self.dynamic_grid(coords, knot), (0, 1))
-        return appearance, torch.cat(
-            [g(coords, knot) for g in self.motion_grids], -1
-        ) if motion else None
+        if not motion:
+            return appearance, None
+        return appearance, torch.cat([grid(coords, knot) for grid in self.motion_grids], -1)
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        c = self.config
+    def param_groups(self) -> list[ParamGroup]:
         appearance, motion = [self.static_grid, self.dynamic_grid], list(self.motion_grids)
         return [
-            {"params": [g.table for g in grids], "touched": [g.touched for g in grids], "lr": lr}
-            for grids, lr in ((appearance, c.lr), (motion, c.motion_lr))
+            table_group(appearance, self.config.lr),
+            table_group(motion, self.config.motion_lr),
         ]
 
 
+def table_group(grids: list[Any], lr: float) -> ParamGroup:
+    """A parameter group of grids' tables, of which only touched rows move."""
+    return ParamGroup([g.table for g in grids], lr, row_marks=[g.touched for g in grids])
+
+
 class Trunk(nn.Module):
-    """`layers` x `width` ReLU layers with one skip, a density head and a view-dependent
-    radiance head, which may know a code of `code_size` numbers besides: they come
-    behind the directions.
+    """ReLU layers with one skip, a density head and a view-dependent radiance head.
+
+    `dims` is the number of input coordinates, `extra` the number of outputs besides
+    radiance and density. The radiance head may also know a code of `code_size` numbers,
+    which follow the directions.
     """
 
     def __init__(self, config: MlpConfig, dims: int, extra: int, code_size: int = 0) -> None:
         super().__init__()
         self.config = config
         inputs = dims * (1 + 2 * config.octaves)
-        sizes = [inputs] + [
-            config.width + (inputs if i == config.skip_after else 0)
-            for i in range(1, config.layers)
-        ]
+        sizes = [inputs] + [config.width] * (config.layers - 1)
+        if 0 < config.skip_after < config.layers:
+            sizes[config.skip_after] += inputs
         self.hidden = nn.ModuleList(nn.Linear(n, config.width) for n in sizes)
-        self.extra = nn.Linear(
-            config.width, 1 + extra
-        )  # density, then whatever else depends on position alone
+        self.extra = nn.Linear(config.width, 1 + extra)  # density, and what else ignores the view
         self.feature = nn.Linear(config.width, config.width)
-        self.view = nn.Linear(
-            config.width + 3 * (1 + 2 * config.direction_octaves) + code_size, config.width // 2
-        )
+        views = 3 * (1 + 2 * config.direction_octaves)
+        self.view = nn.Linear(config.width + views + code_size, config.width // 2)
         self.radiance = nn.Linear(config.width // 2, 3)
 
     def forward(self, position: Tensor, directions: Tensor) -> Tensor:
-        """Raw radiance (3), density and the extra outputs: (M, 4 + extra)."""
+        """Raw radiance (3), density and the extra outputs: (M, 4 + extra).
+
+        `position` is (M, dims) in [-1, 1], `directions` (M, 3 + code_size).
+        """
         encoded = frequencies(position, self.config.octaves)
         h = encoded
         for i, layer in enumerate(self.hidden):
-            h = torch.cat([encoded, h], -1) if i == self.config.skip_after else h
+            if i == self.config.skip_after:
+                h = torch.cat([encoded, h], -1)
             h = layer(h).relu()
         views = frequencies(directions[:, :3], self.config.direction_octaves)
-        viewed = torch.cat([self.feature(h), views, directions[:, 3:]], -1)
-        return torch.cat([self.radiance(self.view(viewed).relu()), self.extra(h)], -1)
+        code = directions[:, 3:]
+        h_view = self.view(torch.cat([self.feature(h), views, code], -1)).relu()
+        return torch.cat([self.radiance(h_view), self.extra(h)], -1)
 
 
 class MlpBranches(nn.Module):
-    """The published pair of networks; time is a fourth input in [0, 1], space is the
-    cube scaled to [-1, 1].
+    """The published pair of networks.
+
+    Time is a fourth input in [0, 1]; space is the cube scaled to [-1, 1].
     """
 
     def __init__(self, config: MlpConfig, num_knots: int) -> None:
@@ -178,7 +203,8 @@ class MlpBranches(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         time = torch.full_like(coords[:, :1], knot / max(self.num_knots - 1, 1))
         raw = self.dynamic_trunk(torch.cat([2 * coords - 1, time], -1), directions)
-        return raw[:, :APPEARANCE], raw[:, APPEARANCE:] if motion else None
+        raw_motion = raw[:, APPEARANCE:] if motion else None
+        return raw[:, :APPEARANCE], raw_motion
 
-    def param_groups(self) -> list[dict[str, Any]]:
-        return [{"params": list(self.parameters()), "lr": self.config.lr}]
+    def param_groups(self) -> list[ParamGroup]:
+        return [ParamGroup(list(self.parameters()), self.config.lr)]

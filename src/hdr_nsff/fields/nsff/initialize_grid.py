@@ -1,11 +1,11 @@
-"""Start a grid field from what `prepare` knows: every pixel paints its radiance where
-its depth prior puts it.
+"""Initialize a grid field from the depth prior: every pixel stores its radiance where
+its prior depth puts it.
 
-Radiance goes in coarse to fine, each level taking the mean of what the coarser ones
+Radiance is fitted coarse to fine: each level takes the mean of what the coarser ones
 leave (a residual pyramid). Density is the maximum-likelihood one of a medium: rays
-stopped in a cell, per length of ray that crossed it. Static pixels paint the static
-branch, moving pixels their own time's slice of the dynamic one. Training refines all of
-it; this only saves it the first minutes.
+stopped in a cell, per length of ray that crossed it. Static pixels initialize the
+static branch, moving pixels their own time's slice of the dynamic one. Training refines
+all of it; this only saves it the first minutes.
 """
 
 from __future__ import annotations
@@ -19,140 +19,145 @@ from hdr_nsff.core.progress import track
 from hdr_nsff.fields.nsff.branches import GridBranches
 from hdr_nsff.fields.nsff.encodings import AdditiveGrid
 from hdr_nsff.fields.nsff.two_branches import TwoBranches
-from hdr_nsff.fields.surface import ToRadiance, exposure_trust
+from hdr_nsff.fields.point_cloud import ToRadiance, point_trust, prior_confidence, prior_disparity
 from hdr_nsff.scene.scene import Frame
 
-CROSSINGS = 24  # places along a ray where its passing is counted
-SWEEPS = 4  # over the finest level
-HARDEST, SOFTEST = 5.0, -4.0  # bounds of painted raw density
+FREE_SAMPLES = 24  # per ray, at which the space in front of the surface counts as crossed
+FINEST_SWEEPS = 4  # fits of the finest level: one weighted mean blurs (see its test)
+# bounds of the raw density, log of density per cube side (hand-chosen on rendered
+# scenes)
+MIN_LOG_DENSITY, MAX_LOG_DENSITY = -4.0, 5.0
+PRIOR_SHARE = 0.05  # of a cell's mean trust that pulls its residual to 0 (hand-chosen)
+# of half a cell: a cell crossed or hit by less than this length keeps the field's start
+MIN_SEEN = 1e-3
+# `refresh` keeps cells near a surface: it observed weight 1, and forgets half of it
+SURFACE_THRESHOLD, SURFACE_DECAY = 0.5, 0.5
 
 
 @dataclass(frozen=True)
-class Splash:
-    """What one frame paints."""
+class SurfaceSamples:
+    """The surface that one frame sees, and the free space in front of it."""
 
     coords: Tensor  # (P, 3) surface points, cube
     raw_radiance: Tensor  # (P, 3) as the grids store it
-    trust: Tensor  # (P,)
+    trust: Tensor  # (P,) > 0
     moving: Tensor  # (P,) bool
-    crossed: Tensor  # (P, CROSSINGS, 3) cube points in front of the surface
-    lengths: Tensor  # (P,) cube length of ray that each of those stands for
-    knot: float
+    crossed: Tensor  # (P, FREE_SAMPLES, 3) cube points in front of the surface
+    lengths: Tensor  # (P,) cube length of ray that each of those represents
+    knot: float  # of the frame's time
 
 
-def paint(field: TwoBranches, frames: list[Frame], to_radiance: ToRadiance) -> bool:
-    """Paint `field` from the frames' depth priors; False where it has no grids or the
-    frames no depth in scene units.
+def initialize_grid(field: TwoBranches, frames: list[Frame], to_radiance: ToRadiance) -> bool:
+    """Initialize `field` from the frames' depth priors; whether it could.
 
+    It cannot where it has no grids, or a frame no depth in scene units.
     `to_radiance(rgb (P, 3), i)` inverts the recording of frame `i`.
     """
-    if not isinstance(field.branches, GridBranches) or any(f.disparity is None for f in frames):
+    if not isinstance(field.branches, GridBranches):
         return False
-    splashes = [splash(field, f, i, to_radiance) for i, f in enumerate(track(frames, "painting"))]
+    if any(f.disparity is None for f in frames):
+        return False
+    samples = [
+        sample_surface(field, frame, i, to_radiance)
+        for i, frame in enumerate(track(frames, "initializing grids"))
+    ]
     static, dynamic = field.branches.static_grid, field.branches.dynamic_grid
-    paint_density(
-        static,
-        splashes,
-        static_density_level(static),
-        moving=False,
-        bias=field.density_bias(static=True),
-    )
-    paint_radiance(static, splashes, moving=False)
-    for s in splashes:
-        field.static_cells.observe(s.coords[~s.moving], torch.ones(int((~s.moving).sum())))
-    field.static_cells.refresh(threshold=0.5, decay=0.5)
-    if any(s.moving.any() for s in splashes):
-        paint_density(
-            dynamic,
-            splashes,
-            static_density_level(dynamic),
-            moving=True,
-            bias=field.density_bias(static=False),
-        )
-        paint_radiance(dynamic, splashes, moving=True)
+    fit_density(static, samples, moving=False, bias=field.density_bias(static=True))
+    fit_radiance(static, samples, moving=False)
+    for s in samples:
+        surface = s.coords[~s.moving]
+        field.static_cells.observe(surface, torch.ones(len(surface)))
+    field.static_cells.refresh(SURFACE_THRESHOLD, SURFACE_DECAY)
+    if any(s.moving.any() for s in samples):
+        fit_density(dynamic, samples, moving=True, bias=field.density_bias(static=False))
+        fit_radiance(dynamic, samples, moving=True)
     return True
 
 
-def static_density_level(grid: AdditiveGrid) -> int:
-    """The finest level without hashing: free space painted into a hash would erase
-    surfaces elsewhere.
-    """
-    dense = [i for i, hashed in enumerate(grid.hashed) if not hashed]
-    return dense[-1] if dense else 0
+def sample_surface(
+    field: TwoBranches, frame: Frame, position: int, to_radiance: ToRadiance
+) -> SurfaceSamples:
+    """Surface points, their radiance and the free space that one frame sees.
 
-
-def splash(field: TwoBranches, f: Frame, position: int, to_radiance: ToRadiance) -> Splash:
-    """Points, colors and crossed space of the frame at `position` of the training
-    frames.
+    `position` is the frame's place in the list of training frames.
     """
-    assert f.disparity is not None
-    rays = f.camera.rays(f.camera.pixel_grid())
-    disparity = f.disparity.reshape(-1).clamp(1 / field.far, 1 / field.near)
-    rgb = f.image.reshape(-1, 3)
-    coords = field.space.encode(rays.origins + rays.directions / disparity[:, None])
-    share = (torch.arange(CROSSINGS) + 0.5) / CROSSINGS
-    passing = 1 / field.near + share * (
-        disparity[:, None] - 1 / field.near
-    )  # (P, CROSSINGS) even in disparity
-    crossed = field.space.encode(
-        rays.origins[:, None] + rays.directions[:, None] / passing[..., None]
-    )
-    confidence = (
-        torch.ones_like(disparity)
-        if f.disparity_confidence is None
-        else f.disparity_confidence.reshape(-1)
-    )
-    return Splash(
-        coords=coords,
+    rays = frame.camera.rays(frame.camera.pixel_grid())
+    disparity = prior_disparity(frame, field.near, field.far)
+    rgb = frame.image.reshape(-1, 3)
+    surface = rays.origins + rays.directions / disparity[:, None]  # (P, 3)
+    # samples in front of the surface, even in disparity
+    share = (torch.arange(FREE_SAMPLES) + 0.5) / FREE_SAMPLES
+    nearest = 1 / field.near
+    passing = nearest + share * (disparity[:, None] - nearest)  # (P, FREE_SAMPLES)
+    in_front = rays.origins[:, None] + rays.directions[:, None] / passing[..., None]
+    crossed = field.space.encode(in_front)
+    if frame.moving is None:
+        moving = torch.zeros_like(disparity, dtype=torch.bool)
+    else:
+        moving = frame.moving.reshape(-1)
+    return SurfaceSamples(
+        coords=field.space.encode(surface),
         raw_radiance=field.from_radiance(to_radiance(rgb, position)),
-        trust=(confidence + 0.02) * exposure_trust(rgb),
-        moving=torch.zeros_like(disparity, dtype=torch.bool)
-        if f.moving is None
-        else f.moving.reshape(-1),
+        trust=point_trust(rgb, prior_confidence(frame)),
+        moving=moving,
         crossed=crossed,
-        lengths=(crossed[:, -1] - crossed[:, 0]).norm(dim=-1) / (CROSSINGS - 1),
-        knot=field.knot(f.time),
+        lengths=(crossed[:, -1] - crossed[:, 0]).norm(dim=-1) / (FREE_SAMPLES - 1),
+        knot=field.knot(frame.time),
     )
 
 
-def paint_radiance(grid: AdditiveGrid, splashes: list[Splash], moving: bool) -> None:
-    """Coarse to fine, every level the trust-weighted mean of what is left; the finest
-    one several times, as one mean blurs.
+def fit_radiance(grid: AdditiveGrid, samples: list[SurfaceSamples], moving: bool) -> None:
+    """Fit radiance coarse to fine, to static or to moving pixels.
+
+    Every level is the trust-weighted mean of what the others leave. The finest one is
+    fitted several times, as one mean blurs.
     """
     finest = len(grid.res) - 1
-    for level in [*range(finest), *[finest] * SWEEPS]:
-        total = torch.zeros(int(grid.size[level]), 4)
-        for s in splashes:
+    for level in [*range(finest), *[finest] * FINEST_SWEEPS]:
+        total = torch.zeros(int(grid.size[level]), 4)  # trust * residual (3), trust
+        for s in samples:
             chosen = s.moving == moving
             coords, trust = s.coords[chosen], s.trust[chosen, None]
             with torch.no_grad():
-                left = s.raw_radiance[chosen] - grid(coords, s.knot)[:, :3]
-            total += grid.spread_to(level, coords, torch.cat([left * trust, trust], -1), s.knot)
+                residual = s.raw_radiance[chosen] - grid(coords, s.knot)[:, :3]
+            weighted = torch.cat([residual * trust, trust], -1)
+            total += grid.scatter_level(level, coords, weighted, s.knot)
         weight = total[:, 3:]
-        grid.rows_of(level)[:, :3] += total[:, :3] / (
-            weight + 0.05 * weight[weight > 0].mean().nan_to_num(1.0) + 1e-9
-        )
+        mean_weight = weight[weight > 0].mean().nan_to_num(1.0)
+        grid.rows_of(level)[:, :3] += total[:, :3] / (weight + PRIOR_SHARE * mean_weight + 1e-9)
 
 
-def paint_density(
-    grid: AdditiveGrid, splashes: list[Splash], level: int, moving: bool, bias: float
+def fit_density(
+    grid: AdditiveGrid, samples: list[SurfaceSamples], moving: bool, bias: float
 ) -> None:
-    """Rays stopped per length crossed, as raw density at one level. Unseen cells keep
-    the field's own start.
+    """Fit raw density at one level, to static or to moving pixels.
+
+    It is rays stopped in a cell, per length of ray that crossed it. Unseen cells keep
+    the field's own start, raw density 0.
     """
-    total = torch.zeros(int(grid.size[level]), 4)
-    for s in splashes:
+    level = finest_dense_level(grid)
+    total = torch.zeros(int(grid.size[level]), 4)  # rays stopped, length crossed, unused (2)
+    for s in samples:
         chosen = s.moving == moving
         stops = torch.zeros(int(chosen.sum()), 4)
         stops[:, 0] = 1
-        total += grid.spread_to(level, s.coords[chosen], stops, s.knot)
-        passes = torch.zeros(len(s.coords) * CROSSINGS, 4)
-        passes[:, 1] = s.lengths[:, None].expand(-1, CROSSINGS).reshape(-1)
-        total += grid.spread_to(level, s.crossed.reshape(-1, 3), passes, s.knot)
+        total += grid.scatter_level(level, s.coords[chosen], stops, s.knot)
+        passes = torch.zeros(len(s.coords) * FREE_SAMPLES, 4)
+        passes[:, 1] = s.lengths[:, None].expand(-1, FREE_SAMPLES).reshape(-1)
+        total += grid.scatter_level(level, s.crossed.reshape(-1, 3), passes, s.knot)
     stopped, length = total[:, 0], total[:, 1]
-    half_cell = 0.5 / float(grid.res[level, 2])
+    half_cell = 0.5 / float(grid.res[level, 2])  # a ray that stops has crossed half a cell
     density = stopped / (length + stopped * half_cell).clamp_min(1e-9)
-    raw = density.clamp_min(1e-6).log().clamp(SOFTEST, HARDEST) - bias
-    grid.rows_of(level)[:, 3] = torch.where(
-        stopped + length > 1e-3 * half_cell, raw, torch.zeros_like(raw)
-    )
+    log_density = density.clamp_min(1e-6).log().clamp(MIN_LOG_DENSITY, MAX_LOG_DENSITY)
+    raw = log_density - bias
+    seen = stopped + length > MIN_SEEN * half_cell
+    grid.rows_of(level)[:, 3] = torch.where(seen, raw, torch.zeros_like(raw))
+
+
+def finest_dense_level(grid: AdditiveGrid) -> int:
+    """The finest level without hashing.
+
+    Free space written into a hash table would erase surfaces elsewhere.
+    """
+    dense = [i for i, hashed in enumerate(grid.hashed) if not hashed]
+    return dense[-1] if dense else 0

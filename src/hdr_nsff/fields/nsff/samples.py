@@ -1,9 +1,13 @@
-"""Samples along rays, what a branch holds there, and pictures made chunk by chunk."""
+"""Samples along rays, what a branch answers there, and pictures rendered in chunks.
+
+Shapes are (N rays, S samples). Cube coordinates are those of `space.py`.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,30 +17,33 @@ from hdr_nsff.fields.space import Space
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import volume
 
-CHUNK = 8192  # pixels rendered at once
+T = TypeVar("T")
+
+CHUNK = 8192  # pixels rendered at once, which bounds memory
+MAX_LOG_RADIANCE = 14.0  # of a sample: keeps its exponential and sums of it finite
 
 
 @dataclass(frozen=True)
-class March:
+class RaySamples:
     """Samples along rays, all of them."""
 
-    depths: Tensor  # (N, S) z-depth
+    depths: Tensor  # (N, S) z-depth, scene units
     points: Tensor  # (N, S, 3) scene units
     coords: Tensor  # (N, S, 3) cube
-    deltas: Tensor  # (N, S) cube
+    deltas: Tensor  # (N, S) cube length of the step to the next sample
     directions: Tensor  # (N, 3) unit view directions
 
 
 @dataclass(frozen=True)
-class Content:
-    """What one branch holds at the samples of some rays."""
+class BranchOutput:
+    """What one branch answers at the samples of some rays."""
 
-    density: Tensor  # (N, S)
-    radiance: Tensor  # (N, S, 3)
-    blend: Tensor  # (N, S)
+    density: Tensor  # (N, S) per cube length, >= 0
+    radiance: Tensor  # (N, S, 3) linear HDR, >= 0
+    blend: Tensor  # (N, S) share of dynamic content, where eq. 6 blends
 
 
-def march(
+def sample_rays(
     space: Space,
     camera: Camera,
     pixels: Tensor,
@@ -44,40 +51,68 @@ def march(
     near: float,
     far: float,
     generator: torch.Generator | None,
-) -> March:
-    """Samples along the rays of `pixels` (N, 2), evenly in disparity from `near` to
-    `far`; jittered where a generator is given.
+) -> RaySamples:
+    """Samples along the rays of `pixels` (N, 2), evenly in disparity, near to far.
+
+    `near` and `far` are z-depths in scene units. With a generator, samples are jittered
+    within their bins.
     """
     rays = camera.rays(pixels)
-    n = len(pixels)
-    jitter = None if generator is None else torch.rand(n, num_samples, generator=generator)
-    depths = volume.stratified_disparity(n, num_samples, near, far, jitter).to(pixels)
+    num_rays = len(pixels)
+    jitter = None
+    if generator is not None:
+        jitter = torch.rand(num_rays, num_samples, generator=generator)
+    depths = volume.stratified_disparity(num_rays, num_samples, near, far, jitter).to(pixels)
     points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]  # (N, S, 3)
     coords = space.encode(points)
-    return March(
-        depths,
-        points,
-        coords,
-        volume.step_lengths(coords),
-        nn.functional.normalize(rays.directions, dim=-1),
+    return RaySamples(
+        depths=depths,
+        points=points,
+        coords=coords,
+        deltas=volume.step_lengths(coords),
+        directions=nn.functional.normalize(rays.directions, dim=-1),
     )
 
 
-def in_chunks(
-    field: nn.Module, camera: Camera, pixels: Tensor | None, part: Callable[[Tensor], Render]
-) -> Render:
-    """What `part` renders of `pixels` (S, 2), or of every pixel row by row, a few
-    thousand at once; the field is out of training meanwhile.
+def ray_of(index: Tensor, num_samples: int) -> Tensor:
+    """The ray (M,) of each sample, of its position `index` (M,) among N * S samples."""
+    return torch.div(index, num_samples, rounding_mode="floor")
+
+
+def sum_per_ray(values: Tensor, ray: Tensor, num_rays: int) -> Tensor:
+    """The sum of `values` (M, C) over the samples of each `ray` (M,): (num_rays, C)."""
+    return values.new_zeros(num_rays, values.shape[1]).index_add(0, ray, values)
+
+
+def map_chunks(
+    field: nn.Module, camera: Camera, pixels: Tensor | None, function: Callable[[Tensor], T]
+) -> list[T]:
+    """`function` of `pixels` (S, 2), or of every pixel row by row, chunk by chunk.
+
+    The field is in evaluation mode meanwhile.
     """
     pixels = camera.pixel_grid() if pixels is None else pixels
     was_training = field.training
     field.eval()
-    parts = [part(chunk) for chunk in pixels.split(CHUNK)]
+    parts = [function(chunk) for chunk in pixels.split(CHUNK)]
     field.train(was_training)
-    radiance, depth, opacity, motion = (
-        torch.cat(maps)
-        for maps in zip(*((p.radiance, p.depth, p.opacity, p.motion) for p in parts), strict=True)
-    )
-    flows = {o: torch.cat([p.scene_flow[o] for p in parts]) for o in parts[0].scene_flow}
+    return parts
+
+
+def render_in_chunks(
+    field: nn.Module, camera: Camera, pixels: Tensor | None, function: Callable[[Tensor], Render]
+) -> Render:
+    """The render that `function` makes of `pixels` (S, 2), or of every pixel.
+
+    It is called with a few thousand pixels at once; warps are not joined.
+    """
+    parts = map_chunks(field, camera, pixels, function)
     rgb = [p.rgb for p in parts if p.rgb is not None]
-    return Render(radiance, depth, opacity, motion, flows, rgb=torch.cat(rgb) if rgb else None)
+    return Render(
+        radiance=torch.cat([p.radiance for p in parts]),
+        depth=torch.cat([p.depth for p in parts]),
+        opacity=torch.cat([p.opacity for p in parts]),
+        motion=torch.cat([p.motion for p in parts]),
+        scene_flow={o: torch.cat([p.scene_flow[o] for p in parts]) for o in parts[0].scene_flow},
+        rgb=torch.cat(rgb) if rgb else None,
+    )

@@ -1,4 +1,4 @@
-"""What fields of a static and a dynamic branch share: sampling rays, culling, asking
+"""What fields of a static and a dynamic branch share: sampling rays, culling, querying
 the branches, compositing. Grids and the published network are two encodings of one
 class. `NSFF` adds scene flow to it, `NerfWT` an appearance code per image.
 
@@ -11,30 +11,64 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import torch
+from pydantic import Discriminator
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import HIGHEST, FrameError
+from hdr_nsff.core.settings import Advanced, Count, Number, Share, Weight
+from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE, FrameError, ParamGroup
 from hdr_nsff.fields.knots import knot_of
-from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpBranches, MlpConfig
+from hdr_nsff.fields.nsff.branches import (
+    Branches,
+    GridBranches,
+    GridConfig,
+    MlpBranches,
+    MlpConfig,
+)
 from hdr_nsff.fields.nsff.occupancy import Occupancy
-from hdr_nsff.fields.nsff.samples import Content, March, march
+from hdr_nsff.fields.nsff.samples import (
+    MAX_LOG_RADIANCE,
+    BranchOutput,
+    RaySamples,
+    ray_of,
+    sample_rays,
+)
 from hdr_nsff.fields.space import Space
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import volume
 from hdr_nsff.scene.batch import PixelBatch
+from hdr_nsff.scene.scene import Frame
+
+MIN_RADIANCE = 1e-5  # that is turned into a raw number: keeps its logarithm finite
+MAX_LOG_DENSITY = 10.0  # per cube side: keeps the exponential finite
+# raw density at the start: a thin static fog, almost no dynamic one, so that static
+# content explains what it can (hand-chosen on rendered scenes)
+STATIC_DENSITY_BIAS, DYNAMIC_DENSITY_BIAS = 0.0, -3.0
+
+# culling grids (hand-chosen on rendered scenes)
+CULL_CELL_PX = 4  # of the static grid, at the frames' size
+CULL_DEPTH_CELLS = 48
+DYNAMIC_CULL_SCALE = 2  # times as large are the dynamic grids' cells, along every axis
+MIN_CULL_CELLS = 8  # across the image
+REFRESH_EVERY = 16  # steps
+STATIC_MIN_WEIGHT, DYNAMIC_MIN_WEIGHT = 2e-3, 1e-3  # rendered weight that keeps a cell
+WEIGHT_DECAY = 0.97  # of remembered weights, at every refresh
+
+MASK_DILATION_PX = 9  # dynamic content may lie this far outside of the moving masks
 
 
 @dataclass(frozen=True)
 class BranchesConfig:
     """A static and a dynamic branch."""
 
-    encoding: GridConfig | MlpConfig = field(default_factory=GridConfig)
-    samples: int = 32
+    encoding: Annotated[GridConfig | MlpConfig, Discriminator("type")] = field(
+        default_factory=GridConfig
+    )
+    samples: Count = 32
     """Samples along a ray while training."""
-    render_samples: int = 64
+    render_samples: Count = 64
     """Samples along a ray when rendering."""
     compositing: Literal["add", "blend"] = "add"
     """How static and dynamic content share a place: densities add up, or the blend
@@ -42,39 +76,43 @@ class BranchesConfig:
     """
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or the published one below 1."""
-    density: Literal["exp", "relu"] = "exp"
-    density_noise: float = 0.0
+    density: Advanced[Literal["exp", "relu"]] = "exp"
+    """Density as an exponential, or the published ReLU."""
+    density_noise: Advanced[Weight] = 0.0
     """Standard deviation added to raw densities while training (published: 1)."""
-    cull: bool = True
+    cull: Advanced[bool] = True
     """Skip samples in cells that never mattered."""
-    cull_after: int = 100
+    cull_after: Advanced[Number] = 100
     """Steps before culling starts."""
-    explore: float = 0.04
+    explore: Advanced[Share] = 0.04
     """Share of the culled samples that is evaluated all the same."""
 
 
 @dataclass(frozen=True)
-class Pass:
-    """One training pass after both branches were asked at the batch's own time."""
+class BranchPass:
+    """One training pass, after both branches were queried at the batch's own time."""
 
-    m: March
+    samples: RaySamples
     knot: float
     index: Tensor  # (M,) dynamic samples among N * S
     coords: Tensor  # (M, 3) cube
     raw_motion: Tensor | None  # (M, 8)
-    static: Content
-    dynamic: Content
-    w: volume.Weights
+    static: BranchOutput
+    dynamic: BranchOutput
+    weights: volume.Weights
 
 
 class TwoBranches(nn.Module):
-    """See the module. `times` (T,) are those of the training frames; frames are `width`
-    x `height`.
+    """A static and a dynamic branch in the unit cube.
+
+    `times` (T,) are those of the training frames, which are `width` x `height`; `near`
+    and `far` are z-depths in scene units. Without `branches`, plain ones are built.
     """
 
     times: Tensor
     bias: Tensor
     config: BranchesConfig
+    branches: Branches
 
     def __init__(
         self,
@@ -85,49 +123,49 @@ class TwoBranches(nn.Module):
         far: float,
         width: int,
         height: int,
-        log_radiance: float = 0.0,
         branches: GridBranches | MlpBranches | None = None,
     ) -> None:
         super().__init__()
-        self.config, self.space, self.near, self.far = config, space, near, far
+        self.config, self.space = config, space
+        self.near, self.far = near, far
         self.register_buffer("times", times.double())
-        knots = len(times)
-        self.branches = (
-            plain_branches(config.encoding, width, height, knots) if branches is None else branches
-        )
-        aspect = (max(8, round(width / 4)), max(8, round(height / 4)), 48)
-        self.static_cells = Occupancy(aspect)
-        self.dynamic_cells = Occupancy((aspect[0] // 2, aspect[1] // 2, 24), knots)
-        self.register_buffer(
-            "bias", torch.tensor(log_radiance)
-        )  # raw radiance 0 is this log radiance
-        self.step = 0
+        num_knots = len(times)
+        if branches is None:
+            branches = build_branches(config.encoding, width, height, num_knots)
+        self.branches = branches
+        x = max(MIN_CULL_CELLS, round(width / CULL_CELL_PX))
+        y = max(MIN_CULL_CELLS, round(height / CULL_CELL_PX))
+        z, scale = CULL_DEPTH_CELLS, DYNAMIC_CULL_SCALE
+        self.static_cells = Occupancy((x, y, z))
+        self.dynamic_cells = Occupancy((x // scale, y // scale, z // scale), num_knots)
+        self.register_buffer("bias", torch.tensor(0.0))  # log radiance of raw radiance 0
 
     # What the raw numbers mean
 
     def to_radiance(self, raw: Tensor) -> Tensor:
         """Linear HDR radiance, >= 0."""
-        return (
-            (raw + self.bias).clamp(max=14.0).exp()
-            if self.config.radiance == "exp"
-            else raw.sigmoid()
-        )
+        if self.config.radiance == "exp":
+            return (raw + self.bias).clamp(max=MAX_LOG_RADIANCE).exp()
+        return raw.sigmoid()
 
     def from_radiance(self, radiance: Tensor) -> Tensor:
-        """Raw numbers of which `to_radiance` makes `radiance` (..., 3), as near as it
-        can.
-        """
+        """Raw numbers of which `to_radiance` makes `radiance` (..., 3), clamped."""
         if self.config.radiance == "exp":
-            return radiance.clamp_min(1e-5).log() - self.bias
-        return radiance.clamp(1 - HIGHEST, HIGHEST).logit()
+            return radiance.clamp_min(MIN_RADIANCE).log() - self.bias
+        return radiance.clamp(1 - MAX_SIGMOID_RADIANCE, MAX_SIGMOID_RADIANCE).logit()
 
     def to_density(self, raw: Tensor, bias: float) -> Tensor:
-        """Density per cube unit, >= 0."""
+        """Density per cube side, >= 0; with noise while training, by the settings."""
         if self.training and self.config.density_noise:
-            raw = raw + self.config.density_noise * torch.randn(raw.shape, generator=self.rng).to(
-                raw
-            )
-        return (raw + bias).clamp(max=10.0).exp() if self.config.density == "exp" else raw.relu()
+            noise = torch.randn(raw.shape, generator=self.generator).to(raw)
+            raw = raw + self.config.density_noise * noise
+        if self.config.density == "exp":
+            return (raw + bias).clamp(max=MAX_LOG_DENSITY).exp()
+        return raw.relu()
+
+    def density_bias(self, static: bool) -> float:
+        """What is added to the raw density of a branch, 0 at the start."""
+        return STATIC_DENSITY_BIAS if static else DYNAMIC_DENSITY_BIAS
 
     # Time and space
 
@@ -135,160 +173,154 @@ class TwoBranches(nn.Module):
         """Position of a time (in frames) on the list of training times."""
         return knot_of(self.times, time)
 
-    def march(
+    def sample(
         self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None
-    ) -> March:
-        """Samples along the rays of `pixels` (N, 2); jittered where a generator is
-        given.
-        """
-        return march(self.space, camera, pixels, num_samples, self.near, self.far, generator)
+    ) -> RaySamples:
+        """Samples along the rays of `pixels` (N, 2); jittered with a generator."""
+        return sample_rays(self.space, camera, pixels, num_samples, self.near, self.far, generator)
 
-    # Asking the branches
+    # Querying the branches
 
-    def static_content(self, m: March, keep: Tensor) -> Content:
-        """The static branch at the samples `keep` (N, S) bool; empty space elsewhere."""
+    def query_static(self, samples: RaySamples, keep: Tensor) -> BranchOutput:
+        """The static branch at the samples `keep` (N, S) bool; empty elsewhere."""
         index = keep.reshape(-1).nonzero()[:, 0]
-        raw = self.branches.static(m.coords.reshape(-1, 3)[index], self.views(m, index))
-        return self.spread(raw, index, keep.shape, self.density_bias(static=True))
+        coords = samples.coords.reshape(-1, 3)[index]
+        raw = self.branches.static(coords, self.view_directions(samples, index))
+        return self.scatter(raw, index, keep.shape, self.density_bias(static=True))
 
-    def dynamic_content(
+    def query_dynamic(
         self,
         coords: Tensor,
         index: Tensor,
         shape: torch.Size,
         knot: float,
-        views: Tensor,
+        directions: Tensor,
         motion: bool,
-    ) -> tuple[Content, Tensor | None]:
-        """The dynamic branch at `coords` (M, 3), which are samples `index` (M,) of rays
-        of `shape` (N, S), and raw motion (M, 8).
+    ) -> tuple[BranchOutput, Tensor | None]:
+        """The dynamic branch at `coords` (M, 3), and with `motion` raw motion (M, 8).
+
+        The coordinates are those of samples `index` (M,) of rays of `shape` (N, S).
         """
-        raw, raw_motion = self.branches.dynamic(coords, knot, views, motion)
-        return self.spread(raw, index, shape, self.density_bias(static=False)), raw_motion
+        raw, raw_motion = self.branches.dynamic(coords, knot, directions, motion)
+        return self.scatter(raw, index, shape, self.density_bias(static=False)), raw_motion
 
-    def density_bias(self, static: bool) -> float:
-        """Raw density at the start: a thin static fog, almost no dynamic one."""
-        return 0.0 if static else -3.0
-
-    def spread(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> Content:
-        """Samples in packed order, as dense rays."""
+    def scatter(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> BranchOutput:
+        """Raw numbers (M, 5) of samples `index` (M,), as rays of `shape` (N, S)."""
         total = shape[0] * shape[1]
         density = raw.new_zeros(total).index_copy(0, index, self.to_density(raw[:, 3], bias))
         radiance = raw.new_zeros(total, 3).index_copy(0, index, self.to_radiance(raw[:, :3]))
-        share = (
-            raw.new_zeros(total).index_copy(0, index, raw[:, 4].sigmoid())
-            if self.config.compositing == "blend"
-            else density
-        )
-        return Content(density.view(shape), radiance.view(*shape, 3), share.view(shape))
+        blend = density  # unused where densities add up
+        if self.config.compositing == "blend":
+            blend = raw.new_zeros(total).index_copy(0, index, raw[:, 4].sigmoid())
+        return BranchOutput(density.view(shape), radiance.view(*shape, 3), blend.view(shape))
 
-    def views(self, m: March, index: Tensor) -> Tensor:
-        """View directions (M, 3) of samples `index`; grids do not look at them."""
+    def view_directions(self, samples: RaySamples, index: Tensor) -> Tensor:
+        """View directions (M, 3) of samples `index`; none for grids."""
         if isinstance(self.config.encoding, GridConfig):
-            return m.directions[:0]
-        return m.directions[torch.div(index, m.depths.shape[1], rounding_mode="floor")]
+            return samples.directions[:0]
+        return samples.directions[ray_of(index, samples.depths.shape[1])]
 
-    def weights(self, static: Content, dynamic: Content, deltas: Tensor) -> volume.Weights:
+    def composite_weights(
+        self, static: BranchOutput, dynamic: BranchOutput, deltas: Tensor
+    ) -> volume.Weights:
         """Compositing weights of both branches."""
         if self.config.compositing == "add":
             return volume.add(static.density, dynamic.density, deltas)
         return volume.blend(static.density, dynamic.density, dynamic.blend, deltas)
 
-    def kept(
-        self, m: March, knot: float, explore: float, generator: torch.Generator | None
+    def select_samples(
+        self, samples: RaySamples, knot: float, explore: float, generator: torch.Generator | None
     ) -> tuple[Tensor, Tensor]:
-        """Which samples to ask of the static and of the dynamic branch, (N, S) bool
-        each.
-        """
-        flat, shape = m.coords.reshape(-1, 3), m.depths.shape
+        """Samples to query of the static and the dynamic branch: (N, S) bool."""
+        coords, shape = samples.coords.reshape(-1, 3), samples.depths.shape
         if not self.config.cull:
-            everything = torch.ones(shape, dtype=torch.bool, device=flat.device)
-            return everything, everything
-        static = self.static_cells.asks(flat, 0.0, explore, generator).view(shape)
-        dynamic = self.dynamic_cells.asks(flat, knot, explore, generator).view(shape)
+            every = torch.ones(shape, dtype=torch.bool, device=coords.device)
+            return every, every
+        static = self.static_cells.select(coords, 0.0, explore, generator).view(shape)
+        dynamic = self.dynamic_cells.select(coords, knot, explore, generator).view(shape)
         return static, dynamic
 
     # Training
 
-    def ask(self, batch: PixelBatch, motion: bool) -> Pass:
-        """Both branches at samples along the batch's rays, composited; raw motion if
-        there is `motion`.
+    def query(self, batch: PixelBatch, motion: bool) -> BranchPass:
+        """Both branches at samples along the batch's rays, composited.
+
+        With `motion`, the pass has raw motion.
         """
-        rng = torch.Generator().manual_seed(batch.seed)
-        self.rng = rng
+        generator = torch.Generator().manual_seed(batch.seed)
+        self.generator = generator
         knot = self.knot(batch.time)
-        m = self.march(batch.camera, batch.pixels, self.config.samples, rng)
-        keep_static, keep_dynamic = self.kept(m, knot, self.config.explore, rng)
-        static = self.static_content(m, keep_static)
-        index = keep_dynamic.reshape(-1).nonzero()[:, 0]
-        coords = m.coords.reshape(-1, 3)[index]
-        dynamic, raw_motion = self.dynamic_content(
-            coords, index, keep_dynamic.shape, knot, self.views(m, index), motion
+        samples = self.sample(batch.camera, batch.pixels, self.config.samples, generator)
+        keep_static, keep_dynamic = self.select_samples(
+            samples, knot, self.config.explore, generator
         )
-        w = self.weights(static, dynamic, m.deltas)
+        static = self.query_static(samples, keep_static)
+        index = keep_dynamic.reshape(-1).nonzero()[:, 0]
+        all_coords = samples.coords.reshape(-1, 3)
+        coords = all_coords[index]
+        directions = self.view_directions(samples, index)
+        dynamic, raw_motion = self.query_dynamic(
+            coords, index, keep_dynamic.shape, knot, directions, motion
+        )
+        weights = self.composite_weights(static, dynamic, samples.deltas)
         if self.config.cull:
-            self.static_cells.observe(m.coords.reshape(-1, 3), w.static.reshape(-1))
-            self.dynamic_cells.observe(coords, w.dynamic.reshape(-1)[index], knot)
-        return Pass(m, knot, index, coords, raw_motion, static, dynamic, w)
+            self.static_cells.observe(all_coords, weights.static.reshape(-1))
+            self.dynamic_cells.observe(coords, weights.dynamic.reshape(-1)[index], knot)
+        return BranchPass(samples, knot, index, coords, raw_motion, static, dynamic, weights)
 
     # Housekeeping
 
-    def param_groups(self) -> list[dict[str, Any]]:
+    def param_groups(self) -> list[ParamGroup]:
         """The branches' groups."""
         return self.branches.param_groups()
 
     @torch.no_grad()
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
-        """Refresh the culling grids every 16 steps once they have seen enough."""
-        self.step = step
-        if self.config.cull and step >= self.config.cull_after and step % 16 == 0:
-            self.static_cells.refresh(threshold=2e-3, decay=0.97)
-            self.dynamic_cells.refresh(threshold=1e-3, decay=0.97)
+        """Refresh the culling grids now and then, once they have seen enough."""
+        if self.config.cull and step >= self.config.cull_after and step % REFRESH_EVERY == 0:
+            self.static_cells.refresh(STATIC_MIN_WEIGHT, WEIGHT_DECAY)
+            self.dynamic_cells.refresh(DYNAMIC_MIN_WEIGHT, WEIGHT_DECAY)
 
     def shared_maxima(self) -> list[Tensor]:
-        """What several processes must agree on between steps: the culling grids'
-        memories.
-        """
+        """The culling grids' memories: several processes share their maximum."""
         return [self.static_cells.weight, self.dynamic_cells.weight] if self.config.cull else []
 
     @torch.no_grad()
-    def allow_motion(self, frames: list[Any], dilate: int = 9) -> None:
-        """Dynamic content may only be where the moving masks (dilated by `dilate`
-        pixels) of its time say; everywhere where a time has none.
+    def allow_motion(self, frames: list[Frame], dilation: int = MASK_DILATION_PX) -> None:
+        """Allow dynamic content only where the moving masks of its time do.
+
+        Masks are dilated by `dilation` pixels; a time without masks allows it
+        everywhere.
         """
-        centers = self.space.decode(self.dynamic_cells.centers())
+        centers = self.space.decode(self.dynamic_cells.cell_centers())
         for k, time in enumerate(self.times.tolist()):
-            views = [f for f in frames if f.time == time and f.moving is not None]
-            if not views:
+            masked = [f for f in frames if f.time == time and f.moving is not None]
+            if not masked:
                 continue
             allowed = torch.zeros(len(centers), dtype=torch.bool)
-            for f in views:
-                moving = (
-                    nn.functional.max_pool2d(
-                        f.moving[None, None].float(), 2 * dilate + 1, 1, dilate
-                    )[0, 0]
-                    > 0
-                )
-                xy, depth = f.camera.project(centers)
-                x, y = xy[:, 0].long(), xy[:, 1].long()
-                seen = (
-                    (depth > 0)
-                    & (xy[:, 0] >= 0)
-                    & (xy[:, 1] >= 0)
-                    & (x < f.camera.width)
-                    & (y < f.camera.height)
-                )
-                allowed |= (
-                    seen & moving[y.clamp(0, f.camera.height - 1), x.clamp(0, f.camera.width - 1)]
-                )
+            for frame in masked:
+                allowed |= seen_as_moving(frame, centers, dilation)
             self.dynamic_cells.allowed[k] = allowed.view_as(self.dynamic_cells.allowed[k])
             self.dynamic_cells.mask[k] = self.dynamic_cells.allowed[k]
 
 
-def plain_branches(
+def seen_as_moving(frame: Frame, points: Tensor, dilation: int) -> Tensor:
+    """Which `points` (P, 3) project into a frame's dilated moving mask: (P,) bool."""
+    assert frame.moving is not None
+    size = 2 * dilation + 1
+    mask = frame.moving[None, None].float()
+    moving = nn.functional.max_pool2d(mask, size, 1, dilation)[0, 0] > 0  # (H, W)
+    camera = frame.camera
+    pixels, depth = camera.project(points)
+    x, y = pixels[:, 0].long(), pixels[:, 1].long()
+    inside = (depth > 0) & (pixels >= 0).all(-1) & (x < camera.width) & (y < camera.height)
+    return inside & moving[y.clamp(0, camera.height - 1), x.clamp(0, camera.width - 1)]
+
+
+def build_branches(
     encoding: GridConfig | MlpConfig, width: int, height: int, num_knots: int
 ) -> GridBranches | MlpBranches:
-    """Branches as a config asks for them."""
+    """Plain branches of the given encoding for frames of `width` x `height`."""
     match encoding:
         case GridConfig():
             return GridBranches(encoding, width, height, num_knots)

@@ -6,33 +6,32 @@ the radiance that the initial response recovers from what did not clip.
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy import ndimage
+from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 
-from hdr_nsff.fields.knots import knot_of
+from hdr_nsff.fields.point_cloud import (
+    CELLS_PER_KIND,
+    PointCloud,
+    ToRadiance,
+    assign_cells,
+    concatenate,
+    merge_by_cell,
+    thin_points,
+    unproject_frame,
+)
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.splat import Splat
-from hdr_nsff.fields.surface import (
-    CELLS,
-    Points,
-    ToRadiance,
-    cells_for,
-    joined,
-    lift,
-    thinned,
-    thinned_to,
-)
-from hdr_nsff.priors.movers.bundle import Cameras, Shape
-from hdr_nsff.priors.movers.motion_segmentation import things
-from hdr_nsff.priors.movers.mover_shape import apply
-from hdr_nsff.priors.movers.rigid_groups import Group, Tracks, View, follow
+from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene
 
 # a cell is this many times longer along the view than across, as shares of the frustum
@@ -42,10 +41,11 @@ OVERLAP = 0.6  # standard deviation relative to the distance to the neighbors
 OPACITY = 0.7
 KEY_FRAMES = 12  # times whose moving pixels become Gaussians
 ABSENT = -6.0  # logit offset of what is not seen
+KMEANS_ROUNDS = 10
 OWN = 4.0  # logit of the nearest basis over the others
 
 
-def seed(
+def initialize_gaussians(
     field: Splat, scene: Scene, to_radiance: ToRadiance, typical: float, from_priors: bool = True
 ) -> str:
     """Place all Gaussians; one sentence about what was found. `typical` is the median
@@ -54,15 +54,25 @@ def seed(
     frames = scene.train
     with torch.no_grad():
         field.background[:] = from_log_radiance(torch.tensor(typical), field.bounded)
-        if not from_priors or any(f.disparity is None for f in frames):
+        in_scene_units = scene.manifest.depth_kind == "scene"
+        if not (from_priors and in_scene_units) or any(f.disparity is None for f in frames):
             scatter(field, scene, typical)
-            return "static Gaussians start at random places and moving ones not at all, without a depth prior in scene units"
-        static = joined(
-            [lift(f, i, still(f), scene.near, scene.far, to_radiance) for i, f in enumerate(frames)]
+            return (
+                "static Gaussians start at random places and moving ones not at all, "
+                "without a depth prior in scene units"
+            )
+        static = concatenate(
+            [
+                unproject_frame(f, i, still(f), scene.near, scene.far, to_radiance)
+                for i, f in enumerate(frames)
+            ]
         )
         count = place(field.static, thin(static, scene, int(FILL * len(field.static))))
-        groups, moving = movers(field, scene, to_radiance)
-        return f"{count} static Gaussians from the depth prior; {moving} moving ones in {groups} groups"
+        num_movers, moving = place_movers(field, scene, to_radiance)
+        return (
+            f"{count} static Gaussians from the depth prior; "
+            f"{moving} moving ones on {num_movers} movers"
+        )
 
 
 def still(f: Frame) -> Tensor:
@@ -73,17 +83,17 @@ def still(f: Frame) -> Tensor:
     return ~near.reshape(-1)
 
 
-def thin(points: Points, scene: Scene, limit: int) -> Points:
+def thin(points: PointCloud, scene: Scene, limit: int) -> PointCloud:
     """At most `limit` points, one per cell: pixel-shaped in a frustum, cubes elsewhere."""
     space = build_space([f.camera for f in scene.train], scene.near, scene.far)
     coords = space.encode(points.positions)
     if isinstance(space, FrustumSpace):
         extent = space.high - space.low
         coords = coords * torch.stack([extent[0], extent[1], extent[0] / DEPTH_CELLS]) / extent[0]
-    return thinned_to(points, coords, limit)
+    return thin_points(points, coords, limit)
 
 
-def place(gaussians: Gaussians, points: Points) -> int:
+def place(gaussians: Gaussians, points: PointCloud) -> int:
     """Put the first Gaussians at the points, as wide as their neighbors are away; the
     others stay invisible. How many.
     """
@@ -124,250 +134,171 @@ def scatter(field: Splat, scene: Scene, typical: float) -> None:
         rays = f.camera.rays(pixels)
         positions = rays.origins + rays.directions / disparity[:, None]
         footprint = 2 / (disparity * f.camera.K[0, 0])
-        parts.append(Points(positions, torch.full((per, 3), typical), torch.ones(per), footprint))
-    place(field.static, joined(parts))
+        parts.append(
+            PointCloud(positions, torch.full((per, 3), typical), torch.ones(per), footprint)
+        )
+    place(field.static, concatenate(parts))
 
 
 # Movers
 
 
-def movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, int]:
-    """Fit groups and their motions, share out the bases, place moving Gaussians; how
-    many groups and Gaussians.
+def place_movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, int]:
+    """Place moving Gaussians on the scene's movers and give these the shared motions.
+
+    Returns the number of movers and of Gaussians.
     """
-    views, frame_of = views_of(field, scene)
-    frames = [scene.train[i] for i in frame_of]
-    if not any(v.moving.any() for v in views):
+    movers = scene.movers[: field.config.bases]
+    if not movers:
         return 0, 0
-    tracks = follow(views)
-    cameras = [f.camera for f in frames]
-    known = Cameras(
-        *(
-            torch.stack(m).double().numpy()
-            for m in ([c.K for c in cameras], [c.c2w for c in cameras])
-        )
-    )
-    found = things(tracks, known)[: field.config.bases] if len(tracks.trust) else []
-    groups = [shape.group if shape else group for group, shape in found] or [drift(views)]
-    frames = [
-        relieved(f, t, tracks, [shape for _, shape in found if shape]) for t, f in enumerate(frames)
-    ]
-    seen = [t for t, v in enumerate(views) if v.moving.any()]
-    key = sorted(
-        {seen[round(i)] for i in np.linspace(0, len(seen) - 1, min(KEY_FRAMES, len(seen))).tolist()}
-    )
+    position = {f.index: i for i, f in enumerate(scene.train)}
+    frames = [position[int(index)] for index in movers[0].frames]
     parts = [
-        mover_points(scene, frames[t], frame_of[t], t, tracks, groups, to_radiance) for t in key
+        mover_points(scene, frames[t], t, movers, to_radiance) for t in key_times(scene, frames)
     ]
-    points, owner = joined([p for p, _ in parts]), torch.cat([o for _, o in parts])
+    points, owner = concatenate([p for p, _ in parts]), torch.cat([o for _, o in parts])
     limit = int(FILL * len(field.moving))
-    cell = cells_for(points.positions, owner, limit)  # groups never share one
-    kept, kept_owner = thinned(points, cell), torch.unique(cell) // CELLS
+    cell = assign_cells(points.positions, owner, limit)  # movers never share one
+    kept, kept_owner = merge_by_cell(points, cell), torch.unique(cell) // CELLS_PER_KIND
     count = place(field.moving, kept)
-    hide_unseen(field, tracks, groups, kept_owner[:count])
-    share_bases(field, groups, kept.positions[:count], kept_owner[:count])
+    hide_unseen(field, movers, kept_owner[:count])
+    share_bases(field, movers, kept.positions[:count], kept_owner[:count])
     field.find_neighbors()
-    return len(groups), count
+    return len(movers), count
+
+
+def key_times(scene: Scene, frames: list[int]) -> list[int]:
+    """Up to `KEY_FRAMES` of the times with moving pixels, evenly spread."""
+    moving = [surely_moving(scene.train[i]) for i in frames]
+    seen = [t for t, mask in enumerate(moving) if mask.any()]
+    if not seen:
+        return list(range(len(frames)))[:1]
+    chosen = np.linspace(0, len(seen) - 1, min(KEY_FRAMES, len(seen)))
+    return sorted({seen[round(i)] for i in chosen.tolist()})
 
 
 def mover_points(
-    scene: Scene,
-    f: Frame,
-    i: int,
-    t: int,
-    tracks: Tracks,
-    groups: list[Group],
-    to_radiance: ToRadiance,
-) -> tuple[Points, Tensor]:
-    """The moving pixels of a frame (the `i`-th of training, at time `t`) as points at
-    their canonical places, and the group of each (P,).
+    scene: Scene, i: int, t: int, movers: Sequence[Mover], to_radiance: ToRadiance
+) -> tuple[PointCloud, Tensor]:
+    """The moving pixels of training frame `i` (the t-th time of `movers`) as points at
+    their canonical places, and the mover of each (P,).
     """
+    f = with_mover_depth(scene.train[i], t, movers)
     moving = surely_moving(f)
-    f = replace(f, moving=moving)
-    points = lift(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
-    owner = owner_of(f, t, tracks, groups)
+    points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
+    y, x = np.nonzero(moving.numpy())
+    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
     canonical = points.positions.double().numpy().copy()
-    for g, group in enumerate(groups):
-        canonical[owner == g] = group.canonical(canonical[owner == g], t)
+    for k, mover in enumerate(movers):
+        canonical[owner == k] = mover.canonical(canonical[owner == k], t)
     positions = torch.from_numpy(canonical).float()
-    return Points(positions, points.log_radiance, points.trust, points.footprint), torch.from_numpy(
-        owner
-    )
+    return replace(points, positions=positions), torch.from_numpy(owner)
 
 
 def surely_moving(f: Frame) -> Tensor:
-    """(H, W) bool: the moving mask without its doubtful outline; small and thin things
+    """(H, W) bool: the moving mask without its doubtful outline; small and thin objects
     stay whole.
     """
-    assert f.moving is not None
+    if f.moving is None:
+        return torch.zeros(f.image.shape[:2], dtype=torch.bool)
     if f.outline is None:
         return f.moving
-    things, count = ndimage.label(f.moving.numpy())
+    objects, count = ndimage.label(f.moving.numpy())
     sure = f.moving & ~f.outline
-    whole = ~np.isin(np.arange(count + 1), np.unique(things[sure.numpy()]))
-    return sure | (f.moving & torch.from_numpy(whole[things]))
+    whole = ~np.isin(np.arange(count + 1), np.unique(objects[sure.numpy()]))
+    return sure | (f.moving & torch.from_numpy(whole[objects]))
 
 
-def relieved(f: Frame, t: int, tracks: Tracks, shapes: list[Shape]) -> Frame:
-    """The frame of time `t` with the depth that the movers' shapes tell."""
-    assert f.disparity is not None and f.moving is not None
-    disparity = f.disparity.numpy().copy()
-    confidence = (
-        np.ones_like(disparity)
-        if f.disparity_confidence is None
-        else f.disparity_confidence.numpy().copy()
-    )
-    apply(f.moving.numpy(), f.camera.c2w.double().numpy(), t, tracks, shapes, disparity, confidence)
-    return replace(
-        f, disparity=torch.from_numpy(disparity), disparity_confidence=torch.from_numpy(confidence)
-    )
+def with_mover_depth(f: Frame, t: int, movers: Sequence[Mover]) -> Frame:
+    """The frame of the t-th time with the depth of the movers' shapes."""
+    assert f.disparity is not None
+    moving = np.zeros(f.image.shape[:2], bool) if f.moving is None else f.moving.numpy()
+    confidence = f.disparity_confidence
+    if confidence is None:
+        confidence = torch.ones_like(f.disparity)
+    c2w = f.camera.c2w.double().numpy()
+    maps = fill_mover_depth(movers, t, moving, c2w, f.disparity.numpy(), confidence.numpy())
+    disparity, confidence = (torch.from_numpy(m) for m in maps)
+    return replace(f, disparity=disparity, disparity_confidence=confidence)
 
 
-def views_of(field: Splat, scene: Scene) -> tuple[list[View], list[int]]:
-    """What the movers look like at every training time (one frame of each), and the
-    frames' positions.
-    """
-    chosen: dict[int, int] = {}
-    for i, f in enumerate(scene.train):
-        chosen.setdefault(round(knot_of(field.times, f.time)), i)
-    views = []
-    for k in sorted(chosen):
-        f = scene.train[chosen[k]]
-        assert f.disparity is not None
-        shape = f.image.shape[:2]
-        moving = np.zeros(shape, bool) if f.moving is None else surely_moving(f).numpy()
-        rays = f.camera.rays(f.camera.pixel_grid())
-        points = rays.origins + rays.directions / f.disparity.reshape(-1, 1).clamp(
-            1 / scene.far, 1 / scene.near
-        )
-        trust = np.ones(shape) if f.disparity_confidence is None else f.disparity_confidence.numpy()
-        leads = [
-            o for o in f.flow if chosen.get(k + o) == f.neighbors.get(o)
-        ]  # to a frame that speaks for its time
-        flow, valid = ({o: v[o].numpy() for o in leads} for v in (f.flow, f.flow_valid))
-        views.append(View(moving, points.view(*shape, 3).double().numpy(), trust, flow, valid))
-    return views, [chosen[k] for k in sorted(chosen)]
-
-
-def drift(views: list[View]) -> Group:
-    """The fallback where flow gives no chains: all that moves follows the median of its
-    points.
-    """
-    centers = np.array(
-        [np.median(v.points[v.moving], 0) if v.moving.any() else np.full(3, np.nan) for v in views]
-    )
-    at, times = np.nonzero(np.isfinite(centers[:, 0]))[0], np.arange(len(views))
-    centers = np.stack([np.interp(times, at, c[at]) for c in centers.T], 1)
-    centers = ndimage.gaussian_filter1d(centers, 1.0, axis=0, mode="nearest")
-    return Group(
-        np.tile(np.eye(3), (len(views), 1, 1)),
-        centers - centers[0],
-        centers[0],
-        np.zeros(0, int),
-        np.isin(times, at),
-    )
-
-
-def owner_of(f: Frame, t: int, tracks: Tracks, groups: list[Group]) -> np.ndarray:
-    """The group of every moving pixel of a frame (row by row): that of the nearest
-    track in the picture.
-    """
-    assert f.moving is not None
-    y, x = np.nonzero(f.moving.numpy())
-    at, label = [], []
-    for g, group in enumerate(groups):
-        pixels = tracks.pixels[group.members, t] if len(group.members) else np.zeros((0, 2))
-        pixels = pixels[np.isfinite(pixels[:, 0])]
-        at.append(pixels)
-        label += [g] * len(pixels)
-    if not label:
-        return np.zeros(len(x), np.int64)
-    nearest = cKDTree(np.concatenate(at)).query(np.stack([x, y], -1) + 0.5)[1]
-    return np.array(label, np.int64)[nearest]
-
-
-def hide_unseen(field: Splat, tracks: Tracks, groups: list[Group], owner: Tensor) -> None:
-    """Make moving Gaussians invisible at the times their group (P,) is not seen: it has
+def hide_unseen(field: Splat, movers: Sequence[Mover], owner: Tensor) -> None:
+    """Make moving Gaussians invisible at the times their mover (P,) is not seen: it has
     left, or is hidden.
     """
-    knots, num = len(field.opacity_offsets), field.trajectories.num_knots
-    for g, group in enumerate(groups):
-        if not len(group.members):
+    knots, num_times = len(field.opacity_offsets), field.trajectories.num_knots
+    for k, mover in enumerate(movers):
+        if not len(mover.trust):
             continue
-        seen = (tracks.trust[group.members] > 0).any(0)
-        for k in range(knots):
-            low, high = (
-                int(np.clip(round((k + o) / max(knots - 1, 1) * (num - 1)), 0, num - 1))
-                for o in (-1, 1)
-            )
-            if not seen[low : high + 1].any():
-                field.opacity_offsets[k, : len(owner)][owner == g] = ABSENT
+        seen = np.any(mover.trust > 0, axis=0, keepdims=True)[0]
+        for knot in range(knots):
+            ends = [(knot + side) / max(knots - 1, 1) * (num_times - 1) for side in (-1, 1)]
+            low, high = (int(np.clip(round(end), 0, num_times - 1)) for end in ends)
+            if not np.any(seen[low : high + 1]):
+                field.opacity_offsets[knot, : len(owner)][owner == k] = ABSENT
 
 
-def share_bases(field: Splat, groups: list[Group], points: Tensor, owner: Tensor) -> None:
-    """Give every group bases by its size (at least one), spread over it; each Gaussian
-    starts with its nearest basis.
+def share_bases(field: Splat, movers: Sequence[Mover], points: Tensor, owner: Tensor) -> None:
+    """Give every mover motion bases by its number of Gaussians (at least one), spread
+    over it; each Gaussian starts with its nearest basis.
+
+    `points` (P, 3): canonical places of the first moving Gaussians; `owner` (P,): their
+    mover.
     """
-    t, num_bases = field.trajectories, field.config.bases
-    sizes = torch.bincount(owner, minlength=len(groups)).double()
-    given = [1] * len(groups)
-    while sum(given) < num_bases:
-        g = int(torch.argmax(sizes / torch.tensor(given)))
-        given[g] += 1
-    turns, shifts = (
-        t.turns.data.view(t.num_knots, num_bases, 4),
-        t.shifts.data.view(t.num_knots, num_bases, 4),
-    )
+    motions, num_bases = field.trajectories, field.config.bases
+    turns = motions.turns.data.view(motions.num_knots, num_bases, 4)
+    shifts = motions.shifts.data.view(motions.num_knots, num_bases, 4)
     field.mixture_logits[:] = 0
-    b = 0
-    for g, (group, count) in enumerate(zip(groups, given, strict=True)):
-        own = owner == g
-        centers = spread(points[own], count, torch.from_numpy(group.center).float())
-        rotations = torch.from_numpy(group.rotations).float()
-        for c in centers:
-            t.centers[b] = c
+    first = 0
+    counts = bases_per_mover(torch.bincount(owner, minlength=len(movers)), num_bases)
+    for k, (mover, count) in enumerate(zip(movers, counts, strict=True)):
+        own = owner == k
+        center = torch.from_numpy(mover.center).float()
+        rotations = torch.from_numpy(mover.rotations).float()
+        path = torch.from_numpy(mover.center + mover.translations).float()
+        centers = spread_centers(points[own], count, center)
+        for b, c in enumerate(centers, start=first):
+            motions.centers[b] = c
             turns[:, b] = quaternions(rotations)
-            moved = (rotations @ (c - torch.from_numpy(group.center).float())) + torch.from_numpy(
-                group.center + group.shifts
-            ).float()
-            shifts[:, b, :3] = moved - c
-            b += 1
-        distance = torch.cdist(points[own], centers)
+            shifts[:, b, :3] = rotations @ (c - center) + path - c
+        nearest = torch.cdist(points[own], centers).argmin(1) + first
         logits = torch.full((num_bases, int(own.sum())), -OWN)
-        logits[b - count : b] = -OWN * 0.5
-        logits.scatter_(0, (distance.argmin(1) + b - count)[None], 0.0)
+        logits[first : first + count] = -OWN * 0.5
+        logits.scatter_(0, nearest[None], 0.0)
         field.mixture_logits[:, : len(points)][:, own] = logits
+        first += count
 
 
-def spread(points: Tensor, count: int, center: Tensor) -> Tensor:
-    """`count` places (count, 3) spread over points by farthest-point choice and a few
-    rounds of k-means; the given center where one is enough, or the points are too few.
+def bases_per_mover(sizes: Tensor, num_bases: int) -> list[int]:
+    """How many of `num_bases` each mover gets, by its `sizes` (M,): at least one."""
+    counts = [1] * len(sizes)
+    while sum(counts) < num_bases:
+        counts[int(torch.argmax(sizes.double() / torch.tensor(counts)))] += 1
+    return counts
+
+
+def spread_centers(points: Tensor, count: int, center: Tensor) -> Tensor:
+    """`count` places (count, 3) spread over points (P, 3) by k-means from a
+    farthest-point start; the given center where one is enough or points are too few.
     """
     if count == 1 or len(points) < count:
         return center.expand(count, 3).clone()
     chosen = [points[(points - points.mean(0)).norm(dim=-1).argmax()]]
     for _ in range(count - 1):
         chosen.append(points[torch.cdist(points, torch.stack(chosen)).amin(1).argmax()])
-    places = torch.stack(chosen)
-    for _ in range(10):
-        nearest = torch.cdist(points, places).argmin(1)
-        places = torch.stack(
-            [
-                points[nearest == k].mean(0) if (nearest == k).any() else places[k]
-                for k in range(count)
-            ]
-        )
-    return places
+    start = torch.stack(chosen).double().numpy()
+    with warnings.catch_warnings():  # coinciding points leave a cluster empty, which is fine
+        warnings.simplefilter("ignore", UserWarning)
+        places, _ = kmeans2(points.double().numpy(), start, iter=KMEANS_ROUNDS, minit="matrix")
+    return torch.from_numpy(places).to(points)
 
 
 def quaternions(rotations: Tensor) -> Tensor:
     """Unit quaternions (T, 4) w x y z of rotations (T, 3, 3), without sign jumps from
     one to the next.
     """
-    q = torch.from_numpy(
-        Rotation.from_matrix(rotations.double().numpy()).as_quat()[:, [3, 0, 1, 2]]
-    ).to(rotations)
-    for i in range(1, len(q)):
-        if (q[i] * q[i - 1]).sum() < 0:
-            q[i] = -q[i]
-    return q
+    xyzw = Rotation.from_matrix(rotations.double().numpy()).as_quat()
+    products = np.einsum("tk,tk->t", xyzw[1:], xyzw[:-1])
+    signs = np.cumprod(np.concatenate([[1.0], np.where(products < 0, -1.0, 1.0)]))
+    xyzw = xyzw * signs[:, None]
+    return torch.from_numpy(xyzw[:, [3, 0, 1, 2]]).to(rotations)

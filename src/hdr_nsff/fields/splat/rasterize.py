@@ -1,7 +1,9 @@
 """3D Gaussians to feature maps, differentiable in everything, the camera's pose and
-focal lengths included (EWA splatting; Zwicker et al. 2001, Kerbl et al. 2023). One
-call, twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`, the
-plain-torch one, slow and obviously right.
+focal lengths included (EWA splatting: Zwicker et al. 2001, Kerbl et al. 2023).
+
+One call with twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`,
+plain torch, slow and obviously right. Shapes: G Gaussians with D features, pictures of
+(H, W).
 """
 
 from __future__ import annotations
@@ -16,6 +18,9 @@ from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.kernels import compositing, projection
 from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
 from hdr_nsff.geometry.cameras import Camera
+
+ALPHA_MIN, ALPHA_MAX = float(projection.ALPHA_MIN), float(compositing.ALPHA_MAX)
+MIN_LENGTH = projection.MIN_LENGTH  # added to a quaternion's length, which may be 0
 
 
 class Maps(NamedTuple):
@@ -38,104 +43,116 @@ def rasterize(
 
     `means` (G, 3) and `scales` (G, 3; standard deviations > 0) in scene units,
     `quaternions` (G, 4) w x y z of any length, `opacities` (G,) in [0, 1], `features`
-    (G, D) anything. Gaussians whose shape or opacity is no finite number are not drawn.
+    (G, D) anything. Gaussians whose shape or opacity is not finite are not drawn.
     Float32 on the CPU or on CUDA; every other dtype and device takes `dense`.
     """
     gaussians = means, quaternions, scales, opacities, features
-    match means.device.type if means.dtype == torch.float32 else None:
+    device = means.device.type if means.dtype == torch.float32 else None
+    match device:
         case "cpu":
-            maps, alpha = Rasterize.apply(*gaussians, stretched(camera), camera)
-            seen, depth = maps.split(
-                [len(maps) - 1, 1]
-            )  # whose gradients are joined, where slices' would be added up
+            maps, alpha = RasterizeNumba.apply(
+                *gaussians, world_to_camera_and_focal(camera), camera
+            )
+            # `split` joins the two gradients, where slices' would be added up
+            seen, depth = maps.split([len(maps) - 1, 1])
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
         case "cuda" if rasterize_cuda.available():
-            rules = camera.width, camera.height, projection.NEAREST, projection.BLUR
-            return Maps(
-                *rasterize_cuda.composite(*gaussians, stretched(camera), camera.K.detach(), *rules)
+            w2c, K = world_to_camera_and_focal(camera), camera.K.detach()
+            size = camera.width, camera.height
+            seen = rasterize_cuda.composite(
+                *gaussians, w2c, K, size, projection.NEAREST, projection.BLUR
             )
-        case (
-            "cuda"
-        ):  # `dense` would hold every Gaussian at every pixel: too much for a real picture
-            seen = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
-            return Maps(*(m.to(means.device) for m in seen))
+            return Maps(*seen)
+        case "cuda":
+            # not `dense`, which would hold every Gaussian at every pixel
+            on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
+            return Maps(*(m.to(means.device) for m in on_cpu))
         case _:
             return dense(*gaussians, camera)
 
 
 def world_to_camera(camera: Camera) -> Tensor:
-    """(3, 4), differentiable in the pose."""
+    """World to camera (3, 4), differentiable in the pose."""
     rotation = camera.c2w[:, :3].T
     return torch.cat([rotation, -rotation @ camera.c2w[:, 3:]], 1)
 
 
-def stretched(camera: Camera) -> Tensor:
-    """`world_to_camera` that carries the gradient of the focal lengths as well, for
-    kernels to which K is numbers: a longer focal length is a camera whose x and y are
-    stretched.
+def world_to_camera_and_focal(camera: Camera) -> Tensor:
+    """`world_to_camera` (3, 4) that carries the gradient of the focal lengths as well.
+
+    For kernels to which K is numbers: a longer focal length is a camera whose x and y
+    are stretched.
     """
     w2c, focal = world_to_camera(camera), camera.K[[0, 1], [0, 1]]
     if not focal.requires_grad:
         return w2c
-    return torch.cat([focal / focal.detach(), focal.new_ones(1)])[:, None] * w2c
+    stretch = torch.cat([focal / focal.detach(), focal.new_ones(1)])  # ones, with a gradient
+    return stretch[:, None] * w2c
 
 
-def products(*wanted: str) -> Tensor:
-    """(16, n) that makes the `wanted` sums of products, such as "wx -zy", of the outer
-    product (16) of two quaternions w x y z.
+def sum_products(*sums: str) -> Tensor:
+    """A matrix (16, n) that turns the outer product of two quaternions into n sums.
+
+    A sum such as "+wx -zy" is `a_w b_x - a_z b_y` of quaternions a and b, w x y z; the
+    outer product is flattened to (16,). One matrix product takes the place of dozens of
+    small operations, forward and backward.
     """
-    table = torch.zeros(16, len(wanted))
-    for column, terms in enumerate(wanted):
+    table = torch.zeros(16, len(sums))
+    for column, terms in enumerate(sums):
         for term in terms.split():
-            first, second = ("wxyz".index(axis) for axis in term[-2:])
-            table[4 * first + second, column] += -1 if term[0] == "-" else 1
+            sign, first, second = tuple(term)
+            row = 4 * "wxyz".index(first) + "wxyz".index(second)
+            table[row, column] += 1 if sign == "+" else -1
     return table
 
 
-ROTATION = products(
-    "ww xx -yy -zz", "xy xy -wz -wz", "xz xz wy wy",
-    "xy xy wz wz", "ww -xx yy -zz", "yz yz -wx -wx",
-    "xz xz -wy -wy", "yz yz wx wx", "ww -xx -yy zz",
-)  # fmt: skip
+# the rotation matrix of a unit quaternion, row by row, from its outer product with
+# itself
+ROTATION_MATRIX = sum_products(
+    "+ww +xx -yy -zz",
+    "+xy +xy -wz -wz",
+    "+xz +xz +wy +wy",
+    "+xy +xy +wz +wz",
+    "+ww -xx +yy -zz",
+    "+yz +yz -wx -wx",
+    "+xz +xz -wy -wy",
+    "+yz +yz +wx +wx",
+    "+ww -xx -yy +zz",
+)
 
 
 def rotation_matrices(quaternions: Tensor) -> Tensor:
-    """(G, 3, 3) from (G, 4) w x y z of any length."""
-    unit = quaternions / (quaternions.norm(dim=-1, keepdim=True) + 1e-12)
-    return ((unit[..., None] * unit[..., None, :]).flatten(-2) @ ROTATION.to(unit)).unflatten(
-        -1, (3, 3)
-    )
+    """Rotation matrices (G, 3, 3) of quaternions (G, 4) w x y z of any length."""
+    unit = quaternions / (quaternions.norm(dim=-1, keepdim=True) + MIN_LENGTH)
+    outer = (unit[..., None] * unit[..., None, :]).flatten(-2)  # (G, 16)
+    return (outer @ ROTATION_MATRIX.to(unit)).unflatten(-1, (3, 3))
 
 
 def project(
     means: Tensor, quaternions: Tensor, scales: Tensor, camera: Camera
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixel centers (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,)."""
+    """Pixel centers (G, 2), 2D covariances (G, 2, 2) in pixels^2 and z-depths (G,).
+
+    The plain-torch twin of `projection.project`, in its notation.
+    """
     w2c, K = world_to_camera(camera), camera.K
-    t = means @ w2c[:, :3].T + w2c[:, 3]
+    t = means @ w2c[:, :3].T + w2c[:, 3]  # camera points
     z = t[:, 2].clamp_min(projection.NEAREST)
     size = torch.tensor([camera.width, camera.height]).to(means)
     focal, center = K[[0, 1], [0, 1]], K[:2, 2]
+    # far outside of the frame the projection is linearized at its edge
     edge = projection.MARGIN * 0.5 * size / focal
-    xy = z[:, None] * torch.minimum(
-        torch.maximum(t[:, :2] / z[:, None], -center / focal - edge), (size - center) / focal + edge
-    )
+    low, high = -center / focal - edge, (size - center) / focal + edge
+    ratio = t[:, :2] / z[:, None]
+    xy = z[:, None] * torch.minimum(torch.maximum(ratio, low), high)
     zero = torch.zeros_like(z)
-    jacobian = torch.stack(
-        [
-            focal[0] / z,
-            zero,
-            -focal[0] * xy[:, 0] / z**2,
-            zero,
-            focal[1] / z,
-            -focal[1] * xy[:, 1] / z**2,
-        ],
-        -1,
-    ).unflatten(-1, (2, 3))
+    row_x = torch.stack([focal[0] / z, zero, -focal[0] * xy[:, 0] / z**2], -1)
+    row_y = torch.stack([zero, focal[1] / z, -focal[1] * xy[:, 1] / z**2], -1)
+    jacobian = torch.stack([row_x, row_y], 1)  # (G, 2, 3)
     half_axes = rotation_matrices(quaternions) * scales[:, None]
     spread = jacobian @ w2c[:, :3] @ half_axes
     covariance = spread @ spread.mT + projection.BLUR * torch.eye(2).to(means)
-    return t[:, :2] / z[:, None] * focal + center, covariance, t[:, 2]
+    return ratio * focal + center, covariance, t[:, 2]
 
 
 def dense(
@@ -148,50 +165,59 @@ def dense(
     cut: bool = True,
 ) -> Maps:
     """The plain-torch twin: every Gaussian at every pixel, any dtype and device.
+
     Without `cut`, no alpha is too small to count.
     """
-    known = torch.cat([means, quaternions, scales, opacities[:, None]], 1).isfinite().all(1)
-    means, quaternions, scales, opacities, features = (
-        t[known] for t in (means, quaternions, scales, opacities, features)
-    )
+    shape = torch.cat([means, quaternions, scales, opacities[:, None]], 1)
+    finite = shape.isfinite().all(1)
+    means, features = means[finite], features[finite]
+    quaternions, scales = quaternions[finite], scales[finite]
+    opacities = opacities[finite]
     centers, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
     order = order[z.detach()[order] > projection.NEAREST]
     d = camera.pixel_grid().to(means)[:, None] - centers[order]  # (S, G, 2)
-    s = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance[order]) @ d[..., None])[..., 0, 0]
-    alpha = (opacities[order] * torch.exp(-s)).clamp_max(float(compositing.ALPHA_MAX))
+    inverse = torch.linalg.inv(covariance[order])
+    exponent = 0.5 * (d[:, :, None] @ inverse @ d[..., None])[..., 0, 0]
+    alpha = (opacities[order] * torch.exp(-exponent)).clamp_max(ALPHA_MAX)
     if cut:
-        alpha = torch.where(alpha >= float(projection.ALPHA_MIN), alpha, torch.zeros_like(alpha))
+        alpha = torch.where(alpha >= ALPHA_MIN, alpha, torch.zeros_like(alpha))
     left = torch.cumprod(1 - alpha, 1)
-    weights = alpha * torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
-    shape = (camera.height, camera.width)
-    seen = (weights @ torch.cat([features, z[:, None]], 1)[order]).unflatten(0, shape)
-    return Maps(seen[..., :-1], seen[..., -1], weights.sum(1).unflatten(0, shape))
+    transmittance = torch.cat([torch.ones_like(left[:, :1]), left[:, :-1]], 1)
+    weights = alpha * transmittance
+    size = (camera.height, camera.width)
+    values = torch.cat([features, z[:, None]], 1)[order]
+    seen = (weights @ values).unflatten(0, size)
+    return Maps(seen[..., :-1], seen[..., -1], weights.sum(1).unflatten(0, size))
 
 
-def front_to_back(depths: np.ndarray) -> np.ndarray:
-    """Stable order (G,) of positive float32 depths, the others last: radix sort on the
-    halves of their bits, which numpy has for 16 bits.
+def depth_order(depths: np.ndarray) -> np.ndarray:
+    """Stable order (G,) of positive float32 `depths` (G,), the others last.
+
+    A radix sort on the two halves of their bits, which grow with a positive float:
+    twenty times as fast as numpy's stable sort of floats.
     """
     bits = depths.view(np.uint32)
-    low = np.argsort((bits & 0xFFFF).astype(np.uint16), kind="stable")
-    return low[np.argsort((bits >> 16).astype(np.uint16)[low], kind="stable")]
+    low, high = (bits & 0xFFFF).astype(np.uint16), (bits >> 16).astype(np.uint16)
+    by_low = np.argsort(low, kind="stable")
+    return by_low[np.argsort(high[by_low], kind="stable")]
 
 
-def blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
-    """Features (G, D) and z-depths (G,) side by side, then zeros up to a whole number
-    of the kernels' blocks.
+def pad_to_blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Features (G, D) and z-depths (G,) side by side, padded with zeros.
+
+    The number of columns is a multiple of the kernels' `BLOCK`.
     """
-    count, d = features.shape
-    values = np.zeros((count, -(-(d + 1) // compositing.BLOCK) * compositing.BLOCK), np.float32)
-    values[:, :d], values[:, d] = features, depths
+    count, channels = features.shape
+    num_blocks = -(-(channels + 1) // compositing.BLOCK)
+    values = np.zeros((count, num_blocks * compositing.BLOCK), np.float32)
+    values[:, :channels] = features
+    values[:, channels] = depths
     return values
 
 
-class Rasterize(torch.autograd.Function):
-    """The numba twin. Returns maps (D + 1, H, W), the last one z-depth, and alpha (H,
-    W).
-    """
+class RasterizeNumba(torch.autograd.Function):
+    """The numba twin: maps (D + 1, H, W), the last one z-depth, and alpha (H, W)."""
 
     @staticmethod
     def forward(
@@ -204,39 +230,48 @@ class Rasterize(torch.autograd.Function):
         w2c: Tensor,
         camera: Camera,
     ) -> tuple[Tensor, Tensor]:
-        arrays = [t.detach().contiguous().numpy() for t in (means, quaternions, scales, opacities)]
+        gaussians = [
+            t.detach().contiguous().numpy() for t in (means, quaternions, scales, opacities)
+        ]
         pose = w2c.detach().double().numpy()
-        k = camera.K.detach().double().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]
-        count, size = len(means), (camera.width, camera.height)
-        centers, depths, conics = (np.empty(s, np.float32) for s in ((count, 2), count, (count, 3)))
-        rows, boxes = np.empty((count, 2), np.int64), np.empty((count, 4), np.int64)
-        projection.project(*arrays, pose, k, *size, centers, depths, conics, rows, boxes)
-        order = front_to_back(depths)
-        tiles = -(-size[0] // projection.TILE_X), -(-size[1] // projection.TILE_Y)
-        starts, members, places, owned = compositing.bin_tiles(boxes, order, *tiles)
-        values, channels = blocks(features.detach().numpy(), depths), features.shape[1] + 1
-        maps = torch.empty(channels, size[1], size[0])
-        alpha = torch.empty(size[1], size[0])
-        drawn = (starts, members, centers, conics, arrays[3], values, rows)
-        compositing.forward(*drawn, maps.numpy(), alpha.numpy())
-        ctx.kept = (arrays, pose, k, size, drawn, places, owned)
+        k = camera.K.detach().double().numpy()[[0, 1, 0, 1], [0, 1, 2, 2]]  # fx, fy, cx, cy
+        count, (width, height) = len(means), (camera.width, camera.height)
+        centers = np.empty((count, 2), np.float32)
+        depths = np.empty(count, np.float32)
+        conics = np.empty((count, 3), np.float32)
+        rows = np.empty((count, 2), np.int64)
+        boxes = np.empty((count, 4), np.int64)
+        view = (pose, k, width, height)
+        projection.project(*gaussians, *view, centers, depths, conics, rows, boxes)
+        tiles_x = -(-width // projection.TILE_X)
+        tiles_y = -(-height // projection.TILE_Y)
+        order = depth_order(depths)
+        starts, members, places, owned = compositing.bin_tiles(boxes, order, tiles_x, tiles_y)
+        values = pad_to_blocks(features.detach().numpy(), depths)
+        maps = torch.empty(features.shape[1] + 1, height, width)
+        alpha = torch.empty(height, width)
+        drawn = (centers, conics, gaussians[3], values, rows)
+        compositing.forward(starts, members, *drawn, maps.numpy(), alpha.numpy())
+        ctx.gaussians, ctx.view, ctx.drawn = gaussians, view, drawn
+        ctx.tiles = starts, members, places, owned
         ctx.save_for_backward(maps, alpha)
         return maps, alpha
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
         maps, alpha = ctx.saved_tensors
-        arrays, pose, k, size, (starts, members, *drawn), places, owned = ctx.kept
-        values = drawn[3]
+        starts, members, places, owned = ctx.tiles
+        means, _, _, _ = ctx.gaussians
+        values = ctx.drawn[3]
         pairs = np.empty((len(members), projection.MOMENTS + values.shape[1]), np.float32)
-        seen = maps.numpy(), alpha.numpy()
-        compositing.backward(
-            starts, members, places, *drawn, *seen, *(g.contiguous().numpy() for g in grads), pairs
-        )
-        out = [torch.empty(a.shape) for a in (*arrays, values[:, : len(maps)])]
-        poses = torch.zeros(len(arrays[0]) if ctx.needs_input_grad[5] else 0, 12)
-        projection.project_backward(
-            *arrays, pose, k, *size, owned, pairs, *(t.numpy() for t in out), poses.numpy()
-        )
+        grad_maps, grad_alpha = (g.contiguous().numpy() for g in grads)
+        seen = (maps.numpy(), alpha.numpy(), grad_maps, grad_alpha)
+        compositing.backward(starts, members, places, *ctx.drawn, *seen, pairs)
+        out = [torch.empty(a.shape) for a in (*ctx.gaussians, values[:, : len(maps)])]
+        needs_pose = ctx.needs_input_grad[5]
+        poses = torch.zeros(len(means) if needs_pose else 0, 12)
+        arrays = [t.numpy() for t in (*out, poses)]
+        projection.project_backward(*ctx.gaussians, *ctx.view, owned, pairs, *arrays)
         grad_pose = poses.double().sum(0).view(3, 4).to(maps) if len(poses) else None
-        return *out[:4], out[4][:, :-1], grad_pose, None
+        grad_features = out[4][:, :-1]  # without the z-depth, whose gradient is in the means
+        return *out[:4], grad_features, grad_pose, None

@@ -1,9 +1,10 @@
 """How moving Gaussians move: a few shared rigid motions over the training times; each
-Gaussian follows its own mixture of them.
+Gaussian follows its own mixture of them (motion bases as in Shape of Motion, Wang et
+al. 2024).
 
 Basis b turns by R_b(t) about its center c_b and shifts by s_b(t): x(t) = sum_b w_b
 (R_b(t) (x - c_b) + c_b + s_b(t)). Poses are kept at the training times (knots) and
-interpolated by a cubic with continuous velocity, so any time between can be asked for.
+interpolated by a cubic with continuous velocity, so any time between can be rendered.
 """
 
 from __future__ import annotations
@@ -12,15 +13,26 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.fields.knots import catmull_rom
-from hdr_nsff.fields.splat.rasterize import products, rotation_matrices
+from hdr_nsff.fields.splat.rasterize import rotation_matrices, sum_products
 
-WINDOW = 3  # knots on either side whose smoothness a step may change
-THIRD_DIFFERENCE = torch.tensor([-1.0, 3.0, -3.0, 1.0])
-HAMILTON = products("ww -xx -yy -zz", "wx xw yz -zy", "wy -xz yw zx", "wz xy -yx zw")
+# knots on either side whose poses a step may change: the reach of `roughness` and of
+# the cubic
+WINDOW = 3
+THIRD_DIFFERENCE = torch.tensor([-1.0, 3.0, -3.0, 1.0])  # 0 for constant acceleration
+POSE_NUMBERS = 8  # of a basis at a knot: a quaternion, and a shift with an unused column
+# w, x, y, z of the Hamilton product of two quaternions
+HAMILTON_PRODUCT = sum_products(
+    "+ww -xx -yy -zz",
+    "+wx +xw +yz -zy",
+    "+wy -xz +yw +zx",
+    "+wz +xy -yx +zw",
+)
+
+Pose = tuple[Tensor, Tensor]  # unit quaternions (B, 4) w x y z, shifts (B, 3) scene units
 
 
 class Trajectories(nn.Module):
-    """`num_bases` rigid motions over `num_knots` training times."""
+    """`num_bases` (B) rigid motions over `num_knots` (T) training times."""
 
     centers: Tensor
     turns_touched: Tensor
@@ -29,61 +41,71 @@ class Trajectories(nn.Module):
     def __init__(self, num_bases: int, num_knots: int) -> None:
         super().__init__()
         self.num_bases, self.num_knots = num_bases, num_knots
-        still = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(num_knots * num_bases, 1)
-        self.turns = nn.Parameter(still)  # (T * B, 4) quaternions w x y z of any length
-        self.shifts = nn.Parameter(
-            torch.zeros(num_knots * num_bases, 4)
-        )  # (T * B, 3) scene units, and one unused column
+        rows = num_knots * num_bases
+        unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1)
+        self.turns = nn.Parameter(unturned)  # (T * B, 4) quaternions w x y z of any length
+        # (T * B, 3) scene units, and a column that is not used: optimizer rows have
+        # four
+        self.shifts = nn.Parameter(torch.zeros(rows, 4))
         self.register_buffer("centers", torch.zeros(num_bases, 3))  # scene units
         for name in ("turns_touched", "shifts_touched"):  # rows with a gradient
-            self.register_buffer(
-                name, torch.zeros(num_knots * num_bases, dtype=torch.uint8), persistent=False
-            )
+            marks = torch.zeros(rows, dtype=torch.uint8)
+            self.register_buffer(name, marks, persistent=False)
 
-    def pose(self, knot: float) -> tuple[Tensor, Tensor]:
-        """Unit quaternions (B, 4) and shifts (B, 3) at a knot."""
-        q = catmull_rom(self.turns.view(self.num_knots, self.num_bases, 4), knot)
-        s = catmull_rom(self.shifts.view(self.num_knots, self.num_bases, 4), knot)
-        return nn.functional.normalize(q, dim=-1), s[:, :3]
+    def pose(self, knot: float) -> Pose:
+        """The bases' poses at a knot."""
+        turns = catmull_rom(self.turns.view(self.num_knots, self.num_bases, 4), knot)
+        shifts = catmull_rom(self.shifts.view(self.num_knots, self.num_bases, 4), knot)
+        return nn.functional.normalize(turns, dim=-1), shifts[:, :3]
 
-    def move(self, points: Tensor, mixture: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
-        """Where canonical `points` (G, 3) are in the bases' `pose`, given each one's
-        `mixture` (B, G) of them.
+    def move(self, points: Tensor, mixture: Tensor, pose: Pose) -> Tensor:
+        """Where canonical `points` (G, 3) are when the bases are in `pose`: (G, 3).
+
+        `mixture` (B, G) are each point's weights of the bases.
         """
-        q, s = pose
-        r = rotation_matrices(q)  # (B, 3, 3)
-        offset = self.centers + s - (r @ self.centers[..., None])[..., 0]
-        motions = (mixture.T @ torch.cat([r, offset[..., None]], 2).flatten(1)).unflatten(
-            1, (3, 4)
-        )  # each point's own
+        quaternions, shifts = pose
+        rotations = rotation_matrices(quaternions)  # (B, 3, 3)
+        turned_centers = (rotations @ self.centers[..., None])[..., 0]
+        offsets = self.centers + shifts - turned_centers
+        bases = torch.cat([rotations, offsets[..., None]], 2)  # (B, 3, 4)
+        motions = (mixture.T @ bases.flatten(1)).unflatten(1, (3, 4))  # each point's own
         return torch.baddbmm(motions[..., 3:], motions[..., :3], points[..., None])[..., 0]
 
-    def turn(self, quaternions: Tensor, mixture: Tensor, pose: tuple[Tensor, Tensor]) -> Tensor:
-        """Orientations (G, 4) of Gaussians with canonical `quaternions` (G, 4): the
-        mixture's mean turn in that `pose`, then their own.
+    def turn(self, quaternions: Tensor, mixture: Tensor, pose: Pose) -> Tensor:
+        """Orientations (G, 4) of Gaussians with canonical `quaternions` (G, 4).
+
+        Their own turn comes first, then the mixture's mean turn in `pose`.
         """
         return quaternion_product(mixture.T @ pose[0], quaternions)
 
-    def mark(self, knot: float, reach: int = WINDOW) -> None:
-        """Say that a step touches the poses near `knot` only."""
-        low, high = max(int(knot) - reach, 0), min(int(knot) + 1 + reach, self.num_knots)
+    def mark(self, knot: float) -> None:
+        """Mark the poses near `knot` as the only ones that this step may change."""
+        first, last = self.window(knot)
         for touched in (self.turns_touched, self.shifts_touched):
-            touched.view(self.num_knots, self.num_bases)[low:high] = 1
+            touched.view(self.num_knots, self.num_bases)[first:last] = 1
+
+    def window(self, knot: float) -> tuple[int, int]:
+        """First and last + 1 of the knots within `WINDOW` of a knot."""
+        return max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
 
     def roughness(self, knot: float, unit: float) -> Tensor:
-        """Mean square third difference of the poses near a knot (quaternions; shifts in
-        `unit`): 0 for constant acceleration.
+        """Mean square third difference of the poses near a knot, 0 for smooth motion.
+
+        Of quaternions, and of shifts in `unit` (scene units); the sum over the 4 + 4
+        numbers of a pose. Constant acceleration costs nothing.
         """
-        low, high = max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
-        turns = nn.functional.normalize(self.turns.view(self.num_knots, -1, 4)[low:high], dim=-1)
-        if high - low < 4:
+        first, last = self.window(knot)
+        turns = self.turns.view(self.num_knots, -1, 4)[first:last]
+        turns = nn.functional.normalize(turns, dim=-1)
+        if last - first < len(THIRD_DIFFERENCE):
             return turns.sum() * 0
-        shifts = self.shifts.view(self.num_knots, -1, 4)[low:high] / unit
+        shifts = self.shifts.view(self.num_knots, -1, 4)[first:last] / unit
         poses = torch.cat([turns, shifts], -1)
-        bent = poses.unfold(0, 4, 1) @ THIRD_DIFFERENCE.to(poses)
-        return 8 * bent.square().mean()  # the sum over the 4 + 4 numbers of a pose
+        third_differences = poses.unfold(0, 4, 1) @ THIRD_DIFFERENCE.to(poses)
+        return POSE_NUMBERS * third_differences.square().mean()
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product a b of (..., 4) w x y z: first b turns, then a."""
-    return (a[..., None] * b[..., None, :]).flatten(-2) @ HAMILTON.to(a)
+    outer = (a[..., None] * b[..., None, :]).flatten(-2)  # (..., 16)
+    return outer @ HAMILTON_PRODUCT.to(a)

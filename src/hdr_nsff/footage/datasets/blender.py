@@ -29,7 +29,7 @@ from hdr_nsff.footage.datasets.set_files import (
     source_of,
 )
 from hdr_nsff.footage.pose_formats import from_transforms
-from hdr_nsff.scene.scene import LARGEST_EV
+from hdr_nsff.scene.manifest import MAX_EV
 
 TRAIN = "transforms_train.json"
 TEST = "transforms_test.json"
@@ -108,7 +108,7 @@ def exposure_of(path: Path, frame: dict[str, Any], kind: str) -> float | None:
                 f"{path}: {name} has an exposure time of {value:g}; it must be above 0"
             )
         value = math.log2(value)
-    if abs(value) > LARGEST_EV:
+    if abs(value) > MAX_EV:
         raise InputError(
             f"{path}: {name} has an exposure of {value:g} stops, which is none; correct it"
         )

@@ -11,8 +11,9 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 
 from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.core.notes import first_problem
 from hdr_nsff.footage.datasets.capture import Exposures
-from hdr_nsff.scene.scene import Strict, bracket_problem, first_problem, is_intrinsic, is_matrix
+from hdr_nsff.scene.manifest import Strict, bracket_problem, is_intrinsic, is_matrix
 
 
 class ExtraFrame(Strict):

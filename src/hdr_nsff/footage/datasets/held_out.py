@@ -23,7 +23,9 @@ import numpy as np
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_exr, read_image, write_exr, write_json, write_png
+from hdr_nsff.core.exr import read_exr, write_exr
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.core.io import write_json
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.datasets.capture import Capture, select_poses
@@ -37,7 +39,7 @@ from hdr_nsff.footage.ingest import hash_file, shrink
 from hdr_nsff.footage.pose_files import placed
 from hdr_nsff.footage.pose_formats import GivenPoses
 from hdr_nsff.geometry.poses import Poses
-from hdr_nsff.scene.scene import FrameEntry, Manifest
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
 from hdr_nsff.scene.truth import Truth, TruthView
 
 NOTE = "made_of.json"

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask
+from hdr_nsff.core.images import read_mask
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
 from hdr_nsff.footage.depth_files import read_map

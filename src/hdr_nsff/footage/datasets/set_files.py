@@ -14,7 +14,7 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.footage.ingest import FRAMES
-from hdr_nsff.scene.scene import LARGEST
+from hdr_nsff.scene.manifest import MAX_NUMBER
 
 
 def read_object(path: Path, purpose: str) -> dict[str, Any]:
@@ -50,9 +50,9 @@ def read_document(path: Path, purpose: str) -> dict[str, Any]:
 
 
 def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> float:
-    """A number of a frame, up to `LARGEST`; `purpose` is what an InputError names."""
+    """A number of a frame, up to `MAX_NUMBER`; `purpose` is what an InputError names."""
     value = frame.get(key)
-    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST:
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER:
         return float(value)
     name = shorten(frame.get("file_path"))
     raise InputError(f"{path}: {name} has no number `{key}`, {purpose}; copy the file again")

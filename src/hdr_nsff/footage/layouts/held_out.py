@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_image, write_png
+from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.layouts.writer import HeldOutPicture, Source, copy
 from hdr_nsff.geometry import alignment
-from hdr_nsff.scene.scene import FrameEntry, inside
+from hdr_nsff.scene.manifest import FrameEntry, inside
 from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
 
 

@@ -18,7 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import atomic, read_mask, read_npy, write_json, write_npy, write_png
+from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.io import atomic, read_npy, write_json, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.datasets.extra import ExtraFrame, ExtraView
 from hdr_nsff.footage.datasets.llff import MULTI_VIEW, NOTE
@@ -32,7 +33,7 @@ from hdr_nsff.footage.layouts.writer import (
     z_depth,
 )
 from hdr_nsff.footage.pose_formats import FROM_LLFF
-from hdr_nsff.scene.scene import FlowFiles, FrameEntry
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry
 
 SAME_TIME = 1e-6  # frames: times closer than that are one
 MAX_OFFSET_PX = 0.5  # by which intrinsics may differ from the layout's unreported

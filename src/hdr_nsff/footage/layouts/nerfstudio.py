@@ -26,7 +26,7 @@ from hdr_nsff.footage.layouts.writer import (
     z_depth,
 )
 from hdr_nsff.footage.pose_formats import FROM_OPENGL
-from hdr_nsff.scene.scene import FrameEntry
+from hdr_nsff.scene.manifest import FrameEntry
 
 VIEW_MASKS = "held_out_masks/"  # where the moving masks of held-out views go
 

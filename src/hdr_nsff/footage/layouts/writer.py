@@ -24,7 +24,8 @@ from hdr_nsff.core.io import atomic, read_npy
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.core.progress import track
 from hdr_nsff.footage.datasets.extra import Extra, ExtraFrame
-from hdr_nsff.scene.scene import FrameEntry, Manifest, Scene, inside
+from hdr_nsff.scene.manifest import FrameEntry, Manifest, inside
+from hdr_nsff.scene.scene import Scene
 
 NOTE = "hdr_nsff_export.json"
 # name below the export's folder, with slashes -> what writes the file at a path

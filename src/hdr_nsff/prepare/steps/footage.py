@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import write_png
+from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.exposure_lists import (
@@ -21,9 +21,10 @@ from hdr_nsff.footage.exposure_lists import (
     read_exif_ev,
     read_exposure_csv,
 )
+from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.scene.scene import FrameEntry, Protocol, Step, bracket_problem
+from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
 
 MIN_FRAMES = 3  # fewer show no motion
 MAX_ROUNDING_8_BIT = 1e-6  # off whole codes of 8 bits up to which 8 bits hold a picture
@@ -35,7 +36,7 @@ MIN_CONFIDENCE = 0.8
 # Frames
 
 
-def frames_step(work: Work) -> Step:
+def frames_step(work: Work) -> StepResult:
     """Decode the chosen frames into `images/`, and check that they show something."""
     c, m = work.config, work.manifest
     entries: list[FrameEntry] = []
@@ -56,13 +57,18 @@ def frames_step(work: Work) -> Step:
         entries.append(entry)
         extents.append(exposure.extent(frame.rgb))
     check_frames(c.clip, entries, extents)
-    m.frames = entries
     m.fps = work.footage.fps / c.stride
-    vars(work).pop("video", None)  # of the frames before
+    if [identity(f) for f in m.frames] != [identity(f) for f in entries]:
+        m.frames = entries  # else the results of later steps for these frames stay
     note = f"{len(entries)} frames of {m.width}x{m.height} pixels"
     if work.footage.linear:
         note += "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
-    return Step(provenance="given", note=note)
+    return StepResult(provenance="given", note=note)
+
+
+def identity(entry: FrameEntry) -> tuple[int, str, float, int]:
+    """What makes a frame of the scene the same frame."""
+    return entry.index, entry.source, entry.time, entry.camera_id
 
 
 def expected_frames(work: Work) -> int | None:
@@ -120,7 +126,7 @@ class FrameExposures:
     notes: tuple[str, ...] = ()  # sentences for people
 
 
-def exposure_step(work: Work) -> Step:
+def exposure_step(work: Work) -> StepResult:
     """Give each frame its exposure, and choose the frames to hold out of training."""
     m = work.manifest
     found = frame_exposures(work)
@@ -144,11 +150,10 @@ def exposure_step(work: Work) -> Step:
         frame.bracket = bracket
         frame.ev = m.bracket_ev[bracket]
         frame.split = "test" if frame.index in held_out else "train"
-    vars(work).pop("equalized", None)  # of the brackets before
     cycle = "no alternation"
     if m.cycle > 1:
         cycle = f"cycle of {m.cycle}, {len(found.ev)} exposures"
-    return Step(
+    return StepResult(
         provenance="estimated" if found.estimated else "given",
         note=f"{cycle} ({found.source}); {len(held_out)} frames held out",
         details={"source": found.source, "doubts": list(found.notes)},

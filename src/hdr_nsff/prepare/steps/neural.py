@@ -10,17 +10,22 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_mask, read_npy, write_json
+from hdr_nsff.core.io import read_npy, write_json
 from hdr_nsff.core.progress import say
 from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
 from hdr_nsff.priors.depth.depth_anything import Kind, anchored_depth, network_disparity
 from hdr_nsff.priors.flow.sources import flow_weights
-from hdr_nsff.priors.masks.prompts import PointsFile, as_file, corrected, movers, read_points
+from hdr_nsff.priors.masks.points_file import (
+    PointsFile,
+    merge_prompts,
+    read_points,
+    to_points_file,
+)
+from hdr_nsff.priors.masks.prompts import find_objects
 from hdr_nsff.priors.masks.sam2 import sam2_mask
 from hdr_nsff.priors.poses.lightglue import check_matcher, matcher_weights
 from hdr_nsff.priors.pretrained import architecture, pretrained
 from hdr_nsff.priors.weights import content, find
-from hdr_nsff.scene.posed_video import PosedVideo
 
 SAM2, DEPTH_ANYTHING = "Sam2VideoModel", "DepthAnythingForDepthEstimation"
 PROMPTS = "masks/prompts.json"
@@ -54,7 +59,7 @@ def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
             paths = matcher_weights(config.matcher)
         case "masks" if config.masks == "sam2":
             paths = [find(config.mask_weights)]
-        case "depth" if config.depth == "depth-anything":
+        case "static_depth" if config.depth == "depth-anything":
             paths = [find(config.depth_weights)]
         case _:
             paths = []
@@ -92,14 +97,14 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     number = 0  # of objects of the cameras before
     for frames in work.camera_frames():
         train = [i for i in frames if m.frames[i].split == "train"]
-        asked = corrected(movers(moving[train], number + 1), given, train)
+        asked = merge_prompts(find_objects(moving[train], number + 1), given, train)
         number = max([number, *(a.number for a in asked)])
-        for key, entries in as_file(asked, train).items():
+        for key, entries in to_points_file(asked, train).items():
             written[key] += entries
         outlined[train] = sam2_mask(network, video[train], asked, "masks: sam2")
         held_out = [i for i in frames if i not in train]
         if held_out:
-            again = [a.among(train, frames) for a in asked]
+            again = [a.remap_frames(train, frames) for a in asked]
             among = sam2_mask(network, video[frames], again, "masks: sam2, held-out frames")
             outlined[held_out] = among[np.searchsorted(frames, held_out)]
     if not written["points"] and not written["boxes"]:
@@ -108,30 +113,14 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     return outlined
 
 
-def network_depth(
-    work: Work, index: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, float, float, Kind]:
-    """Disparity and confidence of the frames `index` (increasing), near and far, by
-    Depth Anything; and its kind.
+def network_depth(work: Work) -> tuple[np.ndarray, np.ndarray, float, float, Kind]:
+    """Disparity and confidence (T, H, W) of the training frames, near and far, by Depth
+    Anything; and its kind.
     """
     m = work.manifest
-    video, clipped = work.equalized
-    answered, kind = network_disparity(
-        ready(DEPTH_ANYTHING, work.config.depth_weights), video[index]
-    )
-    K, c2w = work.cameras()
-    moving = np.stack([read_mask(work.folder / str(m.frames[i].mask)) for i in index])
-    times = np.array([m.frames[i].time for i in index], np.float64)
-    clip = PosedVideo(K[index], c2w[index], times, video[index], clipped[index], moving)
+    clip = work.training_clip()
+    network = ready(DEPTH_ANYTHING, work.config.depth_weights)
+    answered, kind = network_disparity(network, clip.video)
     points = np.array(read_npy(work.folder / m.points)) if m.points else np.zeros((0, 3))
-    flow, valid, pairs = work.raw_flows
-    among = np.isin(pairs, index).all(1)
-    return *anchored_depth(
-        answered,
-        kind,
-        clip,
-        points,
-        flow[among],
-        valid[among],
-        np.searchsorted(index, pairs[among]),
-    ), kind
+    flow = work.training_flows(work.raw_flows)
+    return *anchored_depth(answered, kind, clip, points, *flow), kind

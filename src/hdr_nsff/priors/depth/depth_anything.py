@@ -1,15 +1,16 @@
-"""Depth of every frame by Depth Anything V2 (Yang et al. 2024), laid onto the static
+"""Depth of every frame by Depth Anything V2 (Yang et al. 2024), aligned to the static
 points of structure from motion.
 
-The network answers each frame by itself: relative variants with disparity up to an
-unknown scale and shift, metric ones with depth in meters of its own making. So each
-frame gets the scale (and shift) that its points ask for, robustly, since points err and
-so does the network; where a frame has few points its neighbors in time decide along
-with it. It sees exposure-equalized frames.
+The network sees each frame by itself, equalized in exposure. Relative variants predict
+disparity up to an unknown scale and shift, metric ones depth in meters up to a scale.
+So each frame gets the scale (and shift) of its points, robustly, since points err and
+so does the network. A frame with few points is aligned together with its neighbors in
+time.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -20,203 +21,254 @@ from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.priors.depth.geometric import LEAST_POINTS, depth_range, doubt_edges
+from hdr_nsff.priors.depth.geometric import depth_range, lower_confidence_at_edges
 from hdr_nsff.priors.depth.parallax import triangulate
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD
 from hdr_nsff.scene.posed_video import PosedVideo
 
 Kind = Literal["relative", "metric"]
-TRIALS = 200  # pairs of points tried for a first scale and shift
-ROUNDS = 10  # of reweighting
-FEW = 30  # points below which a frame listens to its neighbors in time
-QUIET = 0.005  # least noise of disparity, as a share of it: no network is better
-HALF = 0.1  # relative error of disparity at the points that halves the confidence
-FLOOR = 0.25  # of the smallest disparity of the points (all but 1 %): nothing is farther
+MIN_METRIC_DEPTH = 1e-3  # meters: what a metric network predicts below is raised to this
+MAD_TO_SIGMA = 1.48  # standard deviation of a normal distribution per median |deviation|
+
+
+@dataclass(frozen=True)
+class DepthAnythingTuning:
+    """The robust alignment of predictions to points.
+
+    Hand-chosen on rendered scenes; half or twice changes little.
+    """
+
+    min_points: int = 30  # a frame with fewer is drawn to its neighbors in time
+    num_hypotheses: int = 200  # pairs of points tried for a first scale and shift (RANSAC)
+    num_iterations: int = 10  # of reweighting
+    # standard deviations from which on points have little weight (Geman-McClure)
+    outlier_scale: float = 2.4
+    # relative error of disparity at the points that halves the confidence
+    half_confidence_error: float = 0.1
+    # no pixel's disparity is below this share of the lowest disparity of the points,
+    # not counting the lowest percent of them
+    min_disparity_share: float = 0.25
+    min_disparity_percentile: float = 1.0
 
 
 def network_disparity(network: Any, video: np.ndarray) -> tuple[np.ndarray, Kind]:
-    """What the network says of `video` (T, H, W, 3), equalized rgb in [0, 1]: disparity
-    (T, H, W), up to scale and shift per frame ("relative") or up to scale ("metric").
-    `network`: transformers' DepthAnythingForDepthEstimation.
+    """What the network predicts for `video` (T, H, W, 3), equalized rgb in [0, 1].
+
+    Disparity (T, H, W) up to a scale and shift per frame ("relative"), or up to a scale
+    ("metric"). `network`: transformers' DepthAnythingForDepthEstimation.
     """
     kind: Kind = network.config.depth_estimation_type
-    found = np.empty(video.shape[:3], np.float32)
+    size = video.shape[1:3]
+    disparity = np.empty(video.shape[:3], np.float32)
     for t in track(range(len(video)), "depth: network"):
         with torch.inference_mode():
-            answer = (
-                network(pixel_values=picture(network, video[t])).predicted_depth[:, None].float()
-            )
-            values = (
-                functional.interpolate(
-                    answer, video.shape[1:3], mode="bilinear", align_corners=False
-                )[0, 0]
-                .cpu()
-                .numpy()
-            )
-        found[t] = 1 / np.maximum(values, 1e-3) if kind == "metric" else values
-    return found, kind
+            output = network(pixel_values=network_input(network, video[t]))
+            predicted = output.predicted_depth[:, None].float()
+            resized = functional.interpolate(predicted, size, mode="bilinear", align_corners=False)
+        values = resized[0, 0].cpu().numpy()
+        disparity[t] = 1 / np.maximum(values, MIN_METRIC_DEPTH) if kind == "metric" else values
+    return disparity, kind
 
 
-def picture(network: Any, rgb: np.ndarray) -> Tensor:
-    """A frame (H, W, 3) as the network wants it: (1, 3, h, w), normalized, the shorter
-    side what it was trained with, both multiples of its patches.
+def network_input(network: Any, rgb: np.ndarray) -> Tensor:
+    """A frame (H, W, 3) in [0, 1] as the network's input (1, 3, h, w), normalized.
+
+    The shorter side is that of the training images, both are multiples of the patch.
     """
-    patch, short = network.config.patch_size, network.config.backbone_config.image_size
-    height, width = (
-        max(1, round(n * short / min(rgb.shape[:2]) / patch)) * patch for n in rgb.shape[:2]
+    patch = network.config.patch_size
+    short, shorter_side = network.config.backbone_config.image_size, min(rgb.shape[:2])
+    size = tuple(
+        max(1, round(side * short / shorter_side / patch)) * patch for side in rgb.shape[:2]
     )
     values = torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
-    values = functional.interpolate(values, (height, width), mode="bicubic", antialias=True).clamp(
-        0, 1
-    )
-    return ((values - IMAGENET_MEAN) / IMAGENET_STD).to(network.device)
+    resized = functional.interpolate(values, size, mode="bicubic", antialias=True).clamp(0, 1)
+    return ((resized - IMAGENET_MEAN) / IMAGENET_STD).to(network.device)
 
 
 def anchored_depth(
-    answered: np.ndarray,
+    predicted: np.ndarray,
     kind: Kind,
     clip: PosedVideo,
     points: np.ndarray,
     flow: np.ndarray,
     valid: np.ndarray,
     pairs: np.ndarray,
+    tuning: DepthAnythingTuning = DepthAnythingTuning(),
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Disparity (T, H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], near and
-    far z-depth, as `geometric_depth` gives them, from disparity (T, H, W) that the
-    network `answered`.
+    far z-depth, from the disparity (T, H, W) that the network `predicted`.
 
     `points` (N, 3) static; where there are too few, more are triangulated from `flow`
     (P, H, W, 2) px, `valid` (P, H, W) of `pairs` (P, 2). InputError where there still
     are too few.
     """
-    count = len(answered)
-    seen = [sample(clip, t, points, answered[t]) for t in range(count)]
-    if sum(len(s) for s in seen) < LEAST_POINTS * count:
-        points = np.concatenate(
-            [np.asarray(points).reshape(-1, 3), triangulate(clip, flow, valid, pairs)]
-        )
-        seen = [sample(clip, t, points, answered[t]) for t in range(count)]
-    if sum(len(s) for s in seen) < LEAST_POINTS:
+    count = len(predicted)
+    samples = [sample_at_points(clip, t, points, predicted[t]) for t in range(count)]
+    if sum(map(len, samples)) < tuning.min_points * count:
+        from_flow = triangulate(clip, flow, valid, pairs)
+        points = np.concatenate([np.asarray(points).reshape(-1, 3), from_flow])
+        samples = [sample_at_points(clip, t, points, predicted[t]) for t in range(count)]
+    num_samples = sum(map(len, samples))
+    if num_samples < tuning.min_points:
         raise InputError(
-            f"--depth depth-anything: only {sum(len(s) for s in seen)} static points to bring the network's depth to scale; use --depth geometric, "
-            "or give depth maps (--depth FOLDER)"
+            f"--depth depth-anything: {num_samples} static points are too few to align the "
+            "network's depth to; use --depth geometric, or give depth maps (--depth FOLDER)"
         )
-    lines, errors = align(seen, shift=kind == "relative")
-    least = FLOOR * float(np.percentile(np.concatenate(seen)[:, 1], 1))
-    disparity = np.maximum(
-        lines[:, 0, None, None] * answered + lines[:, 1, None, None], least
-    ).astype(np.float32)
-    trust = 1 / (1 + (errors / HALF) ** 2)
+    lines, errors = align(samples, kind == "relative", tuning)
+    scale, shift = lines[:, 0, None, None], lines[:, 1, None, None]
+    known = np.concatenate(samples)[:, 1]
+    lowest = tuning.min_disparity_share * float(
+        np.percentile(known, tuning.min_disparity_percentile)
+    )
+    disparity = np.maximum(scale * predicted + shift, lowest).astype(np.float32)
+    frame_confidence = 1 / (1 + (errors / tuning.half_confidence_error) ** 2)  # (T,)
     confidence = np.stack(
         [
-            doubt_edges(d, np.full(d.shape, c, np.float32))
-            for d, c in zip(disparity, trust, strict=True)
+            lower_confidence_at_edges(d, np.full(d.shape, c, np.float32))
+            for d, c in zip(disparity, frame_confidence, strict=True)
         ]
     )
-    confidence[disparity <= least] = 0
-    few = sum(len(s) < FEW for s in seen)
-    say(
-        f"depth: {kind} answers laid onto {np.mean([len(s) for s in seen]):.0f} points a frame, off by {np.median(errors):.1%} of the disparity there"
-        + (f"; {few} frames with few points follow their neighbors" if few else "")
-    )
+    confidence[disparity <= lowest] = 0
+    report(kind, samples, errors, tuning.min_points)
     return disparity, confidence, *depth_range(disparity, confidence)
 
 
-def sample(clip: PosedVideo, t: int, points: np.ndarray, answered: np.ndarray) -> np.ndarray:
-    """What the network `answered` (H, W) for frame `t` where static `points` are seen,
-    and their disparity: (N, 2). Points behind something that moves are left out.
+def report(kind: Kind, samples: list[np.ndarray], errors: np.ndarray, min_points: int) -> None:
+    """Print how many points the predictions were aligned to, and how well they fit."""
+    num_few = sum(len(s) < min_points for s in samples)
+    sentence = (
+        f"depth: {kind} predictions aligned to {np.mean([len(s) for s in samples]):.0f} points "
+        f"per frame, with a median error of {np.median(errors):.1%} of their disparity"
+    )
+    if num_few:
+        sentence += f"; {num_few} frames with few points follow their neighbors"
+    say(sentence)
+
+
+def sample_at_points(
+    clip: PosedVideo, t: int, points: np.ndarray, predicted: np.ndarray
+) -> np.ndarray:
+    """What the network `predicted` (H, W) for frame `t` where static `points` (P, 3)
+    are seen, and their disparity: (N, 2). Points behind moving pixels are left out.
     """
-    pixels, z, inside = clip.project(t, np.asarray(points, np.float64).reshape(-1, 3))
-    height, width = answered.shape
-    at = pixels[inside]
-    x, y = np.clip(at[:, 0].astype(int), 0, width - 1), np.clip(at[:, 1].astype(int), 0, height - 1)
-    still = ~clip.moving[t, y, x]
-    there = map_coordinates(answered, (at[:, 1] - 0.5, at[:, 0] - 0.5), order=1, mode="nearest")
-    return np.stack([there, 1 / z[inside]], 1)[still].astype(np.float64)
+    pixels, depth, inside = clip.project(t, np.asarray(points, np.float64).reshape(-1, 3))
+    height, width = predicted.shape
+    x, y = pixels[inside].T
+    column = np.clip(x.astype(int), 0, width - 1)
+    row = np.clip(y.astype(int), 0, height - 1)
+    static = ~clip.moving[t, row, column]
+    values = map_coordinates(predicted, (y - 0.5, x - 0.5), order=1, mode="nearest")
+    return np.stack([values, 1 / depth[inside]], 1)[static].astype(np.float64)
 
 
-def align(seen: list[np.ndarray], shift: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Per frame the scale and shift (T, 2) that take answers to disparities (`seen`:
-    per frame (N, 2) of both; without `shift` it is 0), and how far the points are from
-    it, (T,), as a share of their disparity (median; of frames without points that of
-    all).
+def align(
+    samples: list[np.ndarray],
+    with_shift: bool,
+    tuning: DepthAnythingTuning = DepthAnythingTuning(),
+) -> tuple[np.ndarray, np.ndarray]:
+    """Per frame the scale and shift (T, 2) from predictions to disparities, and the
+    median error (T,) as a share of the disparity.
+
+    `samples`: per frame (N, 2) predictions and disparities; without `with_shift` the
+    shift is 0. Frames without points get the median error of all.
 
     Each frame's line starts from the best of many through two of its points (RANSAC)
-    and is refined by reweighting; then all frames are solved together, those that lack
-    points to `FEW` drawn to their neighbors as strongly as the lacking points would.
+    and is refined by reweighting. All frames are solved together: those that lack
+    points to `min_points` are drawn to their neighbors as strongly as the lacking
+    points would.
     """
-    own = [first_line(s, shift) for s in seen]
-    everything = np.concatenate([s for s in seen if len(s)])
-    middle = first_line(everything, shift)
-    starts = np.array([middle if line is None else line for line in own])
-    spread = max(
-        np.median(
-            [
-                float(np.median(np.abs(misses(s, line))))
-                for s, line in zip(seen, starts, strict=True)
-                if len(s)
-            ]
-        )
-        * 1.48,
-        1e-9,
-    )
-    lines = starts
-    for _ in range(ROUNDS):
-        lines = solve(seen, lines, spread, shift, everything[:, 0])
-    off = [
-        float(np.median(np.abs(misses(s, line)) / s[:, 1])) if len(s) >= FEW else np.nan
-        for s, line in zip(seen, lines, strict=True)
+    every_sample = np.concatenate([s for s in samples if len(s)])
+    common = ransac_line(every_sample, with_shift, tuning)
+    lines = np.zeros((len(samples), 2))
+    for t, s in enumerate(samples):
+        own = ransac_line(s, with_shift, tuning)
+        lines[t] = common if own is None else own
+    deviations = [
+        float(np.median(np.abs(residuals(s, line))))
+        for s, line in zip(samples, lines, strict=True)
+        if len(s)
     ]
-    known = np.nanmedian(off) if np.isfinite(off).any() else 1.0
-    return lines, np.where(np.isfinite(off), off, known)
+    noise = max(np.median(deviations) * MAD_TO_SIGMA, 1e-9)
+    for _ in range(tuning.num_iterations):
+        lines = solve_lines(samples, lines, noise, with_shift, every_sample[:, 0], tuning)
+    errors = np.full(len(samples), np.nan)
+    for t, s in enumerate(samples):
+        if len(s) >= tuning.min_points:
+            errors[t] = np.median(np.abs(residuals(s, lines[t])) / s[:, 1])
+    known = np.isfinite(errors)
+    typical = np.median(errors[known]) if known.any() else 1.0
+    return lines, np.where(known, errors, typical)
 
 
-def misses(s: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """How far (N,) the points `s` (N, 2) are from a line (scale, shift)."""
-    return s[:, 1] - line[0] * s[:, 0] - line[1]
+def residuals(samples: np.ndarray, line: np.ndarray) -> np.ndarray:
+    """How far (N,) the `samples` (N, 2) are from a line (scale, shift)."""
+    return samples[:, 1] - line[0] * samples[:, 0] - line[1]
 
 
-def first_line(s: np.ndarray, shift: bool) -> np.ndarray | None:
-    """The scale and shift, of many through two points of `s` (N, 2) (through one and
-    zero without `shift`), with the least median distance to all; None for fewer than
-    `FEW` points. Scale is above 0: what is nearer for the network is nearer.
+def ransac_line(
+    samples: np.ndarray,
+    with_shift: bool,
+    tuning: DepthAnythingTuning = DepthAnythingTuning(),
+) -> np.ndarray | None:
+    """The scale and shift (2,) with the least median distance to `samples` (N, 2), of
+    many through two of them (through one of them and zero without `with_shift`).
+
+    None for fewer than `min_points`, or where no scale is above 0: what is nearer for
+    the network is nearer.
     """
-    if len(s) < FEW:
+    count = len(samples)
+    if count < tuning.min_points:
         return None
     rng = np.random.default_rng(0)
-    a, b = s[rng.integers(len(s), size=TRIALS)], s[rng.integers(len(s), size=TRIALS)]
-    run = a[:, 0] - (b[:, 0] if shift else 0)
-    scale = (a[:, 1] - (b[:, 1] if shift else 0)) / np.where(np.abs(run) < 1e-12, np.inf, run)
-    offset = a[:, 1] - scale * a[:, 0] if shift else np.zeros(TRIALS)
-    off = np.median(np.abs(s[:, 1] - scale[:, None] * s[:, 0] - offset[:, None]), 1)
-    best = int(np.argmin(np.where(scale > 0, off, np.inf)))
-    return np.array([scale[best], offset[best]]) if scale[best] > 0 else None
+    first = samples[rng.integers(count, size=tuning.num_hypotheses)]
+    second = samples[rng.integers(count, size=tuning.num_hypotheses)]
+    if not with_shift:
+        second = np.zeros_like(first)
+    run, rise = (first - second).T
+    scale = rise / np.where(np.abs(run) < 1e-12, np.inf, run)
+    shift = first[:, 1] - scale * first[:, 0] if with_shift else np.zeros_like(scale)
+    lines = scale[:, None] * samples[:, 0] + shift[:, None]
+    distance = np.median(np.abs(samples[:, 1] - lines), 1)
+    best = int(np.argmin(np.where(scale > 0, distance, np.inf)))
+    return np.array([scale[best], shift[best]]) if scale[best] > 0 else None
 
 
-def solve(
-    seen: list[np.ndarray], lines: np.ndarray, spread: float, shift: bool, answers: np.ndarray
+def solve_lines(
+    samples: list[np.ndarray],
+    lines: np.ndarray,
+    noise: float,
+    with_shift: bool,
+    predictions: np.ndarray,
+    tuning: DepthAnythingTuning = DepthAnythingTuning(),
 ) -> np.ndarray:
-    """One round: the lines (T, 2) that fit all points, each weighted by how well it
-    fits now (Geman-McClure: plainly wrong points have no say), and in frames with few
-    points the neighbors' lines. Two lines differ by what they differ by at the clip's
-    `answers`.
+    """One round of reweighted least squares: the lines (T, 2) that fit all samples, and
+    in frames with few of them the neighbors' lines.
+
+    Each sample is weighted by how well it fits `lines` now (Geman-McClure: plainly
+    wrong points have almost no weight; `noise` is the standard deviation of the
+    others). Two lines differ by their difference at the clip's `predictions` (N,).
     """
-    count, size = len(seen), 2 if shift else 1
-    matrix, vector = np.zeros((count, size, count, size)), np.zeros((count, size))
-    for t, s in enumerate(seen):
-        weight = 1 / (1 + (misses(s, lines[t]) / (2.4 * spread)) ** 2) ** 2
-        columns = np.stack([s[:, 0], np.ones(len(s))], 1)[:, :size]
+    count, size = len(samples), 2 if with_shift else 1
+    matrix, right = np.zeros((count, size, count, size)), np.zeros((count, size))
+    for t, s in enumerate(samples):
+        weight = 1 / (1 + (residuals(s, lines[t]) / (tuning.outlier_scale * noise)) ** 2) ** 2
+        columns = line_columns(s[:, 0], size)
         matrix[t, :, t] += columns.T @ (weight[:, None] * columns)
-        vector[t] += columns.T @ (weight * s[:, 1])
-    columns = np.stack([answers, np.ones(len(answers))], 1)[:, :size]
-    tie = columns.T @ columns / len(answers)
-    for t, s in enumerate(seen):
-        beside = [n for n in (t - 1, t + 1) if 0 <= n < count]
-        lacking = max(FEW - len(s), 0) * tie / max(len(beside), 1)
-        for n in beside:  # into this frame's own equations alone: it pulls nothing
-            matrix[t, :, t] += lacking
-            matrix[t, :, n] -= lacking
-    found = np.linalg.lstsq(matrix.reshape(count * size, -1), vector.reshape(-1), rcond=1e-12)[
-        0
-    ].reshape(count, size)
-    return found if shift else np.concatenate([found, np.zeros((count, 1))], 1)
+        right[t] += columns.T @ (weight * s[:, 1])
+    columns = line_columns(predictions, size)
+    difference = columns.T @ columns / len(predictions)
+    for t, s in enumerate(samples):
+        neighbors = [n for n in (t - 1, t + 1) if 0 <= n < count]
+        num_lacking = max(tuning.min_points - len(s), 0)
+        pull = num_lacking * difference / max(len(neighbors), 1)
+        for n in neighbors:  # in this frame's own equations alone: it pulls no other frame
+            matrix[t, :, t] += pull
+            matrix[t, :, n] -= pull
+    flat = matrix.reshape(count * size, -1)
+    solution = np.linalg.lstsq(flat, right.reshape(-1), rcond=1e-12)[0].reshape(count, size)
+    return solution if with_shift else np.concatenate([solution, np.zeros((count, 1))], 1)
+
+
+def line_columns(values: np.ndarray, size: int) -> np.ndarray:
+    """The design (N, size) of a scale, and a shift if `size` is 2, at `values` (N,)."""
+    return np.stack([values, np.ones(len(values))], 1)[:, :size]

@@ -1,66 +1,73 @@
-"""Many noisy disparity maps of one static scene into one good map per frame: carry the
-neighbors' maps over, let them vote, and fill what nobody saw along the image's edges.
+"""Many noisy disparity maps of one static scene fused into one clean map per frame.
+
+The maps of neighboring frames are warped into the frame and vote (weighted median, as
+in Merrell et al. 2007); then depth edges are moved onto image edges by a joint weighted
+median filter (Ma et al. 2013). Numba without the GIL: one thread per frame.
 """
 
 from __future__ import annotations
 
-import numba
+from dataclasses import dataclass
+
 import numpy as np
 
-AGREE = 0.03  # disparities within this share of the median are the same surface
-REACH = 4  # pixels a cleaned value may come from
-ALIKE = 0.1  # sum of rgb differences at which a pixel speaks e times less for another
-
-jit = numba.njit(cache=True, nogil=True, fastmath=True)
+from hdr_nsff.core.jit import jit
 
 
-@jit
-def carry_over(disparity, weight, rotation, shift, result, result_weight):
+@dataclass(frozen=True)
+class FuseTuning:
+    """Hand-chosen on rendered scenes."""
+
+    # share of the disparity: values this close to the median are the same surface
+    max_disparity_difference: float = 0.03
+    window_px: int = 4  # a cleaned value comes from at most this far along x and y
+    # sum of rgb differences at which another pixel's weight falls to 1 / e
+    rgb_scale: float = 0.1
+
+
+@jit(nogil=True, fastmath=True)
+def warp_disparity(disparity, weight, rotation, shift, warped, warped_weight):
     """Splat one frame's map into another: pixels go to `rotation` (x, y, 1) + disparity
-    `shift`, whose third entry is z * disparity.
+    `shift`, homogeneous, whose third entry is z * disparity (see `pinhole.transfer`).
 
-    Each lands on the nearest pixel; the nearest surface wins. `result_weight` is 0
-    where nothing landed.
+    `disparity`, `weight` (H, W); each pixel lands on the nearest pixel of `warped`, and
+    the nearest surface wins. `warped_weight` is 0 where nothing landed.
     """
-    h, w = result.shape
-    result[:] = 0
-    result_weight[:] = 0
+    height, width = warped.shape
+    warped[:] = 0
+    warped_weight[:] = 0
     for y in range(disparity.shape[0]):
         for x in range(disparity.shape[1]):
             if weight[y, x] <= 0:
                 continue
-            u, v, d = x + 0.5, y + 0.5, disparity[y, x]
+            u, v = x + 0.5, y + 0.5
+            d = disparity[y, x]
             q = rotation[2, 0] * u + rotation[2, 1] * v + rotation[2, 2] + d * shift[2]
             if q <= 1e-6:
                 continue
-            px = int(
-                np.floor(
-                    (rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2] + d * shift[0]) / q
-                )
-            )
-            py = int(
-                np.floor(
-                    (rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2] + d * shift[1]) / q
-                )
-            )
-            if 0 <= px < w and 0 <= py < h and d / q > result[py, px]:
-                result[py, px] = d / q
-                result_weight[py, px] = weight[y, x]
+            qx = rotation[0, 0] * u + rotation[0, 1] * v + rotation[0, 2] + d * shift[0]
+            qy = rotation[1, 0] * u + rotation[1, 1] * v + rotation[1, 2] + d * shift[1]
+            px = int(np.floor(qx / q))
+            py = int(np.floor(qy / q))
+            inside = 0 <= px < width and 0 <= py < height
+            if inside and d / q > warped[py, px]:
+                warped[py, px] = d / q
+                warped_weight[py, px] = weight[y, x]
 
 
-@jit
-def vote(disparities, weights):
-    """Weighted median over `n` maps (n, H, W), averaged over those within `AGREE` of
-    it: disparity (H, W), weight that agrees (H, W), weight of all (H, W).
+@jit(nogil=True, fastmath=True)
+def vote(disparities, weights, max_difference):
+    """Weighted median over `n` maps (n, H, W), averaged over those within the share
+    `max_difference` of it.
+
+    Returns disparity (H, W), the weight that agrees (H, W), and the weight of all.
     """
-    n, h, w = disparities.shape
-    fused, agreeing, everything = (
-        np.zeros((h, w), np.float32),
-        np.zeros((h, w), np.float32),
-        np.zeros((h, w), np.float32),
-    )
-    for y in range(h):
-        for x in range(w):
+    n, height, width = disparities.shape
+    fused = np.zeros((height, width), np.float32)
+    agreeing_weight = np.zeros((height, width), np.float32)
+    total_weight = np.zeros((height, width), np.float32)
+    for y in range(height):
+        for x in range(width):
             order = np.argsort(disparities[:, y, x])
             total = np.float32(0)
             for i in range(n):
@@ -73,47 +80,50 @@ def vote(disparities, weights):
                 if running >= 0.5 * total:
                     median = disparities[i, y, x]
                     break
-            mean, agree = np.float32(0), np.float32(0)
+            mean, agreeing = np.float32(0), np.float32(0)
             for i in range(n):
-                if weights[i, y, x] > 0 and abs(disparities[i, y, x] - median) <= AGREE * median:
+                difference = abs(disparities[i, y, x] - median)
+                if weights[i, y, x] > 0 and difference <= max_difference * median:
                     mean += weights[i, y, x] * disparities[i, y, x]
-                    agree += weights[i, y, x]
-            fused[y, x], agreeing[y, x], everything[y, x] = mean / agree, agree, total
-    return fused, agreeing, everything
+                    agreeing += weights[i, y, x]
+            fused[y, x] = mean / agreeing
+            agreeing_weight[y, x] = agreeing
+            total_weight[y, x] = total
+    return fused, agreeing_weight, total_weight
 
 
-@jit
-def clean(disparity, weight, rgb):
+@jit(nogil=True, fastmath=True)
+def joint_median(disparity, weight, rgb, radius, rgb_scale):
     """Weighted median (H, W) over the pixels around that look alike: depth edges move
-    onto image edges, outliers go.
+    onto image edges, outliers disappear.
 
-    `weight` (H, W) as found, `rgb` (H, W, 3) in [0, 1]. A pixel without any weight
-    around it keeps its value.
+    `weight` (H, W) of the `disparity` (H, W), `rgb` (H, W, 3) in [0, 1]; the window
+    reaches `radius` pixels, and pixels that differ by `rgb_scale` weigh 1 / e. A pixel
+    without any weight around it keeps its value.
     """
-    h, w = disparity.shape
+    height, width = disparity.shape
     result = disparity.copy()
-    values, weights = (
-        np.empty((2 * REACH + 1) ** 2, np.float32),
-        np.empty((2 * REACH + 1) ** 2, np.float32),
-    )
-    for y in range(h):
-        for x in range(w):
+    values = np.empty((2 * radius + 1) ** 2, np.float32)
+    weights = np.empty((2 * radius + 1) ** 2, np.float32)
+    for y in range(height):
+        for x in range(width):
             n, total = 0, np.float32(0)
-            for v in range(max(0, y - REACH), min(h, y + REACH + 1)):
-                for u in range(max(0, x - REACH), min(w, x + REACH + 1)):
+            for v in range(max(0, y - radius), min(height, y + radius + 1)):
+                for u in range(max(0, x - radius), min(width, x + radius + 1)):
                     difference = np.float32(0)
                     for c in range(3):
                         difference += abs(rgb[y, x, c] - rgb[v, u, c])
-                    distance = ((v - y) ** 2 + (u - x) ** 2) / (2.0 * REACH**2)
+                    distance = ((v - y) ** 2 + (u - x) ** 2) / (2.0 * radius**2)
                     values[n] = disparity[v, u]
-                    weights[n] = weight[v, u] * np.exp(-difference / ALIKE - distance)
+                    weights[n] = weight[v, u] * np.exp(-difference / rgb_scale - distance)
                     total += weights[n]
                     n += 1
-            if total > 0:
-                running = np.float32(0)
-                for k in np.argsort(values[:n]):
-                    running += weights[k]
-                    if running >= 0.5 * total:
-                        result[y, x] = values[k]
-                        break
+            if total <= 0:
+                continue
+            running = np.float32(0)
+            for k in np.argsort(values[:n]):
+                running += weights[k]
+                if running >= 0.5 * total:
+                    result[y, x] = values[k]
+                    break
     return result

@@ -1,176 +1,191 @@
-"""Depth of every frame: inverse z-depth (disparity) of every pixel in scene units, and
-how far it can be believed.
+"""Geometric depth of the static scene: inverse z-depth (disparity) of every pixel in
+scene units, and a confidence.
 
-A depth prior is a function `(K, c2w, flow, valid, pairs, moving, points, video,
-clipped) -> (disparity, confidence, near, far)`. `geometric_depth` is the offline
-default: the static scene by a plane sweep over the frames (`sweep.py`) between the
-disparities that structure from motion found, fused over all frames (`fuse.py`); moving
-objects by their path (`movers.py`). `read_depth` reads maps made by any other tool.
+A plane sweep over the frames (`plane_sweep.py`) between the disparities that structure
+from motion found, fused over all frames (`fuse.py`). Moving objects are placed by their
+path and shape afterwards (`priors/movers`).
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Protocol
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
 
 from hdr_nsff.core.parallel import in_threads
 from hdr_nsff.core.progress import say
-from hdr_nsff.priors.depth.fuse import AGREE, carry_over, clean, vote
-from hdr_nsff.priors.depth.parallax import choose_views, disparity_range, triangulate
-from hdr_nsff.priors.depth.plane_sweep import sweep
-from hdr_nsff.priors.movers.distance import mover_depth
-from hdr_nsff.priors.movers.mover_shape import relief
+from hdr_nsff.priors.depth.fuse import FuseTuning, joint_median, vote, warp_disparity
+from hdr_nsff.priors.depth.parallax import (
+    ParallaxTuning,
+    choose_views,
+    disparity_range,
+    triangulate,
+)
+from hdr_nsff.priors.depth.plane_sweep import PlaneSweepTuning, sweep
 from hdr_nsff.scene.posed_video import PosedVideo
 
-CANDIDATES = 64  # disparities tried per pixel
-VIEWS = 12  # other frames compared per frame
-LEAST_PARALLAX = 1.0  # pixels: below this, between any two frames, depth cannot be told
-LEAST_POINTS = 30
-GUESSED = 0.02  # weight of a disparity that no view supports: only smoothness spoke
-STILL, STILL_CONFIDENCE = (
-    0.7,
-    0.5,
-)  # match and fused confidence of a pixel in a moving mask that stands still after all
-# relative step of disparity within two pixels that makes a pixel doubtful: which side
-# of the edge is it on?
-EDGE = 0.06
-AT_EDGE = 0.5  # its confidence is multiplied by this
+NO_PARALLAX_RANGE = (0.5, 2.0)  # near and far around distance 1, scene units
 
 
-class DepthPrior(Protocol):
-    """What `prepare` calls, whatever is behind it."""
+@dataclass(frozen=True)
+class DepthTuning:
+    """Evidence that depth needs, and how far it is trusted (hand-chosen on rendered
+    scenes).
+    """
 
-    def __call__(
-        self,
-        K: np.ndarray,
-        c2w: np.ndarray,
-        flow: np.ndarray,
-        valid: np.ndarray,
-        pairs: np.ndarray,
-        moving: np.ndarray,
-        points: np.ndarray,
-        video: np.ndarray,
-        clipped: np.ndarray,
-        times: np.ndarray | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, float, float]:
-        """See `geometric_depth`."""
-        ...
+    num_candidates: int = 64  # disparities tried per pixel
+    max_views: int = 12  # other frames compared per frame
+    # below this, between any two frames, there is no depth
+    min_parallax_px: float = 1.0
+    min_points: int = 30  # static points, per frame; with fewer, flow gives more
+    # weight of a disparity that no view supports and only smoothness determines
+    unsupported_weight: float = 0.02
+    # match and fused confidence from which on a pixel in a moving mask is static after
+    # all
+    min_static_match: float = 0.7
+    min_static_confidence: float = 0.5
+    static_median_px: int = 5  # window of the median over those pixels
+    # relative step of disparity, within `edge_px`, at which a pixel may be on either
+    # side of an edge, and the factor on its confidence
+    min_edge_step: float = 0.06
+    edge_px: int = 2
+    edge_confidence: float = 0.5
+    # near and far: these percentiles of the depth of the pixels above this quantile of
+    # confidence, with room for movers and unreliable pixels
+    min_range_quantile: float = 0.25
+    range_percentiles: tuple[float, float] = (0.5, 99.5)
+    near_factor: float = 0.8
+    far_factor: float = 1.2
+    plane_sweep: PlaneSweepTuning = field(default_factory=PlaneSweepTuning)
+    fuse: FuseTuning = field(default_factory=FuseTuning)
+    parallax: ParallaxTuning = field(default_factory=ParallaxTuning)
 
 
-def geometric_depth(
-    K: np.ndarray,
-    c2w: np.ndarray,
+def static_geometric_depth(
+    clip: PosedVideo,
     flow: np.ndarray,
     valid: np.ndarray,
     pairs: np.ndarray,
-    moving: np.ndarray,
     points: np.ndarray,
-    video: np.ndarray,
-    clipped: np.ndarray,
-    times: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Disparity (T, H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], near and
-    far z-depth, from known poses.
+    tuning: DepthTuning = DepthTuning(),
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth of the static scene from known poses, also behind moving objects.
 
-    `K` (3, 3) or (T, 3, 3) px, `c2w` (T, 3, 4) OpenCV; `flow` (P, H, W, 2) px, `valid`
-    (P, H, W) of `pairs` (P, 2), both directions of neighbors; `moving`, `clipped` (T,
-    H, W) bool; `points` (N, 3) static, may be none; `video` (T, H, W, 3) equalized rgb;
-    `times` (T,) in frames, 0, 1, 2, ... if not given. Without parallax all is at
-    distance 1, confidence 0.
+    `flow` (P, H, W, 2) px and `valid` (P, H, W) of `pairs` (P, 2) of frames, both
+    directions of neighbors; `points` (N, 3) static, may be none. Returns disparity (T,
+    H, W) in 1 / scene units, confidence (T, H, W) in [0, 1], and the pixels (T, H, W)
+    of the moving masks that are static after all. Without parallax all is at distance
+    1, with confidence 0.
     """
-    count, size = len(video), video.shape[1:3]
-    times = np.arange(count, dtype=np.float64) if times is None else np.asarray(times, np.float64)
-    clip = PosedVideo(
-        np.broadcast_to(np.asarray(K, np.float64), (count, 3, 3)),
-        np.asarray(c2w, np.float64),
-        times,
-        video,
-        clipped,
-        moving,
-    )
-    if sum(clip.project(i, points)[2].sum() for i in range(count)) < LEAST_POINTS * count:
-        points = np.concatenate(
-            [np.asarray(points).reshape(-1, 3), triangulate(clip, flow, valid, pairs)]
-        )
-    views, parallax = (
-        choose_views(clip, points, VIEWS) if len(points) >= LEAST_POINTS else ([], 0.0)
-    )
-    if parallax < LEAST_PARALLAX:
+    count = len(clip.video)
+    num_visible = sum(clip.project(i, points)[2].sum() for i in range(count))
+    if num_visible < tuning.min_points * count:
+        from_flow = triangulate(clip, flow, valid, pairs, tuning.parallax)
+        points = np.concatenate([np.asarray(points).reshape(-1, 3), from_flow])
+    views: list[list[int]] = []
+    parallax = 0.0
+    if len(points) >= tuning.min_points:
+        views, parallax = choose_views(clip, points, tuning.max_views, tuning.parallax)
+    if parallax < tuning.min_parallax_px:
         say(
-            f"depth: {parallax:.1f} pixels of parallax between the frames are too few: everything is put at distance 1"
+            f"depth: {parallax:.1f} pixels of parallax between the frames are too few: "
+            "everything is put at distance 1"
         )
-        return np.ones((count, *size), np.float32), np.zeros((count, *size), np.float32), 0.5, 2.0
-    disparity, confidence, still = static_depth(clip, views, *disparity_range(clip, points))
-    moves = moving & ~still
-    with_movers, mover_confidence = mover_depth(
-        replace(clip, moving=moves), flow, valid, pairs, disparity
-    )
-    disparity, confidence = (
-        np.where(moves, with_movers, disparity),
-        np.where(moves, mover_confidence, confidence),
-    )
-    disparity, confidence = relief(
-        replace(clip, moving=moves), flow, valid, pairs, disparity, confidence
-    )
-    confidence = np.stack([doubt_edges(d, c) for d, c in zip(disparity, confidence, strict=True)])
-    return disparity, confidence, *depth_range(disparity, confidence)
+        shape = (count, *clip.size)
+        flat = np.ones(shape, np.float32)
+        return flat, np.zeros(shape, np.float32), np.zeros(shape, bool)
+    low, high = disparity_range(clip, points, tuning.parallax)
+    return static_depth(clip, views, low, high, tuning)
 
 
 def static_depth(
-    clip: PosedVideo, views: list[list[int]], low: float, high: float
+    clip: PosedVideo,
+    views: list[list[int]],
+    low: float,
+    high: float,
+    tuning: DepthTuning = DepthTuning(),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Disparity of the static scene, also behind what moves, its confidence, and which
-    moving pixels stand still after all (T, H, W): by sweep, fusion and cleaning.
+    """Disparity of the static scene by sweep, fusion and cleaning, also behind moving
+    objects; its confidence; and which moving pixels are static after all: all (T, H,
+    W).
+
+    `views`: the frames that each frame is compared with; `low` to `high`: disparities
+    to try, in 1 / scene units.
     """
     frames = list(range(len(views)))
-    candidates = np.linspace(low, high, CANDIDATES).astype(np.float32)
-    swept = in_threads(lambda i: sweep(clip, i, views[i], candidates), frames, "depth: plane sweep")
-    disparity, matched = (np.stack(x) for x in zip(*swept, strict=True))
-    disparity[(matched == 0).all((1, 2))] = np.sqrt(low * high)  # a frame that no view could match
-    doubtful = clip.moving & (matched < STILL)
-    weight = np.where(doubtful, GUESSED**2, np.maximum(matched, GUESSED)).astype(np.float32)
+    candidates = np.linspace(low, high, tuning.num_candidates).astype(np.float32)
+    swept = in_threads(
+        lambda i: sweep(clip, i, views[i], candidates, tuning.plane_sweep),
+        frames,
+        "depth: plane sweep",
+    )
+    disparity, matched = (np.stack(maps) for maps in zip(*swept, strict=True))
+    unmatched = (matched == 0).all((1, 2))  # frames
+    disparity[unmatched] = np.sqrt(low * high)
+    doubtful = clip.moving & (matched < tuning.min_static_match)
+    unsupported = tuning.unsupported_weight
+    weight = np.where(doubtful, unsupported**2, np.maximum(matched, unsupported))
+    weight = weight.astype(np.float32)
     fused = in_threads(
-        lambda i: fuse(clip, i, views[i], disparity, weight), frames, "depth: fusion"
+        lambda i: fuse_frame(clip, i, views[i], disparity, weight, tuning.fuse),
+        frames,
+        "depth: fusion",
     )
-    result, confidence = (np.stack(x) for x in zip(*fused, strict=True))
-    still = (
-        ~doubtful & (np.abs(disparity - result) < AGREE * result) & (confidence > STILL_CONFIDENCE)
-    )
-    return result, confidence, np.stack([cv2.medianBlur(s.astype(np.uint8), 5) > 0 for s in still])
+    result, confidence = (np.stack(maps) for maps in zip(*fused, strict=True))
+    unchanged = np.abs(disparity - result) < tuning.fuse.max_disparity_difference * result
+    static = ~doubtful & unchanged & (confidence > tuning.min_static_confidence)
+    smooth = [cv2.medianBlur(s.astype(np.uint8), tuning.static_median_px) > 0 for s in static]
+    return result, confidence, np.stack(smooth)
 
 
-def fuse(
-    clip: PosedVideo, i: int, views: list[int], disparity: np.ndarray, weight: np.ndarray
+def fuse_frame(
+    clip: PosedVideo,
+    i: int,
+    views: list[int],
+    disparity: np.ndarray,
+    weight: np.ndarray,
+    tuning: FuseTuning,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparity and confidence (H, W) of frame `i` from its own map and those of its
-    `views`, carried over.
+    `views`, warped into it. `disparity`, `weight` (T, H, W).
     """
     maps, weights = [disparity[i]], [weight[i]]
     for j in views:
-        there, there_weight = np.empty_like(disparity[i]), np.empty_like(disparity[i])
-        carry_over(disparity[j], weight[j], *clip.transfer(j, i), there, there_weight)
-        maps.append(there)
-        weights.append(there_weight)
-    voted, agreeing, everything = vote(np.stack(maps), np.stack(weights))
-    confidence = agreeing / (everything + 1)
-    cleaned = clean(voted, confidence, np.ascontiguousarray(clip.video[i], np.float32))
+        rotation, shift = clip.transfer(j, i)
+        warped, warped_weight = np.empty_like(disparity[i]), np.empty_like(disparity[i])
+        warp_disparity(disparity[j], weight[j], rotation, shift, warped, warped_weight)
+        maps.append(warped)
+        weights.append(warped_weight)
+    voted, agreeing_weight, total_weight = vote(
+        np.stack(maps), np.stack(weights), tuning.max_disparity_difference
+    )
+    confidence = agreeing_weight / (total_weight + 1)
+    rgb = np.ascontiguousarray(clip.video[i], np.float32)
+    cleaned = joint_median(voted, confidence, rgb, tuning.window_px, tuning.rgb_scale)
     return cleaned, confidence.astype(np.float32)
 
 
-def doubt_edges(disparity: np.ndarray, confidence: np.ndarray) -> np.ndarray:
-    """`confidence` (H, W), lower within two pixels of a step of `disparity` (H, W)."""
-    square = np.ones((5, 5), np.uint8)
-    step = cv2.dilate(disparity, square) / np.maximum(cv2.erode(disparity, square), 1e-9) - 1
-    return np.where(step > EDGE, AT_EDGE * confidence, confidence).astype(np.float32)
+def lower_confidence_at_edges(
+    disparity: np.ndarray, confidence: np.ndarray, tuning: DepthTuning = DepthTuning()
+) -> np.ndarray:
+    """`confidence` (H, W), lower near steps of `disparity` (H, W)."""
+    side = 2 * tuning.edge_px + 1
+    window = np.ones((side, side), np.uint8)
+    step = cv2.dilate(disparity, window) / np.maximum(cv2.erode(disparity, window), 1e-9) - 1
+    lowered = tuning.edge_confidence * confidence
+    return np.where(step > tuning.min_edge_step, lowered, confidence).astype(np.float32)
 
 
-def depth_range(disparity: np.ndarray, confidence: np.ndarray) -> tuple[float, float]:
-    """Near and far z-depth that hold what is believed, with room: movers and unbelieved
-    pixels are somewhere in between.
+def depth_range(
+    disparity: np.ndarray, confidence: np.ndarray, tuning: DepthTuning = DepthTuning()
+) -> tuple[float, float]:
+    """Near and far z-depth that hold the confident pixels, with room: movers and other
+    pixels are somewhere in between. `disparity`, `confidence` (T, H, W).
     """
-    z = 1 / disparity[confidence >= np.quantile(confidence, 0.25)]
-    near, far = np.percentile(z, [0.5, 99.5])
-    return 0.8 * float(near), 1.2 * float(far)
+    if not confidence.any():  # no parallax: everything is at distance 1
+        return NO_PARALLAX_RANGE
+    least = np.quantile(confidence, tuning.min_range_quantile)
+    depth = 1 / disparity[confidence >= least]
+    near, far = np.percentile(depth, tuning.range_percentiles)
+    return tuning.near_factor * float(near), tuning.far_factor * float(far)

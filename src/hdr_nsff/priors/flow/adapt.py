@@ -1,11 +1,14 @@
-"""Features fitted to one clip: a small residual network, trained for a minute on
-nothing but the clip.
+"""Features fitted to one clip: a small residual network, trained for a minute on the
+clip alone.
 
-What it learns from: points followed between frames of equal exposure, where ordinary
-flow can be believed; that a match across exposures leads back to where it came from;
-that best buddies (each other's nearest) stay ahead of all others; and that features
-stay near what they were. The paper's tracker learns from flow across exposures instead,
-which is what it is to replace.
+Four losses: points followed between frames of equal exposure, where ordinary flow is
+valid; matches across exposures that return to their start; best buddies (each other's
+nearest neighbor) that stay ahead of all other cells; and closeness to the original
+features. The losses follow DINO-Tracker (Tumanyan et al., ECCV 2024), which the paper
+trains on flow across exposures: the very flow that this is to replace, so points of
+equal exposure take its place.
+
+Positions and motions are in cells, as in `correlation`.
 """
 
 from __future__ import annotations
@@ -21,34 +24,53 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.priors.flow.correlation import cells, costs, locate, sample
+from hdr_nsff.priors.flow.correlation import (
+    EXCLUDED,
+    Search,
+    cell_positions,
+    cosines,
+    locate,
+    sample_features,
+)
 from hdr_nsff.priors.flow.features import Features
 
-DETAIL = 4  # by how many colors across a cell is shown to the network
-HIDDEN = 32
-POINTS = 128  # per term and step
-RATE = 1e-3
-DOUBTFUL = 2.0  # cells: round trips that miss by more teach nothing
-HUBER = 0.5  # cells: errors count as squares below
-
 
 @dataclass(frozen=True)
-class Matching:
-    """How a feature is looked for."""
+class AdaptTuning:
+    """Tuning constants of the fit to a clip, hand-chosen on rendered scenes."""
 
-    reach: float  # cells, in x and in y
-    radius: float = 1.0  # cells around the best one that its position is the mean of
-    temperature: float = 0.05  # of the softmax of cosines
+    colors_per_cell: int = 4
+    """The network sees this many by this many colors of each cell."""
+    hidden_channels: int = 32
+    """Channels of the network's hidden layers."""
+    points_per_step: int = 128
+    """Points per loss and step."""
+    learning_rate: float = 1e-3
+    """Of Adam at the first step; it falls linearly to zero."""
+    max_error_cells: float = 2.0
+    """Points that miss by more are taken as lost and have no gradient."""
+    huber_cells: float = 0.5
+    """Errors below this count as squares, above it by their size."""
+    trajectory_weight: float = 3.0
+    """Weight of points followed between frames of equal exposure."""
+    cycle_weight: float = 1.0
+    """Weight of round trips across exposures."""
+    buddies_weight: float = 0.05
+    """Weight of best buddies."""
+    closeness_weight: float = 0.3
+    """Weight of closeness to the original features."""
+
+    def weights(self) -> dict[str, float]:
+        """The weights of the losses, by name."""
+        return {
+            "trajectory": self.trajectory_weight,
+            "cycle": self.cycle_weight,
+            "buddies": self.buddies_weight,
+            "closeness": self.closeness_weight,
+        }
 
 
-@dataclass(frozen=True)
-class AdaptWeights:
-    """What each term counts."""
-
-    trajectory: float = 3.0
-    cycle: float = 1.0
-    buddies: float = 0.05
-    near: float = 0.3
+ADAPT_TUNING = AdaptTuning()
 
 
 class Track(NamedTuple):
@@ -59,104 +81,114 @@ class Track(NamedTuple):
     end: Tensor  # (N, 2)
 
 
-class Residual(nn.Module):
-    """Features plus a correction that starts at zero, seen from the features and from
-    colors finer than them.
+class ResidualNetwork(nn.Module):
+    """Features plus a correction that starts at zero.
+
+    The correction is predicted from the features and from colors on a finer grid.
     """
 
-    def __init__(self, channels: int, size: float) -> None:
-        """`channels` C of the features, `size` their mean length, which is the unit of
-        the correction.
-        """
+    def __init__(
+        self, channels: int, feature_norm: float, tuning: AdaptTuning = ADAPT_TUNING
+    ) -> None:
+        """For features of `channels` whose mean length is `feature_norm`."""
         super().__init__()
-        self.size = size
-        self.inner = nn.Conv2d(
-            channels + 3 * DETAIL**2, HIDDEN, 3, padding=1, padding_mode="replicate"
-        )
-        self.middle = nn.Conv2d(HIDDEN, HIDDEN, 3, padding=1, padding_mode="replicate")
-        self.outer = nn.Conv2d(HIDDEN, channels, 1)
+        self.feature_norm = feature_norm
+        hidden = tuning.hidden_channels
+        inputs = channels + 3 * tuning.colors_per_cell**2
+        self.inner = nn.Conv2d(inputs, hidden, 3, padding=1, padding_mode="replicate")
+        self.middle = nn.Conv2d(hidden, hidden, 3, padding=1, padding_mode="replicate")
+        self.outer = nn.Conv2d(hidden, channels, 1)
         nn.init.zeros_(self.outer.weight)
         nn.init.zeros_(self.outer.bias)  # type: ignore[arg-type]
 
-    def forward(self, maps: Tensor, detail: Tensor) -> Tensor:
-        """Corrected features (B, C, h, w) from `maps` (B, C, h, w) and `detail` (B, 3 *
-        DETAIL^2, h, w).
+    def forward(self, maps: Tensor, colors: Tensor) -> Tensor:
+        """Corrected features (B, C, h, w) from `maps` (B, C, h, w) and `colors`.
+
+        `colors` are those of `cell_colors`, (B, 3 * colors_per_cell^2, h, w).
         """
-        x = functional.gelu(self.inner(torch.cat([maps / self.size, detail - 0.5], 1)))
-        return maps + self.size * self.outer(functional.gelu(self.middle(x)))
+        inputs = torch.cat([maps / self.feature_norm, colors - 0.5], 1)
+        x = functional.gelu(self.inner(inputs))
+        x = functional.gelu(self.middle(x))
+        return maps + self.feature_norm * self.outer(x)
 
 
-def colors(video: np.ndarray, features: Features, across: int) -> Tensor:
-    """What `video` (T, H, W, 3) shows in each cell, in `across` x `across` samples: (T,
-    3 * across^2, h, w).
+def cell_colors(video: np.ndarray, features: Features, per_side: int) -> Tensor:
+    """Colors (T, 3 * per_side^2, h, w) of the cells of `features`.
+
+    They are read from `video` (T, H, W, 3) on a grid of `per_side` x `per_side` samples
+    in each cell.
     """
     h, w = features.maps.shape[-2:]
-    step = features.stride / across
-    first = features.origin - 0.5 - (across - 1) / 2 * step  # as a pixel index
-    x, y = ((first + step * np.arange(n * across)).astype(np.float32) for n in (w, h))
-    smooth = [cv2.GaussianBlur(frame, (0, 0), max(step / 2, 0.3)) for frame in video]
-    x, y = np.broadcast_to(x, (len(y), len(x))), np.broadcast_to(y[:, None], (len(y), len(x)))
-    seen = np.stack(
-        [
-            cv2.remap(frame, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            for frame in smooth
-        ]
-    )
-    return functional.pixel_unshuffle(torch.from_numpy(seen).permute(0, 3, 1, 2), across)
+    step = features.stride / per_side
+    first = features.origin - 0.5 - (per_side - 1) / 2 * step  # as a pixel index
+    x = (first + step * np.arange(w * per_side)).astype(np.float32)
+    y = (first + step * np.arange(h * per_side)).astype(np.float32)
+    x, y = np.meshgrid(x, y)
+    sampled = []
+    for frame in video:
+        blurred = cv2.GaussianBlur(frame, (0, 0), max(step / 2, 0.3))
+        sampled.append(cv2.remap(blurred, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
+    colors = torch.from_numpy(np.stack(sampled)).permute(0, 3, 1, 2)
+    return functional.pixel_unshuffle(colors, per_side)
 
 
-def trajectory_term(found: Tensor, end: Tensor) -> Tensor:
-    """How far each point was `found` (N, 2) from its `end` (N, 2), cells: (N,), without
-    gradient where it is another place altogether.
+def trajectory_loss(found: Tensor, end: Tensor, tuning: AdaptTuning = ADAPT_TUNING) -> Tensor:
+    """Huber loss (N,) of the distance from points `found` (N, 2) to `end` (N, 2).
+
+    It is zero, without gradient, for points that are lost.
     """
-    error = functional.huber_loss(found, end, reduction="none", delta=HUBER).sum(-1)
-    return error * ((found - end).detach().norm(dim=-1) < DOUBTFUL)
+    loss = functional.huber_loss(found, end, reduction="none", delta=tuning.huber_cells).sum(-1)
+    return loss * ((found - end).detach().norm(dim=-1) < tuning.max_error_cells)
 
 
-def cycle_term(start: Tensor, back: Tensor) -> Tensor:
-    """How far each point lands from its `start` (N, 2) when it comes `back` (N, 2):
-    (N,), 0 where it plainly lost its way.
+def cycle_loss(start: Tensor, back: Tensor, tuning: AdaptTuning = ADAPT_TUNING) -> Tensor:
+    """Huber loss (N,) of the distance from `back` (N, 2) to `start` (N, 2).
+
+    `back` is where a round trip brings the points; the loss of lost points is zero.
     """
-    return trajectory_term(back, start)
+    return trajectory_loss(back, start, tuning)
 
 
 def best_buddies(a: Tensor, b: Tensor, reach: float) -> tuple[Tensor, Tensor]:
-    """Cells (N,), (N,) of `a` and `b` (C, h, w) that are each other's nearest in
-    feature, within `reach` cells.
+    """Cells (N,), (N,) of `a` and `b` (C, h, w) that are mutual nearest neighbors.
+
+    Nearest in feature, within `reach` cells.
     """
-    place = cells(*a.shape[-2:]).to(a)
-    cost = costs(a.flatten(1).T, b)
-    cost = cost.masked_fill(((place[None] - place[:, None]).abs() > reach).any(-1), -9.0)
-    there, back = cost.argmax(1), cost.argmax(0)
-    mutual = (back[there] == torch.arange(len(there), device=a.device)).nonzero()[:, 0]
-    return mutual, there[mutual]
+    positions = cell_positions(*a.shape[-2:]).to(a)
+    beyond = ((positions[None] - positions[:, None]).abs() > reach).any(-1)
+    similarity = cosines(a.flatten(1).T, b).masked_fill(beyond, EXCLUDED)
+    nearest_in_b = similarity.argmax(1)
+    nearest_in_a = similarity.argmax(0)
+    cells = torch.arange(len(positions), device=a.device)
+    mutual = (nearest_in_a[nearest_in_b] == cells).nonzero()[:, 0]
+    return mutual, nearest_in_b[mutual]
 
 
-def buddies_term(queries: Tensor, target: Tensor, buddy: Tensor, temperature: float) -> Tensor:
-    """Cross-entropy (N,) of finding each of `queries` (N, C) at its `buddy` (N,) among
-    the cells of `target` (C, h, w).
+def buddies_loss(queries: Tensor, target: Tensor, buddy: Tensor, temperature: float) -> Tensor:
+    """Cross-entropy (N,) of finding each of `queries` (N, C) at its `buddy` (N,).
 
-    The cells around a buddy do not compete with it: driving them off would round motion
-    to whole cells.
+    It competes with the other cells of `target` (C, h, w), except those next to the
+    buddy: driving them away would round motion to whole cells.
     """
-    place = cells(*target.shape[-2:]).to(target)
-    gap = (place - place[buddy][:, None]).abs().amax(-1)  # (N, cells)
-    cost = (costs(queries, target) / temperature).masked_fill((gap > 0) & (gap < 2), -torch.inf)
-    return functional.cross_entropy(cost, buddy, reduction="none")
+    positions = cell_positions(*target.shape[-2:]).to(target)
+    distance = (positions - positions[buddy][:, None]).abs().amax(-1)  # (N, cells)
+    adjacent = (distance > 0) & (distance < 2)
+    logits = (cosines(queries, target) / temperature).masked_fill(adjacent, -torch.inf)
+    return functional.cross_entropy(logits, buddy, reduction="none")
 
 
-def near_term(refined: Tensor, original: Tensor) -> Tensor:
-    """How far features (B, C, h, w) went from where they were, in angle and in length:
-    (B, h, w).
+def closeness_loss(refined: Tensor, original: Tensor) -> Tensor:
+    """Distance (B, h, w) of features (B, C, h, w) from the original ones.
+
+    One minus the cosine, plus the squared relative change of length.
     """
     angle = 1 - functional.cosine_similarity(refined, original, dim=1)
-    return angle + (refined.norm(dim=1) / original.norm(dim=1).clamp_min(1e-6) - 1) ** 2
+    length_ratio = refined.norm(dim=1) / original.norm(dim=1).clamp_min(1e-6)
+    return angle + (length_ratio - 1) ** 2
 
 
-class Lesson:
-    """A clip to learn from: its features and colors, tracks, and the pairs of
-    neighbors.
-    """
+class TrainingClip:
+    """Training data of one clip: features, colors, tracks and best buddies."""
 
     def __init__(
         self,
@@ -164,88 +196,103 @@ class Lesson:
         video: np.ndarray,
         tracks: list[Track],
         neighbors: list[tuple[int, int]],
-        matching: Matching,
+        search: Search,
+        tuning: AdaptTuning = ADAPT_TUNING,
     ) -> None:
-        """`video` (T, H, W, 3) exposure-equalized; `neighbors`: pairs of frames one
-        after the other, whatever their exposures.
+        """`video` (T, H, W, 3) is exposure-equalized.
+
+        `neighbors` are pairs of consecutive frames of any exposures; frames in no pair
+        are not learned from.
         """
-        self.maps, self.detail = features.maps, colors(video, features, DETAIL)
-        self.tracks, self.neighbors, self.matching = tracks, neighbors, matching
-        frames = sorted(
-            {t for pair in neighbors for t in pair}
-        )  # to learn from; the others may be held out
-        self.size = float(features.maps[frames].norm(dim=1).mean())
+        self.maps = features.maps
+        self.colors = cell_colors(video, features, tuning.colors_per_cell)
+        self.tracks = tracks
+        self.neighbors = neighbors
+        self.search = search
+        self.tuning = tuning
+        frames = sorted({t for pair in neighbors for t in pair})
+        self.feature_norm = float(features.maps[frames].norm(dim=1).mean())
         self.buddies = {
-            (i, j): best_buddies(self.maps[i], self.maps[j], matching.reach) for i, j in neighbors
+            (i, j): best_buddies(self.maps[i], self.maps[j], search.reach) for i, j in neighbors
         }
 
-    def terms(self, network: Residual, rng: np.random.Generator) -> dict[str, Tensor]:
-        """The terms of one step, each a mean, over one pair of neighbors and one track."""
+    def losses(self, network: ResidualNetwork, rng: np.random.Generator) -> dict[str, Tensor]:
+        """The mean losses of one step, over one pair of neighbors and one track."""
         i, j = self.neighbors[rng.integers(len(self.neighbors))]
-        refined, original = self.refine(network, [i, j]), self.maps[[i, j]]
-        m = self.matching
-        h, w = self.maps.shape[-2:]
-        start = torch.from_numpy(
-            rng.random((POINTS, 2)) * [w - 1, h - 1]
-        ).float()  # between cells, so that snapping to them costs
-        there = locate(
-            sample(refined[0], start), start, refined[1], m.reach, m.radius, m.temperature
-        )
-        back = locate(
-            sample(refined[1], there), there, refined[0], m.reach, m.radius, m.temperature
-        )
-        from_, to = self.buddies[i, j]
-        some = torch.from_numpy(rng.integers(len(from_), size=POINTS))
-        contrast = buddies_term(
-            refined[0].flatten(1).T[from_[some]], refined[1], to[some], m.temperature
-        )
-        terms = {
-            "cycle": cycle_term(start, back),
-            "buddies": contrast,
-            "near": near_term(refined, original),
+        original = self.maps[[i, j]]
+        refined = self.refine(network, [i, j])
+        losses = {
+            "cycle": self.cycle(refined, rng),
+            "buddies": self.contrast(refined, *self.buddies[i, j], rng),
+            "closeness": closeness_loss(refined, original),
         }
         if self.tracks:
-            terms["trajectory"] = self.followed(
-                network, self.tracks[rng.integers(len(self.tracks))], rng
-            )
-        return {name: term.mean() for name, term in terms.items()}
+            track = self.tracks[rng.integers(len(self.tracks))]
+            losses["trajectory"] = self.trajectory(network, track, rng)
+        return {name: loss.mean() for name, loss in losses.items()}
 
-    def followed(self, network: Residual, track: Track, rng: np.random.Generator) -> Tensor:
-        """The trajectory term (N,) of some points of a track: among the cells within
-        reach of where they end.
+    def cycle(self, refined: Tensor, rng: np.random.Generator) -> Tensor:
+        """The cycle loss (N,) of random points between two frames (2, C, h, w)."""
+        h, w = refined.shape[-2:]
+        # between cells, so that snapping to cells costs
+        drawn = rng.random((self.tuning.points_per_step, 2)) * [w - 1, h - 1]
+        start = torch.from_numpy(drawn).float()
+        there = locate(sample_features(refined[0], start), start, refined[1], self.search)
+        back = locate(sample_features(refined[1], there), there, refined[0], self.search)
+        return cycle_loss(start, back, self.tuning)
+
+    def contrast(
+        self, refined: Tensor, cells: Tensor, buddies: Tensor, rng: np.random.Generator
+    ) -> Tensor:
+        """The loss (N,) of some `cells` (B,) of one frame at their `buddies` (B,).
+
+        `refined` (2, C, h, w) are the features of both frames.
+        """
+        chosen = torch.from_numpy(rng.integers(len(cells), size=self.tuning.points_per_step))
+        queries = refined[0].flatten(1).T[cells[chosen]]
+        return buddies_loss(queries, refined[1], buddies[chosen], self.search.temperature)
+
+    def trajectory(
+        self, network: ResidualNetwork, track: Track, rng: np.random.Generator
+    ) -> Tensor:
+        """The trajectory loss (N,) of some points of a track.
+
+        Each is searched within reach of its true end.
         """
         a, b = self.refine(network, list(track.frames))
-        some = torch.from_numpy(rng.integers(len(track.start), size=POINTS))
-        m, end = self.matching, track.end[some]
-        return trajectory_term(
-            locate(sample(a, track.start[some]), end, b, m.reach, m.radius, m.temperature), end
-        )
+        count = self.tuning.points_per_step
+        chosen = torch.from_numpy(rng.integers(len(track.start), size=count))
+        end = track.end[chosen]
+        found = locate(sample_features(a, track.start[chosen]), end, b, self.search)
+        return trajectory_loss(found, end, self.tuning)
 
-    def refine(self, network: Residual, frames: list[int]) -> Tensor:
+    def refine(self, network: ResidualNetwork, frames: list[int]) -> Tensor:
         """The corrected features of some frames."""
-        return network(self.maps[frames], self.detail[frames])
+        return network(self.maps[frames], self.colors[frames])
 
 
-def adapt(lesson: Lesson, steps: int, seed: int, weights: AdaptWeights) -> Tensor:
-    """Train on a clip: its features (T, C, h, w) as they are then.
+def adapt_features(clip: TrainingClip, steps: int, seed: int) -> Tensor:
+    """The features (T, C, h, w) of a clip after `steps` of Adam from `seed`.
 
-    `steps` of Adam from `seed`; the original features get no gradient. Says how many
-    steps a second were done.
+    The original features get no gradient. The number of steps per second is reported.
     """
+    tuning = clip.tuning
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = Residual(lesson.maps.shape[1], lesson.size)
+        network = ResidualNetwork(clip.maps.shape[1], clip.feature_norm, tuning)
     rng = np.random.default_rng(seed)
-    optimizer = torch.optim.Adam(network.parameters(), RATE)
-    begun = time.monotonic()
+    optimizer = torch.optim.Adam(network.parameters(), tuning.learning_rate)
+    weights = tuning.weights()
+    begin = time.monotonic()
     for step in track(range(steps), "features of this clip"):
         for group in optimizer.param_groups:
-            group["lr"] = RATE * (1 - step / steps)
-        terms = lesson.terms(network, rng)
-        loss = torch.stack([getattr(weights, name) * term for name, term in terms.items()]).sum()
+            group["lr"] = tuning.learning_rate * (1 - step / steps)
+        losses = clip.losses(network, rng)
+        total = torch.stack([weights[name] * loss for name, loss in losses.items()]).sum()
         optimizer.zero_grad()
-        loss.backward()
+        total.backward()
         optimizer.step()
-    say(f"features of this clip: {steps} steps, {steps / (time.monotonic() - begun):.1f} a second")
+    steps_per_second = steps / (time.monotonic() - begin)
+    say(f"features of this clip: {steps} steps, {steps_per_second:.1f} a second")
     with torch.no_grad():
-        return torch.cat([lesson.refine(network, [t]) for t in range(len(lesson.maps))])
+        return torch.cat([clip.refine(network, [t]) for t in range(len(clip.maps))])

@@ -1,73 +1,93 @@
-"""Where a feature of one frame lies in another: cosine cost volume, and a soft-argmax
+"""The position of a feature in another frame: cosine cost volume, and a soft-argmax
 around its maximum.
 
-Positions are in cells (x, y), a cell's middle at its whole number, so they need no
-rounding; everything is differentiable but for the choice of the maximum.
+Positions are in cells (x, y), with the centers of cells at whole numbers. All of it is
+differentiable except the choice of the maximum.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 from torch.nn import functional
 
-CHUNK = 512  # queries whose costs are held at a time
-FAR = -9.0  # below every cosine
+CHUNK = 512  # queries whose similarities are held at a time: bounds the memory
+EXCLUDED = -9.0  # a similarity below every cosine
 
 
-def cells(height: int, width: int) -> Tensor:
+@dataclass(frozen=True)
+class Search:
+    """How a feature is searched for in another frame."""
+
+    reach: float
+    """Largest motion, in x and in y, in cells."""
+    radius: float
+    """The soft-argmax covers the cells within this distance of the best one, in x and
+    in y, in cells.
+    """
+    temperature: float
+    """Of the softmax of cosines."""
+
+
+def cell_positions(height: int, width: int) -> Tensor:
     """The positions (H*W, 2) of all cells, row by row."""
     y, x = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
     return torch.stack([x, y], -1).reshape(-1, 2).float()
 
 
-def sample(maps: Tensor, positions: Tensor) -> Tensor:
-    """`maps` (C, h, w) at `positions` (N, 2), between cells linearly, outside as at the
-    edge: (N, C).
+def sample_features(maps: Tensor, positions: Tensor) -> Tensor:
+    """Features (N, C) of `maps` (C, h, w) at `positions` (N, 2), bilinear.
+
+    Positions outside the grid read its edge.
     """
     h, w = maps.shape[-2:]
     grid = (2 * positions + 1) / positions.new_tensor([w, h]) - 1
-    found = functional.grid_sample(
+    sampled = functional.grid_sample(
         maps[None], grid[None, None], mode="bilinear", padding_mode="border", align_corners=False
     )
-    return found[0, :, 0].T
+    return sampled[0, :, 0].T
 
 
-def costs(queries: Tensor, target: Tensor) -> Tensor:
-    """Cosine (N, h*w) of each of `queries` (N, C) with each cell of `target` (C, h, w)."""
+def cosines(queries: Tensor, target: Tensor) -> Tensor:
+    """Cosine (N, h*w) of `queries` (N, C) with all cells of `target` (C, h, w)."""
     return functional.normalize(queries, dim=-1) @ functional.normalize(target, dim=0).flatten(1)
 
 
-def soft_argmax(cost: Tensor, place: Tensor, radius: float, temperature: float) -> Tensor:
-    """Sub-cell positions (N, 2) of the maxima of `cost` (N, M) at `place` (M, 2): the
-    mean of the places within `radius` cells of the largest cost, weighted by
-    softmax(cost / temperature).
+def soft_argmax(similarity: Tensor, positions: Tensor, radius: float, temperature: float) -> Tensor:
+    """Sub-cell positions (N, 2) of the maxima of `similarity` (N, M).
+
+    Each is the mean of those `positions` (M, 2) that lie within `radius` cells of the
+    maximum, weighted by softmax(similarity / temperature).
     """
-    best = place[cost.detach().argmax(1)]
-    near = ((place - best[:, None]).abs() <= radius).all(-1)
-    return torch.softmax(cost.masked_fill(~near, FAR) / temperature, 1) @ place
+    best = positions[similarity.detach().argmax(1)]
+    near = ((positions - best[:, None]).abs() <= radius).all(-1)
+    masked = similarity.masked_fill(~near, EXCLUDED)
+    return torch.softmax(masked / temperature, 1) @ positions
 
 
-def locate(
-    queries: Tensor, start: Tensor, target: Tensor, reach: float, radius: float, temperature: float
-) -> Tensor:
-    """Where in `target` (C, h, w) each of `queries` (N, C) is: positions (N, 2), at
-    most `reach` cells in x and in y from `start` (N, 2).
+def locate(queries: Tensor, start: Tensor, target: Tensor, search: Search) -> Tensor:
+    """Positions (N, 2) of `queries` (N, C) in `target` (C, h, w).
+
+    They are searched around `start` (N, 2).
     """
-    place = cells(*target.shape[-2:]).to(target)
+    positions = cell_positions(*target.shape[-2:]).to(target)
     found = []
-    for some, origin in zip(queries.split(CHUNK), start.split(CHUNK), strict=True):
-        cost = costs(some, target)
-        cost = cost.masked_fill(((place - origin[:, None]).abs() > reach).any(-1), FAR)
-        found.append(soft_argmax(cost, place, radius, temperature))
+    for chunk, center in zip(queries.split(CHUNK), start.split(CHUNK), strict=True):
+        similarity = cosines(chunk, target)
+        beyond = ((positions - center[:, None]).abs() > search.reach).any(-1)
+        similarity = similarity.masked_fill(beyond, EXCLUDED)
+        found.append(soft_argmax(similarity, positions, search.radius, search.temperature))
     return torch.cat(found)
 
 
-def motion(a: Tensor, b: Tensor, reach: float, radius: float, temperature: float) -> Tensor:
-    """Motion (h, w, 2), in cells, of all cells of `a` (C, h, w) to where they are in
-    `b` (C, h, w).
+def feature_motion(a: Tensor, b: Tensor, search: Search) -> Tensor:
+    """Motion (h, w, 2), in cells, of each cell of `a` to its position in `b`.
+
+    Both are features (C, h, w).
     """
-    start = cells(*a.shape[-2:]).to(a)
-    return (locate(a.flatten(1).T, start, b, reach, radius, temperature) - start).reshape(
-        *a.shape[-2:], 2
-    )
+    h, w = a.shape[-2:]
+    start = cell_positions(h, w).to(a)
+    end = locate(a.flatten(1).T, start, b, search)
+    return (end - start).reshape(h, w, 2)

@@ -1,10 +1,10 @@
-"""Dense features of frames: what a place looks like to a network, nearly whatever the
-exposure.
+"""Dense features of frames, which change little with the exposure.
 
-A source is a function `features(video) -> Features`; two are here. XFeat (Potje et al.,
-CVPR 2024) is small enough for a CPU, and a package carries its weights. DINOv2 (Oquab
-et al., 2023) is what the paper matches by: ViT-L/14, layer 15, stride 7 (its section
-3.4). Neither learns here: no gradient enters.
+A feature source is a function `(video) -> Features`; two are here. XFeat (Potje et al.,
+"XFeat: Accelerated Features for Lightweight Image Matching", CVPR 2024) is small enough
+for a CPU, and a package carries its weights. DINOv2 (Oquab et al., 2023) is what the
+paper matches by: ViT-L/14, layer 15, stride 7 (section 3.4). Neither is trained here:
+no gradient enters.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
-from hdr_nsff.priors.pretrained import pretrained
+from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD, pretrained
 from hdr_nsff.priors.weights import find
 
 # The convolutions of XFeat's dense part: (channels in, channels out, kernel, stride),
-# by the names its weights have.
+# by the names of its weights.
 BLOCKS: dict[str, tuple[tuple[int, int, int, int], ...]] = {
     "block1": ((1, 4, 3, 1), (4, 8, 3, 2), (8, 8, 3, 1), (8, 24, 3, 2)),
     "block2": ((24, 24, 3, 1), (24, 24, 3, 1)),
@@ -37,35 +37,43 @@ BLOCKS: dict[str, tuple[tuple[int, int, int, int], ...]] = {
 }
 LINEAR = {"skip1.1": (1, 24), "block_fusion.2": (64, 64)}  # 1x1 convolutions without normalization
 NORM_EPSILON = 1e-5  # of torch's normalization layers, with which the weights were trained
-XFEAT_STRIDE, XFEAT_MULTIPLE = (
-    8,
-    32,
-)  # pixels per cell; the sides of its input are multiples of that
-# pixels: the middle of what its first cell looks at, measured by gradients (1.9 +- 0.5)
-XFEAT_ORIGIN = 2.0
-SMALL = 100_000  # frames of fewer pixels are doubled before XFeat sees them
-DINO_SIDE = 854  # pixels of the longer side of the frames that DINOv2 sees, as in the paper
-DINO_DEPTH = 15 / 24  # the share of the layers after which features are taken, if none is named
-IMAGENET_MEAN, IMAGENET_STD = (
-    (0.485, 0.456, 0.406),
-    (0.229, 0.224, 0.225),
-)  # what DINOv2 was trained with
+XFEAT_STRIDE = 8  # pixels per cell
+XFEAT_MULTIPLE = 32  # pixels: sides of XFeat's input are multiples of this
+XFEAT_ORIGIN = 2.0  # pixels: center of the first cell's field, by its gradients (1.9 +- 0.5)
+
+
+@dataclass(frozen=True)
+class FeatureTuning:
+    """Tuning constants of the features."""
+
+    doubled_below_pixels: int = 100_000
+    """Frames with fewer pixels are doubled for XFeat (hand-chosen on rendered scenes).
+    """
+    dino_longer_side_px: int = 854
+    """Longer side of the frames that DINOv2 sees, as in the paper."""
+    dino_depth: float = 15 / 24
+    """Share of DINOv2's layers that run where no layer is named, as in the paper."""
+
+
+FEATURE_TUNING = FeatureTuning()
 
 
 @dataclass(frozen=True)
 class Features:
     """Features of every frame on a grid of cells."""
 
-    maps: Tensor  # (T, C, h, w) float32, not normalized
-    stride: float  # pixels of the frame from cell to cell
-    # pixel coordinate (centers at +0.5), in x and y, of the middle of what cell (0, 0)
-    # looks at
+    maps: Tensor
+    """(T, C, h, w) float32, not normalized."""
+    stride: float
+    """Distance between cells, in pixels of the frame."""
     origin: float
+    """Center of cell (0, 0) in x and in y, in pixels of the frame, where the center of
+    the first pixel is 0.5.
+    """
 
 
-Source = Callable[
-    [np.ndarray], Features
-]  # exposure-equalized rgb (T, H, W, 3) in [0, 1] -> Features
+# exposure-equalized rgb (T, H, W, 3) in [0, 1] -> Features
+FeatureSource = Callable[[np.ndarray], Features]
 FeatureName = Literal["xfeat", "dinov2-small", "dinov2-base", "dinov2-large"]
 
 
@@ -74,111 +82,117 @@ def feature_source(
     weights: Path | None = None,
     layer: int | None = None,
     stride: int | None = None,
-) -> Source:
-    """The features called `name`, their weights from `weights` or wherever they are
-    found.
+    tuning: FeatureTuning = FEATURE_TUNING,
+) -> FeatureSource:
+    """The features called `name`, with the `weights` given, or where weights are kept.
 
-    `layer`, `stride` are DINOv2's: how many of its layers to run, and pixels from token
-    to token; XFeat's are fixed.
+    `layer` (layers that run) and `stride` (pixels from token to token) are of DINOv2
+    alone. InputError where weights are missing, or where XFeat is given one of the two.
     """
     if name != "xfeat":
         network = pretrained("Dinov2Model", name, weights)
-        return partial(dinov2_features, network, layer=layer, stride=stride)
+        return partial(dinov2_features, network, layer=layer, stride=stride, tuning=tuning)
     if layer is not None or stride is not None:
         raise InputError(
-            "--semantic.layer and --semantic.stride: are for the features of DINOv2; leave them out with `xfeat`"
+            "--semantic.layer and --semantic.stride: apply to the features of DINOv2 only; "
+            "leave them out with `xfeat`"
         )
-    return partial(xfeat_features, load_xfeat(find("xfeat", weights)))
+    return partial(xfeat_features, load_xfeat(find("xfeat", weights)), tuning=tuning)
 
 
-def per_frame(
+def run_per_frame(
     video: np.ndarray, scale: float, multiple: int, network: Callable[[Tensor], Tensor]
 ) -> Tensor:
-    """What `network` makes of each frame of `video` (T, H, W, 3), magnified: (T, C, h,
-    w).
+    """The maps (T, C, h, w) of `network` for each frame of `video` (T, H, W, 3).
+
+    The network sees frames `scale` times as large, padded to a `multiple` of pixels.
     """
+    maps = []
     with torch.no_grad():
-        return torch.cat(
-            [network(magnified(frame, scale, multiple)) for frame in track(video, "features")]
-        )
+        for frame in track(video, "features"):
+            maps.append(network(enlarge_and_pad(frame, scale, multiple)))
+    return torch.cat(maps)
 
 
-def magnified(frame: np.ndarray, scale: float, multiple: int) -> Tensor:
-    """A frame (H, W, 3) as (1, 3, h, w), `scale` times as large, its right and lower
-    edges repeated to sides that are multiples.
+def enlarge_and_pad(frame: np.ndarray, scale: float, multiple: int) -> Tensor:
+    """A frame (H, W, 3) as (1, 3, h, w), `scale` times as large and padded.
+
+    Its right and lower edges are repeated until its sides are multiples of `multiple`.
     """
     image = torch.from_numpy(np.ascontiguousarray(frame, np.float32)).permute(2, 0, 1)[None]
     if scale != 1:
         image = functional.interpolate(
             image, scale_factor=scale, mode="bicubic", recompute_scale_factor=False
         ).clamp(0, 1)
-    return functional.pad(
-        image, (0, -image.shape[-1] % multiple, 0, -image.shape[-2] % multiple), mode="replicate"
-    )
+    height, width = image.shape[-2:]
+    return functional.pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
 
 
 class XFeat(nn.Module):
-    """XFeat's dense descriptors: 64 channels at an eighth of the picture. Each
-    normalization is folded into its convolution.
+    """XFeat's dense descriptors: 64 channels at an eighth of the image's size.
+
+    Each normalization is folded into its convolution.
     """
 
     def __init__(self, state: dict[str, Tensor]) -> None:
-        """`state` holds the published weights by their names; those of its keypoint
-        heads are not used.
-        """
+        """Load the published weights by their names, except the keypoint heads."""
         super().__init__()
         for block, layers in BLOCKS.items():
-            for i, (inside, outside, kernel, _) in enumerate(layers):
-                weight = state[f"{block}.{i}.layer.0.weight"]
-                assert weight.shape == (outside, inside, kernel, kernel), (
+            for i, (channels_in, channels_out, kernel, _) in enumerate(layers):
+                layer = f"{block}.{i}.layer"
+                weight = state[f"{layer}.0.weight"]
+                assert weight.shape == (channels_out, channels_in, kernel, kernel), (
                     f"{block}.{i}: {tuple(weight.shape)}"
                 )
-                mean, variance = (
-                    state[f"{block}.{i}.layer.1.running_{s}"] for s in ("mean", "var")
+                mean = state[f"{layer}.1.running_mean"]
+                variance = state[f"{layer}.1.running_var"]
+                gain = (variance + NORM_EPSILON).rsqrt()
+                self.add_convolution(
+                    f"{block}_{i}", weight * gain[:, None, None, None], -mean * gain
                 )
-                shrink = (variance + NORM_EPSILON).rsqrt()
-                self.keep(f"{block}_{i}", weight * shrink[:, None, None, None], -mean * shrink)
-        for name, (inside, outside) in LINEAR.items():
+        for name, (channels_in, channels_out) in LINEAR.items():
             weight = state[f"{name}.weight"]
-            assert weight.shape == (outside, inside, 1, 1), f"{name}: {tuple(weight.shape)}"
-            self.keep(name.replace(".", "_"), weight, state[f"{name}.bias"])
+            assert weight.shape == (channels_out, channels_in, 1, 1), (
+                f"{name}: {tuple(weight.shape)}"
+            )
+            self.add_convolution(name.replace(".", "_"), weight, state[f"{name}.bias"])
 
-    def keep(self, name: str, weight: Tensor, bias: Tensor) -> None:
-        """Hold a convolution, not to be learned."""
+    def add_convolution(self, name: str, weight: Tensor, bias: Tensor) -> None:
+        """Register a convolution's numbers, which are not trained."""
         self.register_buffer(f"{name}_weight", weight.float())
         self.register_buffer(f"{name}_bias", bias.float())
 
     def convolve(self, x: Tensor, name: str, stride: int = 1) -> Tensor:
-        """One convolution of what is held, with zeros around."""
-        weight, bias = getattr(self, f"{name}_weight"), getattr(self, f"{name}_bias")
+        """The registered convolution `name`, with zeros around the image."""
+        weight = getattr(self, f"{name}_weight")
+        bias = getattr(self, f"{name}_bias")
         return functional.conv2d(x, weight, bias, stride, padding=weight.shape[-1] // 2)
 
     def block(self, x: Tensor, name: str) -> Tensor:
-        """A chain of convolutions and ReLUs."""
+        """The chain `name` of convolutions and ReLUs."""
         for i, (_, _, _, stride) in enumerate(BLOCKS[name]):
             x = functional.relu(self.convolve(x, f"{name}_{i}", stride))
         return x
 
     def forward(self, rgb: Tensor) -> Tensor:
-        """Descriptors (T, 64, H/8, W/8) of rgb (T, 3, H, W), any scale and offset of
-        brightness; sides are multiples of 32.
+        """Descriptors (T, 64, H/8, W/8) of rgb (T, 3, H, W).
+
+        Scale and offset of brightness do not matter; sides are multiples of 32.
         """
         gray = functional.instance_norm(rgb.mean(1, keepdim=True), eps=NORM_EPSILON)
-        quarter = self.block(gray, "block1") + self.convolve(
-            functional.avg_pool2d(gray, 4), "skip1_1"
-        )
+        skip = self.convolve(functional.avg_pool2d(gray, 4), "skip1_1")
+        quarter = self.block(gray, "block1") + skip
         eighth = self.block(self.block(quarter, "block2"), "block3")
         sixteenth = self.block(eighth, "block4")
         coarse = self.block(sixteenth, "block5")
         size = list(eighth.shape[-2:])
-        mixed = eighth + sum(
-            functional.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarse)
-        )
-        return self.convolve(self.block(mixed, "block_fusion"), "block_fusion_2")
+        enlarged = [functional.interpolate(x, size, mode="bilinear") for x in (sixteenth, coarse)]
+        fused = eighth + sum(enlarged)
+        return self.convolve(self.block(fused, "block_fusion"), "block_fusion_2")
 
 
 def load_xfeat(path: Path) -> XFeat:
-    """XFeat with the weights in a file; InputError where they are not its."""
+    """XFeat with the weights of a file; InputError where they are not XFeat's."""
     try:
         return XFeat(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # of many types: no archive, other names, other shapes
@@ -187,10 +201,13 @@ def load_xfeat(path: Path) -> XFeat:
         ) from error
 
 
-def xfeat_features(network: XFeat, video: np.ndarray) -> Features:
-    """`Source` by XFeat: 64 channels every 8 pixels, or every 4 pixels of small frames."""
-    scale = 2 if video.shape[1] * video.shape[2] < SMALL else 1
-    maps = per_frame(video, scale, XFEAT_MULTIPLE, network)
+def xfeat_features(
+    network: XFeat, video: np.ndarray, tuning: FeatureTuning = FEATURE_TUNING
+) -> Features:
+    """`FeatureSource` by XFeat: 64 channels every 8 pixels, every 4 of small frames."""
+    height, width = video.shape[1:3]
+    scale = 2 if height * width < tuning.doubled_below_pixels else 1
+    maps = run_per_frame(video, scale, XFEAT_MULTIPLE, network)
     return Features(maps, XFEAT_STRIDE / scale, XFEAT_ORIGIN / scale)
 
 
@@ -199,14 +216,18 @@ def dinov2_features(
     video: np.ndarray,
     layer: int | None = None,
     stride: int | None = None,
-    side: int = DINO_SIDE,
+    tuning: FeatureTuning = FEATURE_TUNING,
 ) -> Features:
-    """`Source` by transformers' `Dinov2Model`: the tokens after `layer` layers (0.625
-    of them), one every `stride` pixels (half a patch) of frames whose longer side is
-    `side`. InputError for a layer or stride that it has not.
+    """`FeatureSource` by the patch tokens of transformers' `Dinov2Model`.
+
+    Tokens are taken after `layer` layers, `stride` pixels apart in the resized frame
+    (default: half a patch). InputError for a layer or stride out of the network's
+    range.
     """
-    depth, patch = network.config.num_hidden_layers, network.config.patch_size
-    layer, stride = layer or round(DINO_DEPTH * depth), stride or patch // 2
+    depth = network.config.num_hidden_layers
+    patch = network.config.patch_size
+    layer = layer or round(tuning.dino_depth * depth)
+    stride = stride or patch // 2
     if not 1 <= layer <= depth:
         raise InputError(
             f"--semantic.layer {layer}: this network has {depth} layers; choose 1 to {depth}"
@@ -215,31 +236,31 @@ def dinov2_features(
         raise InputError(
             f"--semantic.stride {stride}: the patches are {patch} pixels wide; choose 1 to {patch}"
         )
-    scale = side / max(video.shape[1:3])
-    maps = per_frame(video, scale, patch, partial(tokens, network, layer, stride))
+    scale = tuning.dino_longer_side_px / max(video.shape[1:3])
+    maps = run_per_frame(video, scale, patch, partial(patch_tokens, network, layer, stride))
     return Features(maps, stride / scale, patch / 2 / scale)
 
 
-def tokens(network: Any, layer: int, stride: int, rgb: Tensor) -> Tensor:
-    """What DINOv2's patch tokens are after `layer` layers: (1, C, h, w) of rgb (1, 3,
-    H, W), patches `stride` pixels apart, so that they overlap; the position encodings
-    are interpolated to as many.
+def patch_tokens(network: Any, layer: int, stride: int, rgb: Tensor) -> Tensor:
+    """DINOv2's patch tokens (1, C, h, w) of rgb (1, 3, H, W) after `layer` layers.
+
+    Patches are `stride` pixels apart, so they overlap; position encodings are
+    interpolated to their number.
     """
-    embeddings, shape = network.embeddings, (1, 3, 1, 1)
-    normalized = (rgb - torch.tensor(IMAGENET_MEAN).view(shape)) / torch.tensor(IMAGENET_STD).view(
-        shape
-    )
+    embeddings = network.embeddings
     projection = embeddings.patch_embeddings.projection
-    patches = functional.conv2d(
-        normalized, projection.weight, projection.bias, stride
-    )  # (1, C, h, w)
-    position = embeddings.position_embeddings  # (1, 1 + n * n, C), the class token's first
-    n = round((position.shape[1] - 1) ** 0.5)
-    grid = position[:, 1:].unflatten(1, (n, n)).permute(0, 3, 1, 2)
-    patches = patches + functional.interpolate(
-        grid, list(patches.shape[-2:]), mode="bicubic", align_corners=False
-    )
-    x = torch.cat([embeddings.cls_token + position[:, :1], patches.flatten(2).mT], 1)
+    normalized = (rgb - IMAGENET_MEAN) / IMAGENET_STD
+    patches = functional.conv2d(normalized, projection.weight, projection.bias, stride)
+    size = list(patches.shape[-2:])  # (1, C, h, w)
+
+    encodings = embeddings.position_embeddings  # (1, 1 + n * n, C), the class token's first
+    n = round((encodings.shape[1] - 1) ** 0.5)
+    grid = encodings[:, 1:].unflatten(1, (n, n)).permute(0, 3, 1, 2)
+    grid = functional.interpolate(grid, size, mode="bicubic", align_corners=False)
+    tokens = (patches + grid).flatten(2).mT
+
+    class_token = embeddings.cls_token + encodings[:, :1]
+    x = torch.cat([class_token, tokens], 1)
     for block in network.encoder.layer[:layer]:
         x = block(x)
-    return x[:, 1:].mT.unflatten(2, patches.shape[-2:])
+    return x[:, 1:].mT.unflatten(2, size)

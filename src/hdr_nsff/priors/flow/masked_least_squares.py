@@ -1,75 +1,119 @@
-"""Flow of what moves, mended where it blurs into what is behind.
+"""Flow of movers, corrected near their outlines with the mover's own pixels alone.
 
-Patches and smoothness reach over a mover's outline, so flow within a few pixels of it
-is partly that of the background: on small pictures a mover's whole motion comes out
-some percents too small, and what moves too little seems to be too far away. Once masks
-are known, the motion of a mover is told by its own pixels alone: Lucas & Kanade's least
-squares ("An iterative image registration technique", 1981) in windows that end where
-the mask ends, robust, blind to brightness, and the correction is smooth.
+Patches and smoothness reach across a mover's outline, so flow within a few pixels of it
+is partly that of the background: on small frames a mover's whole motion comes out some
+percent too small, and an object that moves too little seems too far away. Once masks
+are known, Lucas & Kanade's least squares ("An iterative image registration technique",
+1981) run in windows that end at the mask, robust, and blind to brightness; the
+correction is smooth. Flow is in pixels, x then y, as in `dense`.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from hdr_nsff.geometry.round_trip import follow
 
-BLUR = 0.4  # pixels: standard deviation of what takes off the noise
-WINDOW = 2.0  # pixels: standard deviation of the windows
-SMOOTH = 3.0  # pixels: of what the correction is averaged over
-ROUNDS = 6
-# of the range: differences of color from which on pixels count less (Geman & McClure)
-OUTLIER = 0.06
-# added to the windows' mean square gradients: where nothing shows, nothing is corrected
-FLAT = 1e-4
-STEP = 0.5  # pixels a round at most
-MOST = 1.5  # pixels in all: what would go further is left as it was
+
+@dataclass(frozen=True)
+class MaskedLeastSquaresTuning:
+    """Tuning constants of the correction, hand-chosen on rendered scenes."""
+
+    blur_px: float = 0.4
+    """Standard deviation of the blur that reduces noise."""
+    window_px: float = 2.0
+    """Standard deviation of the Gaussian windows."""
+    smoothing_px: float = 3.0
+    """Standard deviation of the Gaussian that the correction is averaged with."""
+    iterations: int = 6
+    """Gauss-Newton steps."""
+    outlier_rgb: float = 0.06
+    """Difference of color, in [0, 1], at which a pixel counts half (Cauchy weight)."""
+    flat_gradient: float = 1e-4
+    """Added to the windows' mean squared gradients (per squared pixel): a window
+    without texture is not corrected.
+    """
+    max_step_px: float = 0.5
+    """Largest change of the flow in one step, in x and in y."""
+    max_correction_px: float = 1.5
+    """Total correction from which on the flow is left as it was."""
 
 
-def mended(here: np.ndarray, there: np.ndarray, flow: np.ndarray, moving: np.ndarray) -> np.ndarray:
-    """`flow` (H, W, 2) px from a picture `here` to another `there`, both rgb (H, W, 3)
-    in [0, 1] at one exposure, corrected where `here` is `moving` (H, W) bool.
+MASKED_LEAST_SQUARES_TUNING = MaskedLeastSquaresTuning()
+
+
+def refine_mover_flow(
+    source: np.ndarray,
+    target: np.ndarray,
+    flow: np.ndarray,
+    moving: np.ndarray,
+    tuning: MaskedLeastSquaresTuning = MASKED_LEAST_SQUARES_TUNING,
+) -> np.ndarray:
+    """`flow` (H, W, 2) px, corrected where `source` is `moving` (H, W) bool.
+
+    It leads from `source` to `target`, rgb (H, W, 3) in [0, 1] at one exposure.
     """
     if not moving.any():
         return flow
-    here, there = (
-        cv2.GaussianBlur(picture.astype(np.float32), (0, 0), BLUR) for picture in (here, there)
-    )
-    own = moving.astype(np.float32)[..., None]
-    change = np.zeros(flow.shape, np.float32)
-    for _ in range(ROUNDS):
-        step = np.clip(towards(here, there, flow + change, own), -STEP, STEP)
-        change = own * averaged((change + step) * own, own, SMOOTH)
-    return np.where(np.linalg.norm(change, axis=-1, keepdims=True) < MOST, flow + change, flow)
+    source = cv2.GaussianBlur(source.astype(np.float32), (0, 0), tuning.blur_px)
+    target = cv2.GaussianBlur(target.astype(np.float32), (0, 0), tuning.blur_px)
+    mask = moving.astype(np.float32)[..., None]
+    correction = np.zeros(flow.shape, np.float32)
+    for _ in range(tuning.iterations):
+        step = lucas_kanade_step(source, target, flow + correction, mask, tuning)
+        step = np.clip(step, -tuning.max_step_px, tuning.max_step_px)
+        smoothed = masked_mean((correction + step) * mask, mask, tuning.smoothing_px)
+        correction = mask * smoothed
+    small = np.linalg.norm(correction, axis=-1, keepdims=True) < tuning.max_correction_px
+    return np.where(small, flow + correction, flow)
 
 
-def towards(here: np.ndarray, there: np.ndarray, flow: np.ndarray, own: np.ndarray) -> np.ndarray:
-    """The step (H, W, 2) px of the flow that makes windows of `own` pixels (H, W, 1)
-    look alike, whatever their brightness.
+def lucas_kanade_step(
+    source: np.ndarray,
+    target: np.ndarray,
+    flow: np.ndarray,
+    mask: np.ndarray,
+    tuning: MaskedLeastSquaresTuning,
+) -> np.ndarray:
+    """The change (H, W, 2) px of `flow` that makes masked windows look alike.
+
+    Windows hold pixels of `mask` (H, W, 1) only; their mean brightness does not matter.
     """
-    x, y = (
-        follow(cv2.Sobel(there, cv2.CV_32F, *order, ksize=3, scale=1 / 8), flow)
-        for order in ((1, 0), (0, 1))
+    gradient_x = follow(cv2.Sobel(target, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), flow)
+    gradient_y = follow(cv2.Sobel(target, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), flow)
+    error = follow(target, flow, interpolation=cv2.INTER_CUBIC) - source
+    error -= masked_mean(error * mask, mask, tuning.window_px)
+
+    ones = np.ones(flow.shape[:2], np.float32)
+    inside = follow(ones, flow, fill=0.0) > 0.99  # 1 but for rounding
+    weight = mask * inside[..., None] / (1 + (error / tuning.outlier_rgb) ** 2)
+    factors = (
+        (gradient_x, gradient_x),
+        (gradient_x, gradient_y),
+        (gradient_y, gradient_y),
+        (gradient_x, error),
+        (gradient_y, error),
     )
-    error = follow(there, flow, interpolation=cv2.INTER_CUBIC) - here
-    error -= averaged(error * own, own, WINDOW)
-    inside = follow(np.ones(flow.shape[:2], np.float32), flow, fill=0.0) > 0.99
-    weight = own * inside[..., None] / (1 + (error / OUTLIER) ** 2)
-    products = np.stack(
-        [(weight * p).sum(-1) for p in (x * x, x * y, y * y, x * error, y * error)], -1
-    )
-    xx, xy, yy, xe, ye = np.moveaxis(averaged(products, own, WINDOW), -1, 0)
-    xx, yy = xx + FLAT, yy + FLAT
-    return np.stack([xy * ye - yy * xe, xy * xe - xx * ye], -1) / (xx * yy - xy**2)[..., None]
+    products = np.stack([(weight * (a * b)).sum(-1) for a, b in factors], -1)
+    means = masked_mean(products, mask, tuning.window_px)  # (H, W, 5)
+    xx = means[..., 0] + tuning.flat_gradient
+    xy = means[..., 1]
+    yy = means[..., 2] + tuning.flat_gradient
+    xe = means[..., 3]
+    ye = means[..., 4]
+    determinant = xx * yy - xy**2
+    return np.stack([xy * ye - yy * xe, xy * xe - xx * ye], -1) / determinant[..., None]
 
 
-def averaged(values: np.ndarray, own: np.ndarray, sigma: float) -> np.ndarray:
-    """The mean of `values` (H, W, C), 0 where not `own` (H, W, 1), over the own pixels
-    around.
+def masked_mean(values: np.ndarray, mask: np.ndarray, sigma_px: float) -> np.ndarray:
+    """The Gaussian mean of `values` (H, W, C) over the `mask` (H, W, 1) pixels around.
+
+    `values` must be 0 outside the mask.
     """
-    weight = np.maximum(cv2.GaussianBlur(own, (0, 0), sigma), 1e-6)
-    channels = [
-        cv2.GaussianBlur(np.ascontiguousarray(v), (0, 0), sigma) for v in np.moveaxis(values, -1, 0)
-    ]
-    return np.stack(channels, -1) / weight[..., None]
+    weight = np.maximum(cv2.GaussianBlur(mask, (0, 0), sigma_px), 1e-6)
+    channels = [np.ascontiguousarray(channel) for channel in np.moveaxis(values, -1, 0)]
+    blurred = [cv2.GaussianBlur(channel, (0, 0), sigma_px) for channel in channels]
+    return np.stack(blurred, -1) / weight[..., None]

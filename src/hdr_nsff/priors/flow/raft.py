@@ -1,5 +1,6 @@
-"""RAFT (Teed and Deng, ECCV 2020), the large variant, as torchvision has it: its only
-door, and imported when one is asked for.
+"""RAFT (Teed and Deng, ECCV 2020), the large variant of torchvision.
+
+torchvision is imported here alone, and only when a RAFT is built.
 """
 
 from __future__ import annotations
@@ -8,29 +9,33 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
 
+MULTIPLE, MIN_SIDE_PX = 32, 128  # sides of its images: multiples of the one, at least the other
+
 
 class Raft(nn.Module):
-    """Two images to the flow between them, both ways, behind the same interface as
-    `GMFlow`.
-    """
+    """A pair of images to the flow between them, both ways, like `GMFlow`."""
 
     def __init__(self) -> None:
         super().__init__()
         self.network = torchvision_raft()
 
     def forward(self, images: Tensor) -> Tensor:
-        """Flow (2B, 2, H, W) px of a pair batch of `images` (2B, 3, H, W) in [0, 1],
-        sides a multiple of 32 and at least 128.
+        """Flow (2B, 2, H, W) px of a pair batch of `images` (2B, 3, H, W) in [0, 1].
+
+        Their sides are multiples of 32 and at least 128.
         """
         return self.predictions(images)[-1]
 
     def predictions(self, images: Tensor) -> list[Tensor]:
-        """The flow after each of the recurrent updates, the last one being the answer."""
-        assert images.shape[0] % 2 == 0 and not any(s % 32 or s < 128 for s in images.shape[2:]), (
-            f"images {tuple(images.shape)}"
+        """Flow (2B, 2, H, W) px after each recurrent update; the last is the result."""
+        sides = images.shape[2:]
+        assert images.shape[0] % 2 == 0, f"images {tuple(images.shape)}: no pairs"
+        assert not any(side % MULTIPLE or side < MIN_SIDE_PX for side in sides), (
+            f"images {tuple(images.shape)}: sides"
         )
-        signed = 2 * images - 1  # what it was trained on
-        return list(self.network(signed, signed.roll(len(images) // 2, 0)))
+        signed = 2 * images - 1  # the range that it was trained on
+        partners = signed.roll(len(images) // 2, 0)
+        return list(self.network(signed, partners))
 
     def load_state_dict(self, state_dict, *args, **kwargs):
         """Load weights by the names of the published file."""
@@ -42,18 +47,18 @@ class Raft(nn.Module):
 
 
 def torchvision_raft() -> nn.Module:
-    """An untrained `raft_large`; InputError where torchvision is missing or does not go
-    with this torch.
+    """An untrained `raft_large`.
+
+    InputError where torchvision is missing or does not fit this torch.
     """
     try:
         from torchvision.models.optical_flow import raft_large
-    except (
-        ImportError,
-        RuntimeError,
-    ) as error:  # RuntimeError: one built for CUDA beside torch for the CPU
+    except (ImportError, RuntimeError) as error:
+        # RuntimeError: a torchvision for CUDA beside a torch for the CPU
+        reason = " ".join(str(error).split())[:120]
         raise InputError(
-            f"--flow raft: torchvision cannot be imported ({' '.join(str(error).split())[:120]}); install the extra `raft` beside the torch it "
-            "was built for, or use --flow gmflow or dis"
+            f"--flow raft: torchvision cannot be imported ({reason}); install the extra `raft` "
+            "beside the torch it was built for, or use --flow gmflow or dis"
         ) from error
     network: nn.Module = raft_large(weights=None, progress=False)
     return network

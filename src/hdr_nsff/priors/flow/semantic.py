@@ -1,19 +1,19 @@
-"""Flow by what things look like to a network (paper section 3.4), which changes little
-with the exposure.
+"""Flow by features of a network (paper section 3.4), which change little with exposure.
 
 Features of all frames, fitted to the clip (`adapt`), are matched between two frames by
-cosine cost volume and soft-argmax; cells whose round trip fails are filled from
-believed ones of like color, and dense inverse search goes on from there to sub-pixel
-flow. Measured on rendered scenes with exact flow, this beats matching from nothing
-wherever things move by more than a few pixels and is as good elsewhere, so it is asked
-everywhere and not on moving pixels alone, as the paper has to with its noisy
-background.
+a cosine cost volume and a soft-argmax. Cells whose round trip fails are filled from
+cells of similar color whose round trip holds, and dense inverse search refines the
+result to sub-pixel flow. On rendered scenes with exact flow, this has a lower error
+than dense inverse search alone wherever motion exceeds a few pixels, and the same
+elsewhere. So it serves all pixels, not only moving ones as in the paper.
+
+Cells are those of `Features`; flow is in pixels, x then y, as in `dense`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -21,20 +21,32 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.round_trip import follow, round_trip
-from hdr_nsff.priors.flow.adapt import AdaptWeights, Lesson, Matching, Track, adapt, colors
-from hdr_nsff.priors.flow.correlation import motion
-from hdr_nsff.priors.flow.dense import checked, dense_inverse_search
-from hdr_nsff.priors.flow.features import FeatureName, Features, Source, feature_source
-from hdr_nsff.radiometry.common_range import common_gray, recorded_range
+from hdr_nsff.priors.flow.adapt import (
+    AdaptTuning,
+    Track,
+    TrainingClip,
+    adapt_features,
+    cell_colors,
+)
+from hdr_nsff.priors.flow.correlation import Search, feature_motion
+from hdr_nsff.priors.flow.dense import (
+    DENSE_FLOW_TUNING,
+    DenseFlowTuning,
+    dense_inverse_search,
+    match_pairs,
+    recorded_ranges,
+)
+from hdr_nsff.priors.flow.features import (
+    FeatureName,
+    Features,
+    FeatureSource,
+    FeatureTuning,
+    feature_source,
+)
+from hdr_nsff.radiometry.common_range import common_gray
 
-REACH = 1 / 6  # of the longer side: how far things may move from frame to frame
-LOST = 1.5  # cells by which a round trip may miss
-ALIKE = 0.05  # difference of rgb at which a neighbor's motion counts exp(-1/2)
-FILL_RADIUS, PIXEL_RADIUS = (
-    4,
-    1,
-)  # cells around from which a cell is filled, and a pixel gets its motion
-ENOUGH = 100  # believed pixels, below which a pair of equal exposure teaches nothing
+DINOV2_STEPS = 300  # of fitting to a clip where no number is given; XFeat gained nothing by any
+MAX_COLOR_EXPONENT = 20.0  # keeps the weight of unlike cells above zero, so that none is empty
 
 Pairs = Sequence[tuple[int, int]]
 
@@ -48,213 +60,322 @@ class SemanticConfig:
     the paper's.
     """
     layer: int | None = None
-    """Of DINOv2: after how many layers features are taken. Default 15 of 24, and that
-    share of fewer.
-    """
+    """DINOv2 only: number of layers that run. Default: 15 of 24, or that share."""
     stride: int | None = None
-    """Of DINOv2: pixels from token to token. Default 7, half a patch."""
+    """DINOv2 only: pixels from token to token. Default: 7, half a patch."""
     steps: int | None = None
-    """Steps of fitting the features to the clip; 0 takes them as they are. Default: 0
-    for XFeat, which fitting made no better, 300 for DINOv2.
+    """Steps of fitting the features to the clip; 0 leaves them as they are. Default: 0
+    for XFeat, which did not gain by it, 300 for DINOv2.
     """
     seed: int = 0
-    """Randomness of that fitting."""
+    """Random seed of that fitting."""
+
+
+@dataclass(frozen=True)
+class SemanticTuning:
+    """Tuning constants of flow by features, hand-chosen on rendered scenes."""
+
+    reach: float = 1 / 6
+    """Largest motion between frames, in x and in y, as a share of the longer side."""
+    argmax_radius_cells: float = 1.0
+    """Cells around the best one that the soft-argmax covers."""
+    temperature: float = 0.05
+    """Of the softmax of cosines."""
+    max_round_trip_cells: float = 1.5
+    """Round-trip error from which on a cell's motion is filled from others."""
+    color_sigma: float = 0.05
+    """Difference of rgb, in [0, 1], at which a cell's motion counts exp(-1/2)."""
+    fill_radius_cells: int = 4
+    """Distance from which an invalid cell is filled in one round."""
+    pixel_radius_cells: int = 1
+    """Distance from which a pixel gets its motion."""
+    min_track_points: int = 100
+    """Pairs of equal exposure with fewer valid pixels teach nothing."""
+    features: FeatureTuning = field(default_factory=FeatureTuning)
+    adapt: AdaptTuning = field(default_factory=AdaptTuning)
+
+    def search(self, features: Features, video: np.ndarray) -> Search:
+        """The search for `features` in frames of the size of `video` (T, H, W, 3)."""
+        reach = self.reach * max(video.shape[1:3]) / features.stride
+        return Search(reach, self.argmax_radius_cells, self.temperature)
+
+
+SEMANTIC_TUNING = SemanticTuning()
 
 
 def semantic_flow(
-    config: SemanticConfig, weights: Path | None, neighbors: Pairs, equal: Pairs
+    config: SemanticConfig,
+    weights: Path | None,
+    neighbors: Pairs,
+    equal: Pairs,
+    tuning: SemanticTuning = SEMANTIC_TUNING,
+    dense: DenseFlowTuning = DENSE_FLOW_TUNING,
 ) -> SemanticFlow:
-    """The flow prior of these settings; `weights` of the features, None for wherever
-    they are found; pairs as of `SemanticFlow`.
+    """The flow prior of these settings.
+
+    `weights` are of the features, None for where weights are kept; pairs as in
+    `SemanticFlow`. InputError for settings out of range.
     """
-    steps = (0 if config.features == "xfeat" else 300) if config.steps is None else config.steps
+    steps = config.steps
+    if steps is None:
+        steps = 0 if config.features == "xfeat" else DINOV2_STEPS
     if steps < 0:
         raise InputError(f"--semantic.steps {steps}: must be 0 or more")
-    source = feature_source(config.features, weights, config.layer, config.stride)
-    return SemanticFlow(source, neighbors, equal, steps, config.seed)
+    source = feature_source(config.features, weights, config.layer, config.stride, tuning.features)
+    return SemanticFlow(source, neighbors, equal, steps, config.seed, tuning, dense)
 
 
 class SemanticFlow:
-    """`FlowPrior` by features. It looks at the clip once, when the first pairs are
-    asked for: features, and their fitting to it.
+    """`FlowPrior` by features.
+
+    The first call computes the features of the whole clip and fits them to it; later
+    calls reuse them.
     """
 
     def __init__(
         self,
-        source: Source,
+        source: FeatureSource,
         neighbors: Pairs = (),
         equal: Pairs = (),
         steps: int = 0,
         seed: int = 0,
+        tuning: SemanticTuning = SEMANTIC_TUNING,
+        dense: DenseFlowTuning = DENSE_FLOW_TUNING,
     ) -> None:
-        """What the features are fitted to: `neighbors`, pairs of frames one after the
-        other, and `equal`, pairs of consecutive frames of equal exposure. No `steps`,
-        or no neighbors, leaves the features as they are.
+        """Features are fitted to `neighbors` and `equal`, and stay without `steps`.
+
+        `neighbors` are pairs of consecutive frames, `equal` pairs of consecutive frames
+        of equal exposure. Without neighbors the features stay as they are, too.
         """
-        self.source, self.neighbors, self.equal = source, list(neighbors), list(equal)
-        self.steps, self.seed = steps, seed
+        self.source = source
+        self.neighbors = list(neighbors)
+        self.equal = list(equal)
+        self.steps = steps
+        self.seed = seed
+        self.tuning = tuning
+        self.dense = dense
         self.features: Features | None = None
 
     def __call__(
         self, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` (P, 2); `video` (T, H, W,
-        3) is that of the whole clip.
+        """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` (P, 2).
+
+        `video` (T, H, W, 3) is the whole clip.
         """
         if self.features is None:
-            self.features = self.fitted(video, clipped)
-        return matched(self.features, video, clipped, pairs)
+            self.features = self.fit_features(video, clipped)
+        return match_features(self.features, video, clipped, pairs, self.tuning, self.dense)
 
-    def fitted(self, video: np.ndarray, clipped: np.ndarray) -> Features:
+    def fit_features(self, video: np.ndarray, clipped: np.ndarray) -> Features:
         """The clip's features, fitted to it."""
-        found = self.source(video)
+        features = self.source(video)
         if self.steps == 0 or not self.neighbors:
-            return found
-        tracks = equal_tracks(found, video, clipped, self.equal)
-        lesson = Lesson(found, video, tracks, self.neighbors, how(found, video))
-        return Features(
-            adapt(lesson, self.steps, self.seed, AdaptWeights()), found.stride, found.origin
+            return features
+        tracks = equal_exposure_tracks(
+            features, video, clipped, self.equal, self.tuning, self.dense
         )
+        search = self.tuning.search(features, video)
+        clip = TrainingClip(features, video, tracks, self.neighbors, search, self.tuning.adapt)
+        maps = adapt_features(clip, self.steps, self.seed)
+        return Features(maps, features.stride, features.origin)
 
 
-def how(features: Features, video: np.ndarray) -> Matching:
-    """How far matches are looked for in frames of this size."""
-    return Matching(reach=REACH * max(video.shape[1:3]) / features.stride)
-
-
-def matched(
+def match_features(
     features: Features,
     video: np.ndarray,
     clipped: np.ndarray,
     pairs: np.ndarray,
+    tuning: SemanticTuning = SEMANTIC_TUNING,
+    dense: DenseFlowTuning = DENSE_FLOW_TUNING,
     report: str | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` (P, 2): coarse by `features`,
-    fine by what the pictures show.
-    """
-    ranges = {
-        int(k): recorded_range(video[k], clipped[k]) for k in np.unique(np.asarray(pairs, np.int64))
-    }
+    """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` (P, 2).
 
-    def both_ways(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    Coarse flow by `features` is refined by dense inverse search.
+    """
+    ranges = recorded_ranges(video, clipped, pairs)
+
+    def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         a, b = common_gray(video, ranges, i, j)
-        there, back = coarse(features, video, i, j)
-        return dense_inverse_search(a, b, there), dense_inverse_search(b, a, back)
+        forward, backward = coarse_flow(features, video, i, j, tuning)
+        forward = dense_inverse_search(a, b, forward, dense)
+        backward = dense_inverse_search(b, a, backward, dense)
+        return forward, backward
 
-    return checked(both_ways, clipped, pairs, report)
+    return match_pairs(match, clipped, pairs, report)
 
 
-def coarse(features: Features, video: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (H, W, 2) px from frame `i` to `j`, and back, by features alone: what fails
-    its round trip is taken from around.
+def coarse_flow(
+    features: Features,
+    video: np.ndarray,
+    i: int,
+    j: int,
+    tuning: SemanticTuning = SEMANTIC_TUNING,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Flow (H, W, 2) px from frame `i` to `j`, and back, by features alone.
+
+    Cells that fail the round trip are filled from others.
     """
-    m, maps = how(features, video), features.maps
+    search = tuning.search(features, video)
+    maps = features.maps
     with torch.no_grad():
-        there = motion(maps[i], maps[j], m.reach, m.radius, m.temperature).numpy()
-        back = motion(maps[j], maps[i], m.reach, m.radius, m.temperature).numpy()
-        shown = colors(video[[i, j]], features, 1).permute(0, 2, 3, 1).numpy()
-    flows = []
-    for one, other, k, cell_rgb in ((there, back, i, shown[0]), (back, there, j, shown[1])):
-        sure = round_trip(one, other) < LOST
-        flows.append(
-            to_pixels(fill(one, sure, cell_rgb), cell_rgb, video[k], features)
-            * np.float32(features.stride)
-        )
-    return flows[0], flows[1]
+        forward = feature_motion(maps[i], maps[j], search).numpy()
+        backward = feature_motion(maps[j], maps[i], search).numpy()
+        cell_rgb = cell_colors(video[[i, j]], features, 1).permute(0, 2, 3, 1).numpy()
 
+    def to_pixels(
+        motion: np.ndarray, reverse: np.ndarray, cell_rgb: np.ndarray, frame: np.ndarray
+    ) -> np.ndarray:
+        valid = round_trip(motion, reverse) < tuning.max_round_trip_cells
+        filled = fill_cells(motion, valid, cell_rgb, tuning)
+        upsampled = upsample_motion(filled, cell_rgb, frame, features, tuning)
+        return upsampled * np.float32(features.stride)
 
-def fill(values: np.ndarray, sure: np.ndarray, rgb: np.ndarray) -> np.ndarray:
-    """Motion (h, w, 2) of cells, where not `sure` (h, w) that of sure cells nearby of
-    like `rgb` (h, w, 3); as it was if none is sure.
-    """
-    at = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in sure.shape[::-1])), -1)
-    while sure.any() and not sure.all():
-        guess, weight = spread(values, sure, rgb, at, rgb, FILL_RADIUS)
-        reached = ~sure & (weight > 0)
-        values, sure = np.where(reached[..., None], guess, values), sure | reached
-    return values
-
-
-def to_pixels(
-    values: np.ndarray, cell_rgb: np.ndarray, rgb: np.ndarray, features: Features
-) -> np.ndarray:
-    """Motion (h, w, 2) of cells as that of the pixels of `rgb` (H, W, 3): each takes
-    after the cells around it that look like it.
-    """
-    h, w = rgb.shape[:2]
-    x, y = (
-        (np.arange(n, dtype=np.float32) + 0.5 - features.origin) / features.stride for n in (w, h)
+    return (
+        to_pixels(forward, backward, cell_rgb[0], video[i]),
+        to_pixels(backward, forward, cell_rgb[1], video[j]),
     )
-    return spread(
-        values,
-        np.ones(values.shape[:2], bool),
-        cell_rgb,
-        np.stack(np.meshgrid(x, y), -1),
-        rgb,
-        PIXEL_RADIUS,
-    )[0]
 
 
-def spread(
-    values: np.ndarray,
-    sure: np.ndarray,
+def fill_cells(
+    motion: np.ndarray,
+    valid: np.ndarray,
+    rgb: np.ndarray,
+    tuning: SemanticTuning = SEMANTIC_TUNING,
+) -> np.ndarray:
+    """Motion (h, w, 2) of cells, where not `valid` (h, w) filled from valid ones.
+
+    Valid cells nearby of similar `rgb` (h, w, 3) count, and cells are filled round by
+    round. If no cell is valid, the motion is unchanged.
+    """
+    h, w = valid.shape
+    x = np.arange(w, dtype=np.float32)
+    y = np.arange(h, dtype=np.float32)
+    positions = np.stack(np.meshgrid(x, y), -1)
+    radius = tuning.fill_radius_cells
+    while valid.any() and not valid.all():
+        mean, weight = joint_bilateral_mean(
+            motion, valid, rgb, positions, rgb, radius, tuning.color_sigma
+        )
+        reached = ~valid & (weight > 0)
+        motion = np.where(reached[..., None], mean, motion)
+        valid = valid | reached
+    return motion
+
+
+def upsample_motion(
+    motion: np.ndarray,
     cell_rgb: np.ndarray,
-    at: np.ndarray,
+    rgb: np.ndarray,
+    features: Features,
+    tuning: SemanticTuning = SEMANTIC_TUNING,
+) -> np.ndarray:
+    """Motion (H, W, 2) of the pixels of `rgb` (H, W, 3), in cells.
+
+    Each pixel averages the `motion` (h, w, 2) of the cells around it of similar color.
+    """
+    height, width = rgb.shape[:2]
+    x = (np.arange(width, dtype=np.float32) + 0.5 - features.origin) / features.stride
+    y = (np.arange(height, dtype=np.float32) + 0.5 - features.origin) / features.stride
+    positions = np.stack(np.meshgrid(x, y), -1)
+    everywhere = np.ones(motion.shape[:2], bool)
+    mean, _ = joint_bilateral_mean(
+        motion,
+        everywhere,
+        cell_rgb,
+        positions,
+        rgb,
+        tuning.pixel_radius_cells,
+        tuning.color_sigma,
+    )
+    return mean
+
+
+def joint_bilateral_mean(
+    values: np.ndarray,
+    valid: np.ndarray,
+    cell_rgb: np.ndarray,
+    positions: np.ndarray,
     rgb: np.ndarray,
     radius: int,
+    color_sigma: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The mean of `values` (h, w, C) of `sure` (h, w) cells around the positions `at`
-    (H, W, 2), in cells, and its total weight (H, W).
+    """The mean (H, W, C) of `values` of cells around `positions`, and its weight.
 
     A cell counts by its distance, at most about `radius` cells, and by the likeness of
-    its `cell_rgb` (h, w, 3) to `rgb` (H, W, 3). Only sure cells enter, so nothing
-    beyond an edge is mixed in, whatever is there; 0 where there is none.
+    its `cell_rgb` (h, w, 3) to `rgb` (H, W, 3) (joint bilateral upsampling, Kopf et al.
+    2007). Only `valid` (h, w) cells enter, so no value from beyond an edge is mixed in.
+    `values` are (h, w, C), `positions` (H, W, 2) in cells; the mean and its weight (H,
+    W) are 0 where no cell counts.
     """
-    h, w = sure.shape
-    nearest = np.rint(at).astype(int)
-    total, weights = (
-        np.zeros((*at.shape[:2], values.shape[-1]), np.float32),
-        np.zeros(at.shape[:2], np.float32),
-    )
+    h, w = valid.shape
+    size = positions.shape[:2]
+    nearest = np.rint(positions).astype(int)
+    total = np.zeros((*size, values.shape[-1]), np.float32)
+    weights = np.zeros(size, np.float32)
     for dy in range(-radius, radius + 1):
         for dx in range(-radius, radius + 1):
-            x, y = nearest[..., 0] + dx, nearest[..., 1] + dy
+            x = nearest[..., 0] + dx
+            y = nearest[..., 1] + dy
             inside = (x >= 0) & (y >= 0) & (x < w) & (y < h)
-            x, y = x.clip(0, w - 1), y.clip(0, h - 1)
-            distance = ((np.stack([x, y], -1) - at) ** 2).sum(-1) / (radius / 2) ** 2
-            unlike = ((cell_rgb[y, x] - rgb) ** 2).sum(-1) / ALIKE**2
-            weight = np.where(
-                inside & sure[y, x], np.exp(-0.5 * (distance + np.minimum(unlike, 20))), 0
-            ).astype(np.float32)
+            x = x.clip(0, w - 1)
+            y = y.clip(0, h - 1)
+            distance = ((np.stack([x, y], -1) - positions) ** 2).sum(-1) / (radius / 2) ** 2
+            unlike = ((cell_rgb[y, x] - rgb) ** 2).sum(-1) / color_sigma**2
+            exponent = distance + np.minimum(unlike, MAX_COLOR_EXPONENT)
+            weight = np.where(inside & valid[y, x], np.exp(-0.5 * exponent), 0)
+            weight = weight.astype(np.float32)
+            # values of invalid cells may be NaN: never multiplied by 0
             total += np.where(weight[..., None] > 0, weight[..., None] * values[y, x], 0)
             weights += weight
     return total / np.maximum(weights, 1e-12)[..., None], weights
 
 
-def equal_tracks(
-    features: Features, video: np.ndarray, clipped: np.ndarray, equal: Pairs
+def equal_exposure_tracks(
+    features: Features,
+    video: np.ndarray,
+    clipped: np.ndarray,
+    equal: Pairs,
+    tuning: SemanticTuning = SEMANTIC_TUNING,
+    dense: DenseFlowTuning = DENSE_FLOW_TUNING,
 ) -> list[Track]:
-    """Points followed over one and over two cycles, both ways, between frames of equal
-    exposure.
+    """Points followed both ways between frames of equal exposure.
+
+    They are followed over the pairs `equal`, and over two such pairs in a row.
     """
-    both = [p for i, j in equal for p in ((i, j), (j, i))]
-    if not both:
+    pairs = [pair for i, j in equal for pair in ((i, j), (j, i))]
+    if not pairs:
         return []
-    found, valid = matched(features, video, clipped, np.array(both), "points of equal exposure")
-    steps = {pair: (f, v) for pair, f, v in zip(both, found, valid, strict=True)}
-    for i, j in both:
-        for j_, k in both:
-            if j == j_ and k != i:
-                (first, ok), (second, ok2) = steps[i, j], steps[j, k]
-                after = follow(ok2.astype(np.float32), first, fill=0.0) > 0.99
-                steps[i, k] = (first + follow(second, first), ok & after)
+    flow, valid = match_features(
+        features, video, clipped, np.array(pairs), tuning, dense, "points of equal exposure"
+    )
+    links = {pair: (f, v) for pair, f, v in zip(pairs, flow, valid, strict=True)}
+    for i, j in pairs:
+        for middle, k in pairs:
+            if middle == j and k != i:
+                links[i, k] = chain(*links[i, j], *links[j, k])
+
     tracks = []
-    for frames, (flow, ok) in steps.items():
-        y, x = np.nonzero(ok)
+    for frames, (link_flow, link_valid) in links.items():
+        y, x = np.nonzero(link_valid)
+        if len(x) < tuning.min_track_points:
+            continue
         start = np.stack([x, y], -1) + 0.5 - features.origin
-        if len(start) >= ENOUGH:
-            ends = [
-                torch.from_numpy(p / features.stride).float() for p in (start, start + flow[ok])
-            ]
-            tracks.append(Track(frames, ends[0], ends[1]))
+        end = start + link_flow[link_valid]
+        tracks.append(
+            Track(
+                frames,
+                torch.from_numpy(start / features.stride).float(),
+                torch.from_numpy(end / features.stride).float(),
+            )
+        )
     return tracks
+
+
+def chain(
+    first: np.ndarray, first_valid: np.ndarray, second: np.ndarray, second_valid: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Two flows (H, W, 2) px one after the other, and where both are valid (H, W)."""
+    still_valid = follow(second_valid.astype(np.float32), first, fill=0.0) > 0.99
+    return first + follow(second, first), first_valid & still_valid

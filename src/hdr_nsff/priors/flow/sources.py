@@ -1,9 +1,12 @@
-"""What `--flow` can name, each as one function behind `FlowPrior`: a matcher that needs
-no weights, networks, or a folder of maps.
+"""The flow sources that `--flow` can name, each as one `FlowPrior`.
+
+They are a matcher without weights, matching by features, networks, and folders of maps
+made by other tools.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Literal, assert_never, get_args
@@ -13,20 +16,33 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.flow_files import read_flow
-from hdr_nsff.priors.flow.dense import FlowPrior, flow
-from hdr_nsff.priors.flow.networks import load, matched_flow, weights_file
-from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, semantic_flow
+from hdr_nsff.priors.flow.dense import DenseFlowTuning, FlowPrior, dense_flow
+from hdr_nsff.priors.flow.networks import NetworkFlowTuning, load, network_flow, weights_file
+from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, SemanticTuning, semantic_flow
 from hdr_nsff.priors.weights import entry, find, locate
 
 FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
-NETWORKS = frozenset(
-    {"semantic", "gmflow", "raft", "raft-finetuned"}
-)  # the names that `--flow-weights` is for
+WITH_WEIGHTS = ("semantic", "gmflow", "raft", "raft-finetuned")  # takers of `--flow-weights`
+NETWORKS = ("gmflow", "raft", "raft-finetuned")
 
 
-def resolved(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
-    """What was chosen; None stands for `semantic` where the weights of its `features`
-    are on this machine, else for `dis`, which needs none.
+@dataclass(frozen=True)
+class FlowTuning:
+    """Tuning constants of the flow sources."""
+
+    dense: DenseFlowTuning = field(default_factory=DenseFlowTuning)
+    network: NetworkFlowTuning = field(default_factory=NetworkFlowTuning)
+    semantic: SemanticTuning = field(default_factory=SemanticTuning)
+
+
+FLOW_TUNING = FlowTuning()
+
+
+def resolve_source(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
+    """The flow source that was chosen.
+
+    None stands for `semantic` where the weights of `features` are on this machine, else
+    for `dis`, which needs none.
     """
     if chosen is not None:
         return chosen
@@ -34,38 +50,49 @@ def resolved(chosen: FlowName | Path | None, features: str) -> FlowName | Path:
 
 
 def fallback_note(chosen: FlowName | Path | None, features: str) -> str:
-    """Half a sentence where None stands for `dis` for want of weights."""
-    lacking = chosen is None and resolved(chosen, features) == "dis"
+    """The reason, for a step's note, where None stands for `dis`; empty elsewhere."""
+    if chosen is not None or resolve_source(chosen, features) != "dis":
+        return ""
     return (
-        f", for the weights of {features} are not on this machine: see `hdr-nsff weights {features}`"
-        if lacking
-        else ""
+        f", because the weights of {features} are not on this machine: "
+        f"see `hdr-nsff weights {features}`"
     )
 
 
 def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
-    """InputError where the source that was chosen, or its weights, cannot be used; a
-    network is loaded, so that this is known early.
+    """InputError where the chosen source, or its weights, cannot be used.
+
+    A network is loaded, so that bad weights are reported before any work is done.
     """
     if isinstance(chosen, Path) and not chosen.is_dir():
+        names = ", ".join(get_args(FlowName))
         raise InputError(
-            f"--flow {chosen}: no such folder of flow maps, and no source of that name; use {', '.join(get_args(FlowName))}, or mend the path"
+            f"--flow {chosen}: neither a folder of flow maps nor a flow source; "
+            f"use {names}, or correct the path"
         )
-    if weights is not None and chosen not in NETWORKS:
-        mend = (
-            "name the network they are of with --flow"
-            if chosen is None
-            else f"`--flow {chosen}` takes no weights; leave the option out"
-        )
-        raise InputError(f"--flow-weights {weights}: {mend}")
-    if weights is not None and not weights.exists():
-        raise InputError(f"--flow-weights {weights}: no such file; mend the path")
+    if weights is not None:
+        check_weights(chosen, weights)
     if chosen == "raft-finetuned" and weights is None:
         raise InputError(
-            "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; name them with --flow-weights"
+            "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; "
+            "name them with --flow-weights"
         )
-    if chosen in ("gmflow", "raft", "raft-finetuned"):
+    if chosen in NETWORKS:
         flow_source(chosen, weights)
+
+
+def check_weights(chosen: FlowName | Path | None, weights: Path) -> None:
+    """InputError where `weights` do not exist, or the chosen source takes none."""
+    if chosen is None:
+        raise InputError(
+            f"--flow-weights {weights}: without a network; name the network with --flow"
+        )
+    if chosen not in WITH_WEIGHTS:
+        raise InputError(
+            f"--flow-weights {weights}: `--flow {chosen}` takes no weights; leave the option out"
+        )
+    if not weights.exists():
+        raise InputError(f"--flow-weights {weights}: no such file; correct the path")
 
 
 def flow_source(
@@ -74,36 +101,38 @@ def flow_source(
     semantic: SemanticConfig | None = None,
     neighbors: Pairs = (),
     equal: Pairs = (),
+    tuning: FlowTuning = FLOW_TUNING,
 ) -> FlowPrior:
-    """The flow prior that `--flow` chose, None for what it stands for; its `video` and
-    `pairs` are those of the whole clip.
+    """The flow prior that `--flow` chose, for the `video` and `pairs` of a whole clip.
 
-    `semantic` (its defaults where None), `neighbors` and `equal` are what
-    `SemanticFlow` fits its features by.
+    `SemanticFlow` uses the settings `semantic` (the defaults where None) and fits its
+    features to `neighbors` and `equal`. InputError where weights are missing.
     """
     semantic = semantic or SemanticConfig()
-    match source := resolved(chosen, semantic.features):
+    match source := resolve_source(chosen, semantic.features):
         case Path():
-            return partial(from_folder, source)
+            return partial(flow_from_folder, source)
         case "dis":
-            return partial(flow, report=None)
+            return partial(dense_flow, tuning=tuning.dense)
         case "semantic":
-            return semantic_flow(semantic, weights, neighbors, equal)
+            return semantic_flow(semantic, weights, neighbors, equal, tuning.semantic, tuning.dense)
         case "gmflow" | "raft":
-            return partial(matched_flow, load(source, weights, device()))
+            network = load(source, weights, default_device())
         case "raft-finetuned":
-            return partial(matched_flow, load(None, weights, device()))
+            network = load(None, weights, default_device())
         case _:
             assert_never(source)
+    return partial(network_flow, network, tuning=tuning.network, dense=tuning.dense)
 
 
 def flow_weights(
     chosen: FlowName | Path | None, weights: Path | None, semantic: SemanticConfig
 ) -> list[Path]:
-    """The weights that the flow prior of these settings reads; none where it reads
-    none. InputError where they are not to be had.
+    """The weights that the flow prior of these settings reads, if any.
+
+    InputError where they are missing.
     """
-    match source := resolved(chosen, semantic.features):
+    match source := resolve_source(chosen, semantic.features):
         case Path() | "dis":
             return []
         case "semantic":
@@ -116,13 +145,13 @@ def flow_weights(
             assert_never(source)
 
 
-def device() -> torch.device:
-    """Where networks run: on a GPU where there is one."""
+def default_device() -> torch.device:
+    """The GPU where there is one, else the CPU."""
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def from_folder(
+def flow_from_folder(
     folder: Path, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`FlowPrior` of maps made elsewhere."""
+    """`FlowPrior` that reads maps made by another tool."""
     return read_flow(folder, pairs, clipped.shape[1:3])

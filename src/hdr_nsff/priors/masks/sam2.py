@@ -1,14 +1,15 @@
-"""Moving masks by SAM 2 (Ravi et al. 2024): it outlines what the motion mask points at,
-and follows it through the clip both ways.
+"""Moving masks by SAM 2, which outlines and tracks the objects of motion masks.
 
-Motion tells what moves but draws it roughly, and loses it where it pauses; the network
-draws well but does not know what moves. An object is asked about by itself
-(`prompts.py`), so that each spreads from its own best frame.
+Flow finds moving objects but outlines them roughly, and loses one that pauses; the
+network (Ravi et al., "SAM 2: Segment Anything in Images and Videos", 2024) outlines
+well but does not know what moves. Each object is prompted by itself (`prompts`), so
+that it spreads from its own clearest frame, both ways through the clip.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,24 +18,36 @@ from torch import Tensor
 from torch.nn import functional
 
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.priors.masks.prompts import Mover, iou
+from hdr_nsff.priors.masks.prompts import PromptedObject, iou
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD, architecture
 
-# intersection over union with the motion mask below which the network outlined
-# something else
-SAME = 0.3
-# share of an object's outline that others hold already, from which it is not asked
-# about again
-COVERED = 0.5
+BOX_LABELS = np.array([2, 3])  # of the two corners of a box, in SAM 2's prompts
 
 
-class Pictures(Mapping[int, Tensor]):
-    """The frames as the network wants them, each made when it is asked for: a long clip
-    at 1024 x 1024 would fill the memory.
+@dataclass(frozen=True)
+class Sam2Tuning:
+    """Tuning constants of masks by SAM 2, hand-chosen on rendered scenes."""
+
+    min_iou: float = 0.3
+    """Intersection over union with the motion mask below which the network outlined
+    another object.
+    """
+    max_covered_share: float = 0.5
+    """An object is skipped if other objects cover more than this share of it."""
+
+
+SAM2_TUNING = Sam2Tuning()
+
+
+class ResizedFrames(Mapping[int, Tensor]):
+    """The frames of a clip as input of the network, each made on demand.
+
+    A long clip at 1024 x 1024 pixels would fill the memory.
     """
 
     def __init__(self, video: np.ndarray, size: int) -> None:
-        self.video, self.size = video, size
+        self.video = video
+        self.size = size
 
     def __len__(self) -> int:
         return len(self.video)
@@ -43,44 +56,62 @@ class Pictures(Mapping[int, Tensor]):
         return iter(range(len(self.video)))
 
     def __getitem__(self, frame: int) -> Tensor:
-        """(3, size, size), normalized."""
-        rgb = torch.from_numpy(np.ascontiguousarray(self.video[frame], np.float32)).permute(
-            2, 0, 1
-        )[None]
-        rgb = functional.interpolate(rgb, (self.size, self.size), mode="bilinear", antialias=True)
+        """The frame (3, size, size), normalized."""
+        image = torch.from_numpy(np.ascontiguousarray(self.video[frame], np.float32))
+        rgb = functional.interpolate(
+            image.permute(2, 0, 1)[None],
+            (self.size, self.size),
+            mode="bilinear",
+            antialias=True,
+        )
         return ((rgb - IMAGENET_MEAN) / IMAGENET_STD)[0]
 
 
 def sam2_mask(
-    network: Any, video: np.ndarray, asked: Sequence[Mover], report: str = "sam2"
+    network: Any,
+    video: np.ndarray,
+    objects: Sequence[PromptedObject],
+    report: str = "sam2",
+    tuning: Sam2Tuning = SAM2_TUNING,
 ) -> np.ndarray:
-    """What moves, (T, H, W) bool: all that `asked` points at, outlined in every frame
-    of `video` (T, H, W, 3) equalized rgb in [0, 1].
+    """Moving pixels (T, H, W) bool: all `objects`, outlined in every frame.
 
-    `network`: transformers' Sam2VideoModel. Where it outlines something else than the
-    motion mask saw, the motion mask's outline stays.
+    `network` is transformers' Sam2VideoModel, `video` (T, H, W, 3) equalized rgb in
+    [0, 1]. Where the network outlines another object than the motion mask shows, the
+    motion mask stays.
     """
-    total = np.zeros(video.shape[:3], bool)
-    for mover in track(asked, report):
-        first = mover.prompts[0].frame
-        if mover.seen and total[first][mover.seen[first]].mean() > COVERED:
+    moving = np.zeros(video.shape[:3], bool)
+    for prompted in track(objects, report):
+        first = prompted.prompts[0].frame
+        expected = prompted.masks.get(first)
+        if expected is not None and moving[first][expected].mean() > tuning.max_covered_share:
             continue
-        outlined = follow(network, video, mover)
-        if mover.seen and (same := iou(outlined[first], mover.seen[first])) < SAME:
-            say(
-                f"{report}: object {mover.number} in frame {first} is outlined unlike what moves there (overlap {same:.0%}): left as it was"
-            )
-            outlined = np.zeros_like(total)
-            for frame, mask in mover.seen.items():
-                outlined[frame] = mask
-        total |= outlined
-    return total
+        outline = track_object(network, video, prompted)
+        if expected is not None:
+            overlap = iou(outline[first], expected)
+            if overlap < tuning.min_iou:
+                say(
+                    f"{report}: the outline of object {prompted.number} in frame {first} differs "
+                    f"from its motion mask (overlap {overlap:.0%}): the motion mask is kept"
+                )
+                outline = motion_masks(prompted, video.shape[:3])
+        moving |= outline
+    return moving
+
+
+def motion_masks(prompted: PromptedObject, shape: tuple[int, ...]) -> np.ndarray:
+    """An object's motion masks as an array of `shape` (T, H, W) bool."""
+    masks = np.zeros(shape, bool)
+    for frame, mask in prompted.masks.items():
+        masks[frame] = mask
+    return masks
 
 
 @torch.inference_mode()
-def follow(network: Any, video: np.ndarray, mover: Mover) -> np.ndarray:
-    """One object's outline in every frame, (T, H, W) bool, from its prompts forward and
-    backward in time.
+def track_object(network: Any, video: np.ndarray, prompted: PromptedObject) -> np.ndarray:
+    """One object's outline in every frame, (T, H, W) bool.
+
+    It spreads from the object's prompts forward and backward in time.
     """
     height, width = video.shape[1:3]
     session = architecture("Sam2VideoInferenceSession")(
@@ -90,45 +121,48 @@ def follow(network: Any, video: np.ndarray, mover: Mover) -> np.ndarray:
         inference_state_device=network.device,
         dtype=network.dtype,
     )
-    session.processed_frames = Pictures(video, network.image_size)
-    index = session.obj_id_to_idx(mover.number)
-    for prompt in mover.prompts:
-        session.add_point_inputs(
-            index,
-            prompt.frame,
-            coordinates(
-                prompt.points, prompt.labels, prompt.box, (height, width), network.image_size
-            ),
+    session.processed_frames = ResizedFrames(video, network.image_size)
+    index = session.obj_id_to_idx(prompted.number)
+    for prompt in prompted.prompts:
+        inputs = prompt_inputs(
+            prompt.points, prompt.labels, prompt.box, (height, width), network.image_size
         )
-        session.obj_with_new_inputs = [mover.number]
+        session.add_point_inputs(index, prompt.frame, inputs)
+        session.obj_with_new_inputs = [prompted.number]
         network(inference_session=session, frame_idx=prompt.frame)
-    outlined = np.zeros(video.shape[:3], bool)
+
+    outline = np.zeros(video.shape[:3], bool)
+    first = prompted.prompts[0].frame
     for backward in (False, True):
-        for seen in network.propagate_in_video_iterator(
-            session, start_frame_idx=mover.prompts[0].frame, reverse=backward
+        for output in network.propagate_in_video_iterator(
+            session, start_frame_idx=first, reverse=backward
         ):
             logits = functional.interpolate(
-                seen.pred_masks.float(), (height, width), mode="bilinear"
+                output.pred_masks.float(), (height, width), mode="bilinear"
             )
-            outlined[seen.frame_idx] = (logits[0, 0] > 0).cpu().numpy()
-    return outlined
+            outline[output.frame_idx] = (logits[0, 0] > 0).cpu().numpy()
+    return outline
 
 
-def coordinates(
+def prompt_inputs(
     points: np.ndarray,
     labels: np.ndarray,
     box: np.ndarray | None,
     size: tuple[int, int],
     image_size: int,
 ) -> dict[str, Tensor]:
-    """Points (N, 2) and box in pixels of frames of `size` (height, width), as the
-    network wants them: a box as its two corners, labeled 2 and 3, before the points;
-    centers of the pixels of its square picture at whole numbers.
+    """A prompt's points and box in the form that the network takes.
+
+    `points` (N, 2) and `box` (4,) are in pixels of frames of `size` (height, width).
+    The network takes a box as its two corners, before the points, in pixels of its
+    square image, with centers at whole numbers.
     """
-    corners = np.zeros((0, 2)) if box is None else np.asarray(box).reshape(2, 2)
-    places = np.concatenate([corners, points]) * image_size / np.array(size[::-1]) - 0.5
-    meaning = np.concatenate([np.array([2, 3])[: len(corners)], labels])
+    corners = np.zeros((0, 2))
+    if box is not None:
+        corners = np.asarray(box).reshape(2, 2)
+    positions = np.concatenate([corners, points]) * image_size / np.array(size[::-1]) - 0.5
+    all_labels = np.concatenate([BOX_LABELS[: len(corners)], labels])
     return {
-        "point_coords": torch.from_numpy(places).float()[None, None],  # (1, 1, N, 2)
-        "point_labels": torch.from_numpy(meaning).int()[None, None],
+        "point_coords": torch.from_numpy(positions).float()[None, None],  # (1, 1, N, 2)
+        "point_labels": torch.from_numpy(all_labels).int()[None, None],
     }

@@ -1,13 +1,15 @@
-"""Learned keypoints and matches: ALIKED (Zhao et al. 2023) or DISK (Tyszkiewicz et al.
-2020), matched by LightGlue (Lindenberger et al. 2023), for structure from motion where
-SIFT finds too little in common. kornia's implementations; this is its only door.
+"""Learned keypoints and matches for structure from motion where SIFT finds too little
+in common: ALIKED (Zhao et al. 2023) or DISK (Tyszkiewicz et al. 2020), matched by
+LightGlue (Lindenberger et al. 2023). kornia's implementations; only this file imports
+kornia.
 
-Keypoints are pixels of the pictures, centers at +0.5.
+Keypoints are pixels of the images, centers at +0.5.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,158 +23,181 @@ from hdr_nsff.core.progress import track
 from hdr_nsff.priors.weights import find
 
 Matcher = Literal["sift", "aliked", "disk"]
-LIMIT = 1024  # keypoints of a picture
-SPARE = 2  # times as many are looked for, since some lie where they must not
+# attention blocks whose names differ between the authors' weights and kornia's network
+RENAMED_BLOCKS = ("self_attn", "cross_attn")
+
+
+@dataclass(frozen=True)
+class LightGlueTuning:
+    """How many keypoints are matched."""
+
+    max_keypoints: int = 1024  # per image (LightGlue's evaluation: up to 2048)
+    # times as many are detected, since masks remove some (hand-chosen)
+    candidate_factor: int = 2
 
 
 def check_matcher(matcher: Matcher) -> None:
     """InputError where kornia or the weights of `matcher` are missing."""
     if matcher != "sift":
-        features()
+        kornia_features()
         matcher_weights(matcher)
 
 
 def matcher_weights(matcher: Matcher) -> list[Path]:
-    """The weights that `matcher` reads; InputError where they are not to be had."""
-    return [] if matcher == "sift" else [find(matcher), find(f"{matcher}-lightglue")]
+    """The weights that `matcher` reads; InputError where they cannot be found."""
+    if matcher == "sift":
+        return []
+    return [find(matcher), find(f"{matcher}-lightglue")]
 
 
-def features() -> Any:
-    """kornia.feature; InputError where kornia is not installed."""
+def kornia_features() -> Any:
+    """The module kornia.feature; InputError where kornia is not installed."""
     try:
         import kornia.feature
     except ImportError as error:
         raise InputError(
-            f"--matcher: kornia cannot be imported ({error}); `pip install 'hdr-nsff[neural]'`, or use --matcher sift"
+            f"--matcher: kornia cannot be imported ({error}); "
+            "`pip install 'hdr-nsff[neural]'`, or use --matcher sift"
         ) from error
     return kornia.feature
 
 
-def match_pictures(
-    pictures: Sequence[np.ndarray],
-    usable: Sequence[np.ndarray],
+def match_images(
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray],
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
+    tuning: LightGlueTuning = LightGlueTuning(),
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Keypoints of every picture, (N, 2) pixels, and of every pair which of them match,
-    (M, 2) rows of the two.
+    """Keypoints (N, 2) of every image, and matches (M, 2) of every pair, rows of both.
 
-    `pictures` (H, W, 3) rgb in [0, 1]; `usable` (H, W): keypoints lie where it is above
-    0.
+    `images` (H, W, 3) rgb in [0, 1]; keypoints lie where `masks` (H, W) are above 0.
+    InputError where kornia or weights are missing.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    extractor, glue = network(matcher, device)
+    extractor, lightglue = load_networks(matcher, device, tuning)
     with torch.inference_mode():
-        found = [
-            describe(extractor, p, u, device)
-            for p, u in track(list(zip(pictures, usable, strict=True)), f"poses: {matcher}")
+        keypoints = [
+            extract_keypoints(extractor, image, mask, device, tuning)
+            for image, mask in track(list(zip(images, masks, strict=True)), f"poses: {matcher}")
         ]
-        matches = [match(glue, found[a], found[b]) for a, b in track(pairs, "poses: lightglue")]
-    return [f["keypoints"][0].cpu().numpy() + 0.5 for f in found], matches
+        matches = [
+            match_keypoints(lightglue, keypoints[a], keypoints[b])
+            for a, b in track(pairs, "poses: lightglue")
+        ]
+    return [k["keypoints"][0].cpu().numpy() + 0.5 for k in keypoints], matches
 
 
-def network(matcher: Matcher, device: torch.device) -> tuple[Any, Any]:
-    """The network that finds keypoints, and the one that matches them, with their
-    weights.
+def load_networks(
+    matcher: Matcher, device: torch.device, tuning: LightGlueTuning = LightGlueTuning()
+) -> tuple[Any, Any]:
+    """The network that extracts keypoints, and LightGlue, with their weights."""
+    kornia = kornia_features()
+    if matcher == "aliked":
+        num_candidates = tuning.candidate_factor * tuning.max_keypoints
+        extractor = kornia.ALIKED("aliked-n16", num_candidates, detection_threshold=-1.0)
+    else:
+        extractor = kornia.DISK()
+    lightglue = kornia.LightGlue(None, input_dim=128, flash=False)
+    stored = read_state_dict(matcher)
+    load_weights(extractor, stored.get("extractor", stored), matcher)
+    stored_lightglue = read_state_dict(f"{matcher}-lightglue")
+    renamed = {kornia_name(key): value for key, value in stored_lightglue.items()}
+    load_weights(lightglue, renamed, f"{matcher}-lightglue")
+    return extractor.to(device).eval(), lightglue.to(device).eval()
+
+
+def kornia_name(key: str) -> str:
+    """kornia's name of a weight of LightGlue, from the authors' name.
+
+    "self_attn.3.ffn" is "transformers.3.self_attn.ffn"; other names are the same.
     """
-    kf = features()
-    extractor = (
-        kf.ALIKED("aliked-n16", SPARE * LIMIT, detection_threshold=-1.0)
-        if matcher == "aliked"
-        else kf.DISK()
-    )
-    glue = kf.LightGlue(None, input_dim=128, flash=False)
-    own = read(matcher)
-    fill(extractor, own.get("extractor", own), matcher)
-    renamed = {}
-    for key, value in read(f"{matcher}-lightglue").items():  # the authors' first names -> today's
-        kind, _, rest = key.partition(".")
-        number, _, tail = rest.partition(".")
-        renamed[
-            f"transformers.{number}.{kind}.{tail}" if kind in ("self_attn", "cross_attn") else key
-        ] = value
-    fill(glue, renamed, f"{matcher}-lightglue")
-    return extractor.to(device).eval(), glue.to(device).eval()
+    block, _, rest = key.partition(".")
+    if block not in RENAMED_BLOCKS:
+        return key
+    number, _, tail = rest.partition(".")
+    return f"transformers.{number}.{block}.{tail}"
 
 
-def read(name: str) -> dict[str, Any]:
+def read_state_dict(name: str) -> dict[str, Any]:
     """The weights `name`; InputError where their file cannot be read."""
     path = find(name)
     try:
         return dict(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # torch raises several unrelated types
         raise InputError(
-            f"{path}: not a readable torch state dict ({type(error).__name__}); `hdr-nsff weights {name}` says how to get it"
+            f"{path}: not a readable torch state dict ({type(error).__name__}); "
+            f"`hdr-nsff weights {name}` shows how to get it"
         ) from error
 
 
-def fill(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
-    """Put weights into a network; InputError where they do not fit. What only training
-    needs may be left over.
+def load_weights(module: torch.nn.Module, state: dict[str, Tensor], name: str) -> None:
+    """Load weights into a network; InputError where they do not fit. Buffers that only
+    training needs may be missing.
     """
     try:
-        lacking = set(module.load_state_dict(state, strict=False).missing_keys) & {
-            n for n, _ in module.named_parameters()
-        }
+        missing = module.load_state_dict(state, strict=False).missing_keys
     except RuntimeError as error:
+        reason = " ".join(str(error).split())[:150]
         raise InputError(
-            f"weights {name}: do not fit its network ({' '.join(str(error).split())[:150]}); get them anew"
+            f"weights {name}: do not fit their network ({reason}); "
+            f"download them again (`hdr-nsff weights {name}`)"
         ) from error
-    if lacking:
+    missing_parameters = set(missing) & {n for n, _ in module.named_parameters()}
+    if missing_parameters:
         raise InputError(
-            f"weights {name}: {min(lacking)} is missing; get them anew (`hdr-nsff weights {name}`)"
+            f"weights {name}: {min(missing_parameters)} is missing; "
+            f"download them again (`hdr-nsff weights {name}`)"
         )
 
 
-def describe(
-    extractor: Any, picture: np.ndarray, usable: np.ndarray, device: torch.device
+def extract_keypoints(
+    extractor: Any,
+    image: np.ndarray,
+    mask: np.ndarray,
+    device: torch.device,
+    tuning: LightGlueTuning = LightGlueTuning(),
 ) -> dict[str, Tensor]:
-    """The `LIMIT` strongest usable keypoints of a picture as LightGlue takes them:
+    """The strongest keypoints of an `image` (H, W, 3) where `mask` (H, W) is above 0,
+    in LightGlue's format.
+
     keypoints (1, N, 2) with centers at whole numbers, descriptors (1, N, 128),
     image_size (1, 2) width and height.
     """
-    rgb = (
-        torch.from_numpy(np.ascontiguousarray(picture, np.float32))
-        .permute(2, 0, 1)[None]
-        .to(device)
-    )
+    height, width = image.shape[:2]
+    channels_first = torch.from_numpy(np.ascontiguousarray(image, np.float32)).permute(2, 0, 1)
+    rgb = channels_first[None].to(device)
     if type(extractor).__name__ == "DISK":
-        seen = extractor(rgb, n=SPARE * LIMIT, pad_if_not_divisible=True)[0]
-        scores = seen.detection_scores
+        num_candidates = tuning.candidate_factor * tuning.max_keypoints
+        detected = extractor(rgb, n=num_candidates, pad_if_not_divisible=True)[0]
+        scores = detected.detection_scores
     else:
-        seen = extractor(rgb)[0]
-        scores = seen.keypoint_scores
-    at = seen.keypoints.round().long().cpu().numpy()
-    allowed = (
-        usable[at[:, 1].clip(0, usable.shape[0] - 1), at[:, 0].clip(0, usable.shape[1] - 1)] > 0
-    )
-    rows = torch.argsort(
-        torch.where(torch.from_numpy(allowed).to(device), scores, -torch.inf),
-        descending=True,
-        stable=True,
-    )
-    rows = rows[: min(LIMIT, int(allowed.sum()))]
-    size = torch.tensor([[picture.shape[1], picture.shape[0]]], device=device, dtype=torch.float32)
+        detected = extractor(rgb)[0]
+        scores = detected.keypoint_scores
+    x, y = detected.keypoints.round().long().cpu().numpy().T
+    allowed = mask[y.clip(0, height - 1), x.clip(0, width - 1)] > 0
+    allowed_scores = torch.where(torch.from_numpy(allowed).to(device), scores, -torch.inf)
+    strongest_first = torch.argsort(allowed_scores, descending=True, stable=True)
+    rows = strongest_first[: min(tuning.max_keypoints, int(allowed.sum()))]
     return {
-        "keypoints": seen.keypoints[rows][None].float(),
-        "descriptors": seen.descriptors[rows][None].float(),
-        "image_size": size,
+        "keypoints": detected.keypoints[rows][None].float(),
+        "descriptors": detected.descriptors[rows][None].float(),
+        "image_size": torch.tensor([[width, height]], device=device, dtype=torch.float32),
     }
 
 
-def match(glue: Any, a: dict[str, Tensor], b: dict[str, Tensor]) -> np.ndarray:
-    """Rows (M, 2) of the keypoints of two pictures that match."""
+def match_keypoints(lightglue: Any, a: dict[str, Tensor], b: dict[str, Tensor]) -> np.ndarray:
+    """Rows (M, 2) of the keypoints of two images that match."""
     if min(a["keypoints"].shape[1], b["keypoints"].shape[1]) < 2:
         return np.zeros((0, 2), np.int64)
-    return glue({"image0": a, "image1": b})["matches"][0].cpu().numpy()
+    return lightglue({"image0": a, "image1": b})["matches"][0].cpu().numpy()
 
 
-def enlarged(frame: np.ndarray, scale: int) -> np.ndarray:
+def upsample(frame: np.ndarray, scale: int) -> np.ndarray:
     """A frame (H, W, 3) in [0, 1], `scale` times larger."""
-    return (
-        frame
-        if scale == 1
-        else cv2.resize(
-            frame.astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC
-        ).clip(0, 1)
+    if scale == 1:
+        return frame
+    enlarged = cv2.resize(
+        frame.astype(np.float32), None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC
     )
+    return enlarged.clip(0, 1)

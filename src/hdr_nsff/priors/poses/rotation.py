@@ -1,13 +1,15 @@
-"""Cameras without parallax: a tripod or a pan. Decides whether the footage is of that
-kind, and recovers the rotations.
+"""Cameras without parallax: a tripod or a pan. Recognizes such footage and estimates
+its rotations.
 
-A camera that only turns sees every static point move by the homography `K R_j^T R_i
-K^-1` (R camera to world). The rotations of all frames and the focal length are those
-that explain the matches between near and far frames at once, so nothing drifts.
+A camera that only turns moves every static point by the homography `K R_j^T R_i K^-1`
+(R camera to world; Hartley and Zisserman 2004, section 8.4). The rotations of all
+frames and the focal length are those that explain the matches between near and far
+frames at once (Szeliski and Shum 1997), so nothing drifts.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,9 +18,56 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.poses.matching import PairMatches
+from hdr_nsff.geometry import pinhole
+from hdr_nsff.priors.poses.matching import (
+    MatchingTuning,
+    PairMatches,
+    detect_keypoints,
+    match_pairs,
+    spread_pairs,
+)
 
-DEFAULT_FOV = 60.0  # degrees across the image, where the footage does not tell
+MAX_RANSAC_STEPS = 2000
+RANSAC_CONFIDENCE = 0.999
+MAD_TO_SIGMA = 1.48  # standard deviation of a normal distribution per median |deviation|
+MIN_RAY_DEPTH = 1e-3  # of unit z-depth: rays closer to sideways project as if they had it
+ROOT_CANDIDATES = 8  # frames tried as the root of the tree of pairs
+
+
+@dataclass(frozen=True)
+class RotationTuning:
+    """When matches support a homography, and when a turn fixes the focal length.
+
+    Hand-chosen on painted and rendered clips if no other origin is given.
+    """
+
+    default_fov_degrees: float = 60.0  # across the image, where the footage does not fix it
+    homography_error_px: float = 1.5  # of inliers
+    epipolar_error_px: float = 1.0  # of inliers
+    min_pair_matches: int = 20  # of inliers of a pair's homography ...
+    min_inlier_share: float = 1 / 3  # ... and their share of the pair's matches
+    max_pair_matches: int = 60  # of a pair that enter the adjustment
+    # the focal length is taken from the turn when its logarithm is this certain and the
+    # field of view within these limits
+    max_log_focal_deviation: float = 0.05
+    min_fov_degrees: float = 25.0
+    max_fov_degrees: float = 120.0
+    # the camera slides past something flat when a long lens explains the matches better
+    # by this factor
+    min_slide_cost_ratio: float = 1.5
+    explained_error_px: float = 2.0  # of matches that count as explained by the rotations
+    min_explained: float = 0.8  # share of the matches, for footage that is only rotations
+    max_tripod_motion_px: float = 0.75  # farthest displacement of a camera that stands still
+    max_iterations: int = 40  # of Levenberg-Marquardt
+    # a point is matched about ten times over, and those errors are one error
+    matches_per_point: float = 10.0
+    # pairs count as far apart from this share of the largest gap on
+    min_gap_share: float = 1 / 6
+    min_far_matches: int = 30  # static matches of such a pair
+    min_static_matches: int = 150  # of all such pairs
+    # a rotation explains a static match to this error, or to this share of the width
+    rotation_error_px: float = 1.5
+    rotation_error_width_share: float = 0.004
 
 
 @dataclass(frozen=True)
@@ -26,139 +75,205 @@ class Panorama:
     """The rotations of a camera that stands still."""
 
     rotations: np.ndarray  # (T, 3, 3) camera to world; the middle frame looks along +z
-    linked: np.ndarray  # (T,) bool: enough matches tie this frame to the others
+    linked: np.ndarray  # (T,) bool: enough matches link this frame to the others
     focal: float  # pixels
-    focal_known: bool  # else the default field of view
-    # a sideways shift before something flat explains the matches much better than any
-    # turn does
+    focal_known: bool  # else it is that of the default field of view
+    # a sideways slide past something flat explains the matches much better than any
+    # turn
     slides: bool
-    explained: float  # share of the matches that these rotations explain to 2 px
-    errors: np.ndarray  # (T,) median residual in pixels, NaN where not linked
-    # pixels: how far the image center or a corner ever strays from where it lies in the
-    # middle frame
-    motion: float
+    explained: float  # share of the matches that these rotations explain
+    frame_errors: np.ndarray  # (T,) median residual in pixels, NaN where not linked
+    # pixels: the farthest that the image center or a corner moves away from its
+    # position in the middle frame
+    max_displacement: float
 
 
-def default_focal(width: int) -> float:
+@dataclass(frozen=True)
+class RotationMatches:
+    """Matches that rotations are fitted to, in pixels from the image center."""
+
+    frames: np.ndarray  # (M, 2) frames i and j of each match
+    p: np.ndarray  # (M, 2) in frame i
+    q: np.ndarray  # (M, 2) in frame j
+
+
+def default_focal(width: int, tuning: RotationTuning = RotationTuning()) -> float:
     """The focal length in pixels of a camera with the default field of view."""
-    return width / 2 / float(np.tan(np.radians(DEFAULT_FOV) / 2))
+    return width / 2 / float(np.tan(np.radians(tuning.default_fov_degrees) / 2))
 
 
 def epipolar(
     p: np.ndarray, q: np.ndarray, threshold: float
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """The fundamental matrix (3, 3) that most of the matches p, q (M, 2) obey, and
-    which (M,) bool do, to `threshold` pixels.
+    which (M,) bool do, to `threshold` pixels. None where no model fits.
     """
     try:
-        matrix, inlier = cv2.findFundamentalMat(p, q, cv2.USAC_MAGSAC, threshold, 0.999, 2000)
+        matrix, inliers = cv2.findFundamentalMat(
+            p, q, cv2.USAC_MAGSAC, threshold, RANSAC_CONFIDENCE, MAX_RANSAC_STEPS
+        )
     except cv2.error:  # raised for matches so degenerate that no model fits at all
         matrix = None
-    return (None, np.zeros(len(p), bool)) if matrix is None else (matrix, inlier.ravel() > 0)
+    if matrix is None:
+        return None, np.zeros(len(p), bool)
+    return matrix, inliers.ravel() > 0
 
 
 def homography(
     p: np.ndarray, q: np.ndarray, threshold: float
 ) -> tuple[np.ndarray | None, np.ndarray]:
     """The homography (3, 3) that most of the matches p, q (M, 2) obey, and which (M,)
-    bool do, to `threshold` pixels.
+    bool do, to `threshold` pixels. None where no model fits.
     """
     try:
-        matrix, inlier = cv2.findHomography(
-            p, q, cv2.USAC_MAGSAC, threshold, maxIters=2000, confidence=0.999
+        matrix, inliers = cv2.findHomography(
+            p,
+            q,
+            cv2.USAC_MAGSAC,
+            threshold,
+            maxIters=MAX_RANSAC_STEPS,
+            confidence=RANSAC_CONFIDENCE,
         )
     except cv2.error:
         matrix = None
-    return (None, np.zeros(len(p), bool)) if matrix is None else (matrix, inlier.ravel() > 0)
+    if matrix is None:
+        return None, np.zeros(len(p), bool)
+    return matrix, inliers.ravel() > 0
 
 
 def rotation_share(
-    matches: list[PairMatches], found: Panorama, width: int, height: int, least: int = 30
+    matches: list[PairMatches],
+    panorama: Panorama,
+    width: int,
+    height: int,
+    tuning: RotationTuning = RotationTuning(),
 ) -> float | None:
-    """How much of what an epipolar geometry explains these rotations explain as well,
-    in [0, 1], over pairs far apart in time.
+    """The share of static matches, in [0, 1], that the rotations of a `panorama`
+    explain.
 
+    Static are matches that obey an epipolar geometry, over pairs far apart in time.
     Near 1 for a camera that only turns, well below with parallax; a flat scene does not
-    deceive it. Explained means to 1.5 pixels, or 0.4 % of the width. None where too few
-    pairs far apart match at all.
+    deceive it. None where too few pairs far apart match at all.
     """
-    wide = max((m.j - m.i for m in matches), default=0) / 6
-    center, tolerance = np.array([width / 2, height / 2]), max(1.5, 0.004 * width)
-    rotational = general = 0
+    min_gap = max((m.j - m.i for m in matches), default=0) * tuning.min_gap_share
+    center = np.array([width / 2, height / 2])
+    tolerance = max(tuning.rotation_error_px, tuning.rotation_error_width_share * width)
+    num_explained = num_static = 0
     for m in matches:
-        if m.j - m.i < wide or len(m.p) < least:
+        if m.j - m.i < min_gap or len(m.p) < tuning.min_far_matches:
             continue
-        static = epipolar(m.p, m.q, 1.0)[1]
-        if static.sum() < least:
+        _, is_static = epipolar(m.p, m.q, tuning.epipolar_error_px)
+        count = int(is_static.sum())
+        if count < tuning.min_far_matches:
             continue
-        ends = np.tile([m.i, m.j], (int(static.sum()), 1))
-        predicted = turned(found.rotations, found.focal, ends, m.p[static] - center)[0]
-        rotational += int(
-            (np.linalg.norm(predicted + center - m.q[static], axis=1) < tolerance).sum()
+        frames = np.tile([m.i, m.j], (count, 1))
+        predicted, _ = rotate_pixels(
+            panorama.rotations, panorama.focal, frames, m.p[is_static] - center
         )
-        general += int(static.sum())
-    return rotational / general if general >= 5 * least else None
+        error = np.linalg.norm(predicted + center - m.q[is_static], axis=1)
+        num_explained += int((error < tolerance).sum())
+        num_static += count
+    if num_static < tuning.min_static_matches:
+        return None
+    return num_explained / num_static
 
 
-def panorama(matches: list[PairMatches], count: int, width: int, height: int) -> Panorama | None:
-    """Rotations of all `count` frames, and the focal length where the turn is wide
-    enough to tell. None where nothing matches.
+def fit_video(
+    video: np.ndarray,
+    ignore: np.ndarray,
+    matching: MatchingTuning,
+    tuning: RotationTuning = RotationTuning(),
+) -> Panorama | None:
+    """The rotations of one camera from all of its frames (T, H, W, 3) in [0, 1], pixels
+    in `ignore` (T, H, W) bool left out. None where nothing matches.
     """
-    kept, homographies = planar_matches(matches)
+    count, height, width = video.shape[:3]
+    keypoints = detect_keypoints(video, ignore, matching)
+    matches = match_pairs(keypoints, spread_pairs(count, matching), matching)
+    return fit_panorama(matches, count, width, height, tuning)
+
+
+def fit_panorama(
+    matches: list[PairMatches],
+    count: int,
+    width: int,
+    height: int,
+    tuning: RotationTuning = RotationTuning(),
+) -> Panorama | None:
+    """Rotations of all `count` frames, and the focal length where the turn is wide
+    enough to fix it. None where nothing matches.
+    """
+    kept, homographies = planar_matches(matches, tuning)
     if not kept:
         return None
     center = np.array([width / 2, height / 2])
-    rotations, linked = chain(kept, homographies, count, default_focal(width), center)
-    kept = [m for m in kept if linked[m.i] and linked[m.j]]
-    ends = np.repeat([(m.i, m.j) for m in kept], [len(m.p) for m in kept], axis=0)  # (M, 2)
-    p, q = (np.concatenate(x) - center for x in ([m.p for m in kept], [m.q for m in kept]))
-    rotations, _, _ = refine(rotations, default_focal(width), ends, p, q, False)
-    free, focal, spread = refine(rotations, default_focal(width), ends, p, q, True)
-    fov = np.degrees(2 * np.arctan(width / 2 / focal))
-    known = bool(spread < 0.05 and 25 < fov < 120)
-    # through an endlessly long lens a turn is a shift of the picture
-    slides = bool(fov <= 25) and cost(rotations, default_focal(width), ends, p, q) > 1.5 * cost(
-        free, focal, ends, p, q
-    )
-    rotations, focal = (free, focal) if known else (rotations, default_focal(width))
-    residual = np.linalg.norm(turned(rotations, focal, ends, p)[0] - q, axis=1)
-    errors = np.full(count, np.nan)
-    for t in np.unique(ends):
-        errors[t] = np.median(residual[(ends == t).any(1)])
-    rotations = rotations[count // 2].T @ rotations
+    guess = default_focal(width, tuning)
+    chained, linked = chain_rotations(kept, homographies, count, guess, center)
+    pairs = collect_matches([m for m in kept if linked[m.i] and linked[m.j]], center)
+    held = refine(chained, guess, pairs, False, tuning)
+    free = refine(held.rotations, guess, pairs, True, tuning)
+    fov = float(np.degrees(2 * np.arctan(width / 2 / free.focal)))
+    plausible = tuning.min_fov_degrees < fov < tuning.max_fov_degrees
+    focal_known = plausible and free.log_focal_deviation < tuning.max_log_focal_deviation
+    # through an endlessly long lens a turn is a shift of the image
+    slides = False
+    if fov <= tuning.min_fov_degrees:
+        held_cost = robust_cost(held.rotations, guess, pairs)
+        free_cost = robust_cost(free.rotations, free.focal, pairs)
+        slides = held_cost > tuning.min_slide_cost_ratio * free_cost
+    best = free if focal_known else held
+    predicted, _ = rotate_pixels(best.rotations, best.focal, pairs.frames, pairs.p)
+    residual = np.linalg.norm(predicted - pairs.q, axis=1)
+    frame_errors = np.full(count, np.nan)
+    for t in np.unique(pairs.frames):
+        frame_errors[t] = np.median(residual[(pairs.frames == t).any(1)])
+    rotations = best.rotations[count // 2].T @ best.rotations
     return Panorama(
         rotations=rotations,
         linked=linked,
-        focal=focal,
-        focal_known=known,
+        focal=best.focal,
+        focal_known=focal_known,
         slides=slides,
-        explained=float((residual < 2).mean()),
-        errors=errors,
-        motion=stray(rotations[linked], focal, width, height),
+        explained=float((residual < tuning.explained_error_px).mean()),
+        frame_errors=frame_errors,
+        max_displacement=max_displacement(rotations[linked], best.focal, width, height),
+    )
+
+
+def collect_matches(pairs: Sequence[PairMatches], center: np.ndarray) -> RotationMatches:
+    """The matches of all pairs in one record, relative to the image `center` (2,)."""
+    return RotationMatches(
+        frames=np.repeat([(m.i, m.j) for m in pairs], [len(m.p) for m in pairs], axis=0),
+        p=np.concatenate([m.p for m in pairs]) - center,
+        q=np.concatenate([m.q for m in pairs]) - center,
     )
 
 
 def planar_matches(
-    matches: list[PairMatches], least: int = 20, most: int = 60
+    matches: list[PairMatches], tuning: RotationTuning = RotationTuning()
 ) -> tuple[list[PairMatches], list[np.ndarray]]:
-    """Of every pair that a homography explains (at least `least` matches, a third of
-    all): at most `most` of those matches, and the homography.
+    """The inliers of every pair that a homography explains, spread over the pair and
+    limited in number, and those homographies (3, 3).
     """
     kept, homographies = [], []
     for m in matches:
-        if len(m.p) < least:
+        count = len(m.p)
+        if count < tuning.min_pair_matches:
             continue
-        h, inlier = homography(m.p, m.q, 1.5)
-        chosen = np.flatnonzero(inlier)
-        if h is not None and len(chosen) >= max(least, len(m.p) / 3):
-            chosen = chosen[np.linspace(0, len(chosen) - 1, min(most, len(chosen))).astype(int)]
-            kept.append(PairMatches(m.i, m.j, m.p[chosen], m.q[chosen]))
-            homographies.append(h)
+        matrix, is_inlier = homography(m.p, m.q, tuning.homography_error_px)
+        inliers = np.flatnonzero(is_inlier)
+        required = max(tuning.min_pair_matches, count * tuning.min_inlier_share)
+        if matrix is None or len(inliers) < required:
+            continue
+        num_chosen = min(tuning.max_pair_matches, len(inliers))
+        chosen = inliers[np.linspace(0, len(inliers) - 1, num_chosen).astype(int)]
+        kept.append(PairMatches(m.i, m.j, m.p[chosen], m.q[chosen]))
+        homographies.append(matrix)
     return kept, homographies
 
 
-def chain(
-    kept: list[PairMatches],
+def chain_rotations(
+    pairs: list[PairMatches],
     homographies: list[np.ndarray],
     count: int,
     focal: float,
@@ -168,170 +283,164 @@ def chain(
     (T,) it reaches from the best-linked one.
     """
     K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
-    edges = {
+    relative = {
         (m.i, m.j): nearest_rotation(np.linalg.inv(K) @ h @ K)
-        for m, h in zip(kept, homographies, strict=True)
+        for m, h in zip(pairs, homographies, strict=True)
     }  # R_j^T R_i
-    i, j = np.array(list(edges)).T
-    lengths = 1.0 / np.array([len(m.p) for m in kept]) * (1 + 0.01 * (j - i))
+    i, j = np.array(list(relative)).T
+    num_matches = np.array([len(m.p) for m in pairs])
+    lengths = 1.0 / num_matches * (1 + 0.01 * (j - i))  # many matches, then near frames
     tree = minimum_spanning_tree(coo_matrix((lengths, (i, j)), shape=(count, count)))
-    order, parent = max(
-        (
-            breadth_first_order(tree, int(t), directed=False)
-            for t in np.unique(i)[:: max(1, len(np.unique(i)) // 8)]
-        ),
-        key=lambda found: len(found[0]),
-    )
+    roots = np.unique(i)[:: max(1, len(np.unique(i)) // ROOT_CANDIDATES)]
+    searches = [breadth_first_order(tree, int(t), directed=False) for t in roots]
+    order, parent = max(searches, key=lambda search: len(search[0]))
     rotations, linked = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count, bool)
     linked[order] = True
     for t in order[1:]:
         s = parent[t]
-        rotations[t] = rotations[s] @ (edges[(s, t)].T if (s, t) in edges else edges[(t, s)])
+        to_parent = relative[(s, t)].T if (s, t) in relative else relative[(t, s)]
+        rotations[t] = rotations[s] @ to_parent
     return rotations, linked
 
 
 def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) nearest to a matrix known up to scale."""
-    u, _, vt = np.linalg.svd(matrix / np.cbrt(np.linalg.det(matrix)))
-    return u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
+    """The rotation (3, 3) nearest, in the Frobenius norm, to a matrix (3, 3) that is
+    known up to a factor: Kabsch's problem for the axes and the matrix's columns.
+    """
+    proper = matrix / np.cbrt(np.linalg.det(matrix))
+    return Rotation.align_vectors(proper.T, np.eye(3))[0].as_matrix()
 
 
-def turned(
-    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray
+def rotate_pixels(
+    rotations: np.ndarray, focal: float, frames: np.ndarray, p: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where frame j sees points `p` (M, 2) of frame i, both in pixels from the image
-    center, and their directions (M, 3) in frame j.
+    center, and their directions (M, 3) in frame j. `frames` (M, 2): i and j.
     """
-    bearing = np.concatenate([p / focal, np.ones((len(p), 1))], 1)
-    seen = np.einsum(
-        "mji,mj->mi", rotations[ends[:, 1]], np.einsum("mij,mj->mi", rotations[ends[:, 0]], bearing)
-    )
-    return focal * seen[:, :2] / np.maximum(seen[:, 2:], 1e-3), seen
+    K = np.diag([focal, focal, 1.0])
+    world = np.einsum("mij,mj->mi", rotations[frames[:, 0]], pinhole.camera_rays(p, K))
+    local = np.einsum("mji,mj->mi", rotations[frames[:, 1]], world)
+    return pinhole.to_pixels(local, K, MIN_RAY_DEPTH), local
+
+
+@dataclass(frozen=True)
+class RefinedRotations:
+    """What `refine` found."""
+
+    rotations: np.ndarray  # (T, 3, 3) camera to world
+    focal: float  # pixels
+    log_focal_deviation: float  # standard deviation of the logarithm of the focal length
 
 
 def refine(
     rotations: np.ndarray,
     focal: float,
-    ends: np.ndarray,
-    p: np.ndarray,
-    q: np.ndarray,
+    matches: RotationMatches,
     free_focal: bool,
-    steps: int = 40,
-) -> tuple[np.ndarray, float, float]:
-    """Rotations and focal length with the least robust (Cauchy, 1 px) residual over all
-    matches, by Levenberg-Marquardt; and how uncertain the logarithm of the focal length
-    is (standard deviation).
-
-    `rotations` (T, 3, 3) camera to world; `ends` (M, 2) the frames i, j of each match;
-    `p`, `q` (M, 2) pixels from the image center.
+    tuning: RotationTuning = RotationTuning(),
+) -> RefinedRotations:
+    """Rotations and focal length with the least `robust_cost` over all matches, by
+    Levenberg-Marquardt from `rotations` (T, 3, 3) and `focal`.
     """
-    damping, least = 1e-4, cost(rotations, focal, ends, p, q)
-    normal, right = normal_equations(rotations, focal, ends, p, q, free_focal)
-    for _ in range(steps):
+    damping, lowest = 1e-4, robust_cost(rotations, focal, matches)
+    normal, right = normal_equations(rotations, focal, matches, free_focal)
+    for _ in range(tuning.max_iterations):
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
-        turned_on = rotations @ Rotation.from_rotvec(step[:-1].reshape(-1, 3)).as_matrix()
-        longer = float(focal * np.exp(np.clip(step[-1], -0.3, 0.3)))
-        now = cost(turned_on, longer, ends, p, q)
-        if now >= least:
+        turns = Rotation.from_rotvec(step[:-1].reshape(-1, 3)).as_matrix()
+        new_rotations = rotations @ turns
+        new_focal = float(focal * np.exp(np.clip(step[-1], -0.3, 0.3)))
+        cost = robust_cost(new_rotations, new_focal, matches)
+        if cost >= lowest:
             damping *= 10
             if damping > 1e6:
                 break
             continue
-        rotations, focal, damping = turned_on, longer, damping / 10
-        normal, right = normal_equations(rotations, focal, ends, p, q, free_focal)
-        if least - now < 1e-7 * least:
+        damping /= 10
+        rotations, focal = new_rotations, new_focal
+        normal, right = normal_equations(rotations, focal, matches, free_focal)
+        if lowest - cost < 1e-7 * lowest:
             break
-        least = now
-    residual = np.linalg.norm(turned(rotations, focal, ends, p)[0] - q, axis=1)
-    # a point is matched about ten times over: those errors are one error
-    return (
-        rotations,
-        focal,
-        float(1.48 * np.median(residual) * np.sqrt(np.linalg.inv(normal)[-1, -1] * 10)),
-    )
+        lowest = cost
+    predicted, _ = rotate_pixels(rotations, focal, matches.frames, matches.p)
+    error = MAD_TO_SIGMA * np.median(np.linalg.norm(predicted - matches.q, axis=1))
+    log_focal_variance = np.linalg.inv(normal)[-1, -1] * tuning.matches_per_point
+    return RefinedRotations(rotations, focal, float(error * np.sqrt(log_focal_variance)))
+
+
+def robust_cost(rotations: np.ndarray, focal: float, matches: RotationMatches) -> float:
+    """The mean of log(1 + r^2) over all matches, r in pixels (Cauchy's loss, 1 px)."""
+    predicted, _ = rotate_pixels(rotations, focal, matches.frames, matches.p)
+    squared_error = np.sum((predicted - matches.q) ** 2, 1)
+    return float(np.mean(np.log1p(squared_error)))
 
 
 def normal_equations(
-    rotations: np.ndarray,
-    focal: float,
-    ends: np.ndarray,
-    p: np.ndarray,
-    q: np.ndarray,
-    free_focal: bool,
+    rotations: np.ndarray, focal: float, matches: RotationMatches, free_focal: bool
 ) -> tuple[np.ndarray, np.ndarray]:
     """J^T W J (3T + 1, 3T + 1) and J^T W r (3T + 1) of the matches; unknowns are three
     turns per frame and the logarithm of the focal length.
     """
-    count = len(rotations)
-    predicted, seen = turned(rotations, focal, ends, p)
-    residual = q - predicted  # (M, 2)
+    count, frames = len(rotations), matches.frames
+    predicted, rays = rotate_pixels(rotations, focal, frames, matches.p)
+    residual = matches.q - predicted  # (M, 2)
     weight = 1 / (1 + np.sum(residual**2, 1))
-    jacobian = derivatives(rotations, focal, ends, p, seen)  # (M, 2, 7)
+    jacobian = rotate_pixels_jacobian(rotations, focal, frames, matches.p, rays)  # (M, 2, 7)
+    of_focal = np.full((len(frames), 1), 3 * count)
     columns = np.concatenate(
-        [
-            3 * ends[:, :1] + np.arange(3),
-            3 * ends[:, 1:] + np.arange(3),
-            np.full((len(p), 1), 3 * count),
-        ],
-        1,
+        [3 * frames[:, :1] + np.arange(3), 3 * frames[:, 1:] + np.arange(3), of_focal], 1
     )
     normal, right = np.zeros((3 * count + 1,) * 2), np.zeros(3 * count + 1)
-    np.add.at(
-        normal,
-        (columns[:, :, None], columns[:, None, :]),
-        np.einsum("mki,m,mkj->mij", jacobian, weight, jacobian),
-    )
+    products = np.einsum("mki,m,mkj->mij", jacobian, weight, jacobian)
+    np.add.at(normal, (columns[:, :, None], columns[:, None, :]), products)
     np.add.at(right, columns, np.einsum("mki,m,mk->mi", jacobian, weight, residual))
-    normal[np.diag_indices(3 * count)] += (
-        1e-3 * focal**2
-    )  # holds the common turn, which is free, and frames without matches
+    # holds the common turn, which is free, and frames without matches
+    normal[np.diag_indices(3 * count)] += 1e-3 * focal**2
     normal[-1, -1] += 1.0 if free_focal else 1e18
     return normal, right
 
 
-def cost(
-    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, q: np.ndarray
-) -> float:
-    """The mean robust residual that `refine` lowers, `log(1 + r^2)`, of matches in
-    pixels from the image center.
-    """
-    return float(np.mean(np.log1p(np.sum((turned(rotations, focal, ends, p)[0] - q) ** 2, 1))))
-
-
-def derivatives(
-    rotations: np.ndarray, focal: float, ends: np.ndarray, p: np.ndarray, seen: np.ndarray
+def rotate_pixels_jacobian(
+    rotations: np.ndarray, focal: float, frames: np.ndarray, p: np.ndarray, rays: np.ndarray
 ) -> np.ndarray:
-    """How `turned` moves (M, 2, 7) when frame i turns (3, right-hand perturbation),
-    frame j turns (3), log focal grows (1).
+    """Derivatives (M, 2, 7) of `rotate_pixels`, which gave the directions `rays` (M,
+    3).
+
+    By a turn of frame i (3, right-hand perturbation), a turn of frame j (3), and the
+    logarithm of the focal length (1).
     """
-    z = np.maximum(seen[:, 2], 1e-3)
-    project = np.zeros((len(p), 2, 3))  # pixels per direction
-    project[:, 0, 0] = project[:, 1, 1] = focal / z
-    project[:, :, 2] = -focal * seen[:, :2] / z[:, None] ** 2
-    bearing = np.concatenate([p / focal, np.ones((len(p), 1))], 1)
-    relative = np.einsum("mki,mkj->mij", rotations[ends[:, 1]], rotations[ends[:, 0]])  # R_j^T R_i
-    by_i = -project @ relative @ cross(bearing)
-    by_j = project @ cross(seen)
-    shrink = np.einsum("mij,mj->mi", relative[:, :, :2], -p / focal)
-    by_focal = focal * seen[:, :2] / z[:, None] + np.einsum("mki,mi->mk", project, shrink)
+    depth = np.maximum(rays[:, 2], MIN_RAY_DEPTH)
+    pixels_by_ray = np.zeros((len(p), 2, 3))
+    pixels_by_ray[:, 0, 0] = pixels_by_ray[:, 1, 1] = focal / depth
+    pixels_by_ray[:, :, 2] = -focal * rays[:, :2] / depth[:, None] ** 2
+    first, second = rotations[frames[:, 0]], rotations[frames[:, 1]]
+    relative = np.einsum("mki,mkj->mij", second, first)  # R_j^T R_i
+    rays_in_i = pinhole.homogeneous(p / focal)
+    by_i = -pixels_by_ray @ relative @ skew(rays_in_i)
+    by_j = pixels_by_ray @ skew(rays)
+    ray_by_focal = np.einsum("mij,mj->mi", relative[:, :, :2], -p / focal)
+    by_focal = focal * rays[:, :2] / depth[:, None]
+    by_focal += np.einsum("mki,mi->mk", pixels_by_ray, ray_by_focal)
     return np.concatenate([by_i, by_j, by_focal[:, :, None]], 2)
 
 
-def cross(v: np.ndarray) -> np.ndarray:
-    """Matrices (M, 3, 3) with `cross(v) @ w == np.cross(v, w)`."""
+def skew(v: np.ndarray) -> np.ndarray:
+    """Matrices (M, 3, 3) with `skew(v) @ w == np.cross(v, w)`."""
     m = np.zeros((len(v), 3, 3))
-    m[:, 0, 1], m[:, 0, 2], m[:, 1, 2] = -v[:, 2], v[:, 1], -v[:, 0]
+    m[:, 0, 1] = -v[:, 2]
+    m[:, 0, 2] = v[:, 1]
+    m[:, 1, 2] = -v[:, 0]
     return m - np.swapaxes(m, 1, 2)
 
 
-def stray(rotations: np.ndarray, focal: float, width: int, height: int) -> float:
-    """The farthest, in pixels, that any of `rotations` (T, 3, 3) carries the image's
-    center or a corner from where the middle frame has it.
+def max_displacement(rotations: np.ndarray, focal: float, width: int, height: int) -> float:
+    """The farthest, in pixels, that any of `rotations` (T, 3, 3) moves the image's
+    center or a corner from its position in the middle frame.
     """
-    spots = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]]) * np.array([width, height]) / 2
-    middle = len(rotations) // 2
-    ends = np.stack(
-        [np.repeat(np.arange(len(rotations)), 5), np.full(5 * len(rotations), middle)], 1
-    )
-    p = np.tile(spots, (len(rotations), 1))
-    return float(np.linalg.norm(turned(rotations, focal, ends, p)[0] - p, axis=1).max())
+    corners = np.array([[0, 0], [1, 1], [1, -1], [-1, 1], [-1, -1]])
+    positions = corners * np.array([width, height]) / 2
+    count = len(rotations)
+    sources = np.repeat(np.arange(count), len(positions))
+    frames = np.stack([sources, np.full_like(sources, count // 2)], 1)
+    p = np.tile(positions, (count, 1))
+    moved, _ = rotate_pixels(rotations, focal, frames, p)
+    return float(np.linalg.norm(moved - p, axis=1).max())

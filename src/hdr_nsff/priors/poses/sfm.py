@@ -4,8 +4,8 @@ hdr_nsff.priors.poses.sfm JOB.json`.
 A separate process because pycolmap brings its own zlib, which breaks PNG and EXR
 writing in the process that imports it, and because native code that crashes must not
 take the user's run along. The worker extracts and matches keypoints once per job
-folder, maps, and leaves COLMAP models behind; the parent shows its progress and kills
-it when it is itself interrupted.
+folder, maps, and leaves COLMAP models behind (Schonberger and Frahm 2016; global: Pan
+et al. 2024). The parent shows its progress and kills it when it is itself interrupted.
 """
 
 from __future__ import annotations
@@ -20,42 +20,65 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import IO, Any, Literal
 
 import numpy as np
 
+from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.progress import track
-from hdr_nsff.priors.poses.trimming import ROUNDS, trim
+from hdr_nsff.priors.poses.trimming import TrimmingTuning, trim
 
 Mapping = Literal["incremental", "global"]
-GIVEN = "given.npz"
-CHUNKS = 24  # progress steps of matching
-# of the error with focal lengths held: what others must reach, for thousands of
-# observations tell less than that by chance
-TOLD = 0.9998
-ROOM = 2**20  # bytes: a disk with less than this free is full
+MATCHES_FILE = "given.npz"
+EXTRACTION_BATCH = 6  # images per call, between two steps of progress
+MATCHING_STEPS = 24  # of progress
+MIN_FREE_BYTES = 2**20  # a disk with less free space is full
+DISK_FULL_WORDS = ("No space left", "disk is full")
+
+
+@dataclass(frozen=True)
+class SfmTuning:
+    """Settings of COLMAP, hand-chosen on rendered scenes."""
+
+    max_features: int = 4096  # SIFT keypoints per image
+    max_epipolar_error_px: float = 3.0  # of verified matches; COLMAP's default is 4
+    max_models: int = 4  # kept by incremental mapping
+    min_model_images: int = 3
+    # free focal lengths must lower the mean reprojection error below this share of the
+    # error with focal lengths held: thousands of observations gain less by chance
+    max_free_focal_error_share: float = 0.9998
+    trimming: TrimmingTuning = field(default_factory=TrimmingTuning)
 
 
 @dataclass(frozen=True)
 class Job:
     """One run of structure from motion; every path is inside `folder`."""
 
-    folder: (
-        str  # holds images/NAME.png, and masks/NAME.png.png where black pixels carry no keypoints
-    )
+    # holds images/NAME.png, and masks/NAME.png.png where black pixels carry no
+    # keypoints
+    folder: str
     groups: list[list[str]]  # image names of each physical camera, which share intrinsics
     pairs: list[tuple[str, str]]  # image names to match
     focal: float  # first guess, pixels of the images
     mapping: Mapping
     threads: int = 0  # 0 = all cores
-    # keypoints and matches lie in the folder (`write_matches`): none are looked for
-    given: bool = False
+    # keypoints and matches lie in the folder (`write_matches`): none are extracted
+    matches_given: bool = False
+    tuning: SfmTuning = field(default_factory=SfmTuning)
 
 
 class SfmError(RuntimeError):
     """The worker ended without a result. The message is its last line."""
+
+
+def read_job(path: Path) -> Job:
+    """A job as `run` wrote it."""
+    raw = json.loads(path.read_text())
+    tuning = raw.pop("tuning")
+    trimming = TrimmingTuning(**tuning.pop("trimming"))
+    return Job(**raw, tuning=SfmTuning(**tuning, trimming=trimming))
 
 
 def run(job: Job) -> list[Path]:
@@ -69,20 +92,21 @@ def run(job: Job) -> list[Path]:
         command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, errors="replace"
     )
     assert worker.stdout is not None and worker.stderr is not None
-    said: deque[str] = deque(maxlen=20)  # in memory: on a full disk a log would stay empty
-    listener = threading.Thread(target=said.extend, args=(worker.stderr,), daemon=True)
+    # kept in memory: on a full disk a log would stay empty
+    error_lines: deque[str] = deque(maxlen=20)
+    listener = threading.Thread(target=error_lines.extend, args=(worker.stderr,), daemon=True)
     listener.start()
     try:
-        follow(worker.stdout)
+        show_progress(worker.stdout)
         code = worker.wait()
     finally:
         worker.kill()
         worker.wait()
         listener.join()
-    need_room(folder, " ".join(said))
+    check_free_space(folder, " ".join(error_lines))
     if code != 0:
-        words = [line.strip() for line in said if line.strip()]
-        raise SfmError(words[-1] if words else f"pycolmap ended with code {code}")
+        messages = [line.strip() for line in error_lines if line.strip()]
+        raise SfmError(messages[-1] if messages else f"pycolmap ended with code {code}")
     return sorted(p for p in (folder / job.mapping).iterdir() if p.is_dir())
 
 
@@ -93,8 +117,8 @@ def write_matches(
     pairs: list[tuple[str, str]],
     matches: list[np.ndarray],
 ) -> None:
-    """Put keypoints (N, 2) of each image, pixels with centers at +0.5, and matches (M,
-    2) of each pair, rows of both, beside a job.
+    """Write keypoints (N, 2) of each image, pixels with centers at +0.5, and matches
+    (M, 2) of each pair, rows of both, into the folder of a job.
     """
     points = {
         f"points_{name}": xy.astype(np.float32) for name, xy in zip(names, keypoints, strict=True)
@@ -102,23 +126,24 @@ def write_matches(
     rows = {
         f"matches_{a}|{b}": m.astype(np.uint32) for (a, b), m in zip(pairs, matches, strict=True)
     }
-    np.savez(folder / GIVEN, allow_pickle=False, **points, **rows)
+    np.savez(folder / MATCHES_FILE, allow_pickle=False, **points, **rows)
 
 
-def need_room(folder: Path, said: str) -> None:
-    """OSError where the disk is full, or was when the worker wrote `said`. On a full
-    disk COLMAP may die without a word, or leave files cut short and not notice, so it
-    is asked whatever the worker's end was.
+def check_free_space(folder: Path, worker_errors: str) -> None:
+    """OSError where the disk is full, or was when the worker wrote `worker_errors`.
+
+    On a full disk COLMAP may die without a message, or cut files short and not notice,
+    so free space is tested however the worker ended.
     """
-    if any(words in said for words in ("No space left", "disk is full")):
+    if any(words in worker_errors for words in DISK_FULL_WORDS):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder.parent))
     with tempfile.TemporaryFile(dir=folder) as file:
-        file.write(bytes(ROOM))
+        file.write(bytes(MIN_FREE_BYTES))
         file.flush()
         os.fsync(file.fileno())
 
 
-def follow(lines: IO[str]) -> None:
+def show_progress(lines: IO[str]) -> None:
     """Show the worker's stages ("stage NAME TOTAL", then "tick" lines, then "end") as
     progress bars.
     """
@@ -136,8 +161,8 @@ def follow(lines: IO[str]) -> None:
                 pass
 
 
-def tell(*words: object) -> None:
-    """One line to the parent."""
+def send(*words: object) -> None:
+    """Send one line to the parent."""
     print(*words, flush=True)
 
 
@@ -157,23 +182,24 @@ def extract(job: Job, database: Path, threads: int) -> None:
     """Keypoints of all images into the database, one camera per group."""
     import pycolmap
 
-    enter(job, database)
-    if job.given:
-        return take_given(job, database)
+    import_images(job, database)
+    if job.matches_given:
+        load_matches(job, database)
+        return
+    folder = Path(job.folder)
     reading = pycolmap.ImageReaderOptions()
-    masks = Path(job.folder) / "masks"
-    if masks.is_dir():
-        reading.mask_path = str(masks)
+    if (folder / "masks").is_dir():
+        reading.mask_path = str(folder / "masks")
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.num_threads = threads
-    extraction.sift.max_num_features = 4096
-    tell("stage keypoints", sum(len(g) for g in job.groups))
+    extraction.sift.max_num_features = job.tuning.max_features
+    send("stage keypoints", sum(len(g) for g in job.groups))
     for group in job.groups:
-        for k in range(0, len(group), 6):
-            names = group[k : k + 6]
+        for k in range(0, len(group), EXTRACTION_BATCH):
+            names = group[k : k + EXTRACTION_BATCH]
             pycolmap.extract_features(
                 database,
-                Path(job.folder) / "images",
+                folder / "images",
                 names,
                 pycolmap.CameraMode.AUTO,
                 reading,
@@ -181,20 +207,22 @@ def extract(job: Job, database: Path, threads: int) -> None:
                 pycolmap.Device.cpu,
             )
             for _ in names:
-                tell("tick")
-    tell("end")
+                send("tick")
+    send("end")
 
 
-def enter(job: Job, database: Path) -> None:
+def import_images(job: Job, database: Path) -> None:
     """Images into the database, one camera per group with the first guess of its focal
-    length. In the order of the job, for threads that extract would number them as they
-    come, and structure from motion of another order is another.
+    length.
+
+    In the order of the job: threads that extract would number images as they come, and
+    structure from motion depends on their order.
     """
     import pycolmap
 
     reading = pycolmap.ImageReaderOptions()
     reading.camera_model = "SIMPLE_PINHOLE"
-    pycolmap.Database.open(database).close()  # makes it
+    pycolmap.Database.open(database).close()  # creates it
     for group in job.groups:
         pycolmap.import_images(
             database, Path(job.folder) / "images", pycolmap.CameraMode.SINGLE, group, reading
@@ -205,21 +233,23 @@ def enter(job: Job, database: Path) -> None:
             db.update_camera(camera)
 
 
-def take_given(job: Job, database: Path) -> None:
-    """The keypoints and matches that lie beside the job."""
+def load_matches(job: Job, database: Path) -> None:
+    """The keypoints and matches that `write_matches` wrote into the database."""
     import pycolmap
 
-    with np.load(Path(job.folder) / GIVEN) as given, pycolmap.Database.open(database) as db:
-        ids = {
-            name: image.image_id
-            for group in job.groups
-            for name in group
-            if (image := db.read_image_with_name(name)) is not None
-        }
-        for name, number in ids.items():
-            db.write_keypoints(number, given[f"points_{name}"])
+    with (
+        np.load(Path(job.folder) / MATCHES_FILE) as stored,
+        pycolmap.Database.open(database) as db,
+    ):
+        ids = {}
+        for name in (name for group in job.groups for name in group):
+            image = db.read_image_with_name(name)
+            if image is not None:
+                ids[name] = image.image_id
+        for name, image_id in ids.items():
+            db.write_keypoints(image_id, stored[f"points_{name}"])
         for a, b in job.pairs:
-            db.write_matches(ids[a], ids[b], given[f"matches_{a}|{b}"])
+            db.write_matches(ids[a], ids[b], stored[f"matches_{a}|{b}"])
 
 
 def match(job: Job, database: Path, threads: int) -> None:
@@ -231,22 +261,23 @@ def match(job: Job, database: Path, threads: int) -> None:
     pairing = pycolmap.ImportedPairingOptions()
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = 0
-    verification.ransac.max_error = 3.0
+    verification.ransac.max_error = job.tuning.max_epipolar_error_px
     verification.detect_watermark = False  # a still camera is not a watermark
-    step = -(-len(job.pairs) // CHUNKS)
-    tell("stage matches", -(-len(job.pairs) // step))
-    for k in range(0, len(job.pairs), step):
+    num_pairs = len(job.pairs)
+    step = -(-num_pairs // MATCHING_STEPS)
+    send("stage matches", -(-num_pairs // step))
+    for k in range(0, num_pairs, step):
         file = Path(job.folder) / "pairs.txt"
         file.write_text("".join(f"{a} {b}\n" for a, b in job.pairs[k : k + step]))
         pairing.match_list_path = str(file)
-        if job.given:
+        if job.matches_given:
             pycolmap.verify_matches(database, file, verification)
         else:
             pycolmap.match_image_pairs(
                 database, matching, pairing, verification, pycolmap.Device.cpu
             )
-        tell("tick")
-    tell("end")
+        send("tick")
+    send("end")
 
 
 def reconstruct(job: Job, database: Path, threads: int) -> None:
@@ -258,35 +289,35 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
     out = Path(job.folder) / job.mapping
     out.mkdir(exist_ok=True)
     images = Path(job.folder) / "images"
-    tell("stage mapping", sum(len(g) for g in job.groups))
+    send("stage mapping", sum(len(g) for g in job.groups))
     if job.mapping == "incremental":
         options = pycolmap.IncrementalPipelineOptions()
         options.num_threads = threads
         options.random_seed = 0
         options.extract_colors = False
-        options.max_num_models = 4
-        options.min_model_size = 3
+        options.max_num_models = job.tuning.max_models
+        options.min_model_size = job.tuning.min_model_images
         models = pycolmap.incremental_mapping(
-            database, images, out, options, next_image_callback=lambda: tell("tick")
+            database, images, out, options, next_image_callback=lambda: send("tick")
         )
     else:
-        whole = pycolmap.GlobalPipelineOptions()
-        whole.num_threads = threads
-        whole.random_seed = 0
+        global_options = pycolmap.GlobalPipelineOptions()
+        global_options.num_threads = threads
+        global_options.random_seed = 0
         pycolmap.calibrate_view_graph(database)
-        models = pycolmap.global_mapping(database, images, out, whole)
-    tell("end")
-    tell("stage adjustment", (ROUNDS + 1) * len(models))
+        models = pycolmap.global_mapping(database, images, out, global_options)
+    send("end")
+    send("stage adjustment", (job.tuning.trimming.max_rounds + 1) * len(models))
     for key, model in models.items():
-        trim(model, adjust)
+        trim(model, lambda m: adjust(m, job.tuning), job.tuning.trimming)
         (out / str(key)).mkdir(exist_ok=True)
         model.write_binary(out / str(key))
-    tell("end")
+    send("end")
 
 
-def adjust(model: Any) -> None:
-    """Fit cameras and points to each other, and focal lengths where that lowers the
-    error: a camera that slides without turning tells none.
+def adjust(model: Any, tuning: SfmTuning) -> None:
+    """Adjust cameras and points to each other, and focal lengths where that lowers the
+    error: a camera that slides without turning does not determine them.
     """
     import pycolmap
 
@@ -295,17 +326,18 @@ def adjust(model: Any) -> None:
     free = pycolmap.BundleAdjustmentOptions()
     free.print_summary = False
     pycolmap.bundle_adjustment(model, held)
-    before, error = {key: c.focal_length for key, c in model.cameras.items()}, mean_error(model)
+    focal_lengths = {key: camera.focal_length for key, camera in model.cameras.items()}
+    held_error = mean_error(model)
     pycolmap.bundle_adjustment(model, free)
-    if mean_error(model) > TOLD * error:
-        for key, focal in before.items():
+    if mean_error(model) > tuning.max_free_focal_error_share * held_error:
+        for key, focal in focal_lengths.items():
             model.cameras[key].focal_length = focal
         pycolmap.bundle_adjustment(model, held)
-    tell("tick")
+    send("tick")
 
 
 def mean_error(model: Any) -> float:
-    """Of all observations, in pixels."""
+    """The mean reprojection error of all observations, in pixels."""
     model.update_point_3d_errors()
     return float(model.compute_mean_reprojection_error())
 
@@ -315,13 +347,13 @@ def main() -> None:
     import zlib  # the system's zlib must be in place before pycolmap brings its own
 
     die_with_parent()
+    prepare_process()
     import pycolmap
 
     assert zlib and np
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     pycolmap.set_random_seed(0)
-    raw = json.loads(Path(sys.argv[1]).read_text())
-    job = Job(**raw)
+    job = read_job(Path(sys.argv[1]))
     threads = job.threads or os.cpu_count() or 1
     database = Path(job.folder) / "database.db"
     if not database.exists():

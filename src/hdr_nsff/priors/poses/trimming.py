@@ -1,12 +1,12 @@
-"""What stands still, told by structure from motion itself: trimmed least squares
-(Rousseeuw and Leroy 1987) over whole points.
+"""Static points separated from moving ones by structure from motion itself: trimmed
+least squares (Rousseeuw and Leroy 1987) over whole points.
 
 A cloth in the wind or a dancer who stays in place is matched from frame to frame as
 well as a wall is. Its points fit a rigid world worse, but where they are many they bend
 cameras and focal length until they fit better. So points whose error is far beyond that
-of the best ones are dropped and everything is adjusted anew, until nothing changes:
-each time the static ones fit better and the others worse. In the end what fits the
-cameras found that way comes back. Runs in the process of `sfm.py`, on a
+of the best ones are dropped and everything is adjusted again, until nothing changes:
+each time the static ones fit better and the others worse. In the end, dropped points
+that fit the cameras found that way are restored. Runs in the process of `sfm.py`, on a
 `pycolmap.Reconstruction`.
 """
 
@@ -14,92 +14,114 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-ROUNDS = 8
-BEST = 0.25  # share of all points that surely stand still
-BEYOND = 2.0  # times the error of the worst of those: dropped
-BACK = 3.0  # times the same, in the end: comes back
-NEEDED = 30  # points of an image; one that would keep fewer keeps all it has
+from hdr_nsff.geometry import pinhole
 
 
-def trim(model: Any, adjust: Callable[[Any], object]) -> None:
-    """Drop the points that do not stand still; `adjust` fits cameras and points of the
-    `model` to what is left.
+@dataclass(frozen=True)
+class TrimmingTuning:
+    """Which points are dropped, and which are restored.
+
+    Hand-chosen on a rendered clip of a cloth and a tube in the wind.
     """
-    before, dropped = len(model.points3D), []
-    for _ in range(ROUNDS if before else 0):
-        keys, noise = errors(model)
-        bad = misfits(model, keys, noise > BEYOND * best_of(noise, before))
-        dropped += [deepcopy(model.points3D[key].track) for key in bad]
-        for key in bad:
+
+    max_rounds: int = 8
+    static_share: float = 0.25  # share of all points that surely stand still
+    drop_factor: float = 2.0  # times the error of the worst of those: dropped
+    restore_factor: float = 3.0  # times the same, in the end: restored
+    min_image_points: int = 30  # an image that would keep fewer keeps all it has
+    min_dropped_share: float = 0.005  # share of all points: a round that drops fewer is the last
+
+
+def trim(
+    model: Any, adjust: Callable[[Any], object], tuning: TrimmingTuning = TrimmingTuning()
+) -> None:
+    """Drop the points that do not stand still, in place; `adjust` fits cameras and
+    points of the `model` to what is left.
+    """
+    num_points = len(model.points3D)
+    num_static = int(tuning.static_share * num_points)
+    dropped = []
+    for _ in range(tuning.max_rounds if num_points else 0):
+        keys, errors = point_errors(model)
+        is_outlier = errors > tuning.drop_factor * static_error(errors, num_static)
+        outliers = droppable_points(model, keys, is_outlier, tuning.min_image_points)
+        dropped += [deepcopy(model.points3D[key].track) for key in outliers]
+        for key in outliers:
             model.delete_point3D(key)
-        if len(bad) < 0.005 * before:
+        if len(outliers) < tuning.min_dropped_share * num_points:
             break
         adjust(model)
-    if dropped:
-        limit = BACK * best_of(errors(model)[1], before)
-        for track in dropped:
-            place, off = triangulated(model, track)
-            if off < limit:
-                model.add_point3D(place, track)
-        adjust(model)
+    if not dropped:
+        return
+    _, errors = point_errors(model)
+    limit = tuning.restore_factor * static_error(errors, num_static)
+    for track in dropped:
+        point, error = triangulate(model, track)
+        if error < limit:
+            model.add_point3D(point, track)
+    adjust(model)
 
 
-def errors(model: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Every point's key (P,) and its error (P,) in pixels, made up for the three
-    coordinates that were fitted to it.
-    """
+def point_errors(model: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The keys (P,) of all points, and their unbiased errors (P,) in pixels."""
     model.update_point_3d_errors()
     keys = np.array(sorted(model.points3D), np.int64)
-    points = [model.points3D[int(k)] for k in keys]
-    return keys, np.array([made_up(p.error, len(p.track.elements)) for p in points])
+    points = [model.points3D[int(key)] for key in keys]
+    return keys, np.array([unbiased_error(p.error, len(p.track.elements)) for p in points])
 
 
-def made_up(error: float, views: int) -> float:
-    """A mean reprojection error of `views` >= 2 views as it would be had the point not
-    been fitted to them.
+def unbiased_error(error: float, num_views: int) -> float:
+    """A mean reprojection error over `num_views` >= 2 views as it would be had the
+    point's three coordinates not been fitted to them.
     """
-    return error * float(np.sqrt(2 * views / (2 * views - 3)))
+    return error * float(np.sqrt(2 * num_views / (2 * num_views - 3)))
 
 
-def best_of(noise: np.ndarray, before: int) -> float:
-    """The error of the worst of the best points."""
-    return float(np.sort(noise)[min(int(BEST * before), len(noise) - 1)])
+def static_error(errors: np.ndarray, num_static: int) -> float:
+    """The highest of the `num_static` lowest point `errors` (P,)."""
+    return float(np.sort(errors)[min(num_static, len(errors) - 1)])
 
 
-def misfits(model: Any, keys: np.ndarray, bad: np.ndarray) -> list[int]:
-    """The `bad` (P,) ones of the points `keys` (P,), but for those that an image needs."""
+def droppable_points(
+    model: Any, keys: np.ndarray, is_outlier: np.ndarray, min_image_points: int
+) -> list[int]:
+    """Those of the points `keys` (P,) that are outliers (P,) bool, without those of
+    images that would keep fewer than `min_image_points`.
+    """
     row = {int(key): n for n, key in enumerate(keys)}
+    droppable = is_outlier.copy()
     for image in model.images.values():
         seen = [row[int(p.point3D_id)] for p in image.points2D if p.has_point3D()]
-        if np.sum(~bad[seen]) < NEEDED:
-            bad[seen] = False
-    return [int(k) for k in keys[bad]]
+        if np.sum(~droppable[seen]) < min_image_points:
+            droppable[seen] = False
+    return [int(key) for key in keys[droppable]]
 
 
-def triangulated(model: Any, track: Any) -> tuple[np.ndarray, float]:
-    """The point (3,) nearest to the rays of a `track`, and its error in pixels;
-    infinite behind a camera.
+def triangulate(model: Any, track: Any) -> tuple[np.ndarray, float]:
+    """The point (3,) nearest to the rays of a `track`, and its unbiased error in
+    pixels, infinite behind a camera.
     """
     images = [model.images[e.image_id] for e in track.elements]
-    seen = np.array(
+    pixels = np.array(
         [i.points2D[e.point2D_idx].xy for i, e in zip(images, track.elements, strict=True)]
     )
     K = np.array([model.cameras[i.camera_id].calibration_matrix() for i in images])
-    pose = np.array([i.cam_from_world().matrix() for i in images])  # (V, 3, 4)
-    turn, shift = pose[:, :, :3], pose[:, :, 3]
-    rays = np.einsum(
-        "vji,vjk,vk->vi", turn, np.linalg.inv(K), np.concatenate([seen, np.ones((len(seen), 1))], 1)
-    )
+    w2c = np.array([i.cam_from_world().matrix() for i in images])  # (V, 3, 4)
+    rotations = np.swapaxes(w2c[:, :, :3], 1, 2)
+    centers = -np.einsum("vij,vj->vi", rotations, w2c[:, :, 3])
+    c2w = np.concatenate([rotations, centers[:, :, None]], 2)
+    rays = np.einsum("vij,vj->vi", rotations, pinhole.camera_rays(pixels, K))
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    across = np.eye(3) - rays[:, :, None] * rays[:, None]  # what lies beside the ray
-    centers = -np.einsum("vji,vj->vi", turn, shift)
-    place = np.linalg.lstsq(across.sum(0), np.einsum("vij,vj->i", across, centers), rcond=None)[0]
-    local = turn @ place + shift
-    if (local[:, 2] <= 0).any():
-        return place, np.inf
-    found = np.einsum("vij,vj->vi", K, local / local[:, 2:])[:, :2]
-    return place, made_up(float(np.linalg.norm(found - seen, axis=1).mean()), len(seen))
+    across = np.eye(3) - rays[:, :, None] * rays[:, None]  # projects onto a ray's normal plane
+    right = np.einsum("vij,vj->i", across, centers)
+    point = np.linalg.lstsq(across.sum(0), right, rcond=None)[0]
+    projected, depth = pinhole.project(point, K, c2w)
+    if (depth <= 0).any():
+        return point, np.inf
+    error = float(np.linalg.norm(projected - pixels, axis=1).mean())
+    return point, unbiased_error(error, len(pixels))

@@ -1,4 +1,4 @@
-"""The synthetic scenes: each is hard in another way."""
+"""The synthetic scenes by name. Each is difficult in its own way."""
 
 from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.cloth import CLOTH

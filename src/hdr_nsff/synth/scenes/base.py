@@ -1,11 +1,11 @@
-"""What a synthetic scene is: parts on bodies, how the bodies move, what lights them,
-and the cameras that film them.
+"""A synthetic scene: parts on bodies, how the bodies move, what lights them, and the
+cameras that film them.
 
-World axes are OpenCV's (+x right, +y down, +z forward), meters; time is in frames. Body
-0 stands still. Of every other body the place of each point of its surface is known at
-any time: a rigid one by its pose, a deforming one by its mesh of that time and the
-point's triangle and barycentric coordinates. So depth and motion of what a picture
-shows are exact.
+World axes are OpenCV's (+x right, +y down, +z forward), in meters; time is in frames.
+Body 0 is static. Of every other body the place of each point of its surface is known at
+any time: of a rigid one by its pose, of a deforming one by its mesh at that time and
+the point's triangle and barycentric coordinates. So the depth and motion of a picture
+are exact.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 
 from hdr_nsff.synth.scenes.geometry import look_at
 
-STILL = "room"  # the body that stands still
+STATIC_BODY = "room"  # the body that never moves
 Views = Literal["mono", "rig"]
 
 
@@ -31,26 +31,24 @@ class Part:
     faces: np.ndarray  # (F, 3) counter-clockwise seen from outside
     uv: np.ndarray  # (V, 2) in [0, 1], v down the texture
     texture: np.ndarray  # (H, W, 3) albedo, radiance where it emits; (1, 1, 3) for one color
-    body: str = STILL
+    body: str = STATIC_BODY
     emits: bool = False
-    circuit: str | None = (
-        # lamps on one circuit are traced together: less time, and more noise where one
-        # outshines another
-        None
-    )
-    radius: float | None = (
-        # an exact sphere about the first vertex: lights of that shape are sampled
-        # without noise
-        None
-    )
+    circuit: str | None = None
+    """Lamps of one circuit are traced together: less time, and more noise where one
+    outshines another.
+    """
+    radius: float | None = None
+    """Of an exact sphere about the first vertex: lights of that shape are sampled
+    without noise.
+    """
 
 
 class Body(Protocol):
-    """Something that moves."""
+    """A moving body."""
 
     @property
     def name(self) -> str:
-        """How its parts refer to it."""
+        """The name by which its parts refer to it."""
         ...
 
     def vertices(self, part: Part, t: float) -> np.ndarray:
@@ -58,8 +56,8 @@ class Body(Protocol):
         ...
 
     def moved(self, points: np.ndarray, uv: np.ndarray, t: float, other: float) -> np.ndarray:
-        """Where its points (N, 3) of time `t`, with texture coordinates (N, 2), are at
-        time `other`, (N, 3).
+        """The places (N, 3) at time `other` of its points (N, 3) of time `t` with
+        texture coordinates (N, 2).
         """
         ...
 
@@ -72,12 +70,14 @@ class Rigid:
     pose: Callable[[float], np.ndarray]  # body to world, (4, 4), at a time in frames
 
     def vertices(self, part: Part, t: float) -> np.ndarray:
-        """Carried by the pose."""
+        """The part's vertices, transformed by the pose."""
         pose = self.pose(t)
         return part.vertices @ pose[:3, :3].T + pose[:3, 3]
 
     def moved(self, points: np.ndarray, uv: np.ndarray, t: float, other: float) -> np.ndarray:
-        """Carried from one pose to the other, whatever its texture coordinates."""
+        """Points transformed from one pose to the other; texture coordinates play no
+        part.
+        """
         carry = self.pose(other) @ np.linalg.inv(self.pose(t))
         return points @ carry[:3, :3].T + carry[:3, 3]
 
@@ -86,34 +86,36 @@ class Rigid:
 class Deforming:
     """A body of one part, a sheet of `rows` x `columns` cells (see `shapes.sheet`),
     that has another shape at every time.
+
+    `shape` gives world points (..., 3) of texture coordinates (..., 2) at a time in
+    frames.
     """
 
     name: str
-    shape: Callable[
-        [np.ndarray, float], np.ndarray
-    ]  # world points (..., 3) of texture coordinates (..., 2) at a time in frames
+    shape: Callable[[np.ndarray, float], np.ndarray]
     rows: int
     columns: int
 
     def vertices(self, part: Part, t: float) -> np.ndarray:
-        """The sheet's corners of cells."""
+        """The corners of the sheet's cells."""
         return self.shape(part.uv, t)
 
     def moved(self, points: np.ndarray, uv: np.ndarray, t: float, other: float) -> np.ndarray:
-        """Carried by the triangle they are on."""
-        return points + self.on_mesh(uv, other) - self.on_mesh(uv, t)
+        """Points moved along with the triangle they are on."""
+        return points + self.mesh_points(uv, other) - self.mesh_points(uv, t)
 
-    def on_mesh(self, uv: np.ndarray, t: float) -> np.ndarray:
+    def mesh_points(self, uv: np.ndarray, t: float) -> np.ndarray:
         """Points (N, 3) of the mesh of time `t` at texture coordinates (N, 2):
         barycentric in one of the two triangles of a cell.
         """
-        scaled = uv * [self.columns, self.rows]
-        cell = np.minimum(np.floor(scaled), [self.columns - 1, self.rows - 1])
+        cells = np.array([self.columns, self.rows])
+        scaled = uv * cells
+        cell = np.minimum(np.floor(scaled), cells - 1)
         across, down = (scaled - cell).T[..., None]
-        here, right, below, opposite = (
-            self.shape((cell + step) / [self.columns, self.rows], t)
-            for step in ([0, 0], [1, 0], [0, 1], [1, 1])
-        )
+        here = self.shape(cell / cells, t)
+        right = self.shape((cell + np.array([1, 0])) / cells, t)
+        below = self.shape((cell + np.array([0, 1])) / cells, t)
+        opposite = self.shape((cell + np.array([1, 1])) / cells, t)
         upper = here + across * (right - here) + down * (opposite - right)
         lower = here + down * (below - here) + across * (opposite - below)
         return np.where(across >= down, upper, lower)
@@ -123,55 +125,60 @@ class Deforming:
 class SynthScene:
     """A scene to be filmed."""
 
-    build: Callable[[int], list[Part]]  # every part, of a seed
-    bodies: tuple[Body, ...]  # what moves; body k of a picture is the k-th of these, counted from 1
-    camera_pose: Callable[
-        [float], np.ndarray
-    ]  # camera to world (3, 4) of the one moving camera, at a time in frames
-    rig: tuple[
-        tuple[float, float, float], ...
-    ]  # where the nine cameras of the rig stand, once around two rows
-    rig_target: tuple[float, float, float]  # what they are aimed at
+    build: Callable[[int], list[Part]]
+    """Every part, from a seed."""
+    bodies: tuple[Body, ...]
+    """The movers; body k of a picture is the k-th of these, counted from 1."""
+    camera_pose: Callable[[float], np.ndarray]
+    """Camera to world (3, 4) of the one moving camera, at a time in frames."""
+    rig: tuple[tuple[float, float, float], ...]
+    """The places of the rig's nine cameras, once around two rows."""
+    rig_target: tuple[float, float, float]
+    """The point that they are aimed at."""
     ev: str = "-4,-2,0"  # exposures that suit it
     spp: int = 128  # paths per pixel that suit it
-    truth_spp: int = 384  # the same of the held-out views
+    truth_spp: int = 384  # paths per pixel of the held-out views
     blur: float = 0.05  # meters of a surface over which bounced light is averaged
-    # radiance (H, W, 3) from all around: latitude down, longitude across
     sky: Callable[[], np.ndarray] | None = None
+    """Radiance (H, W, 3) from all around: latitude down, longitude across."""
 
     @property
     def deforms(self) -> bool:
-        """Whether something has another shape at every time."""
+        """Whether any body has another shape at every time."""
         return any(isinstance(body, Deforming) for body in self.bodies)
 
     def pose(self, views: Views, t: float) -> np.ndarray:
-        """Camera to world, (3, 4) OpenCV, of what records frame `t`: the moving camera,
-        or the rig's camera `t` modulo nine.
+        """Camera to world, (3, 4) OpenCV, of the camera that records frame `t`: the
+        moving one, or the rig's camera `t` modulo nine.
 
-        The rig's cameras are numbered around: whoever records next stands beside.
+        The rig's cameras are numbered around, so the next to record stands beside.
         """
         if views == "mono":
             return self.camera_pose(t)
-        return look_at(np.array(self.rig[round(t) % len(self.rig)]), np.array(self.rig_target))
+        eye = self.rig[round(t) % len(self.rig)]
+        return look_at(np.array(eye), np.array(self.rig_target))
 
     def index(self, body: str) -> int:
-        """The number of a body in pictures."""
-        return [STILL, *(b.name for b in self.bodies)].index(body)
+        """The number of a body in pictures; 0 is the static one."""
+        names = [STATIC_BODY, *(b.name for b in self.bodies)]
+        return names.index(body)
 
     def vertices(self, part: Part, t: float) -> np.ndarray:
         """World vertices (V, 3) of a part at time `t`."""
         index = self.index(part.body)
-        return self.bodies[index - 1].vertices(part, t) if index else part.vertices
+        if index == 0:
+            return part.vertices
+        return self.bodies[index - 1].vertices(part, t)
 
     def moved(
         self, points: np.ndarray, bodies: np.ndarray, uv: np.ndarray, t: float, other: float
     ) -> np.ndarray:
-        """Where world points (..., 3) on `bodies` (...), with texture coordinates (...,
-        2), at time `t` are at time `other`.
+        """The places (..., 3) at time `other` of world points (..., 3) of time `t`, on
+        `bodies` (...) int at texture coordinates (..., 2).
         """
         result = points.copy()
         for index, body in enumerate(self.bodies, 1):
-            mine = bodies == index
-            if mine.any():
-                result[mine] = body.moved(points[mine], uv[mine], t, other)
+            on_body = bodies == index
+            if on_body.any():
+                result[on_body] = body.moved(points[on_body], uv[on_body], t, other)
         return result

@@ -6,11 +6,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from hdr_nsff.geometry import pinhole
+
+FIELD_OF_VIEW = np.radians(57)  # across the picture, of every camera (hand-chosen)
+
 
 def intrinsics(width: int, height: int) -> np.ndarray:
     """K (3, 3) in pixels of a camera that sees 57 degrees across."""
-    focal = width / 2 / np.tan(np.radians(57 / 2))
-    return np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    focal = width / 2 / np.tan(FIELD_OF_VIEW / 2)
+    return pinhole.intrinsics(focal, width, height)
 
 
 def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -20,26 +24,34 @@ def look_at(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     z = (target - eye) / np.linalg.norm(target - eye)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z, eye], 1)
+    y = np.cross(z, x)
+    return np.stack([x, y, z, eye], 1)
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
-    """Rotation matrix (3, 3) by Rodrigues' formula."""
+    """Rotation matrix (3, 3) about `axis` by `angle` radians (Rodrigues' formula)."""
     x, y, z = axis / np.linalg.norm(axis)
     k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
+def pixel_centers(height: int, width: int) -> np.ndarray:
+    """Coordinates (H, W, 2) px of the pixels' centers."""
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return np.stack([x, y], -1)
+
+
+def ray_directions(height: int, width: int, K: np.ndarray) -> np.ndarray:
+    """Directions (H, W, 3) through the pixels' centers in the camera's axes, z = 1."""
+    x, y = np.moveaxis(pixel_centers(height, width), -1, 0)
+    return np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+
+
 def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (..., 2), centers at +0.5, and z-depth (...) of world points (..., 3)."""
-    local = (points - c2w[:, 3]) @ c2w[:, :3]
-    depth = local[..., 2]
-    return local[..., :2] / depth[..., None] * K[[0, 1], [0, 1]] + K[:2, 2], depth
+    return pinhole.project(points, K, c2w)
 
 
 def back_project(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
-    """World points (H, W, 3) at z-depth (H, W) on the rays through the pixel centers."""
-    height, width = depth.shape
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
-    return c2w[:, 3] + depth[..., None] * (rays @ c2w[:, :3].T)
+    """World points (H, W, 3) at z-depth (H, W) behind the pixel centers."""
+    return pinhole.unproject(pinhole.pixel_centers(*depth.shape), depth, K, c2w)

@@ -1,24 +1,28 @@
 """An alley at night: a car turns round with its head lights on, somebody walks by with
-a lantern, a lamp swings on a cable. Hard: small, very bright lights that move and carry
-the light on everything else with them, deep shadow, more than five decades of radiance.
+a lantern, a lamp swings on a cable. Difficult: small, very bright lights move, and with
+them the light on everything else; deep shadow; more than five decades of radiance.
 """
 
 from __future__ import annotations
 
+import itertools
 from functools import partial
 
 import numpy as np
 
-from hdr_nsff.synth import textures as textures
+from hdr_nsff.synth import textures
 from hdr_nsff.synth.scenes.base import Part, Rigid, SynthScene
 from hdr_nsff.synth.scenes.geometry import look_at, rotation
 from hdr_nsff.synth.scenes.shapes import Builder, cylinder, revolved, room, sphere
 
-LEFT, RIGHT, TOP, FLOOR, FRONT, BACK = -3.3, 3.3, -5.5, 1.5, -4.0, 12.5
+# Places and lengths in meters, periods in frames, all chosen by eye. The alley:
+LEFT, RIGHT = -3.3, 3.3
+TOP, FLOOR = -5.5, 1.5
+FRONT, BACK = -4.0, 12.5
 CABLE = np.array([0.9, -2.9, 6.4])  # where the swinging lamp hangs from
 DROP = 1.9  # meters from there to the lamp
 DIM = "dim lights"
-BLACK = np.full((1, 1, 3), 0.02)  # close to lamps: what is lit so brightly would sparkle
+BLACK = np.full((1, 1, 3), 0.02)  # close to lamps, where a brighter albedo would sparkle
 HAND = np.array([0.44, -1.02, -0.12])  # of the walker, above the ground
 
 
@@ -36,11 +40,10 @@ def walker_pose(t: float) -> np.ndarray:
     """The walker crosses the alley and comes back, rocking."""
     pose = np.eye(4)
     pose[:3, :3] = rotation(np.array([0.0, 0.3, 1.0]), 0.05 * np.sin(0.9 * t))
-    pose[:3, 3] = [
-        -0.15 + 1.2 * np.sin(2 * np.pi * (t - 17) / 80),
-        FLOOR - 0.04 * abs(np.sin(0.45 * t)),
-        4.1 + 0.3 * np.cos(0.07 * t),
-    ]
+    x = -0.15 + 1.2 * np.sin(2 * np.pi * (t - 17) / 80)
+    y = FLOOR - 0.04 * abs(np.sin(0.45 * t))
+    z = 4.1 + 0.3 * np.cos(0.07 * t)
+    pose[:3, 3] = [x, y, z]
     return pose
 
 
@@ -55,9 +58,8 @@ def lantern_pose(t: float) -> np.ndarray:
 def bulb_pose(t: float) -> np.ndarray:
     """The lamp swings in the wind on its cable."""
     pose = np.eye(4)
-    pose[:3, :3] = rotation(
-        np.array([0.45, 0.0, 1.0]), np.radians(20.0) * np.sin(2 * np.pi * (t + 3) / 27)
-    )
+    swing = np.radians(20.0) * np.sin(2 * np.pi * (t + 3) / 27)
+    pose[:3, :3] = rotation(np.array([0.45, 0.0, 1.0]), swing)
     pose[:3, 3] = CABLE
     return pose
 
@@ -68,14 +70,9 @@ def camera_pose(t: float) -> np.ndarray:
     """
     a = 2 * np.pi * t / 29 + 0.9
     shake = 0.016 * np.array([np.sin(1.8 * t), np.sin(1.3 * t + 1), np.sin(1.1 * t + 2)])
-    eye = (
-        np.array([0.62 * np.sin(a), -0.05 + 0.24 * np.sin(2 * a + 0.3), 0.3 * np.cos(0.8 * a)])
-        + shake
-    )
-    return look_at(
-        eye,
-        np.array([0.15 * np.sin(0.6 * a), 0.12 + 0.08 * np.sin(0.9 * a), 6.0]) + 1.5 * shake[::-1],
-    )
+    eye = [0.62 * np.sin(a), -0.05 + 0.24 * np.sin(2 * a + 0.3), 0.3 * np.cos(0.8 * a)]
+    target = [0.15 * np.sin(0.6 * a), 0.12 + 0.08 * np.sin(0.9 * a), 6.0]
+    return look_at(np.array(eye) + shake, np.array(target) + 1.5 * shake[::-1])
 
 
 def build(seed: int) -> list[Part]:
@@ -91,9 +88,8 @@ def build(seed: int) -> list[Part]:
 
 def houses(b: Builder) -> None:
     """Cobbles, and fronts of houses with doors, posters and a dark gateway."""
-    b.panel(
-        (LEFT, FLOOR, FRONT), (RIGHT - LEFT, 0, 0), (0, 0, BACK - FRONT), textures.tiles, rows=44
-    )
+    width, depth = RIGHT - LEFT, BACK - FRONT
+    b.panel((LEFT, FLOOR, FRONT), (width, 0, 0), (0, 0, depth), textures.tiles, rows=44)
     bricks = partial(textures.bricks, rows=36)
     room(b, (LEFT, RIGHT, TOP, FLOOR, FRONT, BACK), ceiling=None, sides=bricks, back=bricks)
     for x, y, w, h in [
@@ -129,9 +125,8 @@ def clutter(b: Builder) -> None:
     b.block((0.5, 0.45, 0.5), (-2.2, FLOOR - 0.92, 4.6), textures.planks, turn=-10)
     for x, z in [(2.0, 3.7), (-2.6, 6.2), (1.6, 11.4)]:
         b.add(cylinder(0.33, 0.95), textures.planks(96, 160, b.rng, rows=6), (x, FLOOR - 0.475, z))
-    b.add(
-        cylinder(0.06, 3.9), textures.tiles(320, 40, b.rng, rows=32), (-1.5, FLOOR - 1.95, 5.6)
-    )  # the street lamp's post
+    post = textures.tiles(320, 40, b.rng, rows=32)  # of the street lamp
+    b.add(cylinder(0.06, 3.9), post, (-1.5, FLOOR - 1.95, 5.6))
     b.add(cylinder(0.05, 1.0), textures.tiles(120, 40, b.rng, rows=12), (1.45, FLOOR - 0.5, 2.9))
     b.add(cylinder(0.05, 1.0), textures.tiles(120, 40, b.rng, rows=12), (-1.5, FLOOR - 0.5, 2.7))
 
@@ -140,39 +135,26 @@ def car(b: Builder) -> None:
     """A boxy car; its head lights shine from hoods, so that they are two beams."""
     b.block((1.6, 0.55, 3.3), (0, -0.55, 0), textures.poster, body="car", paper=0.35)
     b.block((1.4, 0.5, 1.7), (0, -1.07, 0.2), textures.books, body="car")
-    for x in (-0.72, 0.72):
-        for z in (-1.05, 1.05):
-            vertices, faces, uv = sphere(0.32, 16)
-            b.add(
-                (vertices * [0.4, 1, 1], faces, uv),
-                textures.tiles(48, 96, b.rng, rows=6),
-                (x, -0.32, z),
-                body="car",
-            )
+    vertices, faces, uv = sphere(0.32, 16)
+    wheel = (vertices * [0.4, 1, 1], faces, uv)
+    for x, z in itertools.product((-0.72, 0.72), (-1.05, 1.05)):
+        b.add(wheel, textures.tiles(48, 96, b.rng, rows=6), (x, -0.32, z), body="car")
+    vertices, faces, uv = revolved(np.array([[0.11, -0.19], [0.11, 0.0], [0.01, 0.0]]))
+    hood = (vertices[:, [0, 2, 1]], faces, uv)
     for x in (-0.58, 0.58):
-        hood, faces, uv = revolved(np.array([[0.11, -0.19], [0.11, 0.0], [0.01, 0.0]]))
-        b.add((hood[:, [0, 2, 1]], faces, uv), BLACK, (x, -0.56, -1.65), body="car")
+        b.add(hood, BLACK, (x, -0.56, -1.65), body="car")
         b.bulb((x, -0.56, -1.74), 0.07, np.array([1800.0, 1740.0, 1560.0]), body="car")
 
 
 def walker(b: Builder) -> None:
     """A wide coat, a head with a hat, an arm and the lantern."""
-    coat = np.array(
-        [
-            [0.01, -1.42],
-            [0.2, -1.36],
-            [0.27, -1.1],
-            [0.25, -0.75],
-            [0.36, -0.15],
-            [0.34, 0.0],
-            [0.01, 0.0],
-        ]
-    )
-    b.add(revolved(coat), textures.poster(160, 240, b.rng, figures=90), body="walker")
+    radii = [0.01, 0.2, 0.27, 0.25, 0.36, 0.34, 0.01]
+    heights = [-1.42, -1.36, -1.1, -0.75, -0.15, 0.0, 0.0]
+    coat = revolved(np.column_stack([radii, heights]))
+    b.add(coat, textures.poster(160, 240, b.rng, figures=90), body="walker")
     b.add(sphere(0.14), textures.plaster(60, 120, b.rng, base=0.6), (0, -1.55, 0), body="walker")
-    b.add(
-        cylinder(0.24, 0.05), textures.planks(32, 96, b.rng, rows=4), (0, -1.66, 0), body="walker"
-    )
+    hat = textures.planks(32, 96, b.rng, rows=4)
+    b.add(cylinder(0.24, 0.05), hat, (0, -1.66, 0), body="walker")
     b.block((0.42, 0.1, 0.1), (0.24, -1.1, -0.1), textures.poster, body="walker")
     b.add(cylinder(0.008, 0.24), BLACK, (0, 0.12, 0), body="lantern")
     for y in (0.24, 0.46):
@@ -182,7 +164,8 @@ def walker(b: Builder) -> None:
 
 def lights(b: Builder) -> None:
     """The lamp on the cable, a street lamp, a sign, lit windows, and hardly any sky."""
-    b.add(cylinder(0.01, DROP - 0.06), BLACK, (0, (DROP - 0.06) / 2, 0), body="bulb")
+    cable = DROP - 0.06
+    b.add(cylinder(0.01, cable), BLACK, (0, cable / 2, 0), body="bulb")
     b.add(cylinder(0.16, 0.05), BLACK, (0, DROP - 0.1, 0), body="bulb")
     b.bulb((0, DROP, 0), 0.06, np.array([750.0, 670.0, 500.0]), body="bulb")
     b.block((6.6, 0.02, 0.02), CABLE - [CABLE[0], 0.01, 0], textures.planks, rows=4)
@@ -191,13 +174,8 @@ def lights(b: Builder) -> None:
     b.light((RIGHT - 0.1, -1.9, 7.0), (0, 0, 1.1), (0, 0.55, 0), sign, DIM)
     window = textures.books(64, 48, b.rng) * np.array([3.0, 2.0, 0.9], np.float32)
     b.light((-2.35, -2.3, BACK - 0.04), (0, 1.1, 0), (0.8, 0, 0), window, DIM)
-    b.light(
-        (LEFT, TOP + 0.01, FRONT),
-        (0, 0, BACK - FRONT),
-        (RIGHT - LEFT, 0, 0),
-        np.full((1, 1, 3), 0.004) * [0.6, 0.8, 1.5],
-        DIM,
-    )
+    sky = np.full((1, 1, 3), 0.004) * [0.6, 0.8, 1.5]
+    b.light((LEFT, TOP + 0.01, FRONT), (0, 0, BACK - FRONT), (RIGHT - LEFT, 0, 0), sky, DIM)
 
 
 NIGHT = SynthScene(

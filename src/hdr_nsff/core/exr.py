@@ -1,0 +1,109 @@
+"""OpenEXR: linear maps of any range, channel by channel, float32 in memory.
+
+Reading checks and refuses in one sentence (`InputError`); writing never clamps. RGB is
+in Rec. 709 primaries with the white point D65 unless the header says otherwise.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import atomic
+from hdr_nsff.core.picture_size import check_size
+
+# Names of motion channels: to the next frame or time, to the one before.
+SIDES = {1: "forward", -1: "backward"}
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # chromaticities of R, G, B and white
+
+
+def write_exr(
+    path: Path | str,
+    channels: dict[str, np.ndarray],
+    header: dict[str, Any] | None = None,
+    half: bool = True,
+) -> None:
+    """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped.
+
+    NaN and Inf are an error. With `half`, channels take 16 bits, but depth `Z` and
+    radiance beyond 65504 keep 32. Header defaults: ZIP compression, Rec. 709
+    chromaticities. Extra keys (str, float) become attributes.
+    """
+    arrays = {}
+    for name, array in channels.items():
+        assert np.isfinite(array).all(), f"{path}: channel {name} holds NaN or Inf"
+        arrays[name] = to_pixels(array, half and name != "Z")
+    full = {
+        "compression": OpenEXR.ZIP_COMPRESSION,
+        "type": OpenEXR.scanlineimage,
+        "chromaticities": REC709,
+        **(header or {}),
+    }
+    with atomic(path) as temporary, OpenEXR.File(full, arrays) as file:
+        file.write(str(temporary))
+
+
+def to_pixels(array: np.ndarray, half: bool) -> np.ndarray:
+    """An array as float16 where asked for and where every value fits, else float32.
+
+    Contiguous, because OpenEXR writes wrong pixels for anything else.
+    """
+    if half:
+        with np.errstate(over="ignore"):
+            small = np.ascontiguousarray(array, dtype=np.float16)
+        if not np.isinf(small).any():
+            return small
+    return np.ascontiguousarray(array, dtype=np.float32)
+
+
+@contextmanager
+def quiet_stderr() -> Iterator[None]:
+    """Keeps what the C library prints to stderr away from the terminal.
+
+    The error that it raises names the same problem.
+    """
+    with open(os.devnull, "wb") as nowhere:
+        stderr = os.dup(2)
+        os.dup2(nowhere.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
+def read_exr(path: Path | str) -> dict[str, np.ndarray]:
+    """Channels of an EXR as float32: {"RGB": (H, W, 3)}, {name: (H, W)} for the others.
+
+    InputError for a file cut short, NaN or Inf.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; put it back or correct the name")
+    try:
+        with quiet_stderr(), OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = file.header()["dataWindow"]
+        check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
+        with quiet_stderr(), OpenEXR.File(str(path)) as file:
+            if not file.parts:
+                raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")
+            channels = {n: np.array(c.pixels, dtype=np.float32) for n, c in file.channels().items()}
+    except InputError:
+        raise
+    except Exception as error:  # OpenEXR raises several unrelated types
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{path}: not a readable EXR ({reason}); copy it again") from error
+    if "RGB" not in channels and "RGBA" in channels:
+        channels["RGB"] = np.ascontiguousarray(channels["RGBA"][..., :3])
+    for name, array in channels.items():
+        if not np.isfinite(array).all():
+            advice = "correct it in the program that wrote it"
+            raise InputError(f"{path}: channel {name} holds NaN or Inf; {advice}")
+    return channels

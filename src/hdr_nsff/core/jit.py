@@ -1,0 +1,61 @@
+"""Compilation of the numeric kernels by numba, with a cache on disk where one can be
+written.
+
+numba keeps compiled code in `__pycache__` beside the source, in the user's cache folder
+or in NUMBA_CACHE_DIR. Where none of them is writable (a read-only installation without
+a home, as in many containers) numba refuses to compile at all. The decorator here then
+compiles without a cache, which costs about a minute at every start.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numba
+
+from hdr_nsff.core.progress import say
+
+
+def jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: compile a function by `numba.njit` with these options, such as
+    `parallel`, `nogil`, `fastmath`, and keep the machine code on disk.
+
+    Functions with `inline="always"` become part of their callers and are not cached.
+    """
+
+    def decorate(function: Callable[..., Any]) -> Any:
+        if options.get("inline") == "always":
+            return numba.njit(**options)(function)
+        try:
+            return numba.njit(cache=True, **options)(function)
+        except RuntimeError as error:
+            if "cannot cache function" not in str(error):
+                raise
+            report_missing_cache()
+            return numba.njit(**options)(function)
+
+    return decorate
+
+
+@cache
+def report_missing_cache() -> None:
+    """Say once that kernels are compiled at every start, and how to change that."""
+    say(
+        "compiling without a cache (no writable folder for numba's); "
+        "set NUMBA_CACHE_DIR to a writable folder"
+    )
+
+
+def cache_is_writable() -> bool:
+    """Whether numba finds a folder for the machine code of this package's kernels."""
+
+    def kernel() -> int:
+        return 0
+
+    try:
+        numba.njit(cache=True)(kernel)  # looks for the folder, compiles nothing
+    except RuntimeError:
+        return False
+    return True

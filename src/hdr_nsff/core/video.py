@@ -1,0 +1,152 @@
+"""Video: frames in and out through PyAV, which is imported when it is needed.
+
+Frames are rgb (H, W, 3) in [0, 1]. Reading checks and refuses in one sentence
+(`InputError`); writing is atomic, H.264 with Rec. 709 tags.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import atomic
+from hdr_nsff.core.picture_size import check_size
+
+DEFAULT_FPS = 24.0  # where a video's header names no rate
+REC709_TAG = 1  # the code of Rec. 709 in H.264's color description, all four fields
+
+
+def write_video(
+    path: Path | str,
+    frames: Iterable[np.ndarray],
+    fps: float = DEFAULT_FPS,
+    crf: int = 16,
+    footage: bool = False,
+) -> int:
+    """Write rgb frames (H, W, 3) in [0, 1] as H.264 MP4, atomically; their number.
+
+    8 bits, Rec. 709 tags, fast start. `footage` keeps the color of every pixel (4:4:4)
+    and the grain: for video to be measured, browsers do not play it. Odd sizes lose
+    their last row or column (4:2:0 needs even ones), so pictures have at least 2 pixels
+    a side.
+    """
+    import av
+
+    count = 0
+    pixels = "yuv444p" if footage else "yuv420p"
+    options = {"crf": str(crf)}
+    if footage:
+        options |= {"tune": "grain", "preset": "slow"}
+    with (
+        atomic(path) as temporary,
+        av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container,
+    ):
+        stream: Any = None
+        for frame in frames:
+            height = frame.shape[0] // 2 * 2
+            width = frame.shape[1] // 2 * 2
+            if stream is None:
+                rate = Fraction(fps).limit_denominator(1001)
+                stream = container.add_stream("libx264", rate=rate, options=options)
+                stream.width, stream.height = width, height
+                stream.pix_fmt = pixels
+                tag_rec709(stream.codec_context)
+            data = np.rint(np.clip(frame[:height, :width], 0, 1) * 255).astype(np.uint8)
+            rgb = av.VideoFrame.from_ndarray(np.ascontiguousarray(data), format="rgb24")
+            picture = rgb.reformat(format=pixels, dst_colorspace="ITU709", dst_color_range="MPEG")
+            tag_rec709(picture)
+            container.mux(stream.encode(picture))
+            count += 1
+        if stream is None:
+            raise InputError(f"{path}: no frames to write")
+        container.mux(stream.encode())
+    return count
+
+
+def tag_rec709(target: Any) -> None:
+    """Rec. 709 color tags on a codec context or a frame (players guess otherwise)."""
+    target.colorspace = REC709_TAG
+    target.color_range = REC709_TAG
+    target.color_primaries = REC709_TAG
+    target.color_trc = REC709_TAG
+
+
+def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
+    """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
+
+    Rotated as the file says. InputError where nothing can be decoded.
+    """
+    import av
+
+    path = Path(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: no video stream in this file")
+            for frame in container.decode(video=0):
+                deep = frame.format.components[0].bits > 8
+                array = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+                turned = np.rot90(array, round(frame.rotation / 90))
+                top = np.float32(65535 if deep else 255)
+                yield turned.astype(np.float32) / top, float(frame.time or 0.0)
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
+        raise unreadable(path, error) from error
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video's header says."""
+
+    frames: int  # 0: unknown
+    fps: float
+    seconds: float  # of the picture; 0: unknown
+
+
+def video_info(path: Path | str) -> VideoInfo:
+    """The header of a video. InputError where the file is no video or cut short."""
+    import av
+
+    path = Path(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: no video stream in this file")
+            stream = container.streams.video[0]
+            codec = stream.codec_context
+            if codec is None:
+                raise InputError(f"{path}: a video in an unknown format; convert it to H.264")
+            check_size(path, codec.width, codec.height)
+            end = max((entry.pos + entry.size for entry in stream.index_entries), default=0)
+            if end > path.stat().st_size:  # decoders stop at the cut without a word
+                raise InputError(f"{path}: the video is cut short; copy it again")
+            seconds = duration_of(container, stream)
+            return VideoInfo(stream.frames, float(stream.average_rate or DEFAULT_FPS), seconds)
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
+        raise unreadable(path, error) from error
+
+
+def duration_of(container: Any, stream: Any) -> float:
+    """Seconds of the picture; 0 where the file does not say."""
+    if (
+        stream.duration
+        and stream.time_base
+        and (found := float(stream.duration * stream.time_base))
+    ):
+        return found
+    alone = len(container.streams) == 1  # else the sound may be what lasts longest
+    if alone and container.duration:
+        return container.duration / 1e6
+    return 0.0
+
+
+def unreadable(path: Path, error: Exception) -> InputError:
+    """The sentence for a file that PyAV cannot read."""
+    reason = getattr(error, "strerror", None) or type(error).__name__
+    problem = f"not a readable video, or cut short ({reason})"
+    return InputError(f"{path}: {problem}; check that it plays, or copy it again")

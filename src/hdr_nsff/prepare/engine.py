@@ -1,0 +1,156 @@
+"""The engine of `prepare`: does each step that is not done, and stores what it found.
+
+A step is a function from what the folder holds so far (`Work`) to a `StepResult`. Its key
+is a hash of its settings, of the files these name, of the weights of the networks it
+asks, and of the steps before it. A finished step with the same key is skipped; one with
+another key starts over, and with it whatever builds on it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, is_dataclass
+from pathlib import Path
+from typing import Any
+
+from hdr_nsff.core.progress import say
+from hdr_nsff.footage import ingest
+from hdr_nsff.footage.datasets.capture import Picture
+from hdr_nsff.prepare.result import StepResult, store
+from hdr_nsff.prepare.steps.neural import weights_of
+from hdr_nsff.prepare.work import StepName, Work
+from hdr_nsff.scene.manifest import Manifest, Split, StepRecord
+
+
+@dataclass(frozen=True)
+class Step:
+    """What a step does, builds on and leaves in the folder."""
+
+    run: Callable[[Work], StepResult]
+    needs: tuple[StepName, ...] = ()
+    settings: tuple[str, ...] = ()  # fields of `PrepareConfig`; a path counts by contents
+    outputs: tuple[str, ...] = ()  # folders and files it owns
+    # whether the manifest names all it should
+    complete: Callable[[Manifest], bool] = field(default=lambda m: True)
+    forgets: tuple[str, ...] = ()  # cached properties of `Work` that it changes
+
+
+def run_step(work: Work, name: StepName, step: Step) -> None:
+    """Do one step, or skip it where it is done."""
+    records = work.manifest.steps
+    key = step_key(work, name, step)
+    record = records.get(name)
+    if record is None or record.key != key or name in work.config.redo:
+        for output in step.outputs:
+            remove(work.folder / output)
+        attempt = record.details.get("attempt", 0) + 1 if record else 1
+        record = StepRecord(key=key, details={"attempt": attempt})
+    elif record.done and step.complete(work.manifest) and present(work, step):
+        return
+    records[name] = record.model_copy(update={"done": False})
+    work.save()
+    start = time.monotonic()
+    result = step.run(work)
+    store(work.folder, work.manifest, result)
+    records[name] = StepRecord(
+        done=True,
+        key=key,
+        provenance=result.provenance,
+        note=result.note,
+        seconds=round(time.monotonic() - start, 2),
+        details={**record.details, **result.details},
+    )
+    work.save()
+    work.forget(step.forgets)
+    say(f"{name}: {result.note}")
+
+
+def step_key(work: Work, name: StepName, step: Step) -> str:
+    """The hash of everything a step depends on: its settings, the files they name, the
+    weights of its networks, the steps before it and how often those were redone.
+    """
+    settings: dict[str, Any] = {}
+    for setting in step.settings:
+        value = getattr(work.config, setting)
+        if (name, setting) == ("poses", "masks") and isinstance(value, str) and not work.capture:
+            value = None  # which network outlines the masks later does not affect poses
+        if isinstance(value, Path):
+            value = hash_of(value)
+        elif is_dataclass(value) and not isinstance(value, type):
+            value = asdict(value)
+        settings[setting] = value
+    records = work.manifest.steps
+    before = [(n, records[n].key, records[n].details.get("attempt")) for n in step.needs]
+    inputs = work.manifest.inputs if name == "frames" else {}
+    from_capture = [capture_part(work, name)] if work.capture is not None else []
+    parts = [settings, before, inputs, *from_capture, *weights_of(work.config, name)]
+    return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def capture_part(work: Work, name: StepName) -> Any:
+    """What of a data set a step depends on: its values, and the hashes of its files."""
+    capture = work.capture
+    assert capture is not None
+    pictures = capture.pictures
+
+    def files(of: Callable[[Picture], Path | None]) -> list[str | None]:
+        paths = [of(p) for p in pictures]
+        return [None if path is None else ingest.hash_file(path) for path in paths]
+
+    match name:
+        case "frames":
+            return [(p.source, p.time, p.camera_id) for p in pictures]
+        case "exposure":
+            known = asdict(capture.exposures) if capture.exposures else None
+            return [capture.withheld, known, [(p.ev, p.bracket) for p in pictures]]
+        case "flow" if work.gives("flow"):
+            named = [sorted(p.flow.items()) for p in pictures]
+            return [[(to, ingest.hash_file(path)) for to, path in each] for each in named]
+        case "poses" if work.gives("poses") and (given := capture.poses) is not None:
+            points = None if capture.points is None else capture.points.tolist()
+            cameras = [given.K.tolist(), given.c2w.tolist(), given.size.tolist()]
+            return [*cameras, given.near, given.far, points]
+        case "masks" if work.gives("masks"):
+            return [capture.still, capture.white_moves, files(lambda p: p.mask)]
+        case "static_depth" if work.gives("depth"):
+            maps = [files(lambda p: p.depth), files(lambda p: p.confidence)]
+            return [capture.depth_kind, capture.depth_units, *maps]
+    return None
+
+
+def hash_of(path: Path) -> str:
+    """The hash of a file, or of all files in a folder."""
+    if path.is_file():
+        return ingest.hash_file(path)
+    files = sorted(p for p in path.rglob("*") if p.is_file())
+    listing = [(p.relative_to(path).as_posix(), ingest.hash_file(p)) for p in files]
+    return hashlib.sha256(json.dumps(listing).encode()).hexdigest()
+
+
+def remove(path: Path) -> None:
+    """Delete a file or folder, if it is there."""
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def present(work: Work, step: Step) -> bool:
+    """Whether every file that the step owns and the manifest names is there."""
+    names = [*work.manifest.file_names(), "contact_sheet.png"]
+    owned = [name for name in names if name.split("/")[0] in step.outputs]
+    return all((work.folder / name).is_file() for name in owned)
+
+
+def all_have(entry_field: str, split: Split | None = None) -> Callable[[Manifest], bool]:
+    """Whether every frame (of `split`) has `entry_field`."""
+
+    def complete(m: Manifest) -> bool:
+        frames = [f for f in m.frames if split in (None, f.split)]
+        return bool(frames) and all(getattr(f, entry_field) for f in frames)
+
+    return complete

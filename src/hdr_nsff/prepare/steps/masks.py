@@ -1,0 +1,97 @@
+"""The step `masks`: which pixels of each frame move by themselves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import read_mask
+from hdr_nsff.footage import ingest
+from hdr_nsff.footage.datasets import maps
+from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.steps.neural import sam2_masks
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.masks.geometric import geometric_mask
+
+
+def find_masks(work: Work) -> StepResult:
+    """Moving masks, given or estimated.
+
+    Training frames are judged by flow among training frames alone; held-out ones by all.
+    """
+    m, c = work.manifest, work.config
+    given = isinstance(c.masks, Path) or work.gives("masks") is not None
+    if given:
+        moving = given_masks(work)
+    else:
+        moving = estimated_masks(work)
+        if c.masks == "sam2":
+            moving = sam2_masks(work, moving)
+    return StepResult(
+        provenance="given" if given else "estimated",
+        note=f"{moving.mean():.1%} of the pixels move",
+        details={"source": "given" if given else c.masks or "motion"},
+        maps={"mask": {f.index: mask for f, mask in zip(m.frames, moving, strict=True)}},
+    )
+
+
+def estimated_masks(work: Work) -> np.ndarray:
+    """Moving masks (T, H, W) from flow and poses."""
+    found, valid, pairs = work.raw_flows
+    video, (K, c2w) = work.equalized[0], work.cameras()
+    train = np.array([f.split == "train" for f in work.manifest.frames])
+    among = train[pairs].all(1)
+    moving = geometric_mask(found[among], valid[among], pairs[among], video, K, c2w)
+    if not train.all():
+        moving[~train] = geometric_mask(found, valid, pairs, video, K, c2w)[~train]
+    return moving
+
+
+def given_masks(work: Work) -> np.ndarray:
+    """The moving masks (T, H, W) of a data set, or the user's, one file per frame in
+    order; InputError where one is missing or of another size.
+    """
+    m, folder, capture = work.manifest, work.config.masks, work.gives("masks")
+    size = (m.height, m.width)
+    masks = []
+    if capture is not None:
+        for f in m.frames:
+            path = work.picture(f).mask
+            mask = np.zeros(size, bool)
+            if path is not None:
+                mask = maps.moving_mask(path, size, capture.white_moves)
+            masks.append(mask)
+        return np.stack(masks)
+    assert isinstance(folder, Path)
+    for f, path in zip(m.frames, given_files(work, folder, ingest.RECORDED), strict=True):
+        mask = read_mask(path)
+        if mask.shape != size:
+            raise InputError(
+                f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
+                f"frame {f.index} is {m.width}x{m.height}; make it that size"
+            )
+        masks.append(mask)
+    return np.stack(masks)
+
+
+def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
+    """The file for each frame in the user's folder of maps: as many files as frames, in
+    order (of each camera, in a folder like the footage's).
+    """
+    folders = [folder]
+    if len(work.footage.cameras) > 1:
+        folders = ingest.sorted_folders(folder)
+    found = [
+        path
+        for each in folders
+        for path in sorted(each.iterdir(), key=ingest.natural)
+        if path.suffix.lower() in suffixes
+    ]
+    frames = work.manifest.frames
+    if len(found) != len(frames):
+        raise InputError(
+            f"{folder}: {len(found)} maps for {len(frames)} frames; one per used frame, in order"
+        )
+    return found

@@ -1,0 +1,53 @@
+"""The step `movers`: tracks, rigid motion and shape of every moving object."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.movers.distance import mover_depth
+from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.scene.movers import Mover, write_movers
+
+
+def find_movers(work: Work) -> StepResult:
+    """The movers of the training frames, from flow, masks and a first depth of theirs."""
+    if work.manifest.depth_kind == "relative":
+        return result((), {}, "none looked for: depth is known up to scale and shift only")
+    flow = work.training_flows(work.refined_flows)
+    disparity, confidence = work.static_depth()
+    still = work.still()
+    clip = work.training_clip()
+    indices = np.array([f.index for f in work.train])
+    maps = {}
+    if still is not None:  # depth of the static scene alone: movers are not in it yet
+        clip = replace(clip, moving=clip.moving & ~still)
+        found, trust = mover_depth(clip, *flow, disparity)
+        disparity = np.where(clip.moving, found, disparity)
+        confidence = np.where(clip.moving, trust, confidence)
+        maps["mover_disparity"] = dict(zip(indices.tolist(), found, strict=True))
+        maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
+    movers = estimate_movers(clip, *flow, disparity, confidence)
+    movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
+    shapes = sum(mover.has_shape for mover in movers)
+    note = f"{len(movers)} found, {shapes} with a shape" if movers else "none found"
+    return result(movers, maps, note)
+
+
+def result(
+    movers: tuple[Mover, ...], maps: dict[str, dict[int, np.ndarray]], note: str
+) -> StepResult:
+    """Movers and the first depth of moving pixels, as the engine stores them."""
+    sizes = [len(mover.pixels) for mover in movers]
+    errors = [round(mover.error, 3) if mover.has_shape else None for mover in movers]
+    return StepResult(
+        note=note,
+        details={"tracks": sizes, "errors": errors},
+        manifest={"movers": "movers.npz"},
+        frames={"mover_disparity": {}, "mover_confidence": {}},
+        maps=maps,
+        files={"movers.npz": lambda path: write_movers(path, movers)},
+    )

@@ -1,0 +1,130 @@
+"""The step `poses`: cameras of all frames and static points, given or estimated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hdr_nsff.core.io import atomic, write_npy
+from hdr_nsff.core.progress import say
+from hdr_nsff.footage.pose_files import import_poses, placed
+from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.steps.masks import given_masks
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
+from hdr_nsff.priors.poses.estimate import estimate_poses
+
+MAX_ROUNDS = 2  # of structure from motion after the first
+MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the same
+# z-depth around distance 1, where everything lies when there is no parallax:
+SPHERE_NEAR = 0.5
+SPHERE_FAR = 2.0
+FIRST_ROUND = "poses/first_round.npz"  # lets a killed run go on with the second round
+
+
+def find_poses(work: Work) -> StepResult:
+    """Cameras of all frames: a data set's, the user's, or by structure from motion."""
+    m, c = work.manifest, work.config
+    given = True
+    capture = work.gives("poses")
+    if capture is not None and capture.poses is not None:
+        poses = data_set_poses(work)
+    elif c.poses is not None:
+        poses = import_poses(c.poses, [f.source for f in m.frames], (m.height, m.width))
+    elif isinstance(c.masks, Path) or work.gives("masks") is not None:
+        poses, given = estimate(work, given_masks(work)), False
+    else:
+        poses, given = poses_and_masks(work), False
+    known_range = bool(poses.near and poses.far)
+    files = {}
+    if len(poses.points):
+        points = poses.points.astype(np.float32)
+        files["points.npy"] = lambda path: write_npy(path, points)
+    registered = poses.registered.tolist()
+    return StepResult(
+        provenance="given" if given else "estimated",
+        note=f"{sum(registered)} of {len(m.frames)} frames placed, parallax: {poses.parallax}",
+        details={"registered": registered, "notes": list(poses.notes)},
+        manifest={
+            "parallax": poses.parallax,
+            "near": poses.near if known_range else SPHERE_NEAR,
+            "far": poses.far if known_range else SPHERE_FAR,
+            "points": "points.npy" if len(poses.points) else None,
+        },
+        frames={
+            "K": {f.index: K.tolist() for f, K in zip(m.frames, poses.K, strict=True)},
+            "c2w": {f.index: c2w.tolist() for f, c2w in zip(m.frames, poses.c2w, strict=True)},
+        },
+        files=files,
+    )
+
+
+def data_set_poses(work: Work) -> Poses:
+    """The poses of a data set, with its static points."""
+    capture, m = work.capture, work.manifest
+    assert capture is not None and capture.poses is not None
+    rows: list[int | None] = [capture.row[f.source] for f in m.frames]
+    poses = placed(capture.root, capture.poses, rows, (m.height, m.width))
+    return poses if capture.points is None else replace(poses, points=capture.points)
+
+
+def poses_and_masks(work: Work) -> Poses:
+    """Structure from motion in up to three rounds: poses need masks, and good masks need
+    poses. The last round is the one whose masks are nearly those before.
+    """
+    cache = work.folder / FIRST_ROUND
+    if cache.is_file():
+        poses, before = read_round(cache)
+    else:
+        before = rough_mask(*work.raw_flows, work.equalized[0])
+        poses = estimate(work, before)
+        write_round(cache, poses, before)
+    for _ in range(MAX_ROUNDS if poses.parallax == "full" else 0):
+        moving = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
+        agreement = (before & moving).sum() / max((before | moving).sum(), 1)
+        again = agreement < MIN_MASK_IOU
+        outcome = ": once more" if again else ""
+        say(f"poses: masks from these poses agree to {agreement:.0%} with those before{outcome}")
+        if not again:
+            break
+        poses, before = estimate(work, moving), moving
+    return poses
+
+
+def estimate(work: Work, moving: np.ndarray) -> Poses:
+    """Poses by structure from motion on equalized frames, without pixels that are
+    `moving` (T, H, W) bool.
+    """
+    video, clipped = work.equalized
+    cameras = [f.camera_id for f in work.manifest.frames]
+    folder = work.folder / "poses"
+    return estimate_poses(video, moving, folder, clipped, cameras, matcher=work.config.matcher)
+
+
+ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")
+
+
+def write_round(path: Path, poses: Poses, moving: np.ndarray) -> None:
+    """Keep poses and the masks (T, H, W) they were estimated with."""
+    arrays = {name: np.asarray(getattr(poses, name)) for name in ARRAYS}
+    arrays["range"] = np.array([poses.near or np.nan, poses.far or np.nan])
+    arrays["words"] = np.array([poses.parallax, *poses.notes])
+    arrays["moving"] = np.packbits(moving, axis=-1)
+    arrays["width"] = np.array(moving.shape[-1])
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.savez(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_round(path: Path) -> tuple[Poses, np.ndarray]:
+    """What `write_round` wrote."""
+    with np.load(path, allow_pickle=False) as arrays:
+        near, far = (None if np.isnan(v) else float(v) for v in arrays["range"])
+        parallax, *notes = arrays["words"].tolist()
+        packed, width = arrays["moving"], int(arrays["width"])
+        moving = np.unpackbits(packed, axis=-1, count=width).astype(bool)
+        values = {name: arrays[name] for name in ARRAYS}
+    poses = Poses(**values, parallax=parallax, near=near, far=far, notes=tuple(notes))
+    return poses, moving

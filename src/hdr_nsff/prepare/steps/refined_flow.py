@@ -1,0 +1,109 @@
+"""The step `refined_flow`: flow of movers once more, now that masks and response are known.
+
+Where pixels move, flow is refined from moving pixels alone, on frames brought to one
+exposure through the response; where it fails the round trip or is clipped, it is filled
+in from its neighborhood. Given flow stays as it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.parallel import in_threads
+from hdr_nsff.geometry.round_trip import agreement
+from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.steps.flow import Pair, flow_files, flow_is_given, stored, write_flow
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.flow.dense import average_with_reverse
+from hdr_nsff.priors.flow.local_motion import fill_uncertain_flow
+from hdr_nsff.priors.flow.masked_least_squares import refine_mover_flow
+from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
+from hdr_nsff.radiometry.response import at_one_exposure
+from hdr_nsff.scene.response import read_response
+
+
+def refine_flow(work: Work) -> StepResult:
+    """Refined flow of every pair that was matched, both ways, a pair at a time so that a
+    killed run keeps them.
+    """
+    m = work.manifest
+    own = [
+        (f.index, j) for f in m.frames for j in f.raw_flow if not flow_is_given(work, f.index, j)
+    ]
+    names = {pair: flow_files("refined_flow", pair) for pair in own}
+    flow = {
+        f.index: {j: names.get((f.index, j), r) for j, r in f.raw_flow.items()} for f in m.frames
+    }
+    if not own:
+        note = "given flow stays as it is"
+        return StepResult(note=note, provenance="given", frames={"flow": flow})
+    video, how = equalized(work)
+    refiner = Refiner(work, video)
+
+    def refine(pair: Pair) -> None:
+        i, j = pair
+        if stored(work, names[i, j]) and stored(work, names[j, i]):
+            return  # by a run that was killed
+        for one, found, valid in refiner.both_ways(i, j):
+            write_flow(work, names[one], found, valid)
+
+    in_threads(refine, [(i, j) for i, j in own if i < j], "flow of movers")
+    note = f"{len(own)} pairs refined inside the moving masks, {how}"
+    return StepResult(note=note, frames={"flow": flow})
+
+
+def equalized(work: Work) -> tuple[np.ndarray, str]:
+    """All frames at one brightness (T, H, W, 3): through the response of their camera
+    where static points determined it, else by the brackets' brightness; and which.
+    """
+    m = work.manifest
+    assert m.response is not None
+    response = read_response(work.folder / m.response, m.num_cameras, m.num_brackets)
+    if response.source != "static points":
+        return work.equalized[0], "on frames equalized by brightness"
+    brackets = np.array([f.bracket for f in m.frames])
+    cameras = np.array([f.camera_id for f in m.frames])
+    video = at_one_exposure(work.video, brackets, cameras, response)
+    return video, "on frames at one exposure through the response"
+
+
+class Refiner:
+    """Refines the flow of one pair of frames at a time."""
+
+    def __init__(self, work: Work, video: np.ndarray) -> None:
+        """`video` (T, H, W, 3): all frames at one brightness, in [0, 1]."""
+        self.work, self.video = work, video
+        self.clipped = work.equalized[1]
+        self.moving = work.masks
+        frames = zip(video, self.clipped, strict=True)
+        self.ranges = [recorded_range(frame, clipped) for frame, clipped in frames]
+
+    def both_ways(self, i: int, j: int) -> list[tuple[Pair, np.ndarray, np.ndarray]]:
+        """((from, to), flow (H, W, 2) px, valid (H, W)) of the pair, there and back."""
+        there, back = self.least_squares(i, j), self.least_squares(j, i)
+        valid_there = agreement(there, back, self.clipped[i], self.clipped[j])
+        valid_back = agreement(back, there, self.clipped[j], self.clipped[i])
+        here_gray, there_gray = common_gray(self.video, self.ranges, i, j)
+        filled = (
+            fill_uncertain_flow(
+                there, back, here_gray, there_gray,
+                self.clipped[i], self.clipped[j], self.moving[i],
+            ),
+            fill_uncertain_flow(
+                back, there, there_gray, here_gray,
+                self.clipped[j], self.clipped[i], self.moving[j],
+            ),
+        )  # fmt: skip
+        there, back = filled
+        return [
+            ((i, j), average_with_reverse(there, back), valid_there),
+            ((j, i), average_with_reverse(back, there), valid_back),
+        ]
+
+    def least_squares(self, i: int, j: int) -> np.ndarray:
+        """Flow (H, W, 2) px from frame `i` to `j`, refined inside the moving mask."""
+        files = self.work.manifest.frames[i].raw_flow[j]
+        matched = read_npy(self.work.folder / files.flow).astype(np.float32)
+        pictures = common_rgb(self.video, self.ranges, i, j)
+        return refine_mover_flow(*pictures, matched, self.moving[i] & ~self.clipped[i])

@@ -1,0 +1,102 @@
+"""The step `sheet`: the contact sheet, for a person to see what `prepare` found."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+
+import numpy as np
+
+from hdr_nsff.core.images import colorize, colorize_flow, contact_sheet, read_mask, write_png
+from hdr_nsff.core.io import read_npy
+from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.scene.manifest import FrameEntry
+from hdr_nsff.scene.movers import Mover, nearest_mover, read_movers
+
+NUM_COLUMNS = 6  # frames shown
+SHEET = "contact_sheet.png"
+
+
+def draw_sheet(work: Work) -> StepResult:
+    """A few training frames as recorded, equalized, with moving pixels red, movers in
+    colors with their tracks, flow to the next frame (from the last to the one before),
+    and disparity.
+    """
+    m = work.manifest
+    assert m.movers is not None
+    chosen = np.unique(np.linspace(0, len(work.train) - 1, NUM_COLUMNS).astype(int))
+    frames = [work.train[k] for k in chosen]
+    movers = read_movers(work.folder / m.movers)
+    rows = {
+        "recorded": [work.video[f.index] for f in frames],
+        "equalized": [work.equalized[0][f.index] for f in frames],
+        "moving": [moving_cell(work, f) for f in frames],
+        "movers in colors": [mover_cell(work, f, movers) for f in frames],
+        "flow (gray: not believed)": [flow_cell(work, f) for f in frames],
+        "disparity": disparity_cells(work, frames),
+    }
+    if not movers:
+        rows.pop("movers in colors")
+    if m.parallax != "full":
+        rows.pop("disparity")  # the same everywhere
+    cells = [[cell.astype(np.float32) for cell in row] for row in rows.values()]
+    return StepResult(
+        note=", ".join(rows),
+        files={SHEET: lambda path: write_png(path, contact_sheet(cells))},
+    )
+
+
+def moving_cell(work: Work, f: FrameEntry) -> np.ndarray:
+    """The equalized frame (H, W, 3) with moving pixels red."""
+    shown = work.equalized[0][f.index]
+    moving = read_mask(work.folder / str(f.mask))
+    return np.where(moving[..., None], 0.5 * shown + [0.5, 0, 0], shown)
+
+
+def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray:
+    """The frame in gray (H, W, 3), moving pixels in the color of their mover, tracks as
+    bright dots; a mover without a shape is drawn pale.
+    """
+    gray = np.repeat(work.equalized[0][f.index].mean(-1, keepdims=True), 3, axis=-1)
+    times = movers[0].frames.tolist() if movers else []
+    if f.index not in times:
+        return gray
+    t = times.index(f.index)
+    y, x = np.nonzero(read_mask(work.folder / str(f.mask)))
+    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
+    colors = mover_colors(movers)
+    gray[y, x] = 0.4 * gray[y, x] + 0.6 * colors[owner]
+    for mover, color in zip(movers, colors, strict=True):
+        pixels = mover.pixels[:, t]
+        column, row = pixels[np.isfinite(pixels[:, 0])].astype(int).T
+        gray[row, column] = 0.5 + 0.5 * color
+    return gray
+
+
+def mover_colors(movers: Sequence[Mover]) -> np.ndarray:
+    """A color (M, 3) in [0, 1] per mover: hues by the golden ratio, pale without a
+    shape.
+    """
+    golden = 0.618034
+    colors = [
+        colorsys.hsv_to_rgb(k * golden % 1, 0.9 if mover.has_shape else 0.35, 1.0)
+        for k, mover in enumerate(movers)
+    ]
+    return np.array(colors).reshape(-1, 3)
+
+
+def flow_cell(work: Work, f: FrameEntry) -> np.ndarray:
+    """Flow (H, W, 3) to the next frame, from the last one to the one before; gray where
+    it is not believed.
+    """
+    files = f.flow[max(f.flow)]
+    flow = colorize_flow(read_npy(work.folder / files.flow).astype(np.float32))
+    return np.where(read_mask(work.folder / files.valid)[..., None], flow, 0.25)
+
+
+def disparity_cells(work: Work, frames: Sequence[FrameEntry]) -> list[np.ndarray]:
+    """Disparity of the frames (H, W, 3), all on one scale of colors."""
+    maps = [read_npy(work.folder / str(f.disparity)).astype(np.float32) for f in frames]
+    low, high = (float(v) for v in np.percentile(np.stack(maps), [1, 99]))
+    return [colorize(disparity, low, high) for disparity in maps]

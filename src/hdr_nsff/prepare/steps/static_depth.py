@@ -1,0 +1,126 @@
+"""The step `static_depth`: depth before movers are known. Of the static scene, also
+behind what moves, or, where a network, the user or a data set gives depth, of all.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdr_nsff.core.io import read_npy
+from hdr_nsff.footage.datasets import maps
+from hdr_nsff.footage.depth_files import read_depth
+from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.steps.masks import given_files
+from hdr_nsff.prepare.steps.neural import network_depth
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
+
+DEPTH_FILES = {".npy", ".exr", ".png"}
+
+
+@dataclass(frozen=True)
+class Depth:
+    """Depth of the training frames, in order."""
+
+    disparity: np.ndarray  # (T, H, W) 1 / scene units, or relative
+    confidence: np.ndarray  # (T, H, W) in [0, 1]
+    note: str
+    source: str  # "geometric", "given", ...
+    given: bool = False
+    still: np.ndarray | None = None  # (T, H, W) pixels of the masks that stand still
+    details: dict[str, Any] = field(default_factory=dict)
+    manifest: dict[str, Any] = field(default_factory=dict)
+
+
+def find_static_depth(work: Work) -> StepResult:
+    """Disparity of the training frames and how far it can be believed."""
+    m, c = work.manifest, work.config
+    if work.gives("depth") is not None:
+        depth = data_set_depth(work)
+    elif isinstance(c.depth, Path):
+        depth = user_depth(work, c.depth)
+    elif m.parallax != "full":
+        ones = np.ones((len(work.train), m.height, m.width), np.float32)
+        note = "everything at distance 1: without parallax there is no depth to find"
+        depth = Depth(ones, ones, note, c.depth or "geometric")
+    elif c.depth == "depth-anything":
+        depth = depth_anything(work)
+    else:
+        depth = geometric_depth(work)
+    result_maps = {"static_disparity": depth.disparity, "static_confidence": depth.confidence}
+    if depth.still is not None:
+        result_maps["still"] = depth.still
+    indices = [f.index for f in work.train]
+    cleared: dict[str, dict[int, Any]] = {"still": {}, "disparity": {}, "disparity_confidence": {}}
+    return StepResult(
+        provenance="given" if depth.given else "estimated",
+        note=depth.note,
+        details={"source": depth.source, **depth.details},
+        manifest={"depth_kind": "scene", **depth.manifest},
+        frames=cleared,
+        maps={
+            name: dict(zip(indices, values, strict=True)) for name, values in result_maps.items()
+        },
+    )
+
+
+def geometric_depth(work: Work) -> Depth:
+    """Depth from the parallax of the static scene."""
+    m = work.manifest
+    points = np.zeros((0, 3))
+    if m.points:
+        points = np.array(read_npy(work.folder / m.points))
+    flow = work.training_flows(work.raw_flows)
+    disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
+    note = f"{(confidence > 0.5).mean():.0%} of the pixels well known"
+    return Depth(disparity, confidence, note, "geometric", still=still)
+
+
+def data_set_depth(work: Work) -> Depth:
+    """The depth of a data set."""
+    m, capture = work.manifest, work.gives("depth")
+    assert capture is not None
+    pictures = [work.picture(f) for f in work.train]
+    disparity, confidence, how = maps.disparities(capture, pictures, (m.height, m.width))
+    changes: dict[str, Any] = {}
+    if capture.depth_kind == "relative":
+        changes["depth_kind"] = "relative"
+    elif capture.poses is not None and capture.poses.near is None:
+        changes["near"], changes["far"] = depth_range(disparity, confidence)
+    note = "; ".join(part for part in (f"given ({capture.depth_kind})", how) if part)
+    return Depth(disparity, confidence, note, "given", given=True, manifest=changes)
+
+
+def user_depth(work: Work, folder: Path) -> Depth:
+    """The depth maps in the user's folder."""
+    m, kind = work.manifest, work.config.depth_kind
+    files = given_files(work, folder, DEPTH_FILES)
+    disparity, confidence = read_depth(files, kind, (m.height, m.width))
+    index = [f.index for f in work.train]
+    changes = {"depth_kind": "relative"} if kind == "relative" else {}
+    return Depth(
+        disparity[index],
+        confidence[index],
+        f"given ({kind})",
+        "given",
+        given=True,
+        manifest=changes,
+    )
+
+
+def depth_anything(work: Work) -> Depth:
+    """Depth by the network Depth Anything, laid onto static points."""
+    name = work.config.depth_weights
+    disparity, confidence, near, far, kind = network_depth(work)
+    return Depth(
+        disparity,
+        confidence,
+        f"{name} ({kind}), near {near:.2f}, far {far:.2f} scene units",
+        "depth-anything",
+        details={"kind": kind, "weights": name},
+        manifest={"near": near, "far": far},
+    )

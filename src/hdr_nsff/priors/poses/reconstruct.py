@@ -1,0 +1,362 @@
+"""Structure from motion on the views of a clip: from images to the poses of all frames.
+
+pycolmap maps the views (`sfm.py`) incrementally, then globally, with and without
+leveled contrast, until enough of them register with a focal length that a lens can
+have. The reconstruction is then brought into a world of its own: +z is the mean viewing
+direction, near is 1. Poses are camera to world, OpenCV axes.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import encode
+from hdr_nsff.core.progress import say
+from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
+from hdr_nsff.geometry.pinhole import intrinsics
+from hdr_nsff.geometry.poses import (
+    ADVICE,
+    LEAST,
+    Poses,
+    interpolate,
+    project,
+    ranges,
+    trusted_points,
+)
+from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.lightglue import LightGlueTuning, Matcher, match_images, upsample
+from hdr_nsff.priors.poses.matching import (
+    MatchingTuning,
+    keypoint_mask,
+    sift_image,
+    upsampling_factor,
+    view_pairs,
+)
+from hdr_nsff.priors.poses.rotation import RotationTuning, default_focal, fit_video
+
+
+@dataclass(frozen=True)
+class ReconstructionTuning:
+    """When a reconstruction is good enough, and which of its points are kept.
+
+    Hand-chosen on rendered clips if no other origin is given.
+    """
+
+    # across the image: what undistorted video cameras plausibly see
+    min_fov_degrees: float = 25.0
+    max_fov_degrees: float = 100.0
+    enough_registered: float = 0.9  # share of the views that ends the search for a model
+    min_registered: float = LEAST  # share of the views below which poses have failed
+    min_track_views: int = 3  # of a point that is kept
+    max_point_error_px: float = 2.0  # mean reprojection error of such a point
+    min_points: int = 10
+    # near and far: these percentiles of the points' depths, times these factors
+    near_percentile: float = 1.0
+    far_percentile: float = 99.0
+    near_factor: float = 0.7
+    far_factor: float = 1.3
+    # frames, spread over the clip, that decide whether a camera stands still or has
+    # parallax
+    max_sampled_frames: int = 24
+    matching: MatchingTuning = field(default_factory=MatchingTuning)
+    rotation: RotationTuning = field(default_factory=RotationTuning)
+    lightglue: LightGlueTuning = field(default_factory=LightGlueTuning)
+    sfm: sfm.SfmTuning = field(default_factory=sfm.SfmTuning)
+
+
+@dataclass(frozen=True)
+class SfmViews:
+    """The images to map: one per frame, but a single one for all frames of a camera
+    that stands still.
+    """
+
+    images: np.ndarray  # (V, H, W, 3) equalized rgb in [0, 1]
+    ignore: np.ndarray  # (V, H, W) bool
+    groups: list[list[int]]  # views of each physical camera
+    of_frame: np.ndarray  # (T,) the view of each frame
+
+
+def spread_frames(count: int, limit: int) -> np.ndarray:
+    """Up to `limit` of `count` frames, spread evenly over the clip."""
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).astype(int))
+
+
+def sfm_views(
+    video: np.ndarray,
+    ignore: np.ndarray,
+    groups: list[list[int]],
+    tuning: ReconstructionTuning = ReconstructionTuning(),
+) -> SfmViews:
+    """One view per frame; of a rig's cameras that stand still, one view per camera.
+
+    That view is the median of the camera's frames, free of most movers. `video` (T, H,
+    W, 3) in [0, 1], `ignore` (T, H, W) bool; `groups`: frames of each camera.
+    """
+    if len(groups) == 1:
+        return SfmViews(video, ignore, groups, np.arange(len(video)))
+    images: list[np.ndarray] = []
+    hidden: list[np.ndarray] = []
+    view_groups: list[list[int]] = []
+    of_frame = np.zeros(len(video), int)
+    for group in groups:
+        first = len(images)
+        sampled = [group[k] for k in spread_frames(len(group), tuning.max_sampled_frames)]
+        if stands_still(video[sampled], ignore[sampled], tuning):
+            images.append(median_image(video[sampled], ignore[sampled]))
+            hidden.append(np.all(ignore[sampled], axis=0))
+            of_frame[group] = first
+        else:
+            images += [video[t] for t in group]
+            hidden += [ignore[t] for t in group]
+            of_frame[group] = first + np.arange(len(group))
+        view_groups.append(list(range(first, len(images))))
+    return SfmViews(np.stack(images), np.stack(hidden), view_groups, of_frame)
+
+
+def stands_still(video: np.ndarray, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
+    """Whether the frames (T, H, W, 3) of a camera are those of a tripod; `ignore` (T,
+    H, W) bool.
+    """
+    if len(video) < 2:
+        return False
+    panorama = fit_video(video, ignore, tuning.matching, tuning.rotation)
+    if panorama is None or panorama.explained <= tuning.rotation.min_explained:
+        return False
+    return panorama.max_displacement < tuning.rotation.max_tripod_motion_px
+
+
+def median_image(video: np.ndarray, ignore: np.ndarray) -> np.ndarray:
+    """The median (H, W, 3) of the frames (T, H, W, 3) at every pixel over the times
+    that `ignore` (T, H, W) leaves free, or over all times where it leaves none.
+    """
+    never_free = ignore.all(0)
+    left_out = ignore & ~never_free
+    return np.nanmedian(np.where(left_out[..., None], np.nan, video), 0)
+
+
+def best_model(
+    views: SfmViews,
+    workdir: Path,
+    threads: int,
+    matcher: Matcher,
+    tuning: ReconstructionTuning = ReconstructionTuning(),
+) -> tuple[ColmapModel, int]:
+    """The best reconstruction of the views, and how many times larger than the views
+    its images were. InputError where none is good enough.
+    """
+    count = len(views.images)
+    best: ColmapModel | None = None
+    scale = upsampling_factor(views.images.shape[2], tuning.matching)
+    failures = []
+    for leftover in workdir.glob(".sfm-*"):
+        shutil.rmtree(leftover, ignore_errors=True)
+    workdir.mkdir(parents=True, exist_ok=True)
+    # learned keypoints work in color, and leveling the contrast gains nothing for them
+    contrasts = {"leveled": True, "plain": False} if matcher == "sift" else {"plain": False}
+    for contrast, level_contrast in contrasts.items():
+        with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
+            job = write_job(Path(folder), views, scale, level_contrast, threads, matcher, tuning)
+            for mapping in ("incremental", "global"):
+                try:
+                    models = [read_model(p) for p in sfm.run(replace(job, mapping=mapping))]
+                except sfm.SfmError as error:
+                    failures.append(str(error))
+                    continue
+                candidates = models if best is None else [best, *models]
+                best = max(candidates, key=lambda m: model_rank(m, count, tuning), default=None)
+                if best is not None and model_rank(best, count, tuning)[:2] == (True, True):
+                    return best, scale
+                num_registered = 0 if best is None else len(best.images)
+                say(
+                    f"poses: {mapping} mapping ({contrast} contrast): "
+                    f"{num_registered} of {count} views registered at best so far"
+                )
+    if best is None or not has_plausible_lens(best, tuning):
+        raise InputError(failure_message(best, views, failures, tuning))
+    if len(best.images) < tuning.min_registered * count:
+        raise InputError(failure_message(best, views, failures, tuning))
+    return best, scale
+
+
+def write_job(
+    folder: Path,
+    views: SfmViews,
+    scale: int,
+    level_contrast: bool,
+    threads: int,
+    matcher: Matcher,
+    tuning: ReconstructionTuning = ReconstructionTuning(),
+) -> sfm.Job:
+    """Write the images and masks, and learned matches if those are wanted, into a
+    `folder`; the job that maps them.
+    """
+    names = [f"{v:05d}.png" for v in range(len(views.images))]
+    masks = [keypoint_mask(i, scale, tuning.matching.mask_margin_px) for i in views.ignore]
+    for name, image, mask in zip(names, views.images, masks, strict=True):
+        gray = sift_image(image, scale, level_contrast, tuning.matching)
+        encode(folder / "images" / name, gray)
+        encode(folder / "masks" / f"{name}.png", mask)
+    pairs = view_pairs(views.groups, tuning.matching)
+    named_pairs = [(names[a], names[b]) for a, b in pairs]
+    if matcher != "sift":
+        images = [upsample(image, scale) for image in views.images]
+        keypoints, matches = match_images(images, masks, pairs, matcher, tuning.lightglue)
+        sfm.write_matches(folder, names, keypoints, named_pairs, matches)
+    return sfm.Job(
+        folder=str(folder),
+        groups=[[names[v] for v in group] for group in views.groups],
+        pairs=named_pairs,
+        focal=default_focal(views.images.shape[2], tuning.rotation) * scale,
+        mapping="incremental",
+        threads=threads,
+        matches_given=matcher != "sift",
+        tuning=tuning.sfm,
+    )
+
+
+def has_plausible_lens(
+    model: ColmapModel, tuning: ReconstructionTuning = ReconstructionTuning()
+) -> bool:
+    """Whether the focal lengths are those of real lenses."""
+    fov = [np.degrees(2 * np.arctan(c.width / 2 / c.K[0, 0])) for c in model.cameras.values()]
+    return all(tuning.min_fov_degrees <= f <= tuning.max_fov_degrees for f in fov)
+
+
+def model_rank(
+    model: ColmapModel, count: int, tuning: ReconstructionTuning = ReconstructionTuning()
+) -> tuple[bool, bool, int, int]:
+    """The order of reconstructions of `count` views, the best one highest: a plausible
+    lens, enough images, then more images, then more long tracks.
+    """
+    num_images = len(model.images)
+    num_tracks = int((model.track_lengths >= tuning.min_track_views).sum())
+    enough = num_images >= tuning.enough_registered * count
+    return has_plausible_lens(model, tuning), enough, num_images, num_tracks
+
+
+def failure_message(
+    model: ColmapModel | None,
+    views: SfmViews,
+    failures: list[str],
+    tuning: ReconstructionTuning = ReconstructionTuning(),
+) -> str:
+    """Why there are no poses, for which frames, and what to do."""
+    count, width = len(views.of_frame), views.images.shape[2]
+    if model is None:
+        last_error = f"; the last error was: {failures[-1]}" if failures else ""
+        return (
+            "poses failed: no two frames could be matched "
+            f"(no common texture seen from two places){last_error}; {ADVICE}"
+        )
+    registered = views_of_images(model)
+    missing = [t for t in range(count) if int(views.of_frame[t]) not in registered]
+    if len(missing) <= (1 - tuning.min_registered) * count:
+        scale = upsampling_factor(width, tuning.matching)
+        focal = next(iter(model.cameras.values())).K[0, 0] / scale
+        return (
+            f"poses failed: the estimated focal length of {focal:.0f} px is impossible "
+            f"for {width} px wide frames; {ADVICE}"
+        )
+    return (
+        f"poses failed: {len(missing)} of {count} frames could not be registered "
+        f"(frames {ranges(missing)}); {ADVICE}"
+    )
+
+
+def views_of_images(model: ColmapModel) -> dict[int, ColmapImage]:
+    """The registered image of each view, whose number is in its file name."""
+    return {int(image.name[:5]): image for image in model.images.values()}
+
+
+def poses_from_model(
+    model: ColmapModel,
+    views: SfmViews,
+    scale: int,
+    size: tuple[int, int],
+    tuning: ReconstructionTuning = ReconstructionTuning(),
+) -> Poses:
+    """Poses of all frames from a reconstruction of the views, in a normalized world.
+
+    `scale`: how many times larger the images of the reconstruction are than the frames
+    of `size` (height, width). InputError where a camera has no registered view, or too
+    few points remain.
+    """
+    count, (height, width) = len(views.of_frame), size
+    image_of = views_of_images(model)
+    registered = np.array([int(v) in image_of for v in views.of_frame])
+    K = np.zeros((count, 3, 3))
+    for group in views.groups:
+        images = [image_of[v] for v in group if v in image_of]
+        if not images:
+            raise InputError(
+                "poses failed: none of the frames of one camera could be registered "
+                f"(views {ranges(group)}); {ADVICE}"
+            )
+        focal = model.cameras[images[0].camera_id].K[0, 0] / scale  # one for the group
+        K[np.isin(views.of_frame, group)] = intrinsics(focal, width, height)
+    c2w = np.tile(np.eye(4)[:3], (count, 1, 1))
+    for t in np.flatnonzero(registered):
+        c2w[t] = image_of[int(views.of_frame[t])].c2w
+    tracks = gather_tracks(model, views, scale)
+    poses = Poses(K, c2w, registered, "full", model.points, model.errors / scale, tracks)
+    poses = trusted_points(poses, tuning.min_track_views, tuning.max_point_error_px)
+    frame_groups = [np.flatnonzero(np.isin(views.of_frame, g)).tolist() for g in views.groups]
+    poses = interpolate(normalize_world(poses, tuning), frame_groups)
+    return replace(poses, notes=(*poses.notes, summary(poses)))
+
+
+def gather_tracks(model: ColmapModel, views: SfmViews, scale: int) -> np.ndarray:
+    """All observations (O, 4): frame, row of the point, x, y in pixels of the frames. A
+    view shared by many frames counts for its first.
+    """
+    row_of_point = {int(key): row for row, key in enumerate(model.point_ids)}
+    first_frame = {int(v): int(np.argmax(views.of_frame == v)) for v in views.of_frame}
+    observations = []
+    for view, image in views_of_images(model).items():
+        for xy, point in zip(image.xy, image.point_ids, strict=True):
+            if point >= 0:
+                observations.append((first_frame[view], row_of_point[int(point)], *(xy / scale)))
+    return np.array(observations, np.float64).reshape(-1, 4)
+
+
+def normalize_world(poses: Poses, tuning: ReconstructionTuning = ReconstructionTuning()) -> Poses:
+    """The same cameras and points in a world of their own: the mean registered camera
+    at the origin, looking along +z, near at 1. InputError for too few points.
+    """
+    if len(poses.points) < tuning.min_points:
+        raise InputError(
+            f"poses failed: only {len(poses.points)} static points were reconstructed; {ADVICE}"
+        )
+    registered = poses.c2w[poses.registered]
+    rotation = Rotation.from_matrix(registered[:, :, :3]).mean().as_matrix()
+    center = registered[:, :, 3].mean(0)
+    frames, rows = poses.tracks[:, 0].astype(int), poses.tracks[:, 1].astype(int)
+    _, depth = project(poses, frames, poses.points[rows])
+    near = tuning.near_factor * np.percentile(depth, tuning.near_percentile)
+    far = tuning.far_factor * np.percentile(depth, tuning.far_percentile)
+    centers = (poses.c2w[:, :, 3] - center) @ rotation / near
+    c2w = np.concatenate([rotation.T @ poses.c2w[:, :, :3], centers[:, :, None]], 2)
+    points = (poses.points - center) @ rotation / near
+    return replace(poses, c2w=c2w, points=points, near=1.0, far=float(far / near))
+
+
+def summary(poses: Poses) -> str:
+    """One sentence: frames, points, focal length, errors."""
+    focal = poses.K[:, 0, 0]
+    fov = np.degrees(2 * np.arctan(poses.K[:, 0, 2] / focal))
+    focal_range = f"{focal.min():.0f}"
+    if np.ptp(focal) >= 1e-6:
+        focal_range += f" to {focal.max():.0f}"
+    return (
+        f"{int(poses.registered.sum())} of {len(focal)} frames registered, "
+        f"{len(poses.points)} static points, focal length {focal_range} px "
+        f"({fov.max():.0f} degrees across), "
+        f"median reprojection error {np.nanmedian(poses.frame_errors):.2f} px"
+    )

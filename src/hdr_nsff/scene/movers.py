@@ -1,0 +1,186 @@
+"""What `prepare` knows of the moving objects of a clip: tracks, rigid motion, shape.
+
+One `Mover` per object, all over the same times. A canonical point X of a mover is at
+`R(t) (X - center) + center + translation(t)` at time t. Depth maps, the contact sheet
+and the start of a field read movers; only `prepare` estimates them. They lie in the
+scene folder as `movers.npz`, plain arrays that a user may read, change or drop.
+"""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import atomic
+
+VERSION = 1  # of movers.npz
+NUM_NEAREST_TRACKS = 4  # tracks that a pixel's depth is interpolated from
+MAX_TRACK_DISTANCE_PX = 8.0  # pixels from the nearest track; half or twice was not measured
+TRACK_CONFIDENCE = 0.5  # at a track: its distance as a whole rests on priors
+MAX_DEPTH_RATIO = 2.0  # a pixel's depth changes by less than this factor
+
+
+@dataclass(frozen=True)
+class Mover:
+    """One moving object over T times."""
+
+    frames: np.ndarray  # (T,) int: index of the frame that stands for each time
+    pixels: np.ndarray  # (N, T, 2) xy px of its tracks, NaN where unseen
+    trust: np.ndarray  # (N, T) of a track's depth, 0 where unseen
+    points: np.ndarray  # (N, 3) canonical, scene units, NaN where unknown: the shape
+    rotations: np.ndarray  # (T, 3, 3) world from canonical
+    translations: np.ndarray  # (T, 3) scene units
+    center: np.ndarray  # (3,) canonical, scene units
+    known: np.ndarray  # (T,) bool: enough of it was seen; motion between is interpolated
+    error: float  # median reprojection error of the shape, in its sigmas; inf: no shape
+
+    @property
+    def has_shape(self) -> bool:
+        """Whether its tracks determined a shape."""
+        return bool(np.isfinite(self.error))
+
+    def at(self, t: int) -> np.ndarray:
+        """World points (N, 3) of its tracks at the t-th time."""
+        turned = (self.points - self.center) @ self.rotations[t].T
+        return turned + self.center + self.translations[t]
+
+    def canonical(self, points: np.ndarray, t: int) -> np.ndarray:
+        """Canonical points (P, 3) of world `points` (P, 3) of the t-th time."""
+        return (points - self.center - self.translations[t]) @ self.rotations[t] + self.center
+
+
+def fill_mover_depth(
+    movers: Sequence[Mover],
+    t: int,
+    moving: np.ndarray,
+    c2w: np.ndarray,
+    disparity: np.ndarray,
+    confidence: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """`disparity` and `confidence` (H, W) with the shapes of movers at the t-th time.
+
+    A pixel that is `moving` (H, W) takes the depth of the nearest tracks of one mover,
+    as the camera at `c2w` (3, 4) sees them; pixels far from any track stay as they are.
+    """
+    disparity, confidence = disparity.copy(), confidence.copy()
+    pixels, inverse_depths, owners = track_depths(movers, t, c2w)
+    y, x = np.nonzero(moving)
+    if not len(pixels) or not len(y):
+        return disparity, confidence
+    num_nearest = min(NUM_NEAREST_TRACKS, len(pixels))
+    distance, nearest = cKDTree(pixels).query(np.stack([x, y], -1) + 0.5, num_nearest)
+    distance, nearest = distance.reshape(len(y), -1), nearest.reshape(len(y), -1)
+    same_mover = owners[nearest] == owners[nearest[:, :1]]
+    weight = same_mover / (distance + 0.5) ** 2
+    found = (weight * inverse_depths[nearest]).sum(1) / weight.sum(1)
+    change = np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9)))
+    near = (distance[:, 0] < MAX_TRACK_DISTANCE_PX) & (change < np.log(MAX_DEPTH_RATIO))
+    y, x = y[near], x[near]
+    disparity[y, x] = found[near]
+    falloff = np.exp(-((distance[near, 0] / MAX_TRACK_DISTANCE_PX) ** 2))
+    confidence[y, x] = np.maximum(confidence[y, x], TRACK_CONFIDENCE * falloff)
+    return disparity, confidence
+
+
+def track_depths(
+    movers: Sequence[Mover], t: int, c2w: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels (P, 2), inverse z-depths (P,) and movers (P,) of all tracks of known shape
+    that are seen at the t-th time.
+    """
+    pixels, inverse_depths, owners = [np.zeros((0, 2))], [np.zeros(0)], [np.zeros(0, int)]
+    for k, mover in enumerate(movers):
+        if not mover.has_shape:
+            continue
+        depth = (mover.at(t) - c2w[:, 3]) @ c2w[:, 2]
+        seen = np.isfinite(mover.pixels[:, t, 0]) & np.isfinite(depth) & (depth > 1e-6)
+        pixels.append(mover.pixels[seen, t])
+        inverse_depths.append(1 / depth[seen])
+        owners.append(np.full(int(seen.sum()), k))
+    return np.concatenate(pixels), np.concatenate(inverse_depths), np.concatenate(owners)
+
+
+def nearest_mover(movers: Sequence[Mover], t: int, pixels: np.ndarray) -> np.ndarray:
+    """The mover (P,) whose track is nearest to each of `pixels` (P, 2) at the t-th time;
+    0 where none has a track there.
+    """
+    tracks = [m.pixels[:, t][np.isfinite(m.pixels[:, t, 0])] for m in movers]
+    owners = np.repeat(np.arange(len(tracks)), [len(p) for p in tracks])
+    if not len(owners) or not len(pixels):
+        return np.zeros(len(pixels), np.int64)
+    return owners[cKDTree(np.concatenate(tracks)).query(pixels)[1]]
+
+
+def write_movers(path: Path, movers: Sequence[Mover]) -> None:
+    """Write `movers.npz`: arrays named `0/pixels`, `0/rotations`, ..., `1/pixels`, ..."""
+    arrays: dict[str, np.ndarray] = {"version": np.array(VERSION)}
+    for k, mover in enumerate(movers):
+        for f in fields(Mover):
+            arrays[f"{k}/{f.name}"] = np.asarray(getattr(mover, f.name))
+    with atomic(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def read_movers(path: Path) -> tuple[Mover, ...]:
+    """Read `movers.npz`; InputError where it is missing, damaged or makes no sense.
+
+    Movers count from 0 without gaps is not required: a user may have dropped one.
+    """
+    advice = "run `hdr-nsff prepare` with `--redo movers`"
+    if not path.is_file():
+        raise InputError(f"{path}: missing; {advice}")
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            data = {name: arrays[name] for name in arrays.files}
+        if data.pop("version", None) != VERSION:
+            raise InputError(f"{path}: of another version; {advice}")
+        keys = sorted({int(name.split("/")[0]) for name in data})
+        movers = tuple(mover_of(data, k) for k in keys)
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        kind = type(error).__name__
+        raise InputError(f"{path}: cut short or damaged ({kind}); {advice}") from error
+    for k, mover in zip(keys, movers, strict=True):
+        if problem := mover_problem(mover):
+            raise InputError(f"{path}: mover {k} {problem}; {advice}")
+    return movers
+
+
+def mover_of(data: dict[str, np.ndarray], k: int) -> Mover:
+    """The mover number `k` of a file's arrays; KeyError where an array is missing."""
+    values: dict[str, Any] = {f.name: data[f"{k}/{f.name}"] for f in fields(Mover)}
+    values["error"] = float(values["error"])
+    return Mover(**values)
+
+
+def mover_problem(mover: Mover) -> str | None:
+    """What does not fit together in a mover; None where all does."""
+    tracks, times = len(mover.pixels), len(mover.frames)
+    shapes = {
+        "pixels": (tracks, times, 2),
+        "trust": (tracks, times),
+        "points": (tracks, 3),
+        "rotations": (times, 3, 3),
+        "translations": (times, 3),
+        "center": (3,),
+        "known": (times,),
+    }
+    for name, shape in shapes.items():
+        if getattr(mover, name).shape != shape:
+            return f"has {name} of shape {getattr(mover, name).shape}, expected {shape}"
+    motion = (mover.rotations, mover.translations, mover.center, mover.trust)
+    if not all(np.isfinite(array).all() for array in motion):
+        return "has a motion with NaN or Inf"
+    turns = mover.rotations @ np.swapaxes(mover.rotations, 1, 2)
+    if not np.allclose(turns, np.eye(3), atol=1e-3):
+        return "has rotations that are none"
+    return None

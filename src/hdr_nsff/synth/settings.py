@@ -1,0 +1,153 @@
+"""The settings of `synth`, and what they may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from tyro.conf import Positional
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.radiometry.recording import Noise, response_curve
+from hdr_nsff.synth.scenes.base import Views
+
+MIN_FRAMES, MAX_FRAMES = 12, 400  # fewer leave no view far from the frames of its time
+MIN_SIDE = 16  # pixels of a picture
+MAX_SEED = 999  # seeds of pictures are made of it, see `views`
+MAX_NOISE = 1000.0  # times the noise of a small sensor
+
+
+@dataclass(frozen=True)
+class SynthConfig:
+    """A path-traced scene filmed by a moving camera or a rig. `interior`: a room with a
+    bright window, a tumbling box and a swinging ball. `lamp`: objects that rush past a
+    lamp. `night`: an alley at night with lights that move. `cloth`: cloth and a dancing
+    tube in the wind.
+    """
+
+    name: Positional[Literal["interior", "lamp", "night", "cloth"]]
+    """The scene."""
+    out: Positional[Path]
+    """Folder to write."""
+    views: Views = "mono"
+    """mono: one moving camera; rig: nine synchronized ones that take the frames in
+    turn.
+    """
+    size: str = "240x136"
+    """Width x height in pixels."""
+    frames: int = 36
+    ev: str | None = None
+    """Exposures that alternate, in stops and in the order they are taken, such as
+    -4,-2,0. Default: the scene's.
+    """
+    response: str = "film"
+    """The camera's response curve: film, log, gamma or srgb."""
+    white_balance: str = "1.12,1,0.87"
+    """Gains of red, green and blue before the response."""
+    vignetting: float = 0.0
+    """Fall-off of light towards the corners: 1 is the cos^4 law of a simple lens."""
+    noise: float = 1.0
+    """Noise relative to that of a small sensor; 0 is a perfect one."""
+    spp: int | None = None
+    """Paths per pixel; above 64 rounded to a multiple of it. Default: what suits the
+    scene.
+    """
+    truth_spp: int | None = None
+    """Paths per pixel of the held-out views."""
+    seed: int = 0
+    """Of textures, paths and noise."""
+    variant: str = "auto"
+    """Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb."""
+    oracle: bool = False
+    """Also write a scene folder with exact poses and masks, and with depth and flow
+    that have a little noise.
+    """
+    depth_noise: float = 0.03
+    """Of the oracle's depth: relative, smooth over an eighth of the frame."""
+    depth_grain: float = 0.0
+    """Of the oracle's depth: relative, every pixel for itself."""
+    flow_noise: float = 0.3
+    """Of the oracle's flow, in pixels."""
+
+
+def check(config: SynthConfig, min_paths: int) -> None:
+    """InputError for numbers out of range, before anything is rendered. `min_paths` is
+    the smaller number of paths per pixel, of the clip or of the held-out views.
+    """
+    response_curve(config.response)
+    parse_white_balance(config.white_balance)
+    c = config
+    if not 0 <= c.vignetting <= 1:
+        raise InputError(f"--vignetting {c.vignetting}: choose from 0 (none) to 1 (the cos^4 law)")
+    if not MIN_FRAMES <= c.frames <= MAX_FRAMES:
+        raise InputError(
+            f"--frames {c.frames}: {MIN_FRAMES} to {MAX_FRAMES} can be made; "
+            "fewer leave no views far from the frames of their time"
+        )
+    if not 0 <= c.seed <= MAX_SEED:
+        raise InputError(f"--seed {c.seed}: choose from 0 to {MAX_SEED}")
+    if min_paths < 1:
+        raise InputError(
+            f"--spp {c.spp} --truth-spp {c.truth_spp}: at least one path per pixel is needed"
+        )
+    if not 0 <= c.noise < MAX_NOISE:
+        raise InputError(f"--noise {c.noise}: choose from 0 (a perfect sensor) to {MAX_NOISE:g}")
+    if not (0 <= c.depth_noise < 1 and 0 <= c.depth_grain < 1):
+        raise InputError(
+            f"--depth-noise {c.depth_noise} --depth-grain {c.depth_grain}: "
+            "choose from 0 (exact) to 1"
+        )
+    if not 0 <= c.flow_noise < 100:
+        raise InputError(f"--flow-noise {c.flow_noise}: choose from 0 (exact) to 100 pixels")
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(width, height) in pixels of "WxH"."""
+    width, _, height = text.lower().partition("x")
+    if width.isdecimal() and height.isdecimal():
+        size = int(width), int(height)
+        if min(size) >= MIN_SIDE:
+            return size
+    raise InputError(
+        f"--size {text!r:.40}: write it as WIDTHxHEIGHT, such as 240x136, "
+        f"at least {MIN_SIDE}x{MIN_SIDE}"
+    )
+
+
+def parse_ev(text: str) -> list[float]:
+    """The exposures of a cycle, in stops."""
+    try:
+        evs = [float(word) for word in text.split(",")]
+    except ValueError as error:
+        raise InputError(
+            f"--ev {text!r:.40}: write stops with commas between them, such as -4,-2,0"
+        ) from error
+    if not np.isfinite(evs).all():
+        raise InputError(f"--ev {text!r:.40}: the stops must be finite numbers")
+    return evs
+
+
+def parse_white_balance(text: str) -> tuple[float, float, float]:
+    """Gains of red, green and blue, of "R,G,B"."""
+    try:
+        red, green, blue = (float(word) for word in text.split(","))
+    except ValueError as error:
+        raise InputError(
+            f"--white-balance {text!r:.40}: write three gains with commas between them, "
+            "such as 1.12,1,0.87"
+        ) from error
+    gains = red, green, blue
+    if not all(0.01 <= gain <= 100 for gain in gains):
+        raise InputError(f"--white-balance {text!r:.40}: the gains must be from 0.01 to 100")
+    return gains
+
+
+def sensor_noise(strength: float) -> Noise | None:
+    """The noise of a small sensor, `strength` times as strong: at 1, read noise of
+    1e-3 of white and 6000 electrons at white. None for a perfect sensor.
+    """
+    if strength == 0:
+        return None
+    return Noise(1e-3 * strength, strength**2 / 6000)

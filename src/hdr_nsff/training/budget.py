@@ -1,0 +1,75 @@
+"""How long a run trains, and how far it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge, Gt, Le
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Steps or minutes: steps count where both are given."""
+
+    steps: Annotated[int, Ge(1), Le(10**12)] | None = None
+    """Stop after this many steps. The same seed and steps give the same result, also
+    through kills and restarts.
+    """
+    minutes: Annotated[float, Gt(0), Le(1e6)] | None = 5.0
+    """Without --steps: stop after this many minutes of training; learning rates and
+    schedules follow the clock.
+    """
+
+    def progress(self, step: int, seconds: float) -> float:
+        """Share of the run that is done, 0 to 1, after `step` steps in `seconds`."""
+        if self.steps is not None:
+            return step / self.steps
+        assert self.minutes is not None
+        return min(seconds / (60 * self.minutes), 1.0)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How learning rates and terms change over a run."""
+
+    period: Annotated[float, Ge(0), Le(1)] = 0.45
+    """The schedules' period K as a share of the run; 0: the published K = 1000
+    min(max(30, frames), 250) steps.
+    """
+    prior_fade: Annotated[float, Ge(0), Le(1)] = 1.0
+    """Depth and flow weights are multiplied by this every period (published: 0.1)."""
+    lr_final: Annotated[float, Ge(0), Le(1)] = 0.05
+    """Learning rates fall exponentially to this share of their start over the run; 0:
+    the published 0.1 per 300k steps.
+    """
+
+
+@dataclass(frozen=True)
+class Clock:
+    """How far a run is."""
+
+    budget: Budget
+    schedule: Schedule
+    num_frames: int
+    step: int = 0
+    seconds: float = 0.0  # of training, without compiling and writing
+
+    @property
+    def progress(self) -> float:
+        """Share of the run that is done, 0 to 1."""
+        return self.budget.progress(self.step, self.seconds)
+
+    @property
+    def phase(self) -> float:
+        """Time in units of the schedules' period K."""
+        if self.schedule.period:
+            return self.progress / self.schedule.period
+        return self.step / (1000 * min(max(30, self.num_frames), 250))
+
+    @property
+    def lr_share(self) -> float:
+        """Learning rates relative to their start."""
+        if self.schedule.lr_final:
+            return self.schedule.lr_final**self.progress
+        return 0.1 ** (self.step / 300_000)

@@ -1,0 +1,63 @@
+"""The optimizers of a run: Adam, and for grids and trajectories an Adam that moves only
+the rows a step has touched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.fields.nsff.encodings import TouchedAdam
+
+
+class Optimizers:
+    """Optimizers over parameter groups, by name: "dense" and "touched"."""
+
+    def __init__(self, groups: Sequence[ParamGroup]) -> None:
+        dense = [group for group in groups if group.row_marks is None]
+        touched = [group for group in groups if group.row_marks is not None]
+        self.by_name: dict[str, torch.optim.Optimizer] = {}
+        if dense:  # grids without a tone mapper have nothing dense
+            self.by_name["dense"] = torch.optim.Adam([as_dict(g) for g in dense], fused=True)
+        if touched:
+            self.by_name["touched"] = TouchedAdam([as_dict(g) for g in touched])
+        self.groups = {"dense": dense, "touched": touched}
+        # marks (rows,) of rows with a gradient, of any process
+        self.row_marks = [marks for group in touched for marks in group.row_marks or ()]
+
+    def parameters(self) -> Iterator[Tensor]:
+        """Everything that is learned."""
+        for optimizer in self.by_name.values():
+            for group in optimizer.param_groups:
+                yield from group["params"]
+
+    def follow_parameters(self) -> None:
+        """Move the moments to the devices of their parameters."""
+        for optimizer in self.by_name.values():
+            optimizer.load_state_dict(optimizer.state_dict())
+
+    def step(self, lr_share: float, progress: float) -> None:
+        """One step at rates of `lr_share` of their start; gradients are cleared."""
+        for name, optimizer in self.by_name.items():
+            for state, group in zip(optimizer.param_groups, self.groups[name], strict=True):
+                started = progress >= group.start
+                state["lr"] = group.lr * lr_share * started
+            optimizer.step()
+            if name == "dense":  # the touched one clears what it used
+                optimizer.zero_grad()
+
+
+def as_dict(group: ParamGroup) -> dict[str, Any]:
+    """A group as torch's optimizers take it."""
+    options: dict[str, Any] = {"params": list(group.params), "lr": group.lr}
+    if group.betas is not None:
+        options["betas"] = group.betas
+    if group.eps is not None:
+        options["eps"] = group.eps
+    if group.row_marks is not None:
+        options["touched"] = group.row_marks
+    return options

@@ -1,0 +1,52 @@
+"""The start of a run: brightness and surfaces of the field, from what `prepare` found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.fields.build import AnyField, initialize_field
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import ToneMapper, informative
+
+SUBSAMPLING = 4  # every this many pixels, along x and y, tell the typical radiance
+MIN_RADIANCE = 1e-6
+
+
+def start_field(
+    field: AnyField, tonemapper: ToneMapper, scene: Scene, from_priors: bool, with_flow: bool
+) -> str | None:
+    """Start an untrained field at the typical radiance and, if `from_priors`, at the
+    surfaces of the depth prior. A sentence about it, if any.
+
+    An objective without flow (`with_flow`) starts without it too: scene flow is 0 then.
+    """
+    if not with_flow:
+        still = [replace(f, flow={}, flow_valid={}) for f in scene.train]
+        scene = replace(scene, train=still)
+
+    def to_radiance(rgb: Tensor, frame: int) -> Tensor:
+        return recorded_radiance(tonemapper, scene, rgb, frame)
+
+    typical = typical_log_radiance(tonemapper, scene)
+    return initialize_field(field, scene, to_radiance, typical, from_priors)
+
+
+def recorded_radiance(tonemapper: ToneMapper, scene: Scene, rgb: Tensor, frame: int) -> Tensor:
+    """Radiance (N, 3) that training frame `frame` recorded as `rgb` (N, 3)."""
+    f = scene.train[frame]
+    return tonemapper.inverse(rgb, f.bracket, f.camera_id, frame)
+
+
+@torch.no_grad()
+def typical_log_radiance(tonemapper: ToneMapper, scene: Scene) -> float:
+    """Median log radiance of what the frames recorded without clipping."""
+    logs = []
+    for i, f in enumerate(scene.train):
+        rgb = f.image[::SUBSAMPLING, ::SUBSAMPLING].reshape(-1, 3)
+        radiance = recorded_radiance(tonemapper, scene, rgb[informative(rgb)], i)
+        logs.append(radiance.clamp_min(MIN_RADIANCE).log().flatten())
+    values = torch.cat(logs)
+    return float(values.median()) if len(values) else 0.0

@@ -1,0 +1,136 @@
+"""Debevec's least squares against simulated cameras: response and exposures come back,
+outliers do not matter.
+"""
+
+import numpy as np
+import pytest
+from wall import EV, GAMMA22, S_CURVE, SRGB, record, rmse
+
+from hdr_nsff.radiometry.debevec import (
+    HIGH,
+    LOW,
+    SATURATED,
+    Samples,
+    brightness_ev,
+    debevec,
+    linked,
+    response_of,
+    saturation,
+    typical_factor,
+)
+
+
+def points(curve, ev, num=700, outliers=0.0, seed=0):
+    """Random points recorded at exposures `ev`; outliers change by a stop or so."""
+    rng = np.random.default_rng(seed)
+    radiance = 2 ** rng.uniform(-7, 3, (num, 1, 1)) * 2 ** rng.normal(0, 0.5, (num, 1, 3))
+    exposure = radiance * 2.0 ** np.array(ev)[:, None]
+    wrong = rng.random((num, len(ev), 1)) < outliers
+    changed = exposure * 2 ** rng.normal(0, 1, exposure.shape)
+    z = record(np.where(wrong, changed, exposure), curve, rng)
+    return Samples(z, (z >= LOW) & (z <= HIGH), z >= SATURATED)
+
+
+@pytest.mark.parametrize("outliers", [0.0, 0.1])
+@pytest.mark.parametrize("curve", [GAMMA22, SRGB, S_CURVE], ids=["gamma", "srgb", "s-curve"])
+def test_the_response_comes_back_from_known_exposures(curve, outliers):
+    fit = debevec(points(curve, EV, outliers=outliers), EV, reference=2)
+    assert rmse(fit.x, fit.y, curve) < 0.02
+    np.testing.assert_allclose(fit.ev, EV)
+    assert not fit.guessed
+
+
+def test_two_exposures_suffice():
+    fit = debevec(points(S_CURVE, [0.0, 3.0]), [0.0, 3.0], reference=0)
+    assert rmse(fit.x, fit.y, S_CURVE) < 0.02
+
+
+def test_unknown_exposures_of_a_typical_camera_come_back():
+    fit = debevec(points(SRGB, EV, outliers=0.05), [None, None, None], reference=2)
+    assert fit.guessed
+    np.testing.assert_allclose(fit.ev, EV, atol=0.15)
+    assert rmse(fit.x, fit.y, SRGB) < 0.03
+
+
+@pytest.mark.parametrize("curve", [GAMMA22, SRGB, S_CURVE], ids=["gamma", "srgb", "s-curve"])
+@pytest.mark.parametrize(
+    "ev", [EV, [-3.0, 0.0], [0.0, 1.0, 2.0]], ids=["2 stops", "3 stops", "1 stop"]
+)
+def test_unknown_exposures_in_whole_stops_come_back_whatever_the_curve(curve, ev):
+    fit = debevec(points(curve, ev), [None] * len(ev), reference=len(ev) - 1)
+    np.testing.assert_allclose(fit.ev, np.array(ev) - ev[-1], atol=0.08)
+    assert rmse(fit.x, fit.y, curve) < 0.03
+
+
+def test_the_proportions_of_unknown_exposures_are_measured_whatever_the_curve():
+    ev = [-4.0, -1.0, 0.0]
+    for curve in (GAMMA22, SRGB, S_CURVE):
+        fit = debevec(points(curve, ev), [None, None, None], reference=2)
+        assert fit.ev[1] / fit.ev[0] == pytest.approx(0.25, abs=0.02)
+
+
+def test_one_known_exposure_settles_the_factor():
+    fit = debevec(points(S_CURVE, EV), [-4.0, None, 0.0], reference=2)
+    assert not fit.guessed
+    assert fit.ev[1] == pytest.approx(-2.0, abs=0.06)
+    assert rmse(fit.x, fit.y, S_CURVE) < 0.02
+
+
+def test_the_typical_factor_undoes_any_power_of_srgb():
+    curves = np.zeros((3, 42))
+    curves[:, 41] = 1.5  # G = 1.5 ln srgb^-1(z)
+    assert typical_factor(curves) == pytest.approx(1 / 1.5)
+
+
+def test_saturation_is_where_recordings_begin_to_saturate():
+    """Linear camera, one channel: exposures 0.1 ... 0.4 read in the dark frame; two
+    stops brighter, those above 0.25 saturate.
+    """
+    dark = np.linspace(0.1, 0.4, 301)[:, None]
+    light = np.minimum(4 * dark, 1)
+    rgb = np.stack([dark, light], 1).repeat(3, -1)  # (P, 2, 3)
+    samples = Samples(rgb, (rgb > 0) & (rgb < 0.99), rgb >= 1)
+    curve = np.zeros(42)
+    curve[40] = 1.0  # G = ln z
+    assert saturation(samples, 0, curve, np.log([1.0, 4.0])) == pytest.approx(0.0, abs=0.01)  # ln 1
+
+
+def test_shadows_do_not_move_saturation():
+    """As above, but points that fell into shadow before the brighter frame outnumber
+    those that are just bright enough to saturate.
+    """
+    dark = np.concatenate(
+        [np.linspace(0.05, 0.225, 300), np.linspace(0.23, 0.4, 30), np.linspace(0.278, 0.6, 40)]
+    )[:, None]
+    light = np.minimum(4 * dark, 1)
+    light[300:330] = 0.3
+    rgb = np.stack([dark, light], 1).repeat(3, -1)
+    samples = Samples(rgb, rgb < 0.99, rgb >= 1)
+    curve = np.zeros(42)
+    curve[40] = 1.0
+    assert saturation(samples, 0, curve, np.log([1.0, 4.0])) == pytest.approx(0.0, abs=0.01)
+
+
+def test_the_response_rises_even_where_the_fit_falls():
+    curves = np.zeros((3, 42))
+    curves[:, 20:30] = -3.0  # a deep dent in G
+    curves[:, 40] = 2.2
+    x, y = response_of(curves, tops=np.zeros(3))
+    assert y[:, 0].tolist() == [0, 0, 0] and y[:, -1] == pytest.approx(1.0)
+    assert (np.diff(y, axis=-1) >= 0).all() and len(x) == 256
+
+
+def test_brackets_without_common_points_are_not_linked():
+    samples = points(SRGB, EV)
+    assert linked(samples, [0, 1, 2])
+    samples.valid[:, 0] = False
+    assert linked(samples, [1, 2]) and not linked(samples, [0, 1, 2])
+
+
+def test_brightness_alone_gives_gamma_exposures():
+    rng = np.random.default_rng(0)
+    radiance = 2 ** rng.uniform(-5, 1, (40, 50, 3))
+    images = [record(radiance * 2.0**ev, GAMMA22, rng) for ev in EV]
+    assert brightness_ev(images, [0, 1, 2], reference=2, num_brackets=3) == pytest.approx(
+        EV, abs=0.15
+    )

@@ -1,0 +1,78 @@
+"""Images of 8 and 16 bits, masks, and pictures of maps, with values worked by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import (
+    colorize,
+    colorize_flow,
+    contact_sheet,
+    encode,
+    read_image,
+    read_mask,
+    write_png,
+)
+
+RGB = np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+def test_a_png_keeps_rgb_to_half_a_step(bits: int, tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", RGB, bits)
+    assert np.abs(read_image(tmp_path / "a.png") - RGB).max() <= 0.5001 / (2**bits - 1)
+
+
+def test_values_outside_the_recorded_range_are_clipped(tmp_path: Path) -> None:
+    write_png(tmp_path / "a.png", np.array([[-1.0, 0.0, 2.0]]))
+    assert read_image(tmp_path / "a.png")[0, :, 1].tolist() == [0, 0, 1]
+
+
+def test_a_mask_is_read_back(tmp_path: Path) -> None:
+    mask = RGB[..., 0] > 0.5
+    write_png(tmp_path / "a.png", mask)
+    assert np.array_equal(read_mask(tmp_path / "a.png"), mask)
+
+
+def test_gray_shows_through_transparent_pixels(tmp_path: Path) -> None:
+    bgra = np.array([[[0, 0, 255, 255], [0, 0, 255, 0]]], np.uint8)  # red: opaque, transparent
+    cv2.imwrite(str(tmp_path / "a.png"), bgra)
+    assert read_image(tmp_path / "a.png", over=0.25).tolist() == [[[1, 0, 0], [0.25] * 3]]
+    assert read_image(tmp_path / "a.png").tolist() == [[[1, 0, 0], [1, 0, 0]]]
+
+
+def test_images_that_are_missing_cut_short_or_damaged_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such image"):
+        read_image(tmp_path / "none.png")
+    for name in ("a.png", "a.jpg"):
+        encode(tmp_path / name, (255 * RGB).astype(np.uint8))
+        (tmp_path / name).write_bytes((tmp_path / name).read_bytes()[:-20])
+        with pytest.raises(InputError, match="cut short"):
+            read_image(tmp_path / name)
+    (tmp_path / "a.tif").write_bytes(b"II*\0 no image")
+    with pytest.raises(InputError, match="not a readable image"):
+        read_image(tmp_path / "a.tif")
+
+
+def test_a_contact_sheet_places_its_cells(tmp_path: Path) -> None:
+    sheet = contact_sheet([[np.ones((2, 3)), np.zeros((1, 1, 3))], [np.ones((2, 3, 3))]], gap=1)
+    assert sheet.shape == (7, 9, 3)  # two rows of 2 and two columns of 3, with gaps of 1
+    assert (sheet[1:3, 1:4] == 1).all() and (sheet[4:6, 1:4] == 1).all()
+    assert (sheet[1, 5] == 0).all() and sheet[1, 6, 0] == pytest.approx(0.12)
+
+
+def test_a_map_is_colored_from_low_to_high_and_black_where_it_is_not_valid() -> None:
+    valid = np.array([[True, True, False]])
+    rgb = colorize(np.array([[0.0, 1.0, 9.0]]), 0.0, 1.0, valid)
+    blue, red, black = rgb[0]
+    assert blue[2] > blue[0] and red[0] > red[2] and not black.any()
+
+
+def test_flow_is_colored_by_direction_and_length() -> None:
+    rgb = colorize_flow(np.array([[[1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]]), maximum=1.0)
+    assert np.allclose(rgb[0], [[1, 0, 0], [1, 0.5, 0.5], [1, 1, 1]])  # red to the right

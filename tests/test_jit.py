@@ -1,0 +1,81 @@
+"""Kernels are compiled with a cache where numba can write one, and without it where it
+cannot.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import hdr_nsff
+
+PACKAGE = Path(hdr_nsff.__file__).parent
+KERNELS = """
+from hdr_nsff.core.jit import cache_is_writable, jit
+
+@jit(nogil=True)
+def double(x):
+    return 2 * x
+
+@jit(inline="always")
+def one():
+    return 1
+
+@jit(fastmath=True)
+def increment(x):
+    return x + one()
+
+print(cache_is_writable(), double(4), increment(4))
+"""
+
+
+def run_kernels(folder: Path, **environment: str) -> tuple[str, str]:
+    """Output and errors of the kernels in a copy of `core/jit.py`, in a new process."""
+    for name in ("__init__.py", "core/__init__.py", "core/jit.py", "core/progress.py"):
+        target = folder / "hdr_nsff" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(PACKAGE / name, target)
+    (folder / "kernels.py").write_text(KERNELS)
+    kept = {k: v for k, v in os.environ.items() if k not in ("XDG_CACHE_HOME", "NUMBA_CACHE_DIR")}
+    environment = kept | {"PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1"} | environment
+    ended = subprocess.run(
+        [sys.executable, folder / "kernels.py"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return ended.stdout, ended.stderr
+
+
+def block_caches(folder: Path) -> str:
+    """Put files where numba would make its folders; a home that is none. Permissions
+    would not hold where the tests run as root.
+    """
+    for parent in (folder, folder / "hdr_nsff/core"):
+        parent.mkdir(parents=True, exist_ok=True)
+        (parent / "__pycache__").touch()
+    (folder / "home").touch()
+    return str(folder / "home")
+
+
+def test_compiled_kernels_are_kept_beside_their_source(tmp_path: Path) -> None:
+    assert run_kernels(tmp_path) == ("True 8 5\n", "")
+    assert list((tmp_path / "__pycache__").glob("kernels.double-*.nbi"))
+
+
+def test_without_a_writable_folder_kernels_are_compiled_and_it_is_said_once(
+    tmp_path: Path,
+) -> None:
+    output, error = run_kernels(tmp_path, HOME=block_caches(tmp_path))
+    assert output == "False 8 5\n"
+    assert error.count("compiling without a cache") == 1
+    assert "set NUMBA_CACHE_DIR to a writable folder" in " ".join(error.split())
+
+
+def test_the_folder_that_the_message_names_is_used(tmp_path: Path) -> None:
+    home = block_caches(tmp_path)
+    cache = tmp_path / "cache"
+    assert run_kernels(tmp_path, HOME=home, NUMBA_CACHE_DIR=str(cache)) == ("True 8 5\n", "")
+    assert list(cache.rglob("*.nbi"))

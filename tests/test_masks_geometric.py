@@ -1,0 +1,71 @@
+"""Moving masks of painted clips whose flow is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from painted_clips import H, K, W, cameras, painted_clip
+
+from hdr_nsff.priors.masks import geometric
+from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
+from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING
+
+
+def iou(a: np.ndarray, b: np.ndarray) -> float:
+    """Intersection over union."""
+    return float((a & b).sum() / (a | b).sum())
+
+
+def test_rough_mask_finds_motion_that_no_common_geometry_explains():
+    *given, truth = painted_clip("rising")
+    assert iou(rough_mask(*given), truth) > 0.75
+
+
+@pytest.mark.parametrize("kind", ["rising", "along"])
+def test_geometric_mask_finds_movers_along_epipolar_lines_too(kind):
+    *given, truth = painted_clip(kind)
+    assert iou(geometric_mask(*given, K, cameras()), truth) > 0.75
+
+
+def test_neither_parallax_nor_what_it_uncovers_is_motion():
+    *given, _ = painted_clip("near")
+    assert geometric_mask(*given, K, cameras()).mean() < 0.005
+
+
+def test_a_camera_at_rest_needs_no_depth():
+    *given, truth = painted_clip("rising", speed=0.0)
+    assert iou(geometric_mask(*given, K, cameras(0.0)), truth) > 0.75
+
+
+def test_flow_that_wanders_over_a_wall_without_texture_is_not_motion():
+    flow, valid, pairs, video, _ = painted_clip("near", speed=0.0)
+    video[:] = 0.5 + 0.002 * np.random.default_rng(0).normal(size=video.shape)
+    flow[:] = 0
+    flow[:, 20:50, 20:60] = 3.0
+    assert not geometric_mask(flow, valid, pairs, video, K, cameras(0.0)).any()
+
+
+def test_nothing_moves_in_frames_without_flow():
+    flow, valid, pairs, video, truth = painted_clip("rising")
+    without = (pairs != 4).all(1)  # frame 4 is held out
+    moving = geometric_mask(flow[without], valid[without], pairs[without], video, K, cameras())
+    assert not moving[4].any()
+    assert iou(moving[1], truth[1]) > 0.6
+
+
+def test_a_mask_of_most_of_the_frame_is_reported(monkeypatch):
+    messages = []
+    monkeypatch.setattr(geometric, "say", messages.append)
+    high_score = np.full((H, W), 4.0, np.float32)
+    monkeypatch.setattr(geometric, "motion_score", lambda *given: high_score)
+    *given, _ = painted_clip("rising")
+    assert rough_mask(*given).all()
+    assert "8 of 8 frames" in messages[0] and "--masks" in messages[0]
+
+
+def test_large_frames_are_judged_on_a_coarser_grid():
+    *given, truth = painted_clip("rising")
+    tuning = replace(GEOMETRIC_MASK_TUNING, working_pixels=H * W // 3)
+    found = geometric_mask(*given, K, cameras(), tuning)
+    assert found.shape == truth.shape
+    assert iou(found, truth) > 0.6

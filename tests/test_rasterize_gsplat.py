@@ -1,0 +1,128 @@
+"""gsplat is tried out at the door, with one Gaussian, and not after minutes of work."""
+
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+from hdr_nsff import cli, fields
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.fields.build import device_for
+from hdr_nsff.fields.nsff.nsff import NSFFConfig
+from hdr_nsff.fields.splat import rasterize_gsplat
+from hdr_nsff.fields.splat.rasterize import dense
+from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.geometry.cameras import Camera
+
+Draw = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]
+
+
+def without_kernels(*gaussians: Tensor, **options: object) -> Any:
+    """What gsplat's wheel does where there is no CUDA toolkit."""
+    raise AttributeError("'NoneType' object has no attribute 'CameraModelType'")
+
+
+def by_plain_torch(
+    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor,
+    views: Tensor, Ks: Tensor, width: int, height: int, **options: object,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+    """What gsplat draws, by the slow twin; only for a camera at the origin."""
+    camera = Camera(Ks[0], torch.eye(4)[:3], width, height)
+    seen = dense(means, quaternions, scales, opacities, features, camera)
+    return (
+        torch.cat([seen.features, seen.depth[..., None]], -1)[None],
+        seen.alpha[None, ..., None],
+        {},
+    )
+
+
+def too_faint(*gaussians: Tensor, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
+    """Kernels that run and draw the wrong thing."""
+    seen, alpha, rest = by_plain_torch(*gaussians, **options)
+    return seen, alpha * 0.5, rest
+
+
+@pytest.fixture
+def gsplat(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Draw], None]]:
+    """Installs a gsplat with this `rasterization`."""
+
+    def install(rasterization: Draw) -> None:
+        module = SimpleNamespace(rasterization=rasterization, __version__="1.5.3")
+        monkeypatch.setitem(sys.modules, "gsplat", module)
+        rasterize_gsplat.fault.cache_clear()
+
+    yield install
+    rasterize_gsplat.fault.cache_clear()
+
+
+def test_a_gsplat_that_draws_has_no_fault(gsplat: Callable[[Draw], None]) -> None:
+    gsplat(by_plain_torch)
+    assert rasterize_gsplat.fault("cpu") is None
+
+
+def test_a_gsplat_without_kernels_is_a_sentence_with_the_fix(
+    gsplat: Callable[[Draw], None],
+) -> None:
+    gsplat(without_kernels)
+    reason = rasterize_gsplat.fault("cpu")
+    assert reason is not None and "gsplat 1.5.3 cannot draw" in reason
+    assert "CameraModelType" in reason and "or the CUDA toolkit" in reason
+
+
+def test_a_gsplat_that_draws_something_else_is_not_used(gsplat: Callable[[Draw], None]) -> None:
+    gsplat(too_faint)
+    reason = rasterize_gsplat.fault("cpu")
+    assert reason is not None and "alpha of 0.375 instead of 0.75" in reason
+
+
+def test_a_missing_gsplat_is_a_sentence_with_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    rasterize_gsplat.fault.cache_clear()
+    assert "pip install 'hdr-nsff[gpu]'" in str(rasterize_gsplat.fault("cpu"))
+    rasterize_gsplat.fault.cache_clear()
+
+
+@pytest.fixture
+def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A CUDA device on which gsplat cannot draw; what the user is told."""
+    said: list[str] = []
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+    monkeypatch.setattr(rasterize_gsplat, "fault", lambda device="cuda": "gsplat cannot draw")
+    monkeypatch.setattr(fields, "say", said.append)
+    return said
+
+
+def test_gaussians_fall_back_to_the_cpu_loudly(broken_cuda: list[str]) -> None:
+    assert device_for(SplatConfig(), "auto") == torch.device("cpu")
+    assert len(broken_cuda) == 1 and "using the CPU" in broken_cuda[0]
+
+
+def test_gaussians_on_cuda_are_refused_where_that_was_asked_for(broken_cuda: list[str]) -> None:
+    with pytest.raises(InputError, match="--device cuda: gsplat cannot draw, or use --device cpu"):
+        device_for(SplatConfig(), "cuda")
+
+
+def test_other_fields_need_no_rasterizer(broken_cuda: list[str]) -> None:
+    assert device_for(NSFFConfig(), "auto") == torch.device("cuda") and not broken_cuda
+
+
+@pytest.mark.parametrize("verb", ["run", "train"])
+def test_nothing_is_prepared_or_trained_before_gsplat_was_tried(
+    verb: str, broken_cuda: list[str], toy_folder: Path, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    out = str(tmp_path / "out")
+    arguments = {
+        "run": ["run", str(toy_folder / "images"), out],
+        "train": ["train", "splat", "--scene", str(toy_folder), "--out", out],
+    }
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*arguments[verb], "--device", "cuda"])
+    assert stop.value.code == 2 and "gsplat cannot draw" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

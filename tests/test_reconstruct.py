@@ -1,0 +1,71 @@
+"""Which views are mapped, which reconstruction wins, and why there may be none."""
+
+from dataclasses import replace
+
+import numpy as np
+from posed_clips import panning
+
+from hdr_nsff.footage.colmap import ColmapCamera, ColmapImage, ColmapModel
+from hdr_nsff.priors.poses.reconstruct import (
+    SfmViews,
+    failure_message,
+    has_plausible_lens,
+    model_rank,
+    sfm_views,
+)
+
+
+def test_cameras_of_a_rig_that_stand_still_share_one_view():
+    rng = np.random.default_rng(0)
+    left, right = panning(np.zeros(1))[0], panning(np.array([20.0]))[0]
+    video = np.stack([f + 0.005 * rng.normal(size=f.shape) for f in [left, right] * 6]).astype(
+        np.float32
+    )
+    video[4, 20:50, 20:50] = 0  # something passes the left camera once
+    views = sfm_views(
+        video, np.zeros(video.shape[:3], bool), [list(range(0, 12, 2)), list(range(1, 12, 2))]
+    )
+    assert len(views.images) == 2 and views.of_frame.tolist() == [0, 1] * 6
+    assert np.abs(views.images[0] - left).max() < 0.03  # the median is free of the passer-by
+
+
+def model(focal: float, images: int) -> ColmapModel:
+    """A reconstruction of `images` images, 240 pixels wide."""
+    camera = ColmapCamera("SIMPLE_PINHOLE", 240, 136, np.diag([focal, focal, 1.0]), np.zeros(0))
+    return ColmapModel(
+        {1: camera},
+        dict.fromkeys(range(images)),
+        np.zeros(0),
+        np.zeros((0, 3)),
+        np.zeros(0),
+        np.zeros(0),
+    )
+
+
+def test_a_plausible_lens_counts_more_than_images():
+    # 107 degrees: the estimate of a 50 degree lens with movers left unmasked
+    assert not has_plausible_lens(model(89, 36))
+    assert model_rank(model(250, 20), 36) > model_rank(model(89, 36), 36)
+    assert model_rank(model(250, 34), 36) > model_rank(model(250, 20), 36)
+
+
+def views_of(count: int) -> SfmViews:
+    """`count` black frames of one camera, 240x136."""
+    return SfmViews(
+        np.zeros((count, 136, 240, 3)),
+        np.zeros((count, 136, 240), bool),
+        [list(range(count))],
+        np.arange(count),
+    )
+
+
+def test_failure_names_the_lens_or_the_frames():
+    images = {
+        k: ColmapImage(f"{k:05d}.png", 1, np.eye(4)[:3], np.zeros((0, 2)), np.zeros(0))
+        for k in (0, 1, 2, 6)
+    }
+    long_lens, short_lens = (replace(model(f, 0), images=images) for f in (500, 90))
+    message = failure_message(short_lens, views_of(5), [])
+    assert "focal length of 45 px is impossible" in message  # doubled frames: 90 / 2
+    message = failure_message(long_lens, views_of(10), [])
+    assert "6 of 10 frames could not be registered (frames 3-5, 7-9)" in message

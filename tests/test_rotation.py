@@ -1,0 +1,56 @@
+"""Cameras without parallax: rotations, their derivatives, and what is no rotation."""
+
+import numpy as np
+from posed_clips import FOCAL, H, W, seen, texture
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.priors.poses.matching import PairMatches, detect_keypoints, match_pairs, view_pairs
+from hdr_nsff.priors.poses.rotation import (
+    fit_panorama,
+    nearest_rotation,
+    rotate_pixels,
+    rotate_pixels_jacobian,
+)
+
+
+def test_a_slide_past_a_flat_wall_is_no_turn():
+    wall = texture(0, 400, 240)
+    slide = np.stack(
+        [seen(wall, np.array([[1, 0, -200 + 8.0 * t], [0, 1, -70], [0, 0, 1]])) for t in range(8)]
+    )
+    keypoints = detect_keypoints(slide, np.zeros((8, H, W), bool))
+    matches = match_pairs(keypoints, view_pairs([list(range(8))]))
+    assert fit_panorama(matches, 8, W, H).slides
+
+
+def test_derivatives_of_turned_pixels_agree_with_differences():
+    rng = np.random.default_rng(0)
+    rotations = Rotation.from_rotvec(0.1 * rng.normal(size=(2, 3))).as_matrix()
+    frames, p = np.tile([0, 1], (5, 1)), rng.uniform(-40, 40, (5, 2))
+    before, rays = rotate_pixels(rotations, FOCAL, frames, p)
+    exact = rotate_pixels_jacobian(rotations, FOCAL, frames, p, rays)
+    step = 1e-6
+    for k in range(7):
+        moved, focal = rotations.copy(), FOCAL
+        if k < 6:
+            turn = Rotation.from_rotvec(step * np.eye(3)[k % 3]).as_matrix()
+            moved[k // 3] = moved[k // 3] @ turn
+        else:
+            focal = FOCAL * np.exp(step)
+        slope = (rotate_pixels(moved, focal, frames, p)[0] - before) / step
+        assert np.allclose(exact[:, :, k], slope, atol=1e-2)
+
+
+def test_random_matches_give_no_panorama():
+    rng = np.random.default_rng(0)
+    noise = PairMatches(0, 1, rng.uniform(0, 90, (50, 2)), rng.uniform(0, 90, (50, 2)))
+    assert fit_panorama([noise], 2, W, H) is None
+
+
+def test_the_nearest_rotation_ignores_scale_sign_and_a_little_noise():
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    noise = 1e-3 * np.random.default_rng(0).normal(size=(3, 3))
+    for factor in (1.0, -4.0, 0.01):
+        found = nearest_rotation(factor * (turn + noise))
+        assert np.allclose(found, turn, atol=3e-3)
+        assert np.allclose(found @ found.T, np.eye(3)) and np.linalg.det(found) > 0

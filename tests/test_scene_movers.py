@@ -1,0 +1,120 @@
+"""Movers as files, and the depth that their shapes give."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.scene.movers import (
+    Mover,
+    fill_mover_depth,
+    nearest_mover,
+    read_movers,
+    write_movers,
+)
+
+TIMES = 3
+C2W = np.eye(3, 4)
+
+
+def mover(pixels: list[list[float]], points: list[list[float]], error: float = 0.1) -> Mover:
+    """One that stands still, its tracks at the same `pixels` at every time."""
+    count = len(pixels)
+    return Mover(
+        frames=np.arange(TIMES),
+        pixels=np.repeat(np.array(pixels, float).reshape(count, 1, 2), TIMES, 1),
+        trust=np.ones((count, TIMES)),
+        points=np.array(points, float).reshape(count, 3),
+        rotations=np.tile(np.eye(3), (TIMES, 1, 1)),
+        translations=np.zeros((TIMES, 3)),
+        center=np.zeros(3),
+        known=np.ones(TIMES, bool),
+        error=error,
+    )
+
+
+def test_canonical_places_come_back_from_any_time() -> None:
+    turning = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.2, 0], [0, 0.5, 0.3]]).as_matrix()
+    m = mover([[1, 1], [2, 2]], [[0.5, 0, 3], [0, 0.5, 4]])
+    m = replace(m, rotations=turning, translations=np.eye(3), center=np.array([1.0, 2, 3]))
+    for t in range(TIMES):
+        np.testing.assert_allclose(m.canonical(m.at(t), t), m.points, atol=1e-12)
+
+
+def test_a_pixel_takes_the_depth_of_near_tracks_unless_it_differs_much() -> None:
+    disparity, confidence = np.full((8, 12), 0.4, np.float32), np.zeros((8, 12), np.float32)
+    disparity[2, 4], disparity[2, 5], confidence[2, 3] = 0, 0.2, 0.9
+    tracks = mover([[2.5, 2.5]], [[0, 0, 2.2]])  # of disparity 1 / 2.2 = 0.455
+    moving = np.ones((8, 12), bool)
+    found, trust = fill_mover_depth([tracks], 0, moving, C2W, disparity, confidence)
+    expected = [1 / 2.2, 1 / 2.2, 0, 0.2, 0.4]  # the last is out of reach
+    assert found[2, [2, 3, 4, 5, 11]] == pytest.approx(expected)
+    assert trust[2, [2, 3, 4, 11]] == pytest.approx([0.5, 0.9, 0, 0])
+    assert disparity[2, 2] == np.float32(0.4)  # what was given stays as it was
+
+
+def test_two_movers_do_not_mix_their_depths() -> None:
+    disparity, confidence = np.full((4, 8), 0.4, np.float32), np.zeros((4, 8), np.float32)
+    movers = [mover([[1.5, 1.5]], [[0, 0, 2.0]]), mover([[6.5, 1.5]], [[0, 0, 3.0]])]
+    found, _ = fill_mover_depth(movers, 1, np.ones((4, 8), bool), C2W, disparity, confidence)
+    assert found[1, [1, 6]] == pytest.approx([1 / 2, 1 / 3])
+    pixels = np.array([[0.5, 0.5], [7.5, 2.5]])
+    assert nearest_mover(movers, 1, pixels).tolist() == [0, 1]
+
+
+def test_a_mover_without_a_shape_gives_no_depth() -> None:
+    disparity, confidence = np.full((4, 4), 0.4, np.float32), np.zeros((4, 4), np.float32)
+    shapeless = [mover([[1.5, 1.5]], [[np.nan] * 3], error=np.inf)]
+    moving = np.ones((4, 4), bool)
+    found, trust = fill_mover_depth(shapeless, 0, moving, C2W, disparity, confidence)
+    assert np.array_equal(found, disparity) and np.array_equal(trust, confidence)
+
+
+def test_movers_are_read_as_they_were_written_and_one_may_be_dropped(tmp_path: Path) -> None:
+    first, second = mover([[1, 1]], [[0, 0, 1]]), mover([[2, 2], [3, 3]], [[0, 0, 2]] * 2, np.inf)
+    write_movers(tmp_path / "movers.npz", [first, second])
+    found = read_movers(tmp_path / "movers.npz")
+    assert [m.error for m in found] == [0.1, np.inf]
+    np.testing.assert_array_equal(found[1].pixels, second.pixels)
+    arrays = dict(np.load(tmp_path / "movers.npz"))
+    kept = {name: array for name, array in arrays.items() if not name.startswith("0/")}
+    np.savez(tmp_path / "movers.npz", **kept)
+    assert len(read_movers(tmp_path / "movers.npz")) == 1
+
+
+def without(name: str, arrays: dict[str, np.ndarray]) -> None:
+    del arrays[name]
+
+
+DAMAGE = {
+    "an array is missing": lambda a: without("0/pixels", a),
+    "another version": lambda a: a.update(version=np.array(9)),
+    "another shape": lambda a: a.update({"0/trust": np.ones((7, TIMES))}),
+    "no rotation": lambda a: a.update({"0/rotations": np.full((TIMES, 3, 3), 0.3)}),
+    "NaN in its motion": lambda a: a.update({"0/translations": np.full((TIMES, 3), np.nan)}),
+    "words": lambda a: a.update({"0/error": np.array("much")}),
+    "no number for its name": lambda a: a.update({"first/error": np.array(1.0)}),
+}
+
+
+@pytest.mark.parametrize("what", DAMAGE)
+def test_movers_that_make_no_sense_are_refused_in_a_sentence(what: str, tmp_path: Path) -> None:
+    path = tmp_path / "movers.npz"
+    write_movers(path, [mover([[1, 1]], [[0, 0, 1]])])
+    arrays = dict(np.load(path))
+    DAMAGE[what](arrays)
+    np.savez(path, **arrays)
+    with pytest.raises(InputError, match="--redo movers"):
+        read_movers(path)
+
+
+@pytest.mark.parametrize("cut", [0, 10, 200, -30])
+def test_a_file_that_was_cut_short_is_refused_in_a_sentence(cut: int, tmp_path: Path) -> None:
+    path = tmp_path / "movers.npz"
+    write_movers(path, [mover([[1, 1]], [[0, 0, 1]])])
+    path.write_bytes(path.read_bytes()[:cut])
+    with pytest.raises(InputError, match="--redo movers"):
+        read_movers(path)

@@ -1,0 +1,100 @@
+"""The worker process of structure from motion: its end, its errors, and full disks."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import asdict
+
+import pytest
+from posed_clips import PLACES, sliding
+
+from hdr_nsff import cli
+from hdr_nsff.core.images import write_png
+from hdr_nsff.core.io import FULL
+from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.trimming import TrimmingTuning
+
+
+def test_a_worker_that_breaks_down_reports_why(tmp_path):
+    pytest.importorskip("pycolmap")
+    (tmp_path / "images").mkdir()
+    job = sfm.Job(str(tmp_path), [["missing.png"]], [], 100.0, "nonsense")  # type: ignore[arg-type]
+    with pytest.raises(sfm.SfmError):
+        sfm.run(job)
+
+
+def test_a_worker_does_not_outlive_its_parent(tmp_path):
+    code = (
+        "import subprocess, sys, time\n"
+        "worker = 'import time; from hdr_nsff.priors.poses.sfm import die_with_parent; '\n"
+        "worker += 'die_with_parent(); time.sleep(60)'\n"
+        "print(subprocess.Popen([sys.executable, '-c', worker]).pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    worker = int(parent.stdout.readline())
+    time.sleep(2.0)  # until it watches
+    os.kill(parent.pid, signal.SIGKILL)
+    parent.wait()
+    for _ in range(100):
+        if not os.path.exists(f"/proc/{worker}"):
+            return
+        time.sleep(0.1)
+    os.kill(worker, signal.SIGKILL)
+    pytest.fail("the worker lives on")
+
+
+FULL_DISK = """
+import errno, os, pathlib
+write = pathlib.Path.write_text
+
+def write_text(self, *arguments, **named):
+    if self.name == "pairs.txt":
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    return write(self, *arguments, **named)
+
+pathlib.Path.write_text = write_text
+"""
+
+
+def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pycolmap")
+    (tmp_path / "inject").mkdir()
+    # Python imports it first: in the worker only
+    (tmp_path / "inject/sitecustomize.py").write_text(FULL_DISK)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path / "inject"), *sys.path]))
+    for t, frame in enumerate(sliding(PLACES)):
+        write_png(tmp_path / f"clip/{t:03d}.png", frame)
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["prepare", str(tmp_path / "clip"), str(tmp_path / "scene"), "--ev", "0"])
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if line.startswith("hdr-nsff: ")]
+    assert stop.value.code == 2 and len(errors) == 1
+    assert "scene/poses: the disk is full" in errors[0]
+    assert not list((tmp_path / "scene/poses").glob(".sfm-*"))
+
+
+def test_a_disk_without_free_space_is_full_however_the_worker_ended(tmp_path):
+    sfm.check_free_space(tmp_path, "all went well")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (sfm.MIN_FREE_BYTES // 2, before[1]))
+    try:
+        with pytest.raises(OSError) as full:
+            sfm.check_free_space(tmp_path, "all went well")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+        signal.signal(signal.SIGXFSZ, handler)
+    assert full.value.errno in FULL and not list(tmp_path.iterdir())
+
+
+def test_a_job_survives_its_way_to_the_worker(tmp_path):
+    tuning = sfm.SfmTuning(max_features=99, trimming=TrimmingTuning(max_rounds=3))
+    job = sfm.Job(str(tmp_path), [["a.png"]], [], 100.0, "global", tuning=tuning)
+    (tmp_path / "job.json").write_text(json.dumps(asdict(job)))
+    assert sfm.read_job(tmp_path / "job.json") == job

@@ -1,0 +1,72 @@
+"""Views of named paths and path files, and the sentences that refuse the others."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from fakes import SPEED, DiscBeforeWall, W, camera, fake_run
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.rendering.shot_views import plan_shot
+from hdr_nsff.rendering.shots import render_still
+
+
+def path_file(folder: Path, x: float, time: float) -> str:
+    """A path file of one view at (x, 0, 0)."""
+    view = {"time": time, "c2w": camera(x).c2w.tolist(), "ev": -2}
+    (folder / "ride.json").write_text(json.dumps([view]))
+    return str(folder / "ride.json")
+
+
+def test_slow_motion_shows_the_disc_between_its_places(tmp_path: Path) -> None:
+    run = fake_run(tmp_path, field=DiscBeforeWall(speed=SPEED / 4, red=3.0))
+    shot = plan_shot(run, "slowmo", factor=4)
+    assert [v.time for v in shot.views[:5]] == [0, 0.25, 0.5, 0.75, 1] and len(shot.views) == 21
+    places = []
+    for view in shot.views[4:9]:
+        motion = render_still(run, replace(view, camera=camera())).motion
+        places.append(float((np.arange(W) * motion.sum(0)).sum() / motion.sum()))
+    assert np.allclose(np.diff(places), 0.5, atol=0.15)  # 2 pixels per frame
+
+
+def test_bullet_time_spirals_around_the_frame_at_its_time(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    views = plan_shot(run, "bullet", frame=1, num_views=8).views
+    assert {v.time for v in views} == {1.0}
+    start = run.scene.train[1].camera.c2w
+    assert torch.allclose(views[0].camera.c2w, start, atol=1e-6)
+    assert len({tuple(v.camera.c2w[:, 3].tolist()) for v in views}) == 8
+
+
+@pytest.mark.parametrize(
+    ("parallax", "word"), [("none", "stood still"), ("rotation", "only turned")]
+)
+def test_bullet_time_without_parallax_is_refused(tmp_path: Path, parallax: str, word: str) -> None:
+    with pytest.raises(InputError, match=f"no bullet time.*{word}"):
+        plan_shot(fake_run(tmp_path, parallax=parallax), "bullet")
+
+
+def test_paths_that_the_footage_cannot_show_are_refused(tmp_path: Path) -> None:
+    run, still = fake_run(tmp_path), fake_run(tmp_path, parallax="none")
+    with pytest.raises(InputError, match="not known"):
+        plan_shot(run, "orbit")
+    with pytest.raises(InputError, match="frame 99: the scene has no such frame"):
+        plan_shot(run, "fixed", frame=99)
+    with pytest.raises(InputError, match="outside the clip"):
+        plan_shot(run, path_file(tmp_path, 0.0, 7.5))
+    with pytest.raises(InputError, match="leaves the clip's viewpoint"):
+        plan_shot(still, path_file(tmp_path, 0.5, 1.0))
+
+
+def test_slow_motion_of_too_many_views_is_refused_before_it_is_planned(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)  # 6 frames: 5 steps
+    assert len(plan_shot(run, "slowmo", factor=1999).views) == 5 * 1999 + 1
+    with pytest.raises(InputError, match="10,001 views; a shot has at most 10,000, use 1999"):
+        plan_shot(run, "slowmo", factor=2000)
+    with pytest.raises(InputError, match=r"--factor 10\^400.* use 1999"):
+        plan_shot(run, "slowmo", factor=10**400)

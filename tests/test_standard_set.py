@@ -1,0 +1,66 @@
+"""The standard set of a run: complete, within its budget, and kept by a restart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import fake_run
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import read_image
+from hdr_nsff.rendering.shots import Output
+from hdr_nsff.rendering.standard_set import cut, render_all
+
+NAMES = {
+    "EXR sequence",
+    "as filmed",
+    "fixed camera",
+    "bullet time",
+    "slow motion",
+    "depth",
+    "scene flow",
+    "overview",
+    "LDR at EV -4.0",
+    "LDR at EV -2.0",
+    "LDR at EV +0.0",
+}
+
+
+def test_the_set_is_complete_and_restarts_without_work(tmp_path: Path) -> None:
+    run, out = fake_run(tmp_path), tmp_path / "out"
+    results = render_all(run, out)
+    assert set(results) == NAMES and all(p.exists() for p in results.values())
+    assert len(list((out / "training").glob("*.exr"))) == 6
+    for folder in ("ldr/ev-2.0", "depth", "scene_flow"):
+        assert len(list((out / folder).glob("*.png"))) == 6
+    dark = read_image(out / "ldr/ev-4.0/00000.png")
+    assert np.allclose(dark, run.scene.train[0].image, atol=0.01)  # frame 0 was recorded at EV -4
+    before = run.field.calls
+    render_all(run, out)
+    assert run.field.calls - before <= 1  # the focus depth of bullet time
+
+
+def test_without_parallax_the_set_goes_on_without_bullet_time(tmp_path: Path) -> None:
+    results = render_all(fake_run(tmp_path, parallax="none"), tmp_path / "out")
+    assert "bullet time" not in results and results["fixed camera"].exists()
+
+
+def test_the_budget_shrinks_videos_and_then_drops_views() -> None:
+    assert cut([1.0] * 10, 20, 0.25, thin=False) == (1.0, list(range(10)))
+    # 10 * 0.75^2 = 5.6
+    assert cut([1.0] * 10, 6, 0.25, thin=False) == (0.75, list(range(10)))
+    # At a quarter of the size 64 views take 4 s, so half of them, in the middle.
+    assert cut([1.0] * 64, 2, 0.25, thin=False) == (0.25, list(range(16, 48)))
+
+
+def test_thinned_shots_drop_views_evenly_and_keep_eight() -> None:
+    # 15 / 8 = 1.875 apart
+    assert cut([1.0] * 16, 9, 1.0, thin=True) == (1.0, [0, 2, 4, 6, 8, 9, 11, 13, 15])
+    assert cut([1.0] * 20, 1, 1.0, thin=True)[1][::7] == [0, 19]
+
+
+def test_the_set_needs_its_exr_sequence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="--exr none"):
+        render_all(fake_run(tmp_path), tmp_path, output=Output(exr="none"))

@@ -1,0 +1,59 @@
+"""Devices by name, and functions mapped over the tensors of a dataclass."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from torch import Tensor
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import pick_device, tree_map
+
+
+@dataclass(frozen=True)
+class Pair:
+    first: Tensor
+    others: dict[str, tuple[Tensor, ...]]
+    name: str
+
+
+def test_a_function_reaches_every_tensor_and_nothing_else() -> None:
+    pair = Pair(torch.tensor(1.0), {"a": (torch.tensor(2.0), torch.tensor(3.0))}, "pair")
+    doubled = tree_map(lambda t: 2 * t, pair)
+    assert (doubled.first, doubled.others, doubled.name) == (2.0, {"a": (4.0, 6.0)}, "pair")
+
+
+def with_cuda_devices(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """A torch that sees so many CUDA devices."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
+
+
+def test_auto_is_cuda_where_there_is_a_device(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_cuda_devices(monkeypatch, 0)
+    assert pick_device("auto") == pick_device("cpu") == torch.device("cpu")
+    with_cuda_devices(monkeypatch, 2)
+    assert pick_device("auto") == pick_device("cuda") == torch.device("cuda")
+    assert pick_device("cuda:1") == torch.device("cuda", 1)
+
+
+@pytest.mark.parametrize(("count", "name", "reason"), [
+    (0, "cuda", "sees no CUDA device"),
+    (0, "cuda:0", "sees no CUDA device"),
+    (2, "cuda:2", "there are 2, counted from cuda:0"),
+])  # fmt: skip
+def test_a_cuda_device_that_is_not_there_is_an_error(
+    count: int, name: str, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with_cuda_devices(monkeypatch, count)
+    with pytest.raises(InputError, match=f"--device {name}: .*{reason}"):
+        pick_device(name)
+
+
+NAMES = ["mps", "hip", "xla", "meta", "privateuseone", "gpu7", "", "cuda:", "cuda:-1", "cuda:x"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_other_devices_are_refused_with_the_list(name: str) -> None:
+    with pytest.raises(InputError, match="choose auto, cpu, cuda or cuda:N"):
+        pick_device(name)

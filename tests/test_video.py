@@ -1,0 +1,43 @@
+"""Videos: the frames and times that were written are read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.video import read_video, video_info, write_video
+
+FRAMES = [np.full((17, 33, 3), level) for level in (0.1, 0.5, 0.9)]
+
+
+def test_frames_and_times_are_read_back_at_even_size(tmp_path: Path) -> None:
+    assert write_video(tmp_path / "a.mp4", FRAMES, fps=12) == 3
+    seen = list(read_video(tmp_path / "a.mp4"))
+    assert [round(time * 12) for _, time in seen] == [0, 1, 2]
+    for (frame, _), given in zip(seen, FRAMES, strict=True):
+        assert frame.shape == (16, 32, 3) and np.abs(frame - given[:16, :32]).max() < 0.02
+
+
+def test_the_header_names_frames_rate_and_length(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", FRAMES, fps=12)
+    info = video_info(tmp_path / "a.mp4")
+    assert (info.frames, info.fps) == (3, 12) and info.seconds == pytest.approx(0.25)
+
+
+def test_no_frames_are_no_video(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no frames to write"):
+        write_video(tmp_path / "a.mp4", [])
+    assert not list(tmp_path.iterdir())
+
+
+def test_videos_that_are_cut_short_or_none_are_refused(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", FRAMES)
+    (tmp_path / "a.mp4").write_bytes((tmp_path / "a.mp4").read_bytes()[:-100])
+    with pytest.raises(InputError, match="the video is cut short"):
+        video_info(tmp_path / "a.mp4")
+    (tmp_path / "b.mp4").write_text("<html>")
+    with pytest.raises(InputError, match="not a readable video"):
+        list(read_video(tmp_path / "b.mp4"))
