@@ -50,7 +50,7 @@ def read_document(path: Path, purpose: str) -> dict[str, Any]:
 
 
 def number_of(path: Path, frame: Mapping[str, Any], key: str, purpose: str) -> float:
-    """A number of a frame, up to `MAX_NUMBER`; `purpose` is what an InputError names."""
+    """A number of a frame up to `MAX_NUMBER`; `purpose` is what an InputError names."""
     value = frame.get(key)
     if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= MAX_NUMBER:
         return float(value)
