@@ -1,4 +1,4 @@
-"""Arrays of other programs: any content of their files ends in numbers or a sentence."""
+"""Arrays of other programs: whatever their files hold ends in numbers or a sentence."""
 
 import io
 import zipfile
