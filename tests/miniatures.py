@@ -32,7 +32,7 @@ TEXTURE = cv2.GaussianBlur(
 
 
 def pose(x: float) -> np.ndarray:
-    """c2w (3, 4) OpenCV of a camera at (x, 0.1 x, 0), turned about all axes a little."""
+    """c2w (3, 4) OpenCV of a camera at (x, 0.1 x, 0), turned a little."""
     turn = Rotation.from_euler("yxz", [-6 * x, 3 * x, 2 * x], degrees=True).as_matrix()
     return np.concatenate([turn, [[x], [0.1 * x], [0.0]]], 1)
 
@@ -99,18 +99,16 @@ def gopro(root: Path, scale: int = 1, held_out: bool = True) -> Path:
     for i in range(COUNT):
         c2w, ev = gopro_pose(i % CAMERAS), EV[i % CAMERAS]
         right, down, forward, center = c2w.T
-        matrix = np.stack(
-            [down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1
-        )  # of pictures twice as large
+        # of pictures twice as large
+        matrix = np.stack([down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)
         rows.append(np.append(matrix.ravel(), [3.0, 5.0]))
         picture = see(c2w, ev, scale)
         write_png(dense / f"images_{W * scale}x{H * scale}/{i:05d}.png", picture)
         write_png(dense / f"images/{i:05d}.png", see(c2w, ev, 2))
         write_png(dense / f"motion_masks/{i:05d}.png", left(3))
         write_png(root / f"masks/{i:05d}.png", ~left(5))
-        write_npy(
-            dense / f"depth-anything/{i:05d}.npy", np.full((H, W), 2.0, np.float32)
-        )  # its unit is 2 scene units
+        # its unit is 2 scene units
+        write_npy(dense / f"depth-anything/{i:05d}.npy", np.full((H, W), 2.0, np.float32))
         for j, side in ((i + 1, "fwd"), (i - 1, "bwd")):
             if 0 <= j < COUNT:
                 flow = np.full((H, W, 2), [j - i, 0.5], np.float32)
@@ -242,9 +240,8 @@ def hdr_nerf_real(root: Path) -> Path:
     for n in range(12):
         c2w = pose(0.1 * n)
         right, down, forward, center = c2w.T
-        matrix = np.stack(
-            [down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1
-        )  # of pictures twice as large
+        # of pictures twice as large
+        matrix = np.stack([down, right, -forward, center, np.array([2 * H, 2 * W, 2 * FOCAL])], 1)
         for e in range(5):
             ev = 2.0 * (e - 2)
             rows.append([*matrix.ravel(), 3.0, 5.0, 2.0**ev])
@@ -267,13 +264,22 @@ def nerfstudio(root: Path, **changes: Any) -> Path:
         write_npy(root / f"depth/{n}.npy", np.full((H, W), 1000 * WALL, np.float32))
         frames.append(
             {
-                "file_path": f"images/frame_{n:05d}.png", "transform_matrix": opengl(c2w), "depth_file_path": f"depth/{n}.npy",
+                "file_path": f"images/frame_{n:05d}.png",
+                "transform_matrix": opengl(c2w),
+                "depth_file_path": f"depth/{n}.npy",
                 "mask_path": f"masks/{n}.png",
             }
-        )  # fmt: skip
+        )
     document = {
-        "camera_model": "OPENCV", "fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2, "w": W, "h": H, "frames": frames,
+        "camera_model": "OPENCV",
+        "fl_x": FOCAL,
+        "fl_y": FOCAL,
+        "cx": W / 2,
+        "cy": H / 2,
+        "w": W,
+        "h": H,
+        "frames": frames,
         "test_filenames": ["images/frame_00004.png"],
-    }  # fmt: skip
+    }
     write_json(root / "transforms.json", document | changes)
     return root

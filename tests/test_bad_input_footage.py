@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,9 +32,9 @@ def prepared(capsys: Capture, clip: Path, *options: object) -> str:
         return {p: b for p, b in files.items() if not p.is_relative_to(clip.parent / "scene")}
 
     before = rest()
-    said = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
+    sentence = refused(capsys, "prepare", clip, clip.parent / "scene", *options)
     assert rest() == before
-    return said
+    return sentence
 
 
 @pytest.mark.parametrize("verb", FOOTAGE_VERBS)
@@ -66,6 +68,13 @@ def exr_with(value: float) -> Callable[[Path], None]:
             file.write(str(path))
 
     return damage
+
+
+def claim_size(path: Path) -> None:
+    """Have a PNG claim 40000 x 30000 pixels in its header."""
+    data = path.read_bytes()
+    header = b"IHDR" + struct.pack(">II", 40000, 30000) + data[24:29]
+    path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
 
 
 def text_video(folder: Path) -> Path:
@@ -105,6 +114,22 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "frames of two sizes": (
         lambda p: one_bad(p, lambda f: write_png(f, np.full((30, 60, 3), 0.5))),
         "004.png: 60x30 pixels",
+    ),
+    "frames of one pixel": (
+        lambda p: clip(p, [np.full((1, 1, 3), 0.5)] * FRAMES),
+        "frames are 1x1 pixels, at least 11x11 are needed",
+    ),
+    "frames of one row": (
+        lambda p: clip(p, [np.full((1, 64, 3), 0.5)] * FRAMES),
+        "frames are 64x1 pixels",
+    ),
+    "frames of ten columns": (
+        lambda p: clip(p, [np.full((64, 10, 3), 0.5)] * FRAMES),
+        "frames are 10x64 pixels",
+    ),
+    "a PNG of a thousand megapixels": (
+        lambda p: one_bad(p, claim_size),
+        "004.png: 40000x30000 pixels, more than the 200 megapixels",
     ),
     "all black": (lambda p: clip(p, [np.zeros((34, 60, 3))] * FRAMES), "all frames are black"),
     "all white": (lambda p: clip(p, [np.ones((34, 60, 3))] * FRAMES), "all frames are white"),
@@ -187,8 +212,8 @@ def test_exposures_that_cannot_be_made(value: str, tmp_path: Path, capsys: Captu
 def test_an_exposure_list_that_fits_no_cycle(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip", recorded(24))
     for given, count in (("--ev=-2,0", 2), ("--exposures=1/1000,1/500,1/250,1/125", 4)):
-        said = prepared(capsys, folder, given)
-        assert f"{count} exposures listed" in said and "repeats every 3" in said
+        sentence = prepared(capsys, folder, given)
+        assert f"{count} exposures listed" in sentence and "repeats every 3" in sentence
 
 
 def test_an_exposure_list_longer_than_the_clip(tmp_path: Path, capsys: Capture) -> None:
@@ -213,10 +238,38 @@ def test_a_csv_that_leaves_frames_out(tmp_path: Path, capsys: Capture) -> None:
 # Settings and maps
 
 
-def test_settings_out_of_range(tmp_path: Path, capsys: Capture) -> None:
+@pytest.mark.parametrize("verb", ["prepare", "reexpose"])
+def test_settings_out_of_range(verb: str, tmp_path: Path, capsys: Capture) -> None:
+    footage, out = clip(tmp_path / "clip"), tmp_path / "out"
+    for option, value, words in (
+        ("--hold-out", 1, "--hold-out 1"),
+        ("--hold-out", -5, "--hold-out -5"),
+        ("--max-size", 3, "--max-size 3"),
+        ("--stride", 0, "in steps of 0"),
+        ("--start", -1, "frames -1"),
+        ("--end", 0, "to 0"),
+        ("--ev", "0,1e308", "--ev 1e+308"),
+    ):
+        assert words in refused(capsys, verb, footage, out, f"{option}={value}")
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    "option", ["--noise=nan", "--noise=-inf", "--noise=1e300", "--noise=-1", "--seed=-1"]
+)
+def test_noise_that_no_sensor_has(option: str, tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
-    assert "--hold-out 1" in prepared(capsys, folder, "--hold-out", 1)
-    assert "--max-size 3" in prepared(capsys, folder, "--max-size", 3)
+    name = option.partition("=")[0]
+    assert name in refused(capsys, "reexpose", folder, tmp_path / "out", option)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_end_beyond_the_clip_is_the_end(tmp_path: Path, capsys: Capture) -> None:
+    """The frames are read, and the exposures found wrong after them."""
+    folder = clip(tmp_path / "clip", recorded(24))
+    sentence = prepared(capsys, folder, "--end", 10**30, "--stride", 1, "--ev=0,1")
+    assert "2 exposures listed" in sentence
+    assert "0 frames to use" in prepared(capsys, folder, "--start", 10**30, "--redo", "frames")
 
 
 def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capture) -> None:
@@ -295,7 +348,7 @@ def test_a_disk_that_fills_up_between_frames_keeps_those_that_are_done(
         assert "the disk is full" in prepared(capsys, folder, "--ev=0,1")
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "scene/images").glob("*.png")}
     assert kept and not list((tmp_path / "scene").rglob(".partial-*"))
-    said = prepared(capsys, folder, "--ev=0,1")
-    assert "2 exposures listed" in said  # in the step after the frames
+    sentence = prepared(capsys, folder, "--ev=0,1")
+    assert "2 exposures listed" in sentence  # in the step after the frames
     assert {p: p.stat().st_mtime_ns for p in kept} == kept
     assert len(list((tmp_path / "scene/images").glob("*.png"))) == 24

@@ -83,8 +83,8 @@ def test_a_place_that_cannot_be_written_is_named(
 ) -> None:
     (tmp_path / "file").write_text("mine")
     footage, out = clip(tmp_path / "clip", recorded(3)), tmp_path / place
-    said = refused(capsys, *commands(run_folder, footage, out)[verb])
-    assert place.partition("/")[0][:40] in said
+    sentence = refused(capsys, *commands(run_folder, footage, out)[verb])
+    assert place.partition("/")[0][:40] in sentence
     assert (tmp_path / "file").read_text() == "mine"
 
 
@@ -129,7 +129,7 @@ def test_files_of_the_users_own_are_not_replaced_by_gaussians(
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b'{"takes": 3}'}
 
 
-def test_gaussians_of_another_run_are_exported_anew_and_that_is_said(
+def test_gaussians_of_another_run_are_exported_again_and_that_is_reported(
     run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     command = commands(run_folder, tmp_path, tmp_path / "out")["export"]

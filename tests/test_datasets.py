@@ -3,19 +3,23 @@ every convention a known point is where its picture shows it, in training pictur
 held-out ones.
 """
 
+import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import miniatures as mini
 import numpy as np
 import pytest
+from mutations import check_json_reader, check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.video import write_video
-from hdr_nsff.footage.datasets import held_out, layout_of, recognize
-from hdr_nsff.footage.datasets.capture import Capture, Clock, turns
-from hdr_nsff.footage.pose_files import Given, placed
+from hdr_nsff.footage.datasets import held_out_views, layout_of, recognize
+from hdr_nsff.footage.datasets.capture import Capture, Clock, number_cameras
+from hdr_nsff.footage.pose_files import placed
+from hdr_nsff.footage.pose_formats import GivenPoses
 
 SETS = {
     "hdr-gopro": mini.gopro,
@@ -28,10 +32,15 @@ SETS = {
     "nerfstudio": mini.nerfstudio,
 }
 NAMES = {
-    "hdr-gopro": "HDR-GoPro / NSFF (LLFF)", "d-nerf": "D-NeRF (Blender)", "nerf": "NeRF synthetic (Blender)",
-    "hdr-hexplane": "HDR-HexPlane (Blender)", "hdr-4d": "HDR-4D (Blender)", "hdr-nerf": "HDR-NeRF (synthetic)",
-    "hdr-nerf-real": "HDR-NeRF (real)", "nerfstudio": "nerfstudio",
-}  # fmt: skip
+    "hdr-gopro": "HDR-GoPro / NSFF (LLFF)",
+    "d-nerf": "D-NeRF (Blender)",
+    "nerf": "NeRF synthetic (Blender)",
+    "hdr-hexplane": "HDR-HexPlane (Blender)",
+    "hdr-4d": "HDR-4D (Blender)",
+    "hdr-nerf": "HDR-NeRF (synthetic)",
+    "hdr-nerf-real": "HDR-NeRF (real)",
+    "nerfstudio": "nerfstudio",
+}
 
 
 def read(root: Path) -> Capture:
@@ -44,7 +53,7 @@ def read(root: Path) -> Capture:
 def misses(
     root: Path,
     files: list[Path],
-    given: Given,
+    given: GivenPoses,
     over: float | None,
     size: tuple[int, int] = (mini.H, mini.W),
 ) -> float:
@@ -66,7 +75,8 @@ def misses(
 def test_a_layout_is_recognized_and_named(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
     assert capture.layout == NAMES[name]
-    assert capture.withheld and all((tmp_path / p.source).is_file() for p in capture.pictures)
+    assert capture.withheld
+    assert all((tmp_path / p.source).is_file() for p in capture.pictures)
 
 
 def test_footage_is_no_data_set(tmp_path: Path) -> None:
@@ -75,9 +85,8 @@ def test_footage_is_no_data_set(tmp_path: Path) -> None:
     write_video(tmp_path / "clip.mp4", [np.zeros((16, 16, 3))] * 3)
     np.save(tmp_path / "a/poses_bounds.npy", np.zeros((2, 17)))  # poses beside frames, for --poses
     elsewhere = {"frames": [{"file_path": "elsewhere/0.png", "transform_matrix": []}]}
-    mini.write_json(
-        tmp_path / "rig/transforms.json", elsewhere
-    )  # poses of other pictures, for --poses
+    # poses of other pictures, for --poses
+    mini.write_json(tmp_path / "rig/transforms.json", elsewhere)
     (tmp_path / "rig/dense").mkdir()
     (tmp_path / "empty").mkdir()
     for place in ("a", "rig", "rig/left", "clip.mp4", "empty", "missing"):
@@ -106,29 +115,31 @@ def test_training_cameras_see_the_dot_where_their_pictures_show_it(
 @pytest.mark.parametrize("name", SETS)
 def test_held_out_cameras_do_too(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
-    views, given = held_out.read(capture)
-    assert views and misses(tmp_path, [v.recorded[0][0] for v in views], given, capture.over) < 0.6
+    views, given = held_out_views.read_views(capture)
+    assert views
+    assert misses(tmp_path, [v.recorded[0][0] for v in views], given, capture.over) < 0.6
 
 
 def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
     capture = read(mini.blender(tmp_path))
     assert capture.poses is not None
-    flipped = Given(
+    flipped = GivenPoses(
         None, capture.poses.K, capture.poses.c2w * [[[1, -1, -1, 1]]], capture.poses.size
     )
     assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], flipped, 1.0) > 3
 
 
-def test_times_become_frames_whatever_their_unit() -> None:
+def test_times_in_any_unit_become_frames() -> None:
     clock = Clock.of([k / 149 for k in range(150) if k % 5])
     assert clock.step == pytest.approx(1 / 149)
-    assert [clock(t / 149) for t in (1, 2, 149)] == [0, 1, 148] and clock(5 / 149) == 4
+    assert [clock(t / 149) for t in (1, 2, 149)] == [0, 1, 148]
+    assert clock(5 / 149) == 4
     assert clock(2.5 / 149) == pytest.approx(1.5)
     assert Clock.of([7.0])(7.0) == 0
 
 
 def test_pictures_of_one_time_are_of_several_cameras() -> None:
-    assert turns([0, 1, 0, 1, 2, 1]) == [0, 0, 1, 1, 0, 2]
+    assert number_cameras([0, 1, 0, 1, 2, 1]) == [0, 0, 1, 1, 0, 2]
 
 
 @pytest.mark.parametrize(
@@ -180,7 +191,7 @@ def test_a_missing_held_out_file_is_named_and_matters_to_the_truth_alone(
     (tmp_path / lost).unlink()
     capture = read(tmp_path)
     with pytest.raises(InputError, match=words):
-        held_out.read(capture)
+        held_out_views.read_views(capture)
 
 
 @pytest.mark.parametrize("name", ["d-nerf", "hdr-nerf", "nerfstudio"])
@@ -211,6 +222,113 @@ def test_cameras_of_real_hdr_nerf_scenes_that_make_no_sense_are_one_sentence(
     np.save(path, change(np.load(path)))
     with pytest.raises(InputError, match=words):
         recognize(tmp_path)
+
+
+def exported_nerfstudio(root: Path, names: dict[str, Any]) -> Path:
+    """nerfstudio's layout as `export` writes it, with these `names` of maps in each
+    entry under `hdr_nsff`, or at its top.
+    """
+    mini.nerfstudio(root)
+    document = json.loads((root / "transforms.json").read_text())
+    top = {"points": names.pop("points", None)}
+    frames = {
+        f["file_path"]: {"time": k, "disparity": "depth/0.npy", **names}
+        for k, f in enumerate(document["frames"])
+    }
+    document["hdr_nsff"] = {
+        "fps": 24, "reference_bracket": 0, "bracket_ev": [0.0], "exposure_given": True,
+        "near": 1.0, "far": 9.0, "depth_kind": "scene", "frames": frames, **top,
+    }  # fmt: skip
+    mini.write_json(root / "transforms.json", document)
+    return root
+
+
+def test_maps_of_an_export_are_found_by_their_names(tmp_path: Path) -> None:
+    names = {"confidence": "depth/1.npy", "points": "depth/2.npy", "flow": {"a": "depth/3.npy"}}
+    root = exported_nerfstudio(tmp_path, names)
+    np.save(root / "depth/2.npy", [[1.0, 2.0, 3.0]])
+    capture = read(root)
+    first = capture.pictures[0]
+    paths = [first.depth, first.confidence, first.flow["a"]]
+    assert paths == [tmp_path.resolve() / f"depth/{k}.npy" for k in (0, 1, 3)]
+    assert capture.points is not None
+    assert (capture.points == [[1, 2, 3]]).all()
+
+
+@pytest.mark.parametrize("name", ["../secret.npy", "/etc/passwd", "link.npy"])
+@pytest.mark.parametrize("key", ["disparity", "confidence", "moving", "points", "flow"])
+def test_a_map_outside_the_data_set_is_refused(key: str, name: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "secret.npy", np.ones((2, 3)))
+    root = tmp_path / "set"
+    exported_nerfstudio(root, {key: {"a": name} if key == "flow" else name})
+    (root / "link.npy").symlink_to(tmp_path / "secret.npy")
+    with pytest.raises(InputError, match="points outside the data set"):
+        capture = read(root)
+        held_out_views.read_views(capture)
+
+
+def test_a_depth_map_outside_the_data_set_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "secret.npy", np.ones((2, 3)))
+    path = mini.nerfstudio(tmp_path / "set") / "transforms.json"
+    path.write_text(path.read_text().replace("depth/3.npy", "../secret.npy"))
+    with pytest.raises(InputError, match="points outside the data set"):
+        recognize(path.parent)
+
+
+@pytest.mark.parametrize("bad", ["\0", "a\0b", "\ud800", "x" * 5000, "a/" * 3000])
+@pytest.mark.parametrize("name", ["d-nerf", "hdr-nerf", "nerfstudio"])
+def test_a_name_that_no_file_can_have_is_one_short_sentence(
+    name: str, bad: str, tmp_path: Path
+) -> None:
+    SETS[name](tmp_path)
+    path = tmp_path / ("transforms.json" if name == "nerfstudio" else "transforms_train.json")
+    document = json.loads(path.read_text())
+    document["frames"][1]["file_path"] = bad
+    path.write_text(json.dumps(document))
+    refusals = "cannot be the name of a file|missing|no exposure"
+    with pytest.raises(InputError, match=refusals) as error:
+        recognize(tmp_path)
+    assert len(str(error.value)) < 500
+
+
+def test_pictures_may_be_links_to_other_places(tmp_path: Path) -> None:
+    root = mini.gopro(tmp_path / "set")
+    picture = root / "dense/images_48x32/00004.png"
+    picture.rename(tmp_path / "elsewhere.png")
+    picture.symlink_to(tmp_path / "elsewhere.png")
+    assert read(root).pictures[4].source == "dense/images_48x32/00004.png"
+
+
+def read_whole(root: Path) -> None:
+    """All that `prepare` asks of a data set before it makes anything of it."""
+    capture = recognize(root)
+    if capture is None:
+        return
+    capture.footage()
+    if capture.poses is not None:
+        placed(root, capture.poses, list(range(len(capture.pictures))), (mini.H, mini.W))
+    if capture.withheld:
+        held_out_views.read_views(capture)
+
+
+@pytest.mark.parametrize("name", [*SETS, "exported"])
+def test_damaged_data_sets_are_read_or_refused(name: str, tmp_path: Path) -> None:
+    if name == "exported":
+        exported_nerfstudio(tmp_path, {"confidence": "depth/1.npy", "flow": {"a": "depth/3.npy"}})
+    else:
+        SETS[name](tmp_path)
+    for path in sorted(tmp_path.rglob("*.json")):
+        check_reader(path, lambda: read_whole(tmp_path), 20)
+        check_json_reader(path, lambda: read_whole(tmp_path), 60)
+    for path in sorted(tmp_path.rglob("poses_bounds*.npy")):
+        check_reader(path, lambda: read_whole(tmp_path), 60)
+
+
+@pytest.mark.parametrize("value", [[{"a": 1}], "all", [3], {}])
+@pytest.mark.parametrize("key", ["train_filenames", "val_filenames", "test_filenames"])
+def test_a_list_of_names_that_is_none_is_one_sentence(key: str, value: Any, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"`{key}` is no list of file names"):
+        recognize(mini.nerfstudio(tmp_path, **{key: value}))
 
 
 def test_a_file_name_that_leaves_the_data_set_is_refused(tmp_path: Path) -> None:

@@ -47,14 +47,23 @@ def write_truth(folder: Path, run: Run, radiance: str, **changes: Any) -> Path:
             )
         views.append(
             TruthView(
-                name=name, time=time, bracket=bracket, anchor=int(time), c2w=c.c2w.tolist(),
-                recorded={b: f"recorded/{name}_{b}.png" for b in recorded}, radiance=f"radiance/{name}.exr" if name in radiance else None,
+                name=name,
+                time=time,
+                bracket=bracket,
+                anchor=int(time),
+                c2w=c.c2w.tolist(),
+                recorded={b: f"recorded/{name}_{b}.png" for b in recorded},
+                radiance=f"radiance/{name}.exr" if name in radiance else None,
             )
-        )  # fmt: skip
+        )
     truth = Truth(
-        bracket_ev=[*EV, BRIGHTER], reference_bracket=2, bracket_frame=[3, 4, 5, None], K=camera().K.tolist(),
-        clip_c2w=[f.camera.c2w.tolist() for f in run.scene.train], views=views,
-    )  # fmt: skip
+        bracket_ev=[*EV, BRIGHTER],
+        reference_bracket=2,
+        bracket_frame=[3, 4, 5, None],
+        K=camera().K.tolist(),
+        clip_c2w=[f.camera.c2w.tolist() for f in run.scene.train],
+        views=views,
+    )
     write_json(folder / "truth.json", truth.model_copy(update=changes).model_dump())
     return folder
 
@@ -64,11 +73,11 @@ def test_a_perfect_run_is_perfect_on_recorded_views(tmp_path: Path) -> None:
     result = evaluate_run(run, write_truth(tmp_path / "truth", run, radiance=""))
     assert result["kind"] == "held-out views as recorded"
     assert [v["psnr"] > 60 for v in result["views"]] == [True, True]
-    assert (
-        result["views"][0]["psnr_novel_exposures"] > 60
-        and "psnr_novel_exposures" not in result["views"][1]
-    )
-    assert "mu5000" not in result["headline"] and result["camera"] == {} and "scale" not in result
+    assert result["views"][0]["psnr_novel_exposures"] > 60
+    assert "psnr_novel_exposures" not in result["views"][1]
+    assert "mu5000" not in result["headline"]
+    assert result["camera"] == {}
+    assert "scale" not in result
     assert result["poses"]["ate"] == pytest.approx(0, abs=1e-6)
 
 
@@ -76,19 +85,21 @@ def test_radiance_beside_recordings_is_scored_too(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     result = evaluate_run(run, write_truth(tmp_path / "truth", run, radiance="ab"))
     assert result["kind"] == "held-out views with exact radiance"
-    assert result["headline"]["mu5000"] > 55 and result["scale"] == pytest.approx(1, abs=1e-3)
+    assert result["headline"]["mu5000"] > 55
+    assert result["scale"] == pytest.approx(1, abs=1e-3)
     assert result["camera"] == {}  # the true response is not known
 
 
 def test_views_without_radiance_do_not_count_in_its_scores(tmp_path: Path) -> None:
-    """The gauge is that of the one view that has radiance; both have recorded values."""
+    """The gauge is that of the view that has radiance; both have recorded values."""
     run = fake_run(tmp_path / "run")
     one = evaluate_run(run, write_truth(tmp_path / "truth", run, radiance="b"))
     a, b = one["views"]
-    assert "mu5000" not in a and b["mu5000"] > 55 and one["headline"]["mu5000"] == b["mu5000"]
-    assert one["scale"] == pytest.approx(1, abs=1e-3) and one["peak"] == pytest.approx(
-        3
-    )  # the disc's red
+    assert "mu5000" not in a
+    assert b["mu5000"] > 55
+    assert one["headline"]["mu5000"] == b["mu5000"]
+    assert one["scale"] == pytest.approx(1, abs=1e-3)
+    assert one["peak"] == pytest.approx(3)  # the disc's red
     assert (
         read_image(run.folder / "evaluation/a.png").shape[0]
         < read_image(run.folder / "evaluation/b.png").shape[0]
@@ -132,9 +143,8 @@ def test_a_view_is_seen_through_a_lens_of_its_own(tmp_path: Path) -> None:
     truth["views"][0]["K"] = K.tolist()
     write_json(folder / "truth.json", truth)
     result = evaluate_run(run, folder)
-    assert result["views"][0]["psnr"] > 60 and result["poses"]["focal_error"] == pytest.approx(
-        0, abs=1e-6
-    )
+    assert result["views"][0]["psnr"] > 60
+    assert result["poses"]["focal_error"] == pytest.approx(0, abs=1e-6)
 
 
 def test_recorded_views_belong_to_protocols(tmp_path: Path) -> None:
@@ -154,10 +164,8 @@ def test_recorded_views_belong_to_protocols(tmp_path: Path) -> None:
     some.scene.manifest.protocol = "novel-view-time"
     result = evaluate_run(some, folder)
     assert [v["protocol"] for v in result["views"]] == ["novel-view-time", "novel-view"]
-    assert (
-        result["headline"]["views"] == 1
-        and result["headline"]["psnr"] == result["views"][0]["psnr"]
-    )
+    assert result["headline"]["views"] == 1
+    assert result["headline"]["psnr"] == result["views"][0]["psnr"]
 
 
 def test_a_wrong_exposure_is_seen(tmp_path: Path) -> None:

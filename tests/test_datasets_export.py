@@ -1,5 +1,5 @@
 """The way back: a scene written in a public layout and prepared again is the same
-scene, bit by bit; what does not fit is said.
+scene, bit by bit; what does not fit is reported.
 """
 
 from __future__ import annotations
@@ -83,7 +83,9 @@ def same_frame(one: Path, f: FrameEntry, other: Path, g: FrameEntry) -> None:
         g.split,
     )
     assert (one / f.image).read_bytes() == (other / g.image).read_bytes()
-    assert f.mask and g.mask and (read_mask(one / f.mask) == read_mask(other / g.mask)).all()
+    assert f.mask
+    assert g.mask
+    assert (read_mask(one / f.mask) == read_mask(other / g.mask)).all()
     for name in ("disparity", "disparity_confidence"):
         a, b = getattr(f, name), getattr(g, name)
         assert (read_npy(one / a) == read_npy(other / b)).all(), name
@@ -111,11 +113,11 @@ def test_a_round_trip_is_exact(layout: str, scene: Path) -> None:
         "fps",
     ):
         assert getattr(a, name) == getattr(b, name), name
-    assert (
-        a.points and b.points and (read_npy(scene / a.points) == read_npy(again / b.points)).all()
-    )
-    found_anew = ("sheet", "response", "movers")
-    steps = {n: s.provenance for n, s in b.steps.items() if n not in found_anew}
+    assert a.points
+    assert b.points
+    assert (read_npy(scene / a.points) == read_npy(again / b.points)).all()
+    estimated = ("sheet", "response", "movers")
+    steps = {n: s.provenance for n, s in b.steps.items() if n not in estimated}
     assert set(steps.values()) == {"given"}
 
 
@@ -126,12 +128,11 @@ def test_other_readers_find_what_the_gopro_layout_promises(scene: Path) -> None:
     assert table.shape == (6, 17)
     for f, row in zip(m.frames, table, strict=True):
         matrix, c2w = row[:15].reshape(3, 5), np.array(f.c2w)
-        assert (
-            (matrix[:, 0] == c2w[:, 1]).all()
-            and (matrix[:, 1] == c2w[:, 0]).all()
-            and (matrix[:, 2] == -c2w[:, 2]).all()
-        )
-        assert (matrix[:, 3] == c2w[:, 3]).all() and matrix[:, 4].tolist() == [
+        assert (matrix[:, 0] == c2w[:, 1]).all()
+        assert (matrix[:, 1] == c2w[:, 0]).all()
+        assert (matrix[:, 2] == -c2w[:, 2]).all()
+        assert (matrix[:, 3] == c2w[:, 3]).all()
+        assert matrix[:, 4].tolist() == [
             m.height,
             m.width,
             f.K[0][0] if f.K else None,
@@ -139,14 +140,11 @@ def test_other_readers_find_what_the_gopro_layout_promises(scene: Path) -> None:
         assert 0 < row[15] < row[16]
     with np.load(dense / "flow_i1/00002_bwd.npz") as flow:
         files = m.frames[2].flow[1]
-        assert (flow["flow"] == read_npy(scene / files.flow)).all() and flow[
-            "flow"
-        ].dtype == np.float32
+        assert (flow["flow"] == read_npy(scene / files.flow)).all()
+        assert flow["flow"].dtype == np.float32
         assert (flow["mask"] == read_mask(scene / files.valid)).all()
-    assert (
-        not (dense / "flow_i1/00000_bwd.npz").exists()
-        and not (dense / "flow_i1/00005_fwd.npz").exists()
-    )
+    assert not (dense / "flow_i1/00000_bwd.npz").exists()
+    assert not (dense / "flow_i1/00005_fwd.npz").exists()
     assert (
         read_mask(dense / "motion_masks/00003.png") == ~read_mask(dense.parent / "masks/00003.png")
     ).all()
@@ -160,9 +158,8 @@ def test_other_readers_find_what_the_gopro_layout_promises(scene: Path) -> None:
 def test_the_colmap_model_projects_points_onto_their_keypoints(scene: Path) -> None:
     dense = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro")) / "dense"
     model, m = read_model(dense / "sparse"), Manifest.load(scene)
-    assert model.points.shape == (50, 3) and [i.name for i in model.images.values()] == [
-        f"{k:05d}.png" for k in range(6)
-    ]
+    assert model.points.shape == (50, 3)
+    assert [i.name for i in model.images.values()] == [f"{k:05d}.png" for k in range(6)]
     seen = 0
     for image, f in zip(model.images.values(), m.frames, strict=True):
         assert np.allclose(image.c2w, f.c2w, atol=1e-12)
@@ -176,12 +173,10 @@ def test_the_colmap_model_projects_points_onto_their_keypoints(scene: Path) -> N
 
 def test_hidden_points_are_not_seen() -> None:
     points = np.array([[0, 0, 4.0], [0, 0, 6.0], [0, 0, -4.0], [9, 0, 4.0]])
-    view = to_colmap.seen(points, mini.K, np.eye(4)[:3], np.full((mini.H, mini.W), 0.25))
-    assert (
-        view.index.tolist() == [0]
-        and view.depth.tolist() == [4]
-        and view.xy.tolist() == [[mini.W / 2, mini.H / 2]]
-    )
+    view = to_colmap.visible_points(points, mini.K, np.eye(4)[:3], np.full((mini.H, mini.W), 0.25))
+    assert view.index.tolist() == [0]
+    assert view.depth.tolist() == [4]
+    assert view.xy.tolist() == [[mini.W / 2, mini.H / 2]]
 
 
 def test_nerfstudio_gets_opengl_poses_and_millimeters(scene: Path) -> None:
@@ -190,7 +185,8 @@ def test_nerfstudio_gets_opengl_poses_and_millimeters(scene: Path) -> None:
     assert [f["time"] for f in document["frames"]] == [k / 5 for k in range(6)]
     for f, entry in zip(m.frames, document["frames"], strict=True):
         matrix, c2w = np.array(entry["transform_matrix"]), np.array(f.c2w)
-        assert (matrix[:3] == c2w * [1, -1, -1, 1]).all() and matrix[3].tolist() == [0, 0, 0, 1]
+        assert (matrix[:3] == c2w * [1, -1, -1, 1]).all()
+        assert matrix[3].tolist() == [0, 0, 0, 1]
         assert np.allclose(
             np.load(out / entry["depth_file_path"]) / 1000,
             1 / read_npy(scene / (f.disparity or "")),
@@ -207,22 +203,20 @@ def test_held_out_frames_become_test_pictures_and_come_back_as_truth(scene: Path
     forget_movers(scene)
     again = round_trip(scene, "nerfstudio")
     b = Manifest.load(again)
-    assert [f.time for f in b.frames] == keep and all(f.split == "train" for f in b.frames)
+    assert [f.time for f in b.frames] == keep
+    assert all(f.split == "train" for f in b.frames)
     for k, g in zip(keep, b.frames, strict=True):
         f = m.frames[k]
         assert (f.K, f.c2w, f.bracket) == (g.K, g.c2w, g.bracket)
         assert (scene / f.image).read_bytes() == (again / g.image).read_bytes()
     truth = Truth.open(again.with_name("again_nerfstudio_truth"))
     (view,) = truth.views
-    assert (
-        view.time == 3
-        and view.bracket == m.frames[3].bracket
-        and np.allclose(view.c2w, m.frames[3].c2w)
-    )
+    assert view.time == 3
+    assert view.bracket == m.frames[3].bracket
+    assert np.allclose(view.c2w, m.frames[3].c2w)
     exact, pictures = true_pictures(truth, view, again.with_name("again_nerfstudio_truth"))
-    assert (
-        exact is None and (pictures[view.bracket] == Scene.open(scene).test[0].image.numpy()).all()
-    )
+    assert exact is None
+    assert (pictures[view.bracket] == Scene.open(scene).test[0].image.numpy()).all()
 
 
 def test_the_gopro_layout_has_no_place_for_held_out_frames_of_the_clip(
@@ -259,25 +253,119 @@ def test_cameras_that_record_at_once_fit_nerfstudio_alone(scene: Path) -> None:
 def test_an_exported_folder_without_one_of_its_notes_is_refused(scene: Path) -> None:
     out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro"))
     note = out / "dense/hdr_nsff.json"
-    told = json.loads(note.read_text())
+    content = json.loads(note.read_text())
     note.write_text(
-        json.dumps(told | {"frames": {k: v for k, v in told["frames"].items() if k != "00003.png"}})
+        json.dumps(
+            content | {"frames": {k: v for k, v in content["frames"].items() if k != "00003.png"}}
+        )
     )
     with pytest.raises(InputError, match="no entry for picture 00003"):
         recognize(out)
-    note.write_text(json.dumps({k: v for k, v in told.items() if k != "near"}))
+    note.write_text(json.dumps({k: v for k, v in content.items() if k != "near"}))
     with pytest.raises(InputError, match="near"):
         recognize(out)
 
 
-def test_exporting_again_replaces_what_was_there_but_nothing_else(
-    scene: Path, tmp_path: Path
+def files_of(folder: Path) -> dict[str, bytes]:
+    """All files below `folder` with their contents."""
+    files = [p for p in folder.rglob("*") if p.is_file()]
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in files}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_exporting_again_leaves_the_files_of_others_alone(layout: str, scene: Path) -> None:
+    out = scene.with_name("out")
+    config = ExportConfig(scene, out, layout=layout)  # type: ignore[arg-type]
+    whole = files_of(export(config))
+    mine = {"logs/my_training.txt": b"a", "notes.md": b"b", "logs/old/c.txt": b"c"}
+    for name, data in mine.items():
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_bytes(data)
+    export(config)
+    assert files_of(out) == whole | mine
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_files_of_an_earlier_export_do_not_stay(layout: str, scene: Path) -> None:
+    out = scene.with_name("out")
+    config = ExportConfig(scene, out, layout=layout)  # type: ignore[arg-type]
+    export(config)
+    (out / "images").mkdir(exist_ok=True)
+    (out / "images/mine.txt").write_text("mine")
+    m = Manifest.load(scene)
+    m.frames, m.points = m.frames[:4], None
+    m.frames[3].flow.pop(4)
+    m.save(scene)
+    forget_movers(scene)
+    export(config)
+    left = files_of(out)
+    assert left.pop("images/mine.txt") == b"mine"
+    assert left == files_of(export(replace(config, out=scene.with_name("new"))))
+
+
+@pytest.mark.parametrize("name", ["transforms.json", "images", "depth/00002.npy", "depth"])
+def test_a_file_in_the_way_of_an_export_is_named_and_stays(name: str, scene: Path) -> None:
+    out = scene.with_name("out")
+    export(ExportConfig(scene, out, layout="hdr-gopro"))
+    mine = out / name
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text("mine")
+    before = files_of(out)
+    with pytest.raises(InputError, match="did not write"):
+        export(ExportConfig(scene, out, layout="nerfstudio"))
+    assert files_of(out) == before
+    assert mine.read_text() == "mine"
+
+
+def test_a_folder_in_the_place_of_a_file_is_named_and_stays(scene: Path) -> None:
+    config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
+    export(config)
+    (config.out / "transforms.json").unlink()
+    (config.out / "transforms.json").mkdir()
+    with pytest.raises(InputError, match=r"transforms\.json: .* did not write"):
+        export(config)
+
+
+def test_an_export_that_was_killed_is_replaced_by_the_next(
+    scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
+    written = []
+
+    def stop(source: Path, target: Path) -> None:
+        if len(written) == 5:
+            raise KeyboardInterrupt
+        written.append(target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_bytes(source.read_bytes())
+
+    with monkeypatch.context() as patch:
+        patch.setattr("hdr_nsff.footage.layouts.nerfstudio.copy", stop)
+        with pytest.raises(KeyboardInterrupt):
+            export(config)
+    export(config)
+    new = replace(config, out=scene.with_name("new"))
+    assert files_of(config.out) == files_of(export(new))
+
+
+@pytest.mark.parametrize("name", ["../mine.txt", "/etc/hostname", "link/mine.txt"])
+def test_an_edited_note_removes_nothing_outside(name: str, scene: Path) -> None:
+    config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
+    note = export(config) / "hdr_nsff_export.json"
+    (scene.with_name("other")).mkdir()
+    for place in (scene.with_name("mine.txt"), scene.with_name("other") / "mine.txt"):
+        place.write_text("mine")
+    (config.out / "link").symlink_to(scene.with_name("other"))
+    content = json.loads(note.read_text())
+    note.write_text(json.dumps(content | {"files": [*content["files"], name]}))
+    with pytest.raises(InputError, match="points outside the export"):
+        export(config)
+    assert scene.with_name("mine.txt").is_file()
+    assert (scene.with_name("other") / "mine.txt").is_file()
+
+
+def test_an_export_goes_into_a_folder_of_exports_alone(scene: Path, tmp_path: Path) -> None:
     config = ExportConfig(scene, tmp_path / "out", layout="hdr-gopro")
-    export(config)
-    write_png(tmp_path / "out/dense/images/00099.png", np.zeros((4, 4, 3)))
-    export(config)
-    assert not (tmp_path / "out/dense/images/00099.png").exists()
     write_png(tmp_path / "mine/photo.png", np.zeros((4, 4, 3)))
     with pytest.raises(InputError, match="not made by export"):
         export(replace(config, out=tmp_path / "mine"))
@@ -353,9 +441,15 @@ def write_truth(scene: Path, folder: Path, **changes: Any) -> Truth:
             )
     curve = response_curve("film")
     truth = Truth(
-        bracket_ev=EXPOSURES, reference_bracket=1, response_x=curve.x.tolist(), response_y=curve.y.tolist(), white_balance=[1.2, 1, 0.9],
-        clip_c2w=[true(f.c2w).tolist() for f in m.frames], views=views, **changes,
-    )  # fmt: skip
+        bracket_ev=EXPOSURES,
+        reference_bracket=1,
+        response_x=curve.x.tolist(),
+        response_y=curve.y.tolist(),
+        white_balance=[1.2, 1, 0.9],
+        clip_c2w=[true(f.c2w).tolist() for f in m.frames],
+        views=views,
+        **changes,
+    )
     write_json(folder / "truth.json", truth.model_dump())
     return truth
 
@@ -392,9 +486,8 @@ def test_a_truth_comes_back_with_the_same_views(
     again = prepare(PrepareConfig(out, scene.with_name("again")))
     place = again.with_name("again_truth")
     back, before = Truth.open(place), {v.name: v for v in truth.views}
-    assert [v.name for v in back.views] == list(names) and len(Manifest.load(again).frames) == len(
-        Manifest.load(scene).frames
-    )
+    assert [v.name for v in back.views] == list(names)
+    assert len(Manifest.load(again).frames) == len(Manifest.load(scene).frames)
     assert back.clip_c2w is not None
     for view in back.views:
         old = before[view.name]
@@ -402,20 +495,18 @@ def test_a_truth_comes_back_with_the_same_views(
         assert np.allclose(
             c2w, carried(scene, view.name), atol=1e-6 if view.name == "off" else 0, rtol=0
         )
-        assert (view.time, view.bracket) == (old.time, old.bracket) and view.radiance is None
+        assert (view.time, view.bracket) == (old.time, old.bracket)
+        assert view.radiance is None
         recorded = true_pictures(truth, old, folder)[1][old.bracket]
         exact = recorded if old.recorded else np.float32(np.rint(recorded * 255) / 255)
-        assert (
-            true_pictures(back, view, place)[1][view.bracket] == exact
-        ).all() and exact.std() > 0.05
-        assert (
-            view.mask
-            and old.mask
-            and (read_mask(place / view.mask) == read_mask(folder / old.mask)).all()
-        )
+        assert (true_pictures(back, view, place)[1][view.bracket] == exact).all()
+        assert exact.std() > 0.05
+        assert view.mask
+        assert old.mask
+        assert (read_mask(place / view.mask) == read_mask(folder / old.mask)).all()
 
 
-def test_a_view_that_the_gopro_layout_cannot_tell_is_named(
+def test_a_view_that_the_gopro_layout_cannot_hold_is_named(
     kept: tuple[Path, Path, Truth], capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene, folder, _ = kept
@@ -441,9 +532,8 @@ def test_cameras_of_a_rig_keep_their_numbers(kept: tuple[Path, Path, Truth]) -> 
     m.save(scene)
     write_truth(scene, folder)
     out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
-    assert (out / "dense/mv_images/00001/00002.png").is_file() and (
-        out / "dense/mv_images_time/00002/00003.png"
-    ).is_file()
+    assert (out / "dense/mv_images/00001/00002.png").is_file()
+    assert (out / "dense/mv_images_time/00002/00003.png").is_file()
 
 
 def test_a_truth_that_does_not_fit_is_one_sentence(
@@ -474,20 +564,20 @@ def test_what_export_noted_of_held_out_views_is_checked(kept: tuple[Path, Path, 
     scene, folder, _ = kept
     out = export(ExportConfig(scene, scene.with_name("out"), layout="hdr-gopro", truth=folder))
     note = out / "dense/hdr_nsff.json"
-    told = json.loads(note.read_text())
-    (first, entry), *_ = told["held_out"].items()
+    content = json.loads(note.read_text())
+    (first, entry), *_ = content["held_out"].items()
     for wrong, words in (
         ({first: entry | {"anchor": "00099.png"}}, "pose of 00099.png"),
         ({first: entry | {"bracket": 7}}, "bracket 7"),
         ({first: entry | {"name": "../up"}}, "name"),
     ):
-        note.write_text(json.dumps(told | {"held_out": wrong}))
+        note.write_text(json.dumps(content | {"held_out": wrong}))
         with pytest.raises(InputError, match=words):
             recognize(out)
-    note.write_text(json.dumps(told | {"held_out": {"../../scene/images/00000.png": entry}}))
+    note.write_text(json.dumps(content | {"held_out": {"../../scene/images/00000.png": entry}}))
     with pytest.raises(InputError, match="points outside the data set"):
         prepare(PrepareConfig(out, scene.with_name("again")))
-    note.write_text(json.dumps(told))
+    note.write_text(json.dumps(content))
     (out / "dense" / first).unlink()
     with pytest.raises(InputError, match="it is held-out view a"):
         prepare(PrepareConfig(out, scene.with_name("again")))

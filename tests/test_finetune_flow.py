@@ -17,10 +17,10 @@ from hdr_nsff.flow_training import finetune_flow as verb
 from hdr_nsff.flow_training.finetune_flow import (
     FinetuneConfig,
     finetune_flow,
-    mean,
-    rate,
+    mean_weights,
+    rate_share,
     sequence_loss,
-    split,
+    split_pairs,
 )
 from hdr_nsff.flow_training.flow_sets import FlowPair, flow_pairs
 from hdr_nsff.priors.flow import networks as flow_networks
@@ -49,23 +49,22 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> FinetuneConfig:
 def test_weights_are_adapted_measured_and_loadable(config: FinetuneConfig):
     path = finetune_flow(config)
     note = json.loads(path.with_suffix(".json").read_text())
-    assert note["network"] == "gmflow" and note["steps"] == 4 and note["training_pairs"] == 3
-    assert (
-        set(note["before"]) == set(note["after"]) == {"0", "2", "4"}
-        and note["before"] != note["after"]
-    )
+    assert note["network"] == "gmflow"
+    assert note["steps"] == 4
+    assert note["training_pairs"] == 3
+    assert set(note["before"]) == set(note["after"]) == {"0", "2", "4"}
+    assert note["before"] != note["after"]
     start, end = (
         torch.load(config.weights, weights_only=True),
         flow_networks.load(None, config.out).state_dict(),
     )
-    assert set(start) == set(end) and not torch.equal(
-        start["backbone.conv1.weight"], end["backbone.conv1.weight"]
-    )
+    assert set(start) == set(end)
+    assert not torch.equal(start["backbone.conv1.weight"], end["backbone.conv1.weight"])
 
 
 def trained(config: FinetuneConfig) -> dict[str, torch.Tensor]:
     """The weights after `train` on the first three pairs, in the folder of `config`."""
-    verb.claim(config)
+    verb.claim_folder(config)
     network = flow_networks.load("gmflow", config.weights)
     verb.train(network, flow_pairs(config.data[0])[:3], (128, 128), config)
     return network.state_dict()
@@ -74,7 +73,7 @@ def trained(config: FinetuneConfig) -> dict[str, torch.Tensor]:
 def test_a_killed_run_ends_as_one_that_was_not(
     config: FinetuneConfig, monkeypatch: pytest.MonkeyPatch
 ):
-    whole, draw = trained(config), verb.drawn
+    whole, draw = trained(config), verb.draw_example
     again = replace(config, out=config.out.with_name("again"))
 
     def killed(pairs, size, config, step, slot):
@@ -82,10 +81,10 @@ def test_a_killed_run_ends_as_one_that_was_not(
             raise KeyboardInterrupt
         return draw(pairs, size, config, step, slot)
 
-    monkeypatch.setattr(verb, "drawn", killed)
+    monkeypatch.setattr(verb, "draw_example", killed)
     with pytest.raises(KeyboardInterrupt):
         trained(again)
-    monkeypatch.setattr(verb, "drawn", draw)
+    monkeypatch.setattr(verb, "draw_example", draw)
     ended = trained(again)
     assert all(torch.equal(whole[k], ended[k]) for k in whole)
 
@@ -124,7 +123,9 @@ def test_the_result_is_half_way_from_where_it_started(config: FinetuneConfig):
     trained = load_file(config.out / "checkpoints/step_00000004.safetensors")
     name = "backbone.conv1.weight"
     assert torch.allclose(half[name], (start[name] + trained[f"network.{name}"]) / 2)
-    assert (mean({"a": torch.tensor([0.0])}, {"a": torch.tensor([1.0])}, 0.25)["a"] == 0.75).all()
+    assert (
+        mean_weights({"a": torch.tensor([0.0])}, {"a": torch.tensor([1.0])}, 0.25)["a"] == 0.75
+    ).all()
 
 
 def pair(scene: str, k: int) -> FlowPair:
@@ -133,36 +134,39 @@ def pair(scene: str, k: int) -> FlowPair:
 
 def test_scenes_are_held_out_whole_and_one_scene_at_its_end():
     scenes = [pair(s, k) for s in "abcdefghij" for k in range(2)]
-    training, held_out = split(scenes, 0.2)
-    assert {p.scene for p in held_out} == {"i", "j"} and not {p.scene for p in training} & {
+    training, held_out = split_pairs(scenes, 0.2)
+    assert {p.scene for p in held_out} == {"i", "j"}
+    assert not {p.scene for p in training} & {
         "i",
         "j",
     }
-    training, held_out = split([pair("a", k) for k in range(10)], 0.2)
-    assert [p.first.name for p in held_out] == ["a8", "a9"] and training[
-        -1
-    ].second.name == "a7"  # no frame in both
+    training, held_out = split_pairs([pair("a", k) for k in range(10)], 0.2)
+    assert [p.first.name for p in held_out] == ["a8", "a9"]
+    assert training[-1].second.name == "a7"  # no frame in both
     with pytest.raises(InputError, match="too few"):
-        split([pair("a", 0), pair("a", 1)], 0.5)
+        split_pairs([pair("a", 0), pair("a", 1)], 0.5)
 
 
 def test_the_rate_rises_and_falls():
-    shares = [rate(p) for p in np.linspace(0, 1, 21)]
-    assert (
-        shares[0] < 0.05 and max(shares) > 0.99 and shares[-1] == 0 and all(np.diff(shares[2:]) < 0)
-    )
+    shares = [rate_share(p) for p in np.linspace(0, 1, 21)]
+    assert shares[0] < 0.05
+    assert max(shares) > 0.99
+    assert shares[-1] == 0
+    assert all(np.diff(shares[2:]) < 0)
 
 
 def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneConfig):
-    for change, said in (
+    for change, words in (
         ({"data": ()}, "--data"),
         ({"size": "100x128"}, "--size"),
+        ({"size": "9" * 5000 + "x128"}, "--size"),
+        ({"seed": -1}, "--seed"),
         ({"steps": 0}, "at least 1"),
         ({"held_out": 1.0}, "--held-out"),
         ({"data": (config.out.parent,)}, "no pairs"),
         ({"weights": config.out}, "no such weights"),
     ):
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=words):
             finetune_flow(replace(config, **change))
     config.out.mkdir()
     (config.out / "letter.txt").write_text("mine")
@@ -171,7 +175,7 @@ def test_settings_and_folders_that_make_no_sense_are_refused(config: FinetuneCon
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"by_stops": {}}', '{"by_stops": {"0": 3}}'])
-def test_damaged_measurements_are_made_again(
+def test_damaged_measurements_are_repeated(
     text: str, config: FinetuneConfig, capsys: pytest.CaptureFixture[str]
 ):
     network, pairs, kept = (
@@ -179,21 +183,17 @@ def test_damaged_measurements_are_made_again(
         flow_pairs(config.data[0])[:1],
         config.out / "before.json",
     )
-    before = verb.measured(network, pairs, kept)
-    assert (
-        verb.measured(network, pairs, kept) == before
-        and "treated as missing" not in capsys.readouterr().err
-    )
+    before = verb.measure_or_read(network, pairs, kept)
+    assert verb.measure_or_read(network, pairs, kept) == before
+    assert "treated as missing" not in capsys.readouterr().err
     kept.write_text(text)
-    assert (
-        verb.measured(network, pairs, kept) == before
-        and "treated as missing" in capsys.readouterr().err
-    )
-    assert verb.measured(network, [], kept) == before  # from the file
+    assert verb.measure_or_read(network, pairs, kept) == before
+    assert "treated as missing" in capsys.readouterr().err
+    assert verb.measure_or_read(network, [], kept) == before  # from the file
 
 
 def test_damaged_settings_are_one_sentence(config: FinetuneConfig):
-    verb.claim(config)
+    verb.claim_folder(config)
     for text in (b"{", b"\xff"):
         (config.out / "config.json").write_bytes(text)
         with pytest.raises(InputError, match="not readable JSON"):
@@ -201,7 +201,7 @@ def test_damaged_settings_are_one_sentence(config: FinetuneConfig):
 
 
 def test_another_run_in_the_folder_is_refused(config: FinetuneConfig):
-    verb.claim(config)
-    verb.claim(config)
+    verb.claim_folder(config)
+    verb.claim_folder(config)
     with pytest.raises(InputError, match="other settings"):
-        verb.claim(replace(config, seed=1))
+        verb.claim_folder(replace(config, seed=1))

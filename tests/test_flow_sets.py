@@ -7,17 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mutations import check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
-from hdr_nsff.flow_training.flow_exposures import cropped, example, random_curve, recorded_pair
+from hdr_nsff.flow_training.flow_exposures import example, random_crop, random_curve, recorded_pair
 from hdr_nsff.flow_training.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
 
 H, W = 12, 16
-FLOW = np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1).astype(
-    np.float32
-)  # (x, y) at (x, y): no two pixels alike
+# (x, y) at (x, y): no two pixels alike
+FLOW = np.stack(np.meshgrid(np.arange(W), np.arange(H)), -1).astype(np.float32)
 
 
 def write_flo(path: Path, flow: np.ndarray) -> None:
@@ -55,9 +55,8 @@ def things(root: Path) -> Path:
             picture(root / f"frames_finalpass/TRAIN/A/0007/{eye}/{k:04d}.png", k / 10)
         write_pfm(scene / f"into_future/{eye}/OpticalFlowIntoFuture_0006_{side}.pfm", FLOW)
         write_pfm(scene / f"into_past/{eye}/OpticalFlowIntoPast_0007_{side}.pfm", -FLOW)
-        write_pfm(
-            scene / f"into_future/{eye}/OpticalFlowIntoFuture_0007_{side}.pfm", FLOW
-        )  # its next frame is not there
+        # its next frame is not there
+        write_pfm(scene / f"into_future/{eye}/OpticalFlowIntoFuture_0007_{side}.pfm", FLOW)
     return root
 
 
@@ -79,39 +78,39 @@ def synth(root: Path, frames: int = 3, size: tuple[int, int] = (H, W)) -> Path:
     return root
 
 
-def test_sintel_has_flow_one_way_and_says_where_it_does_not_know(tmp_path: Path):
+def test_sintel_has_forward_flow_and_masks_unknown_pixels(tmp_path: Path):
     pairs = flow_pairs(sintel(tmp_path))
     assert [(p.first.name, p.second.name, p.scene) for p in pairs] == [
         ("frame_0001.png", "frame_0002.png", "alley"),
         ("frame_0002.png", "frame_0003.png", "alley"),
     ]
     sample = read_sample(pairs[0])
-    assert np.array_equal(sample.flow[0][5, 7], [7, 5]) and not sample.known[1].any()
-    assert not sample.known[0][2, 3] and sample.known[0].sum() == H * W - 1
-    assert sample.radiance[0, 0, 0] == pytest.approx(
-        [0.0331] * 3, abs=1e-3
-    )  # sRGB 0.2: ((0.2 + 0.055) / 1.055)^2.4
+    assert np.array_equal(sample.flow[0][5, 7], [7, 5])
+    assert not sample.known[1].any()
+    assert not sample.known[0][2, 3]
+    assert sample.known[0].sum() == H * W - 1
+    # sRGB 0.2: ((0.2 + 0.055) / 1.055)^2.4
+    assert sample.radiance[0, 0, 0] == pytest.approx([0.0331] * 3, abs=1e-3)
     assert flow_pairs(tmp_path / "training") == pairs
 
 
 def test_flyingthings_has_both_eyes_and_both_ways(tmp_path: Path):
     pairs = flow_pairs(things(tmp_path))
-    assert [p.first.parent.name for p in pairs] == ["left", "right"] and len(
-        {p.scene for p in pairs}
-    ) == 1
+    assert [p.first.parent.name for p in pairs] == ["left", "right"]
+    assert len({p.scene for p in pairs}) == 1
     sample = read_sample(pairs[1])
-    assert (
-        np.array_equal(sample.flow[0], FLOW)
-        and np.array_equal(sample.flow[1], -FLOW)
-        and sample.known.all()
-    )
+    assert np.array_equal(sample.flow[0], FLOW)
+    assert np.array_equal(sample.flow[1], -FLOW)
+    assert sample.known.all()
 
 
 def test_rendered_scenes_are_pairs_of_neighbors(tmp_path: Path):
     pairs = flow_pairs(synth(tmp_path))
     sample = read_sample(pairs[1])
-    assert len(pairs) == 2 and sample.known.all()
-    assert (sample.flow[0] == [1, 0]).all() and (sample.flow[1] == [-1, 0]).all()
+    assert len(pairs) == 2
+    assert sample.known.all()
+    assert (sample.flow[0] == [1, 0]).all()
+    assert (sample.flow[1] == [-1, 0]).all()
 
 
 def test_unknown_flow_is_not_known(tmp_path: Path):
@@ -120,15 +119,17 @@ def test_unknown_flow_is_not_known(tmp_path: Path):
     flow[4, 4] = 1e9  # as the Middlebury format marks it
     write_flo(pairs[1].forward, flow)
     sample = read_sample(pairs[1])
-    assert not sample.known[0][4, 4] and (sample.flow[0][4, 4] == 0).all()
+    assert not sample.known[0][4, 4]
+    assert (sample.flow[0][4, 4] == 0).all()
 
 
 def test_big_endian_and_gray_float_maps(tmp_path: Path):
     (tmp_path / "a.pfm").write_bytes(b"Pf\n2 2\n1.0\n" + np.array([3, 4, 1, 2], ">f4").tobytes())
+    # from the bottom to the top
     assert read_pfm(tmp_path / "a.pfm")[..., 0].tolist() == [
         [1, 2],
         [3, 4],
-    ]  # from the bottom to the top
+    ]
 
 
 def test_files_cut_short_or_of_another_kind_are_refused(tmp_path: Path):
@@ -145,6 +146,13 @@ def test_files_cut_short_or_of_another_kind_are_refused(tmp_path: Path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no pairs with known flow"):
         flow_pairs(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("name", ["sintel", "things", "synth"])
+def test_damaged_flow_is_read_or_refused(name: str, tmp_path: Path):
+    make = {"sintel": sintel, "things": things, "synth": synth}[name]
+    pair = flow_pairs(make(tmp_path))[0]
+    check_reader(pair.forward, lambda: read_sample(pair), 150)
 
 
 def sample(height: int = 60, width: int = 80) -> Sample:
@@ -179,21 +187,25 @@ def test_crops_scale_and_mirror_flow_with_the_pixels():
     """
     s = sample()
     for seed in range(8):
-        one = cropped(
+        one = random_crop(
             np.zeros((2, 60, 80, 3), np.float32), s, (96, 128), np.random.default_rng(seed)
         )
-        assert one.images.shape == (2, 3, 96, 128) and one.known.all()
+        assert one.images.shape == (2, 3, 96, 128)
+        assert one.known.all()
         u, v = one.flow[0, :, 50, 50].abs().tolist()
-        assert 2 * 2.3 < u < 2 * 3.9 and abs(u / v - 2) < 0.1
+        assert 2 * 2.3 < u < 2 * 3.9
+        assert abs(u / v - 2) < 0.1
         assert (one.flow[0] + one.flow[1]).abs().max() < 1e-4
 
 
 def test_an_example_is_a_matter_of_its_seed():
     draw = lambda seed: example(sample(), 4, (96, 128), np.random.default_rng(seed)).images  # noqa: E731
-    assert (draw(1) == draw(1)).all() and not (draw(1) == draw(2)).all()
+    assert (draw(1) == draw(1)).all()
+    assert not (draw(1) == draw(2)).all()
 
 
 def test_random_responses_increase():
     for seed in range(20):
         curve = random_curve(np.random.default_rng(seed))
-        assert (np.diff(curve.y, axis=1) > 0).all() and np.allclose(curve.y[:, [0, -1]], [0, 1])
+        assert (np.diff(curve.y, axis=1) > 0).all()
+        assert np.allclose(curve.y[:, [0, -1]], [0, 1])

@@ -2,14 +2,13 @@
 written down.
 """
 
-import math
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from mutations import check_reader
 from PIL import Image
-from PIL.TiffImagePlugin import IFDRational
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
@@ -17,13 +16,10 @@ from hdr_nsff.core.images import write_png
 from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.ingest import (
     every_of,
+    hash_file,
     held_out,
-    log2_seconds,
-    number,
     open_footage,
-    parse_exposures,
-    read_exif_ev,
-    read_exposure_csv,
+    read_frame,
     read_frames,
     shrink,
 )
@@ -56,6 +52,12 @@ def test_frames_come_in_the_order_of_their_numbers(tmp_path):
     frames = all_frames(folder_of(tmp_path, [0.1 * k for k in range(1, 12)]))
     assert [f.source for f in frames] == [f"f{i}.png" for i in range(1, 12)]
     assert np.allclose([f.rgb.mean() for f in frames[:5]], [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.01)
+
+
+def test_only_decimal_digits_are_numbers_in_names(tmp_path):
+    for name in ("1²2.png", "1²10.png", "0.png"):
+        write_png(tmp_path / name, picture(0.5))
+    assert [f.source for f in all_frames(tmp_path)] == ["0.png", "1²2.png", "1²10.png"]
 
 
 def test_range_and_stride_choose_frames_by_their_number(tmp_path):
@@ -128,81 +130,35 @@ def test_shrinking_averages_and_keeps_the_shape():
     assert shrink(image, 8) is image
 
 
-def test_exposure_times_become_log2_seconds():
-    assert np.allclose(
-        parse_exposures("1/1000, 1/250,0.25", None), [-math.log2(1000), -math.log2(250), -2]
-    )
-    assert parse_exposures(None, "-4,-2,0") == [-4, -2, 0]
-    assert parse_exposures("auto", None) is None and parse_exposures(None, None) is None
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif", ".exr"])
+def test_damaged_frames_are_read_or_refused(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    if suffix == ".exr":
+        write_exr(path, {"RGB": picture(0.5)})
+    else:
+        cv2.imwrite(str(path), (picture(0.5) * 255).astype(np.uint8))
+    check_reader(path, lambda: read_frame(path), 100)
 
 
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        ("1/0", "divides by zero"),
-        ("-1/60", "cannot be"),
-        ("abc", "not a number"),
-        ("inf", "not finite"),
-        ("", "not a number"),
-    ],
-)
-def test_an_impossible_exposure_is_named(text, what):
-    with pytest.raises(InputError, match=what):
-        log2_seconds(text, "--exposures")
-
-
-def test_both_kinds_of_list_at_once_are_refused():
-    with pytest.raises(InputError, match="both given"):
-        parse_exposures("1/60", "0")
-    with pytest.raises(InputError, match="divides by zero"):
-        number("3/0", "--ev")
-
-
-def test_a_csv_beside_the_frames_is_read(tmp_path):
-    folder_of(tmp_path, [0.5] * 2)
-    (tmp_path / "exposures.csv").write_text("file, exposure\nf1.png, 1/4\nf2.png, 1/2\n")
-    path, rows = read_exposure_csv(open_footage(tmp_path))
-    assert path.name == "exposures.csv"
-    assert rows == {"f1.png": -2, "f2.png": -1}
-
-
-def test_a_csv_beside_a_video_names_frames_by_number(tmp_path):
-    write_video(tmp_path / "clip.mp4", [picture(0.5)] * 2)
-    (tmp_path / "clip.csv").write_text("frame,ev\n0,-3\n1,1.5\n", encoding="utf-8-sig")
-    assert read_exposure_csv(open_footage(tmp_path / "clip.mp4"))[1] == {"#0": -3, "#1": 1.5}
-
-
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        ("file,ev\nf1.png,1/0\n", "line 2"),
-        ("name,value\n", "columns"),
-        ("file,ev\nf1.png\n", "line 2"),
-    ],
-)
-def test_a_csv_that_makes_no_sense_is_named(tmp_path, text, what):
-    folder_of(tmp_path, [0.5])
-    (tmp_path / "exposures.csv").write_text(text)
-    with pytest.raises(InputError, match=f"exposures.csv.*{what}"):
-        read_exposure_csv(open_footage(tmp_path))
-
-
-def test_exif_exposure_counts_time_sensitivity_and_aperture(tmp_path):
-    exif = Image.Exif()
-    exif.get_ifd(0x8769).update(
-        {0x829A: IFDRational(1, 64), 0x8827: 400, 0x829D: IFDRational(2, 1)}
-    )  # 1/64 s, ISO 400, f/2: -6 + 2 - 2
-    Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
-    Image.new("RGB", (8, 8)).save(tmp_path / "b.jpg")
-    assert read_exif_ev(tmp_path / "a.jpg") == pytest.approx(-6)
-    assert read_exif_ev(tmp_path / "b.jpg") is None
+def test_damaged_videos_are_read_or_refused(tmp_path):
+    path = tmp_path / "a.mp4"
+    write_video(path, [picture(0.1 * k) for k in range(6)])
+    check_reader(path, lambda: all_frames(path), 60)
 
 
 def test_held_out_frames_go_through_all_exposures():
     chosen = held_out(100, 8, 4)
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
     assert {k % 4 for k in chosen} == {0, 1, 2, 3}
-    assert held_out(100, 0, 3) == [] and 0 not in held_out(9, 2, 1) and 8 not in held_out(9, 2, 1)
+    assert held_out(100, 0, 3) == []
+    assert 0 not in held_out(9, 2, 1)
+    assert 8 not in held_out(9, 2, 1)
+
+
+@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="Linux alone has it")
+def test_a_file_that_cannot_be_read_is_named():
+    with pytest.raises(InputError, match="/proc/self/mem: cannot be read"):
+        hash_file(Path("/proc/self/mem"))
 
 
 def write_dng(path: Path, level: float) -> None:
@@ -212,6 +168,7 @@ def write_dng(path: Path, level: float) -> None:
     tifffile = pytest.importorskip("tifffile")
     raw = np.full((64, 96), int(level * 65535), np.uint16)
     raw[:32] //= 2
+    # XYZ to the camera's own colors
     matrix = (
         3.1339,
         -1.6169,
@@ -222,7 +179,7 @@ def write_dng(path: Path, level: float) -> None:
         0.0720,
         -0.2290,
         1.4057,
-    )  # XYZ to the camera's own colors
+    )
 
     def ratios(values: tuple[float, ...]) -> tuple[int, ...]:
         return tuple(n for v in values for n in (round(v * 10000), 10000))
@@ -259,14 +216,17 @@ def test_a_broken_raw_photograph_is_named(tmp_path):
 
 @pytest.mark.parametrize("every", range(2, 12))
 @pytest.mark.parametrize("cycle", [1, 2, 3])
-def test_what_was_kept_out_tells_every_how_many(every: int, cycle: int) -> None:
-    """Whatever the clip's length, the number found keeps out the same frames."""
+def test_the_spacing_of_held_out_frames_is_found_again(every: int, cycle: int) -> None:
+    """For a clip of any length, the spacing found holds out the same frames."""
     for count in range(every + 2, 40):
         frames = held_out(count, every, cycle)
         if frames:
             found = every_of(frames)
-            assert found is not None and held_out(frames[-1] + 2, found, cycle) == frames
+            assert found is not None
+            assert held_out(frames[-1] + 2, found, cycle) == frames
 
 
-def test_frames_that_are_not_every_so_many_have_no_number() -> None:
-    assert every_of([0, 8]) is None and every_of([4, 8]) is None and every_of([1, 2, 4]) is None
+def test_unevenly_spaced_frames_have_no_spacing() -> None:
+    assert every_of([0, 8]) is None
+    assert every_of([4, 8]) is None
+    assert every_of([1, 2, 4]) is None

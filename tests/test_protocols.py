@@ -18,7 +18,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json
-from hdr_nsff.footage.ingest import between
+from hdr_nsff.footage.ingest import frames_between
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
@@ -29,27 +29,23 @@ from hdr_nsff.training.train import train
 
 
 def kept(count: int, cycle: int) -> list[int]:
-    return sorted(set(range(count)) - set(between(count, cycle)))
+    return sorted(set(range(count)) - set(frames_between(count, cycle)))
 
 
 def test_every_second_frame_is_trained_on_and_so_is_the_last() -> None:
-    assert (
-        kept(9, 3) == [0, 2, 4, 6, 8]
-        and kept(10, 3) == [0, 2, 4, 6, 8, 9]
-        and kept(5, 1) == [0, 2, 4]
-    )
+    assert kept(9, 3) == [0, 2, 4, 6, 8]
+    assert kept(10, 3) == [0, 2, 4, 6, 8, 9]
+    assert kept(5, 1) == [0, 2, 4]
 
 
 @pytest.mark.parametrize("cycle", [1, 2, 3, 4, 5, 6])
 def test_half_of_the_frames_show_all_exposures(cycle: int) -> None:
     frames = kept(36, cycle)
     assert {k % cycle for k in frames} == set(range(cycle))
-    assert (
-        len(frames) in (18, 19)
-        and frames[0] == 0
-        and frames[-1] == 35
-        and max(np.diff(frames)) <= 3
-    )
+    assert len(frames) in (18, 19)
+    assert frames[0] == 0
+    assert frames[-1] == 35
+    assert max(np.diff(frames)) <= 3
 
 
 def test_of_a_cycle_of_two_each_cycle_begins_with_the_other_half() -> None:
@@ -65,13 +61,11 @@ def test_novel_view_time_trains_on_every_second_frame_and_links_those(tmp_path: 
     )
     scene = Scene.open(prepare(config))
     assert scene.manifest.protocol == "novel-view-time"
-    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8, 10, 11] and [
-        f.time for f in scene.test
-    ] == [1, 3, 5, 7, 9]
+    assert [f.time for f in scene.train] == [0, 2, 4, 6, 8, 10, 11]
+    assert [f.time for f in scene.test] == [1, 3, 5, 7, 9]
     middle = scene.train[2]
-    assert (
-        middle.neighbors == {-1: 1, 1: 3} and (middle.flow[1] == -4 * np.array([1, 0])).all()
-    )  # two frames of -2 pixels
+    assert middle.neighbors == {-1: 1, 1: 3}
+    assert (middle.flow[1] == -4 * np.array([1, 0])).all()  # two frames of -2 pixels
     assert all(f.disparity is None and not f.flow for f in scene.test)
 
 
@@ -83,13 +77,13 @@ def test_novel_view_trains_on_all_frames(tmp_path: Path) -> None:
         **given(tmp_path / "given"),
     )
     scene = Scene.open(prepare(config))
-    assert scene.manifest.protocol == "novel-view" and len(scene.train) == COUNT and not scene.test
+    assert scene.manifest.protocol == "novel-view"
+    assert len(scene.train) == COUNT
+    assert not scene.test
     changed = Scene.open(prepare(replace(config, protocol=None, hold_out=4)))
-    assert (
-        changed.manifest.protocol is None
-        and len(changed.test) == 3
-        and all(f.disparity is None for f in changed.test)
-    )
+    assert changed.manifest.protocol is None
+    assert len(changed.test) == 3
+    assert all(f.disparity is None for f in changed.test)
 
 
 def test_protocols_that_cannot_be_followed_are_refused_in_a_sentence(tmp_path: Path) -> None:
@@ -179,7 +173,8 @@ def trained(root: Path, maps: dict[str, Path]) -> dict[str, np.ndarray | dict[st
         if p.suffix in (".npy", ".png")
     }
     checkpoint = latest_checkpoint(run)
-    assert checkpoint is not None and checkpoint.step == 6
+    assert checkpoint is not None
+    assert checkpoint.step == 6
     return found | {f"tensor {k}": v.numpy() for k, v in checkpoint.tensors.items()}
 
 
@@ -196,10 +191,12 @@ def test_a_poisoned_truth_changes_nothing_and_is_not_even_opened(tmp_path: Path)
         assert OPENED == []
         with pytest.raises(InputError):
             Truth.open(other_root / "truth")
-        assert len(OPENED) == 1 and OPENED[0].endswith("truth.json")  # the watch does see it
+        assert len(OPENED) == 1
+        assert OPENED[0].endswith("truth.json")  # the watch does see it
     finally:
         WATCHED.clear()
         OPENED.clear()
-    assert one.keys() == other.keys() and len(one) > 50
+    assert one.keys() == other.keys()
+    assert len(one) > 50
     assert one.pop("manifest") == other.pop("manifest")
     assert all(np.array_equal(one[k], other[k]) for k in one)

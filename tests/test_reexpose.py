@@ -117,10 +117,12 @@ def test_poses_shrink_with_the_frames(tmp_path):
             ordinary_clip(tmp_path / "in"),
             tmp_path / "out",
             poses=tmp_path / "poses_bounds.npy",
-            max_size=20,
+            max_size=32,
         )
     )
-    assert Truth.open(out / "truth").K == [[25, 0, 10], [0, 25, 6], [0, 0, 1]]
+    rows = 19 / 24  # 40x24 pixels become 32x19
+    K = [[0.8 * 50, 0, 16], [0, rows * 50, rows * 12], [0, 0, 1]]
+    assert np.allclose(Truth.open(out / "truth").K, K)
 
 
 def test_an_interrupted_run_continues_and_a_finished_one_is_left_alone(tmp_path):

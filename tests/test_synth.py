@@ -11,7 +11,8 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.video import read_video
-from hdr_nsff.footage.ingest import open_footage, read_exposure_csv
+from hdr_nsff.footage.exposure_lists import read_exposure_csv
+from hdr_nsff.footage.ingest import open_footage
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 from hdr_nsff.synth import synth as verb

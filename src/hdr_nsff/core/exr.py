@@ -17,6 +17,7 @@ import OpenEXR
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
+from hdr_nsff.core.picture_size import check_size
 
 # Names of motion channels: to the next frame or time, to the one before.
 SIDES = {1: "forward", -1: "backward"}
@@ -87,6 +88,9 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; put it back or correct the name")
     try:
+        with quiet_stderr(), OpenEXR.File(str(path), header_only=True) as file:
+            (left, top), (right, bottom) = file.header()["dataWindow"]
+        check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
         with quiet_stderr(), OpenEXR.File(str(path)) as file:
             if not file.parts:
                 raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")

@@ -13,6 +13,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
+from hdr_nsff.core.picture_size import check_size, encoded_size
 
 PNG_END = b"IEND\xaeB`\x82"
 JPEG_END = b"\xff\xd9"
@@ -76,10 +77,13 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
         raise InputError(f"{path}: the PNG is cut short; copy it again")
     if suffix in {".jpg", ".jpeg"} and JPEG_END not in data[-JPEG_TAIL_BYTES:]:
         raise InputError(f"{path}: the JPEG is cut short; copy it again")
+    size = encoded_size(data)
+    if size is not None:
+        check_size(path, *size)
     color_of_any_depth = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
     flags = cv2.IMREAD_UNCHANGED if transparency else color_of_any_depth
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flags) if data else None
+        image = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:

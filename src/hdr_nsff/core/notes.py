@@ -93,6 +93,7 @@ class Layout(Note):
     marks = ("layout",)
     layout: str = Field(min_length=1)
     scene: str
+    files: list[str] = []  # that the export wrote, below its folder
 
 
 class PictureRanges(Note):

@@ -16,6 +16,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
+from hdr_nsff.core.picture_size import check_size
 
 DEFAULT_FPS = 24.0  # where a video's header names no rate
 REC709_TAG = 1  # the code of Rec. 709 in H.264's color description, all four fields
@@ -94,7 +95,7 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
                 turned = np.rot90(array, round(frame.rotation / 90))
                 top = np.float32(65535 if deep else 255)
                 yield turned.astype(np.float32) / top, float(frame.time or 0.0)
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
 
 
@@ -117,12 +118,16 @@ def video_info(path: Path | str) -> VideoInfo:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
             stream = container.streams.video[0]
+            codec = stream.codec_context
+            if codec is None:
+                raise InputError(f"{path}: a video in an unknown format; convert it to H.264")
+            check_size(path, codec.width, codec.height)
             end = max((entry.pos + entry.size for entry in stream.index_entries), default=0)
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")
             seconds = duration_of(container, stream)
             return VideoInfo(stream.frames, float(stream.average_rate or DEFAULT_FPS), seconds)
-    except (av.FFmpegError, OSError) as error:
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
 
 

@@ -1,19 +1,22 @@
-"""`hdr-nsff finetune-flow`: a flow network learns to look across exposures, on pairs
-whose flow is known, recorded anew for every step with random EV pairs, clipping, noise
-and response curves (as the paper does for its ablation, with FlyingThings3D).
+"""`hdr-nsff finetune-flow`: a flow network learns to match across exposures.
 
-Writes into the output folder:
-    weights.safetensors   the adapted network, for `prepare --flow raft-finetuned
-    --flow-weights`
-    weights.json          what it was made of, and its error on pairs kept out of
-    training, before and after
-    config.json, checkpoints/   to go on after a kill
-Every step draws from a generator of its own, so a run that was killed ends as one that
-was not.
+It sees pairs whose flow is known, recorded again for every step with random EV pairs,
+clipping, noise and response curves (as the paper does for its ablation, with
+FlyingThings3D). The output folder then holds
+
+- `weights.safetensors`: the adapted network, for `prepare --flow raft-finetuned
+  --flow-weights`;
+- `weights.json`: what it was made of, and its error on held-out pairs, before and
+  after;
+- `config.json`, `checkpoints/`: what a restart needs after a kill.
+
+Every step draws from a generator of its own, so a run that was killed ends like one
+that was not.
 """
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -27,7 +30,7 @@ from tyro.conf import Positional
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, unpack
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import atomic, read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
@@ -36,16 +39,21 @@ from hdr_nsff.flow_training.flow_exposures import Example, example, recorded_pai
 from hdr_nsff.flow_training.flow_sets import FlowPair, flow_pairs, read_sample
 from hdr_nsff.priors.flow.networks import FINETUNED, MULTIPLE, FlowNetwork, both_ways, load
 
-DECAY = 0.9  # weight of each of a network's predictions against the next one
-FASTEST = 400  # pixels: faster motion is left out of training, as flow networks do
-MEASURED = (0.0, 2.0, 4.0)  # EV differences of the held-out measurement
-WARM_UP = 0.05  # share of the steps
+# weight of each of a network's predictions against the next one; GMFlow (Xu et al.
+# 2022) has 0.9, RAFT 0.8
+PREDICTION_DECAY = 0.9
+MAX_FLOW_PX = 400  # faster motion is left out of training, as RAFT (Teed & Deng 2020) does
+MEASURED_EV = (0.0, 2.0, 4.0)  # EV differences of the held-out measurement
+WARM_UP_SHARE = 0.05  # of the steps, as in RAFT's one-cycle schedule
+WEIGHT_DECAY = 1e-4  # of AdamW, as in RAFT and GMFlow
+MAX_GRADIENT_NORM = 1.0  # as in RAFT and GMFlow
+MIN_CROP_PX = 128  # least side of a crop
+MAX_EV_RANGE = 12.0  # stops: the widest range of exposures that pairs may be drawn from
 
 
 @dataclass(frozen=True)
 class FinetuneConfig:
-    """Adapt a flow network to pairs of different exposure, on pairs whose flow is
-    known.
+    """Adapt a flow network to pairs of different exposure whose flow is known.
 
     Killed? The same command goes on where it was.
     """
@@ -61,6 +69,7 @@ class FinetuneConfig:
     weights: Path | None = None
     """Its weights. Default: where weights are kept, see `hdr-nsff weights`."""
     steps: int = 5000
+    """Steps of training."""
     batch: int = 2
     """Pairs per step."""
     size: str = "320x224"
@@ -68,8 +77,9 @@ class FinetuneConfig:
     below 640 pixels are enlarged up to three times).
     """
     stops: float = 5.0
-    """The farthest that the exposures of a pair are apart, in EV."""
+    """The largest exposure difference of a pair, in EV."""
     lr: float = 5e-5
+    """Learning rate at its peak."""
     keep: float = 0.5
     """Share of the network as it was in the result, which is the mean of the weights
     before and after (Wortsman et al. 2022): it keeps what the data do not show. 0 takes
@@ -78,246 +88,291 @@ class FinetuneConfig:
     held_out: float = 0.1
     """Share of the scenes (of a single scene: of its last pairs) kept for measuring."""
     measure: int = 6
-    """Pairs of the held-out ones that are measured, at 0, 2 and 4 EV."""
+    """Number of held-out pairs that are measured, at 0, 2 and 4 EV."""
     checkpoint_steps: int = 100
     """Steps between two checkpoints."""
     seed: int = 0
+    """Seed of all random choices."""
     device: str = "auto"
     """auto, cpu or cuda."""
 
 
 def finetune_flow(config: FinetuneConfig) -> Path:
-    """Adapt, measure, save; the file of weights. InputError where the data or a setting
-    is at fault.
+    """Adapt, measure and save a network; the file of its weights.
+
+    InputError where the data or a setting is at fault.
     """
-    size = check(config)
+    size = check_settings(config)
     device = pick_device(config.device)
     pairs = [pair for folder in config.data for pair in flow_pairs(folder)]
-    training, held_out = split(pairs, config.held_out)
-    held_out = [
-        held_out[k]
-        for k in np.unique(np.linspace(0, len(held_out) - 1, config.measure).astype(int))
-    ]
+    training, held_out = split_pairs(pairs, config.held_out)
+    chosen = np.unique(np.linspace(0, len(held_out) - 1, config.measure).astype(int))
+    held_out = [held_out[k] for k in chosen]
     network = load(config.network, config.weights, device)
     start = {k: v.clone() for k, v in network.state_dict().items()}
     with writing_to(config.out), lock_output(config.out):
-        claim(config)
+        claim_folder(config)
         say(
-            f"finetune-flow: {len(training)} pairs to train on, {len(held_out)} others to measure on"
+            f"finetune-flow: {len(training)} pairs to train on, "
+            f"{len(held_out)} others to measure on"
         )
-        before = measured(network, held_out, config.out / "before.json")
+        before = measure_or_read(network, held_out, config.out / "before.json")
         seconds = train(network, training, size, config)
-        network.load_state_dict(mean(start, network.state_dict(), config.keep))
-        after = measured(network, held_out, None)
-        weights = write_weights(
-            network,
-            config,
-            {
-                "training_pairs": len(training),
-                "held_out_pairs": len(held_out),
-                "seconds": seconds,
-                "before": before,
-                "after": after,
-            },
-        )
+        network.load_state_dict(mean_weights(start, network.state_dict(), config.keep))
+        after = measure_errors(network, held_out)
+        record = {
+            "training_pairs": len(training),
+            "held_out_pairs": len(held_out),
+            "seconds": seconds,
+            "before": before,
+            "after": after,
+        }
+        weights = write_weights(network, config, record)
     for stops in before:
         say(
-            f"  {stops} EV apart: {before[stops]['mean']:.3f} px mean error before, {after[stops]['mean']:.3f} px after"
+            f"  {stops} EV apart: {before[stops]['mean']:.3f} px mean error before, "
+            f"{after[stops]['mean']:.3f} px after"
         )
     return weights
 
 
-def check(config: FinetuneConfig) -> tuple[int, int]:
+# Settings, folder and data
+
+
+def check_settings(config: FinetuneConfig) -> tuple[int, int]:
     """The size (h, w) of crops; InputError for settings that make no sense."""
     if not config.data:
         raise InputError(
             "finetune-flow: no data; name folders of pairs with known flow with --data"
         )
-    width, _, height = config.size.lower().partition("x")
-    if not (
-        width.isdecimal()
-        and height.isdecimal()
-        and all(int(s) >= 128 and int(s) % MULTIPLE == 0 for s in (width, height))
-    ):
+    match = re.fullmatch(r"(\d{1,5})x(\d{1,5})", config.size.lower())
+    width, height = (int(match[1]), int(match[2])) if match else (0, 0)
+    if min(width, height) < MIN_CROP_PX or width % MULTIPLE or height % MULTIPLE:
         raise InputError(
-            f"--size {config.size!r}: write it as WIDTHxHEIGHT, both multiples of {MULTIPLE} and at least 128"
+            f"--size {shorten(config.size)!r}: write it as WIDTHxHEIGHT, both multiples of "
+            f"{MULTIPLE} and at least {MIN_CROP_PX}"
         )
     if min(config.steps, config.batch, config.measure, config.checkpoint_steps) < 1:
         raise InputError("--steps, --batch, --measure and --checkpoint-steps must be at least 1")
-    if not (
-        0 < config.held_out < 1
-        and 0 <= config.keep < 1
-        and 0 <= config.stops <= 12
-        and 0 < config.lr < 1
-    ):
+    if config.seed < 0:
+        raise InputError(f"--seed {shorten(config.seed)}: it must be 0 or more")
+    shares_fit = 0 < config.held_out < 1 and 0 <= config.keep < 1 and 0 < config.lr < 1
+    if not (shares_fit and 0 <= config.stops <= MAX_EV_RANGE):
         raise InputError(
-            "--held-out, --keep and --lr must be between 0 and 1, --stops from 0 to 12"
+            "--held-out, --keep and --lr must be between 0 and 1, "
+            f"--stops from 0 to {MAX_EV_RANGE:g}"
         )
-    return int(height), int(width)
+    return height, width
 
 
-def split(pairs: list[FlowPair], share: float) -> tuple[list[FlowPair], list[FlowPair]]:
-    """Pairs to train on and pairs to measure on: whole scenes apart; of a single scene
-    its end, and no frame in both.
+def split_pairs(pairs: list[FlowPair], share: float) -> tuple[list[FlowPair], list[FlowPair]]:
+    """Pairs to train on, and a `share` to measure on.
+
+    Scenes stay together. A single scene is measured on at its end, and no frame is in
+    both.
     """
-    scenes = list(dict.fromkeys(p.scene for p in pairs))
+    scenes = list(dict.fromkeys(pair.scene for pair in pairs))
     if len(scenes) > 1:
         kept = set(scenes[-max(1, round(share * len(scenes))) :])
-        return [p for p in pairs if p.scene not in kept], [p for p in pairs if p.scene in kept]
+        training = [pair for pair in pairs if pair.scene not in kept]
+        return training, [pair for pair in pairs if pair.scene in kept]
     count = max(1, round(share * len(pairs)))
-    training, held_out = pairs[: -count - 1], pairs[-count:]
+    training = pairs[: -count - 1]
     if not training:
         raise InputError(
-            f"{scenes[0]}: {len(pairs)} pairs are too few to train on some and measure on others; name more data"
+            f"{scenes[0]}: {len(pairs)} pairs are too few to train on some and measure on "
+            "others; name more data"
         )
-    return training, held_out
+    return training, pairs[-count:]
 
 
-def claim(config: FinetuneConfig) -> None:
-    """Note the settings; InputError where the folder holds a run with other ones, or
-    something else.
+def claim_folder(config: FinetuneConfig) -> None:
+    """Note the settings in the output folder.
+
+    InputError where it holds a run with other settings, or something else.
     """
     path = config.out / "config.json"
-    settings = {
-        k: [str(p) for p in v] if k == "data" else str(v) if isinstance(v, Path) else v
-        for k, v in asdict(config).items()
-        if k not in ("out", "device")
-    }
-    if path.is_file() and settings_in(path) != settings:
-        raise InputError(
-            f"{config.out}: holds a run with other settings; choose a new folder, or repeat its command"
-        )
-    if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
+    settings: dict[str, Any] = {}
+    for name, value in asdict(config).items():
+        if name == "data":
+            settings[name] = [str(folder) for folder in value]
+        elif name not in ("out", "device"):
+            settings[name] = str(value) if isinstance(value, Path) else value
+    if path.is_file():
+        if read_settings(path) != settings:
+            raise InputError(
+                f"{config.out}: holds a run with other settings; choose a new folder, "
+                "or repeat its command"
+            )
+    elif config.out.exists() and any(config.out.iterdir()):
         raise InputError(f"{config.out}: holds other files; choose an empty or new folder")
     write_json(path, settings)
 
 
-def settings_in(path: Path) -> Any:
-    """What a run's config.json holds; InputError where it is damaged."""
+def read_settings(path: Path) -> Any:
+    """The content of a run's config.json; InputError where it is damaged."""
     try:
         return read_json(path)
     except ValueError as error:
         raise InputError(
-            f"{path}: not readable JSON ({error}); restore it, or choose a new folder"
+            f"{path}: not readable JSON ({shorten(error)}); restore it, or choose a new folder"
         ) from error
+
+
+# Training
 
 
 def train(
     network: FlowNetwork, pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig
 ) -> float:
-    """Train to the last step from where the folder's checkpoints are; the seconds it
-    took.
+    """Train to the last step from the folder's checkpoints on; the seconds it took.
+
+    Steps before a kill count. Crops are of `size` (h, w).
     """
     network.requires_grad_(True)
-    optimizer = torch.optim.AdamW(network.parameters(), config.lr, weight_decay=1e-4)
-    found = latest_checkpoint(config.out) if (config.out / "checkpoints").is_dir() else None
-    first, before, started = 0, 0.0, time.monotonic()
+    optimizer = torch.optim.AdamW(network.parameters(), config.lr, weight_decay=WEIGHT_DECAY)
+    started = time.monotonic()
+    first_step = 0
+    seconds_before = 0.0
+    has_checkpoints = (config.out / "checkpoints").is_dir()
+    found = latest_checkpoint(config.out) if has_checkpoints else None
     if found is not None:
         unpack(found.tensors, {"network": network}, {"adam": optimizer})
-        first, before = found.step, found.seconds
-    device = next(network.parameters()).device
-    for step in track(range(first, config.steps), "finetune-flow"):
-        examples = [drawn(pairs, size, config, step, k) for k in range(config.batch)]
-        loss = sequence_loss(
-            network.predictions(stacked(examples, "images").to(device)),
-            *(stacked(examples, n).to(device) for n in ("flow", "known")),
-        )
-        if not torch.isfinite(loss):
-            raise FloatingPointError(f"step {step}: the loss is {float(loss)}")
-        for group in optimizer.param_groups:
-            group["lr"] = config.lr * rate(step / config.steps)
-        optimizer.zero_grad()
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-        optimizer.step()
-        if (step + 1) % config.checkpoint_steps == 0 or step + 1 == config.steps:
-            save_checkpoint(
-                config.out,
-                step + 1,
-                before + time.monotonic() - started,
-                pack({"network": network}, {"adam": optimizer}),
-            )
+        first_step = found.step
+        seconds_before = found.seconds
+    for step in track(range(first_step, config.steps), "finetune-flow"):
+        examples = [draw_example(pairs, size, config, step, k) for k in range(config.batch)]
+        train_step(network, optimizer, examples, step, config)
+        is_last = step + 1 == config.steps
+        if (step + 1) % config.checkpoint_steps == 0 or is_last:
+            seconds = seconds_before + time.monotonic() - started
+            tensors = pack({"network": network}, {"adam": optimizer})
+            save_checkpoint(config.out, step + 1, seconds, tensors)
     network.requires_grad_(False)
-    return before + time.monotonic() - started
+    return seconds_before + time.monotonic() - started
 
 
-def mean(one: dict[str, Tensor], other: dict[str, Tensor], share: float) -> dict[str, Tensor]:
-    """Weights that are `share` of `one` and the rest of the `other`; numbers that are
-    no weights are the other's.
+def train_step(
+    network: FlowNetwork,
+    optimizer: torch.optim.Optimizer,
+    examples: list[Example],
+    step: int,
+    config: FinetuneConfig,
+) -> None:
+    """One step of gradient descent on a batch of `examples`."""
+    device = next(network.parameters()).device
+    predictions = network.predictions(stack_pairs(examples, "images").to(device))
+    flow = stack_pairs(examples, "flow").to(device)
+    known = stack_pairs(examples, "known").to(device)
+    loss = sequence_loss(predictions, flow, known)
+    if not torch.isfinite(loss):
+        raise FloatingPointError(f"step {step}: the loss is {float(loss)}")
+    for group in optimizer.param_groups:
+        group["lr"] = config.lr * rate_share(step / config.steps)
+    optimizer.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT_NORM)
+    optimizer.step()
+
+
+def rate_share(progress: float) -> float:
+    """The learning rate's share of its peak, at a share of the steps.
+
+    It rises linearly over `WARM_UP_SHARE`, then falls linearly to 0.
     """
-    return {
-        k: torch.lerp(v, one[k], share) if v.is_floating_point() else v for k, v in other.items()
-    }
+    rising = (progress + 1e-3) / WARM_UP_SHARE
+    falling = (1 - progress) / (1 - WARM_UP_SHARE)
+    return min(rising, falling)
 
 
-def rate(progress: float) -> float:
-    """The learning rate's share at a share of the steps: up in a line, then down in a
-    line.
-    """
-    return min((progress + 1e-3) / WARM_UP, (1 - progress) / (1 - WARM_UP))
-
-
-def drawn(
+def draw_example(
     pairs: list[FlowPair], size: tuple[int, int], config: FinetuneConfig, step: int, slot: int
 ) -> Example:
-    """The example of a slot of a step."""
+    """The example in a slot of the batch of a step."""
     rng = np.random.default_rng([config.seed, step, slot])
-    return example(read_sample(pairs[rng.integers(len(pairs))]), config.stops, size, rng)
+    sample = read_sample(pairs[rng.integers(len(pairs))])
+    return example(sample, config.stops, size, rng)
 
 
-def stacked(examples: list[Example], name: str) -> Tensor:
-    """One part of some examples as a pair batch (2B, ...): first all firsts, then all
-    seconds.
+def stack_pairs(examples: list[Example], name: str) -> Tensor:
+    """One part of the examples as a pair batch (2B, ...).
+
+    First come all firsts, then all seconds.
     """
     parts = torch.stack([getattr(e, name) for e in examples], 1)  # (2, B, ...)
     return parts.flatten(0, 1)
 
 
 def sequence_loss(predictions: list[Tensor], flow: Tensor, known: Tensor) -> Tensor:
-    """The mean absolute error (pixels, per axis) of every prediction (2B, 2, H, W)
-    where flow is `known` (2B, H, W), later ones weighing more.
+    """The weighted sum of the mean absolute errors (px, per axis) of all predictions.
+
+    `predictions` and `flow` are (2B, 2, H, W); only pixels count where flow is `known`
+    (2B, H, W) and not too fast. Later predictions weigh more (RAFT, equation 7).
     """
-    counted = known & (flow.norm(dim=1) < FASTEST)
-    weights = [DECAY ** (len(predictions) - 1 - k) for k in range(len(predictions))]
-    errors = [
-        ((p - flow).abs().mean(1) * counted).sum() / counted.sum().clamp_min(1) for p in predictions
-    ]
-    return torch.stack([w * e for w, e in zip(weights, errors, strict=True)]).sum()
+    counted = known & (flow.norm(dim=1) < MAX_FLOW_PX)
+    terms = []
+    for k, prediction in enumerate(predictions):
+        error = (prediction - flow).abs().mean(1)
+        mean = (error * counted).sum() / counted.sum().clamp_min(1)
+        terms.append(PREDICTION_DECAY ** (len(predictions) - 1 - k) * mean)
+    return torch.stack(terms).sum()
 
 
-def measured(
-    network: FlowNetwork, pairs: list[FlowPair], kept: Path | None
+def mean_weights(
+    one: dict[str, Tensor], other: dict[str, Tensor], share: float
+) -> dict[str, Tensor]:
+    """Weights that are `share` of `one` and the rest of the `other`.
+
+    Counters, which are no weights, are the other's.
+    """
+    mean = {}
+    for name, value in other.items():
+        mean[name] = torch.lerp(value, one[name], share) if value.is_floating_point() else value
+    return mean
+
+
+# Measuring
+
+
+def measure_or_read(
+    network: FlowNetwork, pairs: list[FlowPair], kept: Path
 ) -> dict[str, dict[str, float]]:
-    """End-point error of `pairs` per EV difference, mean and median in pixels of the
-    frames, as `prepare` matches them.
+    """The result of `measure_errors`, read from the note `kept` or written there."""
+    found = notes.read(kept, notes.FlowErrors)
+    if found is not None:
+        return {stops: error.model_dump() for stops, error in found.by_stops.items()}
+    errors = measure_errors(network, pairs)
+    notes.write(kept, notes.FlowErrors.model_validate({"by_stops": errors}))
+    return errors
 
-    `kept`: a file with the answer, if it is there; where it is not, it is written.
+
+def measure_errors(network: FlowNetwork, pairs: list[FlowPair]) -> dict[str, dict[str, float]]:
+    """The end-point error of `pairs` per EV difference, as `prepare` matches frames.
+
+    Mean and median over all pixels whose flow is known, in pixels of the frames.
     """
-    if kept is not None and (found := notes.read(kept, notes.FlowErrors)) is not None:
-        return {k: e.model_dump() for k, e in found.by_stops.items()}
-    errors: dict[str, list[np.ndarray]] = {f"{stops:g}": [] for stops in MEASURED}
+    errors: dict[str, list[np.ndarray]] = {f"{stops:g}": [] for stops in MEASURED_EV}
     for pair in track(pairs, "measure"):
         sample = read_sample(pair)
-        for stops in MEASURED:
-            flow = np.stack(both_ways(network, *recorded_pair(sample.radiance, stops, equal=True)))
-            errors[f"{stops:g}"].append(np.linalg.norm(flow - sample.flow, axis=-1)[sample.known])
-    result = {
-        k: {"mean": float(np.concatenate(e).mean()), "median": float(np.median(np.concatenate(e)))}
-        for k, e in errors.items()
-    }
-    if kept is not None:
-        notes.write(kept, notes.FlowErrors.model_validate({"by_stops": result}))
+        for stops in MEASURED_EV:
+            pictures = recorded_pair(sample.radiance, stops, equal=True)
+            flow = np.stack(both_ways(network, *pictures))
+            error = np.linalg.norm(flow - sample.flow, axis=-1)[sample.known]
+            errors[f"{stops:g}"].append(error)
+    result = {}
+    for stops_name, parts in errors.items():
+        every = np.concatenate(parts)
+        result[stops_name] = {"mean": float(every.mean()), "median": float(np.median(every))}
     return result
 
 
-def write_weights(network: FlowNetwork, config: FinetuneConfig, record: dict) -> Path:
-    """Save the network and what is to be said of it; the file of weights."""
+def write_weights(network: FlowNetwork, config: FinetuneConfig, record: dict[str, Any]) -> Path:
+    """Save the network and the `record` of how it was made; the file of weights."""
     path = config.out / FINETUNED
     tensors = {k: v.detach().cpu().contiguous() for k, v in network.state_dict().items()}
-    with atomic(path) as partial:
-        partial.write_bytes(save(tensors, {"network": config.network}))
-    write_json(
-        path.with_suffix(".json"), {"network": config.network, "steps": config.steps, **record}
-    )
+    with atomic(path) as temporary:
+        temporary.write_bytes(save(tensors, {"network": config.network}))
+    made_of = {"network": config.network, "steps": config.steps, **record}
+    write_json(path.with_suffix(".json"), made_of)
     say(f"finetune-flow: {path}; use it with `prepare --flow raft-finetuned --flow-weights {path}`")
     return path

@@ -1,6 +1,7 @@
 """Pairs of known flow as an alternating-exposure camera would have recorded them: other
-exposures, responses, noise, white balance, and crops. All randomness comes from the
-generator that is handed in.
+exposures, responses, noise, white balance, and crops.
+
+All randomness comes from the generator that is passed in.
 """
 
 from __future__ import annotations
@@ -18,80 +19,92 @@ from hdr_nsff.radiometry.common_range import LUMA, common_rgb, recorded_range
 from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import POINTS, Curve, Noise, film, record, response_curve
 
-MIDDLE = 0.18  # sensor exposure that the median of a pair gets, give or take
-EQUALIZED = 0.75  # the share of pairs seen as `prepare` shows them; the others as recorded
+# The cameras that pairs are recorded by. All hand-chosen: the range of consumer cameras
+# with some to spare.
+MIDDLE_GRAY = 0.18  # sensor exposure of the median of a pair, give or take ...
+MIDDLE_RANGE_EV = 1.0  # ... this
+# share of pairs seen at a common brightness, as `prepare` matches them; the others are
+# seen as recorded
+EQUALIZED_SHARE = 0.75
+WHITE_BALANCE_SPREAD = 0.1  # standard deviation of the log of each channel's gain
+NOISE_RANGE_LOG2 = (-1.0, 2.0)  # log2 of the noise relative to `Noise`
+GAMMA_RANGE = (1.7, 2.6)  # parameters of `film`
+CONTRAST_RANGE = (0.0, 0.5)
+LIFT_RANGE = (0.0, 0.2)
+CHANNEL_GAMMA_SPREAD = 0.03  # standard deviation of the log of a channel's gamma
+CHANNEL_RANGE = (0.8, 1.2)  # factors on a channel's contrast and lift
+ZOOM_RANGE = (0.8, 1.25)  # factors on the size at which a pair is matched
+MIN_KNOWN_SHARE = 0.999  # of a resampled pixel whose flow counts as known
 
 
 @dataclass(frozen=True)
 class Example:
-    """What a network is trained on: a pair batch, and what it should say of it."""
+    """What a network is trained on: a pair batch, and the flow to predict."""
 
     images: Tensor  # (2, 3, h, w) in [0, 1]
     flow: Tensor  # (2, 2, h, w) px of that size
     known: Tensor  # (2, h, w) bool
 
 
+@dataclass(frozen=True)
+class PairCamera:
+    """How a pair is recorded."""
+
+    evs: np.ndarray  # (2,)
+    white: np.ndarray  # (3,) gains
+    curve: Curve
+    noise: float  # relative to `Noise`
+
+
 def recorded_pair(radiance: np.ndarray, stops: float, equal: bool) -> np.ndarray:
-    """A pair (2, H, W, 3) recorded `stops` EV apart around its own middle by one fixed
-    camera, to measure on.
+    """A pair (2, H, W, 3) recorded `stops` EV apart by one fixed camera, to measure on.
+
+    `radiance` (2, H, W, 3) is exposed around its own middle; `equal` brings both
+    pictures to a common brightness.
     """
-    return seen(
-        radiance,
-        middle(radiance) + np.array([-0.5, 0.5]) * stops,
-        np.ones(3),
-        response_curve("film"),
-        1.0,
-        np.random.default_rng(0),
-        equal,
-    )
+    evs = middle_ev(radiance) + np.array([-0.5, 0.5]) * stops
+    camera = PairCamera(evs, np.ones(3), response_curve("film"), 1.0)
+    return record_pair(radiance, camera, np.random.default_rng(0), equal)
 
 
 def example(
     sample: Sample, stops: float, size: tuple[int, int], rng: np.random.Generator
 ) -> Example:
-    """A random crop of `size` (h, w) of a pair recorded up to `stops` EV apart by a
-    random camera, at about the size it is matched at.
+    """A random crop of a pair, recorded up to `stops` EV apart by a random camera.
+
+    The crop is of `size` (h, w), at about the scale at which `prepare` matches frames.
     """
     apart = rng.uniform(-stops, stops)
-    around = middle(sample.radiance) + rng.uniform(-1, 1)
-    white = np.exp(rng.normal(0, 0.1, 3))
-    noise = 2.0 ** rng.uniform(-1, 2)
-    images = seen(
-        sample.radiance,
-        around + np.array([-0.5, 0.5]) * apart,
-        white,
-        random_curve(rng),
-        noise,
-        rng,
-        rng.random() < EQUALIZED,
-    )
-    return cropped(images, sample, size, rng)
+    around = middle_ev(sample.radiance) + rng.uniform(-MIDDLE_RANGE_EV, MIDDLE_RANGE_EV)
+    white = np.exp(rng.normal(0, WHITE_BALANCE_SPREAD, 3))
+    noise = 2.0 ** rng.uniform(*NOISE_RANGE_LOG2)
+    evs = around + np.array([-0.5, 0.5]) * apart
+    camera = PairCamera(evs, white, random_curve(rng), noise)
+    equal = rng.random() < EQUALIZED_SHARE
+    images = record_pair(sample.radiance, camera, rng, equal)
+    return random_crop(images, sample, size, rng)
 
 
-def middle(radiance: np.ndarray) -> float:
-    """The EV at which the median of `radiance` (..., 3) becomes `MIDDLE`."""
-    return float(np.log2(MIDDLE / max(float(np.median(radiance @ LUMA)), 1e-6)))
+def middle_ev(radiance: np.ndarray) -> float:
+    """The EV at which the median of `radiance` (..., 3) becomes `MIDDLE_GRAY`."""
+    median = max(float(np.median(radiance @ LUMA)), 1e-6)
+    return float(np.log2(MIDDLE_GRAY / median))
 
 
-def seen(
-    radiance: np.ndarray,
-    evs: np.ndarray,
-    white: np.ndarray,
-    curve: Curve,
-    noise: float,
-    rng: np.random.Generator,
-    equal: bool,
+def record_pair(
+    radiance: np.ndarray, camera: PairCamera, rng: np.random.Generator, equal: bool
 ) -> np.ndarray:
-    """`radiance` (2, H, W, 3) recorded at `evs` (2,), and then brought to a common
-    brightness where `equal`; (2, H, W, 3) in [0, 1].
+    """`radiance` (2, H, W, 3) as a camera records it, in [0, 1].
+
+    `equal` brings both pictures to a common brightness.
     """
-    sensor = Noise(Noise.read * noise, Noise.shot * noise)
-    video = np.stack(
-        [
-            record(r, ev, tuple(white), curve, sensor, rng)
-            for r, ev in zip(radiance, evs, strict=True)
-        ]
-    )
+    sensor = Noise(Noise.read * camera.noise, Noise.shot * camera.noise)
+    white = tuple(camera.white)
+    pictures = [
+        record(r, ev, white, camera.curve, sensor, rng)
+        for r, ev in zip(radiance, camera.evs, strict=True)
+    ]
+    video = np.stack(pictures)
     if not equal:
         return video
     frames, clipped = equalize(video, [0, 1])
@@ -100,42 +113,41 @@ def seen(
 
 
 def random_curve(rng: np.random.Generator) -> Curve:
-    """A response curve from the family that `film` spans, every channel a little
-    different.
-    """
-    gamma, contrast, lift = rng.uniform(1.7, 2.6), rng.uniform(0, 0.5), rng.uniform(0, 0.2)
+    """A response curve from the family of `film`, every channel a little different."""
+    gamma = rng.uniform(*GAMMA_RANGE)
+    contrast = rng.uniform(*CONTRAST_RANGE)
+    lift = rng.uniform(*LIFT_RANGE)
+    gammas = gamma * np.exp(rng.normal(0, CHANNEL_GAMMA_SPREAD, 3))
+    contrasts = contrast * rng.uniform(*CHANNEL_RANGE, 3)
+    lifts = lift * rng.uniform(*CHANNEL_RANGE, 3)
     x = np.linspace(0, 1, POINTS) ** 2.2
-    each = zip(
-        gamma * np.exp(rng.normal(0, 0.03, 3)),
-        contrast * rng.uniform(0.8, 1.2, 3),
-        lift * rng.uniform(0.8, 1.2, 3),
-        strict=True,
-    )
-    return Curve(x, np.stack([film(x, *channel) for channel in each]))
+    channels = [film(x, g, c, s) for g, c, s in zip(gammas, contrasts, lifts, strict=True)]
+    return Curve(x, np.stack(channels))
 
 
-def cropped(
+def random_crop(
     images: np.ndarray, sample: Sample, size: tuple[int, int], rng: np.random.Generator
 ) -> Example:
-    """A random place of a pair (2, H, W, 3), enlarged or shrunk to `size` and mirrored
-    at random.
-    """
+    """A random part of a pair (2, H, W, 3), mirrored at random and of `size` (h, w)."""
     height, width = images.shape[1:3]
-    usual = working_size(height, width)[1] / width * rng.uniform(0.8, 1.25)
+    usual = working_size(height, width)[1] / width * rng.uniform(*ZOOM_RANGE)
     zoom = max(usual, size[0] / height, size[1] / width)
-    h, w = min(height, round(size[0] / zoom)), min(width, round(size[1] / zoom))
-    y, x = rng.integers(height - h + 1), rng.integers(width - w + 1)
-    rgb, flow, known = (
-        torch.from_numpy(v[:, y : y + h, x : x + w].copy())
-        for v in (images, sample.flow, sample.known)
-    )
-    rgb, flow = (
-        resized(rgb.permute(0, 3, 1, 2).float(), size),
-        resized_flow(flow.permute(0, 3, 1, 2), size),
-    )
-    known = functional.interpolate(known[:, None].float(), size=size, mode="area")[:, 0] > 0.999
+    h = min(height, round(size[0] / zoom))
+    w = min(width, round(size[1] / zoom))
+    y = rng.integers(height - h + 1)
+    x = rng.integers(width - w + 1)
+
+    def crop(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(array[:, y : y + h, x : x + w].copy())
+
+    rgb = resized(crop(images).permute(0, 3, 1, 2).float(), size)
+    flow = resized_flow(crop(sample.flow).permute(0, 3, 1, 2), size)
+    share = functional.interpolate(crop(sample.known)[:, None].float(), size=size, mode="area")
+    known = share[:, 0] > MIN_KNOWN_SHARE
     for axis, channel in ((-1, 0), (-2, 1)):
         if rng.random() < 0.5:
-            rgb, flow, known = rgb.flip(axis), flow.flip(axis), known.flip(axis)
+            rgb = rgb.flip(axis)
+            flow = flow.flip(axis)
+            known = known.flip(axis)
             flow[:, channel] *= -1
     return Example(rgb, flow, known)

@@ -2,16 +2,15 @@
 `synth`.
 
 Layouts, each below the folder that is named:
-    synth             exact/clip_00000.exr: linear radiance, `forward` and `backward`
-    flow
-    Sintel            [training/]final/SCENE/frame_0001.png,
-    [training/]flow/SCENE/frame_0001.flo, and where there is one
-                      [training/]invalid/SCENE/frame_0001.png, white where the flow is
-                      not known
-    FlyingThings3D    frames_finalpass/TRAIN/A/0000/left/0006.png (or .webp in
-    frames_finalpass_webp) and
-optical_flow/TRAIN/A/0000/into_future/left/OpticalFlowIntoFuture_0006_L.pfm,
-                      into_past/...Past_0007_L.pfm
+
+- synth: `exact/clip_00000.exr` with linear radiance, `forward` and `backward` flow.
+- Sintel: `[training/]final/SCENE/frame_0001.png`,
+  `[training/]flow/SCENE/frame_0001.flo`, and where there is one
+  `[training/]invalid/SCENE/frame_0001.png`, white where the flow is unknown.
+- FlyingThings3D: `frames_finalpass/TRAIN/A/0000/left/0006.png` (or .webp in
+  `frames_finalpass_webp`) and below `optical_flow/TRAIN/A/0000/`
+  `into_future/left/OpticalFlowIntoFuture_0006_L.pfm` and
+  `into_past/left/OpticalFlowIntoPast_0007_L.pfm`.
 """
 
 from __future__ import annotations
@@ -28,41 +27,44 @@ from hdr_nsff.core.exr import SIDES, read_exr
 from hdr_nsff.core.images import read_image, read_mask
 from hdr_nsff.radiometry.recording import response_curve
 
-FLO_MAGIC = 202021.25  # "PIEH"
-FAR = 1e4  # pixels: what files write where flow is not known is farther than that
+FLO_MAGIC = 202021.25  # the first four bytes of a .flo, "PIEH", as a float
+MAX_FLOW_PX = 1e4  # files write larger numbers where flow is unknown
+PFM_HEADER = re.compile(rb"(PF|Pf)\s+(\d{1,9})\s+(\d{1,9})\s+(-?\d+(?:\.\d*)?(?:e[+-]?\d+)?)\s")
 
 
 @dataclass(frozen=True)
 class FlowPair:
-    """Two frames, and the files that say how pixels go from the one to the other."""
+    """Two frames, and the files of the flow between them."""
 
     first: Path
     second: Path
-    forward: Path  # flow of the first to the second
-    backward: Path | None  # flow of the second to the first, where the set has it
-    scene: str  # pairs of one scene show the same things
-    invalid: Path | None = None  # where `forward` is not known
+    forward: Path  # flow from the first to the second
+    backward: Path | None  # flow from the second to the first, where the set has it
+    scene: str  # pairs of one scene show the same objects
+    invalid: Path | None = None  # white where `forward` is unknown
 
 
 @dataclass(frozen=True)
 class Sample:
-    """What a pair holds."""
+    """The content of a pair."""
 
     radiance: np.ndarray  # (2, H, W, 3) linear
     flow: np.ndarray  # (2, H, W, 2) px, there and back
     known: np.ndarray  # (2, H, W) bool
 
 
+# Which pairs
+
+
 def flow_pairs(folder: Path) -> list[FlowPair]:
-    """The pairs of a data set in their order; InputError where it has none of the
-    layouts above.
-    """
-    for reader in (synth_pairs, sintel_pairs, things_pairs):
-        if pairs := reader(folder):
+    """The pairs of a data set in their order; InputError for an unknown layout."""
+    for find_pairs in (synth_pairs, sintel_pairs, flyingthings_pairs):
+        pairs = find_pairs(folder)
+        if pairs:
             return pairs
     raise InputError(
-        f"{folder}: no pairs with known flow; name a folder of `synth`, or of Sintel (final/, flow/) or FlyingThings3D "
-        "(frames_finalpass/, optical_flow/)"
+        f"{folder}: no pairs with known flow; name a folder of `synth`, or of Sintel "
+        "(final/, flow/) or FlyingThings3D (frames_finalpass/, optical_flow/)"
     )
 
 
@@ -75,91 +77,102 @@ def synth_pairs(folder: Path) -> list[FlowPair]:
 def sintel_pairs(folder: Path) -> list[FlowPair]:
     """Neighbors of Sintel's final pass."""
     root = folder / "training" if (folder / "training").is_dir() else folder
-    found = []
+    pairs = []
     for flow in sorted((root / "flow").glob("*/frame_*.flo")):
-        scene, number = flow.parent.name, int(flow.stem.removeprefix("frame_"))
-        first, second = (
-            root / "final" / scene / f"frame_{k:04d}.png" for k in (number, number + 1)
-        )
+        match = re.fullmatch(r"frame_(\d+)", flow.stem)
+        if match is None:
+            continue
+        scene = flow.parent.name
+        number = int(match[1])
+        first = root / "final" / scene / f"frame_{number:04d}.png"
+        second = root / "final" / scene / f"frame_{number + 1:04d}.png"
         invalid = root / "invalid" / scene / f"frame_{number:04d}.png"
         if first.is_file() and second.is_file():
-            found.append(
-                FlowPair(first, second, flow, None, scene, invalid if invalid.is_file() else None)
-            )
-    return found
+            mask = invalid if invalid.is_file() else None
+            pairs.append(FlowPair(first, second, flow, None, scene, mask))
+    return pairs
 
 
-def things_pairs(folder: Path) -> list[FlowPair]:
+def flyingthings_pairs(folder: Path) -> list[FlowPair]:
     """Neighbors of FlyingThings3D's final pass, both eyes."""
-    found = []
-    for flow in sorted(
-        (folder / "optical_flow").glob("*/*/*/into_future/*/OpticalFlowIntoFuture_*.pfm")
-    ):
-        eye, scene = flow.parent.name, flow.parents[2]
-        name = re.fullmatch(r"OpticalFlowIntoFuture_(\d+)_([LR])", flow.stem)
-        if name is None:
+    root = folder / "optical_flow"
+    pairs = []
+    for forward in sorted(root.glob("*/*/*/into_future/*/OpticalFlowIntoFuture_*.pfm")):
+        match = re.fullmatch(r"OpticalFlowIntoFuture_(\d+)_([LR])", forward.stem)
+        if match is None:
             continue
-        number, side = int(name[1]), name[2]
-        back = scene / "into_past" / eye / f"OpticalFlowIntoPast_{number + 1:04d}_{side}.pfm"
-        frames = [
-            things_frame(folder, scene.relative_to(folder / "optical_flow") / eye, k)
-            for k in (number, number + 1)
-        ]
-        if frames[0] and frames[1]:
-            found.append(
-                FlowPair(frames[0], frames[1], flow, back if back.is_file() else None, str(scene))
-            )
-    return found
+        number = int(match[1])
+        eye = forward.parent.name
+        scene = forward.parents[2]
+        name = f"OpticalFlowIntoPast_{number + 1:04d}_{match[2]}.pfm"
+        backward = scene / "into_past" / eye / name
+        place = scene.relative_to(root) / eye
+        first = flyingthings_frame(folder, place, number)
+        second = flyingthings_frame(folder, place, number + 1)
+        if first is not None and second is not None:
+            reverse = backward if backward.is_file() else None
+            pairs.append(FlowPair(first, second, forward, reverse, str(scene)))
+    return pairs
 
 
-def things_frame(folder: Path, inside: Path, number: int) -> Path | None:
-    """The picture of a frame of FlyingThings3D, None where it is not there."""
+def flyingthings_frame(folder: Path, place: Path, number: int) -> Path | None:
+    """A frame of FlyingThings3D; None where it is not there."""
     names = (
-        f"frames_finalpass/{inside}/{number:04d}.png",
-        f"frames_finalpass_webp/{inside}/{number:04d}.webp",
+        f"frames_finalpass/{place}/{number:04d}.png",
+        f"frames_finalpass_webp/{place}/{number:04d}.webp",
     )
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
+# Reading
+
+
 def read_sample(pair: FlowPair) -> Sample:
-    """Radiance and flow of a pair; 8-bit pictures are taken to be sRGB, so 1 is as
-    bright as they go. InputError for broken files.
+    """Radiance and flow of a pair; InputError for files that are broken or do not fit.
+
+    Pictures of 8 bits are taken to be sRGB, so 1 is as bright as they go.
     """
-    flows = [
-        read_flow_file(pair.forward, 1),
-        read_flow_file(pair.backward, -1) if pair.backward else None,
-    ]
-    radiance = [read_radiance(path) for path in (pair.first, pair.second)]
-    size = radiance[0].shape[:2]
-    for path, shape in (
-        (pair.second, radiance[1].shape[:2]),
-        *((pair.forward, f.shape[:2]) for f in flows if f is not None),
-    ):
-        if shape != size:
-            raise InputError(
-                f"{path}: {shape[1]}x{shape[0]}, but {pair.first} is {size[1]}x{size[0]}; restore the file"
-            )
-    given = [np.zeros((*size, 2), np.float32) if f is None else f for f in flows]
-    known = np.stack(
-        [np.zeros(size, bool) if f is None else (np.abs(f) < FAR).all(-1) for f in flows]
-    )
+    first = read_radiance(pair.first)
+    second = read_radiance(pair.second)
+    size = (first.shape[0], first.shape[1])
+    check_size(pair, pair.second, second, size)
+    flow = np.zeros((2, *size, 2), np.float32)
+    known = np.zeros((2, *size), bool)
+    for k, (path, side) in enumerate(((pair.forward, 1), (pair.backward, -1))):
+        if path is None:
+            continue
+        values = read_flow_file(path, side)
+        check_size(pair, path, values, size)
+        known[k] = (np.abs(values) < MAX_FLOW_PX).all(-1)
+        flow[k] = np.where(known[k][..., None], values, 0)
     if pair.invalid is not None:
-        known[0] &= ~read_mask(pair.invalid)
-    return Sample(
-        np.stack(radiance), np.where(known[..., None], np.stack(given), 0).astype(np.float32), known
-    )
+        invalid = read_mask(pair.invalid)
+        check_size(pair, pair.invalid, invalid, size)
+        known[0] &= ~invalid
+        flow[0][invalid] = 0
+    return Sample(np.stack([first, second]), flow, known)
+
+
+def check_size(pair: FlowPair, path: Path, array: np.ndarray, size: tuple[int, int]) -> None:
+    """InputError where a file of a pair is not of `size` (H, W), that of its first."""
+    if array.shape[:2] != size:
+        raise InputError(
+            f"{path}: {array.shape[1]}x{array.shape[0]}, but {pair.first} is "
+            f"{size[1]}x{size[0]}; restore the file"
+        )
 
 
 def read_radiance(path: Path) -> np.ndarray:
     """Linear radiance (H, W, 3) of an EXR, or of a picture in sRGB."""
     if path.suffix == ".exr":
-        return np.maximum(channels(path, "RGB"), 0).astype(np.float32)
+        return np.maximum(read_channel(path, "RGB"), 0).astype(np.float32)
     return response_curve("srgb").invert(read_image(path)).astype(np.float32)
 
 
 def read_flow_file(path: Path, side: int) -> np.ndarray:
-    """Flow (H, W, 2) px of a .flo, a .pfm, or of a rendered frame's EXR to the next
-    (`side` 1) or previous (-1) one.
+    """Flow (H, W, 2) px of a .flo, a .pfm, or an EXR of `synth`.
+
+    An EXR holds flow to the next frame (`side` 1) and to the previous one (-1).
     """
     match path.suffix:
         case ".flo":
@@ -167,11 +180,13 @@ def read_flow_file(path: Path, side: int) -> np.ndarray:
         case ".pfm":
             return read_pfm(path)[..., :2]
         case _:
-            return np.stack([channels(path, f"{SIDES[side]}.{axis}") for axis in "uv"], -1)
+            u = read_channel(path, f"{SIDES[side]}.u")
+            v = read_channel(path, f"{SIDES[side]}.v")
+            return np.stack([u, v], -1)
 
 
-def channels(path: Path, name: str) -> np.ndarray:
-    """A channel of an EXR."""
+def read_channel(path: Path, name: str) -> np.ndarray:
+    """A channel of an EXR; InputError where it has none of that name."""
     found = read_exr(path)
     if name not in found:
         raise InputError(
@@ -181,29 +196,33 @@ def channels(path: Path, name: str) -> np.ndarray:
 
 
 def read_flo(path: Path) -> np.ndarray:
-    """Flow (H, W, 2) px of a Middlebury file: magic number, width, height, then u and v
-    row by row, all little-endian.
+    """Flow (H, W, 2) px of a Middlebury file.
+
+    It holds a magic number, width, height, then u and v row by row, all little-endian.
     """
     data = path.read_bytes()
     if len(data) < 12 or np.frombuffer(data, "<f4", 1)[0] != FLO_MAGIC:
         raise InputError(f"{path}: not a .flo file; copy it again")
     width, height = (int(v) for v in np.frombuffer(data, "<i4", 2, 4))
-    if len(data) != 12 + 8 * width * height:
+    if min(width, height) < 1 or len(data) != 12 + 8 * width * height:
         raise InputError(f"{path}: {len(data)} bytes for {width}x{height} pixels; copy it again")
     return np.frombuffer(data, "<f4", offset=12).reshape(height, width, 2)
 
 
 def read_pfm(path: Path) -> np.ndarray:
-    """Picture (H, W, C) float32 of a portable float map, whose rows go from the bottom
-    to the top.
+    """A picture (H, W, C) float32 of a portable float map.
+
+    Its rows go from the bottom to the top; a negative scale means little-endian.
     """
-    found = re.match(
-        rb"(PF|Pf)\s+(\d+)\s+(\d+)\s+(-?[\d.]+(?:e[+-]?\d+)?)\s", data := path.read_bytes()
-    )
-    if found is None:
+    data = path.read_bytes()
+    header = PFM_HEADER.match(data)
+    if header is None:
         raise InputError(f"{path}: not a .pfm file; copy it again")
-    width, height, count = int(found[2]), int(found[3]), 3 if found[1] == b"PF" else 1
-    if len(data) != found.end() + 4 * width * height * count:
+    width = int(header[2])
+    height = int(header[3])
+    channels = 3 if header[1] == b"PF" else 1
+    if len(data) != header.end() + 4 * width * height * channels:
         raise InputError(f"{path}: {len(data)} bytes for {width}x{height} pixels; copy it again")
-    values = np.frombuffer(data, "<f4" if float(found[4]) < 0 else ">f4", offset=found.end())
-    return values.reshape(height, width, count)[::-1].astype(np.float32)
+    kind = "<f4" if float(header[4]) < 0 else ">f4"
+    values = np.frombuffer(data, kind, offset=header.end())
+    return values.reshape(height, width, channels)[::-1].astype(np.float32)

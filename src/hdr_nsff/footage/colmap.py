@@ -2,36 +2,49 @@
 documentation describes the format.
 
 Poses in these files are world to camera, quaternions (w, x, y, z), OpenCV axes; pixel
-centers at +0.5, like ours.
+centers are at +0.5, as everywhere here.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 
-# model number -> name, number of parameters, whether fx and fy are one number
-MODELS = {
-    0: ("SIMPLE_PINHOLE", 3, True),
-    1: ("PINHOLE", 4, False),
-    2: ("SIMPLE_RADIAL", 4, True),
-    3: ("RADIAL", 5, True),
-    4: ("OPENCV", 8, False),
-    5: ("OPENCV_FISHEYE", 8, False),
-    6: ("FULL_OPENCV", 12, False),
-    7: ("FOV", 5, False),
-    8: ("SIMPLE_RADIAL_FISHEYE", 4, True),
-    9: ("RADIAL_FISHEYE", 5, True),
-    10: ("THIN_PRISM_FISHEYE", 12, False),
+
+class CameraModel(NamedTuple):
+    """One of COLMAP's camera models."""
+
+    name: str
+    num_params: int
+    single_focal: bool  # fx and fy are one number
+
+
+MODELS = {  # by the number that binary files have
+    0: CameraModel("SIMPLE_PINHOLE", 3, True),
+    1: CameraModel("PINHOLE", 4, False),
+    2: CameraModel("SIMPLE_RADIAL", 4, True),
+    3: CameraModel("RADIAL", 5, True),
+    4: CameraModel("OPENCV", 8, False),
+    5: CameraModel("OPENCV_FISHEYE", 8, False),
+    6: CameraModel("FULL_OPENCV", 12, False),
+    7: CameraModel("FOV", 5, False),
+    8: CameraModel("SIMPLE_RADIAL_FISHEYE", 4, True),
+    9: CameraModel("RADIAL_FISHEYE", 5, True),
+    10: CameraModel("THIN_PRISM_FISHEYE", 12, False),
 }
-NUMBERS = {name: number for number, (name, _, _) in MODELS.items()}
+MODELS_BY_NAME = {model.name: model for model in MODELS.values()}
+# what the readers below raise for a file that is damaged or cut short
+UNREADABLE = (struct.error, ValueError, IndexError, KeyError, MemoryError, OverflowError)
+KEYPOINT = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
+TRACK_ELEMENT = np.dtype("<i4,<i4")  # image, keypoint
 
 
 @dataclass(frozen=True)
@@ -42,7 +55,7 @@ class ColmapCamera:
     width: int
     height: int
     K: np.ndarray  # (3, 3) pixels
-    distortion: np.ndarray  # what the model has beyond the pinhole
+    distortion: np.ndarray  # the parameters of the model beyond the pinhole
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class ColmapImage:
     camera_id: int
     c2w: np.ndarray  # (3, 4) OpenCV
     xy: np.ndarray  # (N, 2) keypoints, pixels
-    point_ids: np.ndarray  # (N,) the 3D point each keypoint saw, -1 for none
+    point_ids: np.ndarray  # (N,) the 3D point of each keypoint, -1 for none
 
 
 @dataclass(frozen=True)
@@ -65,76 +78,100 @@ class ColmapModel:
     point_ids: np.ndarray  # (P,)
     points: np.ndarray  # (P, 3) world
     errors: np.ndarray  # (P,) mean reprojection error, pixels
-    track_lengths: np.ndarray  # (P,) how many keypoints saw the point
+    track_lengths: np.ndarray  # (P,) number of keypoints that saw the point
+
+
+# id, x, y, z, error, track length
+PointRow = tuple[int, float, float, float, float, int]
 
 
 def read_model(folder: Path | str) -> ColmapModel:
-    """The COLMAP model in `folder` (cameras, images, points3D; .bin before .txt).
-    InputError where a file is missing or cut short.
+    """The COLMAP model in `folder`: cameras, images, points3D; .bin before .txt.
+
+    InputError where a file is missing, damaged or cut short.
     """
     folder = Path(folder)
-    parts: list[Any] = []
-    for name, readers in {
-        "cameras": (cameras_bin, cameras_txt),
-        "images": (images_bin, images_txt),
-        "points3D": (points_bin, points_txt),
-    }.items():
-        path = next(
-            (p for p in (folder / f"{name}.bin", folder / f"{name}.txt") if p.is_file()), None
-        )
-        if path is None:
-            raise InputError(
-                f"{folder}: no {name}.bin or {name}.txt here; name the folder that COLMAP wrote (often sparse/0)"
-            )
-        try:
-            with open(path, "rb") as file:
-                parts.append(readers[path.suffix == ".txt"](file))
-        except (
-            struct.error,
-            ValueError,
-            IndexError,
-            KeyError,
-            UnicodeDecodeError,
-            MemoryError,
-            OverflowError,
-        ) as error:
-            raise InputError(
-                f"{path}: not a readable COLMAP file, or cut short ({error}); export the model again"
-            ) from error
-    cameras, images, (ids, points, errors, lengths) = parts
+    cameras = read_part(folder, "cameras", cameras_bin, cameras_txt)
+    images = read_part(folder, "images", images_bin, images_txt)
+    rows = read_part(folder, "points3D", points_bin, points_txt)
+    table = np.array(rows, np.float64).reshape(-1, 6)
+    if not np.isfinite(table).all():
+        raise InputError(f"{folder}: points3D holds NaN or Inf; export the model again")
     lost = next((i for i in images.values() if i.camera_id not in cameras), None)
     if lost is not None:
         raise InputError(
-            f"{folder}: image {lost.name} names camera {lost.camera_id}, which the model has not; export it again"
+            f"{folder}: image {shorten(lost.name)} names camera {lost.camera_id}, "
+            "which the model has not; export it again"
         )
-    return ColmapModel(cameras, images, ids, points, errors, lengths)
+    return ColmapModel(
+        cameras,
+        images,
+        point_ids=table[:, 0].astype(np.int64),
+        points=table[:, 1:4],
+        errors=table[:, 4],
+        track_lengths=table[:, 5].astype(np.int64),
+    )
 
 
-def camera(model: str, width: int, height: int, params: np.ndarray) -> ColmapCamera:
-    """A camera from its parameters in COLMAP's order: focal length(s), principal point,
-    distortion.
+def read_part(
+    folder: Path,
+    name: str,
+    read_bin: Callable[[BinaryIO], Any],
+    read_txt: Callable[[BinaryIO], Any],
+) -> Any:
+    """One of the three files of a model; InputError where that is not possible."""
+    path = folder / f"{name}.bin"
+    read = read_bin
+    if not path.is_file():
+        path = folder / f"{name}.txt"
+        read = read_txt
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: no {name}.bin or {name}.txt here; "
+            "name the folder that COLMAP wrote (often sparse/0)"
+        )
+    try:
+        with open(path, "rb") as file:
+            return read(file)
+    except UNREADABLE as error:
+        raise InputError(
+            f"{path}: not a readable COLMAP file, or cut short ({shorten(error)}); "
+            "export the model again"
+        ) from error
+
+
+def make_camera(model: CameraModel, width: int, height: int, params: np.ndarray) -> ColmapCamera:
+    """A camera from its parameters in COLMAP's order.
+
+    These are focal length(s), principal point, distortion. ValueError where their
+    number is wrong.
     """
-    count, single = MODELS[NUMBERS[model]][1:]
-    if len(params) != count:
-        raise ValueError(f"{model} has {count} parameters, found {len(params)}")
-    fx, fy, cx, cy = (params[0], *params[:3]) if single else params[:4]
+    if len(params) != model.num_params:
+        raise ValueError(f"{model.name} has {model.num_params} parameters, found {len(params)}")
+    if model.single_focal:
+        params = np.concatenate([params[:1], params])  # fx, fy, cx, cy, distortion
+    fx, fy, cx, cy = params[:4]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    return ColmapCamera(model, width, height, K, params[3:] if single else params[4:])
+    return ColmapCamera(model.name, width, height, K, distortion=params[4:])
 
 
-def pose(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """c2w (3, 4) from COLMAP's world-to-camera quaternion (w, x, y, z) and translation."""
+def make_pose(quaternion: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """c2w (3, 4) from a world-to-camera quaternion (w, x, y, z) and translation."""
     w2c = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     return np.concatenate([w2c.T, -w2c.T @ translation[:, None]], 1)
 
 
-def take(file: BinaryIO, layout: str) -> tuple:
+# Binary
+
+
+def unpack(file: BinaryIO, layout: str) -> tuple:
     """The next values of a little-endian file; struct.error at its end."""
-    return struct.unpack("<" + layout, file.read(struct.calcsize("<" + layout)))
+    layout = "<" + layout
+    return struct.unpack(layout, file.read(struct.calcsize(layout)))
 
 
-def block(file: BinaryIO, count: int, dtype: np.dtype) -> np.ndarray:
-    """The next `count` records."""
+def read_records(file: BinaryIO, count: int, dtype: np.dtype) -> np.ndarray:
+    """The next `count` records; ValueError where the file ends before."""
     data = file.read(count * dtype.itemsize)
     if len(data) != count * dtype.itemsize:
         raise ValueError(f"expected {count} more records")
@@ -142,88 +179,106 @@ def block(file: BinaryIO, count: int, dtype: np.dtype) -> np.ndarray:
 
 
 def cameras_bin(file: BinaryIO) -> dict[int, ColmapCamera]:
-    """cameras.bin."""
+    """The cameras of cameras.bin."""
     cameras = {}
-    for _ in range(take(file, "Q")[0]):
-        key, number, width, height = take(file, "iiQQ")
-        name, count, _ = MODELS[number]
-        cameras[key] = camera(name, width, height, np.array(take(file, f"{count}d")))
+    (count,) = unpack(file, "Q")
+    for _ in range(count):
+        key, number, width, height = unpack(file, "iiQQ")
+        model = MODELS[number]
+        params = np.array(unpack(file, f"{model.num_params}d"))
+        cameras[key] = make_camera(model, width, height, params)
     return cameras
 
 
 def images_bin(file: BinaryIO) -> dict[int, ColmapImage]:
-    """images.bin."""
+    """The images of images.bin."""
     images = {}
-    keypoint = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
-    for _ in range(take(file, "Q")[0]):
-        key, *values, camera_id = take(file, "i7di")
-        name = bytearray()
-        while (byte := take(file, "c")[0]) != b"\0":
-            name += byte
-        seen = block(file, take(file, "Q")[0], keypoint)
-        c2w = pose(np.array(values[:4]), np.array(values[4:]))
+    (count,) = unpack(file, "Q")
+    for _ in range(count):
+        key, *values, camera_id = unpack(file, "i7di")
+        name = read_name(file)
+        (keypoint_count,) = unpack(file, "Q")
+        keypoints = read_records(file, keypoint_count, KEYPOINT)
+        c2w = make_pose(np.array(values[:4]), np.array(values[4:]))
         images[key] = ColmapImage(
-            name.decode(), camera_id, c2w, seen["xy"].copy(), seen["point"].copy()
+            name, camera_id, c2w, keypoints["xy"].copy(), keypoints["point"].copy()
         )
     return images
 
 
-def points_bin(file: BinaryIO) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """points3D.bin: identities (P,), positions (P, 3), errors (P,), track lengths (P,)."""
+def read_name(file: BinaryIO) -> str:
+    """The next text that ends with a zero byte."""
+    name = bytearray()
+    while True:
+        (byte,) = unpack(file, "c")
+        if byte == b"\0":
+            return name.decode()
+        name += byte
+
+
+def points_bin(file: BinaryIO) -> list[PointRow]:
+    """The points of points3D.bin."""
     rows = []
-    for _ in range(take(file, "Q")[0]):
-        key, x, y, z, error, length = take(file, "Q3d3xdQ")
-        block(file, length, np.dtype("<i4,<i4"))
+    (count,) = unpack(file, "Q")
+    for _ in range(count):
+        key, x, y, z, error, length = unpack(file, "Q3d3xdQ")  # 3x: the color
+        read_records(file, length, TRACK_ELEMENT)
         rows.append((key, x, y, z, error, length))
-    return columns(rows)
+    return rows
 
 
-def columns(rows: list[tuple]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rows (identity, x, y, z, error, length) as arrays."""
-    table = np.array(rows, np.float64).reshape(-1, 6)
-    return table[:, 0].astype(np.int64), table[:, 1:4], table[:, 4], table[:, 5].astype(np.int64)
+# Text
 
 
-def lines(file: BinaryIO) -> list[list[str]]:
-    """The words of every line that is not a comment; empty lines (an image without
-    keypoints) stay, but not at the end.
+def read_lines(file: BinaryIO) -> list[list[str]]:
+    """The words of every line that is not a comment.
+
+    Empty lines (an image without keypoints) stay, but not at the end.
     """
-    text = file.read().decode()
-    return [line.split() for line in text.rstrip("\n").split("\n") if not line.startswith("#")]
+    text = file.read().decode().rstrip("\n")
+    return [line.split() for line in text.split("\n") if not line.startswith("#")]
 
 
 def cameras_txt(file: BinaryIO) -> dict[int, ColmapCamera]:
-    """cameras.txt."""
-    return {
-        int(w[0]): camera(w[1], int(w[2]), int(w[3]), np.array(w[4:], np.float64))
-        for w in lines(file)
-        if w
-    }
+    """The cameras of cameras.txt."""
+    cameras = {}
+    for words in read_lines(file):
+        if words:
+            model = MODELS_BY_NAME[words[1]]
+            width = int(words[2])
+            height = int(words[3])
+            params = np.array(words[4:], np.float64)
+            cameras[int(words[0])] = make_camera(model, width, height, params)
+    return cameras
 
 
 def images_txt(file: BinaryIO) -> dict[int, ColmapImage]:
-    """images.txt: two lines an image."""
-    rows = lines(file)
-    rows += [[]] * (len(rows) % 2)  # the last image may have no keypoints and no line for them
+    """The images of images.txt: two lines an image."""
+    rows = read_lines(file)
+    if len(rows) % 2:
+        rows.append([])  # the last image may have no keypoints and no line for them
     images = {}
-    for head, seen in zip(rows[::2], rows[1::2], strict=True):
+    for head, keypoints in zip(rows[::2], rows[1::2], strict=True):
         if not head:
             continue
         values = np.array(head[1:8], np.float64)
-        table = np.array(seen, np.float64).reshape(-1, 3)
-        name = " ".join(head[9:])
+        table = np.array(keypoints, np.float64).reshape(-1, 3)
         images[int(head[0])] = ColmapImage(
-            name,
-            int(head[8]),
-            pose(values[:4], values[4:]),
-            table[:, :2],
-            table[:, 2].astype(np.int64),
+            name=" ".join(head[9:]),
+            camera_id=int(head[8]),
+            c2w=make_pose(values[:4], values[4:]),
+            xy=table[:, :2],
+            point_ids=table[:, 2].astype(np.int64),
         )
     return images
 
 
-def points_txt(file: BinaryIO) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """points3D.txt."""
-    return columns(
-        [(int(w[0]), *map(float, w[1:4]), float(w[7]), (len(w) - 8) // 2) for w in lines(file) if w]
-    )
+def points_txt(file: BinaryIO) -> list[PointRow]:
+    """The points of points3D.txt."""
+    rows = []
+    for words in read_lines(file):
+        if words:
+            x, y, z = (float(word) for word in words[1:4])
+            track_length = (len(words) - 8) // 2
+            rows.append((int(words[0]), x, y, z, float(words[7]), track_length))
+    return rows

@@ -1,4 +1,4 @@
-"""Depth and disparity maps made by other tools, read from files."""
+"""Depth and disparity maps that other programs estimated, read from files."""
 
 from __future__ import annotations
 
@@ -10,32 +10,31 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image
-from hdr_nsff.core.io import read_npy
+from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.geometry.fill import fill
 
+# what a map holds: z-depth in scene units, 1 / z-depth, or disparity up to scale and
+# shift
 DepthKind = Literal["metric", "disparity", "relative"]
 
 
 def read_depth(
     files: list[Path], kind: DepthKind, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Disparity and confidence (T, H, W) of depth maps made elsewhere, one file per
-    frame (.npy, EXR, 16-bit PNG).
+    """Disparity and confidence (T, H, W) of depth maps, one file per frame.
 
-    `kind` says what they hold: "metric" z-depth in scene units, "disparity" 1 /
-    z-depth, "relative" disparity up to scale and shift. Confidence is 1, and 0 where a
+    Files are .npy, EXR or 16-bit PNG of `size` (H, W). Confidence is 1, and 0 where a
     metric map holds 0 or less (no measurement). InputError for another size, NaN, or an
     empty map.
     """
+    disparity = np.zeros((len(files), *size), np.float32)
+    confidence = np.ones((len(files), *size), np.float32)
     maps = [read_map(path) for path in files]
-    disparity, confidence = (
-        np.zeros((len(maps), *size), np.float32),
-        np.ones((len(maps), *size), np.float32),
-    )
     for k, (path, values) in enumerate(zip(files, maps, strict=True)):
         if values.shape != size:
             raise InputError(
-                f"{path}: a depth map of shape {values.shape}, the frames need {size}; make it at the size of the frames"
+                f"{path}: a depth map of shape {values.shape}, the frames need {size}; "
+                "make it at the size of the frames"
             )
         if not np.isfinite(values).all():
             raise InputError(
@@ -55,14 +54,18 @@ def read_depth(
 
 
 def read_map(path: Path) -> np.ndarray:
-    """One depth or disparity map (H, W) float32: .npy, EXR channel Z (or the only one),
-    or a PNG in [0, 1].
+    """One depth or disparity map (H, W) float32.
+
+    From a .npy, from channel Z of an EXR (or its only one), or from a PNG as shares of
+    white.
     """
     suffix = path.suffix.lower()
     if suffix == ".npy":
-        return np.squeeze(np.array(read_npy(path), np.float32))
-    if suffix == ".exr":
-        channels = read_exr(path)
-        values = channels["Z"] if "Z" in channels else next(iter(channels.values()))
-        return values if values.ndim == 2 else values[..., 0]
-    return read_image(path)[..., 0]
+        return np.squeeze(read_array(path))
+    if suffix != ".exr":
+        return read_image(path)[..., 0]
+    channels = read_exr(path)
+    if not channels:
+        raise InputError(f"{path}: an EXR without channels; write depth as channel Z")
+    values = channels["Z"] if "Z" in channels else next(iter(channels.values()))
+    return values if values.ndim == 2 else values[..., 0]

@@ -1,8 +1,12 @@
-"""Optical flow made by other tools, read from files."""
+"""Optical flow that other programs estimated, read from files.
+
+Two layouts are known: `00003_00004.npy` (H, W, 2) px with an optional mask
+`00003_00004_valid.png`, and the public NSFF layout `00003_fwd.npz`, `00004_bwd.npz`
+with `flow` and `mask` for neighbors.
+"""
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -10,78 +14,98 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask
-from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.progress import say
+from hdr_nsff.footage.arrays import read_array, read_arrays
 from hdr_nsff.geometry.round_trip import agreement
 
 
 def read_flow(
     folder: Path | str, pairs: Iterable[tuple[int, int]], size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` of frame numbers, made
-    elsewhere, for frames of `size` (H, W).
+    """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` of frame numbers.
 
-    Two layouts: `00003_00004.npy` (H, W, 2) px with an optional mask
-    `00003_00004_valid.png`, or the public NSFF layout `00003_fwd.npz`, `00004_bwd.npz`
-    with `flow` and `mask` for neighbors. A pair without a mask is checked against its
+    The frames are of `size` (H, W). A pair without a mask is checked against its
     reverse in the same folder. InputError for what is missing, of another size or not
     finite.
     """
-    folder, pairs = Path(folder), [(int(i), int(j)) for i, j in pairs]
+    folder = Path(folder)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder of flow maps")
-    nothing_clipped = np.zeros(size, bool)
-    flows, masks, unchecked = [], [], 0
+    flows = []
+    masks = []
+    unchecked = 0
     for i, j in pairs:
-        one, mask = read_pair(folder, i, j, size)
-        if mask is None and pair_file(folder, j, i) is not None:
-            mask = agreement(
-                one, read_pair(folder, j, i, size)[0], nothing_clipped, nothing_clipped
-            )
-        unchecked += mask is None
-        flows.append(one)
-        masks.append(np.ones(size, bool) if mask is None else mask)
+        flow, mask = read_pair(folder, int(i), int(j), size)
+        if mask is None:
+            mask = check_reverse(folder, int(i), int(j), flow)
+        if mask is None:
+            unchecked += 1
+            mask = np.ones(size, bool)
+        flows.append(flow)
+        masks.append(mask)
     if unchecked:
         say(
-            f"{folder}: {unchecked} of {len(flows)} flow maps have neither a mask nor a reverse: believed everywhere"
+            f"{folder}: {unchecked} of {len(flows)} flow maps have neither a mask nor a "
+            "reverse: trusted everywhere"
         )
-    return np.array(flows, np.float32).reshape(-1, *size, 2), np.array(masks, bool).reshape(
-        -1, *size
-    )
+    all_flows = np.array(flows, np.float32).reshape(-1, *size, 2)
+    return all_flows, np.array(masks, bool).reshape(-1, *size)
+
+
+def check_reverse(folder: Path, i: int, j: int, flow: np.ndarray) -> np.ndarray | None:
+    """Where `flow` (H, W, 2) from frame `i` to `j` agrees with its reverse (H, W).
+
+    None where the folder has no reverse.
+    """
+    if pair_file(folder, j, i) is None:
+        return None
+    size = (flow.shape[0], flow.shape[1])
+    reverse, _ = read_pair(folder, j, i, size)
+    nothing_clipped = np.zeros(size, bool)
+    return agreement(flow, reverse, nothing_clipped, nothing_clipped)
 
 
 def pair_file(folder: Path, i: int, j: int) -> Path | None:
     """The file that holds the flow from frame `i` to frame `j`, or None."""
-    neighbor = {1: [f"{i:05d}_fwd.npz"], -1: [f"{i:05d}_bwd.npz"]}.get(j - i, [])
-    names = [f"{i:05d}_{j:05d}.npy", *neighbor]
+    names = [f"{i:05d}_{j:05d}.npy"]
+    if j - i == 1:
+        names.append(f"{i:05d}_fwd.npz")
+    if j - i == -1:
+        names.append(f"{i:05d}_bwd.npz")
     return next((folder / name for name in names if (folder / name).is_file()), None)
 
 
 def read_pair(
     folder: Path, i: int, j: int, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """Flow (H, W, 2) px from frame `i` to frame `j` and its mask (H, W) bool, or None
-    where the folder has no mask for it.
+    """Flow (H, W, 2) px from frame `i` to frame `j`, and its mask (H, W) bool.
+
+    The mask is None where the folder has none for it. InputError where the flow is
+    missing or does not fit frames of `size` (H, W).
     """
     path = pair_file(folder, i, j)
     if path is None:
         raise InputError(
-            f"{folder}: no flow from frame {i} to frame {j}; add {i:05d}_{j:05d}.npy, or leave the folder out"
+            f"{folder}: no flow from frame {i} to frame {j}; "
+            f"add {i:05d}_{j:05d}.npy, or leave the folder out"
         )
     mask = None
     if path.suffix == ".npz":
         flow, mask = read_npz(path)
     else:
-        flow = np.array(read_npy(path), np.float32)
-        if (picture := path.with_name(f"{path.stem}_valid.png")).is_file():
+        flow = read_array(path)
+        picture = path.with_name(f"{path.stem}_valid.png")
+        if picture.is_file():
             mask = read_mask(picture)
     if flow.shape != (*size, 2):
         raise InputError(
-            f"{path}: flow of shape {flow.shape}, the frames need {(*size, 2)}; make it at the size of the frames"
+            f"{path}: flow of shape {flow.shape}, the frames need {(*size, 2)}; "
+            "make it at the size of the frames"
         )
     if mask is not None and mask.shape != size:
         raise InputError(
-            f"{path}: its mask has shape {mask.shape}, the frames need {size}; make it at the size of the frames"
+            f"{path}: its mask has shape {mask.shape}, the frames need {size}; "
+            "make it at the size of the frames"
         )
     if not np.isfinite(flow).all():
         raise InputError(
@@ -91,11 +115,6 @@ def read_pair(
 
 
 def read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """`flow` and `mask` of a file in the public NSFF layout."""
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return np.array(arrays["flow"], np.float32), np.array(arrays["mask"]) > 0.5
-    except (KeyError, ValueError, OSError, zipfile.BadZipFile) as error:
-        raise InputError(
-            f"{path}: not a flow file with `flow` and `mask` ({error}); copy it again or make it anew"
-        ) from error
+    """Flow (H, W, 2) px and mask (H, W) bool of a file in the public NSFF layout."""
+    flow, mask = read_arrays(path, ("flow", "mask"), "flow file")
+    return flow, mask > 0.5

@@ -1,16 +1,14 @@
 """Footage: a video, a folder of frames, or a folder of such folders (one per
 synchronized camera), read frame by frame.
 
-Frames come out as recorded rgb in [0, 1]. EXR and DNG are linear; they are scaled by
+Frames come out as recorded rgb in [0, 1]. EXR and DNG are linear: they are scaled by
 one constant for the whole footage and encoded as x^(1/2.2), so that what follows sees
-one kind of recording. Exposures come from EXIF or from a CSV beside the frames.
+one kind of recording.
 """
 
 from __future__ import annotations
 
-import csv
 import hashlib
-import logging
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -20,15 +18,29 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image
+from hdr_nsff.core.picture_size import check_size
 from hdr_nsff.core.video import read_video, video_info
 
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
 FRAMES = RECORDED | LINEAR
-ACCEPTED = "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, or a folder of such folders (one per camera)"
+ACCEPTED = (
+    "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, "
+    "or a folder of such folders (one per camera)"
+)
+GAMMA = 2.2  # linear footage is encoded as x^(1 / GAMMA)
+WHITE_PERCENTILE = 99.9  # of linear radiance, becomes 1 (hand-chosen)
+FOLDER_FPS = 24.0  # frames per second assumed for a folder of frames
+MAX_FRAMES = 10**9  # more than any video without a frame count in its header has
+# pixels: SSIM compares windows of this size (Wang et al. 2004), optical flow needs 9
+MIN_SIDE = 11
+MIN_MAX_SIZE = 32  # pixels: least longest side that frames may be shrunk to
+# frames that may be missing at the end of a video: containers round durations
+MAX_MISSING_FRAMES = 3
+HOLD_OUT = 8  # every this many frames are held out where nothing else is asked for
 
 
 @dataclass(frozen=True)
@@ -38,10 +50,10 @@ class Footage:
     path: Path
     cameras: list[list[Path]]  # per camera its frame files in order, or the one video file
     video: bool
-    count: int  # frames per camera; 0 where a video's header does not say
+    count: int  # frames per camera; 0 where a video's header has no count
     fps: float
     linear: bool  # EXR or DNG
-    # gray that shows through transparent pixels; None: transparency is not looked at
+    # gray that shows through transparent pixels; None: transparency is ignored
     over: float | None = None
 
     @property
@@ -61,97 +73,156 @@ class FootageFrame:
     rgb: np.ndarray  # (H, W, 3) float32 recorded, in [0, 1]
 
 
+# Which files
+
+
 def open_footage(clip: Path) -> Footage:
-    """What there is to read at `clip`; InputError where it is missing, empty, mixed or
-    not understood.
+    """The footage at `clip`.
+
+    InputError where it is missing, empty, mixed or not understood.
     """
     if clip.is_file():
-        if clip.suffix.lower() in FRAMES:
-            raise InputError(f"{clip}: one frame is no footage; give {ACCEPTED}")
-        if not clip.stat().st_size:
-            raise InputError(f"{clip}: the file is empty; copy it again")
-        info = video_info(clip)
-        return Footage(clip, [[clip]], True, info.frames, info.fps, False)
+        return open_video(clip)
     if not clip.is_dir():
         raise InputError(f"{clip}: no such file or folder; give {ACCEPTED}")
-    cameras = (
-        [files]
-        if (files := frame_files(clip))
-        else [f for d in sorted_folders(clip) if (f := frame_files(d))]
-    )
+    cameras = [frame_files(clip)]
+    if not cameras[0]:
+        cameras = [frame_files(folder) for folder in sorted_folders(clip)]
+        cameras = [files for files in cameras if files]
     if not cameras:
         raise InputError(f"{clip}: no frames in this folder; give {ACCEPTED}")
+    first = cameras[0]
     for files in cameras[1:]:
-        if len(files) != len(cameras[0]):
+        if len(files) != len(first):
             raise InputError(
-                f"{files[0].parent}: {len(files)} frames, but {cameras[0][0].parent} has {len(cameras[0])}; "
-                "synchronized cameras need the same number of frames each"
+                f"{files[0].parent}: {len(files)} frames, but {first[0].parent} has "
+                f"{len(first)}; synchronized cameras need the same number of frames each"
             )
     linear = {f.suffix.lower() in LINEAR for files in cameras for f in files}
     if len(linear) > 1:
         raise InputError(
-            f"{clip}: linear (EXR, DNG) and recorded (PNG, JPEG, TIFF) frames are mixed; keep one kind in the folder"
+            f"{clip}: linear (EXR, DNG) and recorded (PNG, JPEG, TIFF) frames are mixed; "
+            "keep one kind in the folder"
         )
-    return Footage(clip, cameras, False, len(cameras[0]), 24.0, linear.pop())
+    return Footage(clip, cameras, False, len(first), FOLDER_FPS, linear.pop())
+
+
+def open_video(clip: Path) -> Footage:
+    """The footage of a video file; InputError where it is none."""
+    if clip.suffix.lower() in FRAMES:
+        raise InputError(f"{clip}: one frame is no footage; give {ACCEPTED}")
+    if not clip.stat().st_size:
+        raise InputError(f"{clip}: the file is empty; copy it again")
+    info = video_info(clip)
+    return Footage(clip, [[clip]], True, info.frames, info.fps, False)
 
 
 def natural(path: Path) -> list[tuple[int, int, str]]:
     """A key that sorts frame2 before frame10."""
-    return [
-        (0, int(p), "") if p.isdigit() else (1, 0, p.lower())
-        for p in re.split(r"(\d+)", path.name)
-        if p
-    ]
+    key = []
+    for part in re.split(r"(\d+)", path.name):
+        if part.isdecimal():  # not `isdigit`: ² is a digit, and no number
+            key.append((0, int(part), ""))
+        elif part:
+            key.append((1, 0, part.lower()))
+    return key
 
 
 def frame_files(folder: Path) -> list[Path]:
     """The frames directly in `folder`, in order."""
-    found = [
-        p
-        for p in folder.iterdir()
-        if p.suffix.lower() in FRAMES and not p.name.startswith(".") and p.is_file()
-    ]
+    shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    found = [p for p in shown if p.suffix.lower() in FRAMES and p.is_file()]
     return sorted(found, key=natural)
 
 
 def sorted_folders(folder: Path) -> list[Path]:
     """The folders directly in `folder`, in order."""
-    return sorted(
-        (p for p in folder.iterdir() if p.is_dir() and not p.name.startswith(".")), key=natural
-    )
+    shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    return sorted((p for p in shown if p.is_dir()), key=natural)
 
 
 def hash_file(path: Path) -> str:
-    """The sha256 of a file, in hexadecimal."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """The sha256 of a file, in hexadecimal; InputError where it cannot be read."""
+    try:
+        with open(path, "rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); check its permissions, or copy it again"
+        ) from error
+
+
+# Settings
+
+
+def check_choice(
+    start: int, end: int | None, stride: int, max_size: int, hold_out: int | None
+) -> None:
+    """InputError for a choice of frames that makes no sense for any footage."""
+    if start < 0 or stride < 1 or (end is not None and end <= start):
+        last = "the end" if end is None else end
+        raise InputError(
+            f"frames {shorten(start)} to {shorten(last)} in steps of {shorten(stride)}: "
+            "nothing to read; correct --start, --end, --stride"
+        )
+    if max_size < MIN_MAX_SIZE:
+        raise InputError(
+            f"--max-size {shorten(max_size)}: too small to find anything in; "
+            f"use at least {MIN_MAX_SIZE}"
+        )
+    if hold_out is not None and (hold_out < 0 or hold_out == 1):
+        raise InputError(
+            f"--hold-out {shorten(hold_out)}: leaves nothing to train on; use 0, or 2 and more"
+        )
+
+
+def check_frame_size(clip: Path, width: int, height: int) -> None:
+    """InputError for frames that are too small to match or to compare."""
+    if min(width, height) < MIN_SIDE:
+        raise InputError(
+            f"{clip}: frames are {width}x{height} pixels, at least {MIN_SIDE}x{MIN_SIDE} are "
+            "needed; choose larger frames, or a larger --max-size"
+        )
+
+
+def check_number(option: str, value: float, least: float, most: float) -> None:
+    """InputError for the value of an `option` that is not from `least` to `most`."""
+    if not least <= value <= most:
+        raise InputError(
+            f"{option} {shorten(value)}: it must be a number from {least:g} to {most:g}"
+        )
+
+
+# Frames
 
 
 def read_frames(
     footage: Footage, start: int, end: int | None, stride: int, max_size: int
 ) -> Iterator[FootageFrame]:
-    """The chosen frames, camera by camera, shrunk so that the longest side is at most
-    `max_size` pixels.
+    """The chosen frames, camera by camera, at most `max_size` pixels on a side.
 
     InputError for unreadable or truncated files, frames of different sizes, and
     negative, NaN or infinite radiance.
     """
-    chosen = range(start, end if end is not None else (footage.count or 10**9), stride)
-    scale = (
-        linear_scale([f for files in footage.cameras for f in files[start:end:stride]])
-        if footage.linear
-        else 1.0
-    )
-    first: tuple[str, tuple[int, ...]] | None = None
+    stop = end if end is not None else (footage.count or MAX_FRAMES)
+    chosen = range(start, stop, stride)
+    scale = 1.0
+    if footage.linear:
+        scale = linear_scale([f for files in footage.cameras for f in files[start:end:stride]])
+    first: tuple[str, int, int] | None = None  # name, height, width
     for camera_id, files in enumerate(footage.cameras):
         for number, source, image in decode(footage, files, chosen):
-            name, shape = first = first or (source, image.shape)
-            if image.shape != shape:
+            h, w = image.shape[:2]
+            first = first or (source, h, w)
+            name, height, width = first
+            if (h, w) != (height, width):
                 raise InputError(
-                    f"{source}: {image.shape[1]}x{image.shape[0]} pixels, but {name} has {shape[1]}x{shape[0]}; all frames must have one size"
+                    f"{source}: {w}x{h} pixels, but {name} has {width}x{height}; "
+                    "all frames must have one size"
                 )
-            image = shrink(image, max_size)
-            rgb = np.clip(image * scale, 0, 1) ** np.float32(1 / 2.2) if footage.linear else image
+            rgb = shrink(image, max_size)
+            if footage.linear:
+                rgb = np.clip(rgb * scale, 0, 1) ** np.float32(1 / GAMMA)
             yield FootageFrame(camera_id, number, source, rgb)
 
 
@@ -162,57 +233,66 @@ def decode(
     if footage.video:
         yield from decode_video(files[0], chosen)
         return
-    for number in chosen[: len(files[chosen.start : chosen.stop : chosen.step])]:
-        yield (
-            number,
-            files[number].relative_to(footage.path).as_posix(),
-            read_frame(files[number], footage.over),
-        )
+    for number, path in list(enumerate(files))[chosen.start : chosen.stop : chosen.step]:
+        source = path.relative_to(footage.path).as_posix()
+        yield number, source, read_frame(path, footage.over)
 
 
 def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames; InputError where it ends
-    before its header says.
+    """(number, source, image (H, W, 3)) of the chosen frames of a video.
+
+    InputError where it ends before the duration in its header.
     """
-    info, last = video_info(path), 0.0
+    info = video_info(path)
+    last = 0.0  # seconds
     for number, (image, seconds) in enumerate(read_video(path)):
         if number >= chosen.stop:
             return
         last = seconds
         if number in chosen:
             yield number, f"{path.name}#{number}", image
-    if last + 3 / info.fps < info.seconds:
+    if last + MAX_MISSING_FRAMES / info.fps < info.seconds:
         raise InputError(
-            f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); copy it again"
+            f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); "
+            "copy it again"
         )
 
 
 def read_frame(path: Path, over: float | None = None) -> np.ndarray:
-    """One frame file as float32 (H, W, 3): recorded rgb (`over` the gray that shows
-    through it), or linear radiance for EXR and DNG.
+    """One frame file as float32 (H, W, 3): recorded rgb, or linear for EXR and DNG.
+
+    `over` is the gray that shows through transparent pixels.
     """
     suffix = path.suffix.lower()
     if suffix == ".dng":
         return read_dng(path)
-    if suffix != ".exr":
-        return read_image(path, over)
+    if suffix == ".exr":
+        return read_linear_exr(path)
+    return read_image(path, over)
+
+
+def read_linear_exr(path: Path) -> np.ndarray:
+    """Linear radiance (H, W, 3) of an EXR, gray or rgb; InputError below zero."""
     channels = read_exr(path)
     if "RGB" not in channels:
         if "Y" not in channels:
+            found = shorten(", ".join(channels))
             raise InputError(
-                f"{path}: no R, G, B channels (found {', '.join(channels)}); write the picture as RGB"
+                f"{path}: no R, G, B channels (found {found}); write the picture as RGB"
             )
         return np.repeat(channels["Y"][..., None], 3, -1)
     if channels["RGB"].min() < 0:
         raise InputError(
-            f"{path}: negative radiance; clip at zero or subtract the black level before writing the EXR"
+            f"{path}: negative radiance; clip at zero or subtract the black level before "
+            "writing the EXR"
         )
     return channels["RGB"]
 
 
 def read_dng(path: Path) -> np.ndarray:
-    """A raw photograph as linear rgb (H, W, 3), 1 where the sensor saturates; daylight
-    white balance, the same for every frame.
+    """A raw photograph as linear rgb (H, W, 3), 1 where the sensor saturates.
+
+    Daylight white balance, the same for every frame.
     """
     try:
         import rawpy
@@ -222,6 +302,7 @@ def read_dng(path: Path) -> np.ndarray:
         ) from error
     try:
         with rawpy.imread(str(path)) as raw:
+            check_size(path, raw.sizes.width, raw.sizes.height)
             image = raw.postprocess(
                 gamma=(1, 1),
                 no_auto_bright=True,
@@ -234,18 +315,18 @@ def read_dng(path: Path) -> np.ndarray:
 
 
 def linear_scale(files: list[Path]) -> float:
-    """The constant that brings linear frames into [0, 1]: 1 where nothing is brighter
-    than 1, else 1 / the 99.9th percentile.
+    """The constant that brings linear frames into [0, 1].
 
-    The same for all frames, so that their exposures keep their ratios; what is brighter
-    is saturated, as on a sensor.
+    1 where nothing is brighter than 1, else 1 / the 99.9th percentile. The same for all
+    frames, so that their exposures keep their ratios; what is brighter is saturated, as
+    on a sensor.
     """
     images = [read_frame(f) for f in files]
     if not images or max(float(i.max()) for i in images) <= 1:
         return 1.0
-    return 1 / max(
-        float(np.percentile(np.concatenate([i[::4, ::4].ravel() for i in images]), 99.9)), 1e-12
-    )
+    sampled = np.concatenate([i[::4, ::4].ravel() for i in images])
+    white = float(np.percentile(sampled, WHITE_PERCENTILE))
+    return 1 / max(white, 1e-12)
 
 
 def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
@@ -254,19 +335,19 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     factor = max_size / max(h, w)
     if factor >= 1:
         return image
-    size = (max(1, round(w * factor)), max(1, round(h * factor)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    width = max(1, round(w * factor))
+    height = max(1, round(h * factor))
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
 
 
-HOLD_OUT = 8  # every this many frames are kept out of training, where nobody says otherwise
+# Frames to hold out
 
 
 def held_out(count: int, every: int, cycle: int) -> list[int]:
-    """Which of `count` frames are kept out of training: every `every`-th, never the
-    first or the last; none for 0.
+    """Which of `count` frames are held out of training: every `every`-th.
 
-    `every` grows until it has no common factor with the exposure cycle, so that all
-    exposures are kept out in turn.
+    Never the first or the last; none for 0. `every` grows until it has no common factor
+    with the exposure cycle, so that all exposures are held out in turn.
     """
     if every <= 0:
         return []
@@ -276,119 +357,24 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
 
 
 def every_of(frames: Sequence[int]) -> int | None:
-    """The smallest `every` for which `held_out` keeps out just these `frames` of a clip
-    that ends soon after them; None where there is none.
+    """The smallest `every` for which `held_out` gives just these `frames`.
+
+    The clip ends soon after them. None where there is no such number.
     """
-    candidates = range(2, 2 * frames[0] + 2)
-    return next(
-        (every for every in candidates if held_out(frames[-1] + 2, every, 1) == list(frames)), None
-    )
+    for every in range(2, 2 * frames[0] + 2):
+        if held_out(frames[-1] + 2, every, 1) == list(frames):
+            return every
+    return None
 
 
-def between(count: int, cycle: int) -> list[int]:
-    """Which of `count` frames are kept out of training by the protocol novel-view-time:
-    every second one, never the first or the last.
+def frames_between(count: int, cycle: int) -> list[int]:
+    """Which of `count` frames the protocol novel-view-time holds out of training.
 
-    With an even exposure cycle every second frame would always show the same exposures:
-    there, each cycle begins with the other half, so that of a cycle of 2 the frames 0,
-    3, 4, 7, 8, ... are trained on.
+    Every second one, never the first or the last. With an even exposure cycle every
+    second frame would always show the same exposures: there, each cycle begins with the
+    other half, so that of a cycle of 2 the frames 0, 3, 4, 7, 8, ... are trained on.
     """
-    phase = [k // cycle if cycle % 2 == 0 else 0 for k in range(count)]
-    return [k for k in range(1, count - 1) if (k + phase[k]) % 2]
-
-
-def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None:
-    """The EV (log2 exposure) of each frame of one cycle from `--exposures 1/1000,1/250`
-    (seconds) or `--ev -4,-2`, None for neither.
-    """
-    if exposures is None or exposures.strip() == "auto":
-        return (
-            None
-            if ev is None or ev.strip() == "auto"
-            else [number(v, "--ev") for v in ev.split(",")]
-        )
-    if ev is not None:
-        raise InputError("--exposures and --ev both given; leave one out")
-    return [log2_seconds(v, "--exposures") for v in exposures.split(",")]
-
-
-def number(text: str, where: str) -> float:
-    """A finite number written as 2, -0.5 or 1/3; InputError saying `where` otherwise."""
-    try:
-        above, _, below = text.partition("/")
-        value = float(above) / (float(below) if "/" in text else 1.0)
-    except ZeroDivisionError as error:
-        raise InputError(
-            f"{where}: {text.strip()!r} divides by zero; write times like 1/250 and EV like -2"
-        ) from error
-    except ValueError as error:
-        raise InputError(
-            f"{where}: {text.strip()!r} is not a number; write times like 1/250 and EV like -2"
-        ) from error
-    if not math.isfinite(value):
-        raise InputError(
-            f"{where}: {text.strip()!r} is not finite; write times like 1/250 and EV like -2"
-        )
-    return value
-
-
-def log2_seconds(text: str, where: str) -> float:
-    """The EV of an exposure time in seconds."""
-    seconds = number(text, where)
-    if seconds <= 0:
-        raise InputError(
-            f"{where}: an exposure of {text.strip()} seconds cannot be; write times like 1/250"
-        )
-    return math.log2(seconds)
-
-
-def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
-    """The CSV beside the frames and its EV by frame (`file name` or `#number`), None
-    where there is none.
-
-    Columns: `file` (or `frame`, a number from 0), and `exposure` (seconds) or `ev`.
-    """
-    beside = footage.path.with_suffix(".csv") if footage.video else footage.path / "exposures.csv"
-    if not beside.is_file():
-        return None
-    with open(beside, newline="", encoding="utf-8-sig") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        columns = set(reader.fieldnames or [])
-        name = next((c for c in ("file", "frame") if c in columns), None)
-        value = next((c for c in ("exposure", "ev") if c in columns), None)
-        if name is None or value is None:
-            raise InputError(
-                f"{beside}: columns {sorted(columns)}; it needs `file` or `frame`, and `exposure` (seconds) or `ev`"
-            )
-        read = log2_seconds if value == "exposure" else number
-        rows = {}
-        for line, row in enumerate(reader, start=2):
-            key = row[name].strip()
-            rows[f"#{key}" if name == "frame" else key] = read(
-                row[value] or "", f"{beside}, line {line}"
-            )
-    return beside, rows
-
-
-def read_exif_ev(path: Path) -> float | None:
-    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF, None where
-    it has no exposure time.
-    """
-    import exifread
-
-    logging.getLogger("exifread").setLevel(logging.ERROR)  # it warns of every picture without EXIF
-    with open(path, "rb") as file:
-        tags = exifread.process_file(file, details=False)
-
-    def value(name: str) -> float | None:
-        tag = tags.get(name)
-        try:
-            return float(tag.values[0]) if tag is not None else None
-        except (ZeroDivisionError, ValueError, TypeError, IndexError):
-            return None
-
-    seconds = value("EXIF ExposureTime")
-    if not seconds or seconds <= 0:
-        return None
-    iso, aperture = value("EXIF ISOSpeedRatings") or 100.0, value("EXIF FNumber") or 1.0
-    return math.log2(seconds * iso / 100 / aperture**2)
+    inner = range(1, count - 1)
+    if cycle % 2:
+        return [k for k in inner if k % 2]
+    return [k for k in inner if (k + k // cycle) % 2]

@@ -20,6 +20,7 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
+from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.prepare.engine import Step, all_have, run_step
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.depth import find_depth
@@ -151,27 +152,12 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
 
 def check_settings(config: PrepareConfig) -> None:
     """InputError for settings that make no sense whatever the footage is."""
-    if (
-        config.start < 0
-        or config.stride < 1
-        or (config.end is not None and config.end <= config.start)
-    ):
-        raise InputError(
-            f"frames {config.start} to {config.end} in steps of {config.stride}: nothing to read; mend --start, --end, --stride"
-        )
-    if config.max_size < 32:
-        raise InputError(
-            f"--max-size {config.max_size}: too small to find anything in; use at least 32"
-        )
-    if config.hold_out is not None and (config.hold_out < 0 or config.hold_out == 1):
-        raise InputError(
-            f"--hold-out {config.hold_out}: leaves nothing to train on; use 0, or 2 and more"
-        )
+    ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
     if config.protocol is not None and config.hold_out is not None:
         raise InputError(
             "--protocol and --hold-out both given, and each says what is kept out of training; leave one out"
         )
-    ingest.parse_exposures(config.exposures, config.ev)
+    parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside"

@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_json, write_json
+from hdr_nsff.core.names import resolve_name
 from hdr_nsff.core.notes import first_problem
 
 Parallax = Literal["full", "rotation", "none"]
@@ -26,7 +27,6 @@ Protocol = Literal["novel-view", "novel-view-time"]
 # single precision.
 MAX_NUMBER = 1e15
 MAX_EV = 60.0  # stops from the reference
-MAX_NAME_SHOWN = 60  # characters of a bad file name that a message repeats
 
 
 class Strict(BaseModel):
@@ -284,17 +284,4 @@ def inside(folder: Path, name: str) -> Path:
     """`folder / name`; InputError where the name leaves the folder or no file can have
     it.
     """
-    try:
-        path = (Path(folder) / name).resolve()
-        path.is_file()
-    except (OSError, ValueError, RuntimeError) as error:  # too long, NUL, links in a circle
-        raise InputError(
-            f"{folder}: {name[:MAX_NAME_SHOWN]!r} cannot be the name of a file; "
-            "restore scene.json or truth.json"
-        ) from error
-    if not path.is_relative_to(Path(folder).resolve()):
-        raise InputError(
-            f"{folder}: the file name {name[:MAX_NAME_SHOWN]!r} points outside the scene folder; "
-            "names must stay inside it"
-        )
-    return path
+    return resolve_name(folder, name, "scene folder")

@@ -30,12 +30,15 @@ from hdr_nsff.core.io import read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.recording import Curve, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.settings import MAX_NOISE, sensor_noise
+
+MAX_SEED = 2**63
 
 
 @dataclass(frozen=True)
@@ -149,26 +152,15 @@ def check(config: ReexposeConfig) -> list[float]:
     """The exposures of a cycle, log2. InputError for settings that make no sense
     whatever the footage is.
     """
-    evs = ingest.parse_exposures(None, config.ev)
+    evs = parse_exposures(None, config.ev)
     if evs is None:
         raise InputError(
             "--ev auto: there is nothing to detect; list the log2 exposures of one cycle, "
             "like -2,0,2"
         )
-    start, end, stride = config.start, config.end, config.stride
-    if start < 0 or stride < 1 or (end is not None and end <= start):
-        raise InputError(
-            f"frames {start} to {end} in steps of {stride}: nothing to read; "
-            "fix --start, --end, --stride"
-        )
-    if not 0 <= config.noise < MAX_NOISE:
-        raise InputError(
-            f"--noise {config.noise}: choose from 0 (a perfect sensor) to {MAX_NOISE:g}"
-        )
-    if config.hold_out < 0:
-        raise InputError(f"--hold-out {config.hold_out}: choose 0 or more")
-    if config.seed < 0:
-        raise InputError(f"--seed {config.seed}: choose 0 or more")
+    ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
+    ingest.check_number("--noise", config.noise, 0, MAX_NOISE)
+    ingest.check_number("--seed", config.seed, 0, MAX_SEED)
     return evs
 
 
@@ -184,6 +176,7 @@ def look_through(
         numbers.append(frame.number)
         extents.append(exposure.extent(frame.rgb))
         size = (frame.rgb.shape[0], frame.rgb.shape[1])
+        ingest.check_frame_size(config.clip, size[1], size[0])
     return numbers, extents, size
 
 

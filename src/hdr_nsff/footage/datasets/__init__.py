@@ -20,15 +20,14 @@ LAYOUTS = {  # the first that fits counts
 
 def layout_of(folder: Path) -> str | None:
     """The name of the layout of `folder`; None for footage."""
-    return (
-        next((name for name, reader in LAYOUTS.items() if reader.recognized(folder)), None)
-        if folder.is_dir()
-        else None
-    )
+    if not folder.is_dir():
+        return None
+    return next((name for name, reader in LAYOUTS.items() if reader.recognized(folder)), None)
 
 
 def recognize(folder: Path) -> Capture | None:
     """The training part of the public data set in `folder`; None where it is none.
+
     InputError where it is one and something is missing or short. Held-out pictures are
     not opened.
     """

@@ -14,21 +14,25 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.footage.datasets.capture import (
     Capture,
     Clock,
     Picture,
-    named_file,
-    number_of,
-    read_document,
-    reorder,
-    source_of,
-    turns,
+    number_cameras,
+    select_poses,
 )
-from hdr_nsff.footage.pose_files import Given, from_transforms
+from hdr_nsff.footage.datasets.set_files import (
+    number_of,
+    picture_file,
+    read_document,
+    source_of,
+)
+from hdr_nsff.footage.pose_formats import from_transforms
+from hdr_nsff.scene.manifest import MAX_EV
 
-TRAIN, TEST = "transforms_train.json", "transforms_test.json"
+TRAIN = "transforms_train.json"
+TEST = "transforms_test.json"
 
 
 def recognized(folder: Path) -> bool:
@@ -41,76 +45,71 @@ def read(folder: Path) -> Capture:
     path = folder / TRAIN
     document = read_document(path, "the training pictures and their poses")
     frames = document["frames"]
+    kind = layout_name(frames)
     files = [
-        named_file(folder, f["file_path"], f"training picture {k} of {TRAIN}")
-        for k, f in enumerate(frames)
+        picture_file(folder, frame["file_path"], f"training picture {number} of {TRAIN}")
+        for number, frame in enumerate(frames)
     ]
-    moves = any("time" in f for f in frames)
-    times = training_times(path, frames)
+    times = stored_times(path, frames)
     clock = Clock.of(times)
-    cameras = turns(times)
-    order = sorted(range(len(frames)), key=lambda k: (cameras[k], times[k]))
-    evs = [exposure(path, f, layout(frames)) for f in frames]
-    if any(e is None for e in evs) and any(e is not None for e in evs):
+    cameras = number_cameras(times)
+    evs = [exposure_of(path, frame, kind) for frame in frames]
+    if any(ev is None for ev in evs) and any(ev is not None for ev in evs):
         raise InputError(
-            f"{path}: only some frames have `exposures`; they say how each was exposed, copy the file again"
+            f"{path}: only some frames have `exposures`; they hold how each was exposed, "
+            "copy the file again"
         )
-    notes = (
-        (f"{max(cameras) + 1} pictures share a time: taken as that many cameras",)
-        if max(cameras)
-        else ()
-    )
+    order = sorted(range(len(frames)), key=lambda k: (cameras[k], times[k]))
+    pictures = [
+        Picture(source_of(folder, files[k]), clock(times[k]), cameras[k], evs[k]) for k in order
+    ]
+    notes: tuple[str, ...] = ()
+    if max(cameras):
+        notes = (f"{max(cameras) + 1} pictures share a time: taken as that many cameras",)
     return Capture(
-        layout=layout(frames),
+        layout=kind,
         root=folder,
-        pictures=[
-            Picture(source_of(folder, files[k]), clock(times[k]), cameras[k], evs[k]) for k in order
-        ],
-        poses=reorder(poses(path, document), order),
+        pictures=pictures,
+        poses=select_poses(from_transforms(path, document), order),
         withheld=(folder / TEST).is_file(),
         over=1.0,
-        still=not moves,
+        still=not any("time" in frame for frame in frames),
         notes=notes,
     )
 
 
-def training_times(path: Path, frames: list[dict[str, Any]]) -> list[float]:
+def stored_times(path: Path, frames: list[dict[str, Any]]) -> list[float]:
     """The times as stored; the number of the view where none is."""
-    if not any("time" in f for f in frames):
-        return [float(k) for k in range(len(frames))]
-    return [number_of(path, f, "time", "which says when it was taken") for f in frames]
+    if not any("time" in frame for frame in frames):
+        return [float(number) for number in range(len(frames))]
+    return [number_of(path, f, "time", "the time it was taken at") for f in frames]
 
 
-def layout(frames: list[dict[str, Any]]) -> str:
+def layout_name(frames: list[dict[str, Any]]) -> str:
     """Which of the layouts these frames are of."""
-    if any("exr_file_path" in f for f in frames):
+    if any("exr_file_path" in frame for frame in frames):
         return "HDR-4D (Blender)"
-    if any("exposures" in f for f in frames):
+    if any("exposures" in frame for frame in frames):
         return "HDR-HexPlane (Blender)"
-    return "D-NeRF (Blender)" if any("time" in f for f in frames) else "NeRF synthetic (Blender)"
+    if any("time" in frame for frame in frames):
+        return "D-NeRF (Blender)"
+    return "NeRF synthetic (Blender)"
 
 
-def exposure(path: Path, frame: dict[str, Any], kind: str) -> float | None:
+def exposure_of(path: Path, frame: dict[str, Any], kind: str) -> float | None:
     """The EV of a frame: HDR-4D stores exposure times, HDR-HexPlane stops."""
     if "exposures" not in frame:
         return None
-    value = number_of(path, frame, "exposures", "which says how it was exposed")
-    if not kind.startswith("HDR-4D"):
-        return value
-    if value <= 0:
+    value = number_of(path, frame, "exposures", "its exposure")
+    name = shorten(frame["file_path"])
+    if kind.startswith("HDR-4D"):
+        if value <= 0:
+            raise InputError(
+                f"{path}: {name} has an exposure time of {value:g}; it must be above 0"
+            )
+        value = math.log2(value)
+    if abs(value) > MAX_EV:
         raise InputError(
-            f"{path}: {frame['file_path']} has an exposure time of {value:g}; it must be above 0"
+            f"{path}: {name} has an exposure of {value:g} stops, which is none; correct it"
         )
-    return math.log2(value)
-
-
-def poses(path: Path, document: dict[str, Any]) -> Given:
-    """The poses of a `transforms*.json`."""
-    try:
-        return from_transforms(path, document)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        if isinstance(error, InputError):
-            raise
-        raise InputError(
-            f"{path}: its poses are not readable ({type(error).__name__}: {error}); copy it again"
-        ) from error
+    return value

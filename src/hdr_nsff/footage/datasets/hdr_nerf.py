@@ -13,83 +13,79 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.datasets.blender import TEST, TRAIN, poses
-from hdr_nsff.footage.datasets.capture import (
-    Capture,
-    Picture,
-    named_file,
+from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.footage.datasets.blender import TEST, TRAIN
+from hdr_nsff.footage.datasets.capture import Capture, Picture
+from hdr_nsff.footage.datasets.set_files import (
+    picture_file,
     read_document,
     read_object,
     source_of,
 )
+from hdr_nsff.footage.pose_formats import from_transforms
 
-COUNT = 5
-TRAINED = (0, 2, 4)
+NUM_EXPOSURES = 5
+TRAINED = (0, 2, 4)  # exposures that are trained on, in turn
 
 
 def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
-    return (folder / TRAIN).is_file() and any(
-        (folder / f"exposure_{split}.json").is_file() for split in ("train", "test")
-    )
+    tables = [folder / f"exposure_{split}.json" for split in ("train", "test")]
+    return (folder / TRAIN).is_file() and any(table.is_file() for table in tables)
 
 
 def read(folder: Path) -> Capture:
-    """One picture of every training view; InputError where something is missing or
-    short.
+    """One picture of every training view.
+
+    InputError where something is missing or short.
     """
     path = folder / TRAIN
     document = read_document(path, "the training views and their poses")
-    table = exposures(folder, "train")
+    times = exposure_times(folder, "train")
     pictures = []
-    for k, frame in enumerate(document["frames"]):
-        which = TRAINED[k % len(TRAINED)]
-        file = named_file(
-            folder, f"{frame['file_path']}_{which}.png", f"exposure {which} of training view {k}"
-        )
-        pictures.append(
-            Picture(
-                source_of(folder, file), float(k), ev=ev_of(folder, "train", table, frame, which)
-            )
-        )
+    for number, frame in enumerate(document["frames"]):
+        which = TRAINED[number % len(TRAINED)]
+        purpose = f"exposure {which} of training view {number}"
+        file = picture_file(folder, picture_name(frame, which), purpose)
+        ev = ev_of(folder, "train", times, frame, which)
+        pictures.append(Picture(source_of(folder, file), float(number), ev=ev))
     return Capture(
         layout="HDR-NeRF (synthetic)",
         root=folder,
         pictures=pictures,
-        poses=poses(path, document),
+        poses=from_transforms(path, document),
         withheld=(folder / TEST).is_file(),
         over=1.0,
         still=True,
     )
 
 
-def exposures(folder: Path, split: str) -> dict[str, Any]:
-    """`exposure_{split}.json`: picture -> exposure time, names without a leading `./`."""
-    table = read_object(
-        folder / f"exposure_{split}.json", f"the exposure times of the {split} pictures"
-    )
-    return {plain(name): value for name, value in table.items()}
+def exposure_times(folder: Path, split: str) -> dict[str, Any]:
+    """`exposure_{split}.json`: picture -> exposure time, names without `./`."""
+    path = folder / f"exposure_{split}.json"
+    table = read_object(path, f"the exposure times of the {split} pictures")
+    return {name.removeprefix("./"): value for name, value in table.items()}
 
 
-def plain(name: str) -> str:
-    """A name without a leading `./`."""
-    return name.removeprefix("./")
+def picture_name(frame: dict[str, Any], which: int) -> str:
+    """The picture of a view at exposure `which`."""
+    return f"{frame['file_path']}_{which}.png"
 
 
 def ev_of(
-    folder: Path, split: str, table: dict[str, Any], frame: dict[str, Any], which: int
+    folder: Path, split: str, times: dict[str, Any], frame: dict[str, Any], which: int
 ) -> float:
     """The EV of exposure `which` of a view."""
-    name = plain(f"{frame['file_path']}_{which}.png")
+    path = folder / f"exposure_{split}.json"
+    name = picture_name(frame, which).removeprefix("./")
     try:
-        seconds = float(table[name])
-    except (KeyError, TypeError, ValueError) as error:
+        seconds = float(times[name])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(
-            f"{folder / f'exposure_{split}.json'}: no exposure time for {name}; copy the file again"
+            f"{path}: no exposure time for {shorten(name)}; copy the file again"
         ) from error
     if not (math.isfinite(seconds) and seconds > 0):
         raise InputError(
-            f"{folder / f'exposure_{split}.json'}: an exposure time of {seconds:g} for {name}; it must be above 0"
+            f"{path}: an exposure time of {seconds:g} for {shorten(name)}; it must be above 0"
         )
     return math.log2(seconds)

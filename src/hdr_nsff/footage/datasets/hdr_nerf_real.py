@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.datasets.capture import Capture, Picture, reorder, source_of
-from hdr_nsff.footage.datasets.hdr_nerf import COUNT, TRAINED
+from hdr_nsff.footage.datasets.capture import Capture, Picture, select_poses
+from hdr_nsff.footage.datasets.hdr_nerf import NUM_EXPOSURES, TRAINED
+from hdr_nsff.footage.datasets.set_files import source_of
 from hdr_nsff.footage.ingest import frame_files
-from hdr_nsff.footage.pose_files import Given, llff_rows, llff_table
+from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
 
 NAME = "poses_bounds_exps.npy"
 PICTURES = "input_images"
@@ -29,39 +30,44 @@ def recognized(folder: Path) -> bool:
 
 
 def read(folder: Path) -> Capture:
-    """One picture of every training pose; InputError where something is missing or
-    short.
+    """One picture of every training pose.
+
+    InputError where something is missing or short.
     """
-    given, ev = rows(folder)
-    files = pictures(folder, len(ev))
-    poses = range(0, len(ev) // COUNT, 2)
-    chosen = [COUNT * pose + TRAINED[k % len(TRAINED)] for k, pose in enumerate(poses)]
+    given, ev = read_cameras(folder)
+    files = picture_files(folder, len(ev))
+    rows = []
+    for number, pose in enumerate(range(0, len(ev) // NUM_EXPOSURES, 2)):
+        rows.append(NUM_EXPOSURES * pose + TRAINED[number % len(TRAINED)])
+    pictures = [
+        Picture(source_of(folder, files[row]), float(number), ev=ev[row])
+        for number, row in enumerate(rows)
+    ]
     return Capture(
         layout="HDR-NeRF (real)",
         root=folder,
-        pictures=[
-            Picture(source_of(folder, files[row]), float(k), ev=ev[row])
-            for k, row in enumerate(chosen)
-        ],
-        poses=reorder(given, chosen),
-        withheld=len(ev) > COUNT,
+        pictures=pictures,
+        poses=select_poses(given, rows),
+        withheld=len(ev) > NUM_EXPOSURES,
         still=True,
     )
 
 
 def held_out_rows(count: int) -> list[range]:
     """The rows of the exposures of each held-out pose, of `count` rows."""
-    return [range(COUNT * pose, COUNT * (pose + 1)) for pose in range(1, count // COUNT, 2)]
+    starts = range(NUM_EXPOSURES, count, 2 * NUM_EXPOSURES)
+    return [range(start, start + NUM_EXPOSURES) for start in starts]
 
 
-def rows(folder: Path) -> tuple[Given, list[float]]:
-    """Camera and EV of every picture."""
+def read_cameras(folder: Path) -> tuple[GivenPoses, list[float]]:
+    """The camera and the EV of every picture."""
     path = folder / NAME
     table = llff_table(path, 18)
     seconds = table[:, 17]
-    if len(table) % COUNT:
+    if len(table) % NUM_EXPOSURES:
         raise InputError(
-            f"{path}: {len(table)} rows, but every pose has {COUNT}, one per exposure; copy the file again"
+            f"{path}: {len(table)} rows, but every pose has {NUM_EXPOSURES}, one per exposure; "
+            "copy the file again"
         )
     if not (np.isfinite(seconds).all() and (seconds > 0).all()):
         raise InputError(
@@ -70,12 +76,13 @@ def rows(folder: Path) -> tuple[Given, list[float]]:
     return llff_rows(table[:, :17]), np.log2(seconds).tolist()
 
 
-def pictures(folder: Path, count: int) -> list[Path]:
-    """All pictures in order."""
+def picture_files(folder: Path, count: int) -> list[Path]:
+    """All pictures in order; InputError where there are not `count`."""
     place = folder / PICTURES
     files = frame_files(place) if place.is_dir() else []
     if len(files) != count:
         raise InputError(
-            f"{place}: {len(files)} pictures, but {NAME} holds the cameras and exposures of {count}; copy both again"
+            f"{place}: {len(files)} pictures, but {NAME} holds the cameras and exposures of "
+            f"{count}; copy both again"
         )
     return files

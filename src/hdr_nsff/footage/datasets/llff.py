@@ -9,7 +9,7 @@ The pictures are those of `images_<W>x<H>/` (the largest), else of `images/`. Ma
 another size are resampled. Flow is that of `semantic_flow_i1/` before `flow_i1/`; depth
 that of `depth-anything/` (metric) before `disp/` (disparity up to scale and shift),
 brought to the units of the poses by the points of `sparse/`. No exposure times are
-stored: brightness tells the exposures apart.
+stored: exposures are found by brightness.
 """
 
 from __future__ import annotations
@@ -20,27 +20,25 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
-from hdr_nsff.footage.colmap import ColmapModel, read_model
-from hdr_nsff.footage.datasets.capture import (
-    Capture,
-    Extra,
-    Picture,
-    Sighting,
-    parse_extra,
-    same_number,
-    source_of,
-)
+from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
+from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
+from hdr_nsff.footage.datasets.extra import Extra, parse_extra
+from hdr_nsff.footage.datasets.set_files import check_count, source_of
 from hdr_nsff.footage.ingest import frame_files, natural
-from hdr_nsff.footage.pose_files import Given, from_llff
+from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
 
 FLOWS = ("semantic_flow_i1", "flow_i1")
 MULTI_VIEW = ("mv_images", "mv_images_time")
 NOTE = "hdr_nsff.json"  # beside poses_bounds.npy where `export` wrote the folder
-TRUSTED = 1.5  # pixels of reprojection error up to which a point of `sparse/` counts
-SHORTEST = 3  # pictures that must see it
+# reprojection error of a point of `sparse/` up to which it counts (hand-chosen)
+MAX_POINT_ERROR_PX = 1.5
+MIN_TRACK_LENGTH = 3  # pictures that must see it (hand-chosen)
 SIZED = re.compile(r"images_(\d+)x(\d+)")
+
+
+# Places
 
 
 def dense_folder(folder: Path) -> Path:
@@ -51,102 +49,105 @@ def dense_folder(folder: Path) -> Path:
 def recognized(folder: Path) -> bool:
     """Whether `folder` holds this layout."""
     dense = dense_folder(folder)
+    if not picture_folders(dense):
+        return False
     if (dense / "poses_bounds.npy").is_file():
-        return bool(picture_folders(dense))
-    return (
-        dense.name == "dense"
-        and bool(picture_folders(dense))
-        and any((dense / n).is_dir() for n in (*FLOWS, "motion_masks"))
-    )
+        return True
+    has_maps = any((dense / name).is_dir() for name in (*FLOWS, "motion_masks"))
+    return dense.name == "dense" and has_maps
 
 
 def picture_folders(dense: Path) -> list[Path]:
     """Where pictures are: sized folders, largest first, then `images/`."""
-    sized = [
-        (int(m[1]) * int(m[2]), p)
-        for p in dense.iterdir()
-        if p.is_dir() and (m := SIZED.fullmatch(p.name))
-    ]
-    plain = [dense / "images"] if (dense / "images").is_dir() else []
-    return [p for _, p in sorted(sized, reverse=True)] + plain
+    sized = []
+    for path in dense.iterdir():
+        match = SIZED.fullmatch(path.name)
+        if match is not None and path.is_dir():
+            sized.append((int(match[1]) * int(match[2]), path))
+    found = [path for _, path in sorted(sized, reverse=True)]
+    if (dense / "images").is_dir():
+        found.append(dense / "images")
+    return found
+
+
+def multi_view(folder: Path, name: str) -> Path | None:
+    """A folder of held-out pictures, under `dense/` or beside it."""
+    places = (dense_folder(folder) / name, folder / name)
+    return next((place for place in places if place.is_dir()), None)
+
+
+# Reading
 
 
 def read(folder: Path) -> Capture:
-    """The training pictures with what the set gives of them; InputError where something
-    is missing or short.
+    """The training pictures with all that the set gives of them.
+
+    InputError where something is missing or short.
     """
     dense = dense_folder(folder)
-    given, bounds = poses(dense)
-    count = len(given.c2w)
-    files = pictures(dense)
-    if len(files) != count:
-        raise InputError(
-            f"{files[0].parent}: {len(files)} pictures, but poses_bounds.npy holds the camera poses of {count}; copy both again"
-        )
-    root = folder
-    names = [source_of(root, f) for f in files]
-    extra = noted(dense, [f.name for f in files])
-    masks, white_moves = moving_masks(folder, dense, count)
-    depth, kind = depth_maps(dense, count, extra)
-    trust = (
-        listed(dense / "disp_confidence", ".npy", count, "how far the disparity is to be believed")
-        if extra
-        else None
-    )
-    flow, flow_notes = flow_maps(dense, names)
+    given, bounds = read_poses(dense)
+    files = read_pictures(dense, len(bounds))
+    sources = [source_of(folder, file) for file in files]
+    extra = read_extra(dense, [file.name for file in files])
+    masks, white_moves = moving_masks(folder, dense, len(files))
+    depth, is_metric = depth_maps(dense, len(files), extra)
+    confidence = None
+    if extra is not None:
+        purpose = "the confidence of the disparity"
+        confidence = map_files(dense / "disp_confidence", ".npy", len(files), purpose)
+    flow, flow_notes = flow_files(dense, sources)
     model = sparse_model(dense)
-    entries = [
+    pictures = [
         Picture(
-            n,
-            float(i),
-            mask=at(masks, i),
-            depth=at(depth, i),
-            confidence=at(trust, i),
-            flow=flow[i],
+            source,
+            float(number),
+            mask=masks[number] if masks else None,
+            depth=depth[number] if depth else None,
+            confidence=confidence[number] if confidence else None,
+            flow=flow[number],
         )
-        for i, n in enumerate(names)
+        for number, source in enumerate(sources)
     ]
+    notes = [f"pictures of {files[0].parent.name}/", *flow_notes]
+    if depth:
+        notes.append(f"depth of {depth[0].parent.name}/")
+    has_views = any(multi_view(folder, name) is not None for name in MULTI_VIEW)
     capture = Capture(
         layout="HDR-GoPro / NSFF (LLFF)",
-        root=root,
-        pictures=entries,
-        poses=replace(given, names=names),
-        withheld=bool(extra and extra.held_out)
-        or any(multi_view(folder, n) is not None for n in MULTI_VIEW),
+        root=folder,
+        pictures=pictures,
+        poses=replace(given, names=sources),
+        withheld=has_views,
         white_moves=white_moves,
-        depth_kind="disparity" if kind == "disparity" else "metric",
+        depth_kind="metric" if is_metric else "disparity",
         depth_units="own",
-        sightings={n: s for n, s in zip(names, sightings(model, files, bounds), strict=True)},
-        points=model.points if extra and model else trusted(model),
-        notes=(
-            f"pictures of {files[0].parent.name}/",
-            *flow_notes,
-            *([f"depth of {depth[0].parent.name}/"] if depth else []),
-        ),
+        sparse_depth=dict(zip(sources, sparse_depths(model, bounds), strict=True)),
+        points=trusted_points(model),
+        notes=tuple(notes),
     )
-    return with_note(capture, extra, [f.name for f in files]) if extra else capture
+    if extra is None:
+        return capture
+    points = None if model is None else model.points
+    capture = replace(capture, points=points, withheld=has_views or bool(extra.held_out))
+    return with_extra(capture, extra, [file.name for file in files])
 
 
-def at(files: list[Path] | None, i: int) -> Path | None:
-    """The file of picture `i`."""
-    return files[i] if files is not None else None
-
-
-def with_note(capture: Capture, extra: Extra, names: list[str]) -> Capture:
-    """Times, exposures, intrinsics and range as `export` noted them."""
-    own = [extra.frames[n] for n in names]
+def with_extra(capture: Capture, extra: Extra, names: list[str]) -> Capture:
+    """`capture` with the times, exposures, intrinsics and range that `export` noted."""
+    own = [extra.frames[name] for name in names]
     assert capture.poses is not None
-    K = np.stack(
-        [k if e.K is None else np.array(e.K) for k, e in zip(capture.poses.K, own, strict=True)]
-    )
-    entries = [
-        replace(p, time=e.time, camera_id=e.camera_id, bracket=e.bracket)
-        for p, e in zip(capture.pictures, own, strict=True)
+    K = np.array(capture.poses.K)
+    for row, frame in enumerate(own):
+        if frame.K is not None:
+            K[row] = np.array(frame.K)
+    pictures = [
+        replace(picture, time=frame.time, camera_id=frame.camera_id, bracket=frame.bracket)
+        for picture, frame in zip(capture.pictures, own, strict=True)
     ]
     return replace(
         capture,
         layout="HDR-GoPro / NSFF (LLFF), written by hdr-nsff",
-        pictures=entries,
+        pictures=pictures,
         poses=replace(capture.poses, K=K, near=extra.near, far=extra.far),
         white_moves=True,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
@@ -156,27 +157,32 @@ def with_note(capture: Capture, extra: Extra, names: list[str]) -> Capture:
     )
 
 
-def poses(dense: Path) -> tuple[Given, np.ndarray]:
+def read_poses(dense: Path) -> tuple[GivenPoses, np.ndarray]:
     """The poses, and the near and far bounds (N, 2) of every picture."""
     path = dense / "poses_bounds.npy"
     if not path.is_file():
         raise InputError(f"{path}: missing; it holds the camera poses, copy it again")
-    given = from_llff(path)
-    return given, np.load(path, allow_pickle=False)[:, 15:].astype(np.float64)
+    table = llff_table(path, 17)
+    return llff_rows(table), table[:, 15:]
 
 
-def pictures(dense: Path) -> list[Path]:
-    """The training pictures in order."""
+def read_pictures(dense: Path, count: int) -> list[Path]:
+    """The training pictures in order; InputError where there are not `count`."""
     folder = picture_folders(dense)[0]
     files = frame_files(folder)
     if not files:
         raise InputError(
             f"{folder}: no pictures in it; it holds the training pictures, copy them again"
         )
+    if len(files) != count:
+        raise InputError(
+            f"{folder}: {len(files)} pictures, but poses_bounds.npy holds the camera poses of "
+            f"{count}; copy both again"
+        )
     return files
 
 
-def noted(dense: Path, names: list[str]) -> Extra | None:
+def read_extra(dense: Path, names: list[str]) -> Extra | None:
     """What `export` noted, if it wrote the folder."""
     path = dense / NOTE
     if not path.is_file():
@@ -184,102 +190,113 @@ def noted(dense: Path, names: list[str]) -> Extra | None:
     try:
         value = read_json(path)
     except ValueError as error:
-        raise InputError(f"{path}: not readable JSON ({error}); export again") from error
+        raise InputError(f"{path}: not readable JSON ({shorten(error)}); export again") from error
     return parse_extra(path, value, names)
 
 
-def listed(folder: Path, suffix: str, count: int, purpose: str) -> list[Path] | None:
+# Maps
+
+
+def map_files(folder: Path, suffix: str, count: int, purpose: str) -> list[Path] | None:
     """The maps in a folder, one per picture; None where it does not exist."""
     if not folder.is_dir():
         return None
-    return same_number(
-        folder,
-        sorted((p for p in folder.iterdir() if p.suffix == suffix), key=natural),
-        count,
-        purpose,
-    )
+    files = sorted((p for p in folder.iterdir() if p.suffix == suffix), key=natural)
+    check_count(folder, files, count, purpose)
+    return files
 
 
 def moving_masks(folder: Path, dense: Path, count: int) -> tuple[list[Path] | None, bool]:
-    """The moving masks, and whether what moves is white: `motion_masks/`, else `masks/`
-    beside `dense/`, where it is black.
+    """The moving masks, and whether moving pixels are white.
+
+    Those of `motion_masks/`, else of `masks/` beside `dense/`, where they are black.
     """
-    found = listed(dense / "motion_masks", ".png", count, "the moving masks, moving = white")
+    found = map_files(dense / "motion_masks", ".png", count, "the moving masks, moving = white")
     if found is not None or dense == folder:
         return found, True
-    return listed(
-        folder / "masks", ".png", count, "the masks that structure from motion used, moving = black"
-    ), False
+    purpose = "the masks that structure from motion used, moving = black"
+    return map_files(folder / "masks", ".png", count, purpose), False
 
 
-def depth_maps(dense: Path, count: int, extra: Extra | None) -> tuple[list[Path] | None, str]:
-    """The depth maps and what they hold. Of our own export the disparity, which is
-    exactly what the scene had.
+def depth_maps(dense: Path, count: int, extra: Extra | None) -> tuple[list[Path] | None, bool]:
+    """The depth maps, and whether they are metric; else they hold disparity.
+
+    Of a folder that `export` wrote, the disparity, which is exactly the scene's.
     """
-    metric = listed(dense / "depth-anything", ".npy", count, "the metric depth of the pictures")
-    disparity = listed(dense / "disp", ".npy", count, "the disparity of the pictures")
-    if metric is not None and not (extra and disparity):
-        return metric, "metric"
-    return disparity, "disparity"
+    metric = map_files(dense / "depth-anything", ".npy", count, "the metric depth of the pictures")
+    disparity = map_files(dense / "disp", ".npy", count, "the disparity of the pictures")
+    if metric is None or (extra is not None and disparity is not None):
+        return disparity, False
+    return metric, True
 
 
-def flow_maps(dense: Path, names: list[str]) -> tuple[list[dict[str, Path]], list[str]]:
-    """Per picture the flow to its neighbors, and which folder it is from."""
-    folder = next((dense / n for n in FLOWS if (dense / n).is_dir()), None)
-    flow: list[dict[str, Path]] = [{} for _ in names]
+def flow_files(dense: Path, sources: list[str]) -> tuple[list[dict[str, Path]], list[str]]:
+    """Per picture the flow to its neighbors, and notes that name its folder."""
+    folder = next((dense / name for name in FLOWS if (dense / name).is_dir()), None)
+    flow: list[dict[str, Path]] = [{} for _ in sources]
     if folder is None:
         return flow, []
-    for i in range(len(names)):
-        for j, side in ((i + 1, "fwd"), (i - 1, "bwd")):
-            if not 0 <= j < len(names):
+    for number in range(len(sources)):
+        for neighbor, side in ((number + 1, "fwd"), (number - 1, "bwd")):
+            if not 0 <= neighbor < len(sources):
                 continue
-            path = folder / f"{i:05d}_{side}.npz"
+            path = folder / f"{number:05d}_{side}.npz"
             if not path.is_file():
                 raise InputError(
-                    f"{path}: missing; it holds the optical flow from picture {i} to {j}, copy it again"
+                    f"{path}: missing; it holds the optical flow from picture {number} to "
+                    f"{neighbor}, copy it again"
                 )
-            flow[i][names[j]] = path
+            flow[number][sources[neighbor]] = path
     return flow, [f"flow of {folder.name}/"]
+
+
+# Static points
 
 
 def sparse_model(dense: Path) -> ColmapModel | None:
     """The COLMAP model that the poses are from, if it is there."""
-    found = next(
-        (f for f in (dense / "sparse", dense / "sparse" / "0") if (f / "images.bin").is_file()),
-        None,
-    )
+    places = (dense / "sparse", dense / "sparse" / "0")
+    found = next((place for place in places if (place / "images.bin").is_file()), None)
     return None if found is None else read_model(found)
 
 
-def trusted(model: ColmapModel | None) -> np.ndarray | None:
-    """The static points (P, 3) of the model that are well seen."""
+def trusted_points(model: ColmapModel | None) -> np.ndarray | None:
+    """The static points (P, 3) of the model that enough pictures agree on."""
     if model is None:
         return None
-    return model.points[(model.errors <= TRUSTED) & (model.track_lengths >= SHORTEST)]
+    is_exact = model.errors <= MAX_POINT_ERROR_PX
+    return model.points[is_exact & (model.track_lengths >= MIN_TRACK_LENGTH)]
 
 
-def sightings(model: ColmapModel | None, files: list[Path], bounds: np.ndarray) -> list[Sighting]:
-    """What every picture sees of the static points; only its bounds where there is no
-    model.
+def sparse_depths(model: ColmapModel | None, bounds: np.ndarray) -> list[SparseDepth]:
+    """The static points that every picture sees; `bounds` (N, 2) are near and far.
+
+    No points where there is no model of just these pictures.
     """
-    empty = np.zeros((0, 2)), np.zeros(0)
-    if model is None or len(model.images) != len(files):
-        return [Sighting(*empty, (float(n), float(f))) for n, f in bounds]
-    row = {int(key): r for r, key in enumerate(model.point_ids)}
+    ranges = [(float(near), float(far)) for near, far in bounds]
+    if model is None or len(model.images) != len(bounds):
+        return [SparseDepth(np.zeros((0, 2)), np.zeros(0), near_far) for near_far in ranges]
+    images = sorted(model.images.values(), key=lambda i: i.name)
+    rows = {int(key): row for row, key in enumerate(model.point_ids)}
     found = []
-    for image, (near, far) in zip(
-        sorted(model.images.values(), key=lambda i: i.name), bounds, strict=True
-    ):
-        camera = model.cameras[image.camera_id]
-        has = np.array([int(p) in row for p in image.point_ids], bool)
-        points = model.points[[row[int(p)] for p in image.point_ids[has]]].reshape(-1, 3)
-        depth = (points - image.c2w[:, 3]) @ image.c2w[:, 2]
-        front = depth > 0
-        xy = image.xy[has][front] / [camera.width, camera.height]
-        found.append(Sighting(xy, depth[front], (float(near), float(far))))
+    for image, near_far in zip(images, ranges, strict=True):
+        xy, depth = seen_points(model, image, rows)
+        found.append(SparseDepth(xy, depth, near_far))
     return found
 
 
-def multi_view(folder: Path, name: str) -> Path | None:
-    """A folder of held-out pictures, under `dense/` or beside it."""
-    return next((p for p in (dense_folder(folder) / name, folder / name) if p.is_dir()), None)
+def seen_points(
+    model: ColmapModel, image: ColmapImage, rows: dict[int, int]
+) -> tuple[np.ndarray, np.ndarray]:
+    """The keypoints (n, 2) of static points, as shares of the picture, and their depth.
+
+    `rows` are the positions of point ids in the model.
+    """
+    camera = model.cameras[image.camera_id]
+    has_point = np.array([int(key) in rows for key in image.point_ids], bool)
+    seen = [rows[int(key)] for key in image.point_ids[has_point]]
+    points = model.points[seen].reshape(-1, 3)
+    depth = (points - image.c2w[:, 3]) @ image.c2w[:, 2]
+    in_front = depth > 0
+    xy = image.xy[has_point][in_front] / [camera.width, camera.height]
+    return xy, depth[in_front]

@@ -17,58 +17,73 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask
-from hdr_nsff.core.io import read_npy
-from hdr_nsff.footage.datasets.capture import Capture, Picture, Sighting
+from hdr_nsff.footage.arrays import read_array
+from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
 from hdr_nsff.footage.depth_files import read_map
 from hdr_nsff.footage.flow_files import read_npz
 from hdr_nsff.geometry.fill import fill
 
-AREA = cv2.INTER_AREA
-SHAPE = 0.02  # by how much the proportions of a map may differ from the frames'
-ENOUGH = 20  # points from which a scale and shift are fitted
-FARTHEST = 3.0  # times the far bound: what fitted disparity is clamped to
+MAX_ASPECT_ERROR = 0.02  # by which the shape of a map may differ from the frames'
+MIN_POINTS = 20  # from which a scale and shift are fitted (hand-chosen)
+MAX_FAR = 3.0  # times the far bound: fitted disparity is clamped there (hand-chosen)
+PNG_WHITE = 65535.0  # the value of white in a PNG of 16 bits
+FIT_ROUNDS = 5  # fits of a line, each without the worst of the last
+FIT_SHARE = 0.75  # of the points, that the next round keeps (hand-chosen)
 
 
-def fitted(path: Path, array: np.ndarray, size: tuple[int, int], interpolation: int) -> np.ndarray:
+# One map at the size of the frames
+
+
+def fit_size(
+    path: Path, array: np.ndarray, size: tuple[int, int], interpolation: int
+) -> np.ndarray:
     """`array` (h, w, ...) at `size` (H, W); InputError for one of another shape."""
     h, w = array.shape[:2]
+    height, width = size
     if (h, w) == size:
         return array
-    if abs(w / h / (size[1] / size[0]) - 1) > SHAPE:
+    if abs(w / h / (width / height) - 1) > MAX_ASPECT_ERROR:
         raise InputError(
-            f"{path}: {w}x{h} for frames of {size[1]}x{size[0]}, another shape; make it the shape of the frames"
+            f"{path}: {w}x{h} for frames of {width}x{height}, another shape; "
+            "make it the shape of the frames"
         )
-    return cv2.resize(array, size[::-1], interpolation=interpolation)
+    return cv2.resize(array, (width, height), interpolation=interpolation)
+
+
+def fit_mask(path: Path, mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A mask (h, w) bool at `size` (H, W), by the nearest pixel."""
+    return fit_size(path, mask.astype(np.uint8), size, cv2.INTER_NEAREST) > 0
 
 
 def moving_mask(path: Path, size: tuple[int, int], white_moves: bool) -> np.ndarray:
     """A moving mask (H, W) bool."""
-    mask = fitted(path, read_mask(path).astype(np.uint8), size, cv2.INTER_NEAREST) > 0
+    mask = fit_mask(path, read_mask(path), size)
     return mask if white_moves else ~mask
 
 
 def flow_map(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Flow (H, W, 2) px and where it is valid (H, W), from .npz (`flow`, `mask`) or
-    .npy with `_valid.png`.
+    """Flow (H, W, 2) px and where it is valid (H, W).
+
+    From a .npz with `flow` and `mask`, or a .npy with `_valid.png`.
     """
     if path.suffix == ".npz":
         flow, valid = read_npz(path)
     else:
-        flow, valid = (
-            np.array(read_npy(path), np.float32),
-            read_mask(path.with_name(f"{path.stem}_valid.png")),
-        )
+        flow = read_array(path)
+        valid = read_mask(path.with_name(f"{path.stem}_valid.png"))
     if flow.ndim != 3 or flow.shape[2] != 2 or valid.shape != flow.shape[:2]:
         raise InputError(
-            f"{path}: expected flow (H, W, 2) with a mask (H, W), found {flow.shape} and {valid.shape}; copy it again"
+            f"{path}: expected flow (H, W, 2) with a mask (H, W), found {flow.shape} and "
+            f"{valid.shape}; copy it again"
         )
     if not np.isfinite(flow).all():
         raise InputError(
             f"{path}: the flow holds NaN or Inf; write 0 there and mask those pixels out"
         )
-    scale = np.array([size[1] / flow.shape[1], size[0] / flow.shape[0]], np.float32)
-    valid = fitted(path, valid.astype(np.uint8), size, cv2.INTER_NEAREST) > 0
-    return fitted(path, flow, size, cv2.INTER_AREA) * scale, valid
+    height, width = size
+    scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
+    valid = fit_mask(path, valid, size)
+    return fit_size(path, flow, size, cv2.INTER_AREA) * scale, valid
 
 
 def depth_map(path: Path, size: tuple[int, int]) -> np.ndarray:
@@ -80,124 +95,153 @@ def depth_map(path: Path, size: tuple[int, int]) -> np.ndarray:
         )
     if not np.isfinite(values).all():
         raise InputError(f"{path}: the depth map holds NaN or Inf; write 0 where depth is unknown")
-    return fitted(path, values, size, cv2.INTER_NEAREST)
+    return fit_size(path, values, size, cv2.INTER_NEAREST)
+
+
+# Depth of all pictures in units of the poses
 
 
 def disparities(
     capture: Capture, chosen: Sequence[Picture], size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, str]:
-    """Disparity and confidence (T, H, W) of the `chosen` pictures, and how they were
-    brought to scene units, in words.
+    """Disparity and confidence (T, H, W) of the `chosen` pictures, and a note.
+
+    The note is a sentence on how they were brought to scene units.
     """
     paths = [p.depth for p in chosen if p.depth is not None]
     maps = np.stack([depth_map(path, size) for path in paths])
-    kind = capture.depth_kind
-    if kind == "metric":
-        whole = [
-            65535.0 if path.suffix.lower() == ".png" else 1.0 for path in paths
-        ]  # pictures are read as shares of white
-        maps *= np.array(whole, np.float32)[:, None, None] * np.float32(capture.depth_scale)
+    sparse = [capture.sparse_depth.get(p.source) for p in chosen]
     for path, values in zip(paths, maps, strict=True):
-        if kind != "relative" and not (values > 0).any():
+        if capture.depth_kind != "relative" and not (values > 0).any():
             raise InputError(f"{path}: nothing above 0 in this depth map; copy it again")
-    seen = [capture.sightings.get(p.source) for p in chosen]
+    if capture.depth_kind == "metric":
+        maps *= unit_scales(paths, capture.depth_scale)[:, None, None]
+        return disparity_of_metric(maps, sparse, capture.depth_units == "own")
     note = ""
-    if capture.depth_units == "own" and kind == "metric":
-        scale, note = metric_scale(maps, seen)
-        maps *= np.float32(scale)
-    known = maps > 0
-    if kind == "metric":
-        disparity = np.stack(
-            [fill(1 / np.where(k, m, 1), k) for m, k in zip(maps, known, strict=True)]
-        )
-        return disparity, known.astype(np.float32), note
     if capture.depth_units == "own":
-        maps, note = shifted(maps, seen)
-    return maps, trust(chosen, size), note
+        maps, note = align_disparity(maps, sparse)
+    return maps, read_confidence(chosen, size), note
 
 
-def trust(chosen: Sequence[Picture], size: tuple[int, int]) -> np.ndarray:
-    """The confidence (T, H, W) that the set gives of its disparity; 1 where it gives
-    none.
+def unit_scales(paths: Sequence[Path], depth_scale: float) -> np.ndarray:
+    """Scene units per unit of each map (T,) as read.
+
+    Pictures are read as shares of white, arrays as they are.
     """
-    one = np.ones(size, np.float32)
-    return np.stack(
-        [
-            one if p.confidence is None else np.array(depth_map(p.confidence, size), np.float32)
-            for p in chosen
-        ]
-    )
+    white = [PNG_WHITE if path.suffix.lower() == ".png" else 1.0 for path in paths]
+    return np.array(white, np.float32) * np.float32(depth_scale)
 
 
-def sampled(values: np.ndarray, seen: Sighting) -> np.ndarray:
+def disparity_of_metric(
+    maps: np.ndarray, sparse: Sequence[SparseDepth | None], own_units: bool
+) -> tuple[np.ndarray, np.ndarray, str]:
+    """Disparity and confidence (T, H, W) of metric depth `maps` (T, H, W), and a note.
+
+    `own_units`: in units of the network, which are scaled to those of the poses.
+    """
+    note = ""
+    if own_units:
+        scale, note = metric_scale(maps, sparse)
+        maps = maps * np.float32(scale)
+    known = maps > 0
+    disparity = [fill(1 / np.where(k, m, 1), k) for m, k in zip(maps, known, strict=True)]
+    return np.stack(disparity), known.astype(np.float32), note
+
+
+def read_confidence(chosen: Sequence[Picture], size: tuple[int, int]) -> np.ndarray:
+    """The confidence (T, H, W) of the disparity; 1 where the set gives none."""
+    confidence = np.ones((len(chosen), *size), np.float32)
+    for k, picture in enumerate(chosen):
+        if picture.confidence is not None:
+            confidence[k] = depth_map(picture.confidence, size)
+    return confidence
+
+
+def sample(values: np.ndarray, sparse: SparseDepth) -> np.ndarray:
     """A map (H, W) at the static points of a picture (n,)."""
     h, w = values.shape
-    x, y = (np.clip((seen.xy * [w, h]).astype(int), 0, [w - 1, h - 1])).T
+    pixels = (sparse.xy * [w, h]).astype(int)
+    x, y = np.clip(pixels, 0, [w - 1, h - 1]).T
     return values[y, x]
 
 
-def metric_scale(maps: np.ndarray, seen: Sequence[Sighting | None]) -> tuple[float, str]:
-    """Scene units per unit of metric depth (T, H, W), one for all pictures: the median
-    over what they see of the static points.
+def metric_scale(maps: np.ndarray, sparse: Sequence[SparseDepth | None]) -> tuple[float, str]:
+    """Scene units per unit of metric depth (T, H, W), one for all pictures, and a note.
+
+    The median over the static points that they see, else from their bounds.
     """
-    ratios = []
-    for values, s in zip(maps, seen, strict=True):
-        if s is not None and len(s.depth):
-            there = sampled(values, s)
-            ratios.append(s.depth[there > 0] / there[there > 0])
-    if ratios and len(every := np.concatenate(ratios)) >= ENOUGH:
+    ratios = [np.zeros(0)]
+    for values, points in zip(maps, sparse, strict=True):
+        if points is not None and len(points.depth):
+            found = sample(values, points)
+            ratios.append(points.depth[found > 0] / found[found > 0])
+    every = np.concatenate(ratios)
+    if len(every) >= MIN_POINTS:
         scale = float(np.median(every))
         spread = float(np.median(np.abs(np.log(every / scale))))
-        return (
-            scale,
-            f"1 unit of it is {scale:.4g} scene units, by {len(every)} static points (median deviation {spread:.0%})",
+        return scale, (
+            f"1 unit of it is {scale:.4g} scene units, by {len(every)} static points "
+            f"(median deviation {spread:.0%})"
         )
-    bounds = [
-        np.sqrt(np.prod(s.bounds) / np.prod(np.percentile(v[v > 0], [5, 95])))
-        for v, s in zip(maps, seen, strict=True)
-        if s is not None and min(s.bounds) > 0 and (v > 0).any()
-    ]
+    bounds = []
+    for values, points in zip(maps, sparse, strict=True):
+        if points is not None and min(points.bounds) > 0 and (values > 0).any():
+            near_far = np.percentile(values[values > 0], [5, 95])
+            bounds.append(np.sqrt(np.prod(points.bounds) / np.prod(near_far)))
     if not bounds:
-        return 1.0, "taken to be in scene units: nothing tells otherwise"
+        return 1.0, "taken to be in scene units: nothing shows otherwise"
     scale = float(np.median(bounds))
-    return (
-        scale,
-        f"1 unit of it is {scale:.4g} scene units, by the near and far bounds of the pictures alone",
+    return scale, (
+        f"1 unit of it is {scale:.4g} scene units, by the near and far bounds of the pictures alone"
     )
 
 
-def shifted(maps: np.ndarray, seen: Sequence[Sighting | None]) -> tuple[np.ndarray, str]:
-    """Disparity (T, H, W) up to scale and shift -> in 1 / scene units: by the static
-    points of each picture, else by its bounds.
+def align_disparity(
+    maps: np.ndarray, sparse: Sequence[SparseDepth | None]
+) -> tuple[np.ndarray, str]:
+    """Disparity (T, H, W) up to scale and shift -> in 1 / scene units, and a note.
+
+    By the static points of each picture, else by its bounds.
     """
-    result, by_points = np.empty_like(maps), 0
-    for k, (values, s) in enumerate(zip(maps, seen, strict=True)):
+    result = np.empty_like(maps)
+    by_points = 0
+    for k, (values, points) in enumerate(zip(maps, sparse, strict=True)):
         line = None
-        if s is not None and len(s.depth) >= ENOUGH:
-            line = robust_line(sampled(values, s), 1 / s.depth)
-            by_points += line is not None
-        if line is None and s is not None and min(s.bounds) > 0:
-            low, high = np.percentile(values, [5, 95])
-            scale = (1 / s.bounds[0] - 1 / s.bounds[1]) / max(float(high - low), 1e-12)
-            line = scale, 1 / s.bounds[1] - scale * float(low)
+        if points is not None and len(points.depth) >= MIN_POINTS:
+            line = robust_line(sample(values, points), 1 / points.depth)
+        if line is not None:
+            by_points += 1
+        elif points is not None and min(points.bounds) > 0:
+            line = line_of_bounds(values, points.bounds)
         scale, shift = line or (1.0, 0.0)
-        least = 1 / (FARTHEST * s.bounds[1]) if s is not None and s.bounds[1] > 0 else 0.0
+        least = 0.0
+        if points is not None and points.bounds[1] > 0:
+            least = 1 / (MAX_FAR * points.bounds[1])
         result[k] = np.maximum(scale * values + shift, least)
-    return (
-        result,
-        f"scale and shift of {by_points} of {len(maps)} maps by static points, the others by their near and far bounds",
+    return result, (
+        f"scale and shift of {by_points} of {len(maps)} maps by static points, "
+        "the others by their near and far bounds"
     )
+
+
+def line_of_bounds(values: np.ndarray, bounds: tuple[float, float]) -> tuple[float, float]:
+    """Scale and shift that bring disparity (H, W) to depth bounds (near, far)."""
+    near, far = bounds
+    low, high = np.percentile(values, [5, 95])
+    scale = (1 / near - 1 / far) / max(float(high - low), 1e-12)
+    return scale, 1 / far - scale * float(low)
 
 
 def robust_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float] | None:
-    """Scale and shift of `y` (n,) over `x` (n,), refitted without the worst quarter;
-    None where it does not rise.
+    """Scale and shift of `y` (n,) over `x` (n,), refitted without the worst quarter.
+
+    None where the line does not rise.
     """
     keep = np.ones(len(x), bool)
-    for _ in range(5):
+    for _ in range(FIT_ROUNDS):
         if np.ptp(x[keep]) < 1e-9:
             return None
         scale, shift = np.polyfit(x[keep], y[keep], 1)
         error = np.abs(scale * x + shift - y)
-        keep = error <= np.quantile(error, 0.75)
+        keep = error <= np.quantile(error, FIT_SHARE)
     return (float(scale), float(shift)) if scale > 0 else None

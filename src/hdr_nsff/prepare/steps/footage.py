@@ -1,11 +1,14 @@
-"""The steps of `prepare` that look at the footage alone: frames, and which exposure
-each was taken with.
+"""The steps of `prepare` that need the footage alone: frames, and the exposure of each.
+
+Exposures come from the command line, a data set, a CSV or EXIF, in this order; where
+none of these has them, frames of one exposure are found by their brightness, and
+training learns the exposures.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -13,29 +16,35 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.exposure_lists import (
+    parse_exposures,
+    read_exif_ev,
+    read_exposure_csv,
+)
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.scene.manifest import FrameEntry, Protocol
+from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
 
-MIN_FRAMES = 3
+MIN_FRAMES = 3  # fewer show no motion
+MAX_ROUNDING_8_BIT = 1e-6  # off whole codes of 8 bits up to which 8 bits hold a picture
+MAX_NOTES = 3  # that are printed; the rest is in scene.json
+# confidence of a cycle by brightness from which it refutes a list (hand-chosen)
+MIN_CONFIDENCE = 0.8
+
+
+# Frames
 
 
 def frames_step(work: Work) -> StepResult:
-    """Decode the chosen frames into `images/`, and check that there is something to see
-    on them.
-    """
+    """Decode the chosen frames into `images/`, and check that they show something."""
     c, m = work.config, work.manifest
-    total = (
-        len(range(c.start, c.end or work.footage.count, c.stride)) * len(work.footage.cameras)
-        if work.footage.count
-        else None
-    )
     entries: list[FrameEntry] = []
     extents = []
-    for frame in track(
-        ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size), "frames", total
-    ):
+    frames = ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size)
+    for frame in track(frames, "frames", expected_frames(work)):
+        m.height, m.width = frame.rgb.shape[:2]
+        ingest.check_frame_size(c.clip, m.width, m.height)
         entry = FrameEntry(
             index=len(entries),
             image=f"images/{len(entries):05d}.png",
@@ -44,36 +53,17 @@ def frames_step(work: Work) -> StepResult:
             camera_id=frame.camera_id,
             bracket=0,
         )
-        if not (work.folder / entry.image).is_file():
-            exact = np.rint(frame.rgb * 255) / 255
-            write_png(
-                work.folder / entry.image,
-                frame.rgb,
-                bits=8 if np.abs(frame.rgb - exact).max() < 1e-6 else 16,
-            )
-        m.height, m.width = frame.rgb.shape[:2]
-        extents.append(exposure.extent(frame.rgb))
+        write_frame(work.folder / entry.image, frame.rgb)
         entries.append(entry)
-    times = len({e.time for e in entries})
-    if times < MIN_FRAMES:
-        raise InputError(
-            f"{c.clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are needed to see motion"
-        )
-    if (color := exposure.all_clipped(extents)) is not None:
-        raise InputError(
-            f"{c.clip}: all frames are {color}; nothing can be learned from them, choose other frames"
-        )
+        extents.append(exposure.extent(frame.rgb))
+    check_frames(c.clip, entries, extents)
     m.fps = work.footage.fps / c.stride
     if [identity(f) for f in m.frames] != [identity(f) for f in entries]:
-        m.frames = entries  # else what later steps found of these frames stays
-    linear = (
-        "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
-        if work.footage.linear
-        else ""
-    )
-    return StepResult(
-        provenance="given", note=f"{len(entries)} frames of {m.width}x{m.height} pixels{linear}"
-    )
+        m.frames = entries  # else the results of later steps for these frames stay
+    note = f"{len(entries)} frames of {m.width}x{m.height} pixels"
+    if work.footage.linear:
+        note += "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
+    return StepResult(provenance="given", note=note)
 
 
 def identity(entry: FrameEntry) -> tuple[int, str, float, int]:
@@ -81,178 +71,273 @@ def identity(entry: FrameEntry) -> tuple[int, str, float, int]:
     return entry.index, entry.source, entry.time, entry.camera_id
 
 
-def exposure_step(work: Work) -> StepResult:
-    """Which frames share an exposure, what the exposures are where that is known, and
-    which frames are kept out of training.
+def expected_frames(work: Work) -> int | None:
+    """The number of frames to decode; None for a video without a count."""
+    c = work.config
+    count = work.footage.count
+    if not count:
+        return None
+    stop = min(c.end or count, count)
+    return len(range(c.start, stop, c.stride)) * len(work.footage.cameras)
+
+
+def write_frame(path: Path, rgb: np.ndarray) -> None:
+    """Write a frame (H, W, 3) in 8 bits where these hold it, else in 16.
+
+    A file that is there already stays.
     """
-    m = work.manifest
-    cameras = work.camera_frames()
-    source, given = given_exposures(work)
-    stored = work.capture.exposures if work.capture is not None and source == "data set" else None
-    notes = []
-    values: list[float | None]
-    if stored is not None:
-        brackets, values = [work.picture(f).bracket or 0 for f in m.frames], list(stored.ev)
-    elif given is None:
-        cycles = [exposure.detect_cycle(work.video[frames]) for frames in cameras]
-        brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
-        values = [None] * (max(brackets) + 1)
-        notes += found_cycle(work, cycles)
-    else:
-        brackets, known = exposure.by_value(given)
-        notes += [
-            d
-            for frames in cameras
-            for d in exposure.doubts(work.video[frames], [given[i] for i in frames])
-        ]
-        values = list(known)
-    for note in notes[:3]:
-        say(f"exposure: {note}")
-    m.cycle = exposure.period([brackets[i] for i in cameras[0]])
-    m.reference_bracket = (
-        stored.reference if stored else exposure.reference_bracket(work.video, brackets)
-    )
-    gauge = values[m.reference_bracket]
-    m.bracket_ev = [None if v is None or gauge is None else v - gauge for v in values]
-    m.exposure_given = stored.given if stored else given is not None
-    m.protocol = work.config.protocol
-    test = kept_out(work)
-    if m.protocol is not None:
-        check_protocol(m.protocol, brackets, test)
-    for f, bracket in zip(m.frames, brackets, strict=True):
-        f.bracket, f.ev, f.split = (
-            bracket,
-            m.bracket_ev[bracket],
-            "test" if f.index in test else "train",
-        )
-    what = "no alternation" if m.cycle == 1 else f"cycle of {m.cycle}, {len(values)} exposures"
-    step: Literal["given", "estimated"] = "given" if stored or given is not None else "estimated"
-    details = {"source": source, "doubts": notes}
-    return StepResult(
-        provenance=step, note=f"{what} ({source}); {len(test)} frames held out", details=details
-    )
+    if path.is_file():
+        return
+    error = np.abs(rgb - np.rint(rgb * 255) / 255).max()
+    write_png(path, rgb, bits=8 if error < MAX_ROUNDING_8_BIT else 16)
 
 
-def kept_out(work: Work) -> set[int]:
-    """Indices of the frames that are kept out of training, by the protocol or every so
-    many of each camera.
+def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[float, float]]) -> None:
+    """InputError where frames are too few, or all black or white.
+
+    `extents` are the recorded values between which nearly all of each frame lies.
     """
-    c, cycle, cameras = work.config, work.manifest.cycle, work.camera_frames()
-    match c.protocol:
-        case "novel-view":
-            return set()
-        case "novel-view-time":
-            return {frames[k] for frames in cameras for k in ingest.between(len(frames), cycle)}
-        case None:
-            return {
-                frames[k]
-                for frames in cameras
-                for k in ingest.held_out(len(frames), held_out_every(work), cycle)
-            }
-
-
-def held_out_every(work: Work) -> int:
-    """Every how many frames are kept out of training; 0 for none, as where a data set
-    brings held-out views of its own.
-    """
-    if work.config.hold_out is not None:
-        return work.config.hold_out
-    return 0 if work.capture is not None and work.capture.withheld else ingest.HOLD_OUT
-
-
-def check_protocol(protocol: Protocol, brackets: list[int], test: set[int]) -> None:
-    """InputError where the frames that are not kept out (`test`, indices) show fewer
-    exposures than all, by their `brackets`.
-    """
-    shown, trained = set(brackets), {b for i, b in enumerate(brackets) if i not in test}
-    if len(trained) < len(shown):
+    times = len({entry.time for entry in entries})
+    if times < MIN_FRAMES:
         raise InputError(
-            f"--protocol {protocol}: of {len(brackets)} frames it trains on {len(brackets) - len(test)}, which show only {len(trained)} "
-            f"of {len(shown)} exposures; use a longer clip, or --hold-out"
+            f"{clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are "
+            "needed to see motion"
         )
+    color = exposure.all_clipped(extents)
+    if color is not None:
+        raise InputError(
+            f"{clip}: all frames are {color}; nothing can be learned from them, choose other frames"
+        )
+
+
+# Exposures
+
+
+@dataclass(frozen=True)
+class FrameExposures:
+    """The exposures of all frames."""
+
+    source: str  # where they come from, for people
+    brackets: list[int]  # per frame
+    ev: list[float | None]  # per bracket, to any reference; None: to be learned
+    given: bool
+    estimated: bool  # the brackets were found by brightness
+    reference: int | None = None  # bracket; None: the best exposed one
+    notes: tuple[str, ...] = ()  # sentences for people
+
+
+def exposure_step(work: Work) -> StepResult:
+    """Give each frame its exposure, and choose the frames to hold out of training."""
+    m = work.manifest
+    found = frame_exposures(work)
+    for note in found.notes[:MAX_NOTES]:
+        say(f"exposure: {note}")
+    m.cycle = exposure.period([found.brackets[i] for i in work.camera_frames()[0]])
+    if found.reference is None:
+        m.reference_bracket = exposure.reference_bracket(work.video, found.brackets)
+    else:
+        m.reference_bracket = found.reference
+    m.bracket_ev = relative_to(found.ev, m.reference_bracket)
+    problem = bracket_problem(found.brackets, m.bracket_ev, m.reference_bracket)
+    if problem is not None:
+        raise InputError(f"{work.config.clip}: exposures by {found.source}: {problem}; correct it")
+    m.exposure_given = found.given
+    m.protocol = work.config.protocol
+    held_out = frames_to_hold_out(work)
+    if m.protocol is not None:
+        check_protocol(m.protocol, found.brackets, held_out)
+    for frame, bracket in zip(m.frames, found.brackets, strict=True):
+        frame.bracket = bracket
+        frame.ev = m.bracket_ev[bracket]
+        frame.split = "test" if frame.index in held_out else "train"
+    cycle = "no alternation"
+    if m.cycle > 1:
+        cycle = f"cycle of {m.cycle}, {len(found.ev)} exposures"
+    return StepResult(
+        provenance="estimated" if found.estimated else "given",
+        note=f"{cycle} ({found.source}); {len(held_out)} frames held out",
+        details={"source": found.source, "doubts": list(found.notes)},
+    )
+
+
+def relative_to(ev: list[float | None], reference: int) -> list[float | None]:
+    """EVs per bracket relative to a bracket; None for all where that one is unknown."""
+    gauge = ev[reference]
+    return [None if v is None or gauge is None else v - gauge for v in ev]
+
+
+def frame_exposures(work: Work) -> FrameExposures:
+    """The exposures of all frames, as given, or by brightness."""
+    capture, frames = work.capture, work.manifest.frames
+    source, given = given_exposures(work)
+    if capture is not None and capture.exposures is not None and source == "data set":
+        stored = capture.exposures
+        brackets = [work.picture(frame).bracket or 0 for frame in frames]
+        return FrameExposures(
+            source, brackets, list(stored.ev), stored.given, False, stored.reference
+        )
+    cameras = work.camera_frames()
+    if given is None:
+        cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
+        brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
+        unknown: list[float | None] = [None] * (max(brackets) + 1)
+        notes = cycle_notes(work, cycles)
+        return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
+    brackets, known = exposure.by_value(given)
+    doubts = []
+    for own in cameras:
+        doubts += exposure.doubts(work.video[own], [given[i] for i in own])
+    return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
 
 
 def given_exposures(work: Work) -> tuple[str, list[float] | None]:
-    """Where the EV of every frame comes from, and the EVs; None where brightness has to
-    tell, or a data set stores brackets.
+    """Where the EVs of the frames come from, and the EV of each frame.
+
+    The EVs are None where brightness has to show them, or a data set stores brackets.
     """
-    c, footage, frames = work.config, work.footage, work.manifest.frames
+    c, frames = work.config, work.manifest.frames
+    capture = work.capture
     numbers = [c.start + int(f.time) * c.stride for f in frames]
-    cycle = ingest.parse_exposures(c.exposures, c.ev)
+    cycle = parse_exposures(c.exposures, c.ev)
     if cycle is not None:
-        check_length(work, cycle, numbers)
+        check_cycle(work, cycle, numbers)
         return "flags", [cycle[n % len(cycle)] for n in numbers]
     if "auto" in (c.exposures, c.ev):
         return "brightness", None
-    if (capture := work.capture) is not None and capture.parts()["exposures"]:
-        evs = [work.picture(f).ev for f in frames]
-        return "data set", None if capture.exposures else [e for e in evs if e is not None]
-    if (table := ingest.read_exposure_csv(footage)) is not None:
+    if capture is not None and capture.parts()["exposures"]:
+        if capture.exposures is not None:
+            return "data set", None
+        stored = [work.picture(f).ev for f in frames]
+        return "data set", [ev for ev in stored if ev is not None]
+    table = read_exposure_csv(work.footage)
+    if table is not None:
         path, rows = table
-        keys = [
-            next((k for k in (f.source, Path(f.source).name, f"#{n}") if k in rows), None)
-            for f, n in zip(frames, numbers, strict=True)
+        return path.name, [
+            csv_exposure(path, rows, f, n) for f, n in zip(frames, numbers, strict=True)
         ]
-        missing = next((f.source for f, k in zip(frames, keys, strict=True) if k is None), None)
-        if missing is not None:
-            raise InputError(
-                f"{path}: no row for frame {missing}; add it, or give `--exposures auto`"
-            )
-        return path.name, [rows[k] for k in keys if k is not None]
-    if not footage.video:
-        files = footage.files
-        found = [ingest.read_exif_ev(files[f.source]) for f in frames]
-        known = [v for v in found if v is not None]
-        if len(known) == len(found) and max(known) - min(known) >= exposure.MIN_STEP:
-            return "EXIF", known
-        if known and len(known) < len(found):
-            say(
-                f"exposure: EXIF of {len(found) - len(known)} frames holds no exposure time; brightness decides instead"
-            )
+    known = [] if work.footage.video else exif_exposures(work)
+    if len(known) == len(frames) and max(known) - min(known) >= exposure.MIN_STEP:
+        return "EXIF", known
     return "brightness", None
 
 
-def check_length(work: Work, cycle: list[float], numbers: list[int]) -> None:
-    """InputError where a list of exposures cannot be the cycle of these frames."""
+def csv_exposure(path: Path, rows: dict[str, float], frame: FrameEntry, number: int) -> float:
+    """The EV of a frame in the `rows` of a CSV, by its name or `number`."""
+    for key in (frame.source, Path(frame.source).name, f"#{number}"):
+        if key in rows:
+            return rows[key]
+    raise InputError(f"{path}: no row for frame {frame.source}; add it, or give `--exposures auto`")
+
+
+def exif_exposures(work: Work) -> list[float]:
+    """The EVs of the frames whose EXIF has one; prints where only some have."""
+    files = work.footage.files
+    found = [read_exif_ev(files[f.source]) for f in work.manifest.frames]
+    known = [ev for ev in found if ev is not None]
+    lost = len(found) - len(known)
+    if known and lost:
+        say(f"exposure: EXIF of {lost} frames holds no exposure time; brightness decides instead")
+    return known
+
+
+def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:
+    """InputError where a list of exposures cannot be the cycle of these frames.
+
+    `numbers` are the positions of the frames in the footage of their camera.
+    """
     frames = work.camera_frames()[0]
     if len(cycle) > len(frames):
         raise InputError(
-            f"{len(cycle)} exposures listed for {len(frames)} frames; list one cycle only, or give `--exposures auto`"
+            f"{len(cycle)} exposures listed for {len(frames)} frames; list one cycle only, "
+            "or give `--exposures auto`"
         )
-    listed = exposure.period(exposure.by_value([cycle[numbers[i] % len(cycle)] for i in frames])[0])
+    brackets, _ = exposure.by_value([cycle[numbers[i] % len(cycle)] for i in frames])
+    listed = exposure.period(brackets)
     found = exposure.detect_cycle(work.video[frames])
-    if listed % found.length and found.confidence > 0.8:
+    if listed % found.length and found.confidence > MIN_CONFIDENCE:
         raise InputError(
-            f"{len(cycle)} exposures listed, which repeat every {listed} frames, but the brightness repeats every {found.length}; "
-            "list the exposures of one cycle in the order of the frames, or give `--exposures auto`"
+            f"{len(cycle)} exposures listed, which repeat every {listed} frames, but the "
+            f"brightness repeats every {found.length}; list the exposures of one cycle in the "
+            "order of the frames, or give `--exposures auto`"
         )
 
 
-def found_cycle(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
-    """What brightness told, in sentences."""
+def cycle_notes(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
+    """What the brightness of each camera's frames shows, in sentences."""
     notes = []
-    for frames, cycle in zip(work.camera_frames(), cycles, strict=True):
-        who = f"camera {work.manifest.frames[frames[0]].camera_id}: " if len(cycles) > 1 else ""
-        change = float(np.abs(exposure.brightness_steps(work.video[frames])).mean())
-        if cycle.length > 1:
-            steps = ", ".join(f"{cycle.ev[b]:.1f}" for b in cycle.order)
-            first = [cycle.brackets.index(b) for b in cycle.order]
-            notes.append(
-                f"{who}brightness repeats every {cycle.length} frames, from dark to bright frame {first} of the cycle, about {steps} EV "
-                f"(gamma 2.2); this explains {cycle.confidence:.0%} of its changes"
-            )
-        elif change > exposure.MIN_STEP:
-            notes.append(
-                f"{who}brightness changes by {change:.1f} EV from frame to frame, but in no cycle of up to {exposure.MAX_CYCLE} frames; "
-                "list the exposures in a CSV if they were set"
-            )
-        else:
-            notes.append(
-                f"{who}no alternation of exposures found; treated as an ordinary clip of one exposure"
-            )
-    if len({c.length for c in cycles}) > 1:
-        notes.insert(
-            0,
-            f"the cameras disagree on the length of the cycle ({[c.length for c in cycles]}); list the exposures in a CSV",
+    lengths = [cycle.length for cycle in cycles]
+    if len(set(lengths)) > 1:
+        notes.append(
+            f"the cameras disagree on the length of the cycle ({lengths}); "
+            "list the exposures in a CSV"
         )
+    for frames, cycle in zip(work.camera_frames(), cycles, strict=True):
+        camera = ""
+        if len(cycles) > 1:
+            camera = f"camera {work.manifest.frames[frames[0]].camera_id}: "
+        steps = exposure.brightness_steps(work.video[frames])
+        notes.append(camera + cycle_note(cycle, float(np.abs(steps).mean())))
     return notes
+
+
+def cycle_note(cycle: exposure.Cycle, change: float) -> str:
+    """A sentence on a cycle; `change` is the mean EV from frame to frame."""
+    if cycle.length > 1:
+        first = [cycle.brackets.index(b) for b in cycle.order]
+        levels = ", ".join(f"{cycle.ev[b]:.1f}" for b in cycle.order)
+        return (
+            f"brightness repeats every {cycle.length} frames, from dark to bright frame {first} "
+            f"of the cycle, about {levels} EV (gamma 2.2); this explains "
+            f"{cycle.confidence:.0%} of its changes"
+        )
+    if change > exposure.MIN_STEP:
+        return (
+            f"brightness changes by {change:.1f} EV from frame to frame, but in no cycle of up "
+            f"to {exposure.MAX_CYCLE} frames; list the exposures in a CSV if they were set"
+        )
+    return "no alternation of exposures found; treated as an ordinary clip of one exposure"
+
+
+# Frames to hold out
+
+
+def frames_to_hold_out(work: Work) -> set[int]:
+    """Indices of the frames to hold out of training, chosen camera by camera."""
+    cycle = work.manifest.cycle
+    chosen: set[int] = set()
+    for frames in work.camera_frames():
+        match work.config.protocol:
+            case "novel-view":
+                numbers = []
+            case "novel-view-time":
+                numbers = ingest.frames_between(len(frames), cycle)
+            case None:
+                numbers = ingest.held_out(len(frames), hold_out_spacing(work), cycle)
+        chosen.update(frames[k] for k in numbers)
+    return chosen
+
+
+def hold_out_spacing(work: Work) -> int:
+    """Every this many frames are held out of training; 0 for none.
+
+    None are where a data set brings held-out views of its own.
+    """
+    if work.config.hold_out is not None:
+        return work.config.hold_out
+    brings_views = work.capture is not None and work.capture.withheld
+    return 0 if brings_views else ingest.HOLD_OUT
+
+
+def check_protocol(protocol: Protocol, brackets: list[int], held_out: set[int]) -> None:
+    """InputError where the frames that are left show fewer exposures than all.
+
+    `brackets` are those of all frames, `held_out` the indices of the others.
+    """
+    shown = set(brackets)
+    trained = {bracket for i, bracket in enumerate(brackets) if i not in held_out}
+    if len(trained) < len(shown):
+        raise InputError(
+            f"--protocol {protocol}: of {len(brackets)} frames it trains on "
+            f"{len(brackets) - len(held_out)}, which show only {len(trained)} of {len(shown)} "
+            "exposures; use a longer clip, or --hold-out"
+        )

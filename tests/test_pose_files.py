@@ -7,6 +7,7 @@ import struct
 
 import numpy as np
 import pytest
+from mutations import check_json_reader, check_reader
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
@@ -18,9 +19,8 @@ W, H, FOCAL = 64, 48, 50.0
 POINT = np.array([0.3, -0.2, 5.0])
 # cameras 0.5 apart, each turned by 0, 10, 20 degrees about the vertical
 TURNS = Rotation.from_euler("y", [[0], [10], [20]], degrees=True).as_matrix().reshape(3, 3, 3)
-C2W = np.concatenate(
-    [TURNS, np.array([[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]])[:, :, None]], 2
-)  # OpenCV: right, down, forward
+# OpenCV: right, down, forward
+C2W = np.concatenate([TURNS, np.array([[0.0, 0, 0], [0.5, 0, 0], [1, 0, 0]])[:, :, None]], 2)
 # camera 0 is the world: x = 32 + 50 * 0.3 / 5 = 35, y = 24 - 50 * 0.2 / 5 = 22
 PIXEL_0 = np.array([35.0, 22.0])
 NAMES = ["a_0.png", "a_1.png", "a_2.png"]
@@ -113,7 +113,8 @@ def test_colmap_cameras_see_the_point_where_they_did(tmp_path, kind):
     poses = import_poses(tmp_path, NAMES, (H, W))
     assert np.allclose(pixels(poses)[0], PIXEL_0)
     assert np.allclose(pixels(poses), expected())
-    assert np.allclose(poses.points, POINT[None]) and np.allclose(poses.point_errors, 0.25)
+    assert np.allclose(poses.points, POINT[None])
+    assert np.allclose(poses.point_errors, 0.25)
     assert np.allclose(poses.tracks[:, 2:], expected())
     assert np.allclose(poses.frame_errors, 0, atol=1e-6)
 
@@ -141,7 +142,8 @@ def test_llff_axes_and_bounds(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", llff_table())
     poses = import_poses(tmp_path / "poses_bounds.npy", NAMES, (H, W))
     assert np.allclose(pixels(poses), expected())
-    assert poses.near == pytest.approx(0.8 * 2) and poses.far == pytest.approx(1.25 * 10)
+    assert poses.near == pytest.approx(0.8 * 2)
+    assert poses.far == pytest.approx(1.25 * 10)
 
 
 def test_json_of_llff_poses_has_columns_right_up_back(tmp_path):
@@ -162,7 +164,7 @@ def test_frames_are_matched_by_name_not_by_order(tmp_path):
     assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H, W))), expected())
 
 
-def test_cameras_with_the_same_file_names_are_told_apart_by_their_folder(tmp_path):
+def test_cameras_with_the_same_file_names_are_matched_by_their_folder(tmp_path):
     sources = ["left/0.png", "right/0.png", "up/0.png"]
     colmap_text(tmp_path, [sources[0], sources[1], sources[2]])
     order = [2, 0, 1]
@@ -179,9 +181,8 @@ def test_frames_of_a_video_are_matched_in_order(tmp_path):
 def test_a_frame_that_colmap_left_out_lies_between_its_neighbors(tmp_path):
     colmap_text(tmp_path)
     text = (tmp_path / "images.txt").read_text().splitlines()
-    (tmp_path / "images.txt").write_text(
-        "\n".join(text[:3] + text[5:]) + "\n"
-    )  # without the second image
+    # without the second image
+    (tmp_path / "images.txt").write_text("\n".join(text[:3] + text[5:]) + "\n")
     poses = import_poses(tmp_path, NAMES, (H, W))
     assert poses.registered.tolist() == [True, False, True]
     assert np.allclose(poses.c2w[1], C2W[1])  # midway in place and angle
@@ -196,7 +197,7 @@ def test_still_cameras_have_no_parallax(tmp_path):
     assert import_poses(tmp_path, NAMES, (H, W)).parallax == "none"
 
 
-def test_a_model_says_how_often_a_point_was_seen(tmp_path):
+def test_a_model_holds_how_often_a_point_was_seen(tmp_path):
     colmap_binary(tmp_path / "m")
     model = read_model(tmp_path / "m")
     assert model.track_lengths.tolist() == [3]
@@ -263,6 +264,48 @@ def test_poses_that_do_not_fit_are_refused_in_a_sentence(tmp_path, make, words):
     make(tmp_path)
     with pytest.raises(InputError, match=words):
         import_poses(tmp_path, NAMES, (H, W))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"fl_x": 10**400},
+        {"w": 10**400},
+        {"k1": 10**400},
+        {"near": 10**400},
+        {"camera_angle_x": 0, "fl_x": None},
+        {"near": -1.0},
+        {"near": 5.0, "far": 1.0},
+        {"far": float("nan")},
+        {"cx": 1e300},
+    ],
+)
+def test_numbers_that_no_camera_has_are_one_short_sentence(tmp_path, change):
+    write(tmp_path / "transforms.json", transforms(**change))
+    with pytest.raises(InputError, match=r"transforms\.json") as error:
+        import_poses(tmp_path, NAMES, (H, W))
+    assert len(str(error.value)) < 400
+
+
+def test_damaged_poses_are_read_or_refused(tmp_path):
+    def read(folder):
+        return lambda: import_poses(folder, NAMES, (H, W))
+
+    (tmp_path / "llff").mkdir()
+    np.save(tmp_path / "llff/poses_bounds.npy", llff_table())
+    check_reader(tmp_path / "llff/poses_bounds.npy", read(tmp_path / "llff"), 150)
+    path = tmp_path / "transforms.json"
+    write(path, transforms(near=1.0, far=9.0, k1=0.0))
+    check_reader(path, read(tmp_path), 150)
+    check_json_reader(path, read(tmp_path), 300)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_damaged_colmap_models_are_read_or_refused(tmp_path, name):
+    for make, suffix in ((colmap_text, "txt"), (colmap_binary, "bin")):
+        make(tmp_path / suffix)
+        path = tmp_path / suffix / f"{name}.{suffix}"
+        check_reader(path, lambda p=path: import_poses(p.parent, NAMES, (H, W)), 150)
 
 
 def test_most_frames_must_have_a_pose(tmp_path):

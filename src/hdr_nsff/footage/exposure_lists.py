@@ -1,0 +1,179 @@
+"""Exposures that somebody wrote down: on the command line, in a CSV beside the frames,
+in the EXIF of photographs.
+
+All become EV, log2 of an exposure to any reference. Exposure times are in seconds;
+EXIF counts sensitivity and aperture too.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.footage.ingest import Footage, check_number
+from hdr_nsff.scene.manifest import MAX_EV
+
+EXAMPLE = "write times like 1/250 and EV like -2"
+
+
+# Command line
+
+
+def parse_exposures(exposures: str | None, ev: str | None) -> list[float] | None:
+    """The EV of each frame of one cycle, from the command line.
+
+    `exposures` are times in seconds (1/1000,1/250), `ev` is -4,-2; None where neither
+    is given, or they are "auto".
+    """
+    times_given = exposures is not None and exposures.strip() != "auto"
+    if times_given and ev is not None:
+        raise InputError("--exposures and --ev both given; leave one out")
+    if times_given:
+        assert exposures is not None
+        return [log2_seconds(text, "--exposures") for text in exposures.split(",")]
+    if ev is None or ev.strip() == "auto":
+        return None
+    cycle = [parse_number(text, "--ev") for text in ev.split(",")]
+    for value in cycle:
+        check_number("--ev", value, -MAX_EV, MAX_EV)
+    return cycle
+
+
+def parse_number(text: str, where: str) -> float:
+    """A finite number written as 2, -0.5 or 1/3; InputError that names `where`."""
+    shown = repr(shorten(text))
+    above, slash, below = text.partition("/")
+    try:
+        value = float(above) / float(below) if slash else float(above)
+    except ZeroDivisionError as error:
+        raise InputError(f"{where}: {shown} divides by zero; {EXAMPLE}") from error
+    except ValueError as error:
+        raise InputError(f"{where}: {shown} is not a number; {EXAMPLE}") from error
+    if not math.isfinite(value):
+        raise InputError(f"{where}: {shown} is not finite; {EXAMPLE}")
+    return value
+
+
+def log2_seconds(text: str, where: str) -> float:
+    """The EV of an exposure time in seconds; InputError that names `where`."""
+    seconds = parse_number(text, where)
+    if seconds <= 0:
+        raise InputError(
+            f"{where}: an exposure of {shorten(text)} seconds cannot be; write times like 1/250"
+        )
+    return math.log2(seconds)
+
+
+# CSV
+
+
+def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
+    """The CSV beside the frames and its EV by frame; None where there is none.
+
+    Frames go by file name or `#number`. Columns: `file` (or `frame`, a number from 0),
+    and `exposure` (seconds) or `ev`. InputError that names the line of what is not
+    understood.
+    """
+    path = footage.path / "exposures.csv"
+    if footage.video:
+        path = footage.path.with_suffix(".csv")
+    if not path.is_file():
+        return None
+    reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
+    try:
+        name, value = find_columns(path, reader.fieldnames or [])
+        read = log2_seconds if value == "exposure" else parse_number
+        rows = {}
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            check_cells(row, (name, value), where)
+            key = row[name].strip()
+            if name == "frame":
+                key = f"#{key}"
+            rows[key] = read(row[value], where)
+    except csv.Error as error:
+        line = reader.line_num + 1
+        raise InputError(
+            f"{path}, line {line}: no readable CSV ({error}); correct the line"
+        ) from error
+    return path, rows
+
+
+def read_utf8(path: Path) -> str:
+    """A text file, with or without a byte order mark.
+
+    InputError that names the line where it is not UTF-8.
+    """
+    data = path.read_bytes()
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise InputError(
+            f"{path}, line {line}: not UTF-8 text; save the list as CSV UTF-8"
+        ) from error
+
+
+def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, str]:
+    """The columns that name the frame and hold its exposure; InputError without."""
+    name = next((c for c in ("file", "frame") if c in columns), None)
+    value = next((c for c in ("exposure", "ev") if c in columns), None)
+    if name is None or value is None:
+        found = shorten(", ".join(columns)) or "none"
+        raise InputError(
+            f"{path}: its columns are {found}; it needs `file` or `frame`, "
+            "and `exposure` (seconds) or `ev`, separated by commas"
+        )
+    return name, value
+
+
+def check_cells(row: Mapping[str | Any, Any], columns: Sequence[str], where: str) -> None:
+    """InputError where a row of a CSV has too few or too many cells.
+
+    Each of `columns` needs one; empty ones at the end of the row are passed over.
+    """
+    lost = next((c for c in columns if row[c] is None), None)
+    if lost is not None:
+        raise InputError(f"{where}: no value for column {lost}; complete the line")
+    if any(row.get(None, ())):  # where `csv` puts the surplus
+        raise InputError(
+            f"{where}: more values than columns; separate values by commas, decimals by a point"
+        )
+
+
+# EXIF
+
+
+def read_exif_ev(path: Path) -> float | None:
+    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF.
+
+    None where it has no exposure time, or is damaged.
+    """
+    import exifread
+
+    # it warns of every picture without EXIF
+    logging.getLogger("exifread").setLevel(logging.ERROR)
+    try:
+        with open(path, "rb") as file:
+            tags = exifread.process_file(file, details=False)
+    except Exception:  # many unrelated types, for damaged EXIF
+        return None
+    seconds = exif_number(tags, "EXIF ExposureTime") or 0.0
+    iso = exif_number(tags, "EXIF ISOSpeedRatings") or 100.0
+    aperture = exif_number(tags, "EXIF FNumber") or 1.0
+    exposure = seconds * iso / 100 / aperture**2
+    return math.log2(exposure) if 0 < exposure < math.inf else None
+
+
+def exif_number(tags: Mapping[str, Any], name: str) -> float | None:
+    """The first value of an EXIF tag; None where it is missing or no number."""
+    try:
+        return float(tags[name].values[0])
+    except (KeyError, ArithmeticError, ValueError, TypeError, IndexError):
+        return None

@@ -1,0 +1,268 @@
+"""Formats of poses: a COLMAP model, `transforms.json` (nerfstudio, Blender),
+`poses_bounds.npy` (LLFF), and the JSON of LLFF poses that non-rigid NeRF publishes.
+
+Every convention is converted here: c2w OpenCV (+x right, +y down, +z forward), pixels
+with centers at +0.5. The world and its units stay as they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.core.io import read_json
+from hdr_nsff.footage.arrays import read_array
+from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
+from hdr_nsff.scene.manifest import MAX_NUMBER
+
+# columns right, up, back -> right, down, forward
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+# columns down, right, back -> right, down, forward
+FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
+# pixels by which a corner may be off where lens distortion is left out (hand-chosen)
+MAX_DISTORTION_PX = 2.0
+# models whose distortion is that of OpenCV: k1, k2, p1, p2, or the first of these
+OPENCV_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+# what Python and numpy raise for JSON values of another shape or size than expected
+UNREADABLE = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
+
+
+@dataclass(frozen=True)
+class GivenPoses:
+    """Poses as a file has them, in its own order."""
+
+    names: list[str] | None  # image file names, None: only the order counts
+    K: np.ndarray  # (N, 3, 3) pixels of `size`
+    c2w: np.ndarray  # (N, 3, 4) OpenCV
+    size: np.ndarray  # (N, 2) width, height that K is for; a height of 0 is unknown
+    near: float | None = None  # z-depth, units of the poses
+    far: float | None = None
+
+
+# COLMAP
+
+
+def from_colmap(path: Path, model: ColmapModel) -> GivenPoses:
+    """The poses of a COLMAP model, by image name; `path` is what messages name."""
+    if not model.images:
+        raise InputError(f"{path}: the COLMAP model has no registered images; map again")
+    images = sorted(model.images.values(), key=lambda i: i.name)
+    cameras = [model.cameras[i.camera_id] for i in images]
+    for camera_id in sorted({i.camera_id for i in images}):
+        camera = model.cameras[camera_id]
+        distortion = colmap_distortion(path, camera)
+        check_distortion(path, camera.K, camera.width, camera.height, distortion)
+    return GivenPoses(
+        names=[i.name for i in images],
+        K=np.stack([c.K for c in cameras]),
+        c2w=np.stack([i.c2w for i in images]),
+        size=np.array([(c.width, c.height) for c in cameras], np.float64),
+    )
+
+
+def colmap_distortion(path: Path, camera: ColmapCamera) -> np.ndarray:
+    """k1, k2, p1, p2 of OpenCV's model.
+
+    InputError for models beyond it, unless nothing is distorted.
+    """
+    values = camera.distortion
+    if camera.model in OPENCV_MODELS or not np.any(values):
+        return np.pad(values, (0, 4))[:4]
+    raise InputError(
+        f"{path}: camera model {camera.model} bends rays; undistort the frames "
+        "(colmap image_undistorter) and export again"
+    )
+
+
+def check_distortion(
+    path: Path, K: np.ndarray, width: float, height: float, distortion: np.ndarray
+) -> None:
+    """InputError where a pinhole would misplace a corner by over `MAX_DISTORTION_PX`.
+
+    `distortion` (4,) is k1, k2, p1, p2 of OpenCV's model, `K` (3, 3) is in pixels.
+    """
+    k1, k2, p1, p2 = distortion
+    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)])
+    with np.errstate(all="ignore"):  # impossible numbers are refused later
+        x, y = ((corners - K[:2, 2]) / K[(0, 1), (0, 1)]).T
+        r2 = x * x + y * y
+        radial = k1 * r2 + k2 * r2 * r2
+        dx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        dy = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        worst = np.hypot(dx * K[0, 0], dy * K[1, 1]).max()
+    if worst > MAX_DISTORTION_PX:
+        raise InputError(
+            f"{path}: lens distortion moves corners by {worst:.0f} px; undistort the frames "
+            "(colmap image_undistorter) and export again"
+        )
+
+
+# LLFF
+
+
+def from_llff(path: Path) -> GivenPoses:
+    """The poses of a `poses_bounds.npy`."""
+    return llff_rows(llff_table(path, 17))
+
+
+def llff_table(path: Path, columns: int) -> np.ndarray:
+    """The numbers (N, columns) float64 of a `.npy` as LLFF writes it."""
+    table = read_array(path, np.float64)
+    if table.ndim != 2 or table.shape[1] != columns or not len(table):
+        raise InputError(
+            f"{path}: expected an array (frames, {columns}) as LLFF writes it, found {table.shape}"
+        )
+    return table
+
+
+def llff_rows(table: np.ndarray) -> GivenPoses:
+    """The poses of rows (N, 17) of `poses_bounds.npy`.
+
+    A row is a 3x5 matrix with the columns down, right, back, center, (height, width,
+    focal length), and then near and far.
+    """
+    return llff_poses(table[:, :15].reshape(-1, 3, 5), table[:, 15:], FROM_LLFF)
+
+
+def llff_poses(matrices: np.ndarray, bounds: np.ndarray, columns: np.ndarray) -> GivenPoses:
+    """Poses from LLFF's `matrices` (N, 3, 5) and depth `bounds` (N, 2).
+
+    `columns` (3, 3) turns the first three columns into right, down, forward.
+    """
+    heights, widths, focal = matrices[:, :, 4].T
+    K = np.zeros((len(matrices), 3, 3))
+    K[:, 0, 0] = focal
+    K[:, 1, 1] = focal
+    K[:, 0, 2] = widths / 2
+    K[:, 1, 2] = heights / 2
+    K[:, 2, 2] = 1
+    c2w = np.concatenate([matrices[:, :, :3] @ columns, matrices[:, :, 3:4]], 2)
+    # a single stray point makes a bound of one frame useless: not the minimum, as is
+    # usual, but what nine frames in ten agree on
+    near = float(0.8 * np.percentile(bounds[:, 0], 10))
+    far = float(1.25 * np.percentile(bounds[:, 1], 90))
+    size = np.stack([widths, heights], 1)
+    if not (np.isfinite(bounds).all() and 0 < near < far):
+        return GivenPoses(None, K, c2w, size)
+    return GivenPoses(None, K, c2w, size, near, far)
+
+
+# JSON
+
+
+def from_json(path: Path) -> GivenPoses:
+    """The poses of a `transforms.json`, or of a JSON with `poses` and `bds`.
+
+    The latter holds LLFF's matrices with the columns right, up, back.
+    """
+    try:
+        document = read_json(path)
+        if isinstance(document, dict) and "frames" in document:
+            return parse_transforms(path, document)
+        if isinstance(document, dict) and "poses" in document and "bds" in document:
+            matrices = np.array(document["poses"], np.float64).reshape(-1, 3, 5)
+            bounds = np.array(document["bds"], np.float64).reshape(len(matrices), 2)
+            return llff_poses(matrices, bounds, FROM_OPENGL)
+    except InputError:
+        raise
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
+    raise InputError(
+        f"{path}: neither `frames` (transforms.json) nor `poses` and `bds` in it; "
+        "export the poses again"
+    )
+
+
+def from_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
+    """The poses of a `transforms.json` that is read already; `path` is where it is."""
+    try:
+        return parse_transforms(path, document)
+    except InputError:
+        raise
+    except UNREADABLE as error:
+        raise unreadable(path, error) from error
+
+
+def unreadable(path: Path, error: Exception) -> InputError:
+    """The error for a JSON whose poses are of another shape than they should."""
+    problem = f"{type(error).__name__}: {shorten(error)}"
+    return InputError(f"{path}: not readable as poses ({problem}); export them again")
+
+
+def parse_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
+    """nerfstudio's and Blender's layout: `transform_matrix` c2w with OpenGL axes.
+
+    Intrinsics are for all frames or per frame. One of `UNREADABLE` for values of
+    another shape.
+    """
+    frames = document["frames"]
+    if not frames:
+        raise InputError(f"{path}: no frames in it; export the poses again")
+    lenses = [parse_intrinsics(path, {**document, **frame}) for frame in frames]
+    matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)[:, :3]
+    c2w = np.concatenate([matrices[:, :, :3] @ FROM_OPENGL, matrices[:, :, 3:4]], 2)
+    near, far = parse_range(path, document)
+    return GivenPoses(
+        names=[str(frame["file_path"]) for frame in frames],
+        K=np.stack([K for K, _ in lenses]),
+        c2w=c2w,
+        size=np.array([size for _, size in lenses], np.float64),
+        near=near,
+        far=far,
+    )
+
+
+def parse_range(path: Path, document: Mapping[str, Any]) -> tuple[float | None, float | None]:
+    """`near` and `far` of a JSON; None where it has none, or 0.
+
+    InputError where they are no range of depths.
+    """
+    near = float(document.get("near") or 0)
+    far = float(document.get("far") or 0)
+    least = near if near else 1 / MAX_NUMBER
+    most = far if far else MAX_NUMBER
+    if not (1 / MAX_NUMBER <= least < most <= MAX_NUMBER):
+        raise InputError(
+            f"{path}: near {near:g} and far {far:g} are no range of depths; correct them"
+        )
+    return near or None, far or None
+
+
+def parse_intrinsics(
+    path: Path, values: Mapping[str, Any]
+) -> tuple[np.ndarray, tuple[float, float]]:
+    """K (3, 3) and the size (width, height) that it is for, from the keys of a frame.
+
+    Without a size the unit is the frame's width, and the height 0.
+    """
+    if "fl_x" in values:
+        fx = float(values["fl_x"])
+        fy = float(values.get("fl_y", fx))
+        width = float(values.get("w", 2 * float(values.get("cx", 0))))
+        height = float(values.get("h", 2 * float(values.get("cy", 0))))
+        if width <= 0 or height <= 0:
+            raise InputError(
+                f"{path}: `fl_x` without `w` and `h`: the size that the focal length is for "
+                "is missing; add it"
+            )
+    elif "camera_angle_x" in values:
+        width = float(values.get("w", 1))
+        height = float(values.get("h", 0))
+        fx = width / 2 / math.tan(float(values["camera_angle_x"]) / 2)
+        fy = fx
+        if height and "camera_angle_y" in values:
+            fy = height / 2 / math.tan(float(values["camera_angle_y"]) / 2)
+    else:
+        raise InputError(f"{path}: neither `fl_x` nor `camera_angle_x`: no focal length; add one")
+    cx = float(values.get("cx", width / 2))
+    cy = float(values.get("cy", height / 2))
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    distortion = np.array([float(values.get(key, 0)) for key in ("k1", "k2", "p1", "p2")])
+    check_distortion(path, K, width, height, distortion)
+    return K, (width, height)

@@ -1,0 +1,58 @@
+"""The steps of `prepare` that need the footage alone: what a scene knows after them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_exposure_cycle import clip
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import write_png
+from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.prepare.prepare import PrepareConfig
+from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.scene.manifest import Manifest
+
+
+def work_on(folder: Path, video: np.ndarray, **settings: object) -> Work:
+    """Frames (T, H, W, 3) as footage, with its frames decoded."""
+    for t, frame in enumerate(video):
+        write_png(folder / f"clip/{t:03d}.png", frame)
+    config = PrepareConfig(folder / "clip", folder / "scene", **settings)
+    manifest = Manifest(source="clip", width=1, height=1)
+    work = Work(config, open_footage(config.clip), manifest)
+    frames_step(work)
+    return work
+
+
+def test_a_cycle_that_goes_up_and_down_again_has_three_exposures(tmp_path: Path) -> None:
+    work = work_on(tmp_path, clip([-2, 0, 2, 0], frames=20))
+    assert exposure_step(work).note.startswith("cycle of 4, 3 exposures (brightness)")
+    assert [f.bracket for f in work.manifest.frames] == [0, 1, 2, 1] * 5
+    assert work.manifest.bracket_ev == [None] * 3
+
+
+def test_a_list_and_the_brightness_find_the_same_brackets(tmp_path: Path) -> None:
+    work = work_on(tmp_path, clip([0, 2, 0, -2], frames=20), ev="0,2,0,-2")
+    assert exposure_step(work).note.startswith("cycle of 4, 3 exposures (flags)")
+    assert [f.bracket for f in work.manifest.frames] == [0, 1, 0, 2] * 5
+    evs = [f.ev or 0.0 for f in work.manifest.frames[:4]]  # relative to the best exposed one
+    assert np.diff(evs).tolist() == [2, -2, -2]
+
+
+def test_the_frames_of_brackets_are_named_by_their_place_in_the_cycle(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    exposure_step(work_on(tmp_path, clip([0, 2, 0, -2], frames=20)))
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "from dark to bright frame [3, 0, 1] of the cycle" in printed
+
+
+def test_exposures_beyond_all_light_are_one_sentence(tmp_path: Path) -> None:
+    rows = "".join(f"{t:03d}.png,1e-{30 * (t % 3)}\n" for t in range(12))
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text(f"file,exposure\n{rows}")
+    work = work_on(tmp_path, clip([-2, 0, 2], frames=12))
+    with pytest.raises(InputError, match=r"exposures\.csv: bracket_ev holds"):
+        exposure_step(work)
