@@ -29,7 +29,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.process import hold_threads, prepare_process
+from hdr_nsff.core.process import limit_torch_threads, prepare_process
 from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.budget import Budget
@@ -101,7 +101,7 @@ def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any
             trainer.clock = replace(trainer.clock, step=trainer.clock.step + 1)
 
         def picture() -> None:
-            hold_threads(config.torch_threads)
+            limit_torch_threads(config.torch_threads)
             frame = scene.train[trainer.clock.step % len(scene.train)]
             render = trainer.field.render(frame.camera, frame.time, scene_flow=False)
             trainer.tonemapper.develop(render.radiance, 0.0)

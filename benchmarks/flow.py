@@ -29,7 +29,7 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import read_npy, write_json
 from hdr_nsff.core.process import prepare_process
-from hdr_nsff.geometry.round_trip import agreement
+from hdr_nsff.geometry.round_trip import valid_flow
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.flow.dense import (
     average_with_reverse,
@@ -205,7 +205,7 @@ def measure(
         there, back = (exact(frames[a], b - a) for a, b in ((i, j), (j, i)))
         errors.append(np.linalg.norm(one - there, axis=-1))
         moving.append(frames[i]["body"] > 0)
-        seen.append(agreement(there, back, nothing, nothing))
+        seen.append(valid_flow(there, back, nothing, nothing))
     error, moves, counts = np.stack(errors), np.stack(moving), np.stack(seen)
     return {
         "moving": summary(error[counts & moves]),

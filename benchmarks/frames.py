@@ -25,7 +25,7 @@ import numba
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.process import hold_threads, prepare_process
+from hdr_nsff.core.process import limit_torch_threads, prepare_process
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.geometry.cameras import Camera
@@ -137,7 +137,7 @@ def measure(
     """Median milliseconds of a frame, and how many a second that are."""
 
     def frame(i: int) -> Tensor:
-        hold_threads(1)
+        limit_torch_threads(1)
         time = float(field.times[0]) + (i % 97) / 97 * float(field.times[-1] - field.times[0])
         render = field.render(camera, time, scene_flow=flow)
         rgb = tonemapper(render.radiance, 0, 0, None, leaky=False)

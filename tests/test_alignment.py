@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.geometry.alignment import carry, pose_errors, scale_between, umeyama
+from hdr_nsff.geometry.alignment import pose_errors, scale_between, transfer_pose, umeyama
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 SHIFT = np.array([1.0, -2.0, 0.5])
@@ -65,4 +65,6 @@ def test_the_scale_between_worlds_is_found_and_is_one_for_given_poses():
 def test_a_carried_pose_is_the_pose_in_the_other_world():
     poses = random_poses(2)
     other = in_another_world(poses, 2.5)
-    np.testing.assert_allclose(carry(other[0], poses[0], poses[1], 2.5), other[1], atol=1e-12)
+    np.testing.assert_allclose(
+        transfer_pose(other[0], poses[0], poses[1], 2.5), other[1], atol=1e-12
+    )

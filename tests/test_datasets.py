@@ -18,7 +18,7 @@ from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.datasets import held_out_views, layout_of, recognize
 from hdr_nsff.footage.datasets.capture import Capture, Clock, number_cameras
-from hdr_nsff.footage.pose_files import placed
+from hdr_nsff.footage.pose_files import fit_poses
 from hdr_nsff.footage.pose_formats import GivenPoses
 
 SETS = {
@@ -60,7 +60,7 @@ def misses(
     """How far the dot of a picture is from where its camera should see it, at worst, in
     pixels.
     """
-    poses = placed(root, given, list(range(len(files))), size)
+    poses = fit_poses(root, given, list(range(len(files))), size)
     worst = 0.0
     for path, K, c2w in zip(files, poses.K, poses.c2w, strict=True):
         x, y, z = K @ (c2w[:, :3].T @ (mini.DOT - c2w[:, 3]))
@@ -306,7 +306,7 @@ def read_whole(root: Path) -> None:
         return
     capture.footage()
     if capture.poses is not None:
-        placed(root, capture.poses, list(range(len(capture.pictures))), (mini.H, mini.W))
+        fit_poses(root, capture.poses, list(range(len(capture.pictures))), (mini.H, mini.W))
     if capture.withheld:
         held_out_views.read_views(capture)
 

@@ -11,9 +11,9 @@ from hdr_nsff.radiometry.debevec import (
     LOW,
     SATURATED,
     Samples,
+    brackets_linked,
     brightness_ev,
     debevec,
-    linked,
     response_of,
     saturation,
     typical_factor,
@@ -122,9 +122,9 @@ def test_the_response_rises_even_where_the_fit_falls():
 
 def test_brackets_without_common_points_are_not_linked():
     samples = points(SRGB, EV)
-    assert linked(samples, [0, 1, 2])
+    assert brackets_linked(samples, [0, 1, 2])
     samples.valid[:, 0] = False
-    assert linked(samples, [1, 2]) and not linked(samples, [0, 1, 2])
+    assert brackets_linked(samples, [1, 2]) and not brackets_linked(samples, [0, 1, 2])
 
 
 def test_brightness_alone_gives_gamma_exposures():

@@ -24,7 +24,7 @@ from posed_planes import (
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.io import write_npy
-from hdr_nsff.footage.depth_files import read_depth
+from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.priors.depth import geometric as depth_module
 from hdr_nsff.priors.movers.distance import (
     differences,
@@ -258,10 +258,10 @@ def test_given_maps_become_disparity_by_their_kind(tmp_path):
     write_npy(tmp_path / "0.npy", values)
     write_exr(tmp_path / "1.exr", {"Z": values})
     files = [tmp_path / "0.npy", tmp_path / "1.exr"]
-    disparity, confidence = read_depth(files, "metric", (H, W))
+    disparity, confidence = read_depth_files(files, "metric", (H, W))
     assert np.allclose(disparity, 0.25) and confidence[0, 0, 0] == 0 and confidence[:, 1:].all()
-    assert np.allclose(read_depth(files, "disparity", (H, W))[0][:, 1:], 4.0)
-    assert np.allclose(read_depth(files, "relative", (H, W))[0][0], values)
+    assert np.allclose(read_depth_files(files, "disparity", (H, W))[0][:, 1:], 4.0)
+    assert np.allclose(read_depth_files(files, "relative", (H, W))[0][0], values)
 
 
 @pytest.mark.parametrize(
@@ -275,4 +275,4 @@ def test_given_maps_become_disparity_by_their_kind(tmp_path):
 def test_a_bad_depth_map_is_one_sentence(tmp_path, values, words):
     write_npy(tmp_path / "0.npy", values)
     with pytest.raises(InputError, match=words):
-        read_depth([tmp_path / "0.npy"], "metric", (H, W))
+        read_depth_files([tmp_path / "0.npy"], "metric", (H, W))

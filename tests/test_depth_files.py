@@ -8,7 +8,7 @@ from mutations import check_reader
 
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
-from hdr_nsff.footage.depth_files import read_depth
+from hdr_nsff.footage.depth_files import read_depth_files
 
 DEPTH = np.random.default_rng(0).uniform(1, 5, (6, 8)).astype(np.float32)
 
@@ -23,4 +23,4 @@ def test_damaged_depth_is_read_or_refused(tmp_path: Path, suffix: str) -> None:
             write_exr(path, {"Z": DEPTH})
         case _:
             write_png(path, DEPTH / 5, bits=16)
-    check_reader(path, lambda: read_depth([path], "metric", DEPTH.shape), 100)
+    check_reader(path, lambda: read_depth_files([path], "metric", DEPTH.shape), 100)

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from hdr_nsff.radiometry.exposure_cycle import (
     ExposureCycleTuning,
-    by_value,
+    brackets_by_ev,
     common_brackets,
+    contradictions,
     detect_cycle,
-    doubts,
     equalize,
     period,
     reference_bracket,
@@ -140,18 +140,18 @@ def test_period_of_a_repeated_sequence_divides_it(length, repeats):
 
 
 def test_equal_values_share_a_bracket():
-    brackets, ev = by_value([-2, 0, 2, 0, -2])
+    brackets, ev = brackets_by_ev([-2, 0, 2, 0, -2])
     assert brackets == [0, 1, 2, 1, 0]
     assert ev == [-2, 0, 2]
 
 
 def test_a_right_list_raises_no_doubts_and_wrong_ones_do():
     video = clip([-2, 0, 2])
-    assert doubts(video, [-2, 0, 2] * 8) == []
-    assert "go the way" in doubts(video, [2, 0, -2] * 8)[0]
-    assert "changes the brightness like" in doubts(video, [-0.5, 0, 0.5] * 8)[0]
-    assert "equally bright" in doubts(clip([0]), [-2, 0, 2] * 8)[0]
-    assert "repeats every 3" in doubts(video, [0.0] * 24)[0]
+    assert contradictions(video, [-2, 0, 2] * 8) == []
+    assert "go the way" in contradictions(video, [2, 0, -2] * 8)[0]
+    assert "changes the brightness like" in contradictions(video, [-0.5, 0, 0.5] * 8)[0]
+    assert "equally bright" in contradictions(clip([0]), [-2, 0, 2] * 8)[0]
+    assert "repeats every 3" in contradictions(video, [0.0] * 24)[0]
 
 
 def test_reference_is_the_best_exposed_bracket():

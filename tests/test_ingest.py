@@ -15,9 +15,9 @@ from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.ingest import (
-    every_of,
     hash_file,
-    held_out,
+    hold_out_every,
+    hold_out_spacing,
     open_footage,
     read_frame,
     read_frames,
@@ -147,12 +147,12 @@ def test_damaged_videos_are_read_or_refused(tmp_path):
 
 
 def test_held_out_frames_go_through_all_exposures():
-    chosen = held_out(100, 8, 4)
+    chosen = hold_out_every(100, 8, 4)
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
     assert {k % 4 for k in chosen} == {0, 1, 2, 3}
-    assert held_out(100, 0, 3) == []
-    assert 0 not in held_out(9, 2, 1)
-    assert 8 not in held_out(9, 2, 1)
+    assert hold_out_every(100, 0, 3) == []
+    assert 0 not in hold_out_every(9, 2, 1)
+    assert 8 not in hold_out_every(9, 2, 1)
 
 
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="Linux alone has it")
@@ -219,14 +219,14 @@ def test_a_broken_raw_photograph_is_named(tmp_path):
 def test_the_spacing_of_held_out_frames_is_found_again(every: int, cycle: int) -> None:
     """For a clip of any length, the spacing found holds out the same frames."""
     for count in range(every + 2, 40):
-        frames = held_out(count, every, cycle)
+        frames = hold_out_every(count, every, cycle)
         if frames:
-            found = every_of(frames)
+            found = hold_out_spacing(frames)
             assert found is not None
-            assert held_out(frames[-1] + 2, found, cycle) == frames
+            assert hold_out_every(frames[-1] + 2, found, cycle) == frames
 
 
 def test_unevenly_spaced_frames_have_no_spacing() -> None:
-    assert every_of([0, 8]) is None
-    assert every_of([4, 8]) is None
-    assert every_of([1, 2, 4]) is None
+    assert hold_out_spacing([0, 8]) is None
+    assert hold_out_spacing([4, 8]) is None
+    assert hold_out_spacing([1, 2, 4]) is None

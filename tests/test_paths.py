@@ -50,9 +50,11 @@ def test_reach_is_half_the_range_in_the_axes_of_the_camera() -> None:
     cameras = [
         camera(0.0, x, 0.0, 0.0) for x in torch.linspace(0, 1, 11).tolist()
     ]  # 10th to 90th percentile: 0.1 to 0.9
-    assert torch.allclose(paths.reach(cameras, camera()), torch.tensor([0.4, 0, 0]), atol=1e-6)
     assert torch.allclose(
-        paths.reach(cameras, camera(90.0)), torch.tensor([0, 0, 0.4]), atol=1e-6
+        paths.center_spread(cameras, camera()), torch.tensor([0.4, 0, 0]), atol=1e-6
+    )
+    assert torch.allclose(
+        paths.center_spread(cameras, camera(90.0)), torch.tensor([0, 0, 0.4]), atol=1e-6
     )  # now it looks along x
 
 
@@ -69,14 +71,14 @@ def test_slow_motion_divides_uneven_intervals_and_glides_the_camera() -> None:
 def test_training_path_and_fixed_camera_pair_cameras_with_times() -> None:
     a, b = camera(), camera(5.0)
     assert [(v.camera, v.time) for v in paths.training_path([a, b], [0, 2])] == [(a, 0.0), (b, 2.0)]
-    assert [(v.camera, v.time, v.ev) for v in paths.fixed(b, [0, 2])] == [
+    assert [(v.camera, v.time, v.ev) for v in paths.fixed_path(b, [0, 2])] == [
         (b, 0.0, None),
         (b, 2.0, None),
     ]
 
 
 def test_resizing_a_view_keeps_what_it_sees() -> None:
-    small = paths.View(camera(), 1.0).resized(0.5).camera
+    small = paths.PathView(camera(), 1.0).resized(0.5).camera
     point = torch.tensor([0.3, -0.2, 2.0])
     assert (small.width, small.height) == (16, 12)
     assert torch.allclose(small.project(point)[0] * 2, camera().project(point)[0])

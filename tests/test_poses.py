@@ -6,7 +6,7 @@ from posed_clips import H, K, W
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.geometry.poses import Poses, interpolate, project, ranges, trusted_points
+from hdr_nsff.geometry.poses import Poses, format_ranges, interpolate, project, trusted_points
 
 
 def test_missing_poses_lie_between_their_neighbors():
@@ -43,8 +43,8 @@ def test_points_seen_twice_or_badly_are_not_trusted():
 
 
 def test_ranges_of_frames_read_well():
-    assert ranges([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
-    assert ranges(list(range(0, 40, 2))).endswith("...")
+    assert format_ranges([1, 2, 3, 7, 9, 10]) == "1-3, 7, 9-10"
+    assert format_ranges(list(range(0, 40, 2))).endswith("...")
 
 
 def test_a_single_registered_frame_lends_its_pose_to_all():

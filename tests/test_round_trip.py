@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hdr_nsff.geometry.round_trip import agreement, follow
+from hdr_nsff.geometry.round_trip import follow, valid_flow
 
 H, W = 64, 96
 NONE_CLIPPED = np.zeros((H, W), bool)
@@ -18,20 +18,20 @@ def test_pixels_clipped_at_either_end_are_invalid():
     clipped_to = NONE_CLIPPED.copy()
     clipped_from[10, 20] = True
     clipped_to[30, 43] = True
-    valid = agreement(constant(3, 0), constant(-3, 0), clipped_from, clipped_to)
+    valid = valid_flow(constant(3, 0), constant(-3, 0), clipped_from, clipped_to)
     assert not valid[10, 20] and not valid[30, 40]  # (40 + 3, 30) is clipped
     assert valid[10, 21] and valid[30, 41]
 
 
 def test_flow_out_of_the_frame_is_invalid():
-    valid = agreement(constant(3, 0), constant(-3, 0), NONE_CLIPPED, NONE_CLIPPED)
+    valid = valid_flow(constant(3, 0), constant(-3, 0), NONE_CLIPPED, NONE_CLIPPED)
     assert valid[:, : W - 3].all() and not valid[:, W - 3 :].any()
 
 
 def test_round_trips_beyond_half_a_pixel_are_rejected():
     """Tolerance is 0.5 px + 1 % of the length: 0.53 px for a motion of 3 px."""
-    within = agreement(constant(3, 0), constant(-3.5, 0), NONE_CLIPPED, NONE_CLIPPED)
-    beyond = agreement(constant(3, 0), constant(-3.6, 0), NONE_CLIPPED, NONE_CLIPPED)
+    within = valid_flow(constant(3, 0), constant(-3.5, 0), NONE_CLIPPED, NONE_CLIPPED)
+    beyond = valid_flow(constant(3, 0), constant(-3.6, 0), NONE_CLIPPED, NONE_CLIPPED)
     assert within[:, :-4].all()
     assert not beyond.any()
 

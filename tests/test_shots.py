@@ -16,18 +16,18 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import REC709, read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.core.video import read_video
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.shots import Output, Shot, fingerprint, render_shot
 
 
 def shot_of(*times: float) -> Shot:
     """Views of one camera."""
-    return Shot("some", [View(camera(), time) for time in times], 12)
+    return Shot("some", [PathView(camera(), time) for time in times], 12)
 
 
 def test_exr_holds_radiance_depth_motion_and_motion_vectors(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
-    view = View(camera(0.1), 2.0)
+    view = PathView(camera(0.1), 2.0)
     render_shot(run, Shot("one", [view], 12), tmp_path / "out", Output(exr="float"))
     seen = read_exr(tmp_path / "out/one/00000.exr")
     truth = run.field.render(view.camera, 2.0)
@@ -42,7 +42,7 @@ def test_exr_holds_radiance_depth_motion_and_motion_vectors(tmp_path: Path) -> N
 
 
 def test_exr_header_names_primaries_exposure_and_time(tmp_path: Path) -> None:
-    shot = Shot("one", [View(camera(), 1.5, ev=-2.0)], 12)
+    shot = Shot("one", [PathView(camera(), 1.5, ev=-2.0)], 12)
     render_shot(fake_run(tmp_path), shot, tmp_path, Output())
     with OpenEXR.File(str(tmp_path / "one/00000.exr")) as file:
         header = dict(file.header())

@@ -18,7 +18,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.evaluate import evaluate_run, views_of_clip
 from hdr_nsff.evaluation.report import check_place, write_report
 from hdr_nsff.fields.build import device_for
-from hdr_nsff.footage.ingest import every_of
+from hdr_nsff.footage.ingest import hold_out_spacing
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.rendering.render import render_all
 from hdr_nsff.training.budget import Budget
@@ -132,7 +132,7 @@ def held_out_every(config: RunConfig) -> int | None:
         return config.hold_out
     if not frames:
         return 0
-    every = every_of(frames)
+    every = hold_out_spacing(frames)
     if every is None:
         first = ", ".join(str(frame) for frame in frames[:4])
         more = ", ..." if len(frames) > 4 else ""

@@ -57,7 +57,7 @@ def keep_memory() -> bool:
     return all(accepted)
 
 
-def hold_threads(count: int) -> None:
+def limit_torch_threads(count: int) -> None:
     """Let torch use `count` threads; 0 leaves the number as it is. Call it before every
     step or frame: numba's kernels set the thread count of the OpenMP library that both
     share.

@@ -20,7 +20,7 @@ from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.targets import Target
 from hdr_nsff.fields import base
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.interpolate import LayeredField, render_at
 from hdr_nsff.rendering.shots import device_of, fingerprint
 from hdr_nsff.scene.batch import Recorder
@@ -39,7 +39,7 @@ class Geometry:
 
 
 def predict(
-    run: Run, views: Mapping[str, View], folder: Path, description: str, motion: bool
+    run: Run, views: Mapping[str, PathView], folder: Path, description: str, motion: bool
 ) -> list[Path]:
     """Render an EXR per named view, `folder`/NAME.exr: radiance and depth.
 
@@ -59,7 +59,7 @@ def predict(
     return list(files.values())
 
 
-def render_maps(run: Run, view: View, motion: bool) -> dict[str, np.ndarray]:
+def render_maps(run: Run, view: PathView, motion: bool) -> dict[str, np.ndarray]:
     """The EXR channels of one view.
 
     Where a time between frames is splatted, the scene flow is that of the field at
@@ -106,7 +106,7 @@ def radiance_of(path: Path) -> Tensor:
     return torch.from_numpy(read_exr(path)["RGB"])
 
 
-def geometry_of(path: Path, view: View) -> Geometry:
+def geometry_of(path: Path, view: PathView) -> Geometry:
     """Depth and motion of a prediction, in scene units."""
     channels = {name: torch.from_numpy(array) for name, array in read_exr(path).items()}
     depth = channels["Z"]

@@ -19,7 +19,7 @@ from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.progress import say
 from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, inside
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
@@ -46,7 +46,7 @@ class Target:
 
     name: str
     group: str
-    view: View
+    view: PathView
     bracket: int
     camera_id: int
     rgb: dict[int, Tensor]  # {bracket: (H, W, 3)} recordings of the true camera in [0, 1]
@@ -125,7 +125,7 @@ def frame_targets(frames: Sequence[Frame], group: str) -> list[Target]:
         Target(
             name=f"{frame.index:05d}",
             group=group,
-            view=View(frame.camera, frame.time),
+            view=PathView(frame.camera, frame.time),
             bracket=frame.bracket,
             camera_id=frame.camera_id,
             rgb={frame.bracket: frame.image.cpu()},
@@ -188,7 +188,7 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     if view.c2w is not None:
         assert truth.clip_c2w is not None, "world_scale refuses this"
         anchor_pose = np.array(truth.clip_c2w[view.anchor])
-        pose = alignment.carry(pose, anchor_pose, np.array(view.c2w), scale)
+        pose = alignment.transfer_pose(pose, anchor_pose, np.array(view.c2w), scale)
     height, width = pictures[view.bracket].shape[:2]
     size = (height, width)
     match = scene_brackets(truth, run.scene.manifest.frames, run.tonemapper.exposures().tolist())
@@ -205,7 +205,7 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
     return Target(
         name=view.name,
         group=group_of(run, view),
-        view=View(camera_of(run, view, anchor, pose, size), view.time),
+        view=PathView(camera_of(run, view, anchor, pose, size), view.time),
         bracket=match[view.bracket],
         camera_id=anchor.camera_id,
         rgb=known,

@@ -18,7 +18,7 @@ from hdr_nsff.geometry.fill import fill
 DepthKind = Literal["metric", "disparity", "relative"]
 
 
-def read_depth(
+def read_depth_files(
     files: list[Path], kind: DepthKind, size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparity and confidence (T, H, W) of depth maps, one file per frame.

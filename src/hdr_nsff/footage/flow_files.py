@@ -16,10 +16,10 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.arrays import read_array, read_arrays
-from hdr_nsff.geometry.round_trip import agreement
+from hdr_nsff.geometry.round_trip import valid_flow
 
 
-def read_flow(
+def read_flow_files(
     folder: Path | str, pairs: Iterable[tuple[int, int]], size: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` of frame numbers.
@@ -62,7 +62,7 @@ def check_reverse(folder: Path, i: int, j: int, flow: np.ndarray) -> np.ndarray 
     size = (flow.shape[0], flow.shape[1])
     reverse, _ = read_pair(folder, j, i, size)
     nothing_clipped = np.zeros(size, bool)
-    return agreement(flow, reverse, nothing_clipped, nothing_clipped)
+    return valid_flow(flow, reverse, nothing_clipped, nothing_clipped)
 
 
 def pair_file(folder: Path, i: int, j: int) -> Path | None:

@@ -117,7 +117,7 @@ def open_video(clip: Path) -> Footage:
     return Footage(clip, [[clip]], True, info.frames, info.fps, False)
 
 
-def natural(path: Path) -> list[tuple[int, int, str]]:
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """A key that sorts frame2 before frame10."""
     key = []
     for part in re.split(r"(\d+)", path.name):
@@ -132,13 +132,13 @@ def frame_files(folder: Path) -> list[Path]:
     """The frames directly in `folder`, in order."""
     shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
     found = [p for p in shown if p.suffix.lower() in FRAMES and p.is_file()]
-    return sorted(found, key=natural)
+    return sorted(found, key=natural_key)
 
 
 def sorted_folders(folder: Path) -> list[Path]:
     """The folders directly in `folder`, in order."""
     shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
-    return sorted((p for p in shown if p.is_dir()), key=natural)
+    return sorted((p for p in shown if p.is_dir()), key=natural_key)
 
 
 def hash_file(path: Path) -> str:
@@ -343,7 +343,7 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
 # Frames to hold out
 
 
-def held_out(count: int, every: int, cycle: int) -> list[int]:
+def hold_out_every(count: int, every: int, cycle: int) -> list[int]:
     """Which of `count` frames are held out of training: every `every`-th.
 
     Never the first or the last; none for 0. `every` grows until it has no common factor
@@ -356,13 +356,13 @@ def held_out(count: int, every: int, cycle: int) -> list[int]:
     return list(range(every // 2, count - 1, every))
 
 
-def every_of(frames: Sequence[int]) -> int | None:
-    """The smallest `every` for which `held_out` gives just these `frames`.
+def hold_out_spacing(frames: Sequence[int]) -> int | None:
+    """The smallest `every` for which `hold_out_every` gives just these `frames`.
 
     The clip ends soon after them. None where there is no such number.
     """
     for every in range(2, 2 * frames[0] + 2):
-        if held_out(frames[-1] + 2, every, 1) == list(frames):
+        if hold_out_every(frames[-1] + 2, every, 1) == list(frames):
             return every
     return None
 

@@ -17,7 +17,14 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapModel, read_model
 from hdr_nsff.footage.pose_formats import GivenPoses, from_colmap, from_json, from_llff
-from hdr_nsff.geometry.poses import LEAST, Poses, interpolate, project, ranges, trusted_points
+from hdr_nsff.geometry.poses import (
+    MIN_REGISTERED_SHARE,
+    Poses,
+    format_ranges,
+    interpolate,
+    project,
+    trusted_points,
+)
 from hdr_nsff.scene.manifest import MAX_NUMBER
 
 # off which a rotation matrix counts as rounded, and is made exact again
@@ -46,7 +53,7 @@ def import_poses(path: Path | str, sources: list[str], size: tuple[int, int]) ->
     else:
         given = from_json(path)
     rows = match_frames(path, given.names, len(given.c2w), sources)
-    poses = placed(path, given, rows, size)
+    poses = fit_poses(path, given, rows, size)
     if model is not None:
         poses = with_points(poses, model, rows)
     if all(row is not None for row in rows):
@@ -98,10 +105,10 @@ def match_frames(
         if rows is None:
             continue
         missing = [t for t, row in enumerate(rows) if row is None]
-        if len(missing) > (1 - LEAST) * len(sources):
+        if len(missing) > (1 - MIN_REGISTERED_SHARE) * len(sources):
             raise InputError(
                 f"{path}: {len(missing)} of {len(sources)} frames have no pose there "
-                f"(frames {ranges(missing)}); give poses for all of them"
+                f"(frames {format_ranges(missing)}); give poses for all of them"
             )
         return rows
     if count != len(sources):
@@ -135,7 +142,7 @@ def path_end(name: str, parts: int) -> tuple[str, ...]:
 # Poses of the frames
 
 
-def placed(
+def fit_poses(
     path: Path, given: GivenPoses, rows: Sequence[int | None], size: tuple[int, int]
 ) -> Poses:
     """The poses `rows` (T) of `given`, for frames of `size` (height, width).

@@ -88,7 +88,7 @@ def scale_between(true: np.ndarray, estimated: np.ndarray) -> float | None:
     return None if fit is None else fit.scale
 
 
-def carry(
+def transfer_pose(
     anchor: np.ndarray, true_anchor: np.ndarray, true_view: np.ndarray, scale: float
 ) -> np.ndarray:
     """The pose (3, 4) relative to `anchor` that `true_view` has relative to

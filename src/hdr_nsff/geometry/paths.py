@@ -37,31 +37,31 @@ ROTATION_TOLERANCE = 1e-3  # per entry of R R^T: poses may be written with few d
 
 
 @dataclass(frozen=True)
-class View:
+class PathView:
     """One picture to be rendered."""
 
     camera: Camera
     time: float  # in frames, may be fractional
     ev: float | None = None  # develop at this EV; None: the caller chooses
 
-    def resized(self, scale: float) -> View:
+    def resized(self, scale: float) -> PathView:
         """The same view with `scale` times the pixels along each side (at least 1)."""
         width = max(1, round(self.camera.width * scale))
         height = max(1, round(self.camera.height * scale))
         return replace(self, camera=self.camera.resized(width, height))
 
 
-def training_path(cameras: Sequence[Camera], times: Sequence[float]) -> list[View]:
+def training_path(cameras: Sequence[Camera], times: Sequence[float]) -> list[PathView]:
     """The recorded viewpoints at the recorded times."""
-    return [View(c, float(t)) for c, t in zip(cameras, times, strict=True)]
+    return [PathView(c, float(t)) for c, t in zip(cameras, times, strict=True)]
 
 
-def fixed(camera: Camera, times: Sequence[float]) -> list[View]:
+def fixed_path(camera: Camera, times: Sequence[float]) -> list[PathView]:
     """One camera that stands still while time goes on."""
-    return [View(camera, float(t)) for t in times]
+    return [PathView(camera, float(t)) for t in times]
 
 
-def reach(cameras: Sequence[Camera], camera: Camera) -> Tensor:
+def center_spread(cameras: Sequence[Camera], camera: Camera) -> Tensor:
     """How far the clip's cameras spread around their middle along the axes of `camera`.
 
     (3,) scene units right, down and forward: half of the range between the 10th and the
@@ -89,7 +89,7 @@ def bullet_time(
     radius: Tensor,
     num_views: int = 24,
     turns: float = 2.0,
-) -> list[View]:
+) -> list[PathView]:
     """Time stands still while the camera spirals out of `camera` and back into it.
 
     It always looks at the point `focus_depth` in front of `camera`. `radius` (3,):
@@ -106,11 +106,11 @@ def bullet_time(
         circle = torch.tensor([math.cos(angle), math.sin(angle), math.sin(angle / 2)])
         offset = radius * (circle.to(radius) * envelope)
         pose = look_at(center + rotation @ offset, target, down)
-        views.append(View(camera.moved(pose), float(time)))
+        views.append(PathView(camera.moved(pose), float(time)))
     return views
 
 
-def slow_motion(cameras: Sequence[Camera], times: Sequence[float], factor: int) -> list[View]:
+def slow_motion(cameras: Sequence[Camera], times: Sequence[float], factor: int) -> list[PathView]:
     """`factor` views per recorded frame, the camera interpolated between its neighbors.
 
     `times` rise strictly and need not be evenly spaced. Centers are interpolated
@@ -125,8 +125,8 @@ def slow_motion(cameras: Sequence[Camera], times: Sequence[float], factor: int) 
         for k in range(factor):
             fraction = k / factor
             camera = interpolate_camera(cameras[i], cameras[i + 1], fraction)
-            views.append(View(camera, times[i] + fraction * interval))
-    return [*views, View(cameras[-1], float(times[-1]))]
+            views.append(PathView(camera, times[i] + fraction * interval))
+    return [*views, PathView(cameras[-1], float(times[-1]))]
 
 
 def interpolate_camera(a: Camera, b: Camera, fraction: float) -> Camera:
@@ -141,7 +141,7 @@ def interpolate_camera(a: Camera, b: Camera, fraction: float) -> Camera:
     return replace(a, K=torch.lerp(a.K, b.K, fraction), c2w=c2w)
 
 
-def from_json(path: Path | str, like: Camera) -> list[View]:
+def from_json(path: Path | str, like: Camera) -> list[PathView]:
     """The views of a path file (format above).
 
     `like` gives the frame size, and `K` for views without one. InputError in one
@@ -165,7 +165,7 @@ def from_json(path: Path | str, like: Camera) -> list[View]:
     return [parse_view(entry, f"{path}: view {i}", like) for i, entry in enumerate(entries)]
 
 
-def parse_view(entry: Any, where: str, like: Camera) -> View:
+def parse_view(entry: Any, where: str, like: Camera) -> PathView:
     """One view of a path file; `where` names it in error messages."""
     if not isinstance(entry, dict):
         raise InputError(f"{where} is not an object with `time` and `c2w`")
@@ -185,7 +185,7 @@ def parse_view(entry: Any, where: str, like: Camera) -> View:
     if entry.get("ev") is not None:
         ev = float(parse_numbers(entry["ev"], (), f"{where}: ev"))
     time = float(parse_numbers(entry["time"], (), f"{where}: time"))
-    return View(replace(like, c2w=torch.from_numpy(c2w).to(like.c2w), K=K), time, ev)
+    return PathView(replace(like, c2w=torch.from_numpy(c2w).to(like.c2w), K=K), time, ev)
 
 
 def parse_pose(value: Any, where: str) -> np.ndarray:

@@ -18,7 +18,7 @@ ADVICE = (
     "moving objects (--mask FOLDER), or import poses (--poses FOLDER or FILE)"
 )
 # share of frames with poses of their own below which poses have failed (hand-chosen)
-LEAST = 0.6
+MIN_REGISTERED_SHARE = 0.6
 MAX_LISTED_RANGES = 8  # in a message
 
 
@@ -43,7 +43,7 @@ class Poses:
     notes: tuple[str, ...] = ()  # sentences for the user
 
 
-def ranges(numbers: list[int]) -> str:
+def format_ranges(numbers: list[int]) -> str:
     """[1, 2, 3, 7] as "1-3, 7", shortened after eight ranges."""
     runs: list[list[int]] = []
     for n in numbers:
@@ -114,7 +114,7 @@ def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
         if not known:
             raise InputError(
                 f"poses failed: none of the frames of one camera could be registered "
-                f"(frames {ranges(missing)}); {ADVICE}"
+                f"(frames {format_ranges(missing)}); {ADVICE}"
             )
         c2w[missing] = interpolated_c2w(c2w[known], known, missing)
         filled += missing
@@ -122,7 +122,7 @@ def interpolate(poses: Poses, groups: list[list[int]]) -> Poses:
         return poses
     note = (
         f"{len(filled)} of {len(c2w)} frames did not register; "
-        f"their poses are interpolated (frames {ranges(sorted(filled))})"
+        f"their poses are interpolated (frames {format_ranges(sorted(filled))})"
     )
     return replace(poses, c2w=c2w, notes=(*poses.notes, note))
 

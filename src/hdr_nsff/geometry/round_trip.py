@@ -44,7 +44,7 @@ def round_trip(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:
     return np.linalg.norm(forward + follow(backward, forward), axis=-1)
 
 
-def agreement(
+def valid_flow(
     forward: np.ndarray,
     backward: np.ndarray,
     clipped_from: np.ndarray,
@@ -59,11 +59,11 @@ def agreement(
     # 1 outside the frame too
     clipped_weight = follow(clipped_to.astype(np.float32), forward, fill=1.0)
     target_recorded = clipped_weight < tuning.max_clipped_weight
-    returns = round_trip(forward, backward) < allowed(forward, tuning)
+    returns = round_trip(forward, backward) < max_round_trip(forward, tuning)
     return returns & target_recorded & ~clipped_from
 
 
-def allowed(flow: np.ndarray, tuning: RoundTripTuning = RoundTripTuning()) -> np.ndarray:
+def max_round_trip(flow: np.ndarray, tuning: RoundTripTuning = RoundTripTuning()) -> np.ndarray:
     """How many pixels (H, W) a round trip that begins with `flow` (H, W, 2) px may miss
     its start by.
     """

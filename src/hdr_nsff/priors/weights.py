@@ -241,7 +241,7 @@ def how_to_get(weights: Weights) -> str:
     return f"{', or '.join(sources)}, or put {files} from another machine into {folder}"
 
 
-def content(path: Path) -> str:
+def content_hash(path: Path) -> str:
     """The hash of weights: of a file, or of all files that a folder's model is loaded
     from.
     """

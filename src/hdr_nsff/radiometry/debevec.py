@@ -130,7 +130,7 @@ def debevec(
 
     `ev` (B,) holds the known log2 exposures, None for those to be estimated; bracket
     `reference` is 0 if unknown. Every bracket must share points with the others, see
-    `linked`.
+    linked.
     """
     assert samples.valid.shape == samples.rgb.shape, (samples.valid.shape, samples.rgb.shape)
     assert samples.rgb.shape[1] == len(ev), (samples.rgb.shape, len(ev))
@@ -367,7 +367,7 @@ def response_of(
     return x, np.stack(y)
 
 
-def linked(
+def brackets_linked(
     samples: Samples, brackets: Collection[int], tuning: DebevecTuning = DebevecTuning()
 ) -> bool:
     """Whether all of `brackets` are linked to each other, directly or through others,

@@ -190,7 +190,7 @@ def period(brackets: list[int]) -> int:
     return len(set(brackets))
 
 
-def by_value(ev: list[float]) -> tuple[list[int], list[float]]:
+def brackets_by_ev(ev: list[float]) -> tuple[list[int], list[float]]:
     """Brackets from the EV of every frame: (bracket per frame, EV per bracket).
 
     Frames with the same EV (to 0.01) share a bracket; brackets are numbered in the
@@ -224,7 +224,7 @@ def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
     return brackets
 
 
-def doubts(
+def contradictions(
     video: np.ndarray, ev: list[float], tuning: ExposureCycleTuning = ExposureCycleTuning()
 ) -> list[str]:
     """What in `video` (T, H, W, 3), recorded, contradicts the given `ev` per frame:

@@ -19,9 +19,9 @@ from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
     DebevecTuning,
     ResponseFit,
+    brackets_linked,
     brightness_ev,
     debevec,
-    linked,
 )
 from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
 
@@ -80,7 +80,7 @@ def estimate_response(
         return from_brightness(views, ev, reference, num_cameras, "one exposure", "")
     rng = np.random.default_rng(SEED)
     samples = static_samples(views, len(ev), tuning.num_samples, rng)
-    if not linked(samples, brackets, tuning.debevec):
+    if not brackets_linked(samples, brackets, tuning.debevec):
         problem = "too few static points seen in several exposures"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
     fit = debevec(samples, ev, reference, tuning.debevec)
@@ -118,7 +118,7 @@ def camera_fits(
         rng = np.random.default_rng(SEED)
         samples = static_samples(mine, len(fit.ev), tuning.num_samples, rng)
         seen = {v.bracket for v in mine}
-        if len(seen) > 1 and linked(samples, seen, tuning.debevec):
+        if len(seen) > 1 and brackets_linked(samples, seen, tuning.debevec):
             camera_fit = debevec(samples, fit.ev.tolist(), reference, tuning.debevec)
             if camera_fit.misfit < MAX_MISFIT:
                 own[camera] = camera_fit

@@ -17,7 +17,7 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import colorize, colorize_flow, contact_sheet, read_image, write_png
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.shots import Shot, develop_view, fingerprint
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
@@ -119,7 +119,7 @@ def write_pictures_of_view(
     run: Run,
     out: Path,
     index: int,
-    view: View,
+    view: PathView,
     seen: dict[str, np.ndarray],
     evs: Sequence[float],
     ranges: SequenceRanges,
@@ -152,7 +152,7 @@ def write_overview(run: Run, out: Path, shot: Shot, evs: Sequence[float], moves:
     write_png(out / "overview.png", contact_sheet(rows))
 
 
-def frame_of(run: Run, view: View) -> Frame:
+def frame_of(run: Run, view: PathView) -> Frame:
     """The training frame that a view of the training path was filmed as."""
     for frame in run.scene.train:
         if frame.time == view.time and torch.equal(frame.camera.c2w, view.camera.c2w):

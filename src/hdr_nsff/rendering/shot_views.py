@@ -14,7 +14,7 @@ import torch
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.geometry import paths
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.shots import Shot, device_of
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
@@ -45,7 +45,7 @@ def plan_shot(
         case "training":
             return Shot(path, paths.training_path(cameras, [f.time for f in frames]), fps)
         case "fixed":
-            return Shot(path, paths.fixed(start.camera, times), fps)
+            return Shot(path, paths.fixed_path(start.camera, times), fps)
         case "bullet":
             return Shot(path, bullet_views(run, start, num_views), min(fps, BULLET_FPS))
         case "slowmo":
@@ -91,7 +91,7 @@ def find_frame(run: Run, index: int | None) -> Frame:
     return known[index]
 
 
-def bullet_views(run: Run, start: Frame, num_views: int) -> list[View]:
+def bullet_views(run: Run, start: Frame, num_views: int) -> list[PathView]:
     """The spiral around a frame, as wide as the cameras of the clip reach.
 
     InputError where the footage has no parallax.
@@ -103,7 +103,7 @@ def bullet_views(run: Run, start: Frame, num_views: int) -> list[View]:
         reason = "so there is no parallax and no depth"
         raise InputError(f"{run.folder}: {problem}, {reason}; use --path fixed or --path slowmo")
     depth = focus_depth(run, start)
-    reach = paths.reach([f.camera for f in run.scene.train], start.camera)
+    reach = paths.center_spread([f.camera for f in run.scene.train], start.camera)
     radius = reach.clamp(max=MAX_RADIUS * depth)  # (3,) right, down, forward
     least = radius.max() * torch.tensor(MIN_RADII).to(radius)
     return paths.bullet_time(start.camera, start.time, depth, radius.maximum(least), num_views)
@@ -114,7 +114,7 @@ def focus_depth(run: Run, frame: Frame) -> float:
 
     Where the picture is empty, the middle of the scene in disparity.
     """
-    small = View(frame.camera, frame.time).resized(0.25)
+    small = PathView(frame.camera, frame.time).resized(0.25)
     seen = run.field.render(to_device(small.camera, device_of(run)), small.time)
     solid = seen.opacity > 0.5
     if solid.any():
@@ -122,7 +122,7 @@ def focus_depth(run: Run, frame: Frame) -> float:
     return 2 / (1 / run.scene.near + 1 / run.scene.far)
 
 
-def check_views(run: Run, path: str, views: Sequence[View]) -> None:
+def check_views(run: Run, path: str, views: Sequence[PathView]) -> None:
     """InputError where a path file leaves the clip's time or its viewpoint.
 
     Its viewpoint only where the clip has no parallax.

@@ -27,13 +27,13 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import SIDES, write_exr
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
-from hdr_nsff.core.process import hold_threads
+from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.core.video import write_video
 from hdr_nsff.fields.base import Render, recorded
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.rendering.interpolate import Mode, render_at
 from hdr_nsff.training.run_folder import Run
@@ -70,7 +70,7 @@ class Shot:
     """A named list of views and its speed."""
 
     name: str
-    views: list[View]
+    views: list[PathView]
     fps: float
 
 
@@ -91,9 +91,9 @@ def device_of(run: Run) -> torch.device:
     return run.tonemapper.knots.device
 
 
-def render_still(run: Run, view: View, between: Mode = "auto", motion: bool = True) -> Still:
+def render_still(run: Run, view: PathView, between: Mode = "auto", motion: bool = True) -> Still:
     """Render one view; without `motion` vectors it takes less time."""
-    hold_threads(run.config.torch_threads)
+    limit_torch_threads(run.config.torch_threads)
     camera = to_device(view.camera, device_of(run))
     times = run.scene.times.tolist()
     with torch.no_grad():
@@ -137,7 +137,12 @@ def develop(
 
 
 def develop_view(
-    run: Run, view: View, radiance: np.ndarray, ev: float | None, camera_id: int, exposure: float
+    run: Run,
+    view: PathView,
+    radiance: np.ndarray,
+    ev: float | None,
+    camera_id: int,
+    exposure: float,
 ) -> np.ndarray:
     """The same for a view of which the run rendered `radiance` (H, W, 3).
 
@@ -152,7 +157,7 @@ def develop_view(
     return picture.cpu().numpy().reshape(radiance.shape)
 
 
-def display_exposure(run: Run, views: Sequence[View]) -> float:
+def display_exposure(run: Run, views: Sequence[PathView]) -> float:
     """One display exposure for a whole shot.
 
     It is that of small pictures of its first, middle and last view.
@@ -165,7 +170,9 @@ def display_exposure(run: Run, views: Sequence[View]) -> float:
     return color.auto_exposure(np.concatenate(radiance))
 
 
-def write_still(path: Path, still: Still, view: View, half: bool, header: dict[str, Any]) -> None:
+def write_still(
+    path: Path, still: Still, view: PathView, half: bool, header: dict[str, Any]
+) -> None:
     """One EXR: RGB radiance, `Z`, `motion`, and motion vectors where known.
 
     The vectors are `forward.u`, `.v`, `backward.u`, `.v` in pixels.
@@ -293,12 +300,12 @@ def numbered_pictures(folder: Path) -> list[Path]:
     return [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}]
 
 
-def ev_of(view: View, output: Output) -> float | None:
+def ev_of(view: PathView, output: Output) -> float | None:
     """The EV at which a view is developed; None: tone-mapped for a display."""
     return output.ev if view.ev is None else view.ev
 
 
-def write_view(run: Run, view: View, picture: Path, output: Output, exposure: float) -> None:
+def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure: float) -> None:
     """Write `picture` and the EXR beside it where one of them is missing.
 
     `exposure` is that of the display.

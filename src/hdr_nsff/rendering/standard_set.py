@@ -19,7 +19,7 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.set_pictures import write_pictures
 from hdr_nsff.rendering.shot_views import SHOTS, find_frame, plan_shot
 from hdr_nsff.rendering.shots import Output, Shot, fingerprint, render_shot, render_still
@@ -189,7 +189,7 @@ def measure_speed(run: Run) -> RenderSpeed:
 
 def time_render(run: Run, camera: Camera, moment: float) -> float:
     """Seconds for one picture of the clip's size at the time `moment` in frames."""
-    view = View(camera, moment)
+    view = PathView(camera, moment)
     render_still(run, view.resized(WARM_UP_SCALE))
     start = time.monotonic()
     render_still(run, view.resized(MEASURE_SCALE))

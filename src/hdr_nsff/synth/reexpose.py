@@ -228,7 +228,7 @@ def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePla
 
     The cycle runs over the recorded frames without a break.
     """
-    test = ingest.held_out(count, hold_out, cycle)
+    test = ingest.hold_out_every(count, hold_out, cycle)
     missing = set(test) if remove else set()
     kept = [k for k in range(count) if k not in missing]
     if len(kept) < MIN_FRAMES:

@@ -21,7 +21,7 @@ from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
-from hdr_nsff.core.process import hold_threads
+from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import bar, say
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.base import FrameError
@@ -165,7 +165,7 @@ class Trainer:
         """
         clock, config = self.clock, self.config
         self.field.train()
-        hold_threads(config.torch_threads)
+        limit_torch_threads(config.torch_threads)
         if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)

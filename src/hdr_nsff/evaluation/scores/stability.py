@@ -14,7 +14,7 @@ import numpy as np
 from torch import Tensor
 
 from hdr_nsff.evaluation.predictions import predict, radiance_of
-from hdr_nsff.geometry.paths import View
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import metrics
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
@@ -68,7 +68,7 @@ def render_pairs(run: Run, pairs: Sequence[tuple[Frame, Frame]], folder: Path) -
     """Predictions of all frames of the pairs, {index of the frame: EXR}."""
     frames = {frame.index: frame for pair in pairs for frame in pair}
     indices = sorted(frames)
-    views = {f"{i:05d}": View(frames[i].camera, frames[i].time) for i in indices}
+    views = {f"{i:05d}": PathView(frames[i].camera, frames[i].time) for i in indices}
     files = predict(run, views, folder, "rendering the training path", motion=False)
     return dict(zip(indices, files, strict=True))
 

@@ -36,7 +36,7 @@ from hdr_nsff.footage.datasets.held_out_views import (
     training_poses,
 )
 from hdr_nsff.footage.ingest import hash_file, shrink
-from hdr_nsff.footage.pose_files import placed
+from hdr_nsff.footage.pose_files import fit_poses
 from hdr_nsff.footage.pose_formats import GivenPoses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.scene.manifest import FrameEntry, Manifest
@@ -79,9 +79,9 @@ def write_truth(
     if claim_folder(out, truth_key(chosen, manifest, max_size, poses)):
         return out
     size = write_pictures(out, capture, chosen, max_size)
-    view_poses = placed(capture.root, poses, list(range(len(chosen))), size)
+    view_poses = fit_poses(capture.root, poses, list(range(len(chosen))), size)
     clip_rows = [capture.row[f.source] for f in manifest.frames]
-    clip = placed(capture.root, training_poses(capture), clip_rows, size)
+    clip = fit_poses(capture.root, training_poses(capture), clip_rows, size)
     records = [
         view_record(view, sorted(pictures), manifest, own_time, clip, K, c2w)
         for (view, pictures), K, c2w in zip(chosen, view_poses.K, view_poses.c2w, strict=True)

@@ -33,7 +33,7 @@ from hdr_nsff.footage.datasets.set_files import (
     read_document,
     source_of,
 )
-from hdr_nsff.footage.ingest import natural
+from hdr_nsff.footage.ingest import natural_key
 from hdr_nsff.footage.pose_formats import GivenPoses, from_transforms
 
 NAME = "transforms.json"
@@ -130,7 +130,7 @@ def stored_times(path: Path, frames: Sequence[dict[str, Any]]) -> list[float]:
     if any("time" in frame for frame in frames):
         return [number_of(path, f, "time", "the time it was taken at") for f in frames]
     names = [Path(frame["file_path"]) for frame in frames]
-    order = sorted(range(len(frames)), key=lambda k: natural(names[k]))
+    order = sorted(range(len(frames)), key=lambda k: natural_key(names[k]))
     times = [0.0] * len(frames)
     for position, k in enumerate(order):
         times[k] = float(position)

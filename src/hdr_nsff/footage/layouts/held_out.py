@@ -80,7 +80,7 @@ def carry_view(
                 "it cannot be carried over"
             )
         true_anchor = np.array(truth.clip_c2w[view.anchor])
-        c2w = alignment.carry(c2w, true_anchor, np.array(view.c2w), scale)
+        c2w = alignment.transfer_pose(c2w, true_anchor, np.array(view.c2w), scale)
     return HeldOutPicture(
         name=view.name,
         time=view.time,

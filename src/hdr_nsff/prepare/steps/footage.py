@@ -183,10 +183,10 @@ def frame_exposures(work: Work) -> FrameExposures:
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         notes = cycle_notes(work, cycles)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
-    brackets, known = exposure.by_value(given)
+    brackets, known = exposure.brackets_by_ev(given)
     doubts = []
     for own in cameras:
-        doubts += exposure.doubts(work.video[own], [given[i] for i in own])
+        doubts += exposure.contradictions(work.video[own], [given[i] for i in own])
     return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
 
 
@@ -251,7 +251,7 @@ def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:
             f"{len(cycle)} exposures listed for {len(frames)} frames; list one cycle only, "
             "or give `--exposures auto`"
         )
-    brackets, _ = exposure.by_value([cycle[numbers[i] % len(cycle)] for i in frames])
+    brackets, _ = exposure.brackets_by_ev([cycle[numbers[i] % len(cycle)] for i in frames])
     listed = exposure.period(brackets)
     found = exposure.detect_cycle(work.video[frames])
     if listed % found.length and found.confidence > MIN_CONFIDENCE:
@@ -312,7 +312,7 @@ def frames_to_hold_out(work: Work) -> set[int]:
             case "novel-view-time":
                 numbers = ingest.frames_between(len(frames), cycle)
             case None:
-                numbers = ingest.held_out(len(frames), hold_out_spacing(work), cycle)
+                numbers = ingest.hold_out_every(len(frames), hold_out_spacing(work), cycle)
         chosen.update(frames[k] for k in numbers)
     return chosen
 

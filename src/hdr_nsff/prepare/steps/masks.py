@@ -86,7 +86,7 @@ def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
     found = [
         path
         for each in folders
-        for path in sorted(each.iterdir(), key=ingest.natural)
+        for path in sorted(each.iterdir(), key=ingest.natural_key)
         if path.suffix.lower() in suffixes
     ]
     frames = work.manifest.frames

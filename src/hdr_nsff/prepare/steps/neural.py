@@ -25,7 +25,7 @@ from hdr_nsff.priors.masks.prompts import find_objects
 from hdr_nsff.priors.masks.sam2 import sam2_mask
 from hdr_nsff.priors.poses.lightglue import check_matcher, matcher_weights
 from hdr_nsff.priors.pretrained import architecture, pretrained
-from hdr_nsff.priors.weights import content, find
+from hdr_nsff.priors.weights import content_hash, find
 
 SAM2, DEPTH_ANYTHING = "Sam2VideoModel", "DepthAnythingForDepthEstimation"
 PROMPTS = "masks/prompts.json"
@@ -63,7 +63,7 @@ def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
             paths = [find(config.depth_weights)]
         case _:
             paths = []
-    return [content(path) for path in paths]
+    return [content_hash(path) for path in paths]
 
 
 def ready(network: str, weights: str) -> Any:

@@ -9,7 +9,7 @@ import numpy as np
 
 from hdr_nsff.core.io import atomic, write_npy
 from hdr_nsff.core.progress import say
-from hdr_nsff.footage.pose_files import import_poses, placed
+from hdr_nsff.footage.pose_files import fit_poses, import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_masks
@@ -67,7 +67,7 @@ def data_set_poses(work: Work) -> Poses:
     capture, m = work.capture, work.manifest
     assert capture is not None and capture.poses is not None
     rows: list[int | None] = [capture.row[f.source] for f in m.frames]
-    poses = placed(capture.root, capture.poses, rows, (m.height, m.width))
+    poses = fit_poses(capture.root, capture.poses, rows, (m.height, m.width))
     return poses if capture.points is None else replace(poses, points=capture.points)
 
 

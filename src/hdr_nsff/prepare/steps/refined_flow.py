@@ -10,8 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from hdr_nsff.core.io import read_npy
-from hdr_nsff.core.parallel import in_threads
-from hdr_nsff.geometry.round_trip import agreement
+from hdr_nsff.core.parallel import map_in_threads
+from hdr_nsff.geometry.round_trip import valid_flow
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.flow import Pair, flow_files, flow_is_given, stored, write_flow
 from hdr_nsff.prepare.work import Work
@@ -48,7 +48,7 @@ def refine_flow(work: Work) -> StepResult:
         for one, found, valid in refiner.both_ways(i, j):
             write_flow(work, names[one], found, valid)
 
-    in_threads(refine, [(i, j) for i, j in own if i < j], "flow of movers")
+    map_in_threads(refine, [(i, j) for i, j in own if i < j], "flow of movers")
     note = f"{len(own)} pairs refined inside the moving masks, {how}"
     return StepResult(note=note, frames={"flow": flow})
 
@@ -82,8 +82,8 @@ class Refiner:
     def both_ways(self, i: int, j: int) -> list[tuple[Pair, np.ndarray, np.ndarray]]:
         """((from, to), flow (H, W, 2) px, valid (H, W)) of the pair, there and back."""
         there, back = self.least_squares(i, j), self.least_squares(j, i)
-        valid_there = agreement(there, back, self.clipped[i], self.clipped[j])
-        valid_back = agreement(back, there, self.clipped[j], self.clipped[i])
+        valid_there = valid_flow(there, back, self.clipped[i], self.clipped[j])
+        valid_back = valid_flow(back, there, self.clipped[j], self.clipped[i])
         here_gray, there_gray = common_gray(self.video, self.ranges, i, j)
         filled = (
             fill_uncertain_flow(

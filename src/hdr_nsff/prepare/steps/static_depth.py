@@ -12,7 +12,7 @@ import numpy as np
 
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.footage.datasets import maps
-from hdr_nsff.footage.depth_files import read_depth
+from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_files
 from hdr_nsff.prepare.steps.neural import network_depth
@@ -99,7 +99,7 @@ def user_depth(work: Work, folder: Path) -> Depth:
     """The depth maps in the user's folder."""
     m, kind = work.manifest, work.config.depth_kind
     files = given_files(work, folder, DEPTH_FILES)
-    disparity, confidence = read_depth(files, kind, (m.height, m.width))
+    disparity, confidence = read_depth_files(files, kind, (m.height, m.width))
     index = [f.index for f in work.train]
     changes = {"depth_kind": "relative"} if kind == "relative" else {}
     return Depth(

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from hdr_nsff.core.parallel import in_threads
+from hdr_nsff.core.parallel import map_in_threads
 from hdr_nsff.core.progress import say
 from hdr_nsff.priors.depth.fuse import FuseTuning, joint_median, vote, warp_disparity
 from hdr_nsff.priors.depth.parallax import (
@@ -115,7 +115,7 @@ def static_depth(
     """
     frames = list(range(len(views)))
     candidates = np.linspace(low, high, tuning.num_candidates).astype(np.float32)
-    swept = in_threads(
+    swept = map_in_threads(
         lambda i: sweep(clip, i, views[i], candidates, tuning.plane_sweep),
         frames,
         "depth: plane sweep",
@@ -127,7 +127,7 @@ def static_depth(
     unsupported = tuning.unsupported_weight
     weight = np.where(doubtful, unsupported**2, np.maximum(matched, unsupported))
     weight = weight.astype(np.float32)
-    fused = in_threads(
+    fused = map_in_threads(
         lambda i: fuse_frame(clip, i, views[i], disparity, weight, tuning.fuse),
         frames,
         "depth: fusion",

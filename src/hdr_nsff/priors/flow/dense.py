@@ -7,7 +7,7 @@ pair differ only where one of them is clipped; both are limited to their common 
 
 Flow is in pixels: `flow[row, column]` is the position in the other frame minus the
 position in this one, x then y. A valid pixel agrees forward and backward within
-`geometry.round_trip.allowed`, ends inside the other frame, and is clipped at neither
+`geometry.round_trip.max_round_trip`, ends inside the other frame, and is clipped at neither
 end of its motion.
 """
 
@@ -20,8 +20,8 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from hdr_nsff.core.parallel import in_threads
-from hdr_nsff.geometry.round_trip import agreement, allowed, follow
+from hdr_nsff.core.parallel import map_in_threads
+from hdr_nsff.geometry.round_trip import follow, max_round_trip, valid_flow
 from hdr_nsff.radiometry.common_range import common_gray, recorded_range
 
 
@@ -122,7 +122,7 @@ def match_pairs(
         f"pairs reach beyond {len(clipped)} frames"
     )
     unordered = sorted({(int(min(p)), int(max(p))) for p in pairs})
-    matches = in_threads(lambda pair: match(*pair), unordered, report, threads)
+    matches = map_in_threads(lambda pair: match(*pair), unordered, report, threads)
     flows: dict[tuple[int, int], np.ndarray] = {}
     for (i, j), (forward, backward) in zip(unordered, matches, strict=True):
         flows[i, j] = forward
@@ -133,7 +133,7 @@ def match_pairs(
     valid = np.empty((len(pairs), *size), bool)
     for p, (i, j) in enumerate(pairs.tolist()):
         flow[p] = flows[i, j]
-        valid[p] = agreement(flows[i, j], flows[j, i], clipped[i], clipped[j])
+        valid[p] = valid_flow(flows[i, j], flows[j, i], clipped[i], clipped[j])
     return flow, valid
 
 
@@ -189,5 +189,5 @@ def average_with_reverse(forward: np.ndarray, backward: np.ndarray) -> np.ndarra
     stays as it is.
     """
     gap = forward + follow(backward, forward)
-    agrees = np.linalg.norm(gap, axis=-1) < allowed(forward)
+    agrees = np.linalg.norm(gap, axis=-1) < max_round_trip(forward)
     return forward - 0.5 * gap * agrees[..., None]

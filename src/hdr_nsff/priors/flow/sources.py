@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.flow_files import read_flow
+from hdr_nsff.footage.flow_files import read_flow_files
 from hdr_nsff.priors.flow.dense import DenseFlowTuning, FlowPrior, dense_flow
 from hdr_nsff.priors.flow.networks import NetworkFlowTuning, load, network_flow, weights_file
 from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, SemanticTuning, semantic_flow
@@ -154,4 +154,4 @@ def flow_from_folder(
     folder: Path, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """`FlowPrior` that reads maps made by another tool."""
-    return read_flow(folder, pairs, clipped.shape[1:3])
+    return read_flow_files(folder, pairs, clipped.shape[1:3])

@@ -23,11 +23,11 @@ from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
     ADVICE,
-    LEAST,
+    MIN_REGISTERED_SHARE,
     Poses,
+    format_ranges,
     interpolate,
     project,
-    ranges,
     trusted_points,
 )
 from hdr_nsff.priors.poses import sfm
@@ -53,7 +53,7 @@ class ReconstructionTuning:
     min_fov_degrees: float = 25.0
     max_fov_degrees: float = 100.0
     enough_registered: float = 0.9  # share of the views that ends the search for a model
-    min_registered: float = LEAST  # share of the views below which poses have failed
+    min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
     min_track_views: int = 3  # of a point that is kept
     max_point_error_px: float = 2.0  # mean reprojection error of such a point
     min_points: int = 10
@@ -266,7 +266,7 @@ def failure_message(
         )
     return (
         f"poses failed: {len(missing)} of {count} frames could not be registered "
-        f"(frames {ranges(missing)}); {ADVICE}"
+        f"(frames {format_ranges(missing)}); {ADVICE}"
     )
 
 
@@ -297,7 +297,7 @@ def poses_from_model(
         if not images:
             raise InputError(
                 "poses failed: none of the frames of one camera could be registered "
-                f"(views {ranges(group)}); {ADVICE}"
+                f"(views {format_ranges(group)}); {ADVICE}"
             )
         focal = model.cameras[images[0].camera_id].K[0, 0] / scale  # one for the group
         K[np.isin(views.of_frame, group)] = intrinsics(focal, width, height)
