@@ -38,7 +38,7 @@ from hdr_nsff.priors.flow.dense import (
     match_pairs,
 )
 from hdr_nsff.priors.flow.local_motion import fill_uncertain_flow
-from hdr_nsff.priors.flow.networks import both_ways, load, network_flow
+from hdr_nsff.priors.flow.networks import load_network, network_flow, predict_both_directions
 from hdr_nsff.priors.flow.semantic import SemanticConfig, SemanticFlow, semantic_flow
 from hdr_nsff.radiometry.common_range import LUMA, common_gray, recorded_range
 from hdr_nsff.radiometry.exposure_cycle import equalize
@@ -104,7 +104,9 @@ def named(name: str, weights: Path | None, finetuned: Path | None) -> object:
     """
     if name == "semantic":
         return semantic_flow(SemanticConfig(steps=0), weights, (), ())
-    return load(None, finetuned) if name == "raft-finetuned" else load(name, weights)  # type: ignore[arg-type]
+    return (
+        load_network(None, finetuned) if name == "raft-finetuned" else load_network(name, weights)
+    )  # type: ignore[arg-type]
 
 
 def neighbors(frames: int, count: int) -> np.ndarray:
@@ -122,7 +124,7 @@ def prior(network, treated: str) -> Callable:
         def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
             if network is not None:
                 assert not isinstance(network, SemanticFlow)
-                return both_ways(network, video[i], video[j])
+                return predict_both_directions(network, video[i], video[j])
             a, b = (np.rint(255 * (video[k] @ LUMA)).astype(np.uint8) for k in (i, j))
             return dense_inverse_search(a, b), dense_inverse_search(b, a)
 

@@ -126,7 +126,7 @@ def made_up(count: int, camera: Camera) -> Splat:
         gaussians.log_scales.copy_(
             apart.log() + 0.3 * torch.randn(len(gaussians), 3, generator=generator) - 0.5
         )
-        gaussians.logits.fill_(1.0)
+        gaussians.opacity_logits.fill_(1.0)
     return field
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_json, read_npy, write_json
 from hdr_nsff.geometry import alignment
@@ -123,7 +123,7 @@ def flows(
     error, moving, believed = [], [], []
     slow = {"matched": np.zeros(2), "flow": np.zeros(2)}
     for f in frames:
-        for side, name in SIDES.items():
+        for side, name in MOTION_DIRECTIONS.items():
             if f.index + side not in f.flow:
                 continue
             files, there = f.flow[f.index + side], exact[f.index]

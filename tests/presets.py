@@ -74,7 +74,11 @@ def random_field(preset: str, scene: Scene, seed: int = 0) -> AnyField:
         initialize_field(field, scene, lambda rgb, i: rgb + 0.1, 0.0, True)
         for p in field.trajectories.parameters():
             p.data.add_(0.02 * torch.randn_like(p))
-        for p in (field.moving.offsets, field.static.offsets, field.mixture_logits):
+        for p in (
+            field.moving.log_radiance_offsets,
+            field.static.log_radiance_offsets,
+            field.mixture_logits,
+        ):
             p.data.add_(0.3 * torch.randn_like(p))
         return field
     for p in field.parameters():

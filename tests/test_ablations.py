@@ -85,7 +85,7 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
         field, toy, lambda rgb, i: 3 * rgb, 0.5, True
     )  # brighter than 1, the background too
     for g in (field.static, field.moving):
-        for p in (g.offsets, g.sh1):  # shades, colors in time, colors by direction
+        for p in (g.log_radiance_offsets, g.sh1):  # shades, colors in time, colors by direction
             p.data.add_(torch.randn(p.shape, generator=torch.Generator().manual_seed(1)))
     for time in (0.0, 2.4):
         radiance = field.render(toy.train[0].camera, time).radiance
@@ -95,10 +95,10 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     for g in (field.static, field.moving):
         assert all(
             float(p.grad.abs().max()) > 0
-            for p in (g.log_radiance, g.offsets, g.sh1)
+            for p in (g.log_radiance, g.log_radiance_offsets, g.sh1)
             if p.grad is not None
         )
-        assert None not in (g.log_radiance.grad, g.offsets.grad, g.sh1.grad)
+        assert None not in (g.log_radiance.grad, g.log_radiance_offsets.grad, g.sh1.grad)
     assert field.background.grad is not None and float(field.background.grad.abs().min()) > 0
 
 
@@ -113,7 +113,7 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
     assert isinstance(bounded, Splat) and isinstance(free, Splat)
     for share in (0.0, 0.3):
         for a, b in ((bounded.static, free.static), (bounded.moving, free.moving)):
-            seeded = b.logits > -10
+            seeded = b.opacity_logits > -10
             torch.testing.assert_close(
                 a.radiance(share)[seeded],
                 b.radiance(share)[seeded].clamp_max(MAX_SIGMOID_RADIANCE),

@@ -75,7 +75,7 @@ def misses(
 def test_a_layout_is_recognized_and_named(name: str, tmp_path: Path) -> None:
     capture = read(SETS[name](tmp_path))
     assert capture.layout == NAMES[name]
-    assert capture.withheld
+    assert capture.has_held_out
     assert all((tmp_path / p.source).is_file() for p in capture.pictures)
 
 
@@ -307,7 +307,7 @@ def read_whole(root: Path) -> None:
     capture.footage()
     if capture.poses is not None:
         fit_poses(root, capture.poses, list(range(len(capture.pictures))), (mini.H, mini.W))
-    if capture.withheld:
+    if capture.has_held_out:
         held_out_views.read_views(capture)
 
 

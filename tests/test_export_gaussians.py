@@ -109,8 +109,8 @@ def test_the_file_renders_the_fields_own_picture(run: Run, tmp_path: Path, time:
 def test_invisible_and_broken_gaussians_are_left_out(run: Run, tmp_path: Path) -> None:
     field = splat(run)
     all_of_them = len(ply.read(export_one(run, tmp_path / "a.ply", 1.0, LINEAR)).means)
-    seen = (field.static.logits.sigmoid() > ALPHA_MIN).nonzero()[:, 0]
-    field.static.logits.data[seen[:3]] = -8.0
+    seen = (field.static.opacity_logits.sigmoid() > ALPHA_MIN).nonzero()[:, 0]
+    field.static.opacity_logits.data[seen[:3]] = -8.0
     field.static.means.data[seen[3], 1] = float("nan")
     exported = ply.read(export_one(run, tmp_path / "a.ply", 1.0, LINEAR))
     assert len(exported.means) == all_of_them - 4

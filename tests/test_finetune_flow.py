@@ -56,7 +56,7 @@ def test_weights_are_adapted_measured_and_loadable(config: FinetuneConfig):
     assert note["before"] != note["after"]
     start, end = (
         torch.load(config.weights, weights_only=True),
-        flow_networks.load(None, config.out).state_dict(),
+        flow_networks.load_network(None, config.out).state_dict(),
     )
     assert set(start) == set(end)
     assert not torch.equal(start["backbone.conv1.weight"], end["backbone.conv1.weight"])
@@ -65,7 +65,7 @@ def test_weights_are_adapted_measured_and_loadable(config: FinetuneConfig):
 def trained(config: FinetuneConfig) -> dict[str, torch.Tensor]:
     """The weights after `train` on the first three pairs, in the folder of `config`."""
     verb.claim_folder(config)
-    network = flow_networks.load("gmflow", config.weights)
+    network = flow_networks.load_network("gmflow", config.weights)
     verb.train(network, flow_pairs(config.data[0])[:3], (128, 128), config)
     return network.state_dict()
 
@@ -102,7 +102,7 @@ def test_errors_count_where_flow_is_known_and_later_predictions_more():
 
 def test_a_few_steps_lower_the_loss(config: FinetuneConfig):
     """Shifted noise, the same example each time: a network that learns gets closer."""
-    network = flow_networks.load("gmflow", config.weights).requires_grad_(True)
+    network = flow_networks.load_network("gmflow", config.weights).requires_grad_(True)
     images = torch.rand(2, 3, 32, 64, generator=torch.Generator().manual_seed(0))
     images[1] = images[0].roll(3, -1)
     flow, known = torch.zeros(2, 2, 32, 64), torch.ones(2, 32, 64, dtype=torch.bool)
@@ -179,7 +179,7 @@ def test_damaged_measurements_are_repeated(
     text: str, config: FinetuneConfig, capsys: pytest.CaptureFixture[str]
 ):
     network, pairs, kept = (
-        flow_networks.load("gmflow", config.weights),
+        flow_networks.load_network("gmflow", config.weights),
         flow_pairs(config.data[0])[:1],
         config.out / "before.json",
     )

@@ -13,7 +13,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors import weights
 from hdr_nsff.priors.flow import gmflow
 from hdr_nsff.priors.flow.gmflow import GMFlow
-from hdr_nsff.priors.flow.networks import both_ways, load
+from hdr_nsff.priors.flow.networks import load_network, predict_both_directions
 
 rng = torch.Generator().manual_seed(0)
 
@@ -127,12 +127,14 @@ def published() -> Path:
 
 
 def test_published_weights_follow_a_sliding_texture_when_it_darkens():
-    network = load("gmflow", published())
+    network = load_network("gmflow", published())
     noise = np.random.default_rng(0).random((168, 232, 3)).astype(np.float32)
     noise = cv2.GaussianBlur(noise, (0, 0), 2)
     texture = (noise - noise.min()) / np.ptp(noise)
     a, b = texture[20:-20, 20:-20], texture[23:-17, 15:-25]  # (x, y) moves to (x + 5, y - 3)
-    there, back = both_ways(network, a, (b / 4) ** 2)  # darker by two stops, and another curve
+    there, back = predict_both_directions(
+        network, a, (b / 4) ** 2
+    )  # darker by two stops, and another curve
     assert np.median(np.abs(there[8:-8, 8:-8] - [5, -3])) < 0.3
     assert np.median(np.abs(back[8:-8, 8:-8] - [-5, 3])) < 0.3
 

@@ -57,7 +57,7 @@ def changed(scene: Scene, change: Callable[[Frame], Frame], frames: int = 6) -> 
 
 def seen(gaussians: Gaussians) -> Tensor:
     """(G,) bool: which of them draw anything."""
-    return gaussians.logits.detach().sigmoid() > MIN_OPACITY
+    return gaussians.opacity_logits.detach().sigmoid() > MIN_OPACITY
 
 
 def moving_at(field: Splat, time: float) -> Tensor:
@@ -179,7 +179,7 @@ def test_flow_that_is_never_believed_is_no_flow(toy: Scene) -> None:
     one = seeded(changed(toy, lambda f: replace(f, flow_valid={o: doubted[o] for o in f.flow})))[0]
     none = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))[0]
     assert torch.equal(one.moving.means, none.moving.means) and torch.equal(
-        one.trajectories.shifts, none.trajectories.shifts
+        one.trajectories.translations, none.trajectories.translations
     )
 
 

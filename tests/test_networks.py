@@ -14,12 +14,12 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.flow import networks
 from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.priors.flow.networks import (
-    both_ways,
-    load,
+    load_network,
     network_flow,
+    predict_both_directions,
     read_weights,
     refine_flow,
-    resized_flow,
+    resize_flow,
     working_size,
 )
 
@@ -50,7 +50,7 @@ def test_frames_are_matched_near_640_pixels():
 def test_flow_comes_back_in_pixels_of_the_frame():
     """60 x 90 is seen as 192 x 256: 4 px of 256 are 4 * 90 / 256 of 90."""
     network = Constant()
-    there, back = both_ways(network, *np.zeros((2, 60, 90, 3), np.float32))
+    there, back = predict_both_directions(network, *np.zeros((2, 60, 90, 3), np.float32))
     assert network.images.shape == (2, 3, 192, 256)
     assert there.shape == (60, 90, 2)
     assert np.allclose(there, [4 * 90 / 256, -2 * 60 / 192], atol=1e-5)
@@ -59,7 +59,7 @@ def test_flow_comes_back_in_pixels_of_the_frame():
 
 def test_a_constant_flow_survives_any_size():
     flow = torch.tensor([1.0, 2.0]).view(1, 2, 1, 1).expand(1, 2, 40, 30)
-    assert torch.allclose(resized_flow(flow, (20, 60))[0, :, 7, 7], torch.tensor([2.0, 1.0]))
+    assert torch.allclose(resize_flow(flow, (20, 60))[0, :, 7, 7], torch.tensor([2.0, 1.0]))
 
 
 def test_a_network_is_a_flow_prior_that_checks_itself():
@@ -91,14 +91,14 @@ def test_weights_name_their_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     torch.save(state, tmp_path / "flownet.pkl")
     save_file(state, tmp_path / "weights.safetensors", {"network": "gmflow"})
     for given in (tmp_path / "flownet.pkl", tmp_path / "weights.safetensors", tmp_path):
-        network = load("gmflow", given)
+        network = load_network("gmflow", given)
         assert torch.equal(network.state_dict()["upsampler.0.bias"], state["upsampler.0.bias"])
         assert not any(p.requires_grad for p in network.parameters())
-    assert isinstance(load(None, tmp_path), GMFlow)
+    assert isinstance(load_network(None, tmp_path), GMFlow)
     with pytest.raises(InputError, match="weights of gmflow, not of raft"):
-        load("raft", tmp_path)
+        load_network("raft", tmp_path)
     with pytest.raises(InputError, match="does not name its network"):
-        load(None, tmp_path / "flownet.pkl")
+        load_network(None, tmp_path / "flownet.pkl")
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_weights_that_do_not_fit_are_refused_in_one_sentence(tmp_path: Path, nam
     (tmp_path / "broken.pkl").write_bytes(b"PK nothing")
     (tmp_path / "broken.safetensors").write_bytes(b"nothing")
     with pytest.raises(InputError, match=words):
-        load("gmflow", tmp_path / name)
+        load_network("gmflow", tmp_path / name)
 
 
 def test_weights_with_code_in_them_are_not_run(tmp_path: Path):

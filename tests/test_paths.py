@@ -92,7 +92,7 @@ def test_path_file_is_read_back(tmp_path) -> None:
     ]
     file = tmp_path / "weg übers Feld.json"
     file.write_text(json.dumps(entries))
-    first, second = paths.from_json(file, camera())
+    first, second = paths.read_path(file, camera())
     assert first.time == 0.5 and first.ev is None and torch.equal(first.camera.K, K)
     assert torch.allclose(first.camera.c2w, pose(10.0, 1.0))
     assert (
@@ -122,12 +122,12 @@ BAD = {
 def test_bad_path_files_are_refused_in_a_sentence(tmp_path, sentence: str) -> None:
     (tmp_path / "path.json").write_text(BAD[sentence])
     with pytest.raises(InputError, match=sentence):
-        paths.from_json(tmp_path / "path.json", camera())
+        paths.read_path(tmp_path / "path.json", camera())
 
 
 def test_missing_and_binary_path_files_are_refused(tmp_path) -> None:
     with pytest.raises(InputError, match="No such file"):
-        paths.from_json(tmp_path / "none.json", camera())
+        paths.read_path(tmp_path / "none.json", camera())
     (tmp_path / "film.json").write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(InputError, match="not a JSON file"):
-        paths.from_json(tmp_path / "film.json", camera())
+        paths.read_path(tmp_path / "film.json", camera())

@@ -61,7 +61,7 @@ def in_corner(field: Splat) -> int:
 
 def test_unseen_gaussians_go_where_the_error_is() -> None:
     field = card_field()
-    field.static.logits.data[::20] = -10.0  # faded away; others lie outside the picture
+    field.static.opacity_logits.data[::20] = -10.0  # faded away; others lie outside the picture
     before = in_corner(field)
     count = field.relocate([frame_error(corner())], torch.Generator().manual_seed(0))
     assert count == int(MAX_RELOCATED_SHARE * len(field.static))  # more are unseen

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import SIDES, read_exr, write_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr, write_exr
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import write_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
@@ -81,7 +81,7 @@ def truth_of(folder: Path, run: Run) -> Path:
         rays = camera.rays(camera.pixel_grid())
         points = rays.origins + seen.depth[:, None] * rays.directions
         maps = {"Z": 3 * seen.depth}
-        for side, name in SIDES.items():
+        for side, name in MOTION_DIRECTIONS.items():
             flow = seen.scene_flow[side]
             world = 3 * flow @ TURN.T
             pixels = camera.project(points + flow)[0] - camera.pixel_grid()

@@ -39,7 +39,7 @@ def card_field(bases: int = 2) -> Splat:
         tile_plane(field.static, 33, 25, z=4.0, spacing=0.1)
         tile_plane(field.moving, 11, 11, z=2.0, spacing=0.04)
         field.moving.log_radiance[:] = torch.tensor([1.0, 0.0, -1.0])
-        shifts = field.trajectories.shifts.view(TIMES, bases, 4)
+        shifts = field.trajectories.translations.view(TIMES, bases, 4)
         shifts[:, :, :3] = torch.arange(TIMES)[:, None, None] * STEP
         field.background[:] = math.log(0.3)
     return field
@@ -54,7 +54,7 @@ def tile_plane(gaussians: Gaussians, columns: int, rows: int, z: float, spacing:
     gaussians.means[:] = points.reshape(-1, 3)
     gaussians.log_scales[:] = math.log(spacing)
     gaussians.log_scales[:, 2] = math.log(1e-3)  # flat
-    gaussians.logits[:] = 6.0
+    gaussians.opacity_logits[:] = 6.0
 
 
 def batch_of(knot: int, offset: int, seed: int = 0) -> PixelBatch:
@@ -84,7 +84,7 @@ def scattered(
         place = torch.rand(len(g), 3, generator=generator)
         g.means.data = (place - 0.5) * torch.tensor([1.0, 0.8, 2.0]) + torch.tensor([0.0, 0, 3.0])
         g.log_scales.data.fill_(-2.0).add_(0.2 * torch.randn(len(g), 3, generator=generator))
-        g.logits.data.fill_(0.0)
+        g.opacity_logits.data.fill_(0.0)
     return field
 
 
@@ -125,10 +125,10 @@ def test_flow_to_the_neighbor_is_the_projected_displacement(offset: int) -> None
 
 def test_flow_through_a_faint_card_is_the_same() -> None:
     field = card_field()
-    field.static.logits.data[:] = -20.0
+    field.static.opacity_logits.data[:] = -20.0
     full, faint = [], []
     for logit, flows in ((6.0, full), (-3.0, faint)):
-        field.moving.logits.data[:] = logit
+        field.moving.opacity_logits.data[:] = logit
         render = field(batch_of(4, 1))[0]
         flows += [render.warps[0].flow.detach(), render.opacity.detach()]
     at = pixel_of(torch.tensor([0.0, 0, 2]) + 4 * STEP)
@@ -170,7 +170,7 @@ def test_times_may_be_uneven() -> None:
 def test_shares_stay_between_0_and_1(seed: int) -> None:
     field = scattered(seed)
     for gaussians in (field.static, field.moving):
-        gaussians.logits.data.fill_(9.0)
+        gaussians.opacity_logits.data.fill_(9.0)
     r = field.render(CAMERA, 2.3)
     assert float(r.motion.min()) >= 0
     assert float(r.motion.max()) <= float(r.opacity.max()) <= 1 + 1e-5
@@ -200,10 +200,10 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(
     assert isinstance(field, Splat)
     trajectories = field.trajectories
     for frame in (10, 2):  # the second step must not act on the first one's momentum
-        before = [p.detach().clone() for p in (trajectories.turns, trajectories.shifts)]
+        before = [p.detach().clone() for p in (trajectories.rotations, trajectories.translations)]
         t.draw = lambda slot, k=frame: whole_frame(t.scene, k)  # type: ignore[method-assign, misc]
         t.step()
-    for p, old in zip((trajectories.turns, trajectories.shifts), before, strict=True):
+    for p, old in zip((trajectories.rotations, trajectories.translations), before, strict=True):
         moved = (p.detach() != old).view(12, -1).any(1).nonzero()[:, 0].tolist()
         assert moved and set(moved) <= set(range(2 + WINDOW + 1)) and 2 in moved
         assert float(p.grad.abs().max()) == 0  # a step clears what it used
@@ -211,10 +211,10 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(
 
 def test_invisible_gaussians_are_left_alone_by_the_regularizers() -> None:
     field = scattered()
-    field.static.logits.data[:10] = -10.0
+    field.static.opacity_logits.data[:10] = -10.0
     own = field.regularizers(field.cloud(3.0), 3.0)
     (own["opacity"] + own["scale"]).backward()
-    for g in (field.static.logits.grad, field.static.log_scales.grad):
+    for g in (field.static.opacity_logits.grad, field.static.log_scales.grad):
         assert g is not None and float(g[:10].abs().max()) == 0 and float(g[10:].abs().min()) > 0
     field.static.log_scales.data[:10] += 5.0
     torch.testing.assert_close(field.regularizers(field.cloud(3.0), 3.0)["scale"], own["scale"])
@@ -232,7 +232,7 @@ def test_the_regularizers_of_a_plain_field_by_hand() -> None:
 
 def test_the_color_change_by_hand() -> None:
     field = card_field()
-    field.moving.offsets.data[3] = 2.0  # up and down: 2 of 6 differences; 1 of 7 times
+    field.moving.log_radiance_offsets.data[3] = 2.0  # up and down: 2 of 6 differences; 1 of 7 times
     change = field.regularizers(field.cloud(3.0), 3.0)["color_change"].detach()
     assert float(change) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
 
@@ -297,7 +297,12 @@ def test_the_background_shows_where_nothing_is() -> None:
 def test_huge_log_radiance_stays_finite() -> None:
     field = card_field()
     static, moving = field.static, field.moving
-    for p in (field.background, static.log_radiance, moving.log_radiance, moving.offsets):
+    for p in (
+        field.background,
+        static.log_radiance,
+        moving.log_radiance,
+        moving.log_radiance_offsets,
+    ):
         p.data += 1e4
     render, own = field(batch_of(4, 1))
     largest = float(render.radiance.detach().max())
@@ -318,7 +323,7 @@ def test_gaussians_behind_or_in_the_camera_give_finite_flow_and_gradients(z: flo
 
 def test_the_cloud_is_what_render_draws() -> None:
     field = card_field()
-    field.static.logits.data[:25] = -20.0
+    field.static.opacity_logits.data[:25] = -20.0
     cloud = field.gaussians(4.5)
     assert len(cloud.means) == 33 * 25 - 25 + 121 and cloud.motion.sum() == 121
     torch.testing.assert_close(cloud.means[-121:].mean(0), torch.tensor([0.0, 0, 2]) + 4.5 * STEP)
@@ -328,7 +333,7 @@ def test_the_cloud_is_what_render_draws() -> None:
 def test_one_training_time_has_no_flow() -> None:
     field = Splat(SplatConfig(static=20, moving=20, bases=1), torch.zeros(1), 1.0, 6.0, 1200)
     for g in (field.static, field.moving):
-        g.means.data[:, 2], g.logits.data[:], g.log_scales.data[:] = 2.0, 0.0, -2.0
+        g.means.data[:, 2], g.opacity_logits.data[:], g.log_scales.data[:] = 2.0, 0.0, -2.0
     assert isinstance(field, RadianceField)
     render = field.render(CAMERA, 0.7)
     assert float(render.scene_flow[1].abs().max()) == float(render.scene_flow[-1].abs().max()) == 0
@@ -340,8 +345,10 @@ def test_one_training_time_has_no_flow() -> None:
 def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> None:
     field = card_field()
     redder = torch.tensor([1.0, 0.0, -1.0]).expand(121, 3)
-    field.moving.offsets.data = torch.linspace(0, 1, 7)[:, None, None] * redder
-    field.static.offsets.data = torch.linspace(0, 2, 5)[:, None, None].expand(5, 825, 1).clone()
+    field.moving.log_radiance_offsets.data = torch.linspace(0, 1, 7)[:, None, None] * redder
+    field.static.log_radiance_offsets.data = (
+        torch.linspace(0, 2, 5)[:, None, None].expand(5, 825, 1).clone()
+    )
     early, late = field.gaussians(0.0).radiance.log(), field.gaussians(9.0).radiance.log()
     torch.testing.assert_close((late - early)[-1], torch.tensor([1.0, 0.0, -1.0]))
     torch.testing.assert_close((late - early)[0], torch.tensor([2.0, 2.0, 2.0]))
@@ -403,7 +410,7 @@ def test_colors_depend_on_the_view_only_where_the_settings_ask() -> None:
     with torch.no_grad():
         for field in (plain, shiny):
             field.static.means[:] = torch.tensor([0.0, 0.0, 2.0])
-            field.static.log_scales[:], field.static.logits[:] = 0.0, 9.0
+            field.static.log_scales[:], field.static.opacity_logits[:] = 0.0, 9.0
         shiny.static.sh1[0, 1, 0] = 1.0  # green grows to the right
         # sees it along (0.6, 0, 0.8)
         beside = CAMERA.moved(torch.tensor([[0.8, 0, 0.6, -1.5], [0, 1, 0, 0], [-0.6, 0, 0.8, 0]]))

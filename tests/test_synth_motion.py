@@ -5,7 +5,7 @@ comes with it.
 import numpy as np
 from synth_scene import BALL, BOX, ROOM
 
-from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
 from hdr_nsff.scene.truth import GEOMETRY, Truth
 from hdr_nsff.synth.motion import exact_flow, view_geometry
 from hdr_nsff.synth.pathtracer import Tracer
@@ -26,7 +26,7 @@ def test_every_pixel_moves_as_its_body_does() -> None:
     depth, bodies = rng.uniform(1.5, 3, (9, 12)), rng.integers(0, 3, (9, 12))
     channels = view_geometry(INTERIOR, {"Z": depth, "body": bodies}, time, K, c2w)
     np.testing.assert_array_equal(channels["Z"], depth)
-    for side, name in SIDES.items():
+    for side, name in MOTION_DIRECTIONS.items():
         for y, x in np.ndindex(9, 12):
             ray = np.linalg.inv(K) @ [x + 0.5, y + 0.5, 1]
             point = c2w[:, :3] @ (depth[y, x] * ray) + c2w[:, 3]
@@ -79,7 +79,7 @@ def test_the_balls_surface_stays_on_the_ball(tracer: Tracer) -> None:
     distance = np.linalg.norm(surface.points - center[0], axis=-1)
     ball = (surface.bodies == BALL) & (distance < 0.17)  # and not its cord
     assert ball.sum() > 20 and (surface.bodies == BOX).any()
-    for side, name in SIDES.items():
+    for side, name in MOTION_DIRECTIONS.items():
         moved = surface.points + np.stack([channels[f"{name}.{a}"] for a in "xyz"], -1)
         assert np.linalg.norm(center[side] - center[0]) > 0.02
         np.testing.assert_allclose(

@@ -20,7 +20,7 @@ def turning(angle: float) -> Trajectories:
     t = Trajectories(1, KNOTS)
     t.centers[:] = torch.tensor([1.0, 2.0, 3.0])
     half = 0.5 * angle * torch.arange(KNOTS)
-    t.turns.data = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
+    t.rotations.data = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], 1)
     return t
 
 
@@ -62,7 +62,7 @@ def test_a_gaussian_turns_as_its_place_does() -> None:
 
 def test_a_mixture_of_two_shifts_is_their_weighted_mean() -> None:
     t, points = Trajectories(2, KNOTS), random(3, 3)
-    shifts = t.shifts.data.view(KNOTS, 2, 4)
+    shifts = t.translations.data.view(KNOTS, 2, 4)
     shifts[:, 0, 0] = torch.arange(KNOTS)  # one knot after another along x
     shifts[:, 1, 1] = 2.0 * torch.arange(KNOTS)  # twice as far along y
     mixture = torch.tensor([[1.0, 0.0, 0.25], [0.0, 1.0, 0.75]])
@@ -85,7 +85,7 @@ def test_rotation_matrices_turn_and_do_not_mirror() -> None:
 
 def test_constant_acceleration_is_smooth_and_a_jump_is_not() -> None:
     t = Trajectories(2, KNOTS)
-    shifts = t.shifts.data.view(KNOTS, 2, 4)
+    shifts = t.translations.data.view(KNOTS, 2, 4)
     shifts[:, 0, 0] = torch.arange(KNOTS) ** 2
     assert float(t.roughness(4.0, 1.0).detach()) == 0
     shifts[5, 1, 2] = 1.0
@@ -95,15 +95,18 @@ def test_constant_acceleration_is_smooth_and_a_jump_is_not() -> None:
 
 def test_a_drawn_knot_has_gradients_only_where_it_is_marked() -> None:
     t = Trajectories(2, 20)
-    t.turns.data += 0.1 * random(40, 4)
+    t.rotations.data += 0.1 * random(40, 4)
     mixture = random(2, 5, seed=1).softmax(0)
     knot = 9.3
     t.mark(knot)
     moved = t.move(random(5, 3), mixture, t.pose(knot))
     turned = t.turn(random(5, 4), mixture, t.pose(knot))
     (moved.square().sum() + turned[:, 1].sum() + t.roughness(knot, 1.0)).backward()
-    for values, touched in ((t.turns, t.turns_touched), (t.shifts, t.shifts_touched)):
+    for values, touched in (
+        (t.rotations, t.rotations_touched),
+        (t.translations, t.translations_touched),
+    ):
         has = (values.grad != 0).any(1)
         assert bool(has.any()) and bool((touched[has] == 1).all())
-    marked = t.turns_touched.view(20, 2)[:, 0].nonzero()[:, 0].tolist()
+    marked = t.rotations_touched.view(20, 2)[:, 0].nonzero()[:, 0].tolist()
     assert marked == list(range(9 - WINDOW, 10 + WINDOW))

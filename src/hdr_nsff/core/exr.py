@@ -20,7 +20,7 @@ from hdr_nsff.core.io import atomic
 from hdr_nsff.core.picture_size import check_size
 
 # Names of motion channels: to the next frame or time, to the one before.
-SIDES = {1: "forward", -1: "backward"}
+MOTION_DIRECTIONS = {1: "forward", -1: "backward"}
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)  # chromaticities of R, G, B and white
 
 

@@ -80,14 +80,14 @@ class ExportedSequence(Note):
     display_exposure: Brightness
 
 
-class Made(Note):
+class TruthNote(Note):
     """`made_of.json`: a hash of the files that a truth folder was made from."""
 
     marks = ("key",)
     key: str
 
 
-class Layout(Note):
+class LayoutNote(Note):
     """`hdr_nsff_export.json` of a scene exported in a public layout."""
 
     marks = ("layout",)

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.exr import SIDES, read_exr, write_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr, write_exr
 from hdr_nsff.core.io import write_text
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import to_device
@@ -80,7 +80,9 @@ def render_maps(run: Run, view: PathView, motion: bool) -> dict[str, np.ndarray]
     for side, frames in intervals(view.time, times).items():
         if side in flows:
             flow = image(flows[side]) / frames
-            channels |= {f"{SIDES[side]}.{axis}": flow[..., k] for k, axis in enumerate("xyz")}
+            channels |= {
+                f"{MOTION_DIRECTIONS[side]}.{axis}": flow[..., k] for k, axis in enumerate("xyz")
+            }
     return channels
 
 
@@ -94,7 +96,7 @@ def intervals(time: float, times: Sequence[float]) -> dict[int, float]:
     positions = np.arange(len(times))
     knot = float(np.interp(time, times, positions))
     spans = {}
-    for side in SIDES:
+    for side in MOTION_DIRECTIONS:
         if 0 <= knot + side <= len(times) - 1:
             end = float(np.interp(knot + side, positions, times))
             spans[side] = abs(end - time)
@@ -114,7 +116,7 @@ def geometry_of(path: Path, view: PathView) -> Geometry:
     rays = view.camera.rays(pixels)
     points = rays.origins + depth.reshape(-1, 1) * rays.directions
     flow, scene_flow = {}, {}
-    for side, name in SIDES.items():
+    for side, name in MOTION_DIRECTIONS.items():
         if f"{name}.x" in channels:
             vectors = torch.stack([channels[f"{name}.{axis}"] for axis in "xyz"], -1)
             landing = view.camera.project(points + vectors.reshape(-1, 3))[0]

@@ -37,7 +37,13 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.flow_training.flow_exposures import Example, example, recorded_pair
 from hdr_nsff.flow_training.flow_sets import FlowPair, flow_pairs, read_sample
-from hdr_nsff.priors.flow.networks import FINETUNED, MULTIPLE, FlowNetwork, both_ways, load
+from hdr_nsff.priors.flow.networks import (
+    FINETUNED,
+    MULTIPLE,
+    FlowNetwork,
+    load_network,
+    predict_both_directions,
+)
 
 # weight of each of a network's predictions against the next one; GMFlow (Xu et al.
 # 2022) has 0.9, RAFT 0.8
@@ -108,7 +114,7 @@ def finetune_flow(config: FinetuneConfig) -> Path:
     training, held_out = split_pairs(pairs, config.held_out)
     chosen = np.unique(np.linspace(0, len(held_out) - 1, config.measure).astype(int))
     held_out = [held_out[k] for k in chosen]
-    network = load(config.network, config.weights, device)
+    network = load_network(config.network, config.weights, device)
     start = {k: v.clone() for k, v in network.state_dict().items()}
     with writing_to(config.out), lock_output(config.out):
         claim_folder(config)
@@ -356,7 +362,7 @@ def measure_errors(network: FlowNetwork, pairs: list[FlowPair]) -> dict[str, dic
         sample = read_sample(pair)
         for stops in MEASURED_EV:
             pictures = recorded_pair(sample.radiance, stops, equal=True)
-            flow = np.stack(both_ways(network, *pictures))
+            flow = np.stack(predict_both_directions(network, *pictures))
             error = np.linalg.norm(flow - sample.flow, axis=-1)[sample.known]
             errors[f"{stops:g}"].append(error)
     result = {}

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hdr_nsff.flow_training.flow_sets import Sample
-from hdr_nsff.priors.flow.networks import resized, resized_flow, working_size
+from hdr_nsff.priors.flow.networks import resize_flow, resize_images, working_size
 from hdr_nsff.radiometry.common_range import LUMA, common_rgb, recorded_range
 from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import POINTS, Curve, Noise, film, record, response_curve
@@ -140,8 +140,8 @@ def random_crop(
     def crop(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array[:, y : y + h, x : x + w].copy())
 
-    rgb = resized(crop(images).permute(0, 3, 1, 2).float(), size)
-    flow = resized_flow(crop(sample.flow).permute(0, 3, 1, 2), size)
+    rgb = resize_images(crop(images).permute(0, 3, 1, 2).float(), size)
+    flow = resize_flow(crop(sample.flow).permute(0, 3, 1, 2), size)
     share = functional.interpolate(crop(sample.known)[:, None].float(), size=size, mode="area")
     known = share[:, 0] > MIN_KNOWN_SHARE
     for axis, channel in ((-1, 0), (-2, 1)):

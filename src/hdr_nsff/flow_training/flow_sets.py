@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
 from hdr_nsff.core.images import read_image, read_mask
 from hdr_nsff.radiometry.recording import response_curve
 
@@ -180,8 +180,8 @@ def read_flow_file(path: Path, side: int) -> np.ndarray:
         case ".pfm":
             return read_pfm(path)[..., :2]
         case _:
-            u = read_channel(path, f"{SIDES[side]}.u")
-            v = read_channel(path, f"{SIDES[side]}.v")
+            u = read_channel(path, f"{MOTION_DIRECTIONS[side]}.u")
+            v = read_channel(path, f"{MOTION_DIRECTIONS[side]}.v")
             return np.stack([u, v], -1)
 
 

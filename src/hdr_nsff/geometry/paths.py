@@ -141,7 +141,7 @@ def interpolate_camera(a: Camera, b: Camera, fraction: float) -> Camera:
     return replace(a, K=torch.lerp(a.K, b.K, fraction), c2w=c2w)
 
 
-def from_json(path: Path | str, like: Camera) -> list[PathView]:
+def read_path(path: Path | str, like: Camera) -> list[PathView]:
     """The views of a path file (format above).
 
     `like` gives the frame size, and `K` for views without one. InputError in one

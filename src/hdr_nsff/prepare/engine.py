@@ -106,7 +106,7 @@ def capture_part(work: Work, name: StepName) -> Any:
             return [(p.source, p.time, p.camera_id) for p in pictures]
         case "exposure":
             known = asdict(capture.exposures) if capture.exposures else None
-            return [capture.withheld, known, [(p.ev, p.bracket) for p in pictures]]
+            return [capture.has_held_out, known, [(p.ev, p.bracket) for p in pictures]]
         case "flow" if work.gives("flow"):
             named = [sorted(p.flow.items()) for p in pictures]
             return [[(to, ingest.hash_file(path)) for to, path in each] for each in named]
@@ -115,7 +115,7 @@ def capture_part(work: Work, name: StepName) -> Any:
             cameras = [given.K.tolist(), given.c2w.tolist(), given.size.tolist()]
             return [*cameras, given.near, given.far, points]
         case "masks" if work.gives("masks"):
-            return [capture.still, capture.white_moves, files(lambda p: p.mask)]
+            return [capture.is_static, capture.white_moves, files(lambda p: p.mask)]
         case "static_depth" if work.gives("depth"):
             maps = [files(lambda p: p.depth), files(lambda p: p.confidence)]
             return [capture.depth_kind, capture.depth_units, *maps]

@@ -49,7 +49,7 @@ def prepare(config: PrepareConfig) -> Path:
         introduce(work)
         for name, step in STEPS.items():
             run_step(work, name, step)
-        if work.capture is not None and work.capture.withheld:
+        if work.capture is not None and work.capture.has_held_out:
             write_truth(
                 work.capture, work.manifest, work.own_time, truth_place(config), config.max_size
             )
@@ -115,7 +115,7 @@ def introduce(work: Work) -> None:
     stored = ["exposures"] if capture.parts()["exposures"] else []
     parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
     given = [*stored, *(part for part in parts if work.gives(part))]
-    kept = f", held-out views for {truth_place(work.config)}" if capture.withheld else ""
+    kept = f", held-out views for {truth_place(work.config)}" if capture.has_held_out else ""
     say(
         f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}"
     )

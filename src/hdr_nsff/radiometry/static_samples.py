@@ -1,7 +1,7 @@
 """Static points with what every exposure recorded of them, found through disparity and
 poses: the input of `debevec.py`.
 
-Points lie where nothing moves and the surface is smooth, so that a pixel of
+Points lie where nothing moves and the surface is patch_statistics, so that a pixel of
 misplacement costs little. They are spread over the recorded levels. A value is the mean
 of 3x3 pixels, and it counts only where all nine are away from black and saturation: a
 mean over clipped pixels is no recording.
@@ -27,7 +27,7 @@ class StaticSamplesTuning:
 
     mover_margin_px: int = 3  # pixels this close to a moving one are left out
     min_confidence: float = 0.1  # of the disparity
-    # a patch is smooth if its values differ by less than this, plus a share of the
+    # a patch is patch_statistics if its values differ by less than this, plus a share of the
     # highest one
     max_contrast: float = 0.03
     max_relative_contrast: float = 0.12
@@ -57,7 +57,7 @@ class PatchStatistics:
     mean: np.ndarray  # (H, W, 3) recorded
     unclipped: np.ndarray  # (H, W, 3) bool: all nine away from black and saturation
     saturated: np.ndarray  # (H, W, 3) bool: all nine saturated
-    good: np.ndarray  # (H, W) bool: smooth, and known to be found again
+    good: np.ndarray  # (H, W) bool: patch_statistics, and known to be found again
 
 
 def static_samples(
@@ -150,13 +150,13 @@ def view_patches(
         known = known & (near_movers == 0)
     if view.confidence is not None:
         known = known & (view.confidence > tuning.min_confidence)
-    return smooth(view.image, known, tuning)
+    return patch_statistics(view.image, known, tuning)
 
 
-def smooth(
+def patch_statistics(
     image: np.ndarray, known: np.ndarray, tuning: StaticSamplesTuning = StaticSamplesTuning()
 ) -> PatchStatistics:
-    """The patches of a recorded `image` (H, W, 3), good where they are smooth and
+    """The patches of a recorded `image` (H, W, 3), good where they are patch_statistics and
     `known` (H, W) bool.
     """
     window = np.ones((3, 3), np.uint8)

@@ -57,7 +57,7 @@ def plan_shot(
     if not path.endswith(".json"):
         known = "training, fixed, bullet, slowmo, all or a .json file"
         raise InputError(f"path {path!r}: not known; use {known}")
-    views = paths.from_json(path, start.camera)
+    views = paths.read_path(path, start.camera)
     check_views(run, path, views)
     return Shot(Path(path).stem, views, fps)
 

@@ -25,7 +25,7 @@ import torch
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import SIDES, write_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, write_exr
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
 from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import say, track
@@ -179,8 +179,8 @@ def write_still(
     """
     channels = {"RGB": still.radiance, "Z": still.depth, "motion": still.motion}
     for offset, flow in still.flow.items():
-        channels[f"{SIDES[offset]}.u"] = flow[..., 0]
-        channels[f"{SIDES[offset]}.v"] = flow[..., 1]
+        channels[f"{MOTION_DIRECTIONS[offset]}.u"] = flow[..., 0]
+        channels[f"{MOTION_DIRECTIONS[offset]}.v"] = flow[..., 1]
     pose = json.dumps([[round(float(x), 6) for x in row] for row in view.camera.c2w])
     write_exr(path, channels, {**header, "time": float(view.time), "cameraToWorld": pose}, half)
 

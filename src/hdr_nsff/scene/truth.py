@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import Field
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.core.io import read_json
 from hdr_nsff.core.notes import first_problem
@@ -40,7 +40,7 @@ LARGEST_GAIN = 1e6  # of a white balance
 # units (0 where it hits nothing); pixels that the surface moves in this camera,
 # standing still, until one frame later and one frame earlier; the same in the truth's
 # world, in true units.
-GEOMETRY = ("Z", *(f"{side}.{axis}" for side in SIDES.values() for axis in "uvxyz"))
+GEOMETRY = ("Z", *(f"{side}.{axis}" for side in MOTION_DIRECTIONS.values() for axis in "uvxyz"))
 
 
 class TruthView(Strict):

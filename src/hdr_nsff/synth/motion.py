@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdr_nsff.core.exr import SIDES
+from hdr_nsff.core.exr import MOTION_DIRECTIONS
 from hdr_nsff.synth.scenes.base import SynthScene
 from hdr_nsff.synth.scenes.geometry import back_project, pixel_centers, project
 
@@ -61,7 +61,7 @@ def view_geometry(
     bodies, uv = surface_points(channels)
     moving = (bodies > 0)[..., None]
     geometry = {"Z": channels["Z"]}
-    for side, name in SIDES.items():
+    for side, name in MOTION_DIRECTIONS.items():
         there = scene.moved(points, bodies, uv, time, time + side)
         flow = exact_flow(there, K, c2w) * moving  # exactly zero where nothing moves
         scene_flow = there - points

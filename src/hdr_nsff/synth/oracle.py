@@ -16,7 +16,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hdr_nsff.core.exr import SIDES
+from hdr_nsff.core.exr import MOTION_DIRECTIONS
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.priors.movers.estimate import estimate_movers
@@ -167,7 +167,7 @@ def depth_error(
 
 def rendered_flow(channels: dict[str, np.ndarray], side: int) -> np.ndarray:
     """The rendered flow (H, W, 2) px to the next (+1) or previous (-1) frame."""
-    name = SIDES[side]
+    name = MOTION_DIRECTIONS[side]
     return np.stack([channels[f"{name}.u"], channels[f"{name}.v"]], -1)
 
 

@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import SIDES, read_exr, write_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr, write_exr
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json, write_text, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -183,7 +183,7 @@ def geometry_channels(
         for k, name in enumerate(UV):
             channels[name] = surface.uv[..., k] * (surface.bodies > 0)
     if view.name.startswith("clip"):
-        for side, name in SIDES.items():
+        for side, name in MOTION_DIRECTIONS.items():
             other = view.time + side
             there = scene.moved(surface.points, surface.bodies, surface.uv, view.time, other)
             flow = exact_flow(there, K, scene.pose(views, other))

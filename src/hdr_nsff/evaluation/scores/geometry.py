@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import SIDES, read_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
 from hdr_nsff.evaluation.predictions import Geometry, geometry_of
 from hdr_nsff.evaluation.targets import GeometryFile, Target, moving_of
 from hdr_nsff.maths import metrics
@@ -60,8 +60,10 @@ def true_geometry(file: GeometryFile) -> Geometry:
         return torch.from_numpy(np.stack([channels[f"{name}.{a}"] for a in axes], -1))
 
     rotation = torch.from_numpy(file.rotation).float()
-    flow = {side: stacked(name, "uv") for side, name in SIDES.items()}
-    scene_flow = {side: stacked(name, "xyz") @ rotation.T for side, name in SIDES.items()}
+    flow = {side: stacked(name, "uv") for side, name in MOTION_DIRECTIONS.items()}
+    scene_flow = {
+        side: stacked(name, "xyz") @ rotation.T for side, name in MOTION_DIRECTIONS.items()
+    }
     return Geometry(torch.from_numpy(channels["Z"]), flow, scene_flow)
 
 

@@ -68,10 +68,10 @@ class Gaussians(nn.Module):
         self.quaternions = nn.Parameter(unturned)  # w x y z, of any length
         # log of standard deviations in scene units
         self.log_scales = nn.Parameter(torch.full((count, 3), START_LOG_SCALE))
-        self.logits = nn.Parameter(torch.full((count,), START_LOGIT))  # of opacity
+        self.opacity_logits = nn.Parameter(torch.full((count,), START_LOGIT))  # of opacity
         self.log_radiance = nn.Parameter(torch.zeros(count, 3))  # or log odds
         # of log radiance, spread over the clip's time
-        self.offsets = nn.Parameter(torch.zeros(knots, count, channels))
+        self.log_radiance_offsets = nn.Parameter(torch.zeros(knots, count, channels))
         # change of log radiance (rgb) per unit of view direction (xyz)
         self.sh1 = nn.Parameter(torch.zeros(count if view_dependence else 0, 3, 3))
 
@@ -80,5 +80,7 @@ class Gaussians(nn.Module):
 
     def radiance(self, share: float) -> Tensor:
         """Radiance (G, 3) at a share in [0, 1] of the clip's time."""
-        offset = interpolate_linear(self.offsets, share * (len(self.offsets) - 1))
+        offset = interpolate_linear(
+            self.log_radiance_offsets, share * (len(self.log_radiance_offsets) - 1)
+        )
         return to_radiance(self.log_radiance + offset, self.bounded)

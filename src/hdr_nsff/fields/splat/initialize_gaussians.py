@@ -104,7 +104,7 @@ def place(gaussians: Gaussians, points: PointCloud) -> int:
     spacing = apart.clamp(min=0.3 * points.footprint[:n], max=8 * points.footprint[:n])
     gaussians.means[:n] = points.positions[:n]
     gaussians.log_scales[:n] = (OVERLAP * spacing).log()[:, None]
-    gaussians.logits[:n] = math.log(OPACITY / (1 - OPACITY))
+    gaussians.opacity_logits[:n] = math.log(OPACITY / (1 - OPACITY))
     gaussians.log_radiance[:n] = from_log_radiance(points.log_radiance[:n], gaussians.bounded)
     return n
 
@@ -246,8 +246,8 @@ def share_bases(field: Splat, movers: Sequence[Mover], points: Tensor, owner: Te
     mover.
     """
     motions, num_bases = field.trajectories, field.config.bases
-    turns = motions.turns.data.view(motions.num_knots, num_bases, 4)
-    shifts = motions.shifts.data.view(motions.num_knots, num_bases, 4)
+    turns = motions.rotations.data.view(motions.num_knots, num_bases, 4)
+    shifts = motions.translations.data.view(motions.num_knots, num_bases, 4)
     field.mixture_logits[:] = 0
     first = 0
     counts = bases_per_mover(torch.bincount(owner, minlength=len(movers)), num_bases)

@@ -65,12 +65,12 @@ def copy_gaussians(
         gaussians.quaternions,
         gaussians.log_scales,
         gaussians.log_radiance,
-        gaussians.logits,
+        gaussians.opacity_logits,
     ):
         parameter[target] = parameter[source]
     if len(gaussians.sh1):
         gaussians.sh1[target] = gaussians.sh1[source]
-    offsets = gaussians.offsets.movedim(1, -1)  # (knots, channels, G)
+    offsets = gaussians.log_radiance_offsets.movedim(1, -1)  # (knots, channels, G)
     for values in (offsets, *companions):
         values[..., target] = values[..., source]
 

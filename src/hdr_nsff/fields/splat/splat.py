@@ -186,7 +186,9 @@ class Splat(nn.Module):
         """Opacities (G,) in [0, 1] at a share of the clip."""
         position = share * (len(self.opacity_offsets) - 1)
         offsets = interpolate_linear(self.opacity_offsets, position)
-        return torch.cat([self.static.logits, self.moving.logits + offsets]).sigmoid()
+        return torch.cat(
+            [self.static.opacity_logits, self.moving.opacity_logits + offsets]
+        ).sigmoid()
 
     def positions(self, knot: float) -> Tensor:
         """Means (G, 3) of all Gaussians at a knot."""
@@ -326,13 +328,13 @@ class Splat(nn.Module):
         """
         static, moving = self.static, self.moving
         visible = cloud.opacities.detach() > MIN_OPACITY
-        color_change = mean_square(moving.offsets.diff(dim=0))
-        color_offset = mean_square(moving.offsets)
+        color_change = mean_square(moving.log_radiance_offsets.diff(dim=0))
+        color_offset = mean_square(moving.log_radiance_offsets)
         terms = {
             "opacity": (cloud.opacities * visible).mean(),
             "scale": (cloud.scales * visible[:, None]).mean() / self.unit,
             "trajectory": self.trajectories.roughness(knot, self.unit),
-            "brightness_drift": mean_square(static.offsets),
+            "brightness_drift": mean_square(static.log_radiance_offsets),
             "opacity_offsets": mean_square(self.opacity_offsets.diff(dim=0)),
             "color_change": color_change + COLOR_OFFSET_SHARE * color_offset,
         }
@@ -376,9 +378,9 @@ class Splat(nn.Module):
             "means": config.position_lr * self.unit,
             "quaternions": config.shape_lr,
             "log_scales": config.shape_lr,
-            "logits": config.opacity_lr,
+            "opacity_logits": config.opacity_lr,
             "log_radiance": config.color_lr,
-            "offsets": config.color_lr,
+            "log_radiance_offsets": config.color_lr,
             "sh1": config.color_lr,
         }
         by_rate: dict[float, list[Tensor]] = {}
@@ -392,9 +394,9 @@ class Splat(nn.Module):
         ]
         t = self.trajectories
         poses = ParamGroup(
-            [t.turns, t.shifts],
+            [t.rotations, t.translations],
             config.lr * config.pose_lr,
-            row_marks=[t.turns_touched, t.shifts_touched],
+            row_marks=[t.rotations_touched, t.translations_touched],
         )
         return [*groups, poses]
 

@@ -35,27 +35,27 @@ class Trajectories(nn.Module):
     """`num_bases` (B) rigid motions over `num_knots` (T) training times."""
 
     centers: Tensor
-    turns_touched: Tensor
-    shifts_touched: Tensor
+    rotations_touched: Tensor
+    translations_touched: Tensor
 
     def __init__(self, num_bases: int, num_knots: int) -> None:
         super().__init__()
         self.num_bases, self.num_knots = num_bases, num_knots
         rows = num_knots * num_bases
         unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1)
-        self.turns = nn.Parameter(unturned)  # (T * B, 4) quaternions w x y z of any length
+        self.rotations = nn.Parameter(unturned)  # (T * B, 4) quaternions w x y z of any length
         # (T * B, 3) scene units, and a column that is not used: optimizer rows have
         # four
-        self.shifts = nn.Parameter(torch.zeros(rows, 4))
+        self.translations = nn.Parameter(torch.zeros(rows, 4))
         self.register_buffer("centers", torch.zeros(num_bases, 3))  # scene units
-        for name in ("turns_touched", "shifts_touched"):  # rows with a gradient
+        for name in ("rotations_touched", "translations_touched"):  # rows with a gradient
             marks = torch.zeros(rows, dtype=torch.uint8)
             self.register_buffer(name, marks, persistent=False)
 
     def pose(self, knot: float) -> Pose:
         """The bases' poses at a knot."""
-        turns = catmull_rom(self.turns.view(self.num_knots, self.num_bases, 4), knot)
-        shifts = catmull_rom(self.shifts.view(self.num_knots, self.num_bases, 4), knot)
+        turns = catmull_rom(self.rotations.view(self.num_knots, self.num_bases, 4), knot)
+        shifts = catmull_rom(self.translations.view(self.num_knots, self.num_bases, 4), knot)
         return nn.functional.normalize(turns, dim=-1), shifts[:, :3]
 
     def move(self, points: Tensor, mixture: Tensor, pose: Pose) -> Tensor:
@@ -81,7 +81,7 @@ class Trajectories(nn.Module):
     def mark(self, knot: float) -> None:
         """Mark the poses near `knot` as the only ones that this step may change."""
         first, last = self.window(knot)
-        for touched in (self.turns_touched, self.shifts_touched):
+        for touched in (self.rotations_touched, self.translations_touched):
             touched.view(self.num_knots, self.num_bases)[first:last] = 1
 
     def window(self, knot: float) -> tuple[int, int]:
@@ -95,11 +95,11 @@ class Trajectories(nn.Module):
         numbers of a pose. Constant acceleration costs nothing.
         """
         first, last = self.window(knot)
-        turns = self.turns.view(self.num_knots, -1, 4)[first:last]
+        turns = self.rotations.view(self.num_knots, -1, 4)[first:last]
         turns = nn.functional.normalize(turns, dim=-1)
         if last - first < len(THIRD_DIFFERENCE):
             return turns.sum() * 0
-        shifts = self.shifts.view(self.num_knots, -1, 4)[first:last] / unit
+        shifts = self.translations.view(self.num_knots, -1, 4)[first:last] / unit
         poses = torch.cat([turns, shifts], -1)
         third_differences = poses.unfold(0, 4, 1) @ THIRD_DIFFERENCE.to(poses)
         return POSE_NUMBERS * third_differences.square().mean()

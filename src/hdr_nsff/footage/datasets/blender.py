@@ -71,9 +71,9 @@ def read(folder: Path) -> Capture:
         root=folder,
         pictures=pictures,
         poses=select_poses(from_transforms(path, document), order),
-        withheld=(folder / TEST).is_file(),
+        has_held_out=(folder / TEST).is_file(),
         over=1.0,
-        still=not any("time" in frame for frame in frames),
+        is_static=not any("time" in frame for frame in frames),
         notes=notes,
     )
 

@@ -70,10 +70,10 @@ class Capture:
     root: Path
     pictures: list[Picture]  # camera by camera, in time
     poses: GivenPoses | None  # row by row those of `pictures`
-    withheld: bool  # the set holds views out, which `prepare` writes into a truth folder
+    has_held_out: bool  # the set holds views out, which `prepare` writes into a truth folder
     # gray behind transparent pixels: 1 white, 0 black; None: none is expected
     over: float | None = None
-    still: bool = False  # nothing moves: times only number the views
+    is_static: bool = False  # nothing moves: times only number the views
     white_moves: bool = True  # moving pixels are white in the masks
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
     # own: of the depth network, brought to scene units by `sparse_depth`
@@ -117,7 +117,7 @@ class Capture:
             "exposures": self.exposures is not None or known_exposures,
             "poses": self.poses is not None,
             "flow": any(p.flow for p in pictures),
-            "masks": self.still or all(p.mask for p in pictures),
+            "masks": self.is_static or all(p.mask for p in pictures),
             "depth": all(p.depth for p in pictures),
         }
 

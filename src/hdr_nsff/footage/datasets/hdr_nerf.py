@@ -54,9 +54,9 @@ def read(folder: Path) -> Capture:
         root=folder,
         pictures=pictures,
         poses=from_transforms(path, document),
-        withheld=(folder / TEST).is_file(),
+        has_held_out=(folder / TEST).is_file(),
         over=1.0,
-        still=True,
+        is_static=True,
     )
 
 

@@ -48,8 +48,8 @@ def read(folder: Path) -> Capture:
         root=folder,
         pictures=pictures,
         poses=select_poses(given, rows),
-        withheld=len(ev) > NUM_EXPOSURES,
-        still=True,
+        has_held_out=len(ev) > NUM_EXPOSURES,
+        is_static=True,
     )
 
 

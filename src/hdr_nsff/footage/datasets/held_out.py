@@ -281,7 +281,7 @@ def claim_folder(out: Path, key: str) -> bool:
     Otherwise a note of that is written, and files made of something else are removed.
     InputError where the folder holds something else.
     """
-    found = notes.read(out / NOTE, notes.Made)
+    found = notes.read(out / NOTE, notes.TruthNote)
     if found is not None and found.key == key:
         if not (out / "truth.json").is_file():
             return False
@@ -295,7 +295,7 @@ def claim_folder(out: Path, key: str) -> bool:
     (out / "truth.json").unlink(missing_ok=True)
     for name in ("recorded", "radiance", "masks"):
         shutil.rmtree(out / name, ignore_errors=True)
-    notes.write(out / NOTE, notes.Made(key=key))
+    notes.write(out / NOTE, notes.TruthNote(key=key))
     return False
 
 

@@ -86,7 +86,7 @@ def blender_views(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
         if isinstance(frame.get("exr_file_path"), str):
             purpose = f"the radiance of held-out view {number}"
             radiance = picture_file(root, frame["exr_file_path"], purpose)
-        view_time = None if capture.still else clock(time)
+        view_time = None if capture.is_static else clock(time)
         views.append(HeldOut(f"{number:04d}", view_time, [(file, exposure)], radiance))
     return views, from_transforms(path, document)
 

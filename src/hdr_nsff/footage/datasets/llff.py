@@ -117,7 +117,7 @@ def read(folder: Path) -> Capture:
         root=folder,
         pictures=pictures,
         poses=replace(given, names=sources),
-        withheld=has_views,
+        has_held_out=has_views,
         white_moves=white_moves,
         depth_kind="metric" if is_metric else "disparity",
         depth_units="own",
@@ -128,7 +128,7 @@ def read(folder: Path) -> Capture:
     if extra is None:
         return capture
     points = None if model is None else model.points
-    capture = replace(capture, points=points, withheld=has_views or bool(extra.held_out))
+    capture = replace(capture, points=points, has_held_out=has_views or bool(extra.held_out))
     return with_extra(capture, extra, [file.name for file in files])
 
 

@@ -96,7 +96,7 @@ def read(folder: Path) -> Capture:
         root=folder,
         pictures=pictures,
         poses=select_poses(given, order),
-        withheld=bool(outside),
+        has_held_out=bool(outside),
         depth_scale=1 / MILLIMETERS,
         notes=notes,
     )
@@ -151,7 +151,7 @@ def read_picture(folder: Path, frame: dict[str, Any], time: float, camera_id: in
 
 
 def exported(
-    folder: Path, frames: list[dict[str, Any]], given: GivenPoses, extra: Extra, withheld: bool
+    folder: Path, frames: list[dict[str, Any]], given: GivenPoses, extra: Extra, has_held_out: bool
 ) -> Capture:
     """A scene that `export` wrote in this layout."""
     own = [extra.frames[frame["file_path"]] for frame in frames]
@@ -162,7 +162,7 @@ def exported(
         root=folder,
         pictures=[exported_picture(folder, frames[k]["file_path"], own[k]) for k in order],
         poses=GivenPoses(poses.names, poses.K, poses.c2w, poses.size, extra.near, extra.far),
-        withheld=withheld,
+        has_held_out=has_held_out,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
         points=static_points(folder, extra.points),
         exposures=extra.exposures(),

@@ -101,7 +101,7 @@ def write_files(out: Path, layout: str, scene: Path, files: LayoutFiles) -> None
     check_places(out, files, earlier)
 
     def note(names: Iterable[str]) -> None:
-        made = notes.Layout(layout=layout, scene=str(scene), files=sorted(names))
+        made = notes.LayoutNote(layout=layout, scene=str(scene), files=sorted(names))
         notes.write(out / NOTE, made)
 
     note({*earlier, *files})  # holds also where this is killed half-way
@@ -120,7 +120,7 @@ def earlier_files(out: Path) -> set[str]:
         raise InputError(f"{out}: is a file; --layout writes a folder, name another one")
     if not out.is_dir():
         return set()
-    note = notes.read(out / NOTE, notes.Layout)
+    note = notes.read(out / NOTE, notes.LayoutNote)
     if note is not None:
         for name in note.files:
             resolve_name(out, name, "export")  # the note may have been edited

@@ -324,7 +324,7 @@ def hold_out_spacing(work: Work) -> int:
     """
     if work.config.hold_out is not None:
         return work.config.hold_out
-    brings_views = work.capture is not None and work.capture.withheld
+    brings_views = work.capture is not None and work.capture.has_held_out
     return 0 if brings_views else ingest.HOLD_OUT
 
 

@@ -45,7 +45,7 @@ def refine_flow(work: Work) -> StepResult:
         i, j = pair
         if stored(work, names[i, j]) and stored(work, names[j, i]):
             return  # by a run that was killed
-        for one, found, valid in refiner.both_ways(i, j):
+        for one, found, valid in refiner.predict_both_directions(i, j):
             write_flow(work, names[one], found, valid)
 
     map_in_threads(refine, [(i, j) for i, j in own if i < j], "flow of movers")
@@ -79,7 +79,7 @@ class Refiner:
         frames = zip(video, self.clipped, strict=True)
         self.ranges = [recorded_range(frame, clipped) for frame, clipped in frames]
 
-    def both_ways(self, i: int, j: int) -> list[tuple[Pair, np.ndarray, np.ndarray]]:
+    def predict_both_directions(self, i: int, j: int) -> list[tuple[Pair, np.ndarray, np.ndarray]]:
         """((from, to), flow (H, W, 2) px, valid (H, W)) of the pair, there and back."""
         there, back = self.least_squares(i, j), self.least_squares(j, i)
         valid_there = valid_flow(there, back, self.clipped[i], self.clipped[j])

@@ -78,7 +78,9 @@ def network_flow(
     ranges = recorded_ranges(video, clipped, pairs)
 
     def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-        forward, backward = both_ways(network, *common_rgb(video, ranges, i, j), tuning)
+        forward, backward = predict_both_directions(
+            network, *common_rgb(video, ranges, i, j), tuning
+        )
         a, b = common_gray(video, ranges, i, j)
         forward = refine_flow(a, b, forward, tuning, dense)
         backward = refine_flow(b, a, backward, tuning, dense)
@@ -104,7 +106,7 @@ def refine_flow(
 
 
 @torch.no_grad()
-def both_ways(
+def predict_both_directions(
     network: FlowNetwork,
     a: np.ndarray,
     b: np.ndarray,
@@ -114,8 +116,8 @@ def both_ways(
     device = next(p.device for p in network.parameters())
     height, width = a.shape[:2]
     pair = torch.from_numpy(np.stack([a, b])).to(device).permute(0, 3, 1, 2).float()
-    flow = network(resized(pair, working_size(height, width, tuning)))
-    flow = resized_flow(flow, (height, width))
+    flow = network(resize_images(pair, working_size(height, width, tuning)))
+    flow = resize_flow(flow, (height, width))
     forward, backward = flow.permute(0, 2, 3, 1).cpu().numpy()
     return forward, backward
 
@@ -135,18 +137,18 @@ def working_size(
     return side(height), side(width)
 
 
-def resized(images: Tensor, size: tuple[int, int]) -> Tensor:
+def resize_images(images: Tensor, size: tuple[int, int]) -> Tensor:
     """Images (N, C, H, W) in [0, 1] at another size (H, W)."""
     return functional.interpolate(images, size=size, mode="bicubic", antialias=True).clamp(0, 1)
 
 
-def resized_flow(flow: Tensor, size: tuple[int, ...]) -> Tensor:
+def resize_flow(flow: Tensor, size: tuple[int, ...]) -> Tensor:
     """Flow (N, 2, H, W) at another size (H, W), in pixels of that size."""
     scale = flow.new_tensor([size[1] / flow.shape[3], size[0] / flow.shape[2]]).view(2, 1, 1)
     return functional.interpolate(flow, size=tuple(size), mode="bilinear", antialias=True) * scale
 
 
-def load(
+def load_network(
     name: Network | None, given: Path | None, device: torch.device | str = "cpu"
 ) -> FlowNetwork:
     """The network `name` with its weights, in evaluation mode.
@@ -179,7 +181,7 @@ def load(
 
 
 def weights_file(name: Network | None, given: Path | None) -> Path:
-    """The file that `load` reads; InputError where there is none."""
+    """The file that `load_network` reads; InputError where there is none."""
     finetuned = None if given is None else finetuned_file(given)
     return finetuned or find(name or "gmflow", given)
 

@@ -17,7 +17,12 @@ import torch
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.flow_files import read_flow_files
 from hdr_nsff.priors.flow.dense import DenseFlowTuning, FlowPrior, dense_flow
-from hdr_nsff.priors.flow.networks import NetworkFlowTuning, load, network_flow, weights_file
+from hdr_nsff.priors.flow.networks import (
+    NetworkFlowTuning,
+    load_network,
+    network_flow,
+    weights_file,
+)
 from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, SemanticTuning, semantic_flow
 from hdr_nsff.priors.weights import entry, find, locate
 
@@ -117,9 +122,9 @@ def flow_source(
         case "semantic":
             return semantic_flow(semantic, weights, neighbors, equal, tuning.semantic, tuning.dense)
         case "gmflow" | "raft":
-            network = load(source, weights, default_device())
+            network = load_network(source, weights, default_device())
         case "raft-finetuned":
-            network = load(None, weights, default_device())
+            network = load_network(None, weights, default_device())
         case _:
             assert_never(source)
     return partial(network_flow, network, tuning=tuning.network, dense=tuning.dense)
