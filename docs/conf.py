@@ -11,7 +11,8 @@ extensions = ["myst_parser"]
 myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
 myst_heading_anchors = 3
 exclude_patterns = ["_build"]
-# anchors such as <a id="eq-9"> work, but MyST does not see them: tests/test_docs.py checks links
+# MyST does not see anchors such as <a id="eq-9">, which work: tests/test_docs.py
+# checks all links instead
 suppress_warnings = ["myst.xref_missing"]
 
 html_theme = "furo"

@@ -8,6 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from dataclasses import asdict
 from functools import cache
 from io import StringIO
 from pathlib import Path
@@ -16,6 +17,8 @@ import pytest
 
 from hdr_nsff import cli
 from hdr_nsff.core.settings import to_plain
+from hdr_nsff.training.objective import merge_weights
+from hdr_nsff.training.presets import PRESETS
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
@@ -108,6 +111,31 @@ def test_every_cited_page_and_anchor_exists() -> None:
     assert not broken
 
 
+def weights_of(preset: str) -> dict[str, float]:
+    """The weights of a preset's terms that are not 0."""
+    config = PRESETS[preset]
+    own = [asdict(config.field.loss), asdict(config.tonemap.loss)]  # type: ignore[union-attr]
+    merged = merge_weights(config.loss, *own, {"pose": config.pose_prior})
+    return {name: weight for name, weight in merged.items() if weight}
+
+
+@pytest.mark.parametrize("preset", ["paper", "grid", "splat"])
+def test_the_method_names_every_term_of_a_preset(preset: str) -> None:
+    named = INLINE.findall(text_of(ROOT / "docs" / "method.md"))
+    assert set(weights_of(preset)) <= set(named)
+
+
+@pytest.mark.parametrize(("preset", "column"), [("paper", 3), ("grid", 4), ("splat", 5)])
+def test_the_table_of_the_method_has_the_weights_of_a_preset(preset: str, column: int) -> None:
+    table = text_of(ROOT / "docs" / "method.md").partition("## Where the presets stand")[2]
+    weights = weights_of(preset)
+    for row in re.findall(r"^\| `\w+` \|.*$", table, re.MULTILINE):
+        cells = [cell.strip() for cell in row.split("|")]
+        name = cells[1].strip("`")
+        number = re.match(r"\**([\d.]+)", cells[column])
+        assert (float(number[1]) if number else None) == weights.get(name), row
+
+
 # Files and functions
 
 
@@ -154,7 +182,7 @@ def test_every_file_and_function_named_exists(page: Path) -> None:
 
 @pytest.fixture(scope="module")
 def flags() -> dict[str, set[str]]:
-    """The flags of every verb as its help lists them; for `train`, of several presets."""
+    """The flags of every verb as its help lists them."""
     return {verb: set().union(*map(flags_in, calls_of(verb))) for verb in cli.VERBS}
 
 
@@ -200,8 +228,6 @@ def test_every_flag_belongs_to_a_verb_or_a_benchmark(
 
 @by_name
 def test_every_setting_given_by_set_exists(page: Path) -> None:
-    from hdr_nsff.training.presets import PRESETS
-
     configs = [json.loads(json.dumps(to_plain(config))) for config in PRESETS.values()]
     for key, _ in SETTING.findall(text_of(page)):
         assert key == "NAME" or any(has_key(config, key.split(".")) for config in configs), key
