@@ -34,19 +34,16 @@ def photometric(
     return (error * expanded).sum() / expanded.sum().clamp_min(MIN_TOTAL_WEIGHT)
 
 
-def saturation_weight(
-    rgb: Tensor, low: float = 0.15, high: float = 0.9, floor: float = 0.25
-) -> Tensor:
+def saturation_weight(rgb: Tensor, low: float = 0.15, high: float = 0.9) -> Tensor:
     """Trust (N, 3) in recorded values: less near 0 and 1, where they clip.
 
-    It is 1 in [low, high] and falls quadratically to `floor` at 0 and at 1. The paper
-    does not mention it; its published code weights the dynamic terms by it, with these
-    defaults.
+    It is 1 in [low, high], `((c + low) / (2 low))^2` below and
+    `((2 - high - c) / (2 (1 - high)))^2` above: 1/4 at 0 and at 1. The paper does not
+    mention it; its published code weights the dynamic terms by it, with these defaults.
     """
-    under = ((low - rgb) / low).clamp_min(0)
-    over = ((rgb - high) / (1 - high)).clamp_min(0)
-    saturation = torch.maximum(under, over).clamp(max=1)
-    return 1 - (1 - floor) * saturation.square()
+    under = ((low - rgb) / low).clamp(0, 1)
+    over = ((rgb - high) / (1 - high)).clamp(0, 1)
+    return (1 - torch.maximum(under, over) / 2).square()
 
 
 def cycle(there: Tensor, back: Tensor, confidence: Tensor) -> Tensor:
@@ -95,6 +92,24 @@ def blend_entropy(share: Tensor) -> Tensor:
     Shares near 0 or 1 cost nothing: the "entropy loss" of HDR-NSFF, section 3.1.
     """
     return -(share * share.clamp_min(MIN_LOG_SHARE).log()).mean()
+
+
+def distortion(weights: Tensor, edges: Tensor) -> Tensor:
+    """Mean distortion of rays (mip-NeRF 360, Barron et al. 2022, eq. 15): how far a
+    ray's weights are spread.
+
+    `sum_ij w_i w_j |m_i - m_j| + 1/3 sum_i w_i^2 d_i` with the intervals' midpoints m
+    and lengths d. `weights` (N, S) >= 0; `edges` (N, S + 1) rising, in [0, 1] along the
+    ray. Its double sum is one pass over cumulative sums.
+    """
+    lengths = edges[:, 1:] - edges[:, :-1]
+    middle = (edges[:, 1:] + edges[:, :-1]) / 2
+    moment = weights * middle
+    weight_before = weights.cumsum(-1) - weights
+    moment_before = moment.cumsum(-1) - moment
+    between = 2 * (weights * (middle * weight_before - moment_before)).sum(-1)
+    within = (weights.square() * lengths).sum(-1) / 3
+    return (between + within).mean()
 
 
 def normalize_shift_scale(values: Tensor) -> Tensor:

@@ -14,6 +14,9 @@ import torch
 from torch import Tensor
 
 
+OPAQUE_STEP = 1e10  # length of the last interval of a ray (NeRF, NSFF)
+
+
 def stratified_disparity(
     num_rays: int, num_samples: int, near: float, far: float, jitter: Tensor | None
 ) -> Tensor:
@@ -27,13 +30,15 @@ def stratified_disparity(
     return 1.0 / (1 / near + fraction * (1 / far - 1 / near))
 
 
-def step_lengths(points: Tensor) -> Tensor:
+def step_lengths(points: Tensor, opaque_end: bool = False) -> Tensor:
     """Distances (N, S) from each sample of `points` (N, S, 3) to the next.
 
-    The last one repeats the one before.
+    The last one repeats the one before; with `opaque_end` it is 1e10, as published, so
+    that any density in the last sample stops all light.
     """
     steps = (points[:, 1:] - points[:, :-1]).norm(dim=-1)
-    return torch.cat([steps, steps[:, -1:]], -1)
+    last = torch.full_like(steps[:, -1:], OPAQUE_STEP) if opaque_end else steps[:, -1:]
+    return torch.cat([steps, last], -1)
 
 
 def alpha_from_density(density: Tensor, deltas: Tensor) -> Tensor:

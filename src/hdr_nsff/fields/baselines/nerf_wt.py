@@ -107,7 +107,7 @@ class CodedGrids(GridBranches):
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
         assert not motion, "NeRF-W has no scene flow"
-        return nn.functional.pad(self.dynamic_grid(coords, knot), (0, 1)), None
+        return self.dynamic_grid(coords, knot), None
 
     def param_groups(self) -> list[ParamGroup]:
         head = [
@@ -131,7 +131,7 @@ class CodedMlp(MlpBranches):
         nn.Module.__init__(self)
         self.config, self.num_knots, self.codes = config, num_knots, codes
         self.static_trunk = Trunk(config, 3, 1, codes.table.shape[1])
-        self.dynamic_trunk = Trunk(config, 4, 1)
+        self.dynamic_trunk = Trunk(config, 4, 0)
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         code = self.codes().expand(len(coords), -1)

@@ -18,7 +18,8 @@ from hdr_nsff.core.settings import Advanced, Count, Number, Positive, Rate
 from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.fields.nsff.encodings import AdditiveGrid, Shape, frequencies
 
-APPEARANCE = 5  # raw radiance (3), raw density, raw blend share (used of the dynamic branch)
+STATIC = 5  # raw radiance (3), raw density, raw blend weight v (eq. 5)
+DYNAMIC = 4  # raw radiance (3), raw density
 MOTION = 8  # raw scene flow forward (3), raw disocclusion forward; the same backward
 
 MIN_GRID_POINTS = 4  # of a level along each axis of space
@@ -70,7 +71,7 @@ class Branches(Protocol):
     """Static and dynamic branch of a field, in cube coordinates."""
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
-        """Raw radiance (3), density and an unused fifth number: (M, 5).
+        """Raw radiance (3), density and blend weight: (M, 5).
 
         `coords` (M, 3) are in [0, 1], `directions` (M, 3) unit view directions.
         """
@@ -79,7 +80,7 @@ class Branches(Protocol):
     def dynamic(
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
-        """Raw radiance (3), density and blend share (M, 5) at time `knot`.
+        """Raw radiance (3) and density (M, 4) at time `knot`.
 
         With `motion` also raw motion (M, 8), else None.
         """
@@ -100,9 +101,15 @@ def pyramid(finest: tuple[float, float, float], levels: int, slices: int) -> lis
 
 
 class GridBranches(nn.Module):
-    """Grids over the cube; each training time has a slice of the dynamic ones."""
+    """Grids over the cube; each training time has a slice of the dynamic ones.
 
-    def __init__(self, config: GridConfig, width: int, height: int, num_knots: int) -> None:
+    With `blending`, a static grid as coarse as those of scene flow holds the blend
+    weight.
+    """
+
+    def __init__(
+        self, config: GridConfig, width: int, height: int, num_knots: int, blending: bool = False
+    ) -> None:
         super().__init__()
         self.config = config
         fine = (width / config.finest, height / config.finest, float(config.depth_cells))
@@ -116,23 +123,31 @@ class GridBranches(nn.Module):
         motion_shapes = pyramid(coarse, MOTION_LEVELS, num_knots)
         self.static_grid = AdditiveGrid(static_shapes, 1, config.max_rows)
         self.dynamic_grid = AdditiveGrid(dynamic_shapes, num_knots, config.max_rows)
+        self.blend_grid = None
+        if blending:
+            self.blend_grid = AdditiveGrid(pyramid(coarse, MOTION_LEVELS, 1), 1, config.max_rows)
         self.motion_grids = nn.ModuleList(  # forward and backward
             AdditiveGrid(motion_shapes, num_knots, config.max_rows) for _ in range(2)
         )
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
-        return nn.functional.pad(self.static_grid(coords), (0, 1))
+        raw = self.static_grid(coords)
+        if self.blend_grid is None:
+            return nn.functional.pad(raw, (0, 1))
+        return torch.cat([raw, self.blend_grid(coords)[:, :1]], -1)
 
     def dynamic(
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
     ) -> tuple[Tensor, Tensor | None]:
-        appearance = nn.functional.pad(self.dynamic_grid(coords, knot), (0, 1))
+        appearance = self.dynamic_grid(coords, knot)
         if not motion:
             return appearance, None
         return appearance, torch.cat([grid(coords, knot) for grid in self.motion_grids], -1)
 
     def param_groups(self) -> list[ParamGroup]:
         appearance, motion = [self.static_grid, self.dynamic_grid], list(self.motion_grids)
+        if self.blend_grid is not None:
+            appearance.append(self.blend_grid)
         return [
             table_group(appearance, self.config.lr),
             table_group(motion, self.config.motion_lr),
@@ -193,7 +208,7 @@ class MlpBranches(nn.Module):
         super().__init__()
         self.config, self.num_knots = config, num_knots
         self.static_trunk = Trunk(config, 3, 1)
-        self.dynamic_trunk = Trunk(config, 4, 1 + MOTION)
+        self.dynamic_trunk = Trunk(config, 4, MOTION)
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         return self.static_trunk(2 * coords - 1, directions)
@@ -203,8 +218,8 @@ class MlpBranches(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         time = torch.full_like(coords[:, :1], knot / max(self.num_knots - 1, 1))
         raw = self.dynamic_trunk(torch.cat([2 * coords - 1, time], -1), directions)
-        raw_motion = raw[:, APPEARANCE:] if motion else None
-        return raw[:, :APPEARANCE], raw_motion
+        raw_motion = raw[:, DYNAMIC:] if motion else None
+        return raw[:, :DYNAMIC], raw_motion
 
     def param_groups(self) -> list[ParamGroup]:
         return [ParamGroup(list(self.parameters()), self.config.lr)]

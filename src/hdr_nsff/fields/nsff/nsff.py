@@ -18,9 +18,9 @@ from hdr_nsff.fields.base import Layers, Render
 from hdr_nsff.fields.nsff.branches import MlpConfig
 from hdr_nsff.fields.nsff.samples import BranchOutput, RaySamples, map_chunks, render_in_chunks
 from hdr_nsff.fields.nsff.scene_flow import SceneFlowPass
-from hdr_nsff.fields.nsff.two_branches import BranchesConfig, TwoBranches
+from hdr_nsff.fields.nsff.two_branches import BranchesConfig, BranchPass, TwoBranches
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.maths import volume
+from hdr_nsff.maths import losses, volume
 from hdr_nsff.scene.batch import PixelBatch
 
 FORWARD, BACKWARD = 1, -1  # offsets in training times; columns 0 and 1 of scene flow
@@ -48,6 +48,8 @@ class SceneFlowLosses:
     """Mean disocclusion."""
     blend_entropy: Weight = 0.0
     """Entropy of the blend weight (compositing `blend`)."""
+    distortion: Weight = 0.0
+    """How far the weights of a ray are spread (mip-NeRF 360, eq. 15)."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,22 @@ class NSFF(TwoBranches):
         """A render of the batch's pixels with warps, and per-sample regularizers."""
         base = self.query(batch, motion=True)
         training_pass = SceneFlowPass(self, self.to_flow, batch, base)
-        return training_pass.render(), training_pass.regularizers()
+        terms = training_pass.regularizers()
+        if self.config.loss.distortion:
+            terms["distortion"] = self.distortion(base)
+        return training_pass.render(), terms
+
+    def distortion(self, base: BranchPass) -> Tensor:
+        """Distortion (2,) of the dynamic branch alone and of the composited ray.
+
+        Along the ray, samples are `num_samples` equal intervals in disparity.
+        """
+        num_rays, num_samples = base.samples.depths.shape
+        edges = torch.linspace(0, 1, num_samples + 1).to(base.samples.depths)
+        edges = edges.expand(num_rays, -1)
+        alone = volume.single(base.dynamic.density, base.samples.deltas)
+        both = base.weights.static + base.weights.dynamic
+        return torch.stack([losses.distortion(w, edges) for w in (alone, both)])
 
     # Rendering
 
@@ -142,9 +159,8 @@ class NSFF(TwoBranches):
         # content of both is mixed by its share of the density
         share = ((1 - fraction) * before.density / density.clamp_min(1e-12))[..., None]
         radiance = share * before.radiance + (1 - share) * after.radiance
-        blend = (1 - fraction) * before.blend + fraction * after.blend
         flow = share[..., None] * flow_before + (1 - share[..., None]) * flow_after
-        return BranchOutput(density, radiance, blend), flow
+        return BranchOutput(density, radiance, before.blend), flow
 
     def dynamic_at(
         self, samples: RaySamples, knot: int, side: int = 0, fraction: float = 0.0
@@ -215,8 +231,8 @@ class NSFF(TwoBranches):
         alpha_static = volume.alpha_from_density(static.density, samples.deltas)
         alpha_dynamic = volume.alpha_from_density(dynamic.density, samples.deltas)
         if self.config.compositing == "blend":
-            alpha_static = alpha_static * (1 - dynamic.blend)
-            alpha_dynamic = alpha_dynamic * dynamic.blend
+            alpha_static = alpha_static * static.blend
+            alpha_dynamic = alpha_dynamic * (1 - static.blend)
         at_rest = torch.zeros_like(flow[:, :, 0])
         return Layers(
             positions=interleave(samples.points, samples.points),

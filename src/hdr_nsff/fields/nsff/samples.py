@@ -40,7 +40,7 @@ class BranchOutput:
 
     density: Tensor  # (N, S) per cube length, >= 0
     radiance: Tensor  # (N, S, 3) linear HDR, >= 0
-    blend: Tensor  # (N, S) share of dynamic content, where eq. 6 blends
+    blend: Tensor  # (N, S) v of eq. 5, of the static branch alone, where eq. 6-7 blend
 
 
 def sample_rays(
@@ -51,11 +51,12 @@ def sample_rays(
     near: float,
     far: float,
     generator: torch.Generator | None,
+    opaque_end: bool = False,
 ) -> RaySamples:
     """Samples along the rays of `pixels` (N, 2), evenly in disparity, near to far.
 
     `near` and `far` are z-depths in scene units. With a generator, samples are jittered
-    within their bins.
+    within their bins. `opaque_end`: see `volume.step_lengths`.
     """
     rays = camera.rays(pixels)
     num_rays = len(pixels)
@@ -69,7 +70,7 @@ def sample_rays(
         depths=depths,
         points=points,
         coords=coords,
-        deltas=volume.step_lengths(coords),
+        deltas=volume.step_lengths(coords, opaque_end),
         directions=nn.functional.normalize(rays.directions, dim=-1),
     )
 

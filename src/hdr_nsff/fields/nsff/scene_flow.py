@@ -19,6 +19,9 @@ from hdr_nsff.fields.nsff.two_branches import BranchPass, TwoBranches
 from hdr_nsff.maths import losses, volume
 from hdr_nsff.scene.batch import PixelBatch
 
+# shares of a ray's samples, from the camera on, whose flow is held smooth in space and
+# of constant velocity: those far away are too far apart (published)
+SMOOTH_SHARE, KINETIC_SHARE = 0.95, 0.9
 MIN_OPACITY = 1e-3  # by which rendered scene flow is divided
 MIN_DEPTH_SHARE = 0.05  # of `near`: points nearer to the neighbor's camera project from there
 
@@ -44,6 +47,10 @@ class SceneFlowPass:
         self.disocclusion = base.raw_motion[:, 3::4].sigmoid()  # (M, 2)
         last_knot = len(field.times) - 1
         self.offsets = [o for o in (1, -1) if 0 <= base.knot + o <= last_knot]
+        # weights (N, S) of the dynamic branch alone, where eq. 6 blends
+        self.alone: Tensor | None = None
+        if field.config.compositing == "blend":
+            self.alone = volume.single(base.dynamic.density, base.samples.deltas)
         self.index_active_rays()
         here = field.space.decode(base.coords)
         # by offset: where the samples go, in the cube, and how far, (M, 3) scene units
@@ -89,19 +96,21 @@ class SceneFlowPass:
         scene_flow = {
             o: self.sum_rays(dynamic_weight * flow) for o, flow in self.displacement.items()
         }
-        warps = [
-            self.warp(o, radiance, depth, scene_flow[o])
-            for o in self.offsets
-            if o in self.batch.neighbors
-        ]
+        dynamic_radiance = dynamic_depth = None
+        if self.alone is not None:
+            dynamic_radiance = volume.weighted_sum(self.alone, base.dynamic.radiance)
+            dynamic_depth = volume.expected_depth(self.alone, depths, far)
+        warps = []
+        for o in self.offsets:
+            if o in self.batch.neighbors:
+                if self.alone is not None:
+                    point = self.published_point(o)
+                else:
+                    point = self.surface_point(depth, scene_flow[o])
+                warps.append(self.warp(o, radiance, point))
         chained = self.warp_twice(self.batch.chain, radiance)
         if chained is not None:
             warps.append(chained)
-        dynamic_radiance = dynamic_depth = None
-        if self.field.config.compositing == "blend":
-            alone = volume.single(base.dynamic.density, base.samples.deltas)
-            dynamic_radiance = volume.weighted_sum(alone, base.dynamic.radiance)
-            dynamic_depth = volume.expected_depth(alone, depths, far)
         return Render(
             radiance=radiance,
             depth=depth,
@@ -118,19 +127,38 @@ class SceneFlowPass:
         return sum_per_ray(values, self.ray, len(self.base.samples.depths))
 
     def dynamic_weights(self) -> Tensor:
-        """Compositing weights (M,) of the dynamic samples."""
-        return self.base.weights.dynamic.reshape(-1)[self.base.index]
+        """Weights (M,) of the dynamic samples by which scene flow is rendered.
 
-    def warp(self, offset: int, radiance: Tensor, depth: Tensor, scene_flow: Tensor) -> Warp:
-        """The render through a neighboring time, and optical flow to that neighbor.
-
-        `radiance` (N, 3), `depth` (N,) and `scene_flow` (N, 3) are this pass's renders.
-        Flow projects the rendered surface point, moved by its scene flow, into the
-        neighbor's camera.
+        Where eq. 6 blends, those of the dynamic branch alone, as published.
         """
+        weights = self.base.weights.dynamic if self.alone is None else self.alone
+        return weights.reshape(-1)[self.base.index]
+
+    def surface_point(self, depth: Tensor, scene_flow: Tensor) -> Tensor:
+        """The rendered surface (N, 3) at `depth` (N,), moved by `scene_flow` (N, 3)."""
         rays = self.batch.camera.rays(self.batch.pixels)
         opacity = self.base.weights.opacity[:, None].clamp_min(MIN_OPACITY)
-        point = rays.origins + depth[:, None] * rays.directions + scene_flow / opacity
+        return rays.origins + depth[:, None] * rays.directions + scene_flow / opacity
+
+    def published_point(self, offset: int) -> Tensor:
+        """The weighted sum (N, 3) of the displaced samples, by the dynamic branch alone.
+
+        It is summed in the cube, as the publication does in NDC; light that no sample
+        stops counts as the ray's last sample.
+        """
+        coords = self.base.samples.coords  # (N, S, 3)
+        moved = coords.reshape(-1, 3).index_copy(0, self.base.index, self.moved[offset])
+        assert self.alone is not None
+        summed = volume.weighted_sum(self.alone, moved.view_as(coords))
+        passed = (1 - self.alone.sum(-1, keepdim=True)).clamp_min(0)
+        return self.field.space.decode(summed + passed * coords[:, -1])
+
+    def warp(self, offset: int, radiance: Tensor, point: Tensor) -> Warp:
+        """The render through a neighboring time, and optical flow to that neighbor.
+
+        `radiance` (N, 3) is this pass's render. Flow projects `point` (N, 3), where the
+        pixels' content is at that time, into the neighbor's camera.
+        """
         neighbor = self.batch.neighbors[offset]
         pixel, _ = neighbor.project(point, min_depth=MIN_DEPTH_SHARE * self.field.near)
         return Warp(
@@ -189,31 +217,47 @@ class SceneFlowPass:
         return 1 - self.sum_rays(weighted[:, None])[:, 0].clamp(0, 1)
 
     def regularizers(self) -> dict[str, Tensor]:
-        """Regularizers by the names of `LossWeights`, means over dynamic samples.
+        """Regularizers by the names of `SceneFlowLosses`, means over dynamic samples.
 
-        Cycle, kinetic energy, smoothness, disocclusion, and blend entropy where eq. 6
-        blends.
+        Cycle, smoothness and disocclusion have one value per neighbor, kinetic energy
+        up to three (`kinetic`): the objective adds them up or averages them.
         """
         if not len(self.base.index):
             return {}
-        terms: dict[str, list[Tensor]] = {"cycle": [], "kinetic": [], "smoothness": []}
+        terms: dict[str, list[Tensor]] = {"cycle": [], "smoothness": []}
         for o in self.offsets:
-            neighbor_flow = self.to_flow(self.neighbor_motion[o])  # (M, 2, 3) cube
-            onward, back = neighbor_flow[:, side_of(o)], neighbor_flow[:, side_of(-o)]
+            back = self.to_flow(self.neighbor_motion[o])[:, side_of(-o)]  # (M, 3) cube
             confidence = 1 - self.disocclusion[:, side_of(o)]
             terms["cycle"].append(losses.cycle(self.flow[:, side_of(o)], back, confidence))
-            further = self.displace(self.moved[o], onward)
-            returning = self.displace(self.moved[o], back)
-            terms["kinetic"].append(losses.kinetic(further, returning))
             terms["smoothness"].append(self.smoothness(self.displacement[o]))
-        if len(self.offsets) == 2:
-            terms["kinetic"].append(losses.kinetic(self.displacement[1], self.displacement[-1]))
-        result = {name: torch.stack(values).mean() for name, values in terms.items() if values}
-        result["disocclusion"] = self.disocclusion.mean()
+        terms["kinetic"] = self.kinetic()
+        result = {name: torch.stack(values) for name, values in terms.items() if values}
+        result["disocclusion"] = self.disocclusion.mean(0)
         if self.field.config.compositing == "blend":
-            blend = self.base.dynamic.blend.reshape(-1)[self.base.index]
-            result["blend_entropy"] = losses.blend_entropy(blend)
+            result["blend_entropy"] = losses.blend_entropy(self.base.static.blend)
         return result
+
+    def kinetic(self) -> list[Tensor]:
+        """Kinetic energy twice here and once at each neighbor along the chain.
+
+        The publication counts it so; without a chain both neighbors count.
+        """
+        near = self.near_samples(KINETIC_SHARE)
+        terms = []
+        if len(self.offsets) == 2:
+            here = losses.kinetic(self.displacement[1][near], self.displacement[-1][near])
+            terms += [here, here]
+        for o in self.offsets:
+            if self.batch.chain in (0, o):
+                flow = self.to_flow(self.neighbor_motion[o])[near]  # (M, 2, 3) cube
+                start = self.moved[o][near]
+                onward = self.displace(start, flow[:, side_of(o)])
+                terms.append(losses.kinetic(onward, self.displace(start, flow[:, side_of(-o)])))
+        return terms
+
+    def near_samples(self, share: float) -> Tensor:
+        """Which dynamic samples (M,) are among the first `share` of their ray's."""
+        return self.base.index % self.num_samples < round(share * self.num_samples)
 
     def displace(self, coords: Tensor, flow: Tensor) -> Tensor:
         """How far `flow` (M, 3) moves `coords` (M, 3) of the cube, in scene units."""
@@ -223,7 +267,7 @@ class SceneFlowPass:
         """Difference of `displacement` (M, 3) between neighbors on a ray."""
         consecutive = self.base.index.diff() == 1
         same_ray = self.ray[1:] == self.ray[:-1]
-        pairs = consecutive & same_ray
+        pairs = consecutive & same_ray & self.near_samples(SMOOTH_SHARE)[1:]
         return losses.smoothness(displacement[1:][pairs], displacement[:-1][pairs])
 
 

@@ -74,6 +74,8 @@ class BranchesConfig:
     """How static and dynamic content share a place: densities add up, or the blend
     weight of eq. 7.
     """
+    opaque_end: Advanced[bool] = False
+    """The last interval of a ray is 1e10, as published: any density there ends it."""
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or the published one below 1."""
     density: Advanced[Literal["exp", "relu"]] = "exp"
@@ -131,7 +133,8 @@ class TwoBranches(nn.Module):
         self.register_buffer("times", times.double())
         num_knots = len(times)
         if branches is None:
-            branches = build_branches(config.encoding, width, height, num_knots)
+            blending = config.compositing == "blend"
+            branches = build_branches(config.encoding, width, height, num_knots, blending)
         self.branches = branches
         x = max(MIN_CULL_CELLS, round(width / CULL_CELL_PX))
         y = max(MIN_CULL_CELLS, round(height / CULL_CELL_PX))
@@ -177,7 +180,8 @@ class TwoBranches(nn.Module):
         self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None
     ) -> RaySamples:
         """Samples along the rays of `pixels` (N, 2); jittered with a generator."""
-        return sample_rays(self.space, camera, pixels, num_samples, self.near, self.far, generator)
+        bounds, opaque = (self.near, self.far), self.config.opaque_end
+        return sample_rays(self.space, camera, pixels, num_samples, *bounds, generator, opaque)
 
     # Querying the branches
 
@@ -205,12 +209,12 @@ class TwoBranches(nn.Module):
         return self.scatter(raw, index, shape, self.density_bias(static=False)), raw_motion
 
     def scatter(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> BranchOutput:
-        """Raw numbers (M, 5) of samples `index` (M,), as rays of `shape` (N, S)."""
+        """Raw numbers (M, 4 or 5) of samples `index` (M,), as rays of `shape` (N, S)."""
         total = shape[0] * shape[1]
         density = raw.new_zeros(total).index_copy(0, index, self.to_density(raw[:, 3], bias))
         radiance = raw.new_zeros(total, 3).index_copy(0, index, self.to_radiance(raw[:, :3]))
-        blend = density  # unused where densities add up
-        if self.config.compositing == "blend":
+        blend = density  # unused where densities add up, and of the dynamic branch
+        if self.config.compositing == "blend" and raw.shape[1] > 4:
             blend = raw.new_zeros(total).index_copy(0, index, raw[:, 4].sigmoid())
         return BranchOutput(density.view(shape), radiance.view(*shape, 3), blend.view(shape))
 
@@ -226,7 +230,7 @@ class TwoBranches(nn.Module):
         """Compositing weights of both branches."""
         if self.config.compositing == "add":
             return volume.add(static.density, dynamic.density, deltas)
-        return volume.blend(static.density, dynamic.density, dynamic.blend, deltas)
+        return volume.blend(static.density, dynamic.density, 1 - static.blend, deltas)
 
     def select_samples(
         self, samples: RaySamples, knot: float, explore: float, generator: torch.Generator | None
@@ -318,11 +322,11 @@ def seen_as_moving(frame: Frame, points: Tensor, dilation: int) -> Tensor:
 
 
 def build_branches(
-    encoding: GridConfig | MlpConfig, width: int, height: int, num_knots: int
+    encoding: GridConfig | MlpConfig, width: int, height: int, num_knots: int, blending: bool
 ) -> GridBranches | MlpBranches:
     """Plain branches of the given encoding for frames of `width` x `height`."""
     match encoding:
         case GridConfig():
-            return GridBranches(encoding, width, height, num_knots)
+            return GridBranches(encoding, width, height, num_knots, blending)
         case MlpConfig():
             return MlpBranches(encoding, num_knots)
