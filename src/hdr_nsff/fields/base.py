@@ -2,10 +2,10 @@
 pixels, in linear HDR radiance. Everything that training asks of a field stands here.
 
 Fields know nothing of exposure, white balance or response curves: tone mapping happens
-outside. `S` is the number of pixels asked for. Camera, time and pixels are the currency,
-not rays: an NSFF casts rays through the pixels, a splat field rasterizes the frame and
-reads them off. Two published baselines need to know what was recorded
-(`RecordingField`): they are handed a `Recorder` from outside.
+outside. `S` is the number of pixels asked for. A field is given pixels, not rays: an
+NSFF casts rays through them, a splat field rasterizes the frame and reads them off. Two
+published baselines need to know what was recorded (`RecordingField`): they are handed a
+`Recorder` from outside.
 """
 
 from __future__ import annotations
@@ -50,8 +50,10 @@ class Render:
 
 @dataclass(frozen=True)
 class Layers:
-    """A view as L translucent layers, front to back. A layer holds one kind of content: a
-    field with two branches interleaves them (static, dynamic, static, ...).
+    """A view as L translucent layers, front to back.
+
+    A layer holds one kind of content: a field with two branches interleaves them
+    (static, dynamic, static, ...).
     """
 
     positions: Tensor  # (S, L, 3) scene units; S = height * width, row by row
@@ -109,8 +111,9 @@ class RadianceField(Protocol):
     def render(
         self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
     ) -> Render:
-        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks
-        itself. `time` in frames, may be fractional. Without `scene_flow` it is faster.
+        """Render all pixels, row by row, or the given `pixels` (S, 2); no gradients.
+
+        `time` is in frames and may be fractional. It is faster without `scene_flow`.
         """
         ...
 

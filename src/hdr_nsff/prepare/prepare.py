@@ -53,9 +53,8 @@ def prepare(config: PrepareConfig) -> Path:
             write_truth(
                 work.capture, work.manifest, work.own_time, truth_place(config), config.max_size
             )
-    say(
-        f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {config.out / 'contact_sheet.png'})"
-    )
+    sheet = config.out / "contact_sheet.png"
+    say(f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {sheet})")
     return config.out
 
 
@@ -84,7 +83,8 @@ def begin(config: PrepareConfig) -> Work:
         found = None  # nothing to lose
     if found is not None and found.inputs != inputs and found.source != str(config.clip):
         raise InputError(
-            f"{config.out}: holds the scene of other footage ({found.source}); choose another folder"
+            f"{config.out}: holds the scene of other footage ({found.source}); "
+            "choose another folder"
         )
     for leftover in config.out.rglob(".partial-*"):  # of a killed run
         leftover.unlink()
@@ -116,9 +116,9 @@ def introduce(work: Work) -> None:
     parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
     given = [*stored, *(part for part in parts if work.gives(part))]
     kept = f", held-out views for {truth_place(work.config)}" if capture.has_held_out else ""
-    say(
-        f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}"
-    )
+    provided = ", ".join(given) or "pictures alone"
+    pictures = f"{len(capture.pictures)} pictures"
+    say(f"{clip}: {capture.layout}, {pictures}, with its own {provided}{kept}")
     for note in capture.notes:
         say(f"{clip}: {note}")
 
@@ -141,7 +141,8 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
         found = Manifest.load(config.out)
         if [f.index for f in found.frames] != list(range(len(found.frames))):
             raise InputError(
-                f"{config.out / 'scene.json'}: frames are missing or out of order; restore it or use `--redo frames`"
+                f"{config.out / 'scene.json'}: frames are missing or out of order; "
+                "restore it or use `--redo frames`"
             )
         return found
     except InputError:
@@ -155,12 +156,13 @@ def check_settings(config: PrepareConfig) -> None:
     ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
     if config.protocol is not None and config.hold_out is not None:
         raise InputError(
-            "--protocol and --hold-out both given, and each says what is kept out of training; leave one out"
+            "--protocol and --hold-out: each decides what is kept out of training; leave one out"
         )
     parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
-            f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside"
+            f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "
+            "choose a place outside"
         )
     check_flow(config.flow, config.flow_weights)
     for option, path in (
@@ -171,7 +173,8 @@ def check_settings(config: PrepareConfig) -> None:
     ):
         if isinstance(path, Path) and not path.exists():
             raise InputError(
-                f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate"
+                f"--{option} {path}: no such file or folder; "
+                "correct the path, or leave the option out to estimate it"
             )
     check_networks(config)
 

@@ -1,4 +1,4 @@
-"""The settings of `prepare`, and the scene folder in the making that its steps hand on."""
+"""The settings of `prepare`, and the unfinished scene folder that its steps share."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ class Work:
         return found, valid, np.array([(i, j) for i, j, _ in files])
 
     def forget(self, names: tuple[str, ...]) -> None:
-        """Drop cached properties that a step has changed, or that nobody needs again."""
+        """Drop cached properties: a step changed them, or they are not needed again."""
         for name in names:
             vars(self).pop(name, None)
 
@@ -273,7 +273,7 @@ class Work:
         )
 
     def training_flows(self, flows: Flows) -> Flows:
-        """Those of `flows` between training frames, with pairs that count these only."""
+        """Flows between training frames; pairs are positions among training frames."""
         index = np.array([f.index for f in self.train])
         flow, valid, pairs = flows
         among = np.isin(pairs, index).all(1)

@@ -21,9 +21,9 @@ class Recorder:
     """
 
     rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to what is recorded of it (M, 3)
-    images: tuple[
-        int, ...
-    ]  # positions in `scene.train` of the images that look like it: the image itself, or those of its exposure
+    # positions in `scene.train` of the images recorded like this one: the image itself,
+    # or those of its exposure
+    images: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -35,9 +35,8 @@ class PixelBatch:
     camera: Camera
     camera_id: int
     bracket: int
-    neighbors: dict[
-        int, Camera
-    ]  # {+-1: camera of the next / previous training frame}; a missing side is absent
+    # {+-1: camera of the next / previous training frame}; a missing side is absent
+    neighbors: dict[int, Camera]
     pixels: Tensor  # (N, 2) xy, centers at +0.5
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)

@@ -79,9 +79,13 @@ class TruthView(Strict):
         if self.K is not None and not is_matrix(self.K, (3, 3), is_intrinsic):
             return "a K that is no 3x3 camera matrix"
         if not all(0 <= b < num_brackets for b in self.recorded):
-            return f"recordings at brackets {sorted(self.recorded)}, but bracket_ev lists {num_brackets}"
+            brackets = sorted(self.recorded)
+            return f"recordings at brackets {brackets}, but bracket_ev lists {num_brackets}"
         if self.bracket not in self.recorded and (self.radiance is None or not response):
-            return f"no picture of bracket {self.bracket}: neither a recording, nor radiance and a response to make it from"
+            return (
+                f"no picture of bracket {self.bracket}: neither a recording, nor radiance "
+                "and a response to make it from"
+            )
         return None
 
 
@@ -124,13 +128,15 @@ class Truth(Strict):
         path = Path(folder) / "truth.json"
         if not path.is_file():
             raise InputError(
-                f"{folder}: no truth.json here; leave `--truth` out to evaluate on held-out frames of the clip"
+                f"{folder}: no truth.json here; "
+                "leave `--truth` out to evaluate on held-out frames of the clip"
             )
         try:
             truth = Truth.model_validate(read_json(path))
         except ValueError as error:
             raise InputError(
-                f"{path}: not a valid truth file ({first_problem(error)}); restore it, or make the truth anew"
+                f"{path}: not a valid truth file ({first_problem(error)}); "
+                "restore it, or make the truth anew"
             ) from error
         if problem := truth.problem():
             raise InputError(f"{path}: {problem}; restore it, or make the truth anew")
@@ -139,10 +145,12 @@ class Truth(Strict):
     def problem(self) -> str | None:
         """What makes no sense together; None where all does."""
         num = len(self.bracket_ev)
-        if not 0 <= self.reference_bracket < num or any(
-            ev is not None and abs(ev) > MAX_EV for ev in self.bracket_ev
-        ):
-            return f"bracket_ev {self.bracket_ev} and reference_bracket {self.reference_bracket} are no exposures in stops"
+        out_of_range = [ev for ev in self.bracket_ev if ev is not None and abs(ev) > MAX_EV]
+        if out_of_range or not 0 <= self.reference_bracket < num:
+            return (
+                f"bracket_ev {self.bracket_ev} and reference_bracket "
+                f"{self.reference_bracket} are no exposures in stops"
+            )
         if self.bracket_frame is None and None in self.bracket_ev:
             return "an exposure is unknown, and bracket_frame does not say which frames have it"
         if self.bracket_frame is not None and len(self.bracket_frame) != num:
@@ -166,7 +174,10 @@ class Truth(Strict):
         if not all(is_matrix(c2w, (3, 4), is_pose) for c2w in self.clip_c2w or []):
             return "clip_c2w are no 3x4 camera poses"
         if self.clip_c2w is None and any(v.geometry is not None for v in self.views):
-            return "views have depth and motion, but clip_c2w is missing, so that nobody knows which way they point"
+            return (
+                "views have depth and motion, but clip_c2w is missing, "
+                "so that nobody knows which way they point"
+            )
         if len({v.name for v in self.views}) < len(self.views):
             return "two views have the same name"
         return next(
@@ -214,7 +225,8 @@ def true_pictures(
             )
         if exact.min() < 0:
             raise InputError(
-                f"{folder / view.radiance}: negative radiance; clip at zero before writing the truth"
+                f"{folder / view.radiance}: negative radiance; "
+                "clip at zero before writing the truth"
             )
     pictures = {b: read_image(inside(folder, name)) for b, name in view.recorded.items()}
     if exact is not None and truth.response is not None:
@@ -277,6 +289,7 @@ def scene_brackets(
     if truth.reference_bracket not in match:
         frame = truth.bracket_frame[truth.reference_bracket]
         raise InputError(
-            f"truth.json: frame {frame} shows the reference exposure, and the scene has none; prepare the whole clip"
+            f"truth.json: frame {frame} shows the reference exposure, and the scene has none; "
+            "prepare the whole clip"
         )
     return match

@@ -66,7 +66,7 @@ class Objective:
         return terms
 
     def trust(self, batch: PixelBatch) -> Tensor:
-        """Trust (N, 3) in recorded values where the dynamic content is compared to them."""
+        """Trust (N, 3) in recorded values in the terms of the dynamic content."""
         if self.saturation:
             return losses.saturation_weight(batch.rgb)
         return torch.ones_like(batch.rgb)
@@ -74,8 +74,10 @@ class Objective:
     def dynamic(
         self, render: Render, rgb: Tensor, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
-        """The dynamic branch against the recording: everywhere in the first phase, later
-        by its share of the ray. Without such a branch, the extra moving pixels.
+        """Eq. 7: the dynamic branch against the recording.
+
+        It counts everywhere in the first phase, later by its share of the ray. Without
+        such a branch, the extra moving pixels count.
         """
         if render.dynamic_radiance is not None:
             rgb = record(render.dynamic_radiance, batch, tonemap)

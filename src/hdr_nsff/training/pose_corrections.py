@@ -98,7 +98,7 @@ class PoseCorrections(nn.Module):
         )  # (G, C * 6)
 
     def twists(self) -> Tensor:
-        """Turns in radians about the world's axes and shifts in typical depths: (C, 6)."""
+        """Rotations about the world axes (radians), shifts (typical depths): (C, 6)."""
         return torch.einsum("cij,cj->ci", self.precondition, self.moves)
 
     def camera(self, camera: Camera, correction: int | None, lens: int) -> Camera:

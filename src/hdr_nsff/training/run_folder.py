@@ -173,7 +173,7 @@ def write_preview(
 
 
 def append_log(folder: Path, clock: Clock, num_rays: int, values: dict[str, float]) -> None:
-    """Add a line to log.jsonl: the `values` of a step, which compared `num_rays` pixels."""
+    """Add to log.jsonl the `values` of a step that compared `num_rays` pixels."""
     line = {
         "step": clock.step,
         "seconds": round(clock.seconds, 3),

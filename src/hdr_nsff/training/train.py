@@ -46,7 +46,7 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
     """Train (or continue training) until the budget is spent; the run folder.
 
     What was learned by the shares `keep_at` of the run, in (0, 1), stays in
-    `snapshots/`; it changes nothing of what is learned. `previews`: a picture with every
+    `snapshots/`; this has no influence on training. `previews`: a picture with every
     checkpoint.
     """
     config = check_config(config)
@@ -111,7 +111,7 @@ class Trainer:
         )
 
     def report(self, message: str | None) -> None:
-        """A line for the person at the terminal, once however many processes there are."""
+        """A line for the person at the terminal, from the main process only."""
         if message and self.ranks.main:
             say(message)
 
@@ -160,8 +160,9 @@ class Trainer:
         self.report(self.poses.describe() if self.poses else None)
 
     def step(self) -> dict[str, float]:
-        """One optimizer step over this process's share of the batches; the terms' values,
-        and the PSNR where a line of the log is due.
+        """One optimizer step over this process's share of the batches.
+
+        The terms' values, and the PSNR where a line of the log is due.
         """
         clock, config = self.clock, self.config
         self.field.train()
@@ -229,7 +230,7 @@ class Trainer:
         return (drawn or self.scene.train[0].image[..., 0].numel()) * self.config.batches
 
     def save(self, preview: bool = False) -> None:
-        """A checkpoint of everything that counts, with a `preview` picture or without."""
+        """Save a checkpoint, and a `preview` picture."""
         if not self.ranks.main:
             return
         out, clock = self.config.out, self.clock

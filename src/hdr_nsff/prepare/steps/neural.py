@@ -41,7 +41,8 @@ def check_networks(config: PrepareConfig) -> None:
         find(config.mask_weights)
     elif config.mask_points is not None:
         raise InputError(
-            "--mask-points: only `--mask sam2` can be corrected by points; choose it, or paint over the files in masks/ and give them"
+            "--mask-points: only `--mask sam2` can be corrected by points; "
+            "choose it, or paint over the files in masks/ and give them"
         )
     if config.depth == "depth-anything":
         architecture(DEPTH_ANYTHING)
