@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.io import is_leftover, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
@@ -86,8 +86,7 @@ def begin(config: PrepareConfig) -> Work:
             f"{config.out}: holds the scene of other footage ({found.source}); "
             "choose another folder"
         )
-    for leftover in config.out.rglob(".partial-*"):  # of a killed run
-        leftover.unlink()
+
     if found is not None:
         found.source, found.inputs = str(config.clip), inputs
         return Work(config, footage, found, capture)
@@ -132,7 +131,7 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
     if not config.out.is_dir():
         raise InputError(f"{config.out}: is a file; choose a folder to write the scene to")
     if not (config.out / "scene.json").exists():
-        if any(not p.name.startswith(".partial-") for p in config.out.iterdir()):
+        if not all(is_leftover(path) for path in config.out.iterdir()):
             raise InputError(
                 f"{config.out}: holds other files and no scene; choose an empty or new folder"
             )
