@@ -51,7 +51,7 @@ def record_pixels(
     recorders: Sequence[Recorder],
     radiance: Tensor | None = None,
 ) -> list[Tensor]:
-    """What each of the `recorders` records of every pixel, row by row: (S, 3) in [0, 1].
+    """What each of the `recorders` records of all pixels, row by row: (S, 3) in [0, 1].
 
     `radiance` (S, 3) is what the field has rendered there, if it has.
     """

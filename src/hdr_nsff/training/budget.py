@@ -79,7 +79,7 @@ class Clock:
 
 
 class Stopwatch:
-    """Seconds of training: without the first step, in which kernels compile, or pauses."""
+    """Seconds of training, without pauses and the first step, which compiles."""
 
     def __init__(self, seconds: float) -> None:
         self.before = seconds  # of training, in processes before this one

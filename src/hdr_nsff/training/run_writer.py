@@ -87,7 +87,7 @@ class RunWriter:
             save_checkpoint(self.config.out, clock.step, clock.seconds, tensors)
 
     def finish_checkpoint(self, clock: Clock) -> None:
-        """Count the time to the next checkpoint; report progress where no bar shows it."""
+        """Start the time to the next checkpoint; report progress where no bar does."""
         self.last_checkpoint = time.monotonic()
         if not self.progress.live.is_started:
             self.say(f"train: {clock.progress:.0%}, step {clock.step}, {self.psnr}")

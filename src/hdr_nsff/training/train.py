@@ -1,8 +1,8 @@
 """Scene to run: the loop, on one screen. Draw, forward, losses, backward, step.
 
-Everything random is drawn from the seed, the step and the batch's slot in the step. So a
-killed run that resumes, or one spread over several processes (`torchrun`), does what an
-unbroken single one does.
+Everything random is drawn from the seed, the step and the batch's slot in it. So a run
+that resumes after a kill, or one spread over several processes (`torchrun`), does what
+an unbroken single one does.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ class Trainer:
         self.writer.say(start_field(self.field, self.tonemapper, scene, from_priors, with_flow))
 
     def loop(self, keep_at: Sequence[float] = (), previews: bool = True) -> None:
-        """Train until the clock runs out, which counts neither compiling nor writing."""
+        """Train until the clock runs out; it counts neither compiling nor writing."""
         if self.clock.progress >= 1:
             self.writer.say(f"training was finished already, at step {self.clock.step}")
             return
