@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-
 OPAQUE_STEP = 1e10  # length of the last interval of a ray (NeRF, NSFF)
 
 

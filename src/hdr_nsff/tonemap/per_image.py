@@ -96,7 +96,8 @@ class ImageToneMapper(ImageGainToneMapper):
             self.set_curve(torch.from_numpy(response.x), torch.from_numpy(response.y).mean(0))
 
     def regularizers(self) -> dict[str, Tensor]:
-        return {"response_smoothness": curve.smoothness(self.response.values(slice(None)))}
+        curves = self.response.values(slice(None))  # (images, 3, K)
+        return {"response_smoothness": curve.smoothness(curves) * (len(curves) * 3)}
 
 
 class SigmoidToneMapper(ImageGainToneMapper):

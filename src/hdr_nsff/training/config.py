@@ -68,7 +68,7 @@ class TrainConfig:
     from_priors: bool = True
     """Start the field from the depth prior and the recorded colors."""
     refine_poses: bool = False
-    """Correct the training cameras (poses and focal length) a little, by the picture."""
+    """Learn small corrections of the training cameras: poses and focal length."""
     pose_lr: Advanced[Rate] = 6e-4
     """Of these corrections, as a motion of the picture in shares of its width."""
     pose_prior: Advanced[Weight] = 1e-4
@@ -76,9 +76,13 @@ class TrainConfig:
     focal length squared.
     """
     squared: Advanced[bool] = False
-    """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
+    """Squared photometric errors (eq. 12-13); the default is absolute ones."""
     saturation: Advanced[bool] = True
     """Trust recorded values near 0 and 1 less in the dynamic terms."""
+    published: Advanced[bool] = False
+    """Form the terms as the reference does: both neighbors add up, depth is compared up
+    to scale and shift whatever the prior, and errors of flow have no upper limit.
+    """
     bf16: bool = False
     """Network layers in bfloat16 (matters for `paper` only)."""
     seed: Annotated[int, Ge(0), Le(MAX_SEED)] = 0
@@ -116,8 +120,9 @@ class TrainConfig:
 
 
 def check_config(config: TrainConfig) -> TrainConfig:
-    """The config after its `set` changes, with an absolute scene folder so that the run
-    can be opened from anywhere; InputError where a value or a combination makes no sense.
+    """The config after its `set` changes; InputError where it makes no sense.
+
+    Its scene folder is absolute, so that the run can be opened from anywhere.
     """
     if config.budget.steps is None and config.budget.minutes is None:
         raise InputError("neither --steps nor --minutes: say how long to train")

@@ -19,6 +19,8 @@ from hdr_nsff.maths import losses
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.tonemap.base import ToneMapper
 
+FLOW_LIMIT_PX = 20.0  # an outlier of the flow prior costs no more (hand-chosen)
+
 
 @dataclass(frozen=True)
 class LossWeights:
@@ -44,9 +46,9 @@ class Objective:
     depth_kind: str  # "scene": disparity in scene units; "relative": up to scale and shift
     near: float  # z-depth, scene units
     squared: bool = False  # eq. 12-13 as printed; False: absolute, as the reference does
+    published: bool = False  # terms formed as the reference forms them: see `TrainConfig`
     saturation: bool = True  # trust rgb near 0 and 1 less in the dynamic terms
     fade: float = 0.1  # of the depth and flow terms, every phase
-    flow_limit: float | None = 20.0  # px: no outlier of the flow prior costs more
 
     def terms(
         self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float
@@ -62,11 +64,25 @@ class Objective:
         terms |= self.priors(render, batch, phase)
         if render.scene_flow:
             lengths = [losses.flow_magnitude(flow) for flow in render.scene_flow.values()]
-            terms["flow_magnitude"] = torch.stack(lengths).mean()
-        return terms
+            terms["flow_magnitude"] = torch.stack(lengths)
+        return self.reduce(terms)
+
+    def reduce(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Scalar terms: those with a value per neighbor (n,) are averaged.
+
+        The reference adds them up, so that times inside the clip weigh twice as much as
+        its ends.
+        """
+        reduced = {}
+        for name, values in terms.items():
+            if values.ndim == 0:
+                reduced[name] = values
+            else:
+                reduced[name] = values.sum() if self.published else values.mean()
+        return reduced
 
     def trust(self, batch: PixelBatch) -> Tensor:
-        """Trust (N, 3) in recorded values where the dynamic content is compared to them."""
+        """Trust (N, 3) in recorded values in the terms of the dynamic content."""
         if self.saturation:
             return losses.saturation_weight(batch.rgb)
         return torch.ones_like(batch.rgb)
@@ -74,8 +90,10 @@ class Objective:
     def dynamic(
         self, render: Render, rgb: Tensor, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
-        """The dynamic branch against the recording: everywhere in the first phase, later
-        by its share of the ray. Without such a branch, the extra moving pixels.
+        """Eq. 7: the dynamic branch against the recording.
+
+        It counts everywhere in the first phase, later by its share of the ray. Without
+        such a branch, the extra moving pixels count.
         """
         if render.dynamic_radiance is not None:
             rgb = record(render.dynamic_radiance, batch, tonemap)
@@ -109,9 +127,9 @@ class Objective:
         double = [term(warp) for warp in warps if abs(warp.offset) == 2 and phase >= 2]
         terms = {}
         if single:
-            terms["temporal"] = torch.stack(single).mean()
+            terms["temporal"] = torch.stack(single)
         if double:
-            terms["chain"] = torch.stack(double).mean()
+            terms["chain"] = torch.stack(double)
         return terms
 
     def priors(self, render: Render, batch: PixelBatch, phase: float) -> dict[str, Tensor]:
@@ -121,7 +139,8 @@ class Objective:
         terms = {}
         fade = self.fade ** int(phase)
         depth = render.depth if render.dynamic_depth is None else render.dynamic_depth
-        if batch.disparity is not None and self.depth_kind == "relative":
+        relative = self.published or self.depth_kind == "relative"
+        if batch.disparity is not None and relative:
             terms["depth"] = fade * losses.depth_relative(depth, batch.disparity)
         elif batch.disparity is not None:
             confidence = batch.disparity_confidence
@@ -131,12 +150,13 @@ class Objective:
                 depth, batch.disparity, confidence, self.near
             )
         flows = []
+        limit = None if self.published else FLOW_LIMIT_PX
         for warp in render.warps:
             if warp.offset in batch.flow:
                 target, valid = batch.flow[warp.offset], batch.flow_valid[warp.offset]
-                flows.append(losses.optical_flow(warp.flow, target, valid, self.flow_limit))
+                flows.append(losses.optical_flow(warp.flow, target, valid, limit))
         if flows:
-            terms["flow"] = fade * torch.stack(flows).mean()
+            terms["flow"] = fade * torch.stack(flows)
         if batch.moving is not None:
             certain = None if batch.outline is None else (~batch.outline).float()
             terms["mask"] = losses.motion_mask(render.motion, batch.moving, certain)

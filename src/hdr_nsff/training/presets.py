@@ -52,6 +52,7 @@ def paper() -> TrainConfig:
             kinetic=0.1,
             disocclusion=0.1,
             blend_entropy=1e-3,
+            distortion=1e-3,
         ),
         samples=PUBLISHED_SAMPLES,
         render_samples=PUBLISHED_SAMPLES,
@@ -59,6 +60,7 @@ def paper() -> TrainConfig:
         radiance="sigmoid",
         density="relu",
         density_noise=1.0,
+        opaque_end=True,
         cull=False,
     )
     tonemap = ToneMapConfig(
@@ -75,6 +77,7 @@ def paper() -> TrainConfig:
         schedule=PUBLISHED_SCHEDULE,
         rays=1024,
         moving_rays=512,
+        published=True,
         from_priors=False,
         tonemap_lr=5e-4,
         anchor_at=1.0,
@@ -95,8 +98,9 @@ def tiny() -> TrainConfig:
 
 
 def nsff_paper() -> TrainConfig:
-    """NSFF at its published size: `paper` without a tone mapper, with squared errors that
-    trust every recorded value.
+    """NSFF at its published size: `paper` without a tone mapper.
+
+    Its errors are squared and trust every recorded value.
     """
     return replace(paper(), tonemap=NO_TONE_MAPPER, squared=True, saturation=False)
 
@@ -127,6 +131,7 @@ def nerf_wt_paper() -> TrainConfig:
         render_samples=PUBLISHED_SAMPLES,
         density="relu",
         density_noise=1.0,
+        opaque_end=True,
         cull=False,
     )
     return replace(nsff_paper(), field=field, loss=PICTURE_ALONE, moving_rays=0)
@@ -165,8 +170,9 @@ def hexplane_paper() -> TrainConfig:
 
 
 def hexplane() -> TrainConfig:
-    """The same for minutes on a CPU: smaller grids and batches, and rates for a twentieth
-    of the steps.
+    """HDR-HexPlane for minutes on a CPU: smaller grids and batches.
+
+    Its rates are those for a twentieth of the steps.
     """
     field = HexPlaneConfig(
         coarsest=48,

@@ -18,8 +18,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.notes import LogLine
-from hdr_nsff.fields.base import RadianceField, recorded
+from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import build_field, device_for
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
@@ -167,13 +168,13 @@ def write_preview(
     """previews/: a training frame as recorded and as rendered, side by side."""
     recorder = tonemapper.recorder(frame.bracket, frame.camera_id, position)
     with torch.no_grad():
-        rgb = recorded(field, frame.camera, frame.time, [recorder])[0].view_as(frame.image)
+        rgb = record_pixels(field, frame.camera, frame.time, [recorder])[0].view_as(frame.image)
     pair = torch.cat([frame.image, rgb], 1).cpu().numpy()
     write_png(folder / "previews" / f"step_{step:08d}.png", pair)
 
 
 def append_log(folder: Path, clock: Clock, num_rays: int, values: dict[str, float]) -> None:
-    """Add a line to log.jsonl: the `values` of a step, which compared `num_rays` pixels."""
+    """Add to log.jsonl the `values` of a step that compared `num_rays` pixels."""
     line = {
         "step": clock.step,
         "seconds": round(clock.seconds, 3),
