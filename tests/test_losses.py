@@ -22,8 +22,8 @@ def test_photometric_ignores_pixels_of_weight_zero() -> None:
 def test_saturation_weight_is_one_inside_and_a_quarter_at_the_ends() -> None:
     w = losses.saturation_weight(torch.tensor([0.0, 0.15, 0.5, 0.9, 1.0]))
     torch.testing.assert_close(w, torch.tensor([0.25, 1.0, 1.0, 1.0, 0.25]))
-    halfway = losses.saturation_weight(torch.tensor([0.075, 0.95]))  # quadratic: 1 - 0.75 / 4
-    torch.testing.assert_close(halfway, torch.full((2,), 0.8125))
+    halfway = losses.saturation_weight(torch.tensor([0.075, 0.95]))  # (1 - 1/4)^2
+    torch.testing.assert_close(halfway, torch.full((2,), 0.5625))
 
 
 def test_opposite_flows_close_the_cycle_and_cost_no_kinetic_energy() -> None:

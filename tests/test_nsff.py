@@ -44,7 +44,8 @@ class Blob(nn.Module):
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         inside = (coords[:, 2] < WALL) & self.wall
         x, y = coords[:, :1], coords[:, 1:2]
-        return torch.cat([2 * x, 1 - y, 0 * x, self.density(inside), 0 * x], -1)
+        blend = torch.where(inside, 30.0, -30.0)[:, None]  # v is 1 inside of the wall
+        return torch.cat([2 * x, 1 - y, 0 * x, self.density(inside), blend], -1)
 
     def dynamic(
         self, coords: Tensor, knot: float, directions: Tensor, motion: bool
@@ -52,8 +53,7 @@ class Blob(nn.Module):
         local = coords - START - knot * self.velocity
         inside = (local.norm(dim=-1) < RADIUS) & self.blob
         x, y = local[:, :1], local[:, 1:2]
-        blend = torch.where(inside, 30.0, -30.0)[:, None]
-        raw = torch.cat([3 * x, 2 + y, 0 * x, self.density(inside), blend], -1)
+        raw = torch.cat([3 * x, 2 + y, 0 * x, self.density(inside)], -1)
         if not motion:
             return raw, None
         return raw, raw_motion(self.velocity, self.disocclusion).expand(len(coords), 8)

@@ -185,7 +185,9 @@ class NerfWT(TwoBranches):
         self.codes.images = batch.recorder.images
         base = self.query(batch, motion=False)
         render = self.compose(base.static, base.dynamic, base.weights, base.samples.depths)
-        return render, {"transient": (base.dynamic.density * base.samples.deltas).mean()}
+        # without the last interval, which has no length of its own where it is opaque
+        thickness = base.dynamic.density[:, :-1] * base.samples.deltas[:, :-1]
+        return render, {"transient": thickness.mean()}
 
     def compose(
         self, static: BranchOutput, dynamic: BranchOutput, weights: volume.Weights, depths: Tensor
