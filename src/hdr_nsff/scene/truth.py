@@ -226,8 +226,9 @@ def true_pictures(
 ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
     """The radiance (H, W, 3) of a view, and its recordings by bracket of the truth.
 
-    Radiance is exact, and None where it is unknown. Recordings (H, W, 3) come from files, else
-    from the radiance by the true response. InputError where files do not fit together.
+    Radiance is exact, and None where it is unknown. Recordings (H, W, 3) come from
+    files, else from the radiance by the true response. InputError where files do not
+    fit together.
     """
     exact = None if view.radiance is None else read_radiance(folder, view.radiance)
     recorded = {b: read_image(inside(folder, name)) for b, name in view.recorded.items()}
