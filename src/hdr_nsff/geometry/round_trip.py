@@ -1,5 +1,7 @@
-"""Maps read where flow leads, and the forward-backward check of flow: whether a pixel
-returns to where it started (Sundaram, Brox and Keutzer 2010).
+"""Maps read where flow leads, and the forward-backward check of flow.
+
+The check is whether a pixel returns to where it started (Sundaram, Brox and Keutzer
+2010).
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ class RoundTripTuning:
     """
 
     max_error_px: float = 0.5  # hand-chosen on rendered scenes
-    max_error_share: float = 0.01  # METHOD.md 5; the reference allows 0.5
+    max_error_share: float = 0.01  # hand-chosen; the paper's reference code allows 0.5
     # share of clipped neighbors that bilinear reading tolerates: rounding only
     max_clipped_weight: float = 0.01
 

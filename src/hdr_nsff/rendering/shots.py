@@ -31,7 +31,8 @@ from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.core.video import write_video
-from hdr_nsff.fields.base import Render, recorded
+from hdr_nsff.fields.base import Render
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
@@ -153,7 +154,7 @@ def develop_view(
     flat = torch.from_numpy(radiance.reshape(-1, 3)).to(device_of(run))
     camera = to_device(view.camera, device_of(run))
     recorder = run.tonemapper.recorder_at(ev, camera_id)
-    picture = recorded(run.field, camera, view.time, [recorder], flat)[0]
+    picture = record_pixels(run.field, camera, view.time, [recorder], flat)[0]
     return picture.cpu().numpy().reshape(radiance.shape)
 
 

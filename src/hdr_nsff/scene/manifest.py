@@ -82,7 +82,7 @@ class FrameEntry(Strict):
 
 
 class StepRecord(Strict):
-    """One finished step of `prepare`: what it did, and the hash of all it depended on."""
+    """One finished step of `prepare`, with a hash of what it depended on."""
 
     done: bool = False
     key: str = ""  # hash of settings and inputs; with another key the step is redone
@@ -258,7 +258,7 @@ def bracket_problem(
 def is_matrix(
     rows: list[list[float]], shape: tuple[int, int], good: Callable[[np.ndarray], bool]
 ) -> bool:
-    """Whether `rows` are a matrix of that shape, with numbers in range, that is `good`."""
+    """Whether `rows` are a `good` matrix of that shape with numbers in range."""
     if len({len(row) for row in rows}) != 1:
         return False
     matrix = np.array(rows)

@@ -95,7 +95,7 @@ class Scene:
 
 
 def check_complete(folder: Path, m: Manifest) -> tuple[float, float]:
-    """Near and far of a scene that `prepare` has finished; InputError where it has not."""
+    """Near and far of a scene; InputError where `prepare` has not finished it."""
     again = "run `hdr-nsff prepare` again"
     if not m.frames:
         raise InputError(f"{folder}: the scene has no frames; {again}")

@@ -298,8 +298,8 @@ class Tracer:
         columns = [np.ascontiguousarray(column, np.float32) for column in directions.T]
         x, y, z = (float(coordinate) for coordinate in origin)
         hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(*columns)))
-        # Shapes are told apart by the numbers of their pointers: asking every shape for
-        # its rays would take longer than a picture.
+        # Shapes are identified by the numbers of their pointers: asking every shape for
+        # its rays would take longer than rendering a picture.
         names = {}
         for shape in scene.shapes():
             number = np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]

@@ -26,7 +26,7 @@ from tyro.conf import Positional
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import read_mask, write_png
-from hdr_nsff.core.io import read_json, write_json, write_npy, writing_to
+from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
@@ -219,7 +219,7 @@ def same_problem(path: Path, settings: dict[str, Any]) -> bool:
 
 def is_empty_folder(path: Path) -> bool:
     """Whether a folder holds nothing but unfinished files of a killed run."""
-    return path.is_dir() and all(p.name.startswith(".partial-") for p in path.iterdir())
+    return path.is_dir() and all(is_leftover(entry) for entry in path.iterdir())
 
 
 def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePlan:

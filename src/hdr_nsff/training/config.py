@@ -68,7 +68,7 @@ class TrainConfig:
     from_priors: bool = True
     """Start the field from the depth prior and the recorded colors."""
     refine_poses: bool = False
-    """Correct the training cameras (poses and focal length) a little, by the picture."""
+    """Learn small corrections of the training cameras: poses and focal length."""
     pose_lr: Advanced[Rate] = 6e-4
     """Of these corrections, as a motion of the picture in shares of its width."""
     pose_prior: Advanced[Weight] = 1e-4
@@ -76,7 +76,7 @@ class TrainConfig:
     focal length squared.
     """
     squared: Advanced[bool] = False
-    """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
+    """Squared photometric errors (eq. 12-13); the default is absolute ones."""
     saturation: Advanced[bool] = True
     """Trust recorded values near 0 and 1 less in the dynamic terms."""
     bf16: bool = False
@@ -116,8 +116,9 @@ class TrainConfig:
 
 
 def check_config(config: TrainConfig) -> TrainConfig:
-    """The config after its `set` changes, with an absolute scene folder so that the run
-    can be opened from anywhere; InputError where a value or a combination makes no sense.
+    """The config after its `set` changes; InputError where it makes no sense.
+
+    Its scene folder is absolute, so that the run can be opened from anywhere.
     """
     if config.budget.steps is None and config.budget.minutes is None:
         raise InputError("neither --steps nor --minutes: say how long to train")

@@ -221,8 +221,8 @@ class Brackets:
         if exposure is None:
             return 0 if len(self.ev) == 1 else None
         if isinstance(exposure, list):
-            alike = set(exposure)
-            return next((f.bracket for f in self.entries if f.source in alike), None)
+            sources = set(exposure)
+            return next((f.bracket for f in self.entries if f.source in sources), None)
         for frame in self.entries:
             own = self.capture.by_source[frame.source].ev
             if own is not None and abs(own - exposure) < SAME_EV:
@@ -276,7 +276,7 @@ def truth_key(
 
 
 def claim_folder(out: Path, key: str) -> bool:
-    """Whether the truth folder `out` is complete and made of what `key` stands for.
+    """Whether the truth folder `out` is complete and was made with this `key`.
 
     Otherwise a note of that is written, and files made of something else are removed.
     InputError where the folder holds something else.

@@ -14,7 +14,7 @@ from hdr_nsff.scene.movers import Mover, write_movers
 
 
 def find_movers(work: Work) -> StepResult:
-    """The movers of the training frames, from flow, masks and a first depth of theirs."""
+    """The movers of the training frames, from flow, masks and their first depth."""
     if work.manifest.depth_kind == "relative":
         return result((), {}, "none looked for: depth is known up to scale and shift only")
     flow = work.training_flows(work.refined_flows)
