@@ -178,7 +178,7 @@ def test_a_room_is_not_rendered_into_a_folder_of_something_else(
 ) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
-    assert "holds something else" in refused(
+    assert "holds other files" in refused(
         capsys, "synth", "interior", str(tmp_path), "--size", "16x16", "--frames", "12"
     )
     assert (tmp_path / "clip" / "00000.png").read_bytes() == b"mine"
