@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.rigid_motion import RigidGroup, canonical_points
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING, BundleTuning
@@ -101,8 +102,9 @@ class BundleProblem:
         self.pixels = np.nan_to_num(tracks.pixels[members])  # (N, T, 2)
         self.noise = tuning.flow_noise_px * np.sqrt(1.0 + tracks.age[members])  # (N, T) px
         self.K = cameras.K
-        self.w2c = np.swapaxes(cameras.c2w[:, :, :3], 1, 2)  # (T, 3, 3)
         self.eyes = cameras.c2w[:, :, 3] - group.center  # (T, 3)
+        self.c2w = np.concatenate([cameras.c2w[:, :, :3], self.eyes[..., None]], -1)
+        self.w2c = np.swapaxes(self.c2w[:, :, :3], 1, 2)  # (T, 3, 3), rotation only
         self.middle = np.zeros(3)
         self.size = 1.0
         if len(members):
@@ -133,7 +135,7 @@ class BundleProblem:
         `prior_points` (N, T, 3), `trust` (N, T).
         """
         tuning = self.tuning
-        depth = np.einsum("tj,ntj->nt", self.w2c[:, 2], prior_points - self.eyes)
+        depth = pinhole.to_camera(prior_points, self.c2w)[..., 2]
         count = np.maximum(self.visible.sum(0), 1)
         depth = np.where(self.visible, np.nan_to_num(depth), 0)
         self.mean_depth = depth.sum(0) / count  # (T,)
@@ -197,20 +199,16 @@ class BundleProblem:
 
     def points_on_rays(self, state: BundleState) -> np.ndarray:
         """Median over time of canonical points (N, 3) at the z-depth of the center."""
-        depth = np.einsum("tj,tj->t", self.w2c[:, 2], state.translations - self.eyes)
-        rays = (self.pixels - self.K[:, :2, 2]) / self.K[:, [0, 1], [0, 1]]
-        local = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) * depth[:, None]
-        world = np.einsum("tji,ntj->nti", self.w2c, local) + self.eyes
+        depth = pinhole.to_camera(state.translations, self.c2w)[..., 2]
+        world = pinhole.unproject(self.pixels, depth, self.K, self.c2w)
         back = np.einsum("tji,ntj->nti", state.rotations, world - state.translations)
         return np.nanmedian(np.where(self.visible[..., None], back, np.nan), 1)
 
     def reproject(self, state: BundleState) -> Reprojection:
         """The points of a state in all cameras."""
         rotated = np.einsum("tij,nj->nti", state.rotations, state.points)
-        local = np.einsum("tij,ntj->nti", self.w2c, rotated + state.translations - self.eyes)
-        z = np.maximum(local[..., 2:], self.min_depth)
-        focal, center = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
-        error = local[..., :2] / z * focal + center - self.pixels
+        local = pinhole.to_camera(rotated + state.translations, self.c2w)
+        error = pinhole.to_pixels(local, self.K, self.min_depth) - self.pixels
         return Reprojection(np.where(self.visible[..., None], error, 0), rotated, local)
 
     @property

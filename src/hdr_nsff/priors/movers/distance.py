@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.regions import (
     RegionTrack,
     flow_steps,
@@ -89,11 +90,7 @@ def track_depth(
     frames = np.array(track.frames)
     pixels = region_centers(track, labels, clip.times, tuning)
     eyes = clip.c2w[frames, :, 3]
-    points = [
-        clip.unproject(f, pixel[None], np.ones(1))[0]
-        for f, pixel in zip(frames, pixels, strict=True)
-    ]
-    rays = np.stack(points) - eyes  # one unit of z-depth long
+    rays = pinhole.world_rays(pixels, clip.K[frames], clip.c2w[frames])
     known = np.array([motion is not None for motion in track.motions[:-1]], bool)
     prior = 1 / (tuning.disparity_ratio * np.maximum(surface, np.median(surface)))
     axes = clip.c2w[frames, :, 2]

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING, RigidGroupsTuning
 
@@ -136,11 +137,11 @@ def fit_rigid(
     w = weight.copy()
     for _ in range(tuning.robust_rounds):
         total = w.sum() + 1e-12
-        a, b = (w[:, None] * source).sum(0) / total, (w[:, None] * target).sum(0) / total
+        a = (w[:, None] * source).sum(0) / total
+        b = (w[:, None] * target).sum(0) / total
         rotation = np.eye(3)
         if len(source) >= tuning.min_rotation_points:
-            u, _, vt = np.linalg.svd((w[:, None] * (source - a)).T @ (target - b))
-            rotation = (u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt).T
+            rotation = nearest_rotation((w[:, None] * (target - b)).T @ (source - a))
         translation = b - rotation @ a
         residual = np.linalg.norm(source @ rotation.T + translation - target, axis=-1)
         w = weight / (1 + (residual / (np.median(residual) + 1e-9)) ** 2)
@@ -200,10 +201,7 @@ def smooth_poses(
     columns = [np.interp(times, known_times, column[known_times]) for column in flat.T]
     flat = np.stack(columns, 1)
     flat = ndimage.convolve1d(flat, TEMPORAL_KERNEL, axis=0, mode="nearest")
-    u, _, vt = np.linalg.svd(flat[:, :9].reshape(-1, 3, 3))
-    sign = np.sign(np.linalg.det(u @ vt))
-    vt[:, 2] *= sign[:, None]
-    return u @ vt, flat[:, 9:]
+    return nearest_rotation(flat[:, :9].reshape(-1, 3, 3)), flat[:, 9:]
 
 
 def motion_residuals(

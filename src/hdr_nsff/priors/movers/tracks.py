@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import ndimage
 
+from hdr_nsff.geometry.round_trip import flow_at
 from hdr_nsff.priors.movers.tuning import TRACK_TUNING, TrackTuning
 
 
@@ -141,12 +142,7 @@ def advance(
     visible = np.isfinite(pixels[:, 0])
     x = np.where(visible, pixels[:, 0], 0).astype(int)
     y = np.where(visible, pixels[:, 1], 0).astype(int)
-    rows_and_columns = np.where(visible[:, None], pixels, 0.5)[:, ::-1].T - 0.5
-    sampled = [
-        ndimage.map_coordinates(flow[..., axis], rows_and_columns, order=1, mode="nearest")
-        for axis in (0, 1)
-    ]
-    motion = np.stack(sampled, -1)
+    motion = flow_at(flow, pixels)
     # a pixel between two motions: interpolation mixes them
     mixed = np.abs(motion - flow[y, x]).max(-1) > 0.5 * tuning.max_flow_difference_px
     moved = np.where(mixed[:, None], np.nan, pixels + motion)

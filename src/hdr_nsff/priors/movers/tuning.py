@@ -264,8 +264,8 @@ class MoversTuning:
     segmentation: MotionSegmentationTuning = MOTION_SEGMENTATION_TUNING
     distance: MoverDistanceTuning = MOVER_DISTANCE_TUNING
     fallback_smoothing_times: float = 1.0
-    """Standard deviation of the Gaussian that smooths the path of the one mover that
-    stands for all moving pixels where no tracks are found.
+    """Standard deviation of the Gaussian that smooths the path of all moving pixels
+    together, where no tracks are found.
     """
 
 
