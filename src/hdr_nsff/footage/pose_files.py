@@ -17,6 +17,7 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapModel, read_model
 from hdr_nsff.footage.pose_formats import GivenPoses, from_colmap, from_json, from_llff
+from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.geometry.poses import (
     MIN_REGISTERED_SHARE,
     Poses,
@@ -165,8 +166,7 @@ def fit_poses(
         )
     error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     rounded = error > MAX_ROTATION_ERROR
-    u, _, vt = np.linalg.svd(rotation)
-    c2w[rounded, :, :3] = (u @ vt)[rounded]
+    c2w[rounded, :, :3] = nearest_rotation(rotation[rounded])
     registered = np.array([row is not None for row in rows])
     return Poses(
         K,
