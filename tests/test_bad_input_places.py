@@ -93,7 +93,9 @@ def test_a_place_that_cannot_be_written_is_named(
 
 def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "thesis.html").write_text("<p>mine</p>")
-    assert "not a report" in refused(capsys, "report", run_folder, "--out", tmp_path / "thesis.html")
+    assert "not a report" in refused(
+        capsys, "report", run_folder, "--out", tmp_path / "thesis.html"
+    )
     assert (tmp_path / "thesis.html").read_text() == "<p>mine</p>"
     assert "is a folder" in refused(capsys, "report", run_folder, "--out", tmp_path)
     for _ in range(2):

@@ -186,5 +186,5 @@ def mover_problem(mover: Mover) -> str | None:
         return "has a motion with NaN or Inf"
     turns = mover.rotations @ np.swapaxes(mover.rotations, 1, 2)
     if not np.allclose(turns, np.eye(3), atol=1e-3):
-        return "has rotations that are none"
+        return "has rotations that are not orthogonal matrices"
     return None

@@ -80,7 +80,7 @@ class TruthView(Strict):
         if self.c2w is not None and not is_matrix(self.c2w, (3, 4), is_pose):
             return "a c2w that is no 3x4 camera pose"
         if self.K is not None and not is_matrix(self.K, (3, 3), is_intrinsic):
-            return "a K that is no 3x3 camera matrix"
+            return "a K that is not a 3x3 camera matrix"
         if not all(0 <= b < num_brackets for b in self.recorded):
             brackets = sorted(self.recorded)
             return f"recordings at brackets {brackets}, but bracket_ev lists {num_brackets}"
@@ -142,11 +142,11 @@ class Truth(Strict):
         except ValueError as error:
             raise InputError(
                 f"{path}: not a valid truth file ({first_problem(error)}); "
-                "restore it, or make the truth anew"
+                "restore it, or make the truth again"
             ) from error
         problem = truth.problem()
         if problem is not None:
-            raise InputError(f"{path}: {problem}; restore it, or make the truth anew")
+            raise InputError(f"{path}: {problem}; restore it, or make the truth again")
         return truth
 
     def problem(self) -> str | None:
@@ -242,7 +242,7 @@ def true_pictures(
         sizes.add(exact.shape[:2])
     if len(sizes) > 1:
         raise InputError(
-            f"{folder}: the pictures of view {view.name} have several sizes; make the truth anew"
+            f"{folder}: the pictures of view {view.name} have several sizes; make the truth again"
         )
     return exact, pictures
 

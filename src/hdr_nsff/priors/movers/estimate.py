@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from hdr_nsff.core.progress import say
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.bundle_problem import Cameras
 from hdr_nsff.priors.movers.motion_segmentation import Segment, segment_tracks
@@ -48,10 +47,7 @@ def estimate_movers(
         segments = segment_tracks(tracks, cameras, tuning)
     if not segments:
         return (mover_without_tracks(np.array(frames), views, tuning),)
-    movers = tuple(mover_of(np.array(frames), tracks, segment) for segment in segments)
-    shapes = sum(mover.has_shape for mover in movers)
-    say(f"movers: {len(movers)} found on {len(tracks.trust)} tracks, {shapes} with a shape")
-    return movers
+    return tuple(mover_of(np.array(frames), tracks, segment) for segment in segments)
 
 
 def mover_of(frames: np.ndarray, tracks: Tracks, segment: Segment) -> Mover:
