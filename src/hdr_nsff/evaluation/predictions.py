@@ -44,7 +44,7 @@ def predict(
     """Render an EXR per named view, `folder`/NAME.exr: radiance and depth.
 
     With `motion` also scene flow per frame in channels like `forward.x`. Files of the
-    same run are kept, so that a killed evaluation goes on where it was.
+    same run are kept, so that a killed evaluation continues where it was.
     """
     key = json.dumps(fingerprint(run, motion, list(views.items())))
     path = folder / "predictions.json"

@@ -154,7 +154,8 @@ def check_settings(config: PrepareConfig) -> None:
     ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
     if config.protocol is not None and config.hold_out is not None:
         raise InputError(
-            "--protocol and --hold-out: each decides what is kept out of training; leave one out"
+            "--protocol and --hold-out both given, and each decides what is kept out of "
+            "training; leave one out"
         )
     parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):

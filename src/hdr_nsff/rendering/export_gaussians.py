@@ -27,7 +27,7 @@ from hdr_nsff.rendering import ply
 from hdr_nsff.rendering.shots import develop, display_exposure, fingerprint
 from hdr_nsff.training.run_folder import Run
 
-NOT_OURS = "is there already and was not made by export"
+NOT_OURS = "already exists and was not made by export"
 
 
 @dataclass(frozen=True)

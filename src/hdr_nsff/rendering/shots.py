@@ -280,7 +280,7 @@ def open_sequence(
         say(f"{shot.name}: settings or checkpoint changed, rendering again")
     old = [*numbered_pictures(folder), *(p for p in products if p.exists())]
     if old and not path.is_file():
-        problem = "is there already and was not made by render"
+        problem = "already exists and was not made by render"
         raise InputError(f"{old[0]}: {problem}; choose another --out")
     for file in old:
         file.unlink()

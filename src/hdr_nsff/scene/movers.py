@@ -32,7 +32,7 @@ MAX_DEPTH_RATIO = 2.0  # a pixel's depth changes by less than this factor
 class Mover:
     """One moving object over T times."""
 
-    frames: np.ndarray  # (T,) int: index of the frame that stands for each time
+    frames: np.ndarray  # (T,) int: index of the frame at each time
     pixels: np.ndarray  # (N, T, 2) xy px of its tracks, NaN where unseen
     trust: np.ndarray  # (N, T) of a track's depth, 0 where unseen
     points: np.ndarray  # (N, 3) canonical, scene units, NaN where unknown: the shape
@@ -186,5 +186,5 @@ def mover_problem(mover: Mover) -> str | None:
         return "has a motion with NaN or Inf"
     turns = mover.rotations @ np.swapaxes(mover.rotations, 1, 2)
     if not np.allclose(turns, np.eye(3), atol=1e-3):
-        return "has rotations that are none"
+        return "has rotations that are not orthogonal matrices"
     return None

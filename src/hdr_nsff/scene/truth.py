@@ -80,7 +80,7 @@ class TruthView(Strict):
         if self.c2w is not None and not is_matrix(self.c2w, (3, 4), is_pose):
             return "a c2w that is no 3x4 camera pose"
         if self.K is not None and not is_matrix(self.K, (3, 3), is_intrinsic):
-            return "a K that is no 3x3 camera matrix"
+            return "a K that is not a 3x3 camera matrix"
         if not all(0 <= b < num_brackets for b in self.recorded):
             brackets = sorted(self.recorded)
             return f"recordings at brackets {brackets}, but bracket_ev lists {num_brackets}"
@@ -142,11 +142,11 @@ class Truth(Strict):
         except ValueError as error:
             raise InputError(
                 f"{path}: not a valid truth file ({first_problem(error)}); "
-                "restore it, or make the truth anew"
+                "restore it, or make the truth again"
             ) from error
         problem = truth.problem()
         if problem is not None:
-            raise InputError(f"{path}: {problem}; restore it, or make the truth anew")
+            raise InputError(f"{path}: {problem}; restore it, or make the truth again")
         return truth
 
     def problem(self) -> str | None:
@@ -226,8 +226,9 @@ def true_pictures(
 ) -> tuple[np.ndarray | None, dict[int, np.ndarray]]:
     """The radiance (H, W, 3) of a view, and its recordings by bracket of the truth.
 
-    Radiance is exact, and None where it is unknown. Recordings (H, W, 3) come from files, else
-    from the radiance by the true response. InputError where files do not fit together.
+    Radiance is exact, and None where it is unknown. Recordings (H, W, 3) come from
+    files, else from the radiance by the true response. InputError where files do not
+    fit together.
     """
     exact = None if view.radiance is None else read_radiance(folder, view.radiance)
     recorded = {b: read_image(inside(folder, name)) for b, name in view.recorded.items()}
@@ -241,7 +242,7 @@ def true_pictures(
         sizes.add(exact.shape[:2])
     if len(sizes) > 1:
         raise InputError(
-            f"{folder}: the pictures of view {view.name} have several sizes; make the truth anew"
+            f"{folder}: the pictures of view {view.name} have several sizes; make the truth again"
         )
     return exact, pictures
 

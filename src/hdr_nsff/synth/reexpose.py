@@ -60,7 +60,7 @@ class ReexposeConfig:
     srgb.
     """
     hold_out: int = ingest.HOLD_OUT
-    """Every this many frames are the truth."""
+    """Spacing of the frames that are held out as truth."""
     poses: Path | None = None
     """Camera poses of all frames of the clip: COLMAP model folder, transforms.json,
     poses_bounds.npy, precomputed.json.
@@ -76,7 +76,7 @@ class ReexposeConfig:
     end: int | None = None
     """Frame to stop before."""
     stride: int = 1
-    """Use every this many frames."""
+    """Spacing of the frames to use; 1 uses all."""
     seed: int = 0
     """Seed of the noise."""
 
@@ -201,7 +201,7 @@ def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
             )
     elif config.out.exists() and not is_empty_folder(config.out):
         raise InputError(
-            f"{config.out}: is there already and was not made by reexpose; "
+            f"{config.out}: already exists and was not made by reexpose; "
             "choose an empty or new folder"
         )
     write_json(path, settings)

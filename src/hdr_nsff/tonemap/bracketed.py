@@ -18,7 +18,7 @@ from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
 class BracketGain(nn.Module):
     """Log gain: the bracket's exposure + white balance + the frame's residual.
 
-    The white balance is the camera's. See docs/method.md, eq. 9-10.
+    The white balance is the camera's. See docs/method.md#eq-9 and #eq-10.
 
     Known exposures are buffers and stay exactly what they are; unknown ones are
     parameters.

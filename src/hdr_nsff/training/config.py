@@ -125,13 +125,13 @@ def check_config(config: TrainConfig) -> TrainConfig:
     Its scene folder is absolute, so that the run can be opened from anywhere.
     """
     if config.budget.steps is None and config.budget.minutes is None:
-        raise InputError("neither --steps nor --minutes: say how long to train")
+        raise InputError("neither --steps nor --minutes: give one of them")
     config = with_changes(replace(config, set=()), config.set, HELP)
     two_branches = not isinstance(config.field, SplatConfig | HexPlaneConfig)
     extra_pixels = config.rays > 0 and config.moving_rays > 0
     if config.loss.dynamic and not (two_branches or extra_pixels):
         raise InputError(
-            f"--loss.dynamic {config.loss.dynamic:g}: this preset forms no such term; "
+            f"--loss.dynamic {config.loss.dynamic:g}: this preset has no such term; "
             "give --rays and --moving-rays too, or leave it out"
         )
     return replace(config, scene=config.scene.resolve())

@@ -50,7 +50,7 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
     with writing_to(config.out), lock_output(config.out), distributed.group() as ranks:
         if ranks.world > config.batches:
             raise InputError(
-                f"{ranks.world} processes share {config.batches} batches a step; "
+                f"{ranks.world} processes share {config.batches} batches per step; "
                 "start fewer, or raise --batches"
             )
         device = device_for(config.field, config.device)

@@ -346,7 +346,7 @@ class Splat(nn.Module):
     def rigidity(self) -> Tensor:
         """Mean square difference of the mixtures of neighboring moving Gaussians.
 
-        Those that mix the motions alike keep their distances.
+        Gaussians with the same mixture of motions keep their distances.
         """
         mixture = self.mixture_logits.softmax(0)  # (B, M)
         of_neighbors = mixture[:, self.neighbors.long().flatten()]
