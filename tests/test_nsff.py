@@ -176,8 +176,8 @@ def test_content_that_follows_its_flow_looks_the_same_through_both_neighbors(
     for warp in render.warps:
         torch.testing.assert_close(warp.radiance[blob], render.radiance[blob], atol=0.02, rtol=0.02)
         torch.testing.assert_close(warp.confidence, torch.ones_like(warp.confidence))
-    assert float(own["cycle"]) < 1e-6
-    assert float(own["disocclusion"]) < 1e-6
+    assert float(own["cycle"].max()) < 1e-6
+    assert float(own["disocclusion"].max()) < 1e-6
 
 
 def test_two_steps_along_the_flow_see_the_same_too() -> None:
@@ -204,7 +204,7 @@ def test_confidence_is_one_minus_the_rendered_disocclusion() -> None:
     render, own = blob_field(Blob(disocclusion=0.0))(batch())  # sigmoid(0) = a half
     confidence = render.warps[0].confidence
     torch.testing.assert_close(confidence, 1 - 0.5 * render.motion, atol=1e-4, rtol=0)
-    assert float(own["disocclusion"]) == 0.5
+    assert own["disocclusion"].tolist() == [0.5, 0.5]
 
 
 def test_steady_flow_costs_little_kinetic_energy_and_a_turn_costs_more() -> None:
@@ -217,7 +217,7 @@ def test_steady_flow_costs_little_kinetic_energy_and_a_turn_costs_more() -> None
         return raw, None if flows is None else torch.cat([flows[:, :4], flows[:, :4]], -1)
 
     bent.dynamic = turn_back  # type: ignore[method-assign]
-    assert float(steady) < 0.01 * float(blob_field(bent)(batch())[1]["kinetic"])
+    assert float(steady.max()) < 0.01 * float(blob_field(bent)(batch())[1]["kinetic"].max())
 
 
 # Gradients, on grids

@@ -240,7 +240,7 @@ def test_an_outlier_of_the_flow_prior_costs_no_more_than_the_limit(
     wild = replace(exact, warps=tuple(replace(w, flow=w.flow + 500) for w in exact.warps))
     assert math.isclose(float(OBJECTIVE.terms(wild, batch, tonemap, 0.0)["flow"]), 20.0)
     assert math.isclose(
-        float(replace(OBJECTIVE, flow_limit=None).terms(wild, batch, tonemap, 0.0)["flow"]),
+        float(replace(OBJECTIVE, published=True).terms(wild, batch, tonemap, 0.0)["flow"]) / 2,
         1000.0,
         rel_tol=1e-5,
     )

@@ -78,12 +78,12 @@ def smoothness(a: Tensor, b: Tensor) -> Tensor:
 
 
 def flow_magnitude(scene_flow: Tensor) -> Tensor:
-    """Mean absolute rendered scene flow (N, 3), over pixels and axes.
+    """Absolute rendered scene flow (N, 3), summed over axes: its mean over pixels.
 
     The published code adds up the signed axes before it takes the absolute value, so
     that opposite components cancel; we do not follow it.
     """
-    return scene_flow.abs().mean()
+    return scene_flow.abs().sum(-1).mean()
 
 
 def blend_entropy(share: Tensor) -> Tensor:

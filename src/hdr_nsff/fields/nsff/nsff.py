@@ -39,8 +39,8 @@ class SceneFlowLosses:
     """The same through two steps, from phase 2 on."""
     cycle: Weight = 0.5
     """Flow there and back returns."""
-    flow_magnitude: Weight = 0.01
-    """Length of the rendered scene flow, per axis."""
+    flow_magnitude: Weight = 0.003
+    """Rendered scene flow, its axes added up."""
     smoothness: Weight = 0.1
     """Scene flow of neighboring samples of a ray."""
     kinetic: Weight = 0.1
