@@ -23,9 +23,8 @@ def main(clips: list[str]) -> None:
         pieces = [video[s : s + n] for n in (7, 9, 12, 20) for s in range(0, len(video) - n + 1, 3)]
         same = [detect_cycle(p).length == cycle.length for p in pieces]
         ev = " ".join(f"{cycle.ev[b]:.2f}" for b in cycle.order)
-        print(
-            f"{Path(clip).name:<28} {cycle.length:<6} {cycle.order!s:<15} {ev:<19} {cycle.confidence:<10.0%} {sum(same)} of {len(same)}"
-        )
+        columns = f"{Path(clip).name:<28} {cycle.length:<6} {cycle.order!s:<15} {ev:<19}"
+        print(f"{columns} {cycle.confidence:<10.0%} {sum(same)} of {len(same)}")
 
 
 if __name__ == "__main__":

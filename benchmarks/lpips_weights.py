@@ -62,7 +62,7 @@ def convert(params: dict[str, Any]) -> dict[str, Tensor]:
 def package_says(
     checkpoint: Path, params: dict[str, Any], a: np.ndarray, b: np.ndarray
 ) -> float | None:
-    """The distance by the package that `checkpoint` lies in; None without JAX and Flax."""
+    """The distance by the package of `checkpoint`; None without JAX and Flax."""
     if importlib.util.find_spec("jax") is None or importlib.util.find_spec("flax") is None:
         return None
     sys.path.insert(0, str(checkpoint.resolve().parents[2]))
@@ -81,9 +81,8 @@ def main(checkpoint: str, out: str, *pictures: str) -> None:
         x, y = read_image(a), read_image(b)
         theirs = package_says(Path(checkpoint), params, x, y)
         said = "" if theirs is None else f", the package says {theirs:.6f}"
-        print(
-            f"{Path(a).name} and {Path(b).name}: {ours(torch.from_numpy(x), torch.from_numpy(y)):.6f}{said}"
-        )
+        distance = ours(torch.from_numpy(x), torch.from_numpy(y))
+        print(f"{Path(a).name} and {Path(b).name}: {distance:.6f}{said}")
 
 
 if __name__ == "__main__":

@@ -37,9 +37,8 @@ def main() -> None:
     )
     print(f"registered {len(placed)} of {len(manifest.frames)}")
     print("\n".join(f"{name} {value:.4g}" for name, value in errors.items()))
-    print(
-        f"focal length {np.mean([manifest.frames[k].K[0][0] / given.K[k][0, 0] for k in placed]) - 1:+.2%}"
-    )
+    focal_ratios = [manifest.frames[k].K[0][0] / given.K[k][0, 0] for k in placed]
+    print(f"focal length {np.mean(focal_ratios) - 1:+.2%}")
 
 
 if __name__ == "__main__":
