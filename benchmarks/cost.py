@@ -13,7 +13,6 @@ peak memory of the process.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import resource
 import statistics
 import tempfile
@@ -24,14 +23,16 @@ from time import perf_counter
 from typing import Any
 
 import numba
+import numpy as np
 import torch
-from record import Record, make_parser
+from record import Record, make_parser, restart_prepared
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.process import limit_torch_threads, prepare_process
+from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig
@@ -40,7 +41,7 @@ from hdr_nsff.training.train import Trainer
 
 MOVING_SHARE = 0.2  # of all Gaussians; hand-chosen, near that of trained scenes
 WARM_UP_STEPS = 20  # before the timed ones: kernels are compiled and memory is touched
-CORES = os.cpu_count() or 1
+CORES = numba.config.NUMBA_NUM_THREADS  # that numba may use
 DEFAULTS = {"gaussians": 20_000, "width": 240, "frames": 0, "cores": CORES}  # 0: all frames
 # Axis: the setting that varies, and its values.
 AXES: dict[str, tuple[str, list[int]]] = {
@@ -52,7 +53,6 @@ AXES: dict[str, tuple[str, list[int]]] = {
 
 
 def main() -> None:
-    prepare_process()
     parser = make_parser(__doc__, "cost")
     parser.add_argument("scene", type=Path, help="a prepared scene")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves to this PNG")
@@ -61,6 +61,7 @@ def main() -> None:
         "--only", nargs="+", choices=AXES, default=list(AXES), help="the axes to measure"
     )
     args = parser.parse_args()
+    restart_prepared()
     record = Record("cost", args, seed=TrainConfig.seed)
     for axis in args.only:
         setting, values = AXES[axis]
@@ -84,7 +85,15 @@ def measure(folder: Path, settings: dict[str, int], steps: int) -> dict[str, Any
     width = settings["width"]
     height = round(width * camera.height / camera.width)
     frames = repeat_frames(scene.train, settings["frames"] or len(scene.train))
-    scene = replace(scene, train=[resize_frame(f, width, height) for f in frames], test=[])
+    shown = [frame.index for frame in frames]
+    scale = np.array([width / camera.width, height / camera.height])
+    resized = [resize_frame(frame, width, height) for frame in frames]
+    scene = replace(
+        scene,
+        train=[replace(frame, index=t) for t, frame in enumerate(resized)],
+        test=[],
+        movers=tuple(repeat_mover(mover, shown, scale) for mover in scene.movers),
+    )
     moving = round(MOVING_SHARE * settings["gaussians"])
     field = SplatConfig(static=settings["gaussians"] - moving, moving=moving)
     budget = Budget(steps=100 * steps, minutes=None)
@@ -168,6 +177,22 @@ def resize_frame(frame: Frame, width: int, height: int) -> Frame:
         disparity_confidence=resize(frame.disparity_confidence),
         flow={offset: resize(flow) * scale for offset, flow in frame.flow.items()},
         flow_valid={offset: resize(valid) for offset, valid in frame.flow_valid.items()},
+    )
+
+
+def repeat_mover(mover: Mover, shown: list[int], scale: np.ndarray) -> Mover:
+    """The mover in a clip whose frames show those of the indices `shown`, resized."""
+    time_of = {int(index): t for t, index in enumerate(mover.frames)}
+    frames = [t for t, index in enumerate(shown) if index in time_of]
+    times = [time_of[shown[t]] for t in frames]
+    return replace(
+        mover,
+        frames=np.array(frames),
+        pixels=mover.pixels[:, times] * scale,
+        trust=mover.trust[:, times],
+        rotations=mover.rotations[times],
+        translations=mover.translations[times],
+        known=mover.known[times],
     )
 
 

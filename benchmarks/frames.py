@@ -22,10 +22,10 @@ from typing import Any
 
 import numba
 import torch
-from record import Record, make_parser
+from record import Record, make_parser, restart_prepared
 from torch import Tensor
 
-from hdr_nsff.core.process import limit_torch_threads, prepare_process
+from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.geometry.cameras import Camera
@@ -44,7 +44,6 @@ DIFFERENT_TIMES = 97  # a prime: stepping by 7 visits all of them
 
 
 def main() -> None:
-    prepare_process()
     parser = make_parser(__doc__, "frames")
     parser.add_argument("--run", type=Path, help="a run of `splat`; default: generated fields")
     parser.add_argument(
@@ -64,6 +63,7 @@ def main() -> None:
         "--plot", type=Path, metavar="FILE", help="draw milliseconds against Gaussians to this PNG"
     )
     args = parser.parse_args()
+    restart_prepared()
     record = Record("frames", args, seed=None if args.run else SEED)
     for size in args.sizes:
         width, height = map(int, size.split("x"))

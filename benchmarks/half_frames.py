@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import Record, make_parser, name_of
+from record import Record, make_parser, name_of, restart_prepared
 
 from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
@@ -44,6 +44,7 @@ def main() -> None:
         help="paths per pixel of the views; default: those of RIG's held-out views",
     )
     args = parser.parse_args()
+    restart_prepared()
     seed = make_truth(args.rig, args.folder, args.spp)
     record = Record("half_frames", args, seed=seed)
     for run in args.runs:

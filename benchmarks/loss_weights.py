@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from record import Record, make_parser
+from record import Record, make_parser, restart_prepared
 
 from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
@@ -42,6 +42,7 @@ def main() -> None:
     )
     parser.add_argument("--jobs", type=int, default=1, help="runs at once, one thread each")
     args = parser.parse_args()
+    restart_prepared()
     budget = Budget(steps=args.steps, minutes=None)
     full = replace(PRESETS[args.preset], scene=args.scene, budget=budget)
     runs = runs_without(full, args.only)
@@ -84,8 +85,8 @@ def without(config: TrainConfig, name: str) -> TrainConfig:
     if name in asdict(config.tonemap.loss):
         losses = replace(config.tonemap.loss, **change)
         return replace(config, tonemap=replace(config.tonemap, loss=losses))
-    losses = replace(config.field.loss, **change)
-    return replace(config, field=replace(config.field, loss=losses))
+    field: Any = config.field
+    return replace(config, field=replace(field, loss=replace(field.loss, **change)))
 
 
 def row(

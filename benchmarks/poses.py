@@ -38,13 +38,13 @@ def measure(scene: Path, poses: Path) -> dict[str, float]:
     given = import_poses(poses, sources, (manifest.height, manifest.width))
     registered = [k for k, frame in enumerate(manifest.frames) if frame.c2w is not None]
     estimated = np.array([manifest.frames[k].c2w for k in registered])
-    focal_lengths = np.array([manifest.frames[k].K[0][0] for k in registered])
+    K = np.array([manifest.frames[k].K for k in registered])
     result = {
         "frames": len(manifest.frames),
         "registered": len(registered) / len(manifest.frames),
     }
     result |= alignment.pose_errors(given.c2w[registered], estimated)
-    result["focal_error"] = np.mean(focal_lengths / given.K[registered, 0, 0]) - 1
+    result["focal_error"] = np.mean(K[:, 0, 0] / given.K[registered, 0, 0]) - 1
     return result
 
 

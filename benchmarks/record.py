@@ -2,6 +2,7 @@
 
     parser = make_parser(__doc__, "speed")
     args = parser.parse_args()
+    restart_prepared()
     record = Record("speed", args)
     record.add({"preset": "grid", "steps_per_second": 7.5})
     record.save()
@@ -17,7 +18,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import os
 import subprocess
+import sys
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -27,6 +30,7 @@ import torch
 
 from hdr_nsff.bench.machine import git, this_machine
 from hdr_nsff.core.io import write_json
+from hdr_nsff.core.process import prepare_process
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -49,6 +53,19 @@ def make_parser(docstring: str | None, benchmark: str) -> argparse.ArgumentParse
         help=f"the JSON file with the results; default: benchmarks/results/{benchmark}.json",
     )
     return parser
+
+
+def restart_prepared() -> None:
+    """Set up threads and memory as the command line does.
+
+    OpenMP reads its settings when torch is imported, before `main` can change them.
+    Where they are not set, the program starts once more with them.
+    """
+    ready = "OMP_WAIT_POLICY" in os.environ
+    prepare_process()
+    if not ready:
+        sys.stdout.flush()
+        os.execv(sys.executable, sys.orig_argv)
 
 
 class Record:
@@ -98,13 +115,13 @@ def code_version() -> tuple[str | None, bool | None]:
 
 
 def name_of(path: Path) -> str:
-    """A file or folder by name, with its parents' names as long as the name is common.
+    """A file or folder by name, with its parents' names where it is a common one.
 
     `demo/out/scene` stays `demo/out/scene`; `/data/lamp` becomes `lamp`.
     """
     parts = path.resolve().parts[1:]  # without the root
     first = len(parts) - 1
-    while first > 0 and parts[first] in COMMON_NAMES:
+    while first > 0 and Path(parts[first]).stem in COMMON_NAMES:
         first -= 1
     return "/".join(parts[max(first, 0) :])
 

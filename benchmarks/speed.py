@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from record import Record, make_parser
+from record import Record, make_parser, restart_prepared
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.budget import Budget
@@ -34,7 +33,6 @@ PUBLISHED_STEPS = 250_000
 
 
 def main() -> None:
-    prepare_process()
     parser = make_parser(__doc__, "speed")
     parser.add_argument("scene", type=Path, help="a prepared scene")
     parser.add_argument("--preset", nargs="+", default=["grid"], choices=PRESETS)
@@ -46,6 +44,7 @@ def main() -> None:
     )
     parser.add_argument("--bf16", action="store_true", help="measure in bfloat16 as well")
     args = parser.parse_args()
+    restart_prepared()
     precisions = (False, True) if args.bf16 else (False,)
     scene = Scene.open(args.scene)
     record = Record("speed", args, seed=TrainConfig.seed)
