@@ -1,5 +1,6 @@
-"""A closed-form scene for tests: a bright disc that moves before a wall of horizontal
-gradient, seen by cameras that slide along x.
+"""A closed-form scene: a bright disc moves before a wall with a horizontal gradient.
+
+Cameras slide along x.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ EV = (-4.0, -2.0, 0.0)
 
 
 def views_of(frames: list[Frame]) -> list[ResponseView]:
-    """The frames as the response is estimated from them."""
+    """The frames as input of the estimation of the response."""
     return [
         ResponseView(f.image.numpy(), f.bracket, f.time, np.eye(3), np.eye(3, 4), np.ones((H, W)))
         for f in frames
@@ -42,9 +43,10 @@ def camera(x: float = 0.0) -> Camera:
 
 
 class DiscBeforeWall:
-    """The scene as a field: samples on two planes. `layered` fields show them; `wall`
-    false leaves the disc alone; `empty_moves` lets the empty samples around the disc
-    flow with it.
+    """The scene as a field, with samples on two planes.
+
+    Without `wall` there is the disc alone. With `empty_moves`, empty samples around the
+    disc have its scene flow.
     """
 
     def __init__(
@@ -116,8 +118,10 @@ def fake_run(
     held_out: int = 0,
     field: DiscBeforeWall | None = None,
 ) -> Run:
-    """A run whose field is the truth itself and whose camera records through gamma 2.2
-    at EV -4, -2, 0 in turn; the last `held_out` frames are test frames.
+    """A run whose field is the exact scene.
+
+    Its camera records with gamma 2.2 at EV -4, -2, 0 in turn. The last `held_out`
+    frames are test frames.
     """
     field = field or DiscBeforeWall(speed=SPEED / 4, red=3.0)
     spacing = 0.05 if parallax == "full" else 0.0

@@ -68,7 +68,7 @@ VIEWS = (
     ("a", 1, 4, 0),
     ("b", 2.5, 5, 1),
     ("c", 3, 0, 2),  # recorded in 16 bits instead of exact radiance
-    ("off", 2, 2, 1),  # off the path, with a pose of its own
+    ("off", 2, 2, 1),  # off the path of the clip
     ("odd", 2.25, 0, 0),  # at a time that is no half frame
 )
 

@@ -113,7 +113,7 @@ gc.collect()
 """
 
 
-def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_later(
+def test_a_failed_write_of_a_map_does_not_crash_python_later(
     tmp_path: Path,
 ) -> None:
     path = os.pathsep.join([str(Path(cli.__file__).parents[1]), *sys.path])

@@ -44,7 +44,7 @@ def other_version(path: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", [cut, other_version])
-def test_a_bad_checkpoint_gives_way_to_the_one_before_for_every_verb(
+def test_every_verb_falls_back_to_the_checkpoint_before_a_bad_one(
     damage: Callable[[Path], None], run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     checkpoints = sorted((run_folder / "checkpoints").glob("step_*"))
@@ -169,9 +169,7 @@ def test_notes_cut_short_are_made_again(text: str, worked: Path, capsys: Capture
 
 
 @pytest.mark.parametrize("name", [PLAN, VIEWS, SEQUENCE, EXPORTED])
-def test_a_json_file_of_the_users_own_is_no_note_and_stays(
-    name: str, worked: Path, capsys: Capture
-) -> None:
+def test_a_json_file_of_the_user_is_kept(name: str, worked: Path, capsys: Capture) -> None:
     kept = (worked / name).read_bytes()
     for text in ('{"takes": 3}', "[1, 2]", "7"):
         (worked / name).write_text(text)
@@ -276,7 +274,7 @@ def test_a_config_edited_into_nonsense_is_named_by_every_verb_that_reads_it(
         "--batches=0",
     ],
 )
-def test_settings_that_cannot_be_are_named_before_anything_is_written(
+def test_invalid_settings_are_named_before_anything_is_written(
     option: str, toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     assert option.partition("=")[0] in refused(

@@ -101,7 +101,7 @@ def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("name", ["fixed.mp4", "fixed/00001.png", "fixed/7.exr", "fixed_sheet.png"])
-def test_pictures_of_the_users_own_are_not_replaced(
+def test_pictures_of_the_user_are_not_replaced(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     write_text(tmp_path / "mine" / name, "mine")
@@ -109,7 +109,7 @@ def test_pictures_of_the_users_own_are_not_replaced(
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b"mine"}
 
 
-def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
+def test_the_standard_set_replaces_no_depth_maps_of_the_user(
     run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     write_text(tmp_path / "mine/depth/00000.png", "mine")
@@ -120,7 +120,7 @@ def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
 
 
 @pytest.mark.parametrize("name", ["00001.ply", "7.ply", "sequence.json"])
-def test_files_of_the_users_own_are_not_replaced_by_gaussians(
+def test_files_of_the_user_are_not_replaced_by_gaussians(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     write_text(tmp_path / "mine" / name, '{"takes": 3}')
@@ -173,9 +173,7 @@ def test_checkpoints_without_their_config_are_not_taken_over(
     assert snapshot(lone) == before
 
 
-def test_a_room_is_not_rendered_into_a_folder_of_something_else(
-    capsys: Capture, tmp_path: Path
-) -> None:
+def test_synth_refuses_a_folder_of_other_files(capsys: Capture, tmp_path: Path) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
     assert "holds something else" in refused(

@@ -59,7 +59,7 @@ def test_a_complete_gopro_tree_needs_few_estimates(
     assert f.moving.sum() == 3 * H
 
 
-def test_masks_beside_dense_show_moving_pixels_in_black(gopro: PrepareConfig) -> None:
+def test_masks_next_to_dense_mark_moving_pixels_in_black(gopro: PrepareConfig) -> None:
     shutil.rmtree(gopro.clip / "dense/motion_masks")
     moving = Scene.open(prepare(gopro)).train[0].moving
     assert moving is not None

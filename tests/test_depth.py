@@ -102,7 +102,7 @@ def test_a_moving_region_has_low_confidence_and_is_never_behind_the_scene():
     assert disparity[moving].min() > 0.98 / 4.0
 
 
-def test_cameras_at_one_instant_see_movers_stand_still():
+def test_movers_are_at_rest_between_cameras_of_one_time():
     """Five cameras, one time: the 'moving' region has exact parallax."""
     c2w = SWEEPING[1:6]
     video, depth = plane(c2w, 4.0, 0.0)
@@ -113,7 +113,7 @@ def test_cameras_at_one_instant_see_movers_stand_still():
     assert np.median(confidence[moving]) > 0.6
 
 
-def test_without_parallax_everything_is_at_distance_one_and_a_message_says_so(monkeypatch):
+def test_without_parallax_all_depth_is_one_and_a_message_reports_it(monkeypatch):
     messages = []
     monkeypatch.setattr(depth_module, "say", messages.append)
     c2w = cameras_at(*[(0.001 * t, 0, 0) for t in range(4)])
@@ -123,7 +123,7 @@ def test_without_parallax_everything_is_at_distance_one_and_a_message_says_so(mo
     assert "parallax" in messages[0]
 
 
-def test_frames_without_anything_to_match_do_not_crash():
+def test_clipped_frames_have_depth_of_low_confidence():
     """All is clipped: only structure from motion's points are left; confidence
     is low.
     """
@@ -136,7 +136,7 @@ def test_frames_without_anything_to_match_do_not_crash():
     assert confidence.max() < 0.5 and 0 < near < far
 
 
-def test_third_differences_vanish_on_parabolas_whatever_the_spacing():
+def test_third_differences_vanish_on_parabolas_for_any_spacing():
     t = np.array([0, 1, 3, 4, 5, 7.0])
     D = differences(t, np.ones(5, bool))
     assert D.shape == (3, 6)
@@ -163,7 +163,7 @@ def path(shake: float, count: int = 24) -> tuple[np.ndarray, np.ndarray, np.ndar
     return point[:, 2] - eyes[:, 2], eyes, local / local[:, 2:]
 
 
-def test_a_shaking_camera_tells_how_far_a_moving_point_is():
+def test_a_shaking_camera_determines_the_depth_of_a_moving_point():
     z, eyes, rays = path(shake=0.02)
     found, sigma = smoothest_path(
         eyes, FORWARD, rays, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
@@ -230,7 +230,7 @@ def test_a_mask_over_the_static_scene_is_seen_through():
     assert np.median(confidence[moving]) > 0.6
 
 
-def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth():
+def test_a_shaking_camera_determines_the_depth_of_a_drifting_object():
     """A square at z = 2 before a wall at z = 4, moving by 0.03 per frame."""
     rng = np.random.default_rng(3)
     eyes = np.concatenate([0.03 * rng.standard_normal((20, 2)), np.zeros((20, 1))], 1)

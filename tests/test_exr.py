@@ -26,7 +26,7 @@ def test_radiance_beyond_half_precision_is_kept(tmp_path: Path) -> None:
     assert np.array_equal(read_exr(tmp_path / "a.exr")["RGB"], np.float32(1e6) * RGB)
 
 
-def test_arrays_that_are_not_contiguous_are_written_right(tmp_path: Path) -> None:
+def test_arrays_that_are_not_contiguous_are_written_correctly(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"RGB": RGB[:, ::-1]}, half=False)
     assert np.array_equal(read_exr(tmp_path / "a.exr")["RGB"], RGB[:, ::-1])
 

@@ -94,7 +94,7 @@ def test_a_file_that_the_user_named_so_stays(name: str, tmp_path: Path) -> None:
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_leftovers_below_the_folder_stay_until_their_own_is_written_to(tmp_path: Path) -> None:
+def test_leftovers_in_a_subfolder_stay_until_it_is_written_to(tmp_path: Path) -> None:
     (tmp_path / "below").mkdir()
     path = leftover(tmp_path / "below")
     write_text(tmp_path / "a.txt", "whole")

@@ -137,7 +137,7 @@ def test_nerfstudio_gets_opengl_poses_and_millimeters(scene: Path) -> None:
         assert np.allclose(depth, 1 / disparity, rtol=1e-3)
 
 
-def test_held_out_frames_become_test_pictures_and_come_back_as_truth(scene: Path) -> None:
+def test_held_out_frames_become_test_pictures_and_then_truth(scene: Path) -> None:
     m = Manifest.load(scene)
     m.frames[3].split, m.frames[3].disparity, m.frames[3].disparity_confidence = "test", None, None
     keep = [0, 1, 2, 4, 5]

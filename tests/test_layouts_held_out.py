@@ -49,7 +49,7 @@ def pose_in_scene(scene: Path, name: str) -> np.ndarray:
 @pytest.mark.parametrize(
     ("layout", "names"), [("hdr-gopro", "abc"), ("nerfstudio", ["a", "b", "c", "off", "odd"])]
 )
-def test_a_truth_comes_back_with_the_same_views(
+def test_a_round_trip_keeps_the_views_of_a_truth(
     layout: Literal["hdr-gopro", "nerfstudio"], names: Sequence[str], kept: tuple[Path, Path, Truth]
 ) -> None:
     scene, folder, truth = kept

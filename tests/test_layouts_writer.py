@@ -99,7 +99,7 @@ def test_an_export_that_was_killed_is_replaced_by_the_next(
 
 
 @pytest.mark.parametrize("name", ["../mine.txt", "/etc/hostname", "link/mine.txt"])
-def test_an_edited_note_removes_nothing_outside(name: str, scene: Path) -> None:
+def test_an_edited_note_removes_no_file_outside_of_the_export(name: str, scene: Path) -> None:
     config = ExportConfig(scene, scene.with_name("out"), layout="nerfstudio")
     note = export(config) / "hdr_nsff_export.json"
     (scene.with_name("other")).mkdir()

@@ -96,7 +96,7 @@ def test_beside_a_truth_of_other_places_or_times_all_frames_are_trained_on(tmp_p
         assert held_out_every(replace(config, truth=truth_of(tmp_path / name, *views))) == 0
 
 
-def test_what_the_user_asks_for_counts_before_the_truth(tmp_path: Path) -> None:
+def test_settings_of_the_user_take_precedence_over_the_truth(tmp_path: Path) -> None:
     config = RunConfig(tmp_path, tmp_path, truth=truth_of(tmp_path / "truth", (4.0, 4), (12.0, 12)))
     assert held_out_every(config) == 8
     assert held_out_every(replace(config, hold_out=3)) == 3

@@ -108,7 +108,7 @@ DAMAGE = {"cut short or damaged": cut, "another version": other_version, "cut sh
 
 
 @pytest.mark.parametrize("what", DAMAGE)
-def test_a_bad_checkpoint_gives_way_to_the_one_before_and_that_is_said(
+def test_a_bad_checkpoint_is_replaced_by_the_one_before_and_reported(
     what: str, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     DAMAGE[what](newest(run))
@@ -123,7 +123,7 @@ def test_a_bad_checkpoint_gives_way_to_the_one_before_and_that_is_said(
 
 
 @pytest.mark.parametrize("what", DAMAGE)
-def test_training_goes_on_from_the_one_before_too(
+def test_training_continues_from_the_checkpoint_before_a_bad_one(
     what: str, run: Path, toy_folder: Path, finished: Path
 ) -> None:
     DAMAGE[what](newest(run))
@@ -184,7 +184,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         Run.open(tmp_path)
 
 
-def test_a_scene_that_moved_away_is_named(run: Path) -> None:
+def test_a_scene_that_was_moved_is_named(run: Path) -> None:
     nowhere = {"scene": "/nowhere/scene", "scene_from_run": "../nowhere"}
     change_config(run, lambda d: d.update(nowhere))
     with pytest.raises(InputError, match="its scene is not at /nowhere/scene any more"):

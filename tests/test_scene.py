@@ -19,7 +19,7 @@ def entry(index: int, time: float, camera: int = 0) -> FrameEntry:
     return FrameEntry(index=index, image="", source="", time=time, camera_id=camera, bracket=0)
 
 
-def test_neighbors_are_the_frames_before_and_after_in_time_whatever_the_order() -> None:
+def test_neighbors_are_the_frames_before_and_after_in_time_in_any_order() -> None:
     assert neighbors([entry(0, 2.0), entry(1, 0.0), entry(2, 1.0)]) == [
         {-1: 2},
         {1: 2},

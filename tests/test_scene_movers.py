@@ -36,7 +36,7 @@ def mover(pixels: list[list[float]], points: list[list[float]], error: float = 0
     )
 
 
-def test_canonical_places_come_back_from_any_time() -> None:
+def test_canonical_points_are_recovered_from_any_time() -> None:
     turning = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.2, 0], [0, 0.5, 0.3]]).as_matrix()
     m = mover([[1, 1], [2, 2]], [[0.5, 0, 3], [0, 0.5, 4]])
     m = replace(m, rotations=turning, translations=np.eye(3), center=np.array([1.0, 2, 3]))

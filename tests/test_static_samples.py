@@ -21,7 +21,7 @@ def test_static_points_are_the_same_points_in_every_bracket():
     )
 
 
-def test_points_hidden_behind_something_are_not_read():
+def test_points_hidden_behind_a_surface_are_not_read():
     rng = np.random.default_rng(0)
     views = [wall_view(i, GAMMA22, rng) for i in range(3)]
     views[1].disparity[:] = 0.5  # something at half the distance stands before the second camera

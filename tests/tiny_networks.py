@@ -1,5 +1,6 @@
-"""SAM 2 and Depth Anything of a few thousand random weights, saved as folders: what
-they answer means nothing, how they are asked does.
+"""SAM 2 and Depth Anything with a few thousand random weights, saved as folders.
+
+Their predictions are meaningless; tests check their inputs and what is done with them.
 """
 
 from pathlib import Path
@@ -9,7 +10,7 @@ import torch
 
 
 def tiny_sam2(folder: Path) -> Path:
-    """A Sam2VideoModel that sees 64 x 64 pixels."""
+    """A Sam2VideoModel for 64 x 64 pixels."""
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     backbone = dict(
@@ -51,8 +52,9 @@ def tiny_sam2(folder: Path) -> Path:
 
 
 def tiny_depth_anything(folder: Path, kind: str) -> Path:
-    """A DepthAnythingForDepthEstimation ("relative" or "metric", up to 20 m) with 28
-    pixels on the shorter side.
+    """A DepthAnythingForDepthEstimation for 28 pixels on the shorter side.
+
+    `kind` is "relative", or "metric" up to 20 m.
     """
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
@@ -78,7 +80,7 @@ def tiny_depth_anything(folder: Path, kind: str) -> Path:
         max_depth=20,
     )
     network = transformers.DepthAnythingForDepthEstimation(config)
-    with torch.no_grad():  # as initialized, all answers are nearly the same
+    with torch.no_grad():  # the initial weights predict nearly constant depth
         for weights in (*network.neck.parameters(), *network.head.parameters()):
             weights.normal_(0, 0.3)
     network.save_pretrained(folder)

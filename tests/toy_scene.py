@@ -1,5 +1,6 @@
-"""A scene folder in closed form: a textured wall at z = 4, a textured card at z = 2.5
-that moves, a camera that moves, three exposures.
+"""A scene folder in closed form, with a moving camera and three exposures.
+
+A textured card moves at z = 2.5 before a textured wall at z = 4.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Ablations of ours: each changes one thing, and what it says it does."""
+"""Ablations of `splat` and `grid`: each changes the one part that its name states."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -40,7 +40,7 @@ def test_every_ablation_that_makes_sense_is_a_preset() -> None:
     }
 
 
-def test_without_flow_nothing_is_started_from_it(
+def test_without_flow_the_field_does_not_start_from_it(
     toy: Scene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def start(with_flow: bool) -> tuple[bool, ...]:
