@@ -43,8 +43,6 @@ def test_the_factor_stays_near_one_for_any_steps():
 
 def test_usual_steps_are_chances():
     chances = usual_steps()
-    assert (
-        sum(chances.values()) == pytest.approx(1)
-        and min(chances.values()) > 0
-        and max(chances, key=chances.get) == 2
-    )
+    assert sum(chances.values()) == pytest.approx(1)
+    assert min(chances.values()) > 0
+    assert max(chances, key=chances.get) == 2

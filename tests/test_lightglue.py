@@ -103,12 +103,10 @@ def test_keypoints_lie_where_they_may_and_matches_name_their_rows(random_weights
     right = np.tile(np.arange(96) >= 48, (64, 1))
     points, matches = match_images(list(pictures), [right, right], [(0, 1)], random_weights[0])
     for xy in points:
-        assert (
-            len(xy) > 5
-            and (xy[:, 0] >= 47.9).all()
-            and (xy[:, 0] <= 96).all()
-            and (xy[:, 1] <= 64).all()
-        )
+        assert len(xy) > 5
+        assert (xy[:, 0] >= 47.9).all()
+        assert (xy[:, 0] <= 96).all()
+        assert (xy[:, 1] <= 64).all()
     assert matches[0].shape[1:] == (2,) and (matches[0] < [len(p) for p in points]).all()
 
 

@@ -60,11 +60,9 @@ def test_without_flow_the_field_does_not_start_from_it(
 
 def test_without_depth_the_prior_neither_paints_nor_pulls() -> None:
     config = ablated(PRESETS["grid"], "no-depth")
-    assert (
-        not config.from_priors
-        and config.loss.depth == 0
-        and config.loss.flow == PRESETS["grid"].loss.flow
-    )
+    assert not config.from_priors
+    assert config.loss.depth == 0
+    assert config.loss.flow == PRESETS["grid"].loss.flow
 
 
 def test_a_sigmoid_keeps_radiance_below_one_and_starts_where_it_is_painted(toy: Scene) -> None:
@@ -124,9 +122,8 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
                 rtol=1e-4,
                 atol=1e-6,
             )
-    assert torch.allclose(
-        bounded.background.sigmoid(), torch.tensor(-1.3).exp()
-    ) and torch.allclose(free.background, torch.tensor(-1.3))
+    assert torch.allclose(bounded.background.sigmoid(), torch.tensor(-1.3).exp())
+    assert torch.allclose(free.background, torch.tensor(-1.3))
     assert not from_priors or bool((free.static.radiance(0.0) > 1).any())  # some had to be held
 
 
