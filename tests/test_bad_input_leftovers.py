@@ -175,7 +175,7 @@ def test_a_json_file_of_the_user_is_kept(name: str, worked: Path, capsys: Captur
         (worked / name).write_text(text)
         before = snapshot(worked)
         render, export, _, _ = making(worked)
-        assert f"{name}: is there already and was not made by" in refused(
+        assert f"{name}: already exists and was not made by" in refused(
             capsys, *(export if name == EXPORTED else render)
         )
         assert snapshot(worked) == before

@@ -139,7 +139,7 @@ def describe_disk_error(error: Exception, place: Path | str) -> str | None:
     path = str(path_of(error, place))[:200]
     disk_full = any(words in str(error) for words in ("No space left", "File too large"))
     if code in FULL or disk_full:
-        advice = "free some space and run the same command again, it goes on where it was"
+        advice = "free some space and run the same command again, it continues where it was"
         return f"{path}: the disk is full ({text}); {advice}"
     if code in FORBIDDEN:
         advice = "check its permissions, or choose another place"

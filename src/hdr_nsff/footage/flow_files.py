@@ -30,7 +30,7 @@ def read_flow_files(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such folder of flow maps")
+        raise InputError(f"{folder}: no such folder of flow maps; correct the path")
     flows = []
     masks = []
     unchecked = 0

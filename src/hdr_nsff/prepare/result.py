@@ -63,7 +63,7 @@ MAPS = {
 
 
 def store(folder: Path, manifest: Manifest, result: StepResult) -> None:
-    """Write a result's files and put its values into the manifest, which is not saved."""
+    """Write a result's files and put its values into the (unsaved) manifest."""
     frames = dict(result.frames)
     for name, maps in result.maps.items():
         kind = MAPS[name]

@@ -1,4 +1,4 @@
-"""The step `flow`: optical flow between neighbors, as matched, before masks are known."""
+"""The step `flow`: optical flow between neighbors, before masks are known."""
 
 from __future__ import annotations
 
