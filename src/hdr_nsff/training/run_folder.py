@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import PoseCorrections
 
 CONFIG = "config.json"
+MANIFEST = "scene.json"  # of the scene folder
 SCENE_FROM_RUN = "scene_from_run"  # key of config.json: the scene's path from the run folder
 
 
@@ -96,17 +98,17 @@ class Run:
 
 def open_folder(config: TrainConfig) -> None:
     """Start a run folder, or make sure an existing one was started with the same
-    settings; a scene that has moved is written down.
+    settings on the same scene; a scene that has moved is written down.
     """
     out = config.out
     if (out / CONFIG).exists():
-        before = read_config(out)
-        before = replace(before, scene=config.scene, out=out, device=config.device)
-        if before != config:
+        before, places = stored_config(out)
+        if replace(before, scene=config.scene, out=out, device=config.device) != config:
             raise InputError(
                 f"{out}: holds a run with other settings; "
                 "choose another --out, or delete it to start over"
             )
+        refuse_another_scene(config, places)
     elif any((out / "checkpoints").glob("step_*.safetensors")):
         raise InputError(
             f"{out}: holds checkpoints but no {CONFIG}; "
@@ -115,11 +117,38 @@ def open_folder(config: TrainConfig) -> None:
     write_config(out, config)
 
 
-def read_config(folder: Path) -> TrainConfig:
-    """The config of a run folder, with its scene where it now is.
+def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:
+    """InputError where the scene of a run still stands at one of `places`, and that of
+    `config` is neither it nor a copy of it.
+    """
+    known = [place / MANIFEST for place in places if (place / MANIFEST).is_file()]
+    given = config.scene / MANIFEST
+    same = any(given.samefile(path) or given.read_bytes() == path.read_bytes() for path in known)
+    if known and not same:
+        raise InputError(
+            f"{config.out}: holds a run on another scene, {known[0].parent}; "
+            "choose another --out, or delete it to start over"
+        )
 
-    The scene is looked for beside the run first, as far from it as when it was trained,
-    so that a folder that holds both can be moved or copied; then where it was.
+
+def read_config(folder: Path) -> TrainConfig:
+    """The config of a run folder, with its scene where it now is. InputError where the
+    scene is at none of the places that the run knows.
+    """
+    config, places = stored_config(folder)
+    for scene in places:
+        if (scene / MANIFEST).is_file():
+            return replace(config, scene=scene)
+    raise InputError(
+        f"{folder}: its scene is not at {config.scene} any more; put it back, or say where it is: "
+        f"`hdr-nsff train` with the same settings, --scene and --out {folder}"
+    )
+
+
+def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
+    """The config of a run folder as it was written, and where its scene may be: beside
+    the run first, as far from it as when it was trained, so that a folder that holds
+    both can be moved or copied; then where it was.
     """
     path = Path(folder) / CONFIG
     if not path.is_file():
@@ -134,16 +163,10 @@ def read_config(folder: Path) -> TrainConfig:
         ) from error
     beside = data.pop(SCENE_FROM_RUN, None) if isinstance(data, dict) else None
     config = TrainConfig.from_json(data)
-    candidates = [config.scene]
+    places = [config.scene]
     if isinstance(beside, str):
-        candidates.insert(0, (Path(folder).resolve() / beside).resolve())
-    for scene in candidates:
-        if (scene / "scene.json").is_file():
-            return replace(config, scene=scene)
-    raise InputError(
-        f"{folder}: its scene is not at {config.scene} any more; put it back, or say where it is: "
-        f"`hdr-nsff train` with the same settings, --scene and --out {folder}"
-    )
+        places.insert(0, (Path(folder).resolve() / beside).resolve())
+    return config, places
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:
