@@ -10,10 +10,12 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from hdr_nsff import core
 from hdr_nsff.core.errors import InputError
@@ -123,6 +125,14 @@ def test_errors_of_the_disk_are_one_sentence_that_names_the_place(code: int, wor
     assert str(refusal.value).startswith("out: ")
     with pytest.raises(InputError, match=r"^other/file: "), writing_to("out"):
         raise OSError(code, os.strerror(code), "other/file")
+
+
+@pytest.mark.parametrize(
+    "allocate", [lambda: np.zeros(2**50), lambda: torch.zeros(2**50), lambda: bytearray(2**62)]
+)
+def test_too_little_memory_is_one_sentence(allocate: Callable[[], object], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the memory does not suffice"), writing_to(tmp_path):
+        allocate()
 
 
 def test_an_error_in_a_temporary_file_names_its_folder(tmp_path: Path) -> None:
