@@ -100,3 +100,11 @@ def test_settings_that_do_not_fit_the_scene_are_refused(toy_folder: Path, tmp_pa
         parse(toy_folder, oracle=True)
     with pytest.raises(InputError, match="is prepared already, for none"):
         parse(toy_folder, protocol="novel-view-time")
+
+
+def test_footage_alone_is_prepared_and_measured_on_its_held_out_frames(tmp_path: Path) -> None:
+    frames = frames_of(tmp_path / "walk")
+    scene = parse(frames, tmp_path / "out")
+    assert scene.name == "walk" and scene.truth is None
+    assert scene.footage is not None and scene.footage.clip == frames
+    assert scene.footage.hold_out is None  # `prepare` chooses which

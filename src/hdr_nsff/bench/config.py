@@ -43,9 +43,9 @@ class BenchConfig:
     """
     scenes: str
     """Scenes with commas between them: scene folders, folders that `synth` or
-    `reexpose` wrote, or public data sets. NAME=FOLDER gives one another name,
-    FOLDER:TRUTH a truth folder; else truth/ in the scene folder or beside it is used,
-    else its held-out frames.
+    `reexpose` wrote, public data sets, videos or folders of frames. NAME=PLACE gives
+    one another name, PLACE:TRUTH a truth folder; else truth/ in the scene folder or
+    beside it is used, else the frames that `prepare` holds out.
     """
     methods: str
     """Presets with commas between them. NAME=PRESET OPTIONS changes settings as `train`

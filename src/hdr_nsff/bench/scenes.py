@@ -1,7 +1,7 @@
 """Scenes of a benchmark.
 
-Scene folders, folders of `synth` and `reexpose` with footage and truth, and public
-data sets.
+Scene folders, folders of `synth` and `reexpose` with footage and truth, public data
+sets, and footage alone, which is measured on the frames that `prepare` holds out.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from hdr_nsff.bench.config import BenchConfig, BenchScene, safe_name
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.evaluation.evaluate import views_of_clip
 from hdr_nsff.footage.datasets import layout_of
+from hdr_nsff.footage.ingest import open_footage
 from hdr_nsff.pipeline import RunConfig, held_out_every
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.manifest import Manifest
@@ -20,9 +21,10 @@ from hdr_nsff.synth.oracle import ORACLE_NOTE
 
 
 def parse_scene(text: str, config: BenchConfig) -> BenchScene:
-    """The scene of "[NAME=]FOLDER[:TRUTH]"; InputError where there is none."""
+    """The scene of "[NAME=]PLACE[:TRUTH]"; InputError where there is none."""
     label, folder, given_truth = split_scene(text.strip())
-    name = safe_name(label or Path(os.path.abspath(folder)).name, "--scenes")
+    own_name = folder.stem if folder.is_file() else Path(os.path.abspath(folder)).name
+    name = safe_name(label or own_name, "--scenes")
     option = f"--scenes {text.strip()!r:.200}"
     if given_truth is not None and not has_truth(given_truth):
         advice = "correct the path, or leave it out"
@@ -37,15 +39,20 @@ def parse_scene(text: str, config: BenchConfig) -> BenchScene:
         return footage_scene(name, footage, truth, config)
     if layout_of(folder) is not None and not config.oracle:
         return footage_scene(name, folder, given_truth, config)
-    known = "no clip with its truth/ as `synth` and `reexpose` write them, and no public data set"
-    advice = "make a scene of other footage with `hdr-nsff prepare`"
-    raise InputError(f"{option}: holds no scene.json, {known}; {advice}")
+    if config.oracle:
+        raise InputError(f"{option}: no clip with its truth/; leave `--oracle` out")
+    try:
+        open_footage(folder)
+    except InputError as error:
+        known = "no scene.json, no clip with its truth/, no public data set and no footage"
+        raise InputError(f"{option}: {known}: {error}") from None
+    return footage_scene(name, folder, given_truth, config)
 
 
 def split_scene(text: str) -> tuple[str | None, Path, Path | None]:
-    """Name, folder and truth folder of "[NAME=]FOLDER[:TRUTH]".
+    """Name, place and truth folder of "[NAME=]PLACE[:TRUTH]".
 
-    A text that is a folder as it stands counts as one.
+    A text that is a folder or file as it stands counts as one.
     """
     candidates: list[tuple[str | None, str]] = [(None, text)]
     label, equals, rest = text.partition("=")
@@ -53,12 +60,12 @@ def split_scene(text: str) -> tuple[str | None, Path, Path | None]:
         candidates.append((label, rest))
     for name, place in candidates:
         folder, colon, truth = place.rpartition(":")
-        if place and Path(place).is_dir():
+        if place and Path(place).exists():
             return name, Path(place), None
-        if colon and folder and Path(folder).is_dir():
+        if colon and folder and Path(folder).exists():
             return name, Path(folder), Path(truth)
     advice = "correct the path (one with a comma in it cannot be given)"
-    raise InputError(f"--scenes {text!r:.200}: no such folder; {advice}")
+    raise InputError(f"--scenes {text!r:.200}: no such folder or video; {advice}")
 
 
 def has_truth(folder: Path) -> bool:

@@ -1,0 +1,241 @@
+"""Writes docs/results.md from the JSON files in benchmarks/results/.
+
+    python benchmarks/results.py            # write the page
+    python benchmarks/results.py --check    # exit code 1 where the page is out of date
+
+Every number of the page stands in one of these files, which the command above its
+table wrote. A file that is not there is listed at the end of the page.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from record import RESULTS, ROOT
+
+from hdr_nsff.core.io import write_text
+
+PAGE = ROOT / "docs" / "results.md"
+INTRO = """# Results
+
+`python benchmarks/results.py` writes this page from the files in
+[benchmarks/results](https://github.com/hdr-nsff/hdr-nsff/tree/main/benchmarks/results):
+one current number per claim, each with the command, machine, commit and seed that it
+comes from. PSNR is of recorded values in dB, over full pictures and over moving pixels;
+HDR is the mu-law PSNR of linear radiance (mu = 5000) after one scale per sequence.
+[Metrics](metrics.md) defines them."""
+
+Document = dict[str, Any]
+Lines = list[str]
+
+
+@dataclass(frozen=True)
+class Section:
+    """A part of the page that one JSON file fills."""
+
+    file: str  # name in benchmarks/results, without .json
+    title: str
+    about: str  # what was measured, and what the table shows
+    command: str
+    body: Callable[[Document], Lines]
+
+
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Lines:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return [f"| {' | '.join(line)} |" for line in lines]
+
+
+def pair(values: dict[str, float], full: str, moving: str) -> str:
+    """Two scores of a run, "full / moving"; a dash for one that it has not."""
+    return " / ".join(number(values.get(key), 1) for key in (full, moving))
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number with these digits; a dash for None."""
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def origin(document: Document) -> str:
+    """The machine, commit and seed of a file, in a line."""
+    machine = document["machine"]
+    commit = (document["commit"] or "unknown")[:9]
+    changed = ", with changes" if document["dirty"] else ""
+    day = document["date"][:10]
+    return (
+        f"*{machine['cores']} cores of {machine['cpu']}, torch {machine['torch']}, "
+        f"commit {commit}{changed}, seed {document['seed']}, {day}.*"
+    )
+
+
+# Bodies
+
+
+def demo(document: Document) -> Lines:
+    """Scores of the demo by group of views, and what was estimated."""
+    run = document["results"][0]
+    rows = []
+    for name, scores in (run["groups"] | {"all": run["headline"]}).items():
+        row = [name, str(scores["views"]), pair(scores, "psnr", "psnr_moving")]
+        row += [number(scores["ssim"], 3), pair(scores, "mu5000", "mu5000_moving")]
+        rows.append(row)
+    lines = table(["views", "number", "PSNR", "SSIM", "HDR"], rows)
+    camera, poses = run["camera"] or {}, run["poses"] or {}
+    prepare = sum(seconds or 0 for seconds in run["prepare_seconds"].values())
+    facts = [
+        ["steps", f"{run['steps']:,}"],
+        ["preparation, training, whole command",
+         f"{prepare:.0f} s, {run['training_seconds']:.0f} s, {run['seconds']:.0f} s"],
+        ["peak memory", f"{run['memory_gib']:.2f} GiB"],
+        ["response RMSE", number(camera.get("response_rmse"), 4)],
+        ["largest error of a step between exposures",
+         f"{number(camera.get('largest_step_error'), 3)} EV"],
+    ]  # fmt: skip
+    facts += [[name.replace("_", " "), number(value, 4)] for name, value in poses.items()]
+    return [*lines, "", *table(["quantity", "value"], facts)]
+
+
+def bench_scores(document: Document) -> Lines:
+    """PSNR, then HDR, of every method on every scene, and means."""
+    runs = [run for run in document["results"] if run["status"] == "done"]
+    scenes = list(dict.fromkeys(run["scene"] for run in runs))
+    methods = list(dict.fromkeys(run["method"] for run in runs))
+    found = {(run["scene"], run["method"]): run["values"] for run in runs}
+    lines: Lines = []
+    for label, full, moving in (
+        ("PSNR", "psnr", "psnr_moving"),
+        ("HDR", "mu5000", "mu5000_moving"),
+    ):
+        if not any(full in values for values in found.values()):
+            continue
+        rows = []
+        for scene in scenes:
+            row = [pair(found.get((scene, method), {}), full, moving) for method in methods]
+            rows.append([f"`{scene}`", *row])
+        means = []
+        for method in methods:
+            own = [found[scene, method] for scene in scenes if (scene, method) in found]
+            means.append(pair(mean_of(own), full, moving))
+        rows.append(["mean", *means])
+        lines += [*table([label, *(f"`{method}`" for method in methods)], rows), ""]
+    steps = []
+    for method in methods:
+        counts = [found[scene, method]["steps"] for scene in scenes if (scene, method) in found]
+        steps.append(f"`{method}` {min(counts):,.0f} to {max(counts):,.0f}")
+    return [*lines, f"Steps: {', '.join(steps)}."]
+
+
+def mean_of(runs: Sequence[dict[str, float]]) -> dict[str, float]:
+    """The mean of every number that all runs have."""
+    shared = set.intersection(*(set(values) for values in runs))
+    return {key: statistics.fmean(values[key] for values in runs) for key in shared}
+
+
+def bench_clips(document: Document) -> Lines:
+    """One line per real clip."""
+    rows = []
+    for run in document["results"]:
+        values = run["values"]
+        row = [f"`{run['scene']}`", pair(values, "psnr", "psnr_moving")]
+        row += [number(values.get("ssim"), 3), number(values.get("steps"), 0)]
+        rows.append(row if run["status"] == "done" else [row[0], run["status"], "-", "-"])
+    return table(["clip", "PSNR", "SSIM", "steps"], rows)
+
+
+def bench_ablations(document: Document) -> Lines:
+    """One line per ablation, one column per scene."""
+    runs = [run for run in document["results"] if run["status"] == "done"]
+    scenes = list(dict.fromkeys(run["scene"] for run in runs))
+    found = {(run["scene"], run["method"]): run["values"] for run in runs}
+    header = ["method"]
+    for scene in scenes:
+        header += [f"`{scene}` PSNR", "HDR", "response RMSE"]
+    rows = []
+    for method in dict.fromkeys(run["method"] for run in runs):
+        row = [f"`{method}`"]
+        for scene in scenes:
+            values = found.get((scene, method), {})
+            row.append(pair(values, "psnr", "psnr_moving"))
+            row.append(pair(values, "mu5000", "mu5000_moving"))
+            row.append(number(values.get("camera.response_rmse"), 3))
+        rows.append(row)
+    return table(header, rows)
+
+
+SECTIONS = (
+    Section(
+        "demo-splat",
+        "The demo clip",
+        "From frames alone: exposures, response, poses, flow, masks and depth are estimated.",
+        "python benchmarks/demo.py",
+        demo,
+    ),
+    Section(
+        "bench-camera",
+        "Methods compared: one moving camera, footage alone",
+        "Rendered scenes of 160x90 pixels and 36 frames; held-out views of other poses and "
+        "times. One minute on one thread is far from the hours that `nsff`, `nerf-wt` and "
+        "`hdr-hexplane` are made for.",
+        "hdr-nsff bench OUT --scenes interior,lamp,night,cloth --methods "
+        "splat,grid,nsff,nerf-wt,hdr-hexplane --budget 1min --views 0 --jobs 2",
+        bench_scores,
+    ),
+    Section(
+        "bench-real",
+        "Real clips",
+        "Alternating exposures as filmed (`hand_books`: re-exposed), nothing given but the "
+        "poses of `hand_books`; every eighth frame held out. Moving pixels are those of the "
+        "estimated masks.",
+        "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 2000 --views 0",
+        bench_clips,
+    ),
+    Section(
+        "bench-ablations",
+        "Ablations",
+        "The same footage of one moving camera, one part changed at a time.",
+        "hdr-nsff bench OUT --scenes interior,night --methods splat,splat-response-none,"
+        "splat-response-fixed,splat-response-mlp,splat-response-per-image,splat-sigmoid,"
+        "splat-no-flow,splat-no-depth --steps 1000 --views 0",
+        bench_ablations,
+    ),
+)  # fmt: skip
+
+
+def page() -> str:
+    """docs/results.md."""
+    parts, missing = [INTRO], []
+    for section in SECTIONS:
+        path = RESULTS / f"{section.file}.json"
+        if not path.is_file():
+            missing.append(f"- {section.title}: `{section.command}`")
+            continue
+        document = json.loads(path.read_text())
+        head = [f"## {section.title}", "", section.about, "", f"```sh\n{section.command}\n```", ""]
+        parts.append("\n".join([*head, *section.body(document), "", origin(document)]))
+    if missing:
+        parts.append("\n".join(["## Not measured at this version", "", *missing]))
+    return "\n\n".join(parts) + "\n"
+
+
+def main() -> None:
+    """Write the page, or compare it."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--check", action="store_true", help="compare only, write nothing")
+    args = parser.parse_args()
+    text = page()
+    if not args.check:
+        write_text(PAGE, text)
+    elif not PAGE.is_file() or PAGE.read_text() != text:
+        sys.exit("docs/results.md is out of date; run `python benchmarks/results.py`")
+
+
+if __name__ == "__main__":
+    main()
