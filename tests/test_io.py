@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from mutations import check_reader
 
 from hdr_nsff import core
 from hdr_nsff.core.errors import InputError
@@ -167,6 +168,15 @@ def test_json_that_is_none_is_a_value_error(tmp_path: Path) -> None:
 def test_arrays_that_are_missing_or_damaged_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="missing; run `hdr-nsff prepare` again"):
         read_npy(tmp_path / "none.npy")
+    os.mkfifo(tmp_path / "pipe.npy")
+    with pytest.raises(InputError, match="missing"):
+        read_npy(tmp_path / "pipe.npy")
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(InputError, match=r"not a readable \.npy array"):
         read_npy(tmp_path / "a.npy")
+
+
+def test_damaged_arrays_are_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    write_npy(path, np.zeros(3))  # little but a header
+    check_reader(path, lambda: np.array(read_npy(path)), 300)

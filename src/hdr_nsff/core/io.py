@@ -210,11 +210,12 @@ def write_npy(path: Path | str, array: np.ndarray) -> None:
 
 def read_npy(path: Path | str) -> np.ndarray:
     """An array as it was written, memory-mapped, read-only."""
+    if not Path(path).is_file():  # a pipe would be waited for
+        raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it")
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it") from error
-    except (ValueError, EOFError, OSError) as error:
+        return np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
-            f"{path}: not a readable .npy array ({error}); run `hdr-nsff prepare` with `--redo`"
+            f"{path}: not a readable .npy array ({shorten(error)}); "
+            "run `hdr-nsff prepare` with `--redo`"
         ) from error

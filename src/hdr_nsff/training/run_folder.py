@@ -164,7 +164,7 @@ def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
     beside = data.pop(SCENE_FROM_RUN, None) if isinstance(data, dict) else None
     config = TrainConfig.from_json(data)
     places = [config.scene]
-    if isinstance(beside, str):
+    if isinstance(beside, str) and "\0" not in beside:
         places.insert(0, (Path(folder).resolve() / beside).resolve())
     return config, places
 
