@@ -25,7 +25,7 @@ PAGE = ROOT / "docs" / "results.md"
 INTRO = """# Results
 
 `python benchmarks/results.py` writes this page from the files in
-[benchmarks/results](https://github.com/hdr-nsff/hdr-nsff/tree/main/benchmarks/results):
+`benchmarks/results`:
 one current number per claim, each with the command, machine, commit and seed that it
 comes from. PSNR is of recorded values in dB, over full pictures and over moving pixels;
 HDR is the mu-law PSNR of linear radiance (mu = 5000) after one scale per sequence.

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from hdr_nsff.priors.masks.static_residuals import pixel_centers
+from hdr_nsff.geometry.pinhole import pixel_centers
 
 T, H, W, FOCAL = 8, 72, 96, 80.0
 SIZE = 20  # of the square, pixels
@@ -56,7 +56,7 @@ def painted_clip(kind: str, speed: float = SPEED) -> tuple[np.ndarray, ...]:
     for p, (i, j) in enumerate(pairs):
         flow[p, ..., 0] = -speed * (j - i)
         flow[p][truth[i]] = corner[j] - corner[i]
-        end = np.floor(pixel_centers((H, W)) + flow[p]).astype(int)
+        end = np.floor(pixel_centers(H, W) + flow[p]).astype(int)
         inside = ((end >= 0) & (end < (W, H))).all(-1)
         end_x, end_y = end[inside].T
         valid[p] = inside

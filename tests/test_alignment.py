@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.geometry.alignment import pose_errors, scale_between, transfer_pose, umeyama
+from hdr_nsff.geometry.alignment import (
+    nearest_rotation,
+    pose_errors,
+    scale_between,
+    transfer_pose,
+    umeyama,
+)
 
 TURN = Rotation.from_euler("xyz", [20, -35, 50], degrees=True).as_matrix()
 SHIFT = np.array([1.0, -2.0, 0.5])
@@ -68,3 +74,23 @@ def test_a_carried_pose_is_the_pose_in_the_other_world():
     np.testing.assert_allclose(
         transfer_pose(other[0], poses[0], poses[1], 2.5), other[1], atol=1e-12
     )
+
+
+def test_the_nearest_rotation_is_that_of_a_matrix_with_small_errors():
+    rotations = random_poses(20)[:, :, :3]
+    noise = 0.01 * np.random.default_rng(3).standard_normal(rotations.shape)
+    found = nearest_rotation(rotations + noise)
+    assert np.abs(found - rotations).max() < 0.04
+    np.testing.assert_allclose(found @ found.swapaxes(1, 2), [np.eye(3)] * 20, atol=1e-12)
+    np.testing.assert_allclose(nearest_rotation(rotations), rotations, atol=1e-12)
+
+
+def test_the_nearest_rotation_of_a_mirror_is_no_mirror():
+    mirror = np.diag([3.0, 2.0, -1.0])
+    np.testing.assert_allclose(nearest_rotation(mirror), np.eye(3), atol=1e-12)
+
+
+def test_the_nearest_rotation_of_a_cross_covariance_maps_source_to_target():
+    source = np.random.default_rng(4).standard_normal((30, 3))
+    found = nearest_rotation((source @ TURN.T).T @ source)
+    np.testing.assert_allclose(found, TURN, atol=1e-12)

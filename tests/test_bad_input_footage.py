@@ -179,7 +179,7 @@ def test_a_jpeg_cut_short(tmp_path: Path, capsys: Capture) -> None:
 
 
 def test_a_single_picture_is_no_footage(tmp_path: Path, capsys: Capture) -> None:
-    assert "one frame is no footage" in prepared(capsys, clip(tmp_path / "clip") / "003.png")
+    assert "a single frame is not footage" in prepared(capsys, clip(tmp_path / "clip") / "003.png")
 
 
 def test_a_range_without_frames(tmp_path: Path, capsys: Capture) -> None:

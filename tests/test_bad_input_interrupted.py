@@ -177,7 +177,6 @@ LEFTOVER = f".partial-{HOST}-{2**22 + 1}-00000000-abcd_123.png"  # of no process
         ("evaluate", ["run", "run/evaluation"]),
         ("report", ["out"]),
         ("train", ["out", "out/checkpoints", "out/previews"]),
-        ("reexpose", ["out"]),
     ],
 )
 def test_what_a_killed_process_left_is_removed_by_the_same_command(
@@ -196,3 +195,15 @@ def test_what_a_killed_process_left_is_removed_by_the_same_command(
     mine.write_text("mine")
     call(*command)
     assert not any(path.exists() for path in paths) and mine.read_text() == "mine"
+
+
+@pytest.mark.parametrize(("name", "works"), [(LEFTOVER, True), (".partial-mine.png", False)])
+def test_reexpose_writes_into_a_folder_that_holds_leftovers_of_killed_processes_alone(
+    name: str, works: bool, run_folder: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    command = commands(run_folder, clip(tmp_path / "clip", recorded(3)), out)["reexpose"]
+    out.mkdir()
+    (out / name).write_bytes(b"half")
+    call(*command)
+    assert (out / name).exists() != works and (out / "reexpose.json").exists() == works

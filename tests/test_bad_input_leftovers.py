@@ -183,7 +183,7 @@ def test_a_json_file_of_the_users_own_is_no_note_and_stays(
         (worked / name).write_text(text)
         before = snapshot(worked)
         render, export, _, _ = making(worked)
-        assert f"{name}: is there already and was not made by" in refused(
+        assert f"{name}: already exists and was not made by" in refused(
             capsys, *(export if name == EXPORTED else render)
         )
         assert snapshot(worked) == before

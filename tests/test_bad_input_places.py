@@ -94,7 +94,9 @@ def test_a_place_that_cannot_be_written_is_named(
 
 def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys: Capture) -> None:
     (tmp_path / "thesis.html").write_text("<p>mine</p>")
-    assert "no report" in refused(capsys, "report", run_folder, "--out", tmp_path / "thesis.html")
+    assert "not a report" in refused(
+        capsys, "report", run_folder, "--out", tmp_path / "thesis.html"
+    )
     assert (tmp_path / "thesis.html").read_text() == "<p>mine</p>"
     assert "is a folder" in refused(capsys, "report", run_folder, "--out", tmp_path)
     for _ in range(2):
@@ -197,7 +199,7 @@ def test_a_room_is_not_rendered_into_a_folder_of_something_else(
 ) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
-    assert "holds something else" in refused(
+    assert "holds other files" in refused(
         capsys, "synth", "interior", str(tmp_path), "--size", "16x16", "--frames", "12"
     )
     assert (tmp_path / "clip" / "00000.png").read_bytes() == b"mine"

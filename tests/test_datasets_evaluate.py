@@ -210,7 +210,7 @@ def test_a_truth_that_makes_no_sense_is_one_sentence(
     [
         ({"recorded": {}}, "no picture of bracket"),
         ({"recorded": {0: "recorded/a_0.png", 9: "recorded/a_0.png"}}, "recordings at brackets"),
-        ({"K": [[1.0]]}, "a K that is no 3x3"),
+        ({"K": [[1.0]]}, "a K that is not a 3x3"),
     ],
 )
 def test_a_view_that_makes_no_sense_is_one_sentence(

@@ -1,5 +1,5 @@
 """Movers and their depth, of a turning ellipsoid before a wall in closed form: exact
-flow, and depth that knows one distance per time only.
+flow, and depth that is one distance per time.
 """
 
 from dataclasses import replace
@@ -10,8 +10,9 @@ import torch
 from estimates import video_of
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.movers.estimate import estimate_movers, mover_without_tracks, views_in_time
-from hdr_nsff.priors.movers.rigid_groups import View
+from hdr_nsff.priors.movers.estimate import estimate_movers, mover_without_tracks, views_by_time
+from hdr_nsff.priors.movers.tracks import MovingView
+from hdr_nsff.priors.movers.tuning import MOVERS_TUNING
 from hdr_nsff.scene.movers import fill_mover_depth
 from hdr_nsff.scene.posed_video import PosedVideo
 from hdr_nsff.scene.scene import Scene
@@ -29,8 +30,8 @@ RAYS = np.stack([(X - W / 2) / FOCAL, (Y - H / 2) / FOCAL, np.ones((H, W))], -1)
 
 
 def body(t: int) -> tuple[np.ndarray, np.ndarray]:
-    """Where the ellipsoid is seen at a time (H, W) and its z-depth there: the nearer
-    root of |diag(1 / axes) R^T (x - place)| = 1.
+    """The ellipsoid's mask (H, W) at a time, and its z-depth there: the nearer root of
+    |diag(1 / axes) R^T (x - place)| = 1.
     """
     ray, eye = RAYS @ ROTATIONS[t] / AXES, (EYES[t] - PLACES[t]) @ ROTATIONS[t] / AXES
     a, b, c = (ray**2).sum(-1), (ray * eye).sum(-1), (eye**2).sum() - 1
@@ -39,8 +40,9 @@ def body(t: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def flow(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
-    """Exact flow (H, W, 2) from time i to j, and where the content is still seen (H,
-    W): the ellipsoid's side that faces the camera.
+    """Exact flow (H, W, 2) from time i to j, and where its end is visible (H, W).
+
+    Of the ellipsoid, the side that faces the camera is visible.
     """
     inside, z = body(i)
     points = EYES[i] + RAYS * np.where(inside, z, WALL)[..., None]
@@ -53,7 +55,7 @@ def flow(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 class Clip:
-    """What `estimate_movers` is given: flat maps, and the truth beside them."""
+    """The arguments of `estimate_movers`, with flat depth, and the true disparity."""
 
     def __init__(self, times: int = TIMES) -> None:
         order = [p for t in range(times - 1) for p in ((t, t + 1), (t + 1, t))]
@@ -83,7 +85,7 @@ class Clip:
         )
 
     def relief(self, **other) -> tuple[np.ndarray, np.ndarray]:
-        """With some of the arguments replaced."""
+        """Disparity and confidence with movers, with some of the arguments replaced."""
         given = {
             "clip": self.clip,
             "flow": self.flow,
@@ -125,7 +127,7 @@ def found(clip: Clip) -> tuple[np.ndarray, np.ndarray]:
     return clip.relief()
 
 
-def test_the_clip_is_what_it_says(clip: Clip) -> None:
+def test_the_clip_agrees_with_the_moving_ellipsoid(clip: Clip) -> None:
     k = clip.pairs.tolist().index([2, 3])
     y, x = np.argwhere(clip.moving[2] & clip.valid[k])[300]
     z = 1 / clip.true[2, y, x]
@@ -137,7 +139,7 @@ def test_the_clip_is_what_it_says(clip: Clip) -> None:
     assert 1 / clip.true[3][tuple(there.astype(int)[::-1])] == pytest.approx(moved[2], abs=0.02)
 
 
-def test_relief_is_found_where_depth_knew_one_distance(
+def test_relief_is_found_from_depth_of_one_distance(
     clip: Clip, found: tuple[np.ndarray, np.ndarray]
 ) -> None:
     before, after = clip.wrong(clip.flat), clip.wrong(found[0])
@@ -146,9 +148,8 @@ def test_relief_is_found_where_depth_knew_one_distance(
         and (after < 0.7 * before).all()
         and after.mean() < 0.55 * before.mean()
     )
-    distance = np.median(
-        (found[0] / clip.true)[clip.moving]
-    )  # found from the camera's shake, not given by depth
+    # the distance comes from the camera's shake, not from the given depth
+    distance = np.median((found[0] / clip.true)[clip.moving])
     assert distance == pytest.approx(1, abs=0.02)
     relief_alone = clip.wrong(found[0] / distance)
     assert (relief_alone < 0.3 * before).all() and relief_alone.mean() < 0.2 * before.mean()
@@ -171,7 +172,7 @@ def test_confidence_grows_at_tracks_and_never_falls(
     assert 0.46 < np.median(confidence[clip.moving]) <= confidence[clip.moving].max() <= 0.5
 
 
-def test_what_was_given_stays_as_it_was(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
+def test_the_arguments_are_not_changed(clip: Clip, found: tuple[np.ndarray, np.ndarray]) -> None:
     fresh = Clip()
     assert np.array_equal(clip.flat, fresh.flat) and np.array_equal(
         clip.confidence, fresh.confidence
@@ -210,7 +211,7 @@ def test_a_mover_in_one_frame_alone_changes_nothing(short: Clip) -> None:
     assert untouched(short, clip=replace(short.clip, moving=moving))
 
 
-def test_of_several_frames_of_one_time_the_first_speaks(short: Clip) -> None:
+def test_of_several_frames_of_one_time_only_the_first_is_used(short: Clip) -> None:
     again = [0, 1, 2, 3, 4, 5, 3]  # one more frame of time 3
     s = short.clip
     clip = PosedVideo(
@@ -231,10 +232,22 @@ def test_wild_flow_is_no_error(short: Clip) -> None:
     assert (abs(np.log(disparity / short.flat)) < np.log(1.5) + 1e-6).all()
 
 
-def scene_views(scene: Scene) -> tuple[list[int], list[View]]:
+def test_the_tuning_reaches_tracks_and_segmentation(short: Clip) -> None:
+    tracks = replace(MOVERS_TUNING.tracks, stride_px=2 * MOVERS_TUNING.tracks.stride_px)
+    segmentation = replace(MOVERS_TUNING.segmentation, min_shape_tracks=10**6)
+    tuning = replace(MOVERS_TUNING, tracks=tracks, segmentation=segmentation)
+    given = (short.clip, short.flow, short.valid, short.pairs, short.flat, short.confidence)
+    dense, sparse = estimate_movers(*given), estimate_movers(*given, tuning)
+    assert any(mover.has_shape for mover in dense)
+    assert not any(mover.has_shape for mover in sparse)
+    # a quarter of the tracks start
+    assert sum(len(m.trust) for m in sparse) < 0.3 * sum(len(m.trust) for m in dense)
+
+
+def scene_views(scene: Scene) -> tuple[list[int], list[MovingView]]:
     clip, flow, valid, pairs = video_of(scene)
     disparity = np.stack([f.disparity.numpy() for f in scene.train])
-    return views_in_time(clip, flow, valid, pairs, disparity, np.ones_like(disparity))
+    return views_by_time(clip, flow, valid, pairs, disparity, np.ones_like(disparity))
 
 
 def test_a_second_camera_counts_where_the_first_has_no_frame(toy: Scene) -> None:
@@ -243,10 +256,10 @@ def test_a_second_camera_counts_where_the_first_has_no_frame(toy: Scene) -> None
     assert chosen == [0, 1, 2, 3, 4, 5] and len(views) == 6
 
 
-def test_flow_to_a_frame_that_does_not_stand_for_its_time_is_left_out(toy: Scene) -> None:
+def test_flow_to_a_frame_that_is_not_the_first_of_its_time_is_left_out(toy: Scene) -> None:
     train = [*toy.train]
     train[2] = replace(train[2], camera_id=1, neighbors={}, flow={}, flow_valid={})
-    train.append(toy.train[2])  # what frames 1 and 3 know the flow to
+    train.append(toy.train[2])  # frames 1 and 3 have flow to it
     for i, o in ((1, 1), (3, -1)):
         train[i] = replace(train[i], neighbors=train[i].neighbors | {o: 6})
     chosen, views = scene_views(replace(toy, train=train))
@@ -254,7 +267,7 @@ def test_flow_to_a_frame_that_does_not_stand_for_its_time_is_left_out(toy: Scene
     assert [sorted(v.flow) for v in views] == [[1], [-1], [], [1], [-1, 1], [-1]]
 
 
-def test_without_tracks_the_path_fills_times_at_which_nothing_is_seen(toy: Scene) -> None:
+def test_without_tracks_the_path_fills_times_without_moving_pixels(toy: Scene) -> None:
     hidden = torch.zeros(34, 60, dtype=torch.bool)
     train = [replace(f, moving=hidden) if f.time in (0, 3, 5) else f for f in toy.train]
     frames, views = scene_views(replace(toy, train=train))

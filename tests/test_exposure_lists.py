@@ -44,7 +44,7 @@ def test_exposure_times_become_log2_seconds():
     ("text", "what"),
     [
         ("1/0", "divides by zero"),
-        ("-1/60", "cannot be"),
+        ("-1/60", "impossible"),
         ("abc", "not a number"),
         ("inf", "not finite"),
         ("", "not a number"),

@@ -7,10 +7,11 @@ import pytest
 import torch
 from presets import NETWORKS, random_field, small, trainer
 
-from hdr_nsff.fields.base import RadianceField, RecordingField, recorded
+from hdr_nsff.fields.base import RadianceField, RecordingField
 from hdr_nsff.fields.baselines.hexplane import HexPlane
 from hdr_nsff.fields.build import AnyField
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths.volume import transmittance, weighted_sum
 from hdr_nsff.scene.batch import Recorder, draw_pixels
@@ -80,8 +81,8 @@ def test_what_is_recorded_of_a_field_has_the_shape_and_range_of_a_picture(
 ) -> None:
     camera = toy.train[2].camera
     darker = Recorder(lambda radiance: LOOK.rgb(radiance / 4), LOOK.images)
-    rgb, dark = recorded(field, camera, 2.0, [LOOK, darker])
-    torch.testing.assert_close(dark, recorded(field, camera, 2.0, [darker])[0])  # as alone
+    rgb, dark = record_pixels(field, camera, 2.0, [LOOK, darker])
+    torch.testing.assert_close(dark, record_pixels(field, camera, 2.0, [darker])[0])  # as alone
     assert dark.shape == rgb.shape and dark.mean() < rgb.mean()
     assert (
         rgb.shape == (camera.width * camera.height, 3)

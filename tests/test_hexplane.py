@@ -13,8 +13,8 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
-from hdr_nsff.fields.base import recorded
 from hdr_nsff.fields.baselines.hexplane import NUM_GROWTHS, HexPlane
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.rendering.export import ExportConfig, export
 from hdr_nsff.rendering.render import RenderConfig, render
 from hdr_nsff.rendering.shots import Output
@@ -137,7 +137,7 @@ def test_a_run_is_rendered_in_linear_radiance_and_developed_by_the_field(
     camera = run.scene.train[3].camera  # the middle frame's
     torch.testing.assert_close(exr, run.field.render(camera, 2.0).radiance, atol=1e-5, rtol=1e-4)
     png = torch.from_numpy(read_image(tmp_path / "fixed/00002.png")).reshape(-1, 3)
-    (rgb,) = recorded(run.field, camera, 2.0, [run.tonemapper.recorder_at(2.0)])
+    (rgb,) = record_pixels(run.field, camera, 2.0, [run.tonemapper.recorder_at(2.0)])
     torch.testing.assert_close(png, rgb, atol=0.003, rtol=0)
 
 
@@ -150,7 +150,7 @@ def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(
     run = Run.open(run_of)
     f = run.scene.train[1]
     recorder = run.tonemapper.recorder(f.bracket, f.camera_id)
-    (rgb,) = recorded(run.field, f.camera, f.time, [recorder])
+    (rgb,) = record_pixels(run.field, f.camera, f.time, [recorder])
     mse = float((rgb.view_as(f.image) - f.image).square().mean())
     psnr = next(v["psnr"] for v in result["views"] if v["time"] == f.time)
     assert psnr == pytest.approx(-10 * math.log10(mse), abs=0.05)

@@ -11,7 +11,7 @@ import torch
 from fakes import FOCAL, WALL, DiscBeforeWall, H, W, camera
 from torch import Tensor
 
-from hdr_nsff.fields.base import Layers
+from hdr_nsff.fields.outputs import Layers
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.rendering.interpolate import Mode, Picture, neighbors, render_at, splat
 

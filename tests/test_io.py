@@ -28,6 +28,7 @@ from hdr_nsff.core.io import (
     is_leftover,
     read_json,
     read_npy,
+    write_half,
     write_json,
     write_npy,
     write_text,
@@ -174,6 +175,13 @@ def test_arrays_that_are_missing_or_damaged_are_refused(tmp_path: Path) -> None:
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(InputError, match=r"not a readable \.npy array"):
         read_npy(tmp_path / "a.npy")
+
+
+def test_values_beyond_half_precision_are_kept(tmp_path: Path) -> None:
+    for largest, dtype in ((100, np.float16), (70_000, np.float32)):
+        write_half(tmp_path / "a.npy", np.array([1.0, largest]))
+        found = read_npy(tmp_path / "a.npy")
+        assert found.dtype == dtype and found[1] == largest
 
 
 def test_damaged_arrays_are_read_or_refused(tmp_path: Path) -> None:

@@ -10,9 +10,10 @@ import pytest
 from synth_scene import BALL, BOX, ROOM, plane
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.pinhole import pixel_centers, project
 from hdr_nsff.synth import pathtracer
 from hdr_nsff.synth.pathtracer import Tracer, smooth
-from hdr_nsff.synth.scenes.geometry import intrinsics, pixel_centers, project
+from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import BACK, CORD, FLOOR, ball_pose, camera_pose
 
 

@@ -68,6 +68,13 @@ def test_unprojection_inverts_projection():
     np.testing.assert_allclose(pinhole.unproject(pixels, depth, K, c2w), points, atol=1e-9)
 
 
+def test_world_rays_reach_points_at_their_depth():
+    c2w, points = random_poses(), random_points(50)
+    pixels, depth = pinhole.project(points, K, c2w)
+    reached = c2w[:, 3] + depth[:, None] * pinhole.world_rays(pixels, K, c2w)
+    np.testing.assert_allclose(reached, points, atol=1e-12)
+
+
 def test_world_and_camera_coordinates_are_inverses():
     c2w, points = random_poses(), random_points(20)
     np.testing.assert_allclose(pinhole.to_world(pinhole.to_camera(points, c2w), c2w), points)

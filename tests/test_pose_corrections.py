@@ -60,7 +60,7 @@ def perturbation(count: int, degrees: float, share: float) -> Tensor:
 
 def set_twists(corrections: PoseCorrections, twists: Tensor) -> None:
     with torch.no_grad():
-        corrections.moves.copy_(torch.einsum("cij,cj->ci", corrections.judge, twists))
+        corrections.moves.copy_(torch.einsum("cij,cj->ci", corrections.to_parameters, twists))
 
 
 def perturbed(scene: Scene) -> Tensor:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hdr_nsff.geometry.round_trip import follow, valid_flow
+from hdr_nsff.geometry.round_trip import flow_at, follow, valid_flow
 
 H, W = 64, 96
 NONE_CLIPPED = np.zeros((H, W), bool)
@@ -39,3 +39,17 @@ def test_round_trips_beyond_half_a_pixel_are_rejected():
 def test_following_a_flow_reads_between_pixels():
     ramp = np.broadcast_to(np.arange(W, dtype=np.float32), (H, W)).copy()
     assert np.allclose(follow(ramp, constant(1.5, 0))[:, :-2], ramp[:, :-2] + 1.5)
+
+
+def test_flow_is_read_between_pixel_centers_and_held_outside():
+    flow = np.zeros((4, 6, 2), np.float32)
+    flow[..., 0] = np.arange(6) + 0.5  # x of the pixel centers
+    found = flow_at(flow, np.array([[2.5, 1.5], [2.75, 2.0], [9.0, 1.0]]))
+    assert found.tolist() == [[2.5, 0], [2.75, 0], [5.5, 0]]
+
+
+def test_unknown_pixels_and_unknown_flow_have_no_flow():
+    flow = np.zeros((4, 6, 2), np.float32)
+    flow[1, 2] = np.nan
+    found = flow_at(flow, np.array([[np.nan, np.nan], [2.5, 1.5], [4.5, 3.5]]))
+    assert np.isnan(found[:2]).all() and found[2].tolist() == [0, 0]

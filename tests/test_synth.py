@@ -13,11 +13,12 @@ from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.video import read_video
 from hdr_nsff.footage.exposure_lists import read_exposure_csv
 from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.geometry.pinhole import pixel_centers, project
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 from hdr_nsff.synth import synth as verb
 from hdr_nsff.synth.scenes.base import Views
-from hdr_nsff.synth.scenes.geometry import intrinsics, pixel_centers, project
+from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
 from hdr_nsff.synth.synth import synth

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.synth.scenes.geometry import intrinsics, look_at, project
+from hdr_nsff.geometry.pinhole import project
+from hdr_nsff.synth.scenes.geometry import intrinsics, look_at
 from hdr_nsff.synth.scenes.interior import camera_pose
 
 

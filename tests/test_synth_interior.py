@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from synth_scene import BOX, ROOM
 
-from hdr_nsff.synth.scenes.geometry import intrinsics, project
+from hdr_nsff.geometry.pinhole import project
+from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import CORD, INTERIOR, PIVOT, ball_pose, box_pose, camera_pose
 
 

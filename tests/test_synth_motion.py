@@ -6,10 +6,11 @@ import numpy as np
 from synth_scene import BALL, BOX, ROOM
 
 from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr
+from hdr_nsff.geometry.pinhole import project
 from hdr_nsff.scene.truth import GEOMETRY, Truth
 from hdr_nsff.synth.motion import exact_flow, view_geometry
 from hdr_nsff.synth.pathtracer import Tracer
-from hdr_nsff.synth.scenes.geometry import intrinsics, project
+from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import CORD, INTERIOR, ball_pose, box_pose, camera_pose
 from hdr_nsff.synth.settings import SynthConfig
 from hdr_nsff.synth.synth import synth

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hdr_nsff.geometry.pinhole import project
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.synth.motion import depth_there, exact_flow
 from hdr_nsff.synth.oracle import OracleNoise, visible, write_oracle
-from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at, project
+from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at
 from hdr_nsff.synth.scenes.interior import INTERIOR, box_pose, camera_pose
 
 SIZE, FRAMES = (48, 32), 4

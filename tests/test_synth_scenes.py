@@ -7,11 +7,12 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pytest
 
+from hdr_nsff.geometry.pinhole import project
 from hdr_nsff.synth.motion import UV, view_geometry
 from hdr_nsff.synth.pathtracer import Surface, Tracer
 from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.base import SynthScene
-from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at, project
+from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at
 from hdr_nsff.synth.scenes.night import DROP, bulb_pose
 from hdr_nsff.synth.scenes.shapes import Builder
 from hdr_nsff.synth.settings import SynthConfig

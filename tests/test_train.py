@@ -22,7 +22,7 @@ from torch import Tensor
 from hdr_nsff.core import distributed
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import write_json
-from hdr_nsff.fields.base import recorded
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.training import run_folder
@@ -30,6 +30,7 @@ from hdr_nsff.training.budget import Budget, Clock, Schedule
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_log, snapshots
+from hdr_nsff.training.run_writer import RunWriter
 from hdr_nsff.training.train import Trainer, train
 
 STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
@@ -166,7 +167,7 @@ def squared_error(run: Run) -> float:
     errors = []
     for i, frame in enumerate(run.scene.train):
         recorder = run.tonemapper.recorder(frame.bracket, frame.camera_id, i)
-        (rgb,) = recorded(run.field, frame.camera, frame.time, [recorder])
+        (rgb,) = record_pixels(run.field, frame.camera, frame.time, [recorder])
         errors.append((rgb.view_as(frame.image) - frame.image).square().mean())
     return float(torch.stack(errors).mean())
 
@@ -247,7 +248,7 @@ def test_a_resumed_run_keeps_the_snapshots_that_are_still_to_come(
 def test_the_clock_stands_still_while_something_is_written(
     toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Trainer, "keep", lambda self, share: time.sleep(3.0))
+    monkeypatch.setattr(RunWriter, "save_snapshot", lambda self, clock, share: time.sleep(3.0))
     monkeypatch.setattr(Trainer, "step", lambda self: {"psnr": 0.0})
     start = time.monotonic()
     run = Run.open(train(config(toy_folder, tmp_path / "run"), keep_at=(0.5,), previews=False))

@@ -256,8 +256,10 @@ def unknown_verb(name: str) -> str:
     import difflib
 
     similar = difflib.get_close_matches(name, VERBS, n=1)
-    suggestion = f"did you mean {similar[0]}? " if similar else ""
-    return f"no verb {name!r:.60}; {suggestion}The verbs are {', '.join(VERBS)}"
+    verbs = ", ".join(VERBS)
+    if similar:
+        return f"no verb {name!r:.60}; did you mean {similar[0]}? The verbs are {verbs}"
+    return f"no verb {name!r:.60}; the verbs are {verbs}"
 
 
 def is_text(argument: str) -> bool:

@@ -44,7 +44,7 @@ def bench(config: BenchConfig) -> None:
         Lpips(config.lpips)  # refuses unreadable weights before anything is trained
     if config.devices is None:
         pick_device(config.device)
-    # `--only` is part of a benchmark that may hold the lock; its run has one of its own.
+    # A part of a benchmark (`--only`) leaves the folder's lock to the benchmark itself.
     lock = lock_output(config.out) if config.only is None else nullcontext()
     with writing_to(config.out), lock:
         claim(plan)

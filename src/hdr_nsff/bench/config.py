@@ -32,7 +32,7 @@ MAX_NAME_LENGTH = 60  # letters of a folder's name
 class BenchConfig:
     """Train and measure methods on scenes; tables, curves and pictures side by side.
 
-    Every pair is a run of its own. Killed, the same command goes on where it was; with
+    Every pair is a run of its own. Killed, the same command continues where it was; with
     more scenes or methods it adds theirs. A run that fails is shown with its reason,
     the others go on, and the exit code is 1.
     """

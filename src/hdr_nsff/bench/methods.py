@@ -57,7 +57,7 @@ def check_words(text: str, name: str | None, words: list[str]) -> None:
     given = {word.split("=")[0] for word in words}
     for option in SAME_FOR_ALL:
         if f"--{option}" in given:
-            problem = f"--{option} is the same for all runs of a bench"
+            problem = f"--{option} is the same for all runs of a benchmark"
             raise InputError(f"--methods {text!r:.60}: {problem}; leave it out there")
 
 

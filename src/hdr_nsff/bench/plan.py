@@ -71,7 +71,9 @@ def claim(plan: BenchPlan) -> None:
     if out.exists() and not out.is_dir():
         raise InputError(f"{out}: is a file; choose a folder")
     if not path.is_file() and out.is_dir() and any(out.iterdir()):
-        raise InputError(f"{out}: holds other files and no bench; choose an empty or new folder")
+        raise InputError(
+            f"{out}: holds other files and no benchmark; choose an empty or new folder"
+        )
     check_place(out / "index.html")
     settings = {name: getattr(plan.config, name) for name in SHARED}
     sources = {scene.name: str(scene.source.resolve()) for scene in plan.scenes}

@@ -163,7 +163,7 @@ def failure_reason(log: Path, code: int) -> str:
     """Why a process failed: the last line of its log, or the signal that ended it."""
     if code < 0:
         ended = f"killed by {signal.Signals(-code).name}"
-        return f"{ended}, as happens where memory runs out" if code == -signal.SIGKILL else ended
+        return f"{ended}; the memory may have run out" if code == -signal.SIGKILL else ended
     lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     words = [line for line in lines if line.strip()]
     if not words:

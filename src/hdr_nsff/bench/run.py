@@ -153,7 +153,7 @@ def frame_seconds(run: Run) -> float:
         if sum(seconds) > MAX_TIMING_S:
             break
     median = float(np.median(seconds))
-    say(f"{median:.3g} s a frame")
+    say(f"{median:.3g} s per frame")
     return median
 
 

@@ -114,7 +114,7 @@ def row_of(run: BenchRun, plan: BenchPlan) -> Row:
     if failure is not None:
         log = f" (log: {failure.log})" if failure.log else ""
         return Row(run, "failed", f"{failure.reason}{log}", None, None)
-    return Row(run, "not finished", "the same command goes on with it", None, None)
+    return Row(run, "not finished", "the same command continues it", None, None)
 
 
 def scenes_of(rows: Iterable[Row]) -> list[str]:

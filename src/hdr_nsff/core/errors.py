@@ -1,17 +1,17 @@
-"""The one exception that the user can fix: the command line prints its sentence and
-exits with code 2.
+"""`InputError`: the one exception for faults that the user can fix.
+
+The command line prints its sentence and exits with code 2.
 """
 
 
 class InputError(ValueError):
-    """Bad input. The message says in one sentence what is wrong, where, and how to fix
-    it.
-    """
+    """Bad input. One sentence says what is wrong, where, and how to fix it."""
 
 
 def shorten(text: object, limit: int = 80) -> str:
-    """`text` as a message quotes it: on one line, and of more than `limit` characters
-    the beginning and the end.
+    """`text` as a message quotes it: on one line, with at most `limit` characters.
+
+    Of a longer text, the beginning and the end stay.
     """
     line = " ".join(str(text).split())
     if len(line) <= limit:

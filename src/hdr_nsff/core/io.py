@@ -152,7 +152,7 @@ def describe_disk_error(error: Exception, place: Path | str) -> str | None:
     path = str(path_of(error, place))[:200]
     disk_full = any(words in str(error) for words in ("No space left", "File too large"))
     if code in FULL or disk_full:
-        advice = "free some space and run the same command again, it goes on where it was"
+        advice = "free some space and run the same command again, it continues where it was"
         return f"{path}: the disk is full ({text}); {advice}"
     if code in FORBIDDEN:
         advice = "check its permissions, or choose another place"
@@ -206,6 +206,14 @@ def write_npy(path: Path | str, array: np.ndarray) -> None:
         # Not `getbuffer`: where writing fails, Python 3.12.1 crashes when it collects
         # the view.
         temporary.write_bytes(buffer.getvalue())
+
+
+def write_half(path: Path | str, array: np.ndarray) -> None:
+    """Write a map in half precision, or in single where it holds larger values."""
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    overflows = np.isinf(half).any()
+    write_npy(path, array.astype(np.float32) if overflows else half)
 
 
 def read_npy(path: Path | str) -> np.ndarray:

@@ -79,7 +79,7 @@ def acquire(place: Path, wait: bool) -> BinaryIO | None:
 
 
 def lock_file(path: Path, place: Path, wait: bool) -> BinaryIO:
-    """Open and lock `path`, which stands for `place`. OSError where it cannot be."""
+    """Open and lock `path`, the lock file of `place`. OSError where that fails."""
     while True:
         try:
             file = open_locked(path)

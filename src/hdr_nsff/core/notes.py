@@ -303,7 +303,7 @@ def read(path: Path, kind: type[N]) -> N | None:
     try:
         data = read_json(path)
         if kind.marks and not (isinstance(data, dict) and set(kind.marks) <= data.keys()):
-            problem = "is there already and was not made by hdr-nsff"
+            problem = "already exists and was not made by hdr-nsff"
             raise InputError(f"{path}: {problem}; move it away, or choose another place")
         return kind.model_validate(data)
     except InputError:

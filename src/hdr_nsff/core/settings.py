@@ -1,8 +1,8 @@
 """Settings as frozen dataclasses: bounds stand at each setting, pydantic checks them.
 
-A number's bounds are part of its type (`Count`, `Weight`, `Annotated[int, Ge(2)]`), also
-where it comes from a config.json. `Advanced` settings are no flags of their own: any
-setting can be changed by `--set KEY=VALUE`, with the key of config.json.
+A number's bounds are part of its type (`Count`, `Weight`, `Annotated[int, Ge(2)]`), and
+hold for a config.json as well. `Advanced` settings have no flag: any setting can be
+changed by `--set KEY=VALUE`, with the key of config.json.
 """
 
 from __future__ import annotations
@@ -89,8 +89,10 @@ def explain(error: ErrorDetails, command: str) -> str:
 
 
 def with_changes(settings: T, changes: tuple[str, ...], command: str = "") -> T:
-    """Settings after `--set KEY=VALUE ...`; keys are dotted as in `field.lr`, values JSON
-    or words. InputError where a key is unknown or a value out of bounds.
+    """Settings after `--set KEY=VALUE ...`.
+
+    Keys are dotted as in `field.lr`, values JSON or words. InputError where a key is
+    unknown or a value out of bounds.
     """
     data = to_plain(settings)
     for change in changes:

@@ -19,7 +19,7 @@ from hdr_nsff.core.io import write_text
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.targets import Target
-from hdr_nsff.fields import base
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.interpolate import LayeredField, render_at
 from hdr_nsff.rendering.shots import device_of, fingerprint
@@ -44,7 +44,7 @@ def predict(
     """Render an EXR per named view, `folder`/NAME.exr: radiance and depth.
 
     With `motion` also scene flow per frame in channels like `forward.x`. Files of the
-    same run are kept, so that a killed evaluation goes on where it was.
+    same run are kept, so that a killed evaluation continues where it was.
     """
     key = json.dumps(fingerprint(run, motion, list(views.items())))
     path = folder / "predictions.json"
@@ -151,5 +151,5 @@ def record(
     camera = to_device(target.view.camera, device)
     flat = radiance.reshape(-1, 3).to(device)
     with torch.no_grad():
-        pictures = base.recorded(run.field, camera, target.view.time, recorders, flat)
+        pictures = record_pixels(run.field, camera, target.view.time, recorders, flat)
     return [picture.cpu().reshape(radiance.shape) for picture in pictures]

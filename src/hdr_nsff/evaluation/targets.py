@@ -161,7 +161,7 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
     trained_on = [t.name for t in targets if t.group == TRAINED_ON]
     if trained_on:
         count = f"{len(trained_on)} views, {trained_on[0]} first,"
-        problem = "are frames that the run was trained on; they are no held-out views"
+        problem = "are frames that the run was trained on; they are not held-out views"
         notes.append(f"{count} {problem}")
     for note in notes:
         say(note)

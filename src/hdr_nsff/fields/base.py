@@ -2,10 +2,10 @@
 pixels, in linear HDR radiance. Everything that training asks of a field stands here.
 
 Fields know nothing of exposure, white balance or response curves: tone mapping happens
-outside. `S` is the number of pixels asked for. Camera, time and pixels are the currency,
-not rays: an NSFF casts rays through the pixels, a splat field rasterizes the frame and
-reads them off. Two published baselines need to know what was recorded
-(`RecordingField`): they are handed a `Recorder` from outside.
+outside. `S` is the number of pixels asked for. A field is given pixels, not rays: an
+NSFF casts rays through them, a splat field rasterizes the frame and reads them off. Two
+published baselines need to know what was recorded (`RecordingField`): they are handed a
+`Recorder` from outside.
 """
 
 from __future__ import annotations
@@ -49,32 +49,6 @@ class Render:
 
 
 @dataclass(frozen=True)
-class Layers:
-    """A view as L translucent layers, front to back. A layer holds one kind of content: a
-    field with two branches interleaves them (static, dynamic, static, ...).
-    """
-
-    positions: Tensor  # (S, L, 3) scene units; S = height * width, row by row
-    alpha: Tensor  # (S, L) in [0, 1]
-    radiance: Tensor  # (S, L, 3) linear HDR
-    # {+-1: (S, L, 3)} scene units to the next / previous training time, 0 where static
-    scene_flow: dict[int, Tensor]
-    motion: Tensor  # (S, L) in [0, 1]: share of dynamic content
-
-
-@dataclass(frozen=True)
-class GaussianCloud:
-    """G Gaussians at one time."""
-
-    means: Tensor  # (G, 3) scene units
-    quaternions: Tensor  # (G, 4) w x y z of any length
-    scales: Tensor  # (G, 3) standard deviations, scene units
-    opacities: Tensor  # (G,) in [0, 1]
-    radiance: Tensor  # (G, 3) linear HDR, >= 0
-    motion: Tensor  # (G,) in [0, 1]: share of dynamic content
-
-
-@dataclass(frozen=True)
 class FrameError:
     """How wrong a picture of one training frame is."""
 
@@ -109,8 +83,9 @@ class RadianceField(Protocol):
     def render(
         self, camera: Camera, time: float, pixels: Tensor | None = None, scene_flow: bool = True
     ) -> Render:
-        """Every pixel (row by row) or the given `pixels` (S, 2), without gradients; chunks
-        itself. `time` in frames, may be fractional. Without `scene_flow` it is faster.
+        """Render all pixels, row by row, or the given `pixels` (S, 2); no gradients.
+
+        `time` is in frames and may be fractional. It is faster without `scene_flow`.
         """
         ...
 
@@ -150,20 +125,3 @@ class RecordingField(RadianceField, Protocol):
         row, without gradients; chunks itself.
         """
         ...
-
-
-def recorded(
-    field: RadianceField,
-    camera: Camera,
-    time: float,
-    recorders: Sequence[Recorder],
-    radiance: Tensor | None = None,
-) -> list[Tensor]:
-    """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by row;
-    `radiance` (S, 3) is what the field rendered, if it was.
-    """
-    if isinstance(field, RecordingField):
-        return field.record(camera, time, recorders)
-    if radiance is None:
-        radiance = field.render(camera, time, scene_flow=False).radiance
-    return [recorder.rgb(radiance) for recorder in recorders]

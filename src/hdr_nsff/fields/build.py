@@ -39,7 +39,7 @@ def device_for(config: FieldConfig, name: str) -> torch.device:
     if reason is None:
         return device
     if name == "auto":
-        say(f"--device auto: using the CPU although there is a CUDA device, for {reason}")
+        say(f"--device auto: using the CPU although there is a CUDA device: {reason}")
         return torch.device("cpu")
     raise InputError(f"--device {name}: {reason}, or use --device cpu")
 

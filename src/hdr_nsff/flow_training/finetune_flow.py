@@ -1,17 +1,17 @@
-"""`hdr-nsff finetune-flow`: a flow network learns to match across exposures.
+"""The verb `finetune-flow`: a flow network learns to match across exposures.
 
-It sees pairs whose flow is known, recorded again for every step with random EV pairs,
-clipping, noise and response curves (as the paper does for its ablation, with
-FlyingThings3D). The output folder then holds
+It is trained on pairs whose flow is known. Every step records them anew with random
+exposures, clipping, noise and response curves, as the paper does for its ablation with
+FlyingThings3D. The output folder then holds
 
 - `weights.safetensors`: the adapted network, for `prepare --flow raft-finetuned
   --flow-weights`;
-- `weights.json`: what it was made of, and its error on held-out pairs, before and
+- `weights.json`: its settings and data, and its error on held-out pairs before and
   after;
 - `config.json`, `checkpoints/`: what a restart needs after a kill.
 
-Every step draws from a generator of its own, so a run that was killed ends like one
-that was not.
+Every step has a random generator, seeded by the step. A killed run that continues
+therefore ends like an unbroken one.
 """
 
 from __future__ import annotations
@@ -45,23 +45,24 @@ from hdr_nsff.priors.flow.networks import (
     predict_both_directions,
 )
 
-# weight of each of a network's predictions against the next one; GMFlow (Xu et al.
-# 2022) has 0.9, RAFT 0.8
+# weight of each of a network's predictions relative to the next one; 0.9 in GMFlow (Xu
+# et al. 2022), 0.8 in RAFT
 PREDICTION_DECAY = 0.9
 MAX_FLOW_PX = 400  # faster motion is left out of training, as RAFT (Teed & Deng 2020) does
 MEASURED_EV = (0.0, 2.0, 4.0)  # EV differences of the held-out measurement
 WARM_UP_SHARE = 0.05  # of the steps, as in RAFT's one-cycle schedule
+FIRST_STEP_SHARE = 1e-3  # of the steps, added while warming up: the first rate is not 0
 WEIGHT_DECAY = 1e-4  # of AdamW, as in RAFT and GMFlow
 MAX_GRADIENT_NORM = 1.0  # as in RAFT and GMFlow
-MIN_CROP_PX = 128  # least side of a crop
-MAX_EV_RANGE = 12.0  # stops: the widest range of exposures that pairs may be drawn from
+MIN_CROP_PX = 128  # shortest side of a crop: RAFT's correlation pyramid needs it
+MAX_EV_RANGE = 12.0  # stops: the largest `--stops`, beyond what cameras record
 
 
 @dataclass(frozen=True)
 class FinetuneConfig:
     """Adapt a flow network to pairs of different exposure whose flow is known.
 
-    Killed? The same command goes on where it was.
+    After a kill, the same command continues.
     """
 
     out: Positional[Path]
@@ -79,17 +80,17 @@ class FinetuneConfig:
     batch: int = 2
     """Pairs per step."""
     size: str = "320x224"
-    """Width x height of the crops in pixels, as matched (frames whose longer side is
-    below 640 pixels are enlarged up to three times).
+    """Width x height of the crops in pixels, at the scale of matching (frames whose
+    longer side is below 640 pixels are enlarged up to three times).
     """
     stops: float = 5.0
     """The largest exposure difference of a pair, in EV."""
     lr: float = 5e-5
     """Learning rate at its peak."""
     keep: float = 0.5
-    """Share of the network as it was in the result, which is the mean of the weights
-    before and after (Wortsman et al. 2022): it keeps what the data do not show. 0 takes
-    the trained network alone.
+    """Share of the original weights in the result, which is a weighted mean of the
+    weights before and after (Wortsman et al. 2022): it preserves what the data do not
+    contain. 0 takes the trained network alone.
     """
     held_out: float = 0.1
     """Share of the scenes (of a single scene: of its last pairs) kept for measuring."""
@@ -286,7 +287,7 @@ def rate_share(progress: float) -> float:
 
     It rises linearly over `WARM_UP_SHARE`, then falls linearly to 0.
     """
-    rising = (progress + 1e-3) / WARM_UP_SHARE
+    rising = (progress + FIRST_STEP_SHARE) / WARM_UP_SHARE
     falling = (1 - progress) / (1 - WARM_UP_SHARE)
     return min(rising, falling)
 
@@ -301,10 +302,7 @@ def draw_example(
 
 
 def stack_pairs(examples: list[Example], name: str) -> Tensor:
-    """One part of the examples as a pair batch (2B, ...).
-
-    First come all firsts, then all seconds.
-    """
+    """One part of the examples as a batch (2B, ...): first frames, then second ones."""
     parts = torch.stack([getattr(e, name) for e in examples], 1)  # (2, B, ...)
     return parts.flatten(0, 1)
 
@@ -327,13 +325,15 @@ def sequence_loss(predictions: list[Tensor], flow: Tensor, known: Tensor) -> Ten
 def mean_weights(
     one: dict[str, Tensor], other: dict[str, Tensor], share: float
 ) -> dict[str, Tensor]:
-    """Weights that are `share` of `one` and the rest of the `other`.
+    """The weighted mean of two networks' weights, with `share` of `one`.
 
-    Counters, which are no weights, are the other's.
+    Counters, which are no weights, are those of the `other`.
     """
     mean = {}
     for name, value in other.items():
-        mean[name] = torch.lerp(value, one[name], share) if value.is_floating_point() else value
+        if value.is_floating_point():
+            value = torch.lerp(value, one[name], share)
+        mean[name] = value
     return mean
 
 

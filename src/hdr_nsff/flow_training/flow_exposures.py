@@ -1,7 +1,7 @@
-"""Pairs of known flow as an alternating-exposure camera would have recorded them: other
-exposures, responses, noise, white balance, and crops.
+"""Pairs of known flow as an alternating-exposure camera would have recorded them.
 
-All randomness comes from the generator that is passed in.
+They get random exposures, responses, noise, white balance and crops. All randomness
+comes from the generator that is passed in.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ from hdr_nsff.radiometry.common_range import LUMA, common_rgb, recorded_range
 from hdr_nsff.radiometry.exposure_cycle import equalize
 from hdr_nsff.radiometry.recording import POINTS, Curve, Noise, film, record, response_curve
 
-# The cameras that pairs are recorded by. All hand-chosen: the range of consumer cameras
-# with some to spare.
-MIDDLE_GRAY = 0.18  # sensor exposure of the median of a pair, give or take ...
-MIDDLE_RANGE_EV = 1.0  # ... this
-# share of pairs seen at a common brightness, as `prepare` matches them; the others are
-# seen as recorded
+# The cameras that record the pairs. All numbers are hand-chosen: the range of consumer
+# cameras and a margin.
+MIDDLE_GRAY = 0.18  # sensor exposure of the median of a pair, on average
+MIDDLE_RANGE_EV = 1.0  # largest distance from it, in either direction
+MIN_RADIANCE = 1e-6  # linear HDR, so that the EV of a black pair is finite
+# share of pairs brought to a common brightness, as `prepare` matches them; the others
+# stay as recorded
 EQUALIZED_SHARE = 0.75
 WHITE_BALANCE_SPREAD = 0.1  # standard deviation of the log of each channel's gain
 NOISE_RANGE_LOG2 = (-1.0, 2.0)  # log2 of the noise relative to `Noise`
@@ -87,7 +88,7 @@ def example(
 
 def middle_ev(radiance: np.ndarray) -> float:
     """The EV at which the median of `radiance` (..., 3) becomes `MIDDLE_GRAY`."""
-    median = max(float(np.median(radiance @ LUMA)), 1e-6)
+    median = max(float(np.median(radiance @ LUMA)), MIN_RADIANCE)
     return float(np.log2(MIDDLE_GRAY / median))
 
 
@@ -113,7 +114,7 @@ def record_pair(
 
 
 def random_curve(rng: np.random.Generator) -> Curve:
-    """A response curve from the family of `film`, every channel a little different."""
+    """A response curve from the family of `film`, slightly different per channel."""
     gamma = rng.uniform(*GAMMA_RANGE)
     contrast = rng.uniform(*CONTRAST_RANGE)
     lift = rng.uniform(*LIFT_RANGE)
@@ -130,8 +131,9 @@ def random_crop(
 ) -> Example:
     """A random part of a pair (2, H, W, 3), mirrored at random and of `size` (h, w)."""
     height, width = images.shape[1:3]
-    usual = working_size(height, width)[1] / width * rng.uniform(*ZOOM_RANGE)
-    zoom = max(usual, size[0] / height, size[1] / width)
+    prepare_zoom = working_size(height, width)[1] / width
+    smallest_zoom = max(size[0] / height, size[1] / width)
+    zoom = max(prepare_zoom * rng.uniform(*ZOOM_RANGE), smallest_zoom)
     h = min(height, round(size[0] / zoom))
     w = min(width, round(size[1] / zoom))
     y = rng.integers(height - h + 1)

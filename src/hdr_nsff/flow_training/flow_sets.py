@@ -1,7 +1,6 @@
-"""Image pairs whose optical flow is known: FlyingThings3D, MPI Sintel, and scenes of
-`synth`.
+"""Image pairs whose flow is known: FlyingThings3D, MPI Sintel, and scenes of `synth`.
 
-Layouts, each below the folder that is named:
+Layouts, each below the folder that the user names:
 
 - synth: `exact/clip_00000.exr` with linear radiance, `forward` and `backward` flow.
 - Sintel: `[training/]final/SCENE/frame_0001.png`,
@@ -49,7 +48,7 @@ class Sample:
     """The content of a pair."""
 
     radiance: np.ndarray  # (2, H, W, 3) linear
-    flow: np.ndarray  # (2, H, W, 2) px, there and back
+    flow: np.ndarray  # (2, H, W, 2) px, forward and backward
     known: np.ndarray  # (2, H, W) bool
 
 
@@ -128,9 +127,9 @@ def flyingthings_frame(folder: Path, place: Path, number: int) -> Path | None:
 
 
 def read_sample(pair: FlowPair) -> Sample:
-    """Radiance and flow of a pair; InputError for files that are broken or do not fit.
+    """Radiance and flow of a pair; InputError for broken files or other sizes.
 
-    Pictures of 8 bits are taken to be sRGB, so 1 is as bright as they go.
+    Pictures of 8 bits are read as sRGB, so their radiance is at most 1.
     """
     first = read_radiance(pair.first)
     second = read_radiance(pair.second)

@@ -101,7 +101,7 @@ def read_model(folder: Path | str) -> ColmapModel:
     if lost is not None:
         raise InputError(
             f"{folder}: image {shorten(lost.name)} names camera {lost.camera_id}, "
-            "which the model has not; export it again"
+            "which the model does not have; export it again"
         )
     return ColmapModel(
         cameras,

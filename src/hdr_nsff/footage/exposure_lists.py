@@ -65,7 +65,7 @@ def log2_seconds(text: str, where: str) -> float:
     seconds = parse_number(text, where)
     if seconds <= 0:
         raise InputError(
-            f"{where}: an exposure of {shorten(text)} seconds cannot be; write times like 1/250"
+            f"{where}: an exposure of {shorten(text)} seconds is impossible; write times like 1/250"
         )
     return math.log2(seconds)
 

@@ -110,7 +110,7 @@ def open_footage(clip: Path) -> Footage:
 def open_video(clip: Path) -> Footage:
     """The footage of a video file; InputError where it is none."""
     if clip.suffix.lower() in FRAMES:
-        raise InputError(f"{clip}: one frame is no footage; give {ACCEPTED}")
+        raise InputError(f"{clip}: a single frame is not footage; give {ACCEPTED}")
     if not clip.stat().st_size:
         raise InputError(f"{clip}: the file is empty; copy it again")
     info = video_info(clip)
@@ -168,10 +168,7 @@ def check_choice(
             "nothing to read; correct --start, --end, --stride"
         )
     if max_size < MIN_MAX_SIZE:
-        raise InputError(
-            f"--max-size {shorten(max_size)}: too small to find anything in; "
-            f"use at least {MIN_MAX_SIZE}"
-        )
+        raise InputError(f"--max-size {shorten(max_size)}: too small; use at least {MIN_MAX_SIZE}")
     if hold_out is not None and (hold_out < 0 or hold_out == 1):
         raise InputError(
             f"--hold-out {shorten(hold_out)}: leaves nothing to train on; use 0, or 2 and more"

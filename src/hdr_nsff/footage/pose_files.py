@@ -17,6 +17,7 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapModel, read_model
 from hdr_nsff.footage.pose_formats import GivenPoses, from_colmap, from_json, from_llff
+from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.geometry.poses import (
     MIN_REGISTERED_SHARE,
     Poses,
@@ -76,7 +77,7 @@ def locate(path: Path) -> Path:
             )
         return path
     if not path.is_dir():
-        raise InputError(f"{path}: no such file or folder of poses")
+        raise InputError(f"{path}: no such file or folder of poses; correct the path")
     for folder in (path, path / "sparse" / "0", path / "sparse", path / "0"):
         if (folder / "images.bin").is_file() or (folder / "images.txt").is_file():
             return folder
@@ -160,13 +161,12 @@ def fit_poses(
     rotation = c2w[:, :, :3]
     if (np.linalg.det(rotation) <= 0).any() or (K[:, (0, 1), (0, 1)] <= 0).any():
         raise InputError(
-            f"{path}: a pose is no rotation (mirrored or all zero), or a focal length is not "
+            f"{path}: a pose is not a rotation (mirrored or all zero), or a focal length is not "
             "positive; export them again"
         )
     error = np.abs(rotation @ rotation.transpose(0, 2, 1) - np.eye(3)).max((1, 2))
     rounded = error > MAX_ROTATION_ERROR
-    u, _, vt = np.linalg.svd(rotation)
-    c2w[rounded, :, :3] = (u @ vt)[rounded]
+    c2w[rounded, :, :3] = nearest_rotation(rotation[rounded])
     registered = np.array([row is not None for row in rows])
     return Poses(
         K,
@@ -196,7 +196,7 @@ def scaled_intrinsics(path: Path, given: GivenPoses, row: int, size: tuple[int, 
     if h > 0 and abs(width / w / (height / h) - 1) > MAX_ASPECT_ERROR:
         raise InputError(
             f"{path}: poses are for {w:.0f}x{h:.0f} frames, these are {width}x{height}: "
-            "another shape; give the same"
+            "another shape; give poses for these frames"
         )
     scale_x = width / w
     scale_y = height / h if h > 0 else scale_x

@@ -51,7 +51,9 @@ class GivenPoses:
 def from_colmap(path: Path, model: ColmapModel) -> GivenPoses:
     """The poses of a COLMAP model, by image name; `path` is what messages name."""
     if not model.images:
-        raise InputError(f"{path}: the COLMAP model has no registered images; map again")
+        raise InputError(
+            f"{path}: the COLMAP model has no registered images; run the COLMAP mapper again"
+        )
     images = sorted(model.images.values(), key=lambda i: i.name)
     cameras = [model.cameras[i.camera_id] for i in images]
     for camera_id in sorted({i.camera_id for i in images}):
@@ -75,7 +77,7 @@ def colmap_distortion(path: Path, camera: ColmapCamera) -> np.ndarray:
     if camera.model in OPENCV_MODELS or not np.any(values):
         return np.pad(values, (0, 4))[:4]
     raise InputError(
-        f"{path}: camera model {camera.model} bends rays; undistort the frames "
+        f"{path}: camera model {camera.model} is not a pinhole camera; undistort the frames "
         "(colmap image_undistorter) and export again"
     )
 
@@ -221,7 +223,7 @@ def parse_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
 def parse_range(path: Path, document: Mapping[str, Any]) -> tuple[float | None, float | None]:
     """`near` and `far` of a JSON; None where it has none, or 0.
 
-    InputError where they are no range of depths.
+    InputError where they are not a range of depths.
     """
     near = float(document.get("near") or 0)
     far = float(document.get("far") or 0)
@@ -229,7 +231,7 @@ def parse_range(path: Path, document: Mapping[str, Any]) -> tuple[float | None, 
     most = far if far else MAX_NUMBER
     if not (1 / MAX_NUMBER <= least < most <= MAX_NUMBER):
         raise InputError(
-            f"{path}: near {near:g} and far {far:g} are no range of depths; correct them"
+            f"{path}: near {near:g} and far {far:g} are not a range of depths; correct them"
         )
     return near or None, far or None
 

@@ -1,6 +1,7 @@
-"""Two trajectories of the same cameras in two worlds: the similarity between them, how
-far they differ, and how a pose known in one is carried over to the other. Poses are
-camera to world, OpenCV axes, (..., 3, 4) float64 numpy.
+"""Alignment of points and of trajectories: the nearest rotation, the similarity between
+two worlds, how far the same cameras differ in them, and how a pose known in one is
+carried over to the other. Poses are camera to world, OpenCV axes, (..., 3, 4) float64
+numpy.
 """
 
 from __future__ import annotations
@@ -28,6 +29,18 @@ class Similarity:
         return self.scale * points @ self.rotation.T + self.translation
 
 
+def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
+    """The rotations (..., 3, 3) nearest to `matrix` (..., 3, 3) in the Frobenius norm.
+
+    Of the sum of `target source^T` over centered points, it is the rotation that best
+    maps `source` to `target` (Kabsch 1976). It never mirrors.
+    """
+    u, _, vt = np.linalg.svd(matrix)
+    sign = np.ones(matrix.shape[:-1])
+    sign[..., 2] = np.sign(np.linalg.det(u @ vt))
+    return (u * sign[..., None, :]) @ vt
+
+
 def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity | None:
     """The least-squares similarity from points `source` (N, 3) to `target` (N, 3).
 
@@ -39,10 +52,9 @@ def umeyama(source: np.ndarray, target: np.ndarray) -> Similarity | None:
     a = source - source.mean(0)
     b = target - target.mean(0)
     variance = (a**2).sum() / len(a)
-    u, d, vt = np.linalg.svd(b.T @ a / len(a))
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    rotation = u * sign @ vt
-    scale = float((d * sign).sum() / variance)
+    covariance = b.T @ a / len(a)
+    rotation = nearest_rotation(covariance)
+    scale = float((rotation * covariance).sum() / variance)
     return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
 
 

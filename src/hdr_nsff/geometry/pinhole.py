@@ -57,6 +57,13 @@ def camera_rays(pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
     return np.einsum("...ij,...j->...i", np.linalg.inv(K), homogeneous(pixels))
 
 
+def world_rays(pixels: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
+    """Directions (..., 3) through `pixels` (..., 2) in world coordinates, one unit of
+    z-depth long.
+    """
+    return np.einsum("...ij,...j->...i", c2w[..., :3], camera_rays(pixels, K))
+
+
 def project(
     points: np.ndarray, K: np.ndarray, c2w: np.ndarray, min_depth: float = MIN_DEPTH
 ) -> tuple[np.ndarray, np.ndarray]:

@@ -1,5 +1,7 @@
-"""Maps read where flow leads, and the forward-backward check of flow: whether a pixel
-returns to where it started (Sundaram, Brox and Keutzer 2010).
+"""Maps read where flow leads, points that follow flow, and the forward-backward check.
+
+The check is whether a pixel returns to where it started (Sundaram, Brox and Keutzer
+2010).
 """
 
 from __future__ import annotations
@@ -8,6 +10,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy import ndimage
 
 
 @dataclass(frozen=True)
@@ -17,7 +20,7 @@ class RoundTripTuning:
     """
 
     max_error_px: float = 0.5  # hand-chosen on rendered scenes
-    max_error_share: float = 0.01  # METHOD.md 5; the reference allows 0.5
+    max_error_share: float = 0.01  # hand-chosen; the paper's reference code allows 0.5
     # share of clipped neighbors that bilinear reading tolerates: rounding only
     max_clipped_weight: float = 0.01
 
@@ -37,6 +40,19 @@ def follow(
     if fill is None:
         return cv2.remap(field, x, y, interpolation, borderMode=cv2.BORDER_REPLICATE)
     return cv2.remap(field, x, y, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=fill)
+
+
+def flow_at(flow: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """`flow` (H, W, 2) px at `pixels` (N, 2), xy with centers at +0.5, bilinear.
+
+    Outside the frame it is the edge's. NaN where pixels, or the flow around, are NaN.
+    """
+    known = np.isfinite(pixels).all(-1)
+    y, x = np.where(known[:, None], pixels - 0.5, 0)[:, ::-1].T
+    axes = [
+        ndimage.map_coordinates(flow[..., axis], (y, x), order=1, mode="nearest") for axis in (0, 1)
+    ]
+    return np.where(known[:, None], np.stack(axes, -1), np.nan)
 
 
 def round_trip(forward: np.ndarray, backward: np.ndarray) -> np.ndarray:

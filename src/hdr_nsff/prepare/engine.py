@@ -1,9 +1,9 @@
 """The engine of `prepare`: does each step that is not done, and stores what it found.
 
-A step is a function from what the folder holds so far (`Work`) to a `StepResult`. Its key
-is a hash of its settings, of the files these name, of the weights of the networks it
-asks, and of the steps before it. A finished step with the same key is skipped; one with
-another key starts over, and with it whatever builds on it.
+A step is a function from what the folder holds so far (`Work`) to a `StepResult`. Its
+key is a hash of its settings, of the files these name, of the weights of its networks,
+and of the steps before it. A finished step with the same key is skipped. One with
+another key starts over, and so does every step that builds on it.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """The verb `prepare`: footage, or a public data set, to a scene folder, step by step.
 
-`STEPS` is the table of steps; `engine.py` does them. Killing `prepare` at any moment
-loses at most the step in the making (of flow, the pair; of structure from motion, the
-round): the same command goes on.
+`STEPS` is the table of steps; `engine.py` runs them. Killing `prepare` loses at most
+the unfinished step (of flow, the pair; of structure from motion, the round). The same
+command then continues.
 
-What a data set gives takes the place of an estimate. What it keeps back for testing no
-step sees: once the scene is whole, it goes into a truth folder outside of it, for
+What a data set gives replaces an estimate. What it holds out for testing is hidden from
+all steps: once the scene is complete, it goes into a truth folder outside of it, for
 `evaluate` alone.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.io import is_leftover, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
@@ -41,21 +41,21 @@ __all__ = ["PrepareConfig", "prepare"]
 
 
 def prepare(config: PrepareConfig) -> Path:
-    """Do every step that is not done; the scene folder. InputError where the footage or
-    a setting is at fault.
+    """Run every step that is not done; the scene folder.
+
+    InputError where the footage or a setting is at fault.
     """
     with writing_to(config.out), lock_output(config.out):
         work = begin(config)
-        introduce(work)
+        report_data_set(work)
         for name, step in STEPS.items():
             run_step(work, name, step)
-        if work.capture is not None and work.capture.has_held_out:
-            write_truth(
-                work.capture, work.manifest, work.own_time, truth_place(config), config.max_size
-            )
-    say(
-        f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {config.out / 'contact_sheet.png'})"
-    )
+        capture = work.capture
+        if capture is not None and capture.has_held_out:
+            place = truth_place(config)
+            write_truth(capture, work.manifest, work.own_time, place, config.max_size)
+    sheet = config.out / "contact_sheet.png"
+    say(f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {sheet})")
     return config.out
 
 
@@ -65,74 +65,72 @@ def truth_place(config: PrepareConfig) -> Path:
 
 
 def held_out_truth(config: PrepareConfig) -> Path | None:
-    """The truth folder that `prepare` wrote, None where the footage brings no held-out
-    views.
-    """
+    """The truth folder that `prepare` wrote; None without held-out views."""
     return truth_folder(truth_place(config))
 
 
 def begin(config: PrepareConfig) -> Work:
-    """Look at the footage and at the scene folder; InputError where they do not belong
-    together.
+    """Open the footage and the scene folder.
+
+    InputError where they do not belong together.
     """
     check_settings(config)
     capture = recognize(config.clip)
     footage = capture.footage() if capture else ingest.open_footage(config.clip)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
-    if found is not None and found.inputs != inputs and not found.frames:
-        found = None  # nothing to lose
-    if found is not None and found.inputs != inputs and found.source != str(config.clip):
-        raise InputError(
-            f"{config.out}: holds the scene of other footage ({found.source}); choose another folder"
-        )
-    for leftover in config.out.rglob(".partial-*"):  # of a killed run
-        leftover.unlink()
+    if found is not None and found.inputs != inputs:
+        if not found.frames:
+            found = None  # nothing to lose
+        elif found.source != str(config.clip):
+            raise InputError(
+                f"{config.out}: holds the scene of other footage ({found.source}); "
+                "choose another folder"
+            )
     if found is not None:
-        found.source, found.inputs = str(config.clip), inputs
+        found.source = str(config.clip)
+        found.inputs = inputs
         return Work(config, footage, found, capture)
-    first = next(
-        ingest.read_frames(footage, config.start, config.start + 1, 1, config.max_size), None
-    )
+    start = config.start
+    first = next(ingest.read_frames(footage, start, start + 1, 1, config.max_size), None)
     if first is None:
-        raise InputError(f"{config.clip}: no frame {config.start}; choose a smaller `--start`")
+        raise InputError(f"{config.clip}: no frame {start}; choose a smaller `--start`")
     height, width = first.rgb.shape[:2]
-    work = Work(
-        config,
-        footage,
-        Manifest(source=str(config.clip), inputs=inputs, width=width, height=height),
-        capture,
-    )
+    manifest = Manifest(source=str(config.clip), inputs=inputs, width=width, height=height)
+    work = Work(config, footage, manifest, capture)
     work.save()
     return work
 
 
-def introduce(work: Work) -> None:
-    """Say which data set was recognized, if it is one, and what of it is used."""
+def report_data_set(work: Work) -> None:
+    """Report which data set was recognized, if any, and which parts of it are used."""
     capture, clip = work.capture, work.config.clip
     if capture is None:
         return
-    stored = ["exposures"] if capture.parts()["exposures"] else []
     parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
-    given = [*stored, *(part for part in parts if work.gives(part))]
-    kept = f", held-out views for {truth_place(work.config)}" if capture.has_held_out else ""
-    say(
-        f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {', '.join(given) or 'pictures alone'}{kept}"
-    )
+    given: list[str] = [part for part in parts if work.gives(part)]
+    if capture.parts()["exposures"]:
+        given.insert(0, "exposures")
+    provided = ", ".join(given) or "pictures alone"
+    message = f"{clip}: {capture.layout}, {len(capture.pictures)} pictures, with its own {provided}"
+    if capture.has_held_out:
+        message += f", held-out views for {truth_place(work.config)}"
+    say(message)
     for note in capture.notes:
         say(f"{clip}: {note}")
 
 
 def found_manifest(config: PrepareConfig) -> Manifest | None:
-    """The manifest already in the output folder, None where there is none yet or a
-    broken one is to be redone from the frames.
+    """The manifest in the output folder; None where it is missing or to be redone.
+
+    A broken one is redone where `--redo frames` asks for it.
     """
     if not config.out.exists():
         return None
     if not config.out.is_dir():
         raise InputError(f"{config.out}: is a file; choose a folder to write the scene to")
     if not (config.out / "scene.json").exists():
-        if any(not p.name.startswith(".partial-") for p in config.out.iterdir()):
+        if not all(is_leftover(path) for path in config.out.iterdir()):
             raise InputError(
                 f"{config.out}: holds other files and no scene; choose an empty or new folder"
             )
@@ -141,7 +139,8 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
         found = Manifest.load(config.out)
         if [f.index for f in found.frames] != list(range(len(found.frames))):
             raise InputError(
-                f"{config.out / 'scene.json'}: frames are missing or out of order; restore it or use `--redo frames`"
+                f"{config.out / 'scene.json'}: frames are missing or out of order; "
+                "restore it or use `--redo frames`"
             )
         return found
     except InputError:
@@ -155,23 +154,27 @@ def check_settings(config: PrepareConfig) -> None:
     ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
     if config.protocol is not None and config.hold_out is not None:
         raise InputError(
-            "--protocol and --hold-out both given, and each says what is kept out of training; leave one out"
+            "--protocol and --hold-out both given, and each decides what is kept out of "
+            "training; leave one out"
         )
     parse_exposures(config.exposures, config.ev)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
-            f"--truth-out {config.truth_out}: inside the scene folder, where training reads; choose a place outside"
+            f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "
+            "choose a place outside"
         )
     check_flow(config.flow, config.flow_weights)
-    for option, path in (
-        ("poses", config.poses),
-        ("mask", config.masks),
-        ("depth", config.depth),
-        ("mask-points", config.mask_points),
-    ):
+    given = {
+        "poses": config.poses,
+        "mask": config.masks,
+        "depth": config.depth,
+        "mask-points": config.mask_points,
+    }
+    for option, path in given.items():
         if isinstance(path, Path) and not path.exists():
             raise InputError(
-                f"--{option} {path}: no such file or folder; mend the path, or leave the option out to estimate"
+                f"--{option} {path}: no such file or folder; "
+                "correct the path, or leave the option out to estimate it"
             )
     check_networks(config)
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.images import write_png
-from hdr_nsff.core.io import write_npy
+from hdr_nsff.core.io import write_half
 from hdr_nsff.scene.manifest import Manifest, Provenance
 
 
@@ -45,11 +45,6 @@ class MapKind:
         return f"{self.folder}/{index:05d}{self.suffix}"
 
 
-def write_half(path: Path, array: np.ndarray) -> None:
-    """A map in half precision."""
-    write_npy(path, array.astype(np.float16))
-
-
 MAPS = {
     "mask": MapKind("masks", ".png", write_png),
     "static_disparity": MapKind("static_disparity", ".npy", write_half),
@@ -63,7 +58,7 @@ MAPS = {
 
 
 def store(folder: Path, manifest: Manifest, result: StepResult) -> None:
-    """Write a result's files and put its values into the manifest, which is not saved."""
+    """Write a result's files and put its values into the (unsaved) manifest."""
     frames = dict(result.frames)
     for name, maps in result.maps.items():
         kind = MAPS[name]

@@ -1,4 +1,4 @@
-"""The settings of `prepare`, and the scene folder in the making that its steps hand on."""
+"""The settings of `prepare`, and the unfinished scene folder that its steps share."""
 
 from __future__ import annotations
 
@@ -24,8 +24,7 @@ from hdr_nsff.scene.posed_video import PosedVideo
 MaskName = Literal["motion", "sam2"]
 DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
-# flow (P, H, W, 2) float32 px, valid (P, H, W) bool, pairs (P, 2) of frame indices
-# (from, to)
+# flow (P, H, W, 2) float32 px, valid (P, H, W) bool, frame indices (P, 2) from and to
 Flows = tuple[np.ndarray, np.ndarray, np.ndarray]
 StepName = Literal[
     "frames",
@@ -44,10 +43,10 @@ StepName = Literal[
 
 @dataclass(frozen=True)
 class PrepareConfig:
-    """Turn alternating-exposure footage into a scene folder: exposures, poses, optical
-    flow, moving masks, depth.
+    """Turn alternating-exposure footage into a scene folder.
 
-    Steps that are done are skipped, so the same command goes on where a killed one was.
+    It holds exposures, poses, optical flow, moving masks and depth. Steps that are done
+    are skipped, so the same command continues where a killed one was.
     """
 
     clip: Positional[Path]
@@ -72,10 +71,10 @@ class PrepareConfig:
     end: int | None = None
     """Frame to stop before."""
     stride: int = 1
-    """Use every this many frames."""
+    """Use every STRIDE-th frame."""
     hold_out: int | None = None
-    """Keep every this many frames out of training, for `evaluate`; 0 keeps all in.
-    Default 8; 0 for a data set with held-out views.
+    """Keep every N-th frame out of training, for `evaluate`; 0 keeps all in. Default
+    8; 0 for a data set with held-out views.
     """
     protocol: Protocol | None = None
     """Split the clip as the published tables do, instead of --hold-out. novel-view:
@@ -91,7 +90,7 @@ class PrepareConfig:
     matcher: Matcher = "sift"
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
     learned, matched by LightGlue (extra `neural`), seconds per pair of frames on a CPU,
-    for footage in which SIFT finds too little in common.
+    for footage in which SIFT finds too few matches.
     """
     flow: FlowName | Path | None = None
     """Where optical flow comes from. Default: semantic where the weights of its
@@ -106,24 +105,24 @@ class PrepareConfig:
     `finetune-flow`. Default: where weights are kept.
     """
     semantic: SemanticConfig = field(default_factory=SemanticConfig)
-    """Of --flow semantic, which is the default where its weights are there."""
+    """Settings of --flow semantic, the default where its weights are installed."""
     masks: Annotated[MaskName | Path | None, arg(name="mask", aliases=("--masks",))] = None
-    """Where moving masks come from. motion: what the camera's motion does not explain
-    (default); sam2: the same outlined by a network (extra `neural`); or a folder of
-    masks made elsewhere: one PNG per frame in order, moving = white.
+    """Where moving masks come from. motion: pixels whose flow the camera's motion does
+    not explain (default); sam2: these, outlined by a network (extra `neural`); or a
+    folder of masks made elsewhere: one PNG per frame in order, moving = white.
     """
     mask_weights: str = "sam2"
     """Weights of sam2: a name of `hdr-nsff weights`, OWNER/MODEL of the Hugging Face
     hub, or a model's folder.
     """
     mask_points: Path | None = None
-    """Points that correct or add to what sam2 is asked: JSON as in `masks/prompts.json`
-    of the scene folder, where its own are written.
+    """Points that correct the prompts of sam2 or add to them: JSON as in
+    `masks/prompts.json` of the scene folder, where the automatic ones are written.
     """
     depth: DepthName | Path | None = None
-    """Where depth comes from. geometric: parallax, and where movers can be (default);
-    depth-anything: a network (extra `neural`), laid onto static points; or a folder of
-    maps made elsewhere, one .npy, EXR or PNG per frame in order.
+    """Where depth comes from. geometric: parallax, and the possible distances of movers
+    (default); depth-anything: a network (extra `neural`), aligned to static points; or
+    a folder of maps made elsewhere, one .npy, EXR or PNG per frame in order.
     """
     depth_weights: str = "depth-anything"
     """Weights of depth-anything, relative or metric: a name of `hdr-nsff weights`,
@@ -134,25 +133,25 @@ class PrepareConfig:
     or disparity up to scale and shift.
     """
     estimate: tuple[Part, ...] = ()
-    """Parts of a public data set to estimate although it gives them. Its depth is left
-    too where its poses are.
+    """Parts of a public data set to estimate although it gives them. Its depth is
+    ignored too where its poses are.
     """
     truth_out: Path | None = None
     """Where the held-out views of a public data set go, for `evaluate --truth`.
     Default: OUT_truth, beside the scene folder.
     """
     redo: tuple[StepName, ...] = ()
-    """Steps to do again although they are done."""
+    """Steps to redo although they are done."""
 
 
 @dataclass
 class Work:
-    """The scene folder in the making."""
+    """The unfinished scene folder, with what steps read of it."""
 
     config: PrepareConfig
     footage: ingest.Footage
     manifest: Manifest
-    capture: Capture | None = None  # what a public data set says of its frames
+    capture: Capture | None = None  # the training pictures of a public data set
 
     @property
     def folder(self) -> Path:
@@ -164,28 +163,28 @@ class Work:
         self.manifest.save(self.folder)
 
     def gives(self, part: Part) -> Capture | None:
-        """The data set, where it gives that part and the settings neither replace it
-        nor ask for an estimate.
+        """The data set, if it gives that part and the settings let it.
+
+        They may replace the part, or ask for an estimate.
         """
         c = self.config
-        own_world = c.poses is not None or "poses" in c.estimate
-        if (
-            self.capture is None
-            or part in c.estimate
-            or getattr(c, part) is not None
-            or (part == "depth" and own_world)
-        ):
+        replaced = part in c.estimate or getattr(c, part) is not None
+        other_poses = c.poses is not None or "poses" in c.estimate
+        if part == "depth" and other_poses:  # its depth is in units of its poses
+            replaced = True
+        if self.capture is None or replaced or not self.capture.parts()[part]:
             return None
-        return self.capture if self.capture.parts()[part] else None
+        return self.capture
 
     def picture(self, frame: FrameEntry) -> Picture:
-        """What the data set says of a frame."""
+        """What the data set gives for a frame."""
         assert self.capture is not None
         return self.capture.by_source[frame.source]
 
     def time_of(self, source: str, number: int) -> float:
-        """The time of a frame, in frames as used; `number` is its place in the footage
-        of its camera.
+        """The time of a frame, in frames as used.
+
+        `number` is its position in the footage of its camera.
         """
         if self.capture is None:
             return (number - self.config.start) // self.config.stride
@@ -194,21 +193,20 @@ class Work:
     def own_time(self, time: float) -> float:
         """A time of the data set, in frames as used."""
         assert self.capture is not None
-        first = min(
-            self.capture.by_source[s].time
-            for s in (files[self.config.start] for files in self.sources())
-        )
+        first_files = [files[self.config.start] for files in self.sources()]
+        first = min(self.capture.by_source[name].time for name in first_files)
         return round((time - first) / self.config.stride, 6)
 
     def sources(self) -> list[list[str]]:
-        """The names of the footage's files, camera by camera; cameras that are too
-        short for the settings left out.
+        """The names of the footage's files, camera by camera.
+
+        Cameras without a frame `start` are left out.
         """
-        names = [
-            [f.relative_to(self.footage.path).as_posix() for f in files]
-            for files in self.footage.cameras
-        ]
-        return [n for n in names if len(n) > self.config.start]
+        names = []
+        for files in self.footage.cameras:
+            if len(files) > self.config.start:
+                names.append([f.relative_to(self.footage.path).as_posix() for f in files])
+        return names
 
     @cached_property
     def video(self) -> np.ndarray:
@@ -217,34 +215,40 @@ class Work:
 
     @cached_property
     def equalized(self) -> tuple[np.ndarray, np.ndarray]:
-        """All frames at one brightness (T, H, W, 3) and where they say nothing (T, H,
-        W); the histograms are those of training frames.
+        """All frames at one brightness (T, H, W, 3), and clipped pixels (T, H, W).
+
+        The histograms are those of training frames.
         """
         frames = self.manifest.frames
-        groups = [f.camera_id * (1 + max(g.bracket for g in frames)) + f.bracket for f in frames]
-        return exposure.equalize(self.video, groups, np.array([f.split == "train" for f in frames]))
+        num_brackets = 1 + max(f.bracket for f in frames)
+        groups = [f.camera_id * num_brackets + f.bracket for f in frames]
+        is_training = np.array([f.split == "train" for f in frames])
+        return exposure.equalize(self.video, groups, is_training)
 
     @cached_property
     def raw_flows(self) -> Flows:
         """All flow as it was matched, which poses and masks come from."""
-        return self.read_flows([(f.index, f.raw_flow) for f in self.manifest.frames])
+        return self.read_flows({f.index: f.raw_flow for f in self.manifest.frames})
 
     @cached_property
     def refined_flows(self) -> Flows:
-        """All flow as training sees it: that of what moves told by what moves alone."""
-        return self.read_flows([(f.index, f.flow) for f in self.manifest.frames])
+        """All flow as training reads it, that of movers from moving pixels alone."""
+        return self.read_flows({f.index: f.flow for f in self.manifest.frames})
 
-    def read_flows(self, named: list[tuple[int, dict[int, FlowFiles]]]) -> Flows:
-        """Flow from files."""
-        files = [(i, j, names) for i, to in named for j, names in to.items()]
-        found = np.stack(
-            [read_npy(self.folder / names.flow).astype(np.float32) for _, _, names in files]
-        )
-        valid = np.stack([read_mask(self.folder / names.valid) for _, _, names in files])
-        return found, valid, np.array([(i, j) for i, j, _ in files])
+    def read_flows(self, files: dict[int, dict[int, FlowFiles]]) -> Flows:
+        """Flow from the files of every frame to others."""
+        flow = []
+        valid = []
+        pairs = []
+        for i, targets in files.items():
+            for j, names in targets.items():
+                flow.append(read_npy(self.folder / names.flow).astype(np.float32))
+                valid.append(read_mask(self.folder / names.valid))
+                pairs.append((i, j))
+        return np.stack(flow), np.stack(valid), np.array(pairs)
 
     def forget(self, names: tuple[str, ...]) -> None:
-        """Drop cached properties that a step has changed, or that nobody needs again."""
+        """Drop cached properties: a step changed them, or they are not needed again."""
         for name in names:
             vars(self).pop(name, None)
 
@@ -273,25 +277,27 @@ class Work:
         )
 
     def training_flows(self, flows: Flows) -> Flows:
-        """Those of `flows` between training frames, with pairs that count these only."""
+        """Flows between training frames; pairs are positions among training frames."""
         index = np.array([f.index for f in self.train])
         flow, valid, pairs = flows
-        among = np.isin(pairs, index).all(1)
-        return flow[among], valid[among], np.searchsorted(index, pairs[among])
+        kept = np.isin(pairs, index).all(1)
+        return flow[kept], valid[kept], np.searchsorted(index, pairs[kept])
 
     def static_depth(self) -> tuple[np.ndarray, np.ndarray]:
-        """Disparity and confidence (T, H, W) of the training frames before movers."""
+        """Disparity and confidence (T, H, W) of the training frames, without movers."""
         disparity = [read_npy(self.folder / str(f.static_disparity)) for f in self.train]
         confidence = [read_npy(self.folder / str(f.static_confidence)) for f in self.train]
         return np.stack(disparity).astype(np.float32), np.stack(confidence).astype(np.float32)
 
     def still(self) -> np.ndarray | None:
-        """Pixels (T, H, W) of the moving masks that stand still after all; None where
-        depth is given, or the same everywhere: movers are then part of it.
+        """Pixels (T, H, W) of the moving masks that stand still, as parallax explains.
+
+        None where depth is given, or the same everywhere: movers are then part of it.
         """
-        names = [f.still for f in self.train]
-        known = [read_mask(self.folder / name) for name in names if name is not None]
-        return np.stack(known) if known else None
+        names = [f.still for f in self.train if f.still is not None]
+        if not names:
+            return None
+        return np.stack([read_mask(self.folder / name) for name in names])
 
     def camera(self, f: FrameEntry) -> tuple[np.ndarray, np.ndarray]:
         """K (3, 3) px and c2w (3, 4) of a frame."""
@@ -304,8 +310,7 @@ class Work:
 
     def camera_frames(self) -> list[list[int]]:
         """Per camera the indices of its frames in time."""
-        frames = self.manifest.frames
-        return [
-            [f.index for f in frames if f.camera_id == c]
-            for c in sorted({f.camera_id for f in frames})
-        ]
+        indices: dict[int, list[int]] = {}
+        for f in self.manifest.frames:
+            indices.setdefault(f.camera_id, []).append(f.index)
+        return [indices[camera_id] for camera_id in sorted(indices)]

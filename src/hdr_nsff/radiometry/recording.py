@@ -1,4 +1,4 @@
-"""What a camera does to radiance (METHOD.md eq. 9 and 10, forwards).
+"""What a camera does to radiance (docs/method.md#eq-9 and #eq-10, forwards).
 
     rgb = g(clip(2^ev * white_balance * vignette * radiance + noise))
 

@@ -133,8 +133,10 @@ def estimate_white_balance(
     ev: np.ndarray,
     tuning: ResponseTuning = ResponseTuning(),
 ) -> np.ndarray:
-    """White balance (C, 3) in stops of every camera against camera 0, from static points
-    that several cameras recorded, through their curves `y` (C, 3, K) over `x` (K,).
+    """White balance (C, 3) in stops of every camera relative to camera 0.
+
+    It comes from static points that several cameras recorded, through their curves `y`
+    (C, 3, K) over `x` (K,).
 
     The robust fit of log exposure = log radiance of the point + white balance of the
     camera, by alternating medians; 0 for cameras that share too few points with others.

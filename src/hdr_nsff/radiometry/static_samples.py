@@ -27,10 +27,9 @@ class StaticSamplesTuning:
 
     mover_margin_px: int = 3  # pixels this close to a moving one are left out
     min_confidence: float = 0.1  # of the disparity
-    # a patch is patch_statistics if its values differ by less than this, plus a share of the
-    # highest one
-    max_contrast: float = 0.03
-    max_relative_contrast: float = 0.12
+    # a patch is flat if its values differ by less than the sum of these two
+    max_contrast: float = 0.03  # of a recorded value
+    max_relative_contrast: float = 0.12  # share of the patch's highest value
     max_disparity_error: float = 0.08  # share, between a point and the map of another frame
     max_cycles_apart: int = 3  # a point is read in frames at most this many cycles away
     level_bins: int = 16  # of the gray levels that points are spread over
@@ -156,9 +155,7 @@ def view_patches(
 def patch_statistics(
     image: np.ndarray, known: np.ndarray, tuning: StaticSamplesTuning = StaticSamplesTuning()
 ) -> PatchStatistics:
-    """The patches of a recorded `image` (H, W, 3), good where they are patch_statistics and
-    `known` (H, W) bool.
-    """
+    """The patches of a recorded `image` (H, W, 3); good ones are flat and `known`."""
     window = np.ones((3, 3), np.uint8)
     image = np.ascontiguousarray(image, np.float32)
     lowest, highest = np.asarray(cv2.erode(image, window)), np.asarray(cv2.dilate(image, window))

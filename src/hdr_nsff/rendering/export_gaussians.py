@@ -20,13 +20,14 @@ import torch
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.fields.base import GaussianCloud, RadianceField
+from hdr_nsff.fields.base import RadianceField
+from hdr_nsff.fields.outputs import GaussianCloud
 from hdr_nsff.geometry.paths import training_path
 from hdr_nsff.rendering import ply
 from hdr_nsff.rendering.shots import develop, display_exposure, fingerprint
 from hdr_nsff.training.run_folder import Run
 
-NOT_OURS = "is there already and was not made by export"
+NOT_OURS = "already exists and was not made by export"
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from typing import Literal, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.base import Layers, RadianceField, Render
+from hdr_nsff.fields.base import RadianceField, Render
+from hdr_nsff.fields.outputs import Layers
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths.volume import transmittance, weighted_sum
 

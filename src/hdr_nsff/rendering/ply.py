@@ -87,7 +87,7 @@ def read(path: Path | str) -> Splats:
     names = tuple(line.split()[-1] for line in lines if line.startswith("property float "))
     binary = lines[1:2] == ["format binary_little_endian 1.0"]
     if not (end and binary and names == PROPERTIES and lines[2].startswith("element vertex ")):
-        problem = "no PLY of Gaussians as `hdr-nsff export` writes them"
+        problem = "not a PLY of Gaussians that `hdr-nsff export` wrote"
         raise InputError(f"{path}: {problem}; export it again")
     count = int(lines[2].split()[-1])
     if len(body) != 4 * len(names) * count:

@@ -31,7 +31,8 @@ from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.core.video import write_video
-from hdr_nsff.fields.base import Render, recorded
+from hdr_nsff.fields.base import Render
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
@@ -153,7 +154,7 @@ def develop_view(
     flat = torch.from_numpy(radiance.reshape(-1, 3)).to(device_of(run))
     camera = to_device(view.camera, device_of(run))
     recorder = run.tonemapper.recorder_at(ev, camera_id)
-    picture = recorded(run.field, camera, view.time, [recorder], flat)[0]
+    picture = record_pixels(run.field, camera, view.time, [recorder], flat)[0]
     return picture.cpu().numpy().reshape(radiance.shape)
 
 
@@ -279,7 +280,7 @@ def open_sequence(
         say(f"{shot.name}: settings or checkpoint changed, rendering again")
     old = [*numbered_pictures(folder), *(p for p in products if p.exists())]
     if old and not path.is_file():
-        problem = "is there already and was not made by render"
+        problem = "already exists and was not made by render"
         raise InputError(f"{old[0]}: {problem}; choose another --out")
     for file in old:
         file.unlink()

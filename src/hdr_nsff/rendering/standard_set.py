@@ -84,7 +84,7 @@ def check_folder(out: Path) -> None:
         return
     for name in ("overview.png", "ldr", "depth", "scene_flow"):
         if (out / name).exists():
-            problem = "is there already and was not made by render"
+            problem = "already exists and was not made by render"
             raise InputError(f"{out / name}: {problem}; choose another --out")
 
 

@@ -1,5 +1,6 @@
-"""A batch of pixels of one frame with everything the objective compares them to, and
-how pixels are drawn.
+"""A batch of pixels of one frame, with everything that the objective compares to them.
+
+Pixels are drawn uniformly, and more from the moving mask.
 """
 
 from __future__ import annotations
@@ -16,14 +17,15 @@ from hdr_nsff.scene.scene import Frame, Scene
 
 @dataclass(frozen=True)
 class Recorder:
-    """One recording, for the baselines' fields that must know of it before samples are
-    composited; the others never ask.
+    """One recording, for fields that need it before samples are composited.
+
+    Only fields of baselines do.
     """
 
-    rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to what is recorded of it (M, 3)
-    images: tuple[
-        int, ...
-    ]  # positions in `scene.train` of the images that look like it: the image itself, or those of its exposure
+    rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to recorded rgb (M, 3)
+    # positions in `scene.train` of the images recorded like this one: the image itself,
+    # or those of its exposure
+    images: tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,8 @@ class PixelBatch:
     camera: Camera
     camera_id: int
     bracket: int
-    neighbors: dict[
-        int, Camera
-    ]  # {+-1: camera of the next / previous training frame}; a missing side is absent
+    # {+-1: camera of the next / previous training frame}; a missing side is absent
+    neighbors: dict[int, Camera]
     pixels: Tensor  # (N, 2) xy, centers at +0.5
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
@@ -56,32 +57,42 @@ class PixelBatch:
 def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = None) -> PixelBatch:
     """The batch of integer `pixels` (N, 2; column, row) of training frame `frame`."""
     column, row = pixels[:, 0], pixels[:, 1]
-    return read_off(scene, frame, pixels + 0.5, lambda image: image[row, column], uniform)
+
+    def select(image: Tensor) -> Tensor:
+        return image[row, column]
+
+    return batch_of(scene, frame, pixels + 0.5, select, uniform)
 
 
 def whole_frame(scene: Scene, frame: int) -> PixelBatch:
-    """The batch of every pixel of training frame `frame`, row by row: views of its
-    images, not copies.
+    """The batch of every pixel of training frame `frame`, row by row.
+
+    It holds views of the frame's images, not copies.
     """
-    return read_off(
-        scene, frame, scene.train[frame].camera.pixel_grid(), lambda image: image.flatten(0, 1)
-    )
+
+    def select(image: Tensor) -> Tensor:
+        return image.flatten(0, 1)
+
+    return batch_of(scene, frame, scene.train[frame].camera.pixel_grid(), select)
 
 
-def read_off(
+def batch_of(
     scene: Scene,
     frame: int,
     pixels: Tensor,
-    at: Callable[[Tensor], Tensor],
+    select: Callable[[Tensor], Tensor],
     uniform: Tensor | None = None,
 ) -> PixelBatch:
-    """The batch of `pixels` (N, 2; centers at +0.5) of training frame `frame`; `at`
-    takes an image (H, W, ...) to its values there.
+    """The batch of `pixels` (N, 2; centers at +0.5) of training frame `frame`.
+
+    `select` returns the values (N, ...) of an image (H, W, ...) at these pixels.
     """
     f: Frame = scene.train[frame]
+    if uniform is None:
+        uniform = torch.ones(len(pixels), dtype=torch.bool, device=f.image.device)
 
-    def maybe(image: Tensor | None) -> Tensor | None:
-        return None if image is None else at(image)
+    def select_if_known(image: Tensor | None) -> Tensor | None:
+        return None if image is None else select(image)
 
     return PixelBatch(
         frame=frame,
@@ -91,30 +102,32 @@ def read_off(
         bracket=f.bracket,
         neighbors={o: scene.train[j].camera for o, j in f.neighbors.items()},
         pixels=pixels.to(f.image),
-        rgb=at(f.image),
-        uniform=torch.ones(len(pixels), dtype=torch.bool, device=f.image.device)
-        if uniform is None
-        else uniform,
-        moving=maybe(f.moving),
-        outline=maybe(f.outline),
-        disparity=maybe(f.disparity),
-        disparity_confidence=maybe(f.disparity_confidence),
-        flow={o: at(v) for o, v in f.flow.items()},
-        flow_valid={o: at(v) for o, v in f.flow_valid.items()},
+        rgb=select(f.image),
+        uniform=uniform,
+        moving=select_if_known(f.moving),
+        outline=select_if_known(f.outline),
+        disparity=select_if_known(f.disparity),
+        disparity_confidence=select_if_known(f.disparity_confidence),
+        flow={o: select(v) for o, v in f.flow.items()},
+        flow_valid={o: select(v) for o, v in f.flow_valid.items()},
     )
 
 
 def draw_pixels(
     scene: Scene, frame: int, num_uniform: int, num_moving: int, generator: torch.Generator
 ) -> PixelBatch:
-    """`num_uniform` random pixels of training frame `frame`, and `num_moving` more from
-    its moving mask (none where nothing moves).
+    """`num_uniform` random pixels of training frame `frame`, and more from its mask.
+
+    `num_moving` pixels are drawn from the moving mask, none where it is empty.
     """
     f = scene.train[frame]
-    h, w = f.image.shape[:2]
-    flat = torch.randint(h * w, (num_uniform,), generator=generator).to(f.image.device)
-    if num_moving and f.moving is not None and len(inside := f.moving.reshape(-1).nonzero()[:, 0]):
-        extra = torch.randint(len(inside), (num_moving,), generator=generator).to(f.image.device)
-        flat = torch.cat([flat, inside[extra]])
-    uniform = torch.arange(len(flat), device=flat.device) < num_uniform
-    return gather(scene, frame, torch.stack([flat % w, flat // w], -1), uniform)
+    height, width = f.image.shape[:2]
+    device = f.image.device
+    drawn = torch.randint(height * width, (num_uniform,), generator=generator).to(device)
+    if num_moving and f.moving is not None:
+        inside = f.moving.reshape(-1).nonzero()[:, 0]
+        if len(inside):
+            chosen = torch.randint(len(inside), (num_moving,), generator=generator).to(device)
+            drawn = torch.cat([drawn, inside[chosen]])
+    uniform = torch.arange(len(drawn), device=device) < num_uniform
+    return gather(scene, frame, torch.stack([drawn % width, drawn // width], -1), uniform)

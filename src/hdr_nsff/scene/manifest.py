@@ -82,7 +82,7 @@ class FrameEntry(Strict):
 
 
 class StepRecord(Strict):
-    """One finished step of `prepare`: what it did, and the hash of all it depended on."""
+    """One finished step of `prepare`, with a hash of what it depended on."""
 
     done: bool = False
     key: str = ""  # hash of settings and inputs; with another key the step is redone
@@ -194,7 +194,7 @@ def manifest_problem(m: Manifest) -> str | None:
     """The first contradiction in a manifest, None where there is none."""
     known = m.near is not None and m.far is not None
     if known and not 1 / MAX_NUMBER < m.near < m.far < MAX_NUMBER:  # type: ignore[operator]
-        return f"near {m.near:g} and far {m.far:g} are no range of depths"
+        return f"near {m.near:g} and far {m.far:g} are not a range of depths"
     attempts = [step.details.get("attempt", 0) for step in m.steps.values()]
     if not all(isinstance(attempt, int) for attempt in attempts):
         return "a step has an `attempt` that is no number"
@@ -230,7 +230,7 @@ def frame_problem(f: FrameEntry, known: set[int]) -> str | None:
     if lost := set(f.flow) - known:
         return f"flow to frame {min(lost)}, which the scene does not have"
     if f.K is not None and not is_matrix(f.K, (3, 3), is_intrinsic):
-        return "a K that is no 3x3 camera matrix"
+        return "a K that is not a 3x3 camera matrix"
     if f.c2w is not None and not is_matrix(f.c2w, (3, 4), is_pose):
         return "a c2w that is no 3x4 camera pose"
     return None
@@ -258,7 +258,7 @@ def bracket_problem(
 def is_matrix(
     rows: list[list[float]], shape: tuple[int, int], good: Callable[[np.ndarray], bool]
 ) -> bool:
-    """Whether `rows` are a matrix of that shape, with numbers in range, that is `good`."""
+    """Whether `rows` are a `good` matrix of that shape with numbers in range."""
     if len({len(row) for row in rows}) != 1:
         return False
     matrix = np.array(rows)

@@ -30,7 +30,7 @@ MAX_DEPTH_RATIO = 2.0  # a pixel's depth changes by less than this factor
 class Mover:
     """One moving object over T times."""
 
-    frames: np.ndarray  # (T,) int: index of the frame that stands for each time
+    frames: np.ndarray  # (T,) int: index of the frame at each time
     pixels: np.ndarray  # (N, T, 2) xy px of its tracks, NaN where unseen
     trust: np.ndarray  # (N, T) of a track's depth, 0 where unseen
     points: np.ndarray  # (N, 3) canonical, scene units, NaN where unknown: the shape
@@ -107,8 +107,9 @@ def track_depths(
 
 
 def nearest_mover(movers: Sequence[Mover], t: int, pixels: np.ndarray) -> np.ndarray:
-    """The mover (P,) whose track is nearest to each of `pixels` (P, 2) at the t-th time;
-    0 where none has a track there.
+    """The mover (P,) whose track is nearest to `pixels` (P, 2) at the t-th time.
+
+    0 where no mover has a track at that time.
     """
     tracks = [m.pixels[:, t][np.isfinite(m.pixels[:, t, 0])] for m in movers]
     owners = np.repeat(np.arange(len(tracks)), [len(p) for p in tracks])
@@ -118,7 +119,10 @@ def nearest_mover(movers: Sequence[Mover], t: int, pixels: np.ndarray) -> np.nda
 
 
 def write_movers(path: Path, movers: Sequence[Mover]) -> None:
-    """Write `movers.npz`: arrays named `0/pixels`, `0/rotations`, ..., `1/pixels`, ..."""
+    """Write `movers.npz`: arrays `0/pixels`, `0/rotations`, ..., `1/pixels`, ...
+
+    The number is that of the mover.
+    """
     arrays: dict[str, np.ndarray] = {"version": np.array(VERSION)}
     for k, mover in enumerate(movers):
         for f in fields(Mover):
@@ -180,5 +184,5 @@ def mover_problem(mover: Mover) -> str | None:
         return "has a motion with NaN or Inf"
     turns = mover.rotations @ np.swapaxes(mover.rotations, 1, 2)
     if not np.allclose(turns, np.eye(3), atol=1e-3):
-        return "has rotations that are none"
+        return "has rotations that are not orthogonal matrices"
     return None

@@ -1,5 +1,6 @@
-"""`response.json` of a scene folder: response curves, exposures and white balance of its
-cameras, as `prepare` estimated them (`radiometry/response.py`).
+"""`response.json` of a scene folder: its cameras' curves, exposures and white balance.
+
+`prepare` estimates them (`radiometry/response.py`).
 """
 
 from __future__ import annotations

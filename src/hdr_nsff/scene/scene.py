@@ -95,14 +95,14 @@ class Scene:
 
 
 def check_complete(folder: Path, m: Manifest) -> tuple[float, float]:
-    """Near and far of a scene that `prepare` has finished; InputError where it has not."""
+    """Near and far of a scene; InputError where `prepare` has not finished it."""
     again = "run `hdr-nsff prepare` again"
     if not m.frames:
         raise InputError(f"{folder}: the scene has no frames; {again}")
     posed = all(f.c2w is not None and f.K is not None for f in m.frames)
     if m.near is None or m.far is None or not posed:
         raise InputError(
-            f"{folder}: the scene has no camera poses yet; {again}, it goes on where it stopped"
+            f"{folder}: the scene has no camera poses yet; {again}, it continues where it stopped"
         )
     return m.near, m.far
 
@@ -112,7 +112,7 @@ def load_response(folder: Path, m: Manifest) -> Response:
     if m.response is None:
         raise InputError(
             f"{folder}: the scene has no response curve yet; "
-            "run `hdr-nsff prepare` again, it goes on where it stopped"
+            "run `hdr-nsff prepare` again, it continues where it stopped"
         )
     return read_response(inside(folder, m.response), m.num_cameras, m.num_brackets)
 
@@ -124,7 +124,7 @@ def load_movers(folder: Path, m: Manifest, entries: list[FrameEntry]) -> tuple[M
     if m.movers is None:
         raise InputError(
             f"{folder}: the scene has no movers yet; "
-            "run `hdr-nsff prepare` again, it goes on where it stopped"
+            "run `hdr-nsff prepare` again, it continues where it stopped"
         )
     movers = read_movers(inside(folder, m.movers))
     first: dict[float, int] = {}
@@ -246,9 +246,11 @@ class MapReader:
             raise InputError(f"{place} holds no numbers; {again}")
         if array.dtype == bool:
             return torch.from_numpy(array)
-        if not np.isfinite(array).all():
+        with np.errstate(over="ignore"):
+            values = array.astype(np.float32)
+        if not np.isfinite(values).all():
             raise InputError(f"{place} holds NaN or Inf; {again}")
-        return torch.from_numpy(array.astype(np.float32))
+        return torch.from_numpy(values)
 
 
 def outline(mask: Tensor) -> Tensor:

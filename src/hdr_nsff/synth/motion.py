@@ -7,8 +7,9 @@ from __future__ import annotations
 import numpy as np
 
 from hdr_nsff.core.exr import MOTION_DIRECTIONS
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.synth.scenes.base import SynthScene
-from hdr_nsff.synth.scenes.geometry import back_project, pixel_centers, project
+from hdr_nsff.synth.scenes.geometry import back_project
 
 # Channels of the texture coordinates, in scenes with bodies that deform.
 UV = ("surface.u", "surface.v")
@@ -29,8 +30,8 @@ def exact_flow(there: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
     `there` (H, W, 3) at another time, seen then by a camera `c2w` (3, 4).
     """
     height, width = there.shape[:2]
-    seen_at, _ = project(there, K, c2w)
-    return seen_at - pixel_centers(height, width)
+    seen_at, _ = pinhole.project(there, K, c2w)
+    return seen_at - pinhole.pixel_centers(height, width)
 
 
 def depth_there(
@@ -46,7 +47,7 @@ def depth_there(
     """
     here = back_project(channels["Z"], K, c2w[i])
     bodies, uv = surface_points(channels)
-    _, depth = project(scene.moved(here, bodies, uv, i, j), K, c2w[j])
+    _, depth = pinhole.project(scene.moved(here, bodies, uv, i, j), K, c2w[j])
     return depth
 
 

@@ -102,7 +102,7 @@ def write_oracle(
 
 
 def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None:
-    """What `prepare` would estimate from the other parts: the response and the movers."""
+    """What `prepare` would estimate from the other parts: response and movers."""
     frames = manifest.frames
     disparity = read_maps(folder, [str(f.disparity) for f in frames])
     moving = np.stack([read_mask(folder / str(f.mask)) for f in frames])

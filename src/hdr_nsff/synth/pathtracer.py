@@ -26,8 +26,8 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.synth.scenes.base import STATIC_BODY, Part, SynthScene
-from hdr_nsff.synth.scenes.geometry import ray_directions
 
 PASS_SPP = 64  # samples per pixel in one launch: bounds the memory
 MAX_DEPTH = 8  # edges of a path (hand-chosen)
@@ -268,9 +268,9 @@ class Tracer:
     def surface(self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]) -> Surface:
         """The first surface along the ray through every pixel center."""
         width, height = size
-        local = ray_directions(height, width, K).reshape(-1, 3)
         origin = c2w[:, 3]
-        directions = local @ c2w[:, :3].T
+        pixels = pinhole.pixel_centers(height, width).reshape(-1, 2)
+        directions = pinhole.world_rays(pixels, K, c2w)
         depth, normals, uv, names = self.trace(self.scene_at(self.scene, t), origin, directions)
         assert np.isfinite(depth).all(), "the geometry of a scene fills every picture of it"
         points = origin + depth[:, None] * directions
@@ -298,8 +298,8 @@ class Tracer:
         columns = [np.ascontiguousarray(column, np.float32) for column in directions.T]
         x, y, z = (float(coordinate) for coordinate in origin)
         hit = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, z), mi.Vector3f(*columns)))
-        # Shapes are told apart by the numbers of their pointers: asking every shape for
-        # its rays would take longer than a picture.
+        # Shapes are identified by the numbers of their pointers: asking every shape for
+        # its rays would take longer than rendering a picture.
         names = {}
         for shape in scene.shapes():
             number = np.array(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape)))[0]

@@ -26,7 +26,7 @@ from tyro.conf import Positional
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import read_mask, write_png
-from hdr_nsff.core.io import read_json, write_json, write_npy, writing_to
+from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
@@ -60,7 +60,7 @@ class ReexposeConfig:
     srgb.
     """
     hold_out: int = ingest.HOLD_OUT
-    """Every this many frames are the truth."""
+    """Spacing of the frames that are held out as truth."""
     poses: Path | None = None
     """Camera poses of all frames of the clip: COLMAP model folder, transforms.json,
     poses_bounds.npy, precomputed.json.
@@ -76,7 +76,7 @@ class ReexposeConfig:
     end: int | None = None
     """Frame to stop before."""
     stride: int = 1
-    """Use every this many frames."""
+    """Spacing of the frames to use; 1 uses all."""
     seed: int = 0
     """Seed of the noise."""
 
@@ -201,7 +201,7 @@ def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
             )
     elif config.out.exists() and not is_empty_folder(config.out):
         raise InputError(
-            f"{config.out}: is there already and was not made by reexpose; "
+            f"{config.out}: already exists and was not made by reexpose; "
             "choose an empty or new folder"
         )
     write_json(path, settings)
@@ -219,7 +219,7 @@ def same_problem(path: Path, settings: dict[str, Any]) -> bool:
 
 def is_empty_folder(path: Path) -> bool:
     """Whether a folder holds nothing but unfinished files of a killed run."""
-    return path.is_dir() and all(p.name.startswith(".partial-") for p in path.iterdir())
+    return path.is_dir() and all(is_leftover(entry) for entry in path.iterdir())
 
 
 def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePlan:

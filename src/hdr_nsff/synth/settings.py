@@ -83,7 +83,7 @@ def check(config: SynthConfig, min_paths: int) -> None:
         raise InputError(f"--vignetting {c.vignetting}: choose from 0 (none) to 1 (the cos^4 law)")
     if not MIN_FRAMES <= c.frames <= MAX_FRAMES:
         raise InputError(
-            f"--frames {c.frames}: {MIN_FRAMES} to {MAX_FRAMES} can be made; "
+            f"--frames {c.frames}: choose from {MIN_FRAMES} to {MAX_FRAMES}; "
             "fewer leave no views far from the frames of their time"
         )
     if not 0 <= c.seed <= MAX_SEED:

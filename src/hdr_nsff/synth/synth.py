@@ -118,7 +118,7 @@ def claim(config: SynthConfig) -> None:
             "choose another folder or remove it"
         )
     if not path.is_file() and config.out.exists() and any(config.out.iterdir()):
-        raise InputError(f"{config.out}: holds something else; choose a new or an empty folder")
+        raise InputError(f"{config.out}: holds other files; choose a new or an empty folder")
     write_json(path, {"digest": digest, **key})
 
 

@@ -1,8 +1,9 @@
-"""The tone mapper: linear HDR radiance in, what the camera recorded out (`rgb = g(gain *
-radiance)`, eq. 9-10), learned.
+"""The tone mapper: linear HDR radiance to what the camera recorded, learned.
 
-Gauge: recordings alone leave scale and power of the radiance free, so these are fixed by
-construction. The gain of the reference bracket and the white balance of camera 0 are
+It computes `rgb = g(gain * radiance)` (eq. 9-10).
+
+Gauge: recordings alone leave scale and power of the radiance free, so construction
+fixes these. The gain of the reference bracket and the white balance of camera 0 are
 exactly 1, per-frame residuals have mean 0, and every response has g(0) = 0, g(1) = 1.
 Hence radiance 1 is where a channel saturates at the reference exposure: with one free
 curve per channel the camera's own white balance is part of that unit, per channel, and
@@ -54,9 +55,9 @@ class ToneMapConfig:
     """How radiance becomes recorded rgb."""
 
     kind: Literal["shared", "per_image", "mlp", "fixed", "sigmoid", "none"] = "shared"
-    """shared: one monotone curve per camera and one exposure per bracket; per_image: the
-    paper's free gain and curve per image; mlp: HDR-NeRF's network for the curve; fixed:
-    gamma 2.2; sigmoid: HDR-HexPlane's x / (1 + x), one exposure per image; none:
+    """shared: one monotone curve per camera and one exposure per bracket; per_image:
+    the paper's free gain and curve per image; mlp: HDR-NeRF's network for the curve;
+    fixed: gamma 2.2; sigmoid: HDR-HexPlane's x / (1 + x), one exposure per image; none:
     radiance is taken for rgb (plain NSFF).
     """
     knots: Advanced[Literal["gamma", "even"]] = "gamma"
@@ -131,16 +132,18 @@ class ToneMapper(nn.Module, ABC):
         images: Tensor | int | None,
         leaky: bool,
     ) -> Tensor:
-        """g(gain * radiance) (N, 3) of radiance (N, 3) and gain (3,), through the response
-        of `camera_id` or of `images` of the training frames.
+        """g(gain * radiance) (N, 3) of radiance (N, 3) and gain (3,).
+
+        g is the response of `camera_id`, or of `images` of the training frames.
         """
 
     @abstractmethod
     def inverse(
         self, rgb: Tensor, bracket: int, camera_id: int = 0, frame: int | None = None
     ) -> Tensor:
-        """Radiance (N, 3) that would be recorded as `rgb` (N, 3); no gradients. Trust it
-        only where `informative(rgb)`.
+        """Radiance (N, 3) that would be recorded as `rgb` (N, 3), without gradients.
+
+        Trust it only where `informative(rgb)`.
         """
 
     @abstractmethod
@@ -204,8 +207,9 @@ class ToneMapper(nn.Module, ABC):
         return Recorder(lambda radiance: self.develop(radiance, ev, camera_id), images)
 
     def neutral(self, camera_id: int = 0) -> Tensor:
-        """Gains (3,), geometric mean 1, that make neutral what the camera records as mid
-        gray at the reference exposure.
+        """Gains (3,), geometric mean 1, that make mid gray neutral.
+
+        Mid gray is what the camera records as such at the reference exposure.
 
         Radiance is in the camera's own units, per channel (the gauge): for looking at,
         its white balance has to be put in.
@@ -256,7 +260,7 @@ class ToneMapper(nn.Module, ABC):
         return {}
 
     def anchor(self) -> None:
-        """Hold what has converged where it is from now on (shared; no other kind does)."""
+        """From now on, hold what has converged (only the shared kind does)."""
 
     def known_ev(self, response: Response) -> list[float]:
         """EV of every bracket: as given, else as estimated."""

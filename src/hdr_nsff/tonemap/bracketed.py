@@ -16,8 +16,9 @@ from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
 
 
 class BracketGain(nn.Module):
-    """log gain = exposure of the bracket + white balance of the camera + residual of the
-    frame (docs/method.md, eq. 9-10).
+    """Log gain: the bracket's exposure + white balance + the frame's residual.
+
+    The white balance is the camera's. See docs/method.md#eq-9 and #eq-10.
 
     Known exposures are buffers and stay exactly what they are; unknown ones are
     parameters.
@@ -103,8 +104,9 @@ class BracketedToneMapper(ToneMapper):
 
     @torch.no_grad()
     def set_exposures(self, ev: list[float]) -> None:
-        """Start the unknown exposures from `ev` (B,), relative to the reference bracket;
-        known ones stay.
+        """Start the unknown exposures from `ev` (B,); known ones stay.
+
+        `ev` is relative to the reference bracket.
         """
         unknown = self.bracket_gain.unknown.tolist()
         self.bracket_gain.learned_ev.copy_(torch.tensor([ev[i] for i in unknown]))
@@ -146,14 +148,17 @@ class SharedToneMapper(BracketedToneMapper):
         return self.response.values(camera_id)
 
     def set_curve(self, x: Tensor, y: Tensor, camera_id: int | None = None) -> None:
-        """Start the response (of one camera, or of all) from a curve y (3, M) over x (M,)
-        in [0, 1].
+        """Start the response from a curve y (3, M) over x (M,) in [0, 1].
+
+        The response is that of one camera, or of all without `camera_id`.
         """
         self.response.set_values(curve.resample(x, y, self.knots), camera_id)
 
     def start(self, response: Response) -> None:
-        """Curves, exposures and white balance; what static points determined for a single
-        camera is anchored at once: a field that is still coarse would only bend it.
+        """Curves, exposures and white balance from what `prepare` estimated.
+
+        What static points determined for a single camera is anchored at once: a field
+        that is still coarse would only bend it.
         """
         self.set_exposures(response.ev.tolist())
         if response.source != "static points":
@@ -168,9 +173,11 @@ class SharedToneMapper(BracketedToneMapper):
             self.anchor()
 
     def regularizers(self) -> dict[str, Tensor]:
-        """`gain_residual` is the mean square of the frames' residuals and of the log white
-        balances: for a camera that only ever saw one bracket, the recordings do not tell
-        exposure from white balance. `response_anchor` is 0 until `anchor()`.
+        """Smoothness of the curve, `gain_residual` and `response_anchor`.
+
+        `gain_residual` is the mean square of the frames' residuals and of the log white
+        balances: for a camera that recorded one bracket only, exposure and white
+        balance cannot be separated. `response_anchor` is 0 until `anchor()`.
         """
         gain = self.bracket_gain
         small = [t for t in (gain.residual, gain.white_balance) if t is not None and t.numel()]
@@ -184,8 +191,9 @@ class SharedToneMapper(BracketedToneMapper):
         }
 
     def anchor_distance(self) -> Tensor:
-        """Mean square distance of curves, exposures (natural log) and white balances from
-        where `anchor()` found them.
+        """Mean square distance from the values that `anchor()` held.
+
+        These are curves, exposures (natural log) and white balances.
         """
         if not self.anchored:
             return self.knots.new_zeros(())

@@ -26,8 +26,8 @@ def piecewise_linear(x: Tensor, values: Tensor, knots: Tensor, power: float) -> 
     evenly in x^power; x (N, 3) is clamped to [0, 1].
 
     Differentiable in x (zero outside [0, 1]) and in `values`. The bin comes in closed
-    form; where rounding puts x just outside its bin, the line is extended, which differs
-    by rounding only.
+    form. Where rounding puts x just outside its bin, the line is extended, which
+    changes the result by rounding only.
     """
     inside = x.clamp(0, 1)
     last = len(knots) - 2
@@ -40,8 +40,10 @@ def piecewise_linear(x: Tensor, values: Tensor, knots: Tensor, power: float) -> 
 
 
 def leaky_ends(x: Tensor, y: Tensor, leak: float) -> Tensor:
-    """Eq. 11 as printed: `leak * x` below 0, `-leak / sqrt(x) + leak + 1` above 1, `y` =
-    g(x) between; continuous at both ends.
+    """Eq. 11 as printed: a leak where x leaves [0, 1], `y` = g(x) between.
+
+    The leak is `leak * x` below 0 and `-leak / sqrt(x) + leak + 1` above 1; the result
+    is continuous at both ends.
     """
     above = 1 + leak - leak * torch.rsqrt(x.clamp_min(1.0))
     return torch.where(x > 1, above, torch.where(x < 0, leak * x, y))
@@ -89,11 +91,11 @@ def resample(x: Tensor, y: Tensor, knots: Tensor) -> Tensor:
 
 
 def smoothness(curves: Tensor) -> Tensor:
-    """Eq. 15: squared second differences of curves (..., K) over their own knots, summed
-    over points and averaged over curves.
+    """Eq. 15: squared second differences of curves (..., K) over their knots.
 
-    On even knots this is the paper's term but for its sum over images and channels. On
-    gamma knots it is curvature over x^(1/2.2): zero for gamma 2.2, and the darks are held
-    as firmly as the lights (evenly in x, the first of 255 cells would hide 20 knots).
+    They are summed over points and averaged over curves. On even knots this is the
+    paper's term but for its sum over images and channels. On gamma knots it is
+    curvature over x^(1/2.2): zero for gamma 2.2, and the darks are held as firmly as
+    the lights (evenly in x, the first of 255 cells would hide 20 knots).
     """
     return curves.diff(n=2, dim=-1).square().sum(-1).mean()

@@ -49,29 +49,29 @@ def bin_of(x, knots, table):
 
 @jit(parallel=True, nogil=True)
 def forward(radiance, gain, values, knots, inverse, table, leaky, leak, out):
-    """Fill `out` (3, N) with what is recorded of `radiance` (3, N) through `gain` (3,)
-    and a curve `values` (3, K) at `knots` (K,).
+    """Fill `out` (3, N) with the recording of `radiance` (3, N).
 
-    `inverse` (K - 1,) is 1 / width of the bins, `table` that of `bin_table`; not
-    `leaky`: clamped instead of eq. 11.
+    Radiance passes `gain` (3,) and a curve `values` (3, K) at `knots` (K,). `inverse`
+    (K - 1,) is 1 / width of the bins, `table` that of `bin_table`. Beyond [0, 1] the
+    result is clamped, or follows eq. 11 if `leaky`.
     """
     n, top = radiance.shape[1], F1 + leak
     for k in numba.prange(CHUNKS):
         for c in range(3):
-            curve, factor, seen, told = values[c], gain[c], radiance[c], out[c]
+            curve, factor = values[c], gain[c]
+            channel, recorded = radiance[c], out[c]
             for i in range(k * n // CHUNKS, (k + 1) * n // CHUNKS):
-                x = seen[i] * factor
+                x = channel[i] * factor
                 if F0 <= x <= F1:
                     b = bin_of(x, knots, table)
-                    told[i] = curve[b] + (curve[b + NEXT] - curve[b]) * (
-                        (x - knots[b]) * inverse[b]
-                    )
+                    share = (x - knots[b]) * inverse[b]
+                    recorded[i] = curve[b] + (curve[b + NEXT] - curve[b]) * share
                 elif x > F1:
-                    told[i] = top - leak / np.sqrt(x) if leaky else curve[-1]
+                    recorded[i] = top - leak / np.sqrt(x) if leaky else curve[-1]
                 elif x < F0:
-                    told[i] = leak * x if leaky else curve[0]
+                    recorded[i] = leak * x if leaky else curve[0]
                 else:
-                    told[i] = x  # NaN
+                    recorded[i] = x  # NaN
 
 
 @jit(parallel=True, nogil=True)

@@ -9,10 +9,9 @@ GAMMA = 2.2
 WIDTH = 128  # of the hidden layer
 SMALLEST = 1e-6  # exposure below which the logarithm is held
 MIDDLE = 0.5  # the recorded value that is held, where the starting curve reaches it
-BENDS = (
-    -12.0,
-    -0.4,
-)  # log exposures where hidden units bend at the start; above, gently on, so that a gradient is left
+# log exposures between which hidden units bend at the start; above the upper end, they
+# stay gently on, so that a gradient is left
+BENDS = (-12.0, -0.4)
 FLOOR = 0.004  # recorded values closer to 0 and 1 than this are taken for it: they have no logit
 RIDGE = 1e-6
 

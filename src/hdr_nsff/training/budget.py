@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -73,3 +76,25 @@ class Clock:
         if self.schedule.lr_final:
             return self.schedule.lr_final**self.progress
         return 0.1 ** (self.step / 300_000)
+
+
+class Stopwatch:
+    """Seconds of training, without pauses and the first step, which compiles."""
+
+    def __init__(self, seconds: float) -> None:
+        self.before = seconds  # of training, in processes before this one
+        self.started: float | None = None
+
+    def read(self) -> float:
+        """Seconds of training so far; the first reading starts the watch."""
+        if self.started is None:
+            self.started = time.monotonic()
+        return self.before + time.monotonic() - self.started
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Time that is not counted, after the first reading."""
+        assert self.started is not None
+        paused = time.monotonic()
+        yield
+        self.started += time.monotonic() - paused

@@ -68,7 +68,7 @@ class TrainConfig:
     from_priors: bool = True
     """Start the field from the depth prior and the recorded colors."""
     refine_poses: bool = False
-    """Correct the training cameras (poses and focal length) a little, by the picture."""
+    """Learn small corrections of the training cameras: poses and focal length."""
     pose_lr: Advanced[Rate] = 6e-4
     """Of these corrections, as a motion of the picture in shares of its width."""
     pose_prior: Advanced[Weight] = 1e-4
@@ -76,7 +76,7 @@ class TrainConfig:
     focal length squared.
     """
     squared: Advanced[bool] = False
-    """Squared photometric errors (eq. 12-13) instead of absolute ones (the reference)."""
+    """Squared photometric errors (eq. 12-13); the default is absolute ones."""
     saturation: Advanced[bool] = True
     """Trust recorded values near 0 and 1 less in the dynamic terms."""
     bf16: bool = False
@@ -116,17 +116,18 @@ class TrainConfig:
 
 
 def check_config(config: TrainConfig) -> TrainConfig:
-    """The config after its `set` changes, with an absolute scene folder so that the run
-    can be opened from anywhere; InputError where a value or a combination makes no sense.
+    """The config after its `set` changes; InputError where it makes no sense.
+
+    Its scene folder is absolute, so that the run can be opened from anywhere.
     """
     if config.budget.steps is None and config.budget.minutes is None:
-        raise InputError("neither --steps nor --minutes: say how long to train")
+        raise InputError("neither --steps nor --minutes: give one of them")
     config = with_changes(replace(config, set=()), config.set, HELP)
     two_branches = not isinstance(config.field, SplatConfig | HexPlaneConfig)
     extra_pixels = config.rays > 0 and config.moving_rays > 0
     if config.loss.dynamic and not (two_branches or extra_pixels):
         raise InputError(
-            f"--loss.dynamic {config.loss.dynamic:g}: this preset forms no such term; "
+            f"--loss.dynamic {config.loss.dynamic:g}: this preset has no such term; "
             "give --rays and --moving-rays too, or leave it out"
         )
     return replace(config, scene=config.scene.resolve())

@@ -19,7 +19,7 @@ ROTATION = 97  # steps after which the same frames are measured again, a prime
 
 
 def check_finite(values: dict[str, float], step: int, batch: PixelBatch, radiance: Tensor) -> None:
-    """FloatingPointError with the step, the term and the ray where a term is NaN or Inf."""
+    """FloatingPointError with step, term and ray where a term is NaN or infinite."""
     bad = [name for name, value in values.items() if not math.isfinite(value)]
     if not bad:
         return
@@ -32,9 +32,7 @@ def check_finite(values: dict[str, float], step: int, batch: PixelBatch, radianc
 
 @torch.no_grad()
 def squared_error(render: Render, batch: PixelBatch, tonemapper: ToneMapper) -> float:
-    """Mean square difference of the recorded and the rendered rgb at the uniformly drawn
-    pixels.
-    """
+    """Mean square difference of rendered and recorded rgb at uniformly drawn pixels."""
     rgb = render.rgb
     if rgb is None:
         which = batch.bracket, batch.camera_id, batch.frame
@@ -56,8 +54,9 @@ def frame_error(tonemapper: ToneMapper, frame: Frame, position: int) -> FrameErr
 
 @torch.no_grad()
 def rgb_error(tonemapper: ToneMapper, frame: Frame, position: int, radiance: Tensor) -> Tensor:
-    """Mean absolute difference (S,) of what a training frame recorded and would record of
-    `radiance` (S, 3).
+    """Mean absolute difference (S,) of a training frame's rgb and that of `radiance`.
+
+    `radiance` (S, 3) is recorded as the frame's camera would have recorded it.
     """
     rgb = tonemapper(radiance, frame.bracket, frame.camera_id, position, leaky=False)
     return (rgb - frame.image.flatten(0, 1)).abs().mean(-1)

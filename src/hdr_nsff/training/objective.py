@@ -1,9 +1,9 @@
-"""The paper's objective (eq. 16), term by term, for any field: everything here needs a
-`Render` and a tone mapper only. docs/method.md lists the terms beside the paper's.
+"""The paper's objective (eq. 16), term by term, for any field.
 
-Terms that only some fields make possible, and the tone mapper's, carry weights of their
-own; `total` sums all of them by name. `phase` is the time since the start in units of
-the schedule's period K.
+Everything here needs a `Render` and a tone mapper only. docs/method.md#eq-16 lists the
+terms beside the paper's. Terms of some fields only, and of the tone mapper, have their
+weights there; `total` sums all terms by name. `phase` is the time since the start in
+units of the schedule's period K.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Objective:
         return terms
 
     def trust(self, batch: PixelBatch) -> Tensor:
-        """Trust (N, 3) in recorded values where the dynamic content is compared to them."""
+        """Trust (N, 3) in recorded values in the terms of the dynamic content."""
         if self.saturation:
             return losses.saturation_weight(batch.rgb)
         return torch.ones_like(batch.rgb)
@@ -74,8 +74,10 @@ class Objective:
     def dynamic(
         self, render: Render, rgb: Tensor, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
-        """The dynamic branch against the recording: everywhere in the first phase, later
-        by its share of the ray. Without such a branch, the extra moving pixels.
+        """Eq. 7: the dynamic branch against the recording.
+
+        It counts everywhere in the first phase, later by its share of the ray. Without
+        such a branch, the extra moving pixels count.
         """
         if render.dynamic_radiance is not None:
             rgb = record(render.dynamic_radiance, batch, tonemap)
@@ -91,8 +93,9 @@ class Objective:
     def warped(
         self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
-        """Eq. 13 for the neighbors, and through two steps from phase 2 on; weighted by
-        what is not disoccluded.
+        """Eq. 13 for the neighbors, and through two steps from phase 2 on.
+
+        Disoccluded pixels weigh less, by the confidence of the warp.
         """
 
         def term(warp: Warp) -> Tensor:
@@ -115,9 +118,7 @@ class Objective:
         return terms
 
     def priors(self, render: Render, batch: PixelBatch, phase: float) -> dict[str, Tensor]:
-        """Depth, optical flow and moving mask; depth and flow are multiplied by `fade`
-        every phase.
-        """
+        """Eq. 14 and the moving mask; depth and flow fade by `fade` every phase."""
         terms = {}
         fade = self.fade ** int(phase)
         depth = render.depth if render.dynamic_depth is None else render.dynamic_depth
@@ -157,10 +158,10 @@ def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
 
 
 def merge_weights(shared: LossWeights, *others: dict[str, float]) -> dict[str, float]:
-    """All weights of a run by the names of their terms, each made in one place."""
+    """All weights of a run by the names of their terms; no name may occur twice."""
     merged = asdict(shared)
     for weights in others:
-        twice = set(merged) & set(weights)
-        assert not twice, f"weights of one name in two places: {sorted(twice)}"
+        repeated = set(merged) & set(weights)
+        assert not repeated, f"weights of one name in two places: {sorted(repeated)}"
         merged |= weights
     return merged

@@ -95,8 +95,9 @@ def tiny() -> TrainConfig:
 
 
 def nsff_paper() -> TrainConfig:
-    """NSFF at its published size: `paper` without a tone mapper, with squared errors that
-    trust every recorded value.
+    """NSFF at its published size: `paper` without a tone mapper.
+
+    Its errors are squared and trust every recorded value.
     """
     return replace(paper(), tonemap=NO_TONE_MAPPER, squared=True, saturation=False)
 
@@ -165,8 +166,9 @@ def hexplane_paper() -> TrainConfig:
 
 
 def hexplane() -> TrainConfig:
-    """The same for minutes on a CPU: smaller grids and batches, and rates for a twentieth
-    of the steps.
+    """HDR-HexPlane for minutes on a CPU: smaller grids and batches.
+
+    Its rates are those for a twentieth of the steps.
     """
     field = HexPlaneConfig(
         coarsest=48,

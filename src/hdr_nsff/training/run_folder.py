@@ -1,5 +1,7 @@
-"""A run folder: config.json, checkpoints/ (safetensors, newest two kept), snapshots/
-where `bench` asks for them, log.jsonl, previews/. `Run.open` rebuilds field and tone
+"""A run folder: save and open.
+
+It holds config.json, checkpoints/ (safetensors, newest two kept), snapshots/ where
+`bench` asks for them, log.jsonl and previews/. `Run.open` rebuilds field and tone
 mapper from it alone. Nothing is unpickled; every write is atomic.
 """
 
@@ -19,8 +21,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.notes import LogLine
-from hdr_nsff.fields.base import RadianceField, recorded
+from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import build_field, device_for
+from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
@@ -36,12 +39,12 @@ SCENE_FROM_RUN = "scene_from_run"  # key of config.json: the scene's path from t
 def keep_snapshot(
     folder: Path, share: float, step: int, seconds: float, tensors: dict[str, Tensor]
 ) -> None:
-    """Write snapshots/share_X.safetensors: what was learned by that share of the run. A
-    resumed run that gets there again writes it again.
+    """Write snapshots/share_X.safetensors: what was learned by that share of the run.
+
+    A resumed run that gets there again writes it again.
     """
-    write_checkpoint(
-        Path(folder) / "snapshots" / f"share_{share:.6f}.safetensors", step, seconds, tensors
-    )
+    path = Path(folder) / "snapshots" / f"share_{share:.6f}.safetensors"
+    write_checkpoint(path, step, seconds, tensors)
 
 
 def snapshots(folder: Path) -> dict[float, Path]:
@@ -64,8 +67,9 @@ class Run:
 
     @staticmethod
     def open(folder: Path | str, device: str = "cpu", at: Path | None = None) -> Run:
-        """Read a run folder, as its newest checkpoint has it or as the file `at` does;
-        InputError in one sentence where it is none, unfinished or damaged.
+        """Read a run folder, from its newest checkpoint or from the file `at`.
+
+        InputError where it is no run folder, unfinished or damaged.
         """
         folder = Path(folder)
         config = read_config(folder)
@@ -97,8 +101,9 @@ class Run:
 
 
 def open_folder(config: TrainConfig) -> None:
-    """Start a run folder, or make sure an existing one was started with the same
-    settings on the same scene; a scene that has moved is written down.
+    """Start a run folder, or check that an existing one has these settings and scene.
+
+    The path of a scene that has moved is updated.
     """
     out = config.out
     if (out / CONFIG).exists():
@@ -118,8 +123,10 @@ def open_folder(config: TrainConfig) -> None:
 
 
 def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:
-    """InputError where the scene of a run still stands at one of `places`, and that of
-    `config` is neither it nor a copy of it.
+    """InputError where a run is to go on with another scene.
+
+    `places` are where its own scene may be. The scene of `config` is another one where
+    it is neither of them, nor a copy, and one of them still exists.
     """
     known = [place / MANIFEST for place in places if (place / MANIFEST).is_file()]
     given = config.scene / MANIFEST
@@ -132,8 +139,9 @@ def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:
 
 
 def read_config(folder: Path) -> TrainConfig:
-    """The config of a run folder, with its scene where it now is. InputError where the
-    scene is at none of the places that the run knows.
+    """The config of a run folder, with its scene where it now is.
+
+    InputError where the scene is at none of the places that the run knows.
     """
     config, places = stored_config(folder)
     for scene in places:
@@ -146,9 +154,10 @@ def read_config(folder: Path) -> TrainConfig:
 
 
 def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
-    """The config of a run folder as it was written, and where its scene may be: beside
-    the run first, as far from it as when it was trained, so that a folder that holds
-    both can be moved or copied; then where it was.
+    """The config of a run folder as it was written, and where its scene may be.
+
+    Its path relative to the run folder comes first, so that a folder with both can be
+    moved or copied; then its absolute path.
     """
     path = Path(folder) / CONFIG
     if not path.is_file():
@@ -190,13 +199,13 @@ def write_preview(
     """previews/: a training frame as recorded and as rendered, side by side."""
     recorder = tonemapper.recorder(frame.bracket, frame.camera_id, position)
     with torch.no_grad():
-        rgb = recorded(field, frame.camera, frame.time, [recorder])[0].view_as(frame.image)
+        rgb = record_pixels(field, frame.camera, frame.time, [recorder])[0].view_as(frame.image)
     pair = torch.cat([frame.image, rgb], 1).cpu().numpy()
     write_png(folder / "previews" / f"step_{step:08d}.png", pair)
 
 
 def append_log(folder: Path, clock: Clock, num_rays: int, values: dict[str, float]) -> None:
-    """Add a line to log.jsonl: the `values` of a step, which compared `num_rays` pixels."""
+    """Add to log.jsonl the `values` of a step that compared `num_rays` pixels."""
     line = {
         "step": clock.step,
         "seconds": round(clock.seconds, 3),
@@ -213,9 +222,7 @@ def append_log(folder: Path, clock: Clock, num_rays: int, values: dict[str, floa
 
 
 def last_logged(folder: Path) -> LogLine | None:
-    """The last complete line of log.jsonl, without reading all of it; None where there
-    is none.
-    """
+    """The last complete line of log.jsonl, if any, without reading all of it."""
     path = Path(folder) / "log.jsonl"
     if not path.is_file():
         return None
@@ -231,14 +238,15 @@ def last_logged(folder: Path) -> LogLine | None:
 
 
 def read_log(folder: Path) -> list[LogLine]:
-    """Complete lines of log.jsonl; where a resumed run wrote a step again, the last
-    line of it counts.
+    """Complete lines of log.jsonl, in order of their steps.
+
+    Where a resumed run wrote a step again, its last line counts.
     """
     path = Path(folder) / "log.jsonl"
+    if not path.is_file():
+        return []
     lines: dict[int, LogLine] = {}
-    for text in (
-        path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
-    ):
+    for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
             line = LogLine.model_validate_json(text)
         except ValueError:  # cut short by a kill

@@ -1,4 +1,4 @@
-"""The start of a run: brightness and surfaces of the field, from what `prepare` found."""
+"""The start of a run: brightness and surfaces of the field, from `prepare`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from hdr_nsff.fields.build import AnyField, initialize_field
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapper, informative
 
-SUBSAMPLING = 4  # every this many pixels, along x and y, tell the typical radiance
-MIN_RADIANCE = 1e-6
+SUBSAMPLING = 4  # pixels: spacing, along x and y, of those that the typical radiance is from
+MIN_RADIANCE = 1e-6  # linear HDR, so that its logarithm is finite
 
 
 def start_field(

@@ -102,7 +102,7 @@ def check_place(path: Path) -> None:
         advice = f"name the file to write, such as {path / 'report.html'}"
         raise InputError(f"{path}: is a folder; {advice}")
     if path.exists() and not is_report(path):
-        problem = "is there already and is no report"
+        problem = "already exists and is not a report"
         raise InputError(f"{path}: {problem}; choose another place for the report")
 
 

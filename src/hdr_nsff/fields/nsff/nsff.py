@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.settings import Advanced, Weight
-from hdr_nsff.fields.base import Layers, Render
+from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.nsff.branches import MlpConfig
 from hdr_nsff.fields.nsff.samples import BranchOutput, RaySamples, map_chunks, render_in_chunks
 from hdr_nsff.fields.nsff.scene_flow import SceneFlowPass
 from hdr_nsff.fields.nsff.two_branches import BranchesConfig, TwoBranches
+from hdr_nsff.fields.outputs import Layers
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import volume
 from hdr_nsff.scene.batch import PixelBatch

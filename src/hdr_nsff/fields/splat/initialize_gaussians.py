@@ -84,7 +84,7 @@ def still(f: Frame) -> Tensor:
 
 
 def thin(points: PointCloud, scene: Scene, limit: int) -> PointCloud:
-    """At most `limit` points, one per cell: pixel-shaped in a frustum, cubes elsewhere."""
+    """At most `limit` points, one per cell: a pixel's frustum, or a cube in a box."""
     space = build_space([f.camera for f in scene.train], scene.near, scene.far)
     coords = space.encode(points.positions)
     if isinstance(space, FrustumSpace):

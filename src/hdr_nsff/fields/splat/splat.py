@@ -20,8 +20,9 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
 from hdr_nsff.core.tensors import tree_map
-from hdr_nsff.fields.base import FrameError, GaussianCloud, ParamGroup, Render, Warp
+from hdr_nsff.fields.base import FrameError, ParamGroup, Render, Warp
 from hdr_nsff.fields.knots import interpolate_linear, knot_of
+from hdr_nsff.fields.outputs import GaussianCloud
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import relocate
@@ -345,7 +346,7 @@ class Splat(nn.Module):
     def rigidity(self) -> Tensor:
         """Mean square difference of the mixtures of neighboring moving Gaussians.
 
-        Those that mix the motions alike keep their distances.
+        Gaussians with the same mixture of motions keep their distances.
         """
         mixture = self.mixture_logits.softmax(0)  # (B, M)
         of_neighbors = mixture[:, self.neighbors.long().flatten()]

@@ -56,7 +56,7 @@ def read(folder: Path) -> Capture:
     evs = [exposure_of(path, frame, kind) for frame in frames]
     if any(ev is None for ev in evs) and any(ev is not None for ev in evs):
         raise InputError(
-            f"{path}: only some frames have `exposures`; they hold how each was exposed, "
+            f"{path}: only some frames have `exposures`, the exposure of a frame; "
             "copy the file again"
         )
     order = sorted(range(len(frames)), key=lambda k: (cameras[k], times[k]))
@@ -110,6 +110,6 @@ def exposure_of(path: Path, frame: dict[str, Any], kind: str) -> float | None:
         value = math.log2(value)
     if abs(value) > MAX_EV:
         raise InputError(
-            f"{path}: {name} has an exposure of {value:g} stops, which is none; correct it"
+            f"{path}: {name} has an exposure of {value:g} stops, beyond {MAX_EV:g}; correct it"
         )
     return value

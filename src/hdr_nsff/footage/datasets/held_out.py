@@ -70,7 +70,7 @@ def write_truth(
     brackets = Brackets.of(capture, manifest)
     rows = comparable_views(views, manifest, own_time, brackets)
     if not rows:
-        say("truth: no held-out view can be compared with")
+        say("truth: no held-out view can be compared with this scene")
         if truth_folder(out) is not None:  # of other settings
             (out / "truth.json").unlink()
         return None
@@ -122,8 +122,8 @@ def comparable_views(
     lost = len(views) - len(rows)
     if lost:
         say(
-            f"truth: {lost} of {len(views)} held-out views are of times that no training "
-            "pictures surround: left out"
+            f"truth: {lost} of {len(views)} held-out views lie outside the times of the "
+            "training pictures: left out"
         )
     kept = {}
     for row in rows:
@@ -221,8 +221,8 @@ class Brackets:
         if exposure is None:
             return 0 if len(self.ev) == 1 else None
         if isinstance(exposure, list):
-            alike = set(exposure)
-            return next((f.bracket for f in self.entries if f.source in alike), None)
+            sources = set(exposure)
+            return next((f.bracket for f in self.entries if f.source in sources), None)
         for frame in self.entries:
             own = self.capture.by_source[frame.source].ev
             if own is not None and abs(own - exposure) < SAME_EV:
@@ -276,7 +276,7 @@ def truth_key(
 
 
 def claim_folder(out: Path, key: str) -> bool:
-    """Whether the truth folder `out` is complete and made of what `key` stands for.
+    """Whether the truth folder `out` is complete and was made with this `key`.
 
     Otherwise a note of that is written, and files made of something else are removed.
     InputError where the folder holds something else.
@@ -289,7 +289,7 @@ def claim_folder(out: Path, key: str) -> bool:
     is_ours = (out / NOTE).is_file()
     if out.exists() and not is_ours and (not out.is_dir() or any(out.iterdir())):
         raise InputError(
-            f"{out}: is there already and was not made by prepare; "
+            f"{out}: already exists and was not made by prepare; "
             "choose another place with --truth-out"
         )
     (out / "truth.json").unlink(missing_ok=True)

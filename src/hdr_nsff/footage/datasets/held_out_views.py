@@ -159,12 +159,12 @@ def exported_view(capture: Capture, name: str, extra: Extra) -> HeldOut:
     """A held-out view as `export` wrote it into nerfstudio's layout."""
     own = extra.frames[name]
     file = picture_file(capture.root, name, f"a held-out view of {nerfstudio.NAME}")
-    alike: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
+    same_exposure: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
     mask = None
     if own.moving is not None:
         purpose = f"the moving mask of held-out view {plain_name(name)}"
         mask = map_file(capture.root, own.moving, purpose)
-    return HeldOut(plain_name(name), own.time, [(file, alike)], mask=mask)
+    return HeldOut(plain_name(name), own.time, [(file, same_exposure)], mask=mask)
 
 
 def plain_name(name: str) -> str:
@@ -210,14 +210,16 @@ def noted_views(capture: Capture, dense: Path, extra: Extra) -> tuple[list[HeldO
     views = []
     rows = []
     for name, own in extra.held_out.items():
-        alike: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
+        same_exposure: Exposure = [p.source for p in capture.pictures if p.bracket == own.bracket]
         picture = picture_file(dense, name, f"held-out view {own.name}")
         mask = None
         if own.mask is not None:
             purpose = f"the moving mask of held-out view {own.name}"
             mask = picture_file(dense, own.mask, purpose)
         anchor = sources[own.anchor]
-        views.append(HeldOut(own.name, own.time, [(picture, alike)], mask=mask, anchor=anchor))
+        views.append(
+            HeldOut(own.name, own.time, [(picture, same_exposure)], mask=mask, anchor=anchor)
+        )
         rows.append(capture.row[anchor])
     return views, select_poses(training_poses(capture), rows)
 
@@ -263,12 +265,12 @@ def llff_view(
             f"{folder / name}: camera {camera + 1} has no training picture and so no pose; "
             "copy the pictures again"
         )
-    alike: Exposure = [p.source for p in pictures[camera::cameras]]
+    same_exposure: Exposure = [p.source for p in pictures[camera::cameras]]
     time = step + (0.5 if folder.name == llff.MULTI_VIEW[1] else 0.0)
     return HeldOut(
         f"t{time:07.1f}_camera{camera + 1}",
         time,
-        [(folder / name, alike)],
+        [(folder / name, same_exposure)],
         mask=mask,
         anchor=pictures[camera].source,
     )

@@ -77,7 +77,7 @@ def carry_view(
         if truth.clip_c2w is None:
             raise InputError(
                 f"{folder}: view {view.name} has a pose of its own, but clip_c2w is missing; "
-                "it cannot be carried over"
+                "make the truth again"
             )
         true_anchor = np.array(truth.clip_c2w[view.anchor])
         c2w = alignment.transfer_pose(c2w, true_anchor, np.array(view.c2w), scale)

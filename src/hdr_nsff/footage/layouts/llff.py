@@ -252,8 +252,8 @@ def place_views(
     if lost:
         say(
             f"{out / 'dense'}: left out {len(lost)} of {len(views)} held-out views "
-            f"({', '.join(lost)}): the layout has a place for one view from the pose of a "
-            "training picture at the time of one or half-way to the next; "
+            f"({', '.join(lost)}): the layout holds one view per pose of a training picture "
+            "and per time, of a training picture or half-way to the next; "
             "--layout nerfstudio takes all"
         )
     return placed

@@ -127,7 +127,7 @@ def earlier_files(out: Path) -> set[str]:
         return set(note.files)
     if any(not path.name.startswith(".") for path in out.iterdir()):
         raise InputError(
-            f"{out}: is there already and was not made by export; choose an empty or new folder"
+            f"{out}: already exists and was not made by export; choose an empty or new folder"
         )
     return set()
 

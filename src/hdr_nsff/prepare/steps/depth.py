@@ -1,4 +1,4 @@
-"""The step `depth`: depth of everything, the static scene with the movers put into it."""
+"""The step `depth`: depth of the static scene with the movers put into it."""
 
 from __future__ import annotations
 

@@ -19,7 +19,8 @@ from hdr_nsff.priors.masks.geometric import geometric_mask
 def find_masks(work: Work) -> StepResult:
     """Moving masks, given or estimated.
 
-    Training frames are judged by flow among training frames alone; held-out ones by all.
+    Masks of training frames come from flow among training frames alone, those of
+    held-out frames from all flow.
     """
     m, c = work.manifest, work.config
     given = isinstance(c.masks, Path) or work.gives("masks") is not None

@@ -1,5 +1,6 @@
-"""Masks and depth by networks: what `prepare --mask sam2` and `--depth depth-anything`
-do with a clip of one or more cameras; and which weights the steps read.
+"""Masks and depth by networks: `prepare --mask sam2` and `--depth depth-anything`.
+
+A clip has one or more cameras. This file also lists the weights that steps read.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ PROMPTS = "masks/prompts.json"
 
 
 def check_networks(config: PrepareConfig) -> None:
-    """InputError where a network that was chosen cannot run, before anything else is
-    done; its weights are downloaded where they may be.
+    """InputError where a chosen network cannot run, before anything else is done.
+
+    Its weights are downloaded where that is allowed.
     """
     check_matcher(config.matcher)
     if config.masks == "sam2":
@@ -41,7 +43,8 @@ def check_networks(config: PrepareConfig) -> None:
         find(config.mask_weights)
     elif config.mask_points is not None:
         raise InputError(
-            "--mask-points: only `--mask sam2` can be corrected by points; choose it, or paint over the files in masks/ and give them"
+            "--mask-points: only `--mask sam2` can be corrected by points; "
+            "choose it, or paint over the files in masks/ and give them"
         )
     if config.depth == "depth-anything":
         architecture(DEPTH_ANYTHING)
@@ -49,9 +52,7 @@ def check_networks(config: PrepareConfig) -> None:
 
 
 def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
-    """The hashes of the weights that a step reads. InputError where they are not to be
-    had.
-    """
+    """Hashes of the weights that a step reads; InputError where they are missing."""
     match step:
         case "flow":
             paths = flow_weights(config.flow, config.flow_weights, config.semantic)
@@ -66,61 +67,70 @@ def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
     return [content_hash(path) for path in paths]
 
 
-def ready(network: str, weights: str) -> Any:
+def load_network(network: str, weights: str) -> Any:
     """The network, on the GPU where there is one."""
-    return pretrained(network, weights).to("cuda" if torch.cuda.is_available() else "cpu")
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    return pretrained(network, weights).to(device)
 
 
 def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
-    """`moving` (T, H, W) bool outlined by SAM 2, camera by camera; what it was asked is
-    written to `masks/prompts.json`.
+    """`moving` (T, H, W) bool outlined by SAM 2, camera by camera.
 
     Masks of training frames come from training frames alone; held-out ones get theirs
-    from a second run over all frames.
+    from a second run over all frames. Prompts are written to `masks/prompts.json`.
     """
-    m, c = work.manifest, work.config
-    given = (
-        PointsFile()
-        if c.mask_points is None
-        else read_points(c.mask_points, len(m.frames), (m.height, m.width))
-    )
-    if other := sorted(
-        {e.frame for e in (*given.points, *given.boxes) if m.frames[e.frame].split != "train"}
-    ):
-        raise InputError(
-            f"{c.mask_points}: frame {other[0]} is held out of training; point at frames beside it"
-        )
-    network = ready(SAM2, c.mask_weights)
+    frames = work.manifest.frames
+    given = given_points(work)
+    network = load_network(SAM2, work.config.mask_weights)
     video = work.equalized[0]
     outlined = np.zeros_like(moving)
     written: dict[str, list[Any]] = {"points": [], "boxes": []}
-    number = 0  # of objects of the cameras before
-    for frames in work.camera_frames():
-        train = [i for i in frames if m.frames[i].split == "train"]
-        asked = merge_prompts(find_objects(moving[train], number + 1), given, train)
-        number = max([number, *(a.number for a in asked)])
-        for key, entries in to_points_file(asked, train).items():
+    num_objects = 0  # of the cameras before
+    for of_camera in work.camera_frames():
+        train = [i for i in of_camera if frames[i].split == "train"]
+        found = find_objects(moving[train], num_objects + 1)
+        prompts = merge_prompts(found, given, train)
+        num_objects = max([num_objects, *(p.number for p in prompts)])
+        for key, entries in to_points_file(prompts, train).items():
             written[key] += entries
-        outlined[train] = sam2_mask(network, video[train], asked, "masks: sam2")
-        held_out = [i for i in frames if i not in train]
+        outlined[train] = sam2_mask(network, video[train], prompts, "masks: sam2")
+        held_out = [i for i in of_camera if i not in train]
         if held_out:
-            again = [a.remap_frames(train, frames) for a in asked]
-            among = sam2_mask(network, video[frames], again, "masks: sam2, held-out frames")
-            outlined[held_out] = among[np.searchsorted(frames, held_out)]
+            remapped = [p.remap_frames(train, of_camera) for p in prompts]
+            note = "masks: sam2, held-out frames"
+            of_all = sam2_mask(network, video[of_camera], remapped, note)
+            outlined[held_out] = of_all[np.searchsorted(of_camera, held_out)]
     if not written["points"] and not written["boxes"]:
-        say("masks: nothing moves that sam2 could be asked about")
+        say("masks: nothing moves that sam2 could outline")
     write_json(work.folder / PROMPTS, written)
     return outlined
 
 
+def given_points(work: Work) -> PointsFile:
+    """The user's points; InputError where one is in a held-out frame."""
+    m = work.manifest
+    path = work.config.mask_points
+    if path is None:
+        return PointsFile()
+    given = read_points(path, len(m.frames), (m.height, m.width))
+    named = sorted({entry.frame for entry in (*given.points, *given.boxes)})
+    held_out = [i for i in named if m.frames[i].split != "train"]
+    if held_out:
+        raise InputError(
+            f"{path}: frame {held_out[0]} is held out of training; point at frames beside it"
+        )
+    return given
+
+
 def network_depth(work: Work) -> tuple[np.ndarray, np.ndarray, float, float, Kind]:
-    """Disparity and confidence (T, H, W) of the training frames, near and far, by Depth
-    Anything; and its kind.
+    """Disparity and confidence (T, H, W) of the training frames by Depth Anything.
+
+    With near and far, and the kind of the network's depth.
     """
     m = work.manifest
     clip = work.training_clip()
-    network = ready(DEPTH_ANYTHING, work.config.depth_weights)
-    answered, kind = network_disparity(network, clip.video)
+    network = load_network(DEPTH_ANYTHING, work.config.depth_weights)
+    predicted, kind = network_disparity(network, clip.video)
     points = np.array(read_npy(work.folder / m.points)) if m.points else np.zeros((0, 3))
     flow = work.training_flows(work.raw_flows)
-    return *anchored_depth(answered, kind, clip, points, *flow), kind
+    return *anchored_depth(predicted, kind, clip, points, *flow), kind

@@ -72,8 +72,10 @@ def data_set_poses(work: Work) -> Poses:
 
 
 def poses_and_masks(work: Work) -> Poses:
-    """Structure from motion in up to three rounds: poses need masks, and good masks need
-    poses. The last round is the one whose masks are nearly those before.
+    """Structure from motion in up to three rounds.
+
+    Poses need masks, and good masks need poses. The rounds end once the masks hardly
+    change any more.
     """
     cache = work.folder / FIRST_ROUND
     if cache.is_file():

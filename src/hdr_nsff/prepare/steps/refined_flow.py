@@ -1,4 +1,4 @@
-"""The step `refined_flow`: flow of movers once more, now that masks and response are known.
+"""The step `refined_flow`: flow of movers again, with masks and response known.
 
 Where pixels move, flow is refined from moving pixels alone, on frames brought to one
 exposure through the response; where it fails the round trip or is clipped, it is filled
@@ -24,8 +24,9 @@ from hdr_nsff.scene.response import read_response
 
 
 def refine_flow(work: Work) -> StepResult:
-    """Refined flow of every pair that was matched, both ways, a pair at a time so that a
-    killed run keeps them.
+    """Refined flow of every pair that was matched, in both directions.
+
+    Each pair is stored at once, so that a killed run keeps it.
     """
     m = work.manifest
     own = [

@@ -1,5 +1,7 @@
-"""The step `static_depth`: depth before movers are known. Of the static scene, also
-behind what moves, or, where a network, the user or a data set gives depth, of all.
+"""The step `static_depth`: depth before movers are known.
+
+It is that of the static scene, also behind moving pixels. Where a network, the user or
+a data set gives depth, it is that of everything.
 """
 
 from __future__ import annotations

@@ -89,7 +89,7 @@ def static_geometric_depth(
         views, parallax = choose_views(clip, points, tuning.max_views, tuning.parallax)
     if parallax < tuning.min_parallax_px:
         say(
-            f"depth: {parallax:.1f} pixels of parallax between the frames are too few: "
+            f"depth: a parallax of {parallax:.1f} pixels between the frames is too small: "
             "everything is put at distance 1"
         )
         shape = (count, *clip.size)

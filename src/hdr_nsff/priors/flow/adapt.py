@@ -293,6 +293,6 @@ def adapt_features(clip: TrainingClip, steps: int, seed: int) -> Tensor:
         total.backward()
         optimizer.step()
     steps_per_second = steps / (time.monotonic() - begin)
-    say(f"features of this clip: {steps} steps, {steps_per_second:.1f} a second")
+    say(f"features of this clip: {steps} steps, {steps_per_second:.1f} per second")
     with torch.no_grad():
         return torch.cat([clip.refine(network, [t]) for t in range(len(clip.maps))])

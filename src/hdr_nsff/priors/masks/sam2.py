@@ -2,8 +2,8 @@
 
 Flow finds moving objects but outlines them roughly, and loses one that pauses; the
 network (Ravi et al., "SAM 2: Segment Anything in Images and Videos", 2024) outlines
-well but does not know what moves. Each object is prompted by itself (`prompts`), so
-that it spreads from its own clearest frame, both ways through the clip.
+well but does not know which objects move. Each object is prompted separately
+(`prompts`) and tracked from its clearest frame, forward and backward.
 """
 
 from __future__ import annotations

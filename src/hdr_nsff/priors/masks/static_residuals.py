@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.round_trip import follow
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING, GeometricMaskTuning
 from hdr_nsff.priors.poses.rotation import epipolar, homography
@@ -124,15 +125,9 @@ def chain_flow(
     return chains
 
 
-def pixel_centers(shape: tuple[int, ...]) -> np.ndarray:
-    """Pixel centers (H, W, 2), x then y."""
-    y, x = np.mgrid[: shape[0], : shape[1]]
-    return np.stack([x, y], -1) + 0.5
-
-
 def sample_matches(flow: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Matches (M, 2), (M, 2) on a sparse grid of pixels, where flow is valid (H, W)."""
-    starts = pixel_centers(valid.shape)
+    starts = pinhole.pixel_centers(*valid.shape)
     chosen = np.zeros(valid.shape, bool)
     grid = np.s_[SAMPLING // 2 :: SAMPLING, SAMPLING // 2 :: SAMPLING]
     chosen[grid] = valid[grid]
@@ -172,7 +167,7 @@ def epipolar_residual(
     matrix, _ = epipolar(*sample_matches(flow, valid), tuning.ransac_px)
     if matrix is None or matrix.shape != (3, 3):
         return np.zeros(flow.shape, np.float32)
-    starts = pixel_centers(valid.shape)
+    starts = pinhole.pixel_centers(*valid.shape)
     lines = starts @ matrix[:, :2].T + matrix[:, 2]  # (H, W, 3) in the other frame
     normals = lines[..., :2]
     offsets = np.sum((starts + flow) * normals, -1) + lines[..., 2]
@@ -190,7 +185,7 @@ def homography_residual(
     matrix, _ = homography(*sample_matches(flow, valid), tuning.ransac_px)
     if matrix is None:
         return np.zeros(flow.shape, np.float32)
-    starts = pixel_centers(valid.shape)
+    starts = pinhole.pixel_centers(*valid.shape)
     ends = cv2.perspectiveTransform(starts.reshape(-1, 1, 2), matrix).reshape(starts.shape)
     return (ends - starts - flow).astype(np.float32)
 
@@ -204,29 +199,24 @@ def static_residual(
 ) -> np.ndarray:
     """Residuals (chains, H, W, 2) px to static points at each pixel's best depth.
 
-    A point at inverse depth `rho >= 0` along a pixel's ray is `rotated + rho * shift`
-    in another camera (up to scale); that it projects to the flow's end is linear in
-    rho. Rho is solved from all frames at once, robustly (Cauchy weights). Invalid flow
+    A pixel at disparity `rho >= 0` falls on the homogeneous `rotated + rho * shift` of
+    another frame (`pinhole.transfer`); that this is the flow's end is linear in rho.
+    Rho is solved from all frames at once, robustly (Cauchy weights). Invalid flow
     counts over one link only, and only where nothing is valid. `K` is (T, 3, 3) px of
     the working grid, `c2w` (T, 3, 4) OpenCV.
     """
-    shape = chains[0].valid.shape
-    starts = np.concatenate([pixel_centers(shape), np.ones((*shape, 1))], -1)
-    rays = starts @ np.linalg.inv(K[frame]).T
+    starts = pinhole.pixel_centers(*chains[0].valid.shape)
+    homogeneous = pinhole.homogeneous(starts)  # (H, W, 3)
     slopes = []  # residual = slope * rho + offset
     offsets = []
     trusts = []
     for chained in chains:
         other = chained.frame
-        focal = K[other, 0, 0]
-        world_to_other = c2w[other, :, :3].T
-        rotated = rays @ (world_to_other @ c2w[frame, :, :3]).T
-        shift = world_to_other @ (c2w[frame, :, 3] - c2w[other, :, 3])
-        end = starts[..., :2] + chained.flow
-        end = (end - K[other, :2, 2]) / K[other, (0, 1), (0, 1)]  # normalized coordinates
-        slopes.append((focal * (shift[:2] - end * shift[2])).astype(np.float32))
-        offset = focal * (rotated[..., :2] - end * rotated[..., 2:])
-        offsets.append(offset.astype(np.float32))
+        rotation, shift = pinhole.transfer(K[frame], c2w[frame], K[other], c2w[other])
+        rotated = homogeneous @ rotation.T
+        end = starts + chained.flow
+        slopes.append((shift[:2] - end * shift[2]).astype(np.float32))
+        offsets.append((rotated[..., :2] - end * rotated[..., 2:]).astype(np.float32))
         invalid_trust = tuning.invalid_trust if chained.count == 1 else 0.0
         trusts.append(np.where(chained.valid, 1.0, invalid_trust).astype(np.float32))
     slope = np.stack(slopes)  # (chains, H, W, 2)

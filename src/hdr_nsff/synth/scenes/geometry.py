@@ -35,23 +35,6 @@ def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
     return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
 
 
-def pixel_centers(height: int, width: int) -> np.ndarray:
-    """Coordinates (H, W, 2) px of the pixels' centers."""
-    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    return np.stack([x, y], -1)
-
-
-def ray_directions(height: int, width: int, K: np.ndarray) -> np.ndarray:
-    """Directions (H, W, 3) through the pixels' centers in the camera's axes, z = 1."""
-    x, y = np.moveaxis(pixel_centers(height, width), -1, 0)
-    return np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
-
-
-def project(points: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (..., 2), centers at +0.5, and z-depth (...) of world points (..., 3)."""
-    return pinhole.project(points, K, c2w)
-
-
 def back_project(depth: np.ndarray, K: np.ndarray, c2w: np.ndarray) -> np.ndarray:
     """World points (H, W, 3) at z-depth (H, W) behind the pixel centers."""
     return pinhole.unproject(pinhole.pixel_centers(*depth.shape), depth, K, c2w)
