@@ -21,6 +21,7 @@ from bad_input import (
     snapshot,
     training,
 )
+from toy_scene import ToyScene
 
 from hdr_nsff.core.io import write_text
 
@@ -161,6 +162,24 @@ def test_a_run_with_other_settings_stays_as_it_is(run_folder: Path, capsys: Capt
     assert "other settings" in refused(
         capsys, *training(run_folder.parent / "scene", run_folder, 3)
     )
+    assert snapshot(run_folder) == before
+
+
+def test_a_run_learns_where_its_scene_has_moved_to(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    moved = (run_folder.parent / "scene").rename(tmp_path / "elsewhere")
+    assert "its scene is not at" in refused(capsys, "report", run_folder)
+    assert call(*training(moved, run_folder, 2)) == 0
+    assert call("report", run_folder) == 0
+
+
+def test_a_run_is_not_continued_on_another_scene(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    other = ToyScene(frames=5).write(tmp_path / "other")
+    before = snapshot(run_folder)
+    assert "on another scene" in refused(capsys, *training(other, run_folder, 2))
     assert snapshot(run_folder) == before
 
 

@@ -189,6 +189,11 @@ MAPS: dict[str, tuple[str, Callable[[Path], None], str]] = {
         lambda p: write_npy(p, np.full((H, W), np.nan)),
         "NaN or Inf",
     ),
+    "a depth beyond single precision": (
+        "disparity/00002.npy",
+        lambda p: write_npy(p, np.full((H, W), 1e300)),
+        "NaN or Inf",
+    ),
     "a flow with Inf": (
         "raw_flow/00002_00003.npy",
         lambda p: write_npy(p, np.full((H, W, 2), np.inf)),

@@ -48,3 +48,15 @@ def test_files_that_are_missing_or_cut_short_are_refused(tmp_path: Path) -> None
     (tmp_path / "a.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-40])
     with pytest.raises(InputError, match="copy it again"):
         read_exr(tmp_path / "a.exr")
+
+
+def test_nothing_is_printed_of_damaged_pixels(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, {"RGB": np.tile(RGB, (9, 9, 1))})
+    data = path.read_bytes()
+    path.write_bytes(data[:-40] + b"\xff" * 40)  # OpenEXR warns of what it cannot decode
+    with pytest.raises(InputError, match="damaged"):
+        read_exr(path)
+    assert capfd.readouterr() == ("", "")

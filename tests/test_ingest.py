@@ -161,6 +161,11 @@ def test_a_file_that_cannot_be_read_is_named():
         hash_file(Path("/proc/self/mem"))
 
 
+def test_pipes_and_devices_are_not_read_without_end():
+    with pytest.raises(InputError, match="/dev/zero: missing, or no ordinary file"):
+        hash_file(Path("/dev/zero"))
+
+
 def write_dng(path: Path, level: float) -> None:
     """A small raw photograph of a gray card, its upper half at half `level` of the
     sensor's range.

@@ -31,6 +31,11 @@ def test_psnr_of_a_known_error():
     assert metrics.psnr(a, a) == pytest.approx(100.0)
 
 
+def test_psnr_of_an_infinite_error_is_its_limit():
+    a = torch.zeros(4, 4, 3)
+    assert metrics.psnr(a + math.inf, a) == -math.inf
+
+
 def test_psnr_on_a_mask_sees_only_the_mask():
     a, mask = torch.zeros(4, 4, 3), torch.zeros(4, 4, dtype=torch.bool)
     b = a.clone()
