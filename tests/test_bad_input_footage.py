@@ -23,8 +23,9 @@ from hdr_nsff.core.video import write_video
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:
-    """The sentence with which `prepare` refuses to make the folder `scene` beside the
-    footage; it leaves the rest alone.
+    """The sentence with which `prepare` refuses to write `scene` next to the footage.
+
+    No other file may change.
     """
 
     def rest() -> dict[Path, bytes]:
@@ -332,7 +333,7 @@ def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> Non
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)
         assert (tmp_path / "scene/scene.json").read_text() == text
-    # What the sentence offers starts anew.
+    # The command that the sentence suggests starts from the beginning.
     assert "at least 3" in prepared(capsys, folder, "--redo", "frames")
 
 

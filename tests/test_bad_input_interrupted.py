@@ -147,7 +147,7 @@ def test_ctrl_c_loses_nothing_and_the_same_command_continues(
     assert "Traceback" not in error and "the same command continues where it was" in error
     suffixes = {".png", ".exr", ".npy", ".ply"}
     if verb == "evaluate":
-        suffixes.remove(".png")  # it draws its comparisons anew
+        suffixes.remove(".png")  # it always draws its comparisons
     files = [p for p in tmp_path.rglob("*") if p.suffix in suffixes]
     kept = {p: p.stat().st_mtime_ns for p in files}
     assert kept and not list(tmp_path.rglob(".partial-*"))

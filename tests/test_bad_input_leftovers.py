@@ -1,5 +1,6 @@
-"""What earlier verbs have left, damaged or edited by hand: it is made again with a word
-about it, or named in one sentence.
+"""Damaged or edited files of earlier verbs.
+
+They are written again with a note about it, or named in one sentence.
 """
 
 from __future__ import annotations
