@@ -74,9 +74,8 @@ def main() -> None:
         frames = [read_exr(path) for path in sorted((scene / "exact").glob("clip_*.exr"))]
         assert len(frames) > args.pairs, f"{scene}: {len(frames)} frames in exact/"
         pairs = neighbors(len(frames), args.pairs)
-        print(
-            f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}"
-        )
+        height, width = frames[0]["Z"].shape
+        print(f"\n{scene.name}, {len(pairs)} pairs of {width}x{height}\n\n{HEADER}")
         for name in args.flows:
             network = (
                 None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
@@ -236,8 +235,18 @@ def summary(error: np.ndarray) -> dict[str, float]:
     }
 
 
-HEADER = """| flow | frames | EV | moving: mean, median px | < 1, < 3 px | still: mean, median px | < 1, < 3 px | believed: share, mean px | s |
-|---|---|---|---|---|---|---|---|---|"""
+COLUMNS = (
+    "flow",
+    "frames",
+    "EV",
+    "moving: mean, median px",
+    "< 1, < 3 px",
+    "still: mean, median px",
+    "< 1, < 3 px",
+    "believed: share, mean px",
+    "s",
+)
+HEADER = f"| {' | '.join(COLUMNS)} |\n|{len(COLUMNS) * '---|'}"
 
 
 def line(row: dict) -> str:

@@ -57,9 +57,7 @@ def main() -> None:
     exact = Scene.open(args.scene)
     wrong = Scene.open(perturbed(args.scene, args.out / "wrong_scene", args.seed))
     before = errors(exact, wrong.train)
-    print(
-        f"benchmark on an oracle scene, {args.preset}, {args.steps} steps; wrong poses: {told(before)}"
-    )
+    print(f"oracle scene, {args.preset}, {args.steps} steps; wrong poses: {told(before)}")
     for case in args.cases:
         scene = wrong.folder if case == "wrong" else args.scene
         for refine in (True,) if args.only_refined else (False, True):

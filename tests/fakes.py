@@ -133,11 +133,18 @@ def fake_run(
         frames.append(Frame(i, float(i), c, 0, i % 3, rgb, moving=moving))
     entries = [
         FrameEntry(
-            index=f.index, image=f"images/{f.index:05d}.png", source="made", time=f.time, bracket=f.bracket, ev=EV[f.bracket],
-            K=f.camera.K.tolist(), c2w=f.camera.c2w.tolist(), split="test" if f.index >= num_frames - held_out else "train",
+            index=f.index,
+            image=f"images/{f.index:05d}.png",
+            source="made",
+            time=f.time,
+            bracket=f.bracket,
+            ev=EV[f.bracket],
+            K=f.camera.K.tolist(),
+            c2w=f.camera.c2w.tolist(),
+            split="test" if f.index >= num_frames - held_out else "train",
         )
         for f in frames
-    ]  # fmt: skip
+    ]
     steps = {
         "exposure": StepRecord(
             done=True, provenance="given", note="EV -4, -2, 0 from --ev", seconds=0.1
@@ -146,9 +153,20 @@ def fake_run(
         "depth": StepRecord(done=True, provenance="absent", note="no parallax"),
     }
     manifest = Manifest(
-        source="made up <clip>", width=W, height=H, fps=12, cycle=3, reference_bracket=2, bracket_ev=list(EV),
-        exposure_given=True, parallax=parallax, near=1.0, far=8.0, frames=entries, steps=steps,
-    )  # fmt: skip
+        source="made up <clip>",
+        width=W,
+        height=H,
+        fps=12,
+        cycle=3,
+        reference_bracket=2,
+        bracket_ev=list(EV),
+        exposure_given=True,
+        parallax=parallax,
+        near=1.0,
+        far=8.0,
+        frames=entries,
+        steps=steps,
+    )
     cut = num_frames - held_out
     scene = Scene(
         folder=folder / "scene",

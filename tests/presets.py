@@ -24,8 +24,16 @@ from hdr_nsff.training.train import Trainer, train
 GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)
 MLP = MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2)
 HEXPLANE = HexPlaneConfig(
-    density_components=3, appearance_components=4, coarsest=8, finest=16, grow_every=3, width=16, samples=12, render_samples=16, cull_after=4
-)  # fmt: skip
+    density_components=3,
+    appearance_components=4,
+    coarsest=8,
+    finest=16,
+    grow_every=3,
+    width=16,
+    samples=12,
+    render_samples=16,
+    cull_after=4,
+)
 NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
     "splat": SplatConfig(static=400, moving=150, bases=2),
     "grid": GRID,

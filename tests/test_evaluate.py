@@ -38,7 +38,7 @@ def true_pose(c2w: Tensor) -> list[list[float]]:
 
 
 def write_truth(folder: Path, run: Run, field: DiscBeforeWall, **changes: Any) -> Path:
-    """Exact views: a clip pose at another time, one between frames, one off the path."""
+    """Exact views: a clip pose at another time, between frames, and off the path."""
     views = []
     for name, time, anchor, off in (
         ("a", 3.0, 1, None),

@@ -1,4 +1,4 @@
-"""`prepare` with networks: tiny ones, on a clip whose camera, flow and mover are known."""
+"""`prepare` with tiny networks, on a clip whose camera, flow and mover are known."""
 
 import json
 import shutil
@@ -76,7 +76,7 @@ def test_the_motion_mask_finds_the_square(motion):
         assert mask[square(t)].mean() > 0.8 and mask.mean() < 0.3
 
 
-def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it_outlines_something_else(
+def test_sam2_gets_points_of_the_square_and_its_wrong_outlines_are_rejected(
     clip, motion, tmp_path, capsys
 ):
     before = masks(motion)
@@ -194,12 +194,17 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         for file in ("config.json", "model.safetensors"):
             write_text(tmp_path / "cache" / name / file, name)
     tuned = {"flow": "raft-finetuned", "flow_weights": tmp_path / "tuned"}
+    dinov2 = SemanticConfig(features="dinov2-small")
     read = {
-        "gmflow": ("flow", {"flow": "gmflow"}), "raft": ("flow", {"flow": "raft"}), "xfeat": ("flow", {"flow": "semantic"}),
-        "dinov2-small": ("flow", {"flow": "semantic", "semantic": SemanticConfig(features="dinov2-small")}), "tuned": ("flow", tuned),
-        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("masks", {"masks": "sam2"}),
+        "gmflow": ("flow", {"flow": "gmflow"}),
+        "raft": ("flow", {"flow": "raft"}),
+        "xfeat": ("flow", {"flow": "semantic"}),
+        "dinov2-small": ("flow", {"flow": "semantic", "semantic": dinov2}),
+        "tuned": ("flow", tuned),
+        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}),
+        "sam2": ("masks", {"masks": "sam2"}),
         "depth-anything": ("static_depth", {"depth": "depth-anything"}),
-    }  # fmt: skip
+    }
     for name, (step, chosen) in read.items():
         config = replace(clip, **chosen)
         found = weights_of(config, step)

@@ -122,9 +122,19 @@ def test_a_truth_counts_all_frames_of_the_clip(tmp_path: Path) -> None:
 
 def test_every_option_of_prepare_reaches_it(tmp_path: Path) -> None:
     config = RunConfig(
-        tmp_path / "clip", tmp_path, ev="-2,0", start=3, end=9, stride=2, flow="dis",
-        masks="motion", depth="geometric", matcher="disk", redo=("poses",), hold_out=4,
-    )  # fmt: skip
+        tmp_path / "clip",
+        tmp_path,
+        ev="-2,0",
+        start=3,
+        end=9,
+        stride=2,
+        flow="dis",
+        masks="motion",
+        depth="geometric",
+        matcher="disk",
+        redo=("poses",),
+        hold_out=4,
+    )
     passed = prepare_settings(config)
     assert passed.out == tmp_path / "scene"
     for f in fields(PrepareConfig):

@@ -152,7 +152,8 @@ def test_a_camera_has_the_gradient_of_its_picture(
     step = 1e-4  # of the picture's width: 0.006 pixels
     if isinstance(field, NSFF):
         field.config = replace(field.config, cull=False, density_noise=0.0)
-    else:  # the wall's Gaussians are all equally deep: their order would change with the smallest turn
+    else:
+        # The wall's Gaussians share one depth: any turn would change their order.
         field.static.means.data.add_(
             0.4 * torch.randn(len(field.static), 3, generator=torch.Generator().manual_seed(1))
         )

@@ -336,9 +336,13 @@ def test_a_rig_has_one_camera_per_folder(tmp_path):
             shutil.copytree(one[kind], tmp_path / kind / name)
     write_npy(tmp_path / "poses_bounds.npy", np.load(one["poses"])[[*range(6)] * 2])
     config = PrepareConfig(
-        tmp_path / "rig", tmp_path / "scene", hold_out=0,
-        poses=tmp_path / "poses_bounds.npy", masks=tmp_path / "masks", depth=tmp_path / "depth",
-    )  # fmt: skip
+        tmp_path / "rig",
+        tmp_path / "scene",
+        hold_out=0,
+        poses=tmp_path / "poses_bounds.npy",
+        masks=tmp_path / "masks",
+        depth=tmp_path / "depth",
+    )
     scene = Scene.open(prepare(config))
     assert [f.camera_id for f in scene.train] == [0] * 6 + [1] * 6
     assert [f.time for f in scene.train] == [*range(6)] * 2

@@ -1,4 +1,4 @@
-"""The process is set up by the command line, and importing the package changes nothing."""
+"""The command line sets up the process; importing the package changes nothing."""
 
 import subprocess
 import sys

@@ -29,9 +29,17 @@ def without_kernels(*gaussians: Tensor, **options: object) -> Any:
 
 
 def by_plain_torch(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor,
-    views: Tensor, Ks: Tensor, width: int, height: int, **options: object,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    views: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    **options: object,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """What gsplat draws, by the slow twin; only for a camera at the origin."""
     camera = Camera(Ks[0], torch.eye(4)[:3], width, height)
     seen = dense(means, quaternions, scales, opacities, features, camera)
@@ -115,9 +123,12 @@ def test_other_fields_need_no_rasterizer(broken_cuda: list[str]) -> None:
 
 @pytest.mark.parametrize("verb", ["run", "train"])
 def test_nothing_is_prepared_or_trained_before_gsplat_was_tried(
-    verb: str, broken_cuda: list[str], toy_folder: Path, tmp_path: Path,
+    verb: str,
+    broken_cuda: list[str],
+    toy_folder: Path,
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     out = str(tmp_path / "out")
     arguments = {
         "run": ["run", str(toy_folder / "images"), out],

@@ -97,7 +97,10 @@ def command(settings: TrainConfig, *launcher: str) -> subprocess.Popen[bytes]:
     """`hdr-nsff train` in processes of its own."""
     script = settings.out.parent / "again.py"
     script.write_text(
-        "import json, sys\nfrom hdr_nsff.training.config import TrainConfig\nfrom hdr_nsff.training import run_folder\nfrom hdr_nsff.training.train import train\n"
+        "import json, sys\n"
+        "from hdr_nsff.training.config import TrainConfig\n"
+        "from hdr_nsff.training import run_folder\n"
+        "from hdr_nsff.training.train import train\n"
         "run_folder.write_preview = lambda *_: None\n"
         "train(TrainConfig.from_json(json.loads(open(sys.argv[1]).read())))\n"
     )
