@@ -1,7 +1,7 @@
 """How much half and double of the constants of `priors/` that decide most change the
 error of their own step of `prepare`.
 
-    python benchmarks/sensitivity.py WORK --data RECORDED
+    python benchmarks/sensitivity.py WORK --data RECORDED [--only NAME]
 
 Clips: the first frames of three scenes of `synth` (rendered into WORK, which takes some
 minutes), and of two recorded clips in the folder RECORDED. Every clip is prepared into
@@ -12,23 +12,21 @@ and of the round trip of flow, which the priors build on, are among them.
 
 A constant that changes no error of any clip by 1 % changes nothing here. Every
 measurement is stored as soon as it is done: the same command continues where a killed
-one was.
+one was, and with everything done prints the table. `commit` is that of the last run.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
-from dataclasses import dataclass, replace
-from datetime import UTC, datetime
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from step_errors import METRICS, STEPS, Clip, Errors
+from record import Record, make_parser
+from step_errors import METRICS, STEPS, Clip
 
-from hdr_nsff.bench.machine import this_machine
-from hdr_nsff.core.io import read_json, write_json, write_npy
+from hdr_nsff.core.io import read_json, write_npy
 from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.progress import progress_of, say
 from hdr_nsff.footage.layouts.llff import llff_table
@@ -42,7 +40,6 @@ from hdr_nsff.synth.settings import SynthConfig, parse_ev
 from hdr_nsff.synth.synth import claim, exact, record_clip, render
 from hdr_nsff.synth.views import clip_views
 
-RESULTS = Path(__file__).parent / "results" / "sensitivity.json"
 SEED = 0
 FRAMES = 12
 SIZE = (160, 90)  # of rendered frames
@@ -96,7 +93,7 @@ CONSTANTS = (
     Constant("flow", "semantic.reach", "flow"),
     Constant("flow", "dense.smoothness", "flow"),
     Constant("poses", "min_rotation_share", "pose"),
-    Constant("poses", "reconstruction.max_point_error_px", "pose"),
+    Constant("poses", "reconstruction.max_point_error_px", "points"),
     Constant("poses", "reconstruction.sfm.max_free_focal_error_share", "pose"),
     Constant("poses", "reconstruction.sfm.trimming.drop_factor", "pose"),
     Constant("masks", "certain", "mask"),
@@ -126,22 +123,22 @@ class Measurement:
 
 def main() -> None:
     prepare_process()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = make_parser(__doc__, "sensitivity")
     parser.add_argument("work", type=Path, help="folder for clips and scenes")
     parser.add_argument("--data", type=Path, help="folder of recorded clips; default: none")
     parser.add_argument("--only", metavar="NAME", help="constants whose name contains this")
-    parser.add_argument("--out", type=Path, default=RESULTS, metavar="FILE")
     args = parser.parse_args()
+    record = Record("sensitivity", args, seed=SEED)
+    record.settings |= {"frames": FRAMES, "size": SIZE, "spp": SPP}
+    if args.out.is_file():
+        record.results = read_json(args.out)["results"]
     constants = [c for c in CONSTANTS if args.only is None or args.only in c.name]
     clips = [*RENDERED, *(RECORDED if args.data else ())]
-    rows = read_json(args.out)["results"] if args.out.is_file() else []
     wanted = [m for clip in clips for m in measurements(clip, constants)]
-    stored = {measurement_of(row) for row in rows}
-    measure([m for m in wanted if m not in stored], constants, rows, args)
-    print(table(constants, rows))
-    idle = [c.name for c in constants if not changes_anything(c, rows)]
+    stored = {measurement_of(row) for row in record.results}
+    measure([m for m in wanted if m not in stored], constants, record, args.work, args.data)
+    print(table(constants, record.results))
+    idle = [c.name for c in constants if not changes_anything(c, record.results)]
     print(f"\nwithout effect: {', '.join(idle) or 'none'}")
 
 
@@ -165,35 +162,24 @@ def measurement_of(row: dict[str, Any]) -> Measurement:
 def measure(
     missing: list[Measurement],
     constants: list[Constant],
-    rows: list[dict[str, Any]],
-    args: argparse.Namespace,
+    record: Record,
+    work: Path,
+    data: Path | None,
 ) -> None:
-    """Do the measurements that are missing, and store each in `rows` and its file."""
-    by_name = {c.name: c for c in constants}
+    """Do the measurements that are missing, and store each as it is done."""
+    path_of = {c.name: c.path.split(".") for c in constants}
     start = time.monotonic()
     clip = None
     for done, m in enumerate(missing, 1):
         if clip is None or clip.name != m.clip:
-            clip = open_clip(m.clip, args.work, args.data)
+            clip = open_clip(m.clip, work, data)
         step = STEPS[m.step]
         tuning, value = step.tuning, None
         if m.constant:
-            path = by_name[m.constant].path.split(".")
-            tuning, value = scaled(step.tuning, path, m.factor)
-        began = time.process_time()
-        errors = step.errors(clip, tuning)
-        rows.append(
-            {
-                "clip": m.clip,
-                "step": m.step,
-                "constant": m.constant,
-                "factor": m.factor,
-                "value": value,
-                "errors": {k: finite(v) for k, v in errors.items()},
-                "cpu_seconds": round(time.process_time() - began, 1),
-            }
-        )
-        save(rows, args.out)
+            tuning, value = scaled(step.tuning, path_of[m.constant], m.factor)
+        errors = {name: digits(error) for name, error in step.errors(clip, tuning).items()}
+        record.add(asdict(m) | {"value": value, "errors": errors}, show=False)
+        record.save(show=False)
         left = progress_of(done, len(missing), time.monotonic() - start)
         say(f"sensitivity: {done}{left}; {m.clip}, {m.constant or m.step} x{m.factor:g}")
 
@@ -211,24 +197,9 @@ def scaled(tuning: Any, path: list[str], factor: float) -> tuple[Any, float]:
     return replace(tuning, **{name: new}), new
 
 
-def finite(value: float) -> float | None:
-    """A number as JSON holds it: None where the step failed."""
-    return float(f"{value:.5g}") if np.isfinite(value) else None
-
-
-def save(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write all results so far."""
-    machine = this_machine().model_dump()
-    document = {
-        "benchmark": "sensitivity",
-        "machine": machine,
-        "commit": machine.pop("commit"),
-        "seed": SEED,
-        "date": datetime.now(UTC).isoformat(timespec="seconds"),
-        "settings": {"frames": FRAMES, "size": SIZE, "spp": SPP},
-        "results": rows,
-    }
-    write_json(path, document)
+def digits(error: float) -> float:
+    """An error in five digits; infinite where the step failed (null in JSON)."""
+    return float(f"{error:.5g}")
 
 
 # Clips
@@ -308,8 +279,8 @@ def table(constants: list[Constant], rows: list[dict[str, Any]]) -> str:
     for c in constants:
         for clip in dict.fromkeys(row["clip"] for row in rows):
             errors = errors_of(c, clip, rows)
-            if errors is None or not errors["default"]:
-                continue  # a step that does not apply to the clip
+            if errors is None or c.metric not in errors["default"]:
+                continue  # not measured on this clip
             cells = [number(errors[key].get(c.metric)) for key in FACTORS]
             lines.append(
                 f"| {c.name} | {clip} | {c.metric} | {' | '.join(cells)} | {unit(c, clip)} |"
@@ -330,14 +301,17 @@ def number(value: float | None) -> str:
 
 def errors_of(
     constant: Constant, clip: str, rows: list[dict[str, Any]]
-) -> dict[str, Errors] | None:
+) -> dict[str, dict[str, float | None]] | None:
     """The errors by the names of `FACTORS`; None where some are not measured."""
     found = {measurement_of(row): row["errors"] for row in rows}
     errors = {}
     for key, factor in FACTORS.items():
         name = "" if key == "default" else constant.name
-        errors[key] = found.get(Measurement(clip, constant.step, name, factor))
-    return None if None in errors.values() else errors
+        measurement = Measurement(clip, constant.step, name, factor)
+        if measurement not in found:
+            return None
+        errors[key] = found[measurement]
+    return errors
 
 
 def changes_anything(constant: Constant, rows: list[dict[str, Any]]) -> bool:

@@ -20,7 +20,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.geometry import alignment, pinhole
-from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.geometry.poses import Poses, project
 from hdr_nsff.geometry.round_trip import follow, valid_flow
 from hdr_nsff.prepare.steps.flow import Pair, learning_pairs
 from hdr_nsff.prepare.steps.refined_flow import RefinedFlowTuning, Refiner, equalized
@@ -69,7 +69,7 @@ METRICS = {
     "flow": Metric(
         "px",
         "mean end-point error of moving pixels that both frames show",
-        "mean difference of recorded values (codes of 255) between frames of equal "
+        "mean difference of recorded values, in codes of 255, of frames of equal "
         "exposure, one cycle apart, along the chain of flow between them",
         "codes",
     ),
@@ -88,6 +88,10 @@ METRICS = {
     ),
     "rotation": Metric("degrees", "mean rotation left after the best common rotation"),
     "focal": Metric("%", "error of the focal length"),
+    "points": Metric(
+        "%",
+        "mean |ln(estimated / true)| of the depth of the points, wherever they are seen, at most 1",
+    ),
     "depth": Metric(
         "%",
         "mean |ln(estimated / true)| of the depth of static pixels, at most 1",
@@ -276,7 +280,7 @@ def pose_errors(clip: Clip, tuning: PosesTuning) -> Errors:
                 video, clip.work.masks, Path(folder), clipped, threads=1, tuning=tuning
             )
         except InputError:
-            return {"pose": np.inf}
+            return {"pose": np.inf, "points": np.inf}
     if clip.exact is None:
         return {"pose": epipolar_distance(clip, poses)}
     assert clip.c2w is not None and clip.focal is not None
@@ -285,7 +289,26 @@ def pose_errors(clip: Clip, tuning: PosesTuning) -> Errors:
         "pose": 100 * errors.get("ate_share", np.inf),
         "rotation": errors["rotation_degrees"],
         "focal": 100 * abs(float(poses.K[0, 0, 0]) / clip.focal - 1),
+        "points": point_error(clip, poses),
     }
+
+
+def point_error(clip: Clip, poses: Poses) -> float:
+    """Percent: the mean error of the logarithm of the depth of the points of `poses` in
+    the frames that see them; infinite where there is none.
+    """
+    assert clip.exact is not None and clip.c2w is not None
+    fit = alignment.umeyama(clip.c2w[:, :, 3], poses.c2w[:, :, 3])
+    if fit is None or not len(poses.tracks):
+        return np.inf
+    frames, rows = poses.tracks[:, 0].astype(int), poses.tracks[:, 1].astype(int)
+    _, estimated = project(poses, frames, poses.points[rows])
+    depth = np.stack([frame["Z"] for frame in clip.exact])
+    height, width = depth.shape[1:]
+    x = poses.tracks[:, 2].astype(int).clip(0, width - 1)
+    y = poses.tracks[:, 3].astype(int).clip(0, height - 1)
+    error = np.abs(np.log(np.maximum(estimated, 1e-9) / (fit.scale * depth[frames, y, x])))
+    return 100 * float(np.minimum(error, MAX_LOG_ERROR).mean())
 
 
 def epipolar_distance(clip: Clip, poses: Poses) -> float:
