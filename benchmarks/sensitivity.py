@@ -15,8 +15,6 @@ measurement is stored as soon as it is done: the same command continues where a 
 one was, and with everything done prints the table. `commit` is that of the last run.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
