@@ -8,17 +8,13 @@ from estimates import geometric_depth
 from posed_planes import (
     RAYS,
     SWEEPING,
-    F,
     H,
     K,
     W,
-    X,
-    Y,
     cameras_at,
     exact_flow,
     neighbors,
     plane,
-    posed_video,
 )
 
 from hdr_nsff.core.errors import InputError
@@ -26,15 +22,6 @@ from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.priors.depth import geometric as depth_module
-from hdr_nsff.priors.movers.distance import (
-    differences,
-    link,
-    mover_depth,
-    regions,
-    smoothest_path,
-    split,
-    steps_in_time,
-)
 from hdr_nsff.scene.posed_video import PosedVideo
 
 NO_POINTS = np.zeros((0, 3))
@@ -136,88 +123,6 @@ def test_frames_without_anything_to_match_do_not_crash():
     assert confidence.max() < 0.5 and 0 < near < far
 
 
-def test_third_differences_vanish_on_parabolas_whatever_the_spacing():
-    t = np.array([0, 1, 3, 4, 5, 7.0])
-    D = differences(t, np.ones(5, bool))
-    assert D.shape == (3, 6)
-    assert np.allclose(D @ (2 - t + 0.3 * t**2), 0, atol=1e-9)
-    assert np.allclose(differences(np.arange(4.0), np.ones(3, bool)), [[-1, 3, -3, 1]])
-    assert (
-        len(differences(t, np.array([1, 1, 0, 1, 1], bool))) == 0
-    )  # a step is unknown in every run of four
-
-
-FORWARD = np.tile([0.0, 0, 1], (24, 1))
-
-
-def path(shake: float, count: int = 24) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A point on a straight line at z = 2 to 2.5, the eyes of a shaking camera, and the
-    rays of z-depth 1 between them.
-    """
-    t = np.arange(count, dtype=float)
-    point = np.stack([0.03 * t - 0.3, 0.01 * t, 2 + 0.02 * t], -1)
-    eyes = shake * np.random.default_rng(0).standard_normal((count, 3)) + np.stack(
-        [0.02 * t, 0 * t, 0 * t], -1
-    )
-    local = point - eyes
-    return point[:, 2] - eyes[:, 2], eyes, local / local[:, 2:]
-
-
-def test_a_shaking_camera_tells_how_far_a_moving_point_is():
-    z, eyes, rays = path(shake=0.02)
-    found, sigma = smoothest_path(
-        eyes, FORWARD, rays, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
-    )
-    assert np.abs(found / z - 1).mean() < 0.03 and np.median(sigma) < 0.03
-
-
-def test_a_smooth_camera_leaves_the_prior():
-    _, eyes, rays = path(shake=0.0)
-    noisy = rays + 0.003 * np.random.default_rng(1).standard_normal(rays.shape) * [1, 1, 0]
-    found, sigma = smoothest_path(
-        eyes, FORWARD, noisy, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
-    )
-    assert np.allclose(found, 3.5, rtol=0.02) and np.median(sigma) > 0.15
-
-
-def crossing() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A large square drifts right in front of a small still one; they touch from frame
-    3. Masks (6, H, W), flow, pairs.
-    """
-    moving, owner = np.zeros((6, H, W), bool), np.zeros((6, H, W), int)
-    for t in range(6):
-        owner[t, 20:28, 34:44] = 2
-        owner[t, 16:32, 10 + 3 * t : 26 + 3 * t] = 1
-        moving[t] = owner[t] > 0
-    pairs = neighbors(6)
-    speed = np.array([0, 3, 0])
-    flow = np.zeros((len(pairs), H, W, 2), np.float32)
-    for k, (i, j) in enumerate(pairs):
-        flow[k, ..., 0] = speed[owner[i]] * (j - i)
-    return moving, flow, pairs
-
-
-def test_regions_are_followed_and_touching_ones_stay_two():
-    moving, flow, pairs = crossing()
-    labels, steps = (
-        regions(moving),
-        steps_in_time(np.arange(6.0), flow, np.ones(flow.shape[:3], bool), pairs),
-    )
-    assert labels[2].max() == 2 and labels[3].max() == 1
-    split(labels, steps)
-    assert labels[3].max() == 2
-    tracks = link(labels, np.arange(6.0), steps)
-    longest = max(tracks, key=lambda t: len(t.frames))
-    assert longest.frames == [0, 1, 2, 3, 4, 5] and np.allclose(longest.motions[0], [3, 0])
-
-
-def test_a_region_that_does_not_flow_back_is_another_object():
-    moving, flow, pairs = crossing()
-    flow[1::2] = 40.0  # all backward flow leads elsewhere
-    steps = steps_in_time(np.arange(6.0), flow, np.ones(flow.shape[:3], bool), pairs)
-    assert all(len(t.frames) == 1 for t in link(regions(moving), np.arange(6.0), steps))
-
-
 def test_a_mask_over_the_static_scene_is_seen_through():
     """A region that was called moving but obeys the plane's depth in all frames gets
     the plane's disparity and its confidence.
@@ -228,28 +133,6 @@ def test_a_mask_over_the_static_scene_is_seen_through():
     disparity, confidence, *_ = solve(SWEEPING, video, depth, moving=moving)
     assert np.median(np.abs(disparity * depth - 1)[moving]) < 0.01
     assert np.median(confidence[moving]) > 0.6
-
-
-def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth():
-    """A square at z = 2 before a wall at z = 4, moving by 0.03 per frame."""
-    rng = np.random.default_rng(3)
-    eyes = np.concatenate([0.03 * rng.standard_normal((20, 2)), np.zeros((20, 1))], 1)
-    center = (np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1) - eyes[:, :2]) / 2 * F + [
-        W / 2,
-        H / 2,
-    ]  # (20, 2) px
-    moving = np.stack([(np.abs(X - x) < 7) & (np.abs(Y - y) < 7) for x, y in center])
-    pairs = neighbors(20)
-    flow = np.stack([np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]).astype(
-        np.float32
-    )
-    wall = np.full((20, H, W), 0.25, np.float32)
-    disparity, confidence = mover_depth(
-        posed_video(cameras_at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall
-    )
-    assert np.abs(disparity[moving] * 2 - 1).mean() < 0.03
-    assert (disparity[~moving] == 0.25).all()
-    assert confidence[~moving].max() == 0 and 0.4 < confidence[moving].mean() <= 0.5
 
 
 def test_given_maps_become_disparity_by_their_kind(tmp_path):

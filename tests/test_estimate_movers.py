@@ -1,5 +1,5 @@
 """Movers and their depth, of a turning ellipsoid before a wall in closed form: exact
-flow, and depth that knows one distance per time only.
+flow, and depth that is one distance per time.
 """
 
 from dataclasses import replace
@@ -10,8 +10,8 @@ import torch
 from estimates import video_of
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.movers.estimate import estimate_movers, mover_without_tracks, views_in_time
-from hdr_nsff.priors.movers.rigid_groups import View
+from hdr_nsff.priors.movers.estimate import estimate_movers, mover_without_tracks, views_by_time
+from hdr_nsff.priors.movers.tracks import MovingView
 from hdr_nsff.scene.movers import fill_mover_depth
 from hdr_nsff.scene.posed_video import PosedVideo
 from hdr_nsff.scene.scene import Scene
@@ -231,10 +231,10 @@ def test_wild_flow_is_no_error(short: Clip) -> None:
     assert (abs(np.log(disparity / short.flat)) < np.log(1.5) + 1e-6).all()
 
 
-def scene_views(scene: Scene) -> tuple[list[int], list[View]]:
+def scene_views(scene: Scene) -> tuple[list[int], list[MovingView]]:
     clip, flow, valid, pairs = video_of(scene)
     disparity = np.stack([f.disparity.numpy() for f in scene.train])
-    return views_in_time(clip, flow, valid, pairs, disparity, np.ones_like(disparity))
+    return views_by_time(clip, flow, valid, pairs, disparity, np.ones_like(disparity))
 
 
 def test_a_second_camera_counts_where_the_first_has_no_frame(toy: Scene) -> None:

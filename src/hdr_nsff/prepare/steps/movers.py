@@ -10,27 +10,28 @@ from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
 from hdr_nsff.scene.movers import Mover, write_movers
 
 
-def find_movers(work: Work) -> StepResult:
-    """The movers of the training frames, from flow, masks and a first depth of theirs."""
+def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
+    """The movers of the training frames, from flow, masks and a first depth."""
     if work.manifest.depth_kind == "relative":
-        return result((), {}, "none looked for: depth is known up to scale and shift only")
+        return result((), {}, "not estimated: depth is known up to scale and shift only")
     flow = work.training_flows(work.refined_flows)
     disparity, confidence = work.static_depth()
     still = work.still()
     clip = work.training_clip()
     indices = np.array([f.index for f in work.train])
     maps = {}
-    if still is not None:  # depth of the static scene alone: movers are not in it yet
+    if still is not None:  # the depth is that of the static scene, without movers
         clip = replace(clip, moving=clip.moving & ~still)
-        found, trust = mover_depth(clip, *flow, disparity)
+        found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
         disparity = np.where(clip.moving, found, disparity)
         confidence = np.where(clip.moving, trust, confidence)
         maps["mover_disparity"] = dict(zip(indices.tolist(), found, strict=True))
         maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
-    movers = estimate_movers(clip, *flow, disparity, confidence)
+    movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
     shapes = sum(mover.has_shape for mover in movers)
     note = f"{len(movers)} found, {shapes} with a shape" if movers else "none found"

@@ -1,247 +1,324 @@
-"""Moving things told apart by what their motions explain in pixels: groups of tracks
-(`groups.py`), found with depth that may be wrong, get shapes (`bundle.py`), and every
-track goes to the motion that explains it over its whole life, its neighbors' lives
-included.
+"""Tracks segmented by the motions that explain them.
+
+Groups of tracks that were found with depth that may be wrong (`rigid_groups.py`) get
+shapes by bundle adjustment (`bundle.py`). Then every track is assigned to the motion
+that reprojects it best over its whole life, its neighbors' lives included, and changed
+groups are adjusted again.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from itertools import combinations, product
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from scipy.sparse import coo_matrix, csr_matrix
 
 from hdr_nsff.core.progress import track
-from hdr_nsff.priors.movers.bundle import Cameras, Problem, Shape, State, adjust
+from hdr_nsff.priors.movers.bundle import MoverShape, adjust_bundle
+from hdr_nsff.priors.movers.bundle_problem import BundleProblem, BundleState, Cameras
 from hdr_nsff.priors.movers.rigid_groups import (
-    GAP,
-    SHORTEST,
-    SMALLEST,
-    Group,
-    Tracks,
     affinity,
-    apart,
-    fit,
-    gather,
-    neighbors,
+    are_in_different_patches,
+    find_rigid_groups,
+    nearest_times,
+    neighbor_pairs,
 )
-
-LEAST_TRACKS = 60  # of a group that can be adjusted
-# standard deviations: reprojection error of a shape, or of a track by one, that is
-# believed
-GOOD = 1.5
-ROUNDS = 3  # of sharing out tracks and adjusting the groups that changed
-# standard deviations: of motions that explain a track as well as this, the larger
-# group's counts
-AS_GOOD = 0.25
-WHOLE = 0.7  # of a track's life a motion must be known for
-TURNS = 6  # iterations that place a track's point by given poses
-PIECE = 0.5  # of the least group: a thing that was hidden may come back for so little
-STRAY = 0.1  # of a group's tracks: where fewer are seen they are strays
-FAR = 4.0  # of a thing's radius in the picture: no further off does it come back
-SETTLED = 0.01  # of a group's tracks: fewer changes change nothing
+from hdr_nsff.priors.movers.rigid_motion import RigidGroup, fit_motion
+from hdr_nsff.priors.movers.tracks import Tracks
+from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
 
 
-Found = tuple[Group, Shape | None]
+@dataclass(frozen=True)
+class Segment:
+    """Tracks of one mover, with its shape where they determine one."""
+
+    group: RigidGroup
+    shape: MoverShape | None
+
+    @property
+    def members(self) -> np.ndarray:
+        """Indices (n,) of its tracks."""
+        return self.group.members
 
 
-def things(tracks: Tracks, cameras: Cameras) -> list[Found]:
-    """Groups of tracks, largest first, each with its shape where its tracks tell one."""
-    return groups_by_motion(tracks, [g.members for g in gather(tracks, PIECE * SMALLEST)], cameras)
+def segment_tracks(
+    tracks: Tracks, cameras: Cameras, tuning: MoversTuning = MOVERS_TUNING
+) -> list[Segment]:
+    """The movers among the tracks, largest first."""
+    groups = find_rigid_groups(tracks, min_piece_share(tuning), tuning.groups)
+    return refine_segments(tracks, [group.members for group in groups], cameras, tuning)
 
 
-def groups_by_motion(tracks: Tracks, members: list[np.ndarray], cameras: Cameras) -> list[Found]:
-    """The same from groups that may be mixed or in pieces: tracks shared out anew,
-    pieces joined, rest left out.
+def min_piece_share(tuning: MoversTuning) -> float:
+    """The share of all tracks that a piece of an object needs."""
+    return tuning.segmentation.min_piece_share * tuning.groups.min_group_share
+
+
+def refine_segments(
+    tracks: Tracks,
+    groups: list[np.ndarray],
+    cameras: Cameras,
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> list[Segment]:
+    """Segments, largest first, from groups of tracks that may be mixed or in pieces.
+
+    `groups` are the members of each. Groups are merged and tracks reassigned until
+    hardly any changes; small segments are dropped, except the first.
     """
-    found = shaped(tracks, members, [], cameras)
-    if any(shape for _, shape in found):
-        found = settled(tracks, found, cameras)
-    return [
-        f
-        for i, f in enumerate(found)
-        if i == 0 or len(f[0].members) >= SMALLEST * len(tracks.trust)
-    ]
+    segments = fit_segments(tracks, groups, [], cameras, tuning)
+    if any(segment.shape is not None for segment in segments):
+        weights = neighbor_weights(tracks, tuning)
+        for _ in range(tuning.segmentation.rounds):
+            segments = merge_segments(tracks, segments, cameras, tuning)
+            before = [segment.members for segment in segments]
+            shapes = [segment.shape for segment in segments]
+            errors = smoothed_errors(tracks, shapes, cameras, weights, tuning)
+            owner = assign_tracks(before, errors, tuning)
+            after = [np.nonzero(owner == k)[0] for k in range(len(before))]
+            if all(same_members(b, a, tuning) for b, a in zip(before, after, strict=True)):
+                break
+            groups = members_by_owner(owner, tuning)
+            segments = fit_segments(tracks, groups, segments, cameras, tuning)
+    min_members = tuning.groups.min_group_share * len(tracks.trust)
+    return [s for i, s in enumerate(segments) if i == 0 or len(s.members) >= min_members]
 
 
-def settled(tracks: Tracks, found: list[Found], cameras: Cameras) -> list[Found]:
-    """Groups joined, and tracks shared out between them, until hardly any changes."""
-    near = nearness(tracks)
-    for _ in range(ROUNDS):
-        found = joined(tracks, found, cameras)
-        before = [g.members for g, _ in found]
-        owner = share_out(before, misfits(tracks, [s for _, s in found], cameras, near))
-        if all(same(m, np.nonzero(owner == k)[0]) for k, m in enumerate(before)):
-            break
-        found = shaped(tracks, members_of(owner), found, cameras)
-    return found
+def fit_segments(
+    tracks: Tracks,
+    groups: list[np.ndarray],
+    known: list[Segment],
+    cameras: Cameras,
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> list[Segment]:
+    """Segments of the members in `groups`; those that hardly changed are `known`."""
+    segments = []
+    for members in track(groups, "movers"):
+        same = [s for s in known if same_members(s.members, members, tuning)]
+        segments.append(same[0] if same else fit_segment(tracks, members, cameras, tuning))
+    return segments
 
 
-def shaped(
-    tracks: Tracks, groups: list[np.ndarray], known: list[Found], cameras: Cameras
-) -> list[Found]:
-    """Groups of given members, and their shapes; of those that hardly changed what is
-    `known`.
+def fit_segment(
+    tracks: Tracks,
+    members: np.ndarray,
+    cameras: Cameras,
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> Segment:
+    """The segment of `members`, with a shape where one of small error is found."""
+    group = fit_motion(tracks, members, tuning.groups)
+    constants = tuning.segmentation
+    few_tracks = len(members) < constants.min_shape_tracks
+    if few_tracks or len(cameras.K) < constants.min_shape_times:
+        return Segment(group, None)
+    shape = adjust_bundle(tracks, group, cameras, tuning.bundle)
+    return Segment(group, shape if shape.error < constants.max_error else None)
+
+
+def merge_segments(
+    tracks: Tracks,
+    segments: list[Segment],
+    cameras: Cameras,
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> list[Segment]:
+    """Segments merged in pairs while one motion explains both about equally well."""
+    segments = list(segments)
+    tried: set[tuple[int, ...]] = set()
+    pair = next_pair(segments, tried)
+    while pair is not None:
+        a, b = segments[pair[0]], segments[pair[1]]
+        tried.add(pair_key(a, b))
+        merged = merge_pair(tracks, a, b, cameras, tuning)
+        if merged is not None:
+            others = [s for k, s in enumerate(segments) if k not in pair]
+            segments = sorted([merged, *others], key=lambda s: -len(s.members))
+        pair = next_pair(segments, tried)
+    return segments
+
+
+def next_pair(segments: list[Segment], tried: set[tuple[int, ...]]) -> tuple[int, int] | None:
+    """The first pair of segments that was not `tried`, None where all were."""
+    for i, j in combinations(range(len(segments)), 2):
+        if pair_key(segments[i], segments[j]) not in tried:
+            return i, j
+    return None
+
+
+def pair_key(a: Segment, b: Segment) -> tuple[int, ...]:
+    """Identifies a pair of segments: for each its number of tracks, and the first."""
+    return len(a.members), int(a.members[0]), len(b.members), int(b.members[0])
+
+
+def merge_pair(
+    tracks: Tracks,
+    a: Segment,
+    b: Segment,
+    cameras: Cameras,
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> Segment | None:
+    """One segment for two, None where their own motions explain them better."""
+    if not may_be_one_mover(tracks, a.group, b.group, tuning):
+        return None
+    merged = fit_segment(tracks, np.union1d(a.members, b.members), cameras, tuning)
+    if merged.shape is None:
+        return None
+    constants = tuning.segmentation
+    for segment in (a, b):
+        own_error = constants.max_error - constants.equal_error
+        if segment.shape is not None:
+            own_error = median_error(tracks, segment.shape, segment.members, cameras, tuning)
+        error = median_error(tracks, merged.shape, segment.members, cameras, tuning)
+        if not error < own_error + constants.equal_error:
+            return None
+    return merged
+
+
+def may_be_one_mover(
+    tracks: Tracks, a: RigidGroup, b: RigidGroup, tuning: MoversTuning = MOVERS_TUNING
+) -> bool:
+    """Whether two groups may be one object.
+
+    They must lie in one patch where both are visible, or one must begin near where and
+    when the other ends.
     """
-    return [
-        next((k for k in known if same(k[0].members, m)), None) or with_shape(tracks, m, cameras)
-        for m in track(groups, "things that move")
-    ]
-
-
-def with_shape(tracks: Tracks, members: np.ndarray, cameras: Cameras) -> Found:
-    """A group of given members, and its shape."""
-    group = fit(tracks, members)
-    return group, shape_of(tracks, group, cameras)
-
-
-def joined(tracks: Tracks, found: list[Found], cameras: Cameras) -> list[Found]:
-    """Groups made one where one motion explains the tracks of both about as well as
-    their own do.
-    """
-    found, tried = list(found), set()
-    while pair := next(
-        (p for p in combinations(range(len(found)), 2) if ids(found, p) not in tried), None
-    ):
-        tried.add(ids(found, pair))
-        (a, _), (b, _) = pieces = [found[k] for k in pair]
-        if not may_be_one(tracks, a, b):
-            continue
-        both = with_shape(tracks, np.union1d(a.members, b.members), cameras)
-        if both[1] and all(about_as_good(tracks, piece, both[1], cameras) for piece in pieces):
-            found = sorted(
-                [both, *(f for k, f in enumerate(found) if k not in pair)],
-                key=lambda f: -len(f[0].members),
-            )
-    return found
-
-
-def may_be_one(tracks: Tracks, a: Group, b: Group) -> bool:
-    """Whether two groups lie in one patch where they are seen together, or one begins
-    about where and when the other ends.
-    """
-    counts = [(tracks.trust[g.members] > 0).sum(0) for g in (a, b)]
-    seen_a, seen_b = (c >= max(SHORTEST, STRAY * c.max()) for c in counts)
-    if not (seen_a.any() and seen_b.any()):
+    visible_a = visible_times(tracks, a, tuning)
+    visible_b = visible_times(tracks, b, tuning)
+    if not (visible_a.any() and visible_b.any()):
         return False
-    if (seen_a & seen_b).sum() >= SHORTEST:
-        return not apart(tracks, a, b)
-    i, j = min(
-        product(np.nonzero(seen_a)[0], np.nonzero(seen_b)[0]),
-        key=lambda ij: abs(int(ij[0]) - int(ij[1])),
-    )
-    here, there = (np.nanmedian(tracks.pixels[g.members, t], 0) for g, t in ((a, i), (b, j)))
-    radius = max(
-        radius_of(tracks.pixels[g.members][:, seen]) for g, seen in ((a, seen_a), (b, seen_b))
-    )
-    return bool(abs(int(i) - int(j)) <= GAP and np.linalg.norm(here - there) < FAR * radius)
+    if (visible_a & visible_b).sum() >= tuning.groups.min_shared_frames:
+        return not are_in_different_patches(tracks, a, b, tuning.groups)
+    i, j = nearest_times(visible_a, visible_b)
+    pixels_a, pixels_b = tracks.pixels[a.members], tracks.pixels[b.members]
+    middle_a = np.nanmedian(pixels_a[:, i], 0)
+    middle_b = np.nanmedian(pixels_b[:, j], 0)
+    radius = max(image_radius(pixels_a[:, visible_a]), image_radius(pixels_b[:, visible_b]))
+    max_distance = tuning.segmentation.max_return_radii * radius
+    near = np.linalg.norm(middle_a - middle_b) < max_distance
+    return bool(near and abs(i - j) <= tuning.groups.max_gap_frames)
 
 
-def radius_of(pixels: np.ndarray) -> float:
-    """How far tracks (N, T, 2), some seen at every time, are from their middle in the
-    pictures: the median.
+def visible_times(
+    tracks: Tracks, group: RigidGroup, tuning: MoversTuning = MOVERS_TUNING
+) -> np.ndarray:
+    """The times (T,) bool at which more than stray tracks of a group are visible."""
+    count = (tracks.trust[group.members] > 0).sum(0)
+    stray = tuning.segmentation.min_visible_share * count.max()
+    return count >= max(tuning.groups.min_tracks, stray)
+
+
+def image_radius(pixels: np.ndarray) -> float:
+    """Median distance of tracks (N, T, 2) px from the median of their time.
+
+    Some must be visible at every time.
     """
     return float(np.nanmedian(np.linalg.norm(pixels - np.nanmedian(pixels, 0), axis=-1)))
 
 
-def ids(found: list[Found], pair: tuple[int, ...]) -> tuple[int, ...]:
-    """What tells a pair of groups from others: how many tracks they have, and their
-    first.
+def members_by_owner(owner: np.ndarray, tuning: MoversTuning = MOVERS_TUNING) -> list[np.ndarray]:
+    """The members of each group, largest first, of the `owner` (N,) of every track.
+
+    Tracks of owner -1 and small groups are dropped; the first group always stays.
     """
-    return tuple(int(v) for k in pair for v in (len(found[k][0].members), found[k][0].members[0]))
+    groups = [np.nonzero(owner == k)[0] for k in range(owner.max(initial=-1) + 1)]
+    groups = sorted(groups, key=len, reverse=True)
+    min_members = min_piece_share(tuning) * len(owner)
+    first = [members for members in groups[:1] if len(members)]
+    return first + [members for members in groups[1:] if len(members) >= min_members]
 
 
-def about_as_good(tracks: Tracks, alone: Found, both: Shape, cameras: Cameras) -> bool:
-    """Whether the motion of `both` explains the tracks of a group about as well as its
-    own does, if it has one.
-    """
-    group, shape = alone
-    own = np.median(misfit(tracks, shape, cameras)[group.members]) if shape else GOOD - AS_GOOD
-    return bool(np.median(misfit(tracks, both, cameras)[group.members]) < own + AS_GOOD)
+def same_members(
+    before: np.ndarray, after: np.ndarray, tuning: MoversTuning = MOVERS_TUNING
+) -> bool:
+    """Whether two groups have the same members, up to a small share."""
+    max_changed = tuning.segmentation.max_changed_share * len(before)
+    return len(np.setxor1d(before, after)) <= max_changed
 
 
-def shape_of(tracks: Tracks, group: Group, cameras: Cameras) -> Shape | None:
-    """The group's shape and motion where its tracks tell them."""
-    if len(group.members) < LEAST_TRACKS or len(cameras.K) < 4:
-        return None
-    shape = adjust(tracks, group, cameras)
-    return shape if shape.error < GOOD else None
-
-
-def members_of(owner: np.ndarray) -> list[np.ndarray]:
-    """The groups, largest first, that tracks with one `owner` (N,) make; -1 and groups
-    of few tracks are left out.
-    """
-    members = sorted(
-        (np.nonzero(owner == k)[0] for k in range(owner.max(initial=-1) + 1)), key=len, reverse=True
-    )
-    return [
-        m
-        for i, m in enumerate(members)
-        if len(m) >= PIECE * SMALLEST * len(owner) or (i == 0 and len(m))
-    ]
-
-
-def same(before: np.ndarray, after: np.ndarray) -> bool:
-    """Whether two groups have the same members but for a few."""
-    return len(np.setxor1d(before, after)) <= SETTLED * len(before)
-
-
-def nearness(tracks: Tracks) -> csr_matrix:
-    """How much tracks listen to their neighbors in the pictures (N, N), rows of sum 1
-    at most.
-    """
-    n, pairs = len(tracks.trust), neighbors(tracks)
-    graph = coo_matrix((affinity(tracks, pairs), pairs.T), (n, n)).tocsr()
+def neighbor_weights(tracks: Tracks, tuning: MoversTuning = MOVERS_TUNING) -> csr_matrix:
+    """The weights (N, N) of a track's neighbors; rows sum to 1, or 0 without any."""
+    count = len(tracks.trust)
+    pairs = neighbor_pairs(tracks, tuning.groups)
+    weights = affinity(tracks, pairs, tuning.groups)
+    graph = coo_matrix((weights, pairs.T), (count, count)).tocsr()
     graph = graph + graph.T
     total = np.maximum(np.asarray(graph.sum(1)).ravel(), 1e-9)
     return csr_matrix(graph.multiply(1 / total[:, None]))
 
 
-def misfits(
-    tracks: Tracks, shapes: list[Shape | None], cameras: Cameras, near: csr_matrix
+def smoothed_errors(
+    tracks: Tracks,
+    shapes: list[MoverShape | None],
+    cameras: Cameras,
+    weights: csr_matrix,
+    tuning: MoversTuning = MOVERS_TUNING,
 ) -> np.ndarray:
-    """Reprojection errors (N, K) of every track by every motion in standard deviations,
-    averaged with its neighbors'; inf where there is no shape or its motion is not
-    known.
+    """`track_errors` (N, K) by every motion, averaged with those of neighbors.
+
+    Longer tracks count more, as they discriminate more. inf where there is no shape or
+    its motion is not known.
     """
-    life = (tracks.trust > 0).sum(1).astype(float)  # a long track tells more
-    out = np.full((len(life), len(shapes)), np.inf)
+    length = (tracks.trust > 0).sum(1).astype(float)
+    result = np.full((len(length), len(shapes)), np.inf)
     for k, shape in enumerate(shapes):
         if shape is None:
             continue
-        own = misfit(tracks, shape, cameras)
-        told = np.isfinite(own)
-        weight = life * told
-        around = near @ weight
-        total = np.where(told, own, 0) * weight + near @ (np.where(told, own, 0) * weight)
-        out[told, k] = (total / np.maximum(weight + around, 1e-9))[told]
-    return out
+        errors = track_errors(tracks, shape, cameras, tuning)
+        known = np.isfinite(errors)
+        own_weight = length * known
+        weighted = np.where(known, errors, 0) * own_weight
+        total = weighted + weights @ weighted
+        total_weight = own_weight + weights @ own_weight
+        result[known, k] = (total / np.maximum(total_weight, 1e-9))[known]
+    return result
 
 
-def misfit(tracks: Tracks, shape: Shape, cameras: Cameras) -> np.ndarray:
-    """Mean reprojection error (N,) of every track, its point placed as well as the
-    shape's motion lets it, in standard deviations.
+def track_errors(
+    tracks: Tracks, shape: MoverShape, cameras: Cameras, tuning: MoversTuning = MOVERS_TUNING
+) -> np.ndarray:
+    """Mean reprojection error (N,) of every track by a shape's motion, in sigmas.
+
+    The track's point is fitted to the motion. inf where the motion is known for too
+    little of the track's life.
     """
-    group = replace(shape.group, members=np.arange(len(tracks.trust)))
-    problem = Problem(tracks, group, cameras)
-    state = problem.points_for(State(problem.start, group.rotations, group.shifts), TURNS)
-    error = np.linalg.norm(problem.residuals(state)[0], axis=-1) / problem.noise
-    known = problem.seen.sum(1)
-    whole = known >= WHOLE * (tracks.trust[problem.use] > 0).sum(1)
-    out = np.full(len(tracks.trust), np.inf)
-    mean = np.where(problem.seen, error, 0).sum(1) / np.maximum(known, 1)
-    out[problem.use] = np.where(whole & np.isfinite(mean), mean, np.inf)
-    return out
+    count = len(tracks.trust)
+    group = replace(shape.group, members=np.arange(count))
+    problem = BundleProblem(tracks, group, cameras, tuning.bundle)
+    state = BundleState(problem.start, group.rotations, group.translations)
+    state = problem.solve_points(state, tuning.segmentation.point_iterations)
+    errors = np.linalg.norm(problem.reproject(state).error, axis=-1) / problem.noise
+    num_known = problem.visible.sum(1)
+    num_visible = (tracks.trust[problem.usable] > 0).sum(1)
+    mean = np.where(problem.visible, errors, 0).sum(1) / np.maximum(num_known, 1)
+    enough = num_known >= tuning.segmentation.min_known_share * num_visible
+    result = np.full(count, np.inf)
+    result[problem.usable] = np.where(enough & np.isfinite(mean), mean, np.inf)
+    return result
 
 
-def share_out(before: list[np.ndarray], cost: np.ndarray) -> np.ndarray:
-    """The group (N,) of every track: of those that explain it about as well as the best
-    and well enough, the largest; else the one that it was in, -1 for none.
+def median_error(
+    tracks: Tracks,
+    shape: MoverShape,
+    members: np.ndarray,
+    cameras: Cameras,
+    tuning: MoversTuning = MOVERS_TUNING,
+) -> float:
+    """Median of `track_errors` over the tracks `members` (n,)."""
+    return float(np.median(track_errors(tracks, shape, cameras, tuning)[members]))
+
+
+def assign_tracks(
+    before: list[np.ndarray], errors: np.ndarray, tuning: MoversTuning = MOVERS_TUNING
+) -> np.ndarray:
+    """The group (N,) of every track by its `errors` (N, K).
+
+    Of the groups that explain it well, and about as well as the best, it is the first
+    and so the largest. A track that none explains stays in its group of `before`, the
+    members of each; -1 is none.
     """
-    owner = np.full(len(cost), -1)
+    owner = np.full(len(errors), -1)
     for k, members in enumerate(before):
         owner[members] = k
-    fine = (cost <= cost.min(1, keepdims=True) + AS_GOOD) & (cost < GOOD)
-    return np.where(fine.any(1), fine.argmax(1), owner)
+    constants = tuning.segmentation
+    near_best = errors <= errors.min(1, keepdims=True) + constants.equal_error
+    explained = near_best & (errors < constants.max_error)
+    return np.where(explained.any(1), explained.argmax(1), owner)

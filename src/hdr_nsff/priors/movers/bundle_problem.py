@@ -1,0 +1,399 @@
+"""The least-squares problem of bundle adjustment for one mover.
+
+Unknowns are canonical points and the rotation and translation of every time, observed
+by tracks in cameras with known poses. Levenberg-Marquardt with the points eliminated
+(Schur complement; Triggs et al., "Bundle adjustment: a modern synthesis", 1999) and
+Huber weights. Weak priors hold what the tracks leave open: the mean z-depth of every
+time, the third differences of the path, whose covariance is estimated from the path,
+the second differences of the rotation, and the extent of the shape.
+
+All points and translations are relative to the group's center, in scene units.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from hdr_nsff.priors.movers.rigid_motion import RigidGroup, canonical_points
+from hdr_nsff.priors.movers.tracks import Tracks
+from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING, BundleTuning
+
+# observations that a point needs; one leaves its depth open
+MIN_OBSERVATIONS = 2
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Known cameras of the tracks' times."""
+
+    K: np.ndarray  # (T, 3, 3) pixels
+    c2w: np.ndarray  # (T, 3, 4) OpenCV, scene units
+
+    def during(self, start: int, stop: int) -> Cameras:
+        """The cameras at the times from `start` to before `stop`."""
+        return Cameras(self.K[start:stop], self.c2w[start:stop])
+
+
+@dataclass(frozen=True)
+class BundleState:
+    """The unknowns."""
+
+    points: np.ndarray  # (N, 3) canonical
+    rotations: np.ndarray  # (T, 3, 3) world from canonical
+    translations: np.ndarray  # (T, 3)
+
+
+@dataclass(frozen=True)
+class Reprojection:
+    """A state's points as the cameras see them."""
+
+    error: np.ndarray  # (N, T, 2) px, 0 where not visible
+    rotated: np.ndarray  # (N, T, 3) rotated canonical points
+    local: np.ndarray  # (N, T, 3) camera coordinates
+
+
+@dataclass(frozen=True)
+class PriorResiduals:
+    """Residuals of the priors, in standard deviations."""
+
+    depth: np.ndarray  # (T,) mean z-depth
+    path: np.ndarray  # (T - 3, 3) third differences of the path
+    rotation: np.ndarray  # (T - 2, 3) second differences of the rotation
+    shape: np.ndarray  # (N, 3) distance of points from the middle
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Blocks of the Gauss-Newton approximation, and gradients of the cost."""
+
+    poses: np.ndarray  # (6 T, 6 T); six unknowns a time: rotation vector, translation
+    points: np.ndarray  # (N, 3, 3)
+    poses_points: np.ndarray  # (N, 6 T, 3)
+    pose_gradient: np.ndarray  # (6 T,)
+    point_gradient: np.ndarray  # (N, 3)
+
+
+class BundleProblem:
+    """Residuals of a state, their derivatives, and the minimization.
+
+    `usable` (members,) bool marks the tracks that have a point; all other arrays of N
+    points are of those.
+    """
+
+    def __init__(
+        self,
+        tracks: Tracks,
+        group: RigidGroup,
+        cameras: Cameras,
+        tuning: BundleTuning = BUNDLE_TUNING,
+    ) -> None:
+        self.tuning = tuning
+        visible = (tracks.trust[group.members] > 0) & group.known
+        prior_points = tracks.points[group.members] - group.center
+        start = canonical_points(prior_points, visible, group.rotations, group.translations)
+        self.usable = np.isfinite(start[:, 0]) & (visible.sum(1) >= MIN_OBSERVATIONS)
+        members = group.members[self.usable]
+        self.visible = visible[self.usable]  # (N, T)
+        self.start = start[self.usable]  # (N, 3)
+        self.pixels = np.nan_to_num(tracks.pixels[members])  # (N, T, 2)
+        self.noise = tuning.flow_noise_px * np.sqrt(1.0 + tracks.age[members])  # (N, T) px
+        self.K = cameras.K
+        self.w2c = np.swapaxes(cameras.c2w[:, :, :3], 1, 2)  # (T, 3, 3)
+        self.eyes = cameras.c2w[:, :, 3] - group.center  # (T, 3)
+        self.middle = np.zeros(3)
+        self.size = 1.0
+        if len(members):
+            self.middle = np.median(self.start, 0)
+            self.size = np.median(np.linalg.norm(self.start - self.middle, axis=-1)) + 1e-9
+        self.init_differences()
+        self.init_depth_prior(prior_points[self.usable], tracks.trust[members])
+
+    def init_differences(self) -> None:
+        """Difference operators over time, and which rows of the path are supported."""
+        num = len(self.K)
+        self.second_differences = np.diff(np.eye(num), n=2, axis=0)  # (T - 2, T)
+        self.third_differences = np.diff(np.eye(num), n=3, axis=0)  # (T - 3, T)
+        # makes third differences, as shares of z-depth, standard deviations
+        self.path_whitening = np.eye(3) / self.tuning.initial_path_sigma  # (3, 3)
+        min_tracks = self.tuning.min_tracks
+        self.depth_known = self.visible.sum(0) >= min_tracks  # (T,)
+        linked = (self.visible[:, 1:] & self.visible[:, :-1]).sum(0) >= min_tracks
+        # (T,) the run of linked times, within which depth has one unknown factor
+        self.run = np.concatenate([[0], np.cumsum(~linked)])
+        in_one_run = self.run[3:] == self.run[:-3]
+        num_unknown = (np.abs(self.third_differences) > 0) @ ~self.depth_known
+        self.path_rows = (num_unknown == 0) & in_one_run  # (T - 3,)
+
+    def init_depth_prior(self, prior_points: np.ndarray, trust: np.ndarray) -> None:
+        """The prior of mean z-depth, from the tracks' points and trust in them.
+
+        `prior_points` (N, T, 3), `trust` (N, T).
+        """
+        tuning = self.tuning
+        depth = np.einsum("tj,ntj->nt", self.w2c[:, 2], prior_points - self.eyes)
+        count = np.maximum(self.visible.sum(0), 1)
+        depth = np.where(self.visible, np.nan_to_num(depth), 0)
+        self.mean_depth = depth.sum(0) / count  # (T,)
+        self.prior_distance = 1.0
+        if self.depth_known.any():
+            self.prior_distance = np.median(self.mean_depth[self.depth_known])
+        num_known = max(int(self.depth_known.sum()), 1)
+        # (T, 3) derivative of the mean z-depth of all times by translations
+        self.distance_gradient = self.depth_known[:, None] * self.w2c[:, 2] / num_known
+
+        confidence = 0.0
+        if self.visible.any():
+            excess = np.median(trust[self.visible]) - tuning.untrusted_confidence
+            confidence = np.clip(excess / (1 - tuning.untrusted_confidence), 0, 1)
+        change = tuning.trusted_depth_sigma - tuning.depth_sigma
+        sigma = tuning.depth_sigma + change * confidence
+        if self.path_rows.sum() >= tuning.min_path_rows:
+            # one observation for all times of a run
+            times_in_run = np.bincount(self.run, self.depth_known)[self.run]
+            sigmas = sigma * np.sqrt(np.maximum(times_in_run, 1))
+        else:
+            sigmas = np.full(len(self.K), min(sigma, tuning.short_path_depth_sigma))
+        self.depth_sigma = self.prior_distance * sigmas  # (T,)
+
+    def minimize(self, state: BundleState, iterations: int) -> tuple[BundleState, float]:
+        """The state after at most `iterations` damped steps, and its cost."""
+        tuning = self.tuning
+        cost = self.cost(state)
+        damping = tuning.initial_damping
+        for _ in range(iterations):
+            candidate = self.damped_step(state, damping)
+            candidate_cost = self.cost(candidate)
+            if candidate_cost < cost:
+                state, cost = candidate, candidate_cost
+                damping /= tuning.damping_decrease
+            else:
+                damping *= tuning.damping_increase
+            if damping > tuning.max_damping:
+                break
+        return state, cost
+
+    def solve_points(self, state: BundleState, iterations: int | None = None) -> BundleState:
+        """The same poses with this problem's points fitted to them.
+
+        The points start from `points_on_rays`; `iterations` is that of the tuning
+        without one.
+        """
+        iterations = self.tuning.iterations if iterations is None else iterations
+        points = self.points_on_rays(state)
+        sigma = self.shape_sigma(state)
+        middle = np.median(points, 0)
+        for _ in range(iterations):
+            reprojection = self.reproject(replace(state, points=points))
+            _, jacobian, weight = self.jacobians(reprojection, state)
+            weighted = jacobian * weight[..., None]
+            hessian = np.einsum("ntij,ntik->njk", weighted, jacobian) + np.eye(3) / sigma**2
+            gradient = np.einsum("ntij,nti->nj", weighted, reprojection.error)
+            gradient = gradient + (points - middle) / sigma**2
+            points = points - np.linalg.solve(hessian, gradient[..., None])[..., 0]
+        return replace(state, points=points)
+
+    def points_on_rays(self, state: BundleState) -> np.ndarray:
+        """Median over time of canonical points (N, 3) at the z-depth of the center."""
+        depth = np.einsum("tj,tj->t", self.w2c[:, 2], state.translations - self.eyes)
+        rays = (self.pixels - self.K[:, :2, 2]) / self.K[:, [0, 1], [0, 1]]
+        local = np.concatenate([rays, np.ones((*rays.shape[:2], 1))], -1) * depth[:, None]
+        world = np.einsum("tji,ntj->nti", self.w2c, local) + self.eyes
+        back = np.einsum("tji,ntj->nti", state.rotations, world - state.translations)
+        return np.nanmedian(np.where(self.visible[..., None], back, np.nan), 1)
+
+    def reproject(self, state: BundleState) -> Reprojection:
+        """The points of a state in all cameras."""
+        rotated = np.einsum("tij,nj->nti", state.rotations, state.points)
+        local = np.einsum("tij,ntj->nti", self.w2c, rotated + state.translations - self.eyes)
+        z = np.maximum(local[..., 2:], self.min_depth)
+        focal, center = self.K[:, [0, 1], [0, 1]], self.K[:, :2, 2]
+        error = local[..., :2] / z * focal + center - self.pixels
+        return Reprojection(np.where(self.visible[..., None], error, 0), rotated, local)
+
+    @property
+    def min_depth(self) -> float:
+        """The z-depth from which nearer points project, scene units."""
+        return self.tuning.min_depth_share * self.prior_distance
+
+    def prior_residuals(self, state: BundleState, local: np.ndarray) -> PriorResiduals:
+        """The residuals of all priors; `local` (N, T, 3) are camera coordinates."""
+        count = np.maximum(self.visible.sum(0), 1)
+        mean_depth = np.where(self.visible, local[..., 2], 0).sum(0) / count
+        depth = (mean_depth - self.mean_depth) / self.depth_sigma
+        path = self.third_differences @ state.translations / self.distance(state)
+        relative = state.rotations[1:] @ np.swapaxes(state.rotations[:-1], 1, 2)
+        steps = Rotation.from_matrix(relative).as_rotvec()
+        return PriorResiduals(
+            depth=np.where(self.depth_known, depth, 0),
+            path=path @ self.path_whitening,
+            rotation=np.diff(steps, axis=0) / self.tuning.rotation_sigma_rad,
+            shape=(state.points - self.middle) / self.shape_sigma(state),
+        )
+
+    def distance(self, state: BundleState) -> float:
+        """The mover's distance: its mean z-depth over all times, scene units."""
+        distance = float((self.distance_gradient * (state.translations - self.eyes)).sum())
+        return max(distance, self.tuning.min_distance_share * self.prior_distance)
+
+    def shape_sigma(self, state: BundleState) -> float:
+        """Standard deviation of a point's distance from the middle, scene units.
+
+        It grows with the mover's distance, since pixels leave that scale open.
+        """
+        sigma = self.tuning.shape_sigma * self.size
+        return sigma * self.distance(state) / self.prior_distance
+
+    def path_jacobian(self, state: BundleState, path: np.ndarray) -> np.ndarray:
+        """Derivatives (T - 3, 3, T, 3) of the path's residuals by the translations.
+
+        The residuals are shares of the distance. In scene units, every mover could
+        lower them by approaching the camera, since near movers move less.
+        """
+        by_path = self.third_differences[:, None, :, None] * self.path_whitening[:, None]
+        by_distance = path[..., None, None] * self.distance_gradient
+        return (by_path - by_distance) / self.distance(state)
+
+    def fit_path_whitening(self, state: BundleState) -> None:
+        """Set the prior's smoothness, per direction, to that of the state's path.
+
+        A mover that goes to and fro does so along a line or in a plane. Across it only
+        the shake of the camera remains, and that determines the distance. Nothing is
+        set where too little of the path was visible.
+        """
+        if self.path_rows.sum() < self.tuning.min_path_rows:
+            return
+        path = (self.third_differences @ state.translations)[self.path_rows]
+        path = path / self.distance(state)
+        floor = self.tuning.path_sigma**2 * np.eye(3)
+        variance, axes = np.linalg.eigh(path.T @ path / len(path) + floor)
+        self.path_whitening = axes / np.sqrt(variance) @ axes.T
+
+    def cost(self, state: BundleState) -> float:
+        """Half the sum of squares of all residuals, with Huber's loss of the errors."""
+        reprojection = self.reproject(state)
+        length = np.linalg.norm(reprojection.error, axis=-1) / self.noise
+        huber = np.where(length < 1, 0.5 * length**2, length - 0.5)[self.visible].sum()
+        priors = self.prior_residuals(state, reprojection.local)
+        squares = [
+            (residual**2).sum()
+            for residual in (priors.depth, priors.path, priors.rotation, priors.shape)
+        ]
+        return float(huber + 0.5 * sum(squares))
+
+    def jacobians(
+        self, reprojection: Reprojection, state: BundleState
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Derivatives of reprojection errors, and their Huber weights (N, T, 1).
+
+        By pose (N, T, 2, 6), rotation vector before translation, and by point
+        (N, T, 2, 3).
+        """
+        length = np.linalg.norm(reprojection.error, axis=-1) / self.noise
+        weight = (self.visible / np.maximum(length, 1) / self.noise**2)[..., None]
+        x, y = reprojection.local[..., 0], reprojection.local[..., 1]
+        z = np.maximum(reprojection.local[..., 2], self.min_depth)
+        fx, fy = self.K[:, 0, 0], self.K[:, 1, 1]
+        zero = np.zeros_like(z)
+        entries = [fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2]
+        by_local = np.stack(entries, -1).reshape(*z.shape, 2, 3)
+        by_world = by_local @ self.w2c  # (N, T, 2, 3)
+        by_rotation = -by_world @ cross_matrices(reprojection.rotated)
+        by_pose = np.concatenate([by_rotation, by_world], -1)
+        by_point = by_world @ state.rotations
+        return by_pose, by_point, weight
+
+    def normal_equations(self, state: BundleState) -> NormalEquations:
+        """The Gauss-Newton system of the reprojection errors and all priors."""
+        count, num = self.visible.shape
+        reprojection = self.reproject(state)
+        priors = self.prior_residuals(state, reprojection.local)
+        by_pose, by_point, weight = self.jacobians(reprojection, state)
+        weighted_pose = by_pose * weight[..., None]
+        weighted_point = by_point * weight[..., None]
+        pose_blocks = np.einsum("ntij,ntik->tjk", weighted_pose, by_pose)
+        points = np.einsum("ntij,ntik->njk", weighted_point, by_point)
+        poses_points = np.einsum("ntij,ntik->ntjk", weighted_pose, by_point)
+        pose_gradient = np.einsum("ntij,nti->tj", weighted_pose, reprojection.error)
+        point_gradient = np.einsum("ntij,nti->nj", weighted_point, reprojection.error)
+
+        # mean z-depth
+        by_depth = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1)
+        by_depth = by_depth / self.depth_sigma[:, None] * self.depth_known[:, None]
+        pose_blocks = pose_blocks + by_depth[:, :, None] * by_depth[:, None]
+        pose_gradient = pose_gradient + by_depth * priors.depth[:, None]
+        poses = np.zeros((num, 6, num, 6))
+        poses[np.arange(num), :, np.arange(num)] = pose_blocks
+
+        # path
+        by_path = self.path_jacobian(state, priors.path).reshape(priors.path.size, 3 * num)
+        poses[:, 3:, :, 3:] += (by_path.T @ by_path).reshape(num, 3, num, 3)
+        path_gradient = (by_path.T @ priors.path.reshape(-1)).reshape(num, 3)
+
+        # shape, whose standard deviation grows with the distance
+        sigma = self.shape_sigma(state)
+        distance = self.distance(state)
+        points = points + np.eye(3) / sigma**2
+        point_gradient = point_gradient + priors.shape / sigma
+        relative_gradient = self.distance_gradient / distance  # (T, 3)
+        by_shape = (priors.shape / sigma)[:, None, None]
+        poses_points[:, :, 3:] -= relative_gradient[None, :, :, None] * by_shape
+        squared = (priors.shape**2).sum()
+        pose_gradient[:, 3:] += path_gradient - squared * self.distance_gradient / distance
+        by_distance = np.sqrt(squared) * self.distance_gradient.reshape(-1) / distance
+        outer = np.outer(by_distance, by_distance)
+        poses[:, 3:, :, 3:] += outer.reshape(num, 3, num, 3)
+
+        # rotation
+        differences, rotation_sigma = self.second_differences, self.tuning.rotation_sigma_rad
+        for axis in range(3):
+            poses[:, axis, :, axis] += differences.T @ differences / rotation_sigma**2
+        pose_gradient[:, :3] += differences.T @ priors.rotation / rotation_sigma
+        return NormalEquations(
+            poses=poses.reshape(6 * num, 6 * num),
+            points=points,
+            poses_points=poses_points.reshape(count, 6 * num, 3),
+            pose_gradient=pose_gradient.reshape(-1),
+            point_gradient=point_gradient,
+        )
+
+    def damped_step(self, state: BundleState, damping: float) -> BundleState:
+        """The state after one damped Gauss-Newton step."""
+        equations = self.normal_equations(state)
+        pose_step, point_step = solve_damped(equations, damping)
+        pose_step = pose_step.reshape(-1, 6)
+        rotations = Rotation.from_rotvec(pose_step[:, :3]).as_matrix() @ state.rotations
+        return BundleState(
+            state.points + point_step, rotations, state.translations + pose_step[:, 3:]
+        )
+
+
+def solve_damped(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """The steps (6 T,) of the poses and (N, 3) of the points, by the Schur complement.
+
+    The diagonals grow by the share `damping`.
+    """
+    poses, points = equations.poses.copy(), equations.points.copy()
+    size = len(poses)
+    poses[np.diag_indices(size)] *= 1 + damping
+    poses[np.diag_indices(size)] += 1e-9 * np.trace(poses) / size + 1e-12
+    points[:, np.arange(3), np.arange(3)] *= 1 + damping
+
+    inverse = np.linalg.inv(points)
+    poses_points = equations.poses_points
+    eliminated = poses_points @ inverse  # (N, 6 T, 3)
+    reduced = poses - np.tensordot(eliminated, poses_points, ((0, 2), (0, 2)))
+    carried = np.einsum("nij,nj->i", eliminated, equations.point_gradient)
+    pose_step = np.linalg.solve(reduced, -equations.pose_gradient + carried)
+    remaining = equations.point_gradient + np.einsum("nij,i->nj", poses_points, pose_step)
+    return pose_step, -np.einsum("nij,nj->ni", inverse, remaining)
+
+
+def cross_matrices(v: np.ndarray) -> np.ndarray:
+    """Matrices (..., 3, 3) that map x to the cross product of `v` (..., 3) and x."""
+    x, y, z = np.moveaxis(v, -1, 0)
+    zero = np.zeros_like(x)
+    entries = [zero, -z, y, z, zero, -x, -y, x, zero]
+    return np.stack(entries, -1).reshape(*v.shape[:-1], 3, 3)

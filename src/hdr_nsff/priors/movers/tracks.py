@@ -1,0 +1,160 @@
+"""Tracks of moving pixels: chains of optical flow, lifted to points by depth.
+
+Tracks start on a grid of moving pixels in a few frames and follow the flow forward and
+backward in time. A track ends where flow is not valid, leaves the moving pixels, or
+lies between two motions. The depth may be wrong; later steps correct it. Pixels are
+(x, y) with centers at +0.5.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+
+from hdr_nsff.priors.movers.tuning import TRACK_TUNING, TrackTuning
+
+
+@dataclass(frozen=True)
+class MovingView:
+    """What one training time shows of its moving pixels."""
+
+    moving: np.ndarray  # (H, W) bool
+    points: np.ndarray  # (H, W, 3) every pixel at its depth, scene units
+    trust: np.ndarray  # (H, W) in the depth, in [0, 1]
+    flow: dict[int, np.ndarray]  # {+-1: (H, W, 2)} px to the neighboring times
+    valid: dict[int, np.ndarray]  # {+-1: (H, W) bool}
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """`N` chains of flow over `T` times."""
+
+    pixels: np.ndarray  # (N, T, 2) xy, NaN where not visible
+    points: np.ndarray  # (N, T, 3) scene units, NaN where not visible
+    trust: np.ndarray  # (N, T) in the depth, 0 where not visible
+    patch: np.ndarray  # (N, T) connected patch of moving pixels, 0 where not visible
+    age: np.ndarray  # (N, T) steps of flow since the start: errors accumulate
+
+    def during(self, start: int, stop: int) -> Tracks:
+        """The same tracks at the times from `start` to before `stop`."""
+        times = slice(start, stop)
+        return Tracks(
+            self.pixels[:, times],
+            self.points[:, times],
+            self.trust[:, times],
+            self.patch[:, times],
+            self.age[:, times],
+        )
+
+
+def follow_moving_pixels(views: list[MovingView], tuning: TrackTuning = TRACK_TUNING) -> Tracks:
+    """Tracks through the moving pixels of consecutive times."""
+    num = len(views)
+    spread = np.linspace(0, num - 1, min(tuning.start_frames, num))
+    starts = sorted({round(start) for start in spread.tolist()})
+    smooth_views = [smooth_flows(view, tuning) for view in views]
+
+    chains = [chain_flow(smooth_views, start, tuning) for start in starts]
+    pixels = np.concatenate(chains)
+    ages = [
+        np.tile(np.abs(np.arange(num) - start), (len(c), 1))
+        for start, c in zip(starts, chains, strict=True)
+    ]
+    age = np.concatenate(ages)
+
+    points = np.full((*pixels.shape[:2], 3), np.nan)
+    trust = np.zeros(pixels.shape[:2])
+    patch = np.zeros(pixels.shape[:2], int)
+    for t, view in enumerate(views):
+        visible = np.isfinite(pixels[:, t, 0])
+        x, y = pixels[visible, t].astype(int).T
+        patches, _ = ndimage.label(view.moving)
+        points[visible, t] = view.points[y, x]
+        trust[visible, t] = view.trust[y, x] + tuning.min_trust
+        patch[visible, t] = patches[y, x]
+    kept = (trust > 0).sum(1) >= min(tuning.min_frames, num)
+    return Tracks(pixels[kept], points[kept], trust[kept], patch[kept], age[kept])
+
+
+def smooth_flows(view: MovingView, tuning: TrackTuning = TRACK_TUNING) -> MovingView:
+    """The view with its flow averaged over valid moving pixels, NaN elsewhere."""
+    smooth = {
+        step: smooth_flow(flow, view.valid[step] & view.moving, tuning)
+        for step, flow in view.flow.items()
+    }
+    return replace(view, flow=smooth)
+
+
+def smooth_flow(
+    flow: np.ndarray, known: np.ndarray, tuning: TrackTuning = TRACK_TUNING
+) -> np.ndarray:
+    """`flow` (H, W, 2) px averaged over `known` (H, W) pixels around of similar flow.
+
+    It is NaN where a pixel itself is not known.
+    """
+    radius = tuning.smoothing_radius_px
+    offsets = range(-radius, radius + 1)
+    flow = np.where(known[..., None], flow, 0).astype(np.float32)
+    weight = known.astype(np.float32)
+    total_weight = np.zeros_like(weight)
+    total_flow = np.zeros_like(flow)
+    for offset in itertools.product(offsets, offsets):
+        other = np.roll(flow, offset, (0, 1))
+        similar = np.abs(other - flow).max(-1) < tuning.max_flow_difference_px
+        other_weight = np.roll(weight, offset, (0, 1)) * weight * similar
+        total_weight += other_weight
+        total_flow += other * other_weight[..., None]
+    mean = total_flow / np.maximum(total_weight, 1)[..., None]
+    return np.where((total_weight > 0)[..., None], mean, np.nan)
+
+
+def chain_flow(
+    views: list[MovingView], start: int, tuning: TrackTuning = TRACK_TUNING
+) -> np.ndarray:
+    """Pixels (N, T, 2) of the tracks that start in one frame, NaN where not visible."""
+    inner = ndimage.binary_erosion(views[start].moving)
+    y, x = np.nonzero(inner)
+    on_grid = (x % tuning.stride_px == 0) & (y % tuning.stride_px == 0)
+    pixels = np.full((int(on_grid.sum()), len(views), 2), np.nan)
+    pixels[:, start] = np.stack([x[on_grid], y[on_grid]], -1) + 0.5
+    for step in (1, -1):
+        t = start
+        while 0 <= t + step < len(views) and step in views[t].flow:
+            pixels[:, t + step] = advance(views[t], views[t + step], step, pixels[:, t], tuning)
+            t += step
+    return pixels
+
+
+def advance(
+    view: MovingView,
+    next_view: MovingView,
+    step: int,
+    pixels: np.ndarray,
+    tuning: TrackTuning = TRACK_TUNING,
+) -> np.ndarray:
+    """`pixels` (N, 2) of `view` in `next_view`, NaN where a track ends or had ended."""
+    height, width = view.moving.shape
+    flow = view.flow[step]
+    visible = np.isfinite(pixels[:, 0])
+    x = np.where(visible, pixels[:, 0], 0).astype(int)
+    y = np.where(visible, pixels[:, 1], 0).astype(int)
+    rows_and_columns = np.where(visible[:, None], pixels, 0.5)[:, ::-1].T - 0.5
+    sampled = [
+        ndimage.map_coordinates(flow[..., axis], rows_and_columns, order=1, mode="nearest")
+        for axis in (0, 1)
+    ]
+    motion = np.stack(sampled, -1)
+    # a pixel between two motions: interpolation mixes them
+    mixed = np.abs(motion - flow[y, x]).max(-1) > 0.5 * tuning.max_flow_difference_px
+    moved = np.where(mixed[:, None], np.nan, pixels + motion)
+
+    next_x = np.nan_to_num(moved[:, 0], nan=-1)
+    next_y = np.nan_to_num(moved[:, 1], nan=-1)
+    inside = (next_x >= 0) & (next_y >= 0) & (next_x < width) & (next_y < height)
+    column = next_x.clip(0, width - 1).astype(int)
+    row = next_y.clip(0, height - 1).astype(int)
+    continues = visible & view.valid[step][y, x] & inside & next_view.moving[row, column]
+    return np.where(continues[:, None], moved, np.nan)

@@ -1,0 +1,272 @@
+"""The tuning constants of movers: one record per task, and all of them together.
+
+Every value is hand-chosen on rendered scenes, except where another origin is named.
+"Pixels" (px) are those of the frames; a share is in [0, 1].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class TrackTuning:
+    """Tuning constants of tracks along flow, hand-chosen on rendered scenes."""
+
+    stride_px: int = 3
+    """Distance of the pixels at which tracks start, in x and in y."""
+    start_frames: int = 12
+    """Frames, spread over the clip, in which tracks start."""
+    smoothing_radius_px: int = 2
+    """Flow is averaged over the square of this radius before it is followed."""
+    max_flow_difference_px: float = 2.0
+    """Flow that differs more from a pixel's belongs to another object. A track ends
+    where interpolation changes its flow by half of this.
+    """
+    min_frames: int = 3
+    """Frames in which a track must be visible."""
+    min_trust: float = 0.02
+    """Added to the trust in depth, so that no visible point has a weight of zero."""
+
+
+TRACK_TUNING = TrackTuning()
+
+
+@dataclass(frozen=True)
+class RigidGroupsTuning:
+    """Tuning constants of groups and their motion, hand-chosen on rendered scenes."""
+
+    link_px: float = 6.0
+    """Tracks that come this near each other are neighbors."""
+    parting_px: float = 1.0
+    """Fastest change of distance per frame at which the affinity of two neighbors falls
+    by a factor of e.
+    """
+    parts: int = 10
+    """Parts that the graph of neighbors is cut into, before they are merged."""
+    min_tracks_per_part: int = 3
+    """Fewer tracks than this times `parts` remain one part."""
+    cut_iterations: int = 1000
+    """Of the eigensolver; a connected graph takes about ten."""
+    max_sampled_tracks: int = 1000
+    """Tracks that merging is decided from."""
+    max_residual_ratio: float = 1.3
+    """A common motion may have this many times the residual of a group's own ..."""
+    depth_error_share: float = 0.1
+    """... plus this share of the group's size, which wrong depth may cause."""
+    min_group_share: float = 0.04
+    """Share of all tracks below which a group is dropped."""
+
+    min_tracks: int = 3
+    """Tracks that a step of motion, and the position of a group in a frame, need."""
+    min_known_share: float = 0.7
+    """Share of a track's visible frames in which a motion must be known to be compared
+    with it.
+    """
+    min_shared_frames: int = 3
+    """Frames in which both groups must be visible to be compared there."""
+    max_gap_frames: int = 6
+    """Frames for which an object may be out of sight."""
+    max_gap_sizes: float = 3.0
+    """Distance over such a gap, in sizes of the group."""
+    min_separate_frames: int = 2
+    """Frames in different patches from which on two groups are separate ..."""
+    min_separate_share: float = 0.3
+    """... if they are more than this share of the frames they are both visible in."""
+
+    min_rotation_points: int = 6
+    """Points below which no rotation is fitted; a rotation needs 3 exact ones."""
+    min_unlinked_points: int = 6
+    """Points whose median continues a path where no track links two times."""
+    robust_rounds: int = 5
+    """Reweighted fits of a rigid motion."""
+    refit_rounds: int = 4
+    """Rounds that fit poses to canonical points, and canonical points to poses."""
+
+
+RIGID_GROUPS_TUNING = RigidGroupsTuning()
+
+
+@dataclass(frozen=True)
+class BundleTuning:
+    """Tuning constants of bundle adjustment, hand-chosen on rendered scenes.
+
+    Shares of depth and distance are of the mover's mean z-depth.
+    """
+
+    iterations: int = 25
+    """Levenberg-Marquardt iterations of a solution."""
+    initial_damping: float = 1e-3
+    """Share that is first added to the diagonal of the normal equations."""
+    damping_decrease: float = 4.0
+    """Factor by which damping falls after a step that lowers the cost."""
+    damping_increase: float = 8.0
+    """Factor by which damping grows after a step that does not."""
+    max_damping: float = 1e6
+    """Damping at which a solution has converged."""
+    max_tracks: int = 200
+    """Tracks that poses are estimated from."""
+    min_tracks: int = 3
+    """Tracks that a shape, the depth of a time, and the link of two times need."""
+    flow_noise_px: float = 0.4
+    """Standard deviation of one step of a track; errors of neighbors are correlated."""
+    min_depth_share: float = 1e-3
+    """Points nearer than this share of the prior's depth project from there."""
+    min_distance_share: float = 0.05
+    """Lower bound of a mover's distance, as a share of the prior's depth."""
+
+    depth_sigma: float = 0.25
+    """Standard deviation of the prior's mean z-depth, as a share of it, where the depth
+    is trusted little: one observation for all times that tracks link.
+    """
+    trusted_depth_sigma: float = 0.01
+    """The same where the depth is trusted fully."""
+    short_path_depth_sigma: float = 0.02
+    """Upper bound of the same, per time, for a path too short to determine depth."""
+    untrusted_confidence: float = 0.52
+    """Trust up to which depth counts as trusted little; geometric depth of movers
+    claims 0.5.
+    """
+
+    path_sigma: float = 0.001
+    """Lower bound of the standard deviation of the path's third differences, as a share
+    of z-depth, in each direction.
+    """
+    initial_path_sigma: float = 0.01
+    """The same before any path is known, in all directions."""
+    min_path_rows: int = 6
+    """Third differences that a path needs to determine its smoothness and distance."""
+    smoothness_rounds: int = 4
+    """Rounds of estimating the path's smoothness and solving again."""
+    rotation_sigma_rad: float = float(np.radians(2.0))
+    """Standard deviation of second differences of the rotation."""
+    shape_sigma: float = 2.0
+    """Standard deviation of a point's distance from the middle, in mover sizes."""
+
+    reversal_rounds: int = 4
+    """Rounds of searching for reversed depth."""
+    reversal_splits: int = 12
+    """Times, about, at which a reversal may end."""
+    min_reversal_frames: int = 3
+    """Distance of those times, at least."""
+    reversal_iterations: int = 8
+    """Iterations after which a reversed candidate is judged."""
+    max_reversal_cost_ratio: float = 0.98
+    """Cost, relative to the cost before, that a reversal must reach."""
+
+
+BUNDLE_TUNING = BundleTuning()
+
+
+@dataclass(frozen=True)
+class MotionSegmentationTuning:
+    """Tuning constants of motion segmentation, hand-chosen on rendered scenes.
+
+    Errors are reprojection errors in standard deviations of a track's noise.
+    """
+
+    min_shape_tracks: int = 60
+    """Tracks that a group needs for a shape."""
+    min_shape_times: int = 4
+    """Times that a group needs for a shape: fewer have no third differences."""
+    max_error: float = 1.5
+    """Error above which a shape, or a track's motion, is rejected."""
+    equal_error: float = 0.25
+    """Motions whose errors differ by less explain a track equally well."""
+    rounds: int = 3
+    """Rounds of merging groups, assigning tracks and fitting the changed groups."""
+    min_known_share: float = 0.7
+    """Share of a track's visible frames in which a motion must be known."""
+    point_iterations: int = 6
+    """Iterations that place a track's point for given poses."""
+    min_piece_share: float = 0.5
+    """Smallest piece of an object that was hidden, relative to `min_group_share`."""
+    min_visible_share: float = 0.1
+    """A group is visible where more than this share of its peak number of tracks is."""
+    max_return_radii: float = 4.0
+    """Distance in the image at which an object may return, in its radii."""
+    max_changed_share: float = 0.01
+    """Groups of which a smaller share of tracks changed are not fitted again."""
+
+
+MOTION_SEGMENTATION_TUNING = MotionSegmentationTuning()
+
+
+@dataclass(frozen=True)
+class MoverDistanceTuning:
+    """Tuning constants of the distance of movers, hand-chosen on rendered scenes."""
+
+    min_region_share: float = 1e-3
+    """Share of the frame below which a moving region is no object."""
+    min_motion_difference_px: float = 1.0
+    """Difference of motion per step at which two parts of a region are two objects."""
+    min_landing_share: float = 1 / 3
+    """Share of a region that must land on another one to be linked to it."""
+    core_share: float = 0.5
+    """The core of a region is deeper inside than this share of its greatest depth."""
+    min_valid_share: float = 0.4
+    """Share of a region's core whose flow must be valid for its motion to count."""
+    max_growth: float = 1.25
+    """Ratio of areas over one step of unknown motion that one object may have."""
+
+    surface_percentile: float = 95.0
+    """Percentile of the static disparity behind a region: its nearest surface."""
+    disparity_ratio: float = 1.1
+    """An object's expected disparity, relative to that surface."""
+    prior_sigma: float = 0.25
+    """Standard deviation of the logarithm of that ratio."""
+    change_sigma: float = 0.1
+    """Standard deviation of each polynomial coefficient of z-depth over time but the
+    constant one, as a share of z-depth.
+    """
+    max_disparity_ratio: float = 8.0
+    """Upper bound of an object's disparity, relative to the surface behind it."""
+
+    max_drift_degree: int = 3
+    """Degree of the polynomial that ties integrated flow to the region's centroid."""
+    frames_per_drift_degree: int = 4
+    """Frames of known motion for each degree of it."""
+    max_depth_degree: int = 4
+    """Degree of the polynomial of z-depth over time."""
+    rows_per_depth_degree: int = 7
+    """Third differences, or pairs of frames, for each degree of it."""
+    min_path_rows: int = 6
+    """Third differences of a path that may determine depth."""
+    huber_rounds: int = 10
+    """Reweighted solutions of a path."""
+    huber_medians: float = 1.5
+    """Threshold of the Huber weights, in medians of the residuals."""
+    signal_to_noise: float = 2.0
+    """A path counts in full only if the mean square of its third differences exceeds
+    this many times the noise left; it counts nothing below that.
+    """
+
+    max_confidence: float = 0.5
+    """Confidence of an object whose distance is known to `full_confidence_sigma`."""
+    full_confidence_sigma: float = 0.05
+    """Relative standard deviation of distance up to which confidence is largest."""
+    min_confidence: float = 0.1
+    """Confidence of an object whose distance is known from the prior alone."""
+
+
+MOVER_DISTANCE_TUNING = MoverDistanceTuning()
+
+
+@dataclass(frozen=True)
+class MoversTuning:
+    """All tuning constants of movers. `dataclasses.replace` changes a record."""
+
+    tracks: TrackTuning = TRACK_TUNING
+    groups: RigidGroupsTuning = RIGID_GROUPS_TUNING
+    bundle: BundleTuning = BUNDLE_TUNING
+    segmentation: MotionSegmentationTuning = MOTION_SEGMENTATION_TUNING
+    distance: MoverDistanceTuning = MOVER_DISTANCE_TUNING
+    fallback_smoothing_times: float = 1.0
+    """Standard deviation of the Gaussian that smooths the path of the one mover that
+    stands for all moving pixels where no tracks are found.
+    """
+
+
+MOVERS_TUNING = MoversTuning()

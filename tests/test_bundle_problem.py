@@ -1,0 +1,153 @@
+"""Residuals, derivatives and steps of the bundle problem of a tumbling body."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from tumbling_body import (
+    CAMERAS,
+    COUNT,
+    LOCAL,
+    TIMES,
+    TRUE,
+    flat_problem,
+    pixels_of,
+    tracked,
+    true_state,
+)
+
+from hdr_nsff.priors.movers.bundle import path_without_rotation
+from hdr_nsff.priors.movers.bundle_problem import BundleProblem, BundleState
+from hdr_nsff.priors.movers.rigid_motion import fit_motion
+from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING
+
+
+def path_residuals(problem: BundleProblem, state: BundleState) -> np.ndarray:
+    """The path's residuals (TIMES - 3, 3) of a state."""
+    return problem.prior_residuals(state, problem.reproject(state).local).path
+
+
+def test_each_direction_of_a_path_has_its_own_smoothness() -> None:
+    problem = flat_problem()
+    s = true_state(problem)
+    jerk = np.outer(0.2 * (-1.0) ** np.arange(TIMES), [0.6, 0.8, 0.0])
+    jerky = replace(s, translations=s.translations + jerk)
+    problem.fit_path_whitening(jerky)
+    path = path_residuals(problem, jerky)
+    assert path.shape == (TIMES - 3, 3)
+    # along the line one standard deviation, across it nothing
+    assert (path**2).mean(0).sum() == pytest.approx(1, abs=0.01)
+    for across in (np.array([0.8, -0.6, 0.0]), np.array([0.0, 0.0, 1.0])):
+        scale = np.linalg.norm(problem.path_whitening @ across)
+        assert scale == pytest.approx(1 / BUNDLE_TUNING.path_sigma)
+
+
+def test_the_path_jacobian_is_its_derivative() -> None:
+    problem, h = flat_problem(), 1e-6
+    s = true_state(problem)
+    noise = np.random.default_rng(0).normal(0, 0.05, s.translations.shape)
+    s = replace(s, translations=s.translations + noise)
+    problem.fit_path_whitening(s)
+    path = path_residuals(problem, s)
+    jacobian = problem.path_jacobian(s, path)
+    for t, axis in ((0, 0), (5, 1), (TIMES - 1, 2)):
+        moved = s.translations.copy()
+        moved[t, axis] += h
+        measured = (path_residuals(problem, replace(s, translations=moved)) - path) / h
+        largest = np.abs(jacobian).max()
+        assert measured == pytest.approx(jacobian[:, :, t, axis], abs=1e-3 * largest)
+
+
+def test_only_the_prior_of_distance_changes_with_scale() -> None:
+    problem = flat_problem()
+    true = true_state(problem)
+    for factor in (0.7, 1.6):
+        scaled = BundleState(
+            true.points * factor,
+            true.rotations,
+            problem.eyes + factor * (true.translations - problem.eyes),
+        )
+        shapes = [
+            s.points / problem.shape_sigma(replace(s, points=problem.middle + s.points))
+            for s in (true, scaled)
+        ]
+        assert np.allclose(*shapes)
+        assert np.allclose(problem.reproject(scaled).error, problem.reproject(true).error)
+        # the path, straight in the world, shows the camera's shake at any other scale,
+        # as a share of the distance
+        path_true, path_scaled = (path_residuals(problem, s) for s in (true, scaled))
+        shake = problem.third_differences @ problem.eyes @ problem.path_whitening
+        expected = (1 / factor - 1) * shake / problem.distance(true)
+        assert np.allclose(path_true, 0) and np.allclose(path_scaled, expected)
+
+
+def test_the_jacobians_are_the_derivatives_of_the_errors() -> None:
+    problem, h = flat_problem(), 1e-6
+    s = true_state(problem)
+    reprojection = problem.reproject(s)
+    by_pose, by_point, _ = problem.jacobians(reprojection, s)
+    for k in range(3):
+        step = h * np.eye(3)[k]
+        rotation = Rotation.from_rotvec(step).as_matrix()
+        for moved, jacobian in (
+            (replace(s, rotations=rotation @ s.rotations), by_pose[..., k]),
+            (replace(s, translations=s.translations + step), by_pose[..., 3 + k]),
+            (replace(s, points=s.points + step), by_point[..., k]),
+        ):
+            measured = (problem.reproject(moved).error - reprojection.error) / h
+            # of derivatives of up to 100 px
+            assert np.abs(measured - jacobian)[problem.visible].max() < 1e-2
+
+
+def test_tracks_of_large_error_weigh_less() -> None:
+    problem = flat_problem()
+    s = true_state(problem)
+    reprojection = problem.reproject(s)
+    wrong = replace(reprojection, error=reprojection.error + np.array([7.0, 0.0]))
+    weight = problem.jacobians(wrong, s)[2][problem.visible]
+    assert weight == pytest.approx(0.4 / 7.0 / 0.4**2)  # Huber beyond 0.4 px: 1 / length
+
+
+def test_old_tracks_weigh_less() -> None:
+    young = tracked(pixels_of(TRUE))
+    old = replace(young, age=np.full(young.age.shape, 3))
+    group = path_without_rotation(young, fit_motion(young, np.arange(COUNT)))
+    weights = []
+    for problem in (BundleProblem(young, group, CAMERAS), BundleProblem(old, group, CAMERAS)):
+        s = true_state(problem)
+        weights.append(problem.jacobians(problem.reproject(s), s)[2][problem.visible])
+    # the errors of three more steps have four times the variance
+    assert weights[0] == pytest.approx(4 * weights[1])
+
+
+def test_points_are_fitted_to_known_poses() -> None:
+    problem = flat_problem()
+    s = true_state(problem)
+    found = problem.solve_points(replace(s, points=np.zeros_like(s.points)))
+    assert np.abs(found.points - LOCAL).max() < 0.01
+    assert np.array_equal(found.rotations, s.rotations)
+    assert np.array_equal(found.translations, s.translations)
+
+
+def test_steps_lower_the_cost() -> None:
+    problem = flat_problem()
+    identity = np.tile(np.eye(3), (TIMES, 1, 1))
+    start = BundleState(problem.start, identity, np.zeros((TIMES, 3)))
+    costs = [problem.minimize(start, k)[1] for k in (0, 1, 4, 25)]
+    assert costs[0] == problem.cost(start)
+    assert costs == sorted(costs, reverse=True)
+    assert costs[-1] < 0.05 * costs[0]
+
+
+def test_a_solution_is_a_local_minimum() -> None:
+    problem = flat_problem()
+    best, cost = problem.minimize(true_state(problem), 60)
+    rng = np.random.default_rng(0)
+    for size in (1e-3, 1e-2):
+        turn = Rotation.from_rotvec(size * rng.standard_normal((TIMES, 3))).as_matrix()
+        away = rng.standard_normal((TIMES, 3)), rng.standard_normal((COUNT, 3))
+        translations = best.translations + size * away[0]
+        assert problem.cost(replace(best, rotations=turn @ best.rotations)) > cost
+        assert problem.cost(replace(best, translations=translations)) > cost
+        assert problem.cost(replace(best, points=best.points + size * away[1])) > cost

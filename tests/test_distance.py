@@ -1,0 +1,67 @@
+"""The distance of a moving point by its smoothest path, in closed form."""
+
+import numpy as np
+from posed_planes import F, H, W, X, Y, cameras_at, neighbors, posed_video
+
+from hdr_nsff.priors.movers.distance import mover_depth, smoothest_path, third_differences
+
+FORWARD = np.tile([0.0, 0, 1], (24, 1))
+
+
+def path(shake: float, count: int = 24) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """z-depth of a point on a straight line at z = 2 to 2.5, the eyes of a shaking
+    camera, and the rays of z-depth 1 between them.
+    """
+    t = np.arange(count, dtype=float)
+    point = np.stack([0.03 * t - 0.3, 0.01 * t, 2 + 0.02 * t], -1)
+    eyes = shake * np.random.default_rng(0).standard_normal((count, 3)) + np.stack(
+        [0.02 * t, 0 * t, 0 * t], -1
+    )
+    local = point - eyes
+    return point[:, 2] - eyes[:, 2], eyes, local / local[:, 2:]
+
+
+def test_third_differences_vanish_on_parabolas_whatever_the_spacing() -> None:
+    t = np.array([0, 1, 3, 4, 5, 7.0])
+    differences = third_differences(t, np.ones(5, bool))
+    assert differences.shape == (3, 6)
+    assert np.allclose(differences @ (2 - t + 0.3 * t**2), 0, atol=1e-9)
+    assert np.allclose(third_differences(np.arange(4.0), np.ones(3, bool)), [[-1, 3, -3, 1]])
+    # a step is unknown in every run of four
+    assert len(third_differences(t, np.array([1, 1, 0, 1, 1], bool))) == 0
+
+
+def test_a_shaking_camera_determines_the_distance_of_a_moving_point() -> None:
+    z, eyes, rays = path(shake=0.02)
+    found, sigma = smoothest_path(
+        eyes, FORWARD, rays, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
+    )
+    assert np.abs(found / z - 1).mean() < 0.03 and np.median(sigma) < 0.03
+
+
+def test_a_smooth_camera_leaves_the_prior() -> None:
+    _, eyes, rays = path(shake=0.0)
+    noisy = rays + 0.003 * np.random.default_rng(1).standard_normal(rays.shape) * [1, 1, 0]
+    found, sigma = smoothest_path(
+        eyes, FORWARD, noisy, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
+    )
+    assert np.allclose(found, 3.5, rtol=0.02) and np.median(sigma) > 0.15
+
+
+def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None:
+    """A square at z = 2 before a wall at z = 4, moving by 0.03 per frame."""
+    rng = np.random.default_rng(3)
+    eyes = np.concatenate([0.03 * rng.standard_normal((20, 2)), np.zeros((20, 1))], 1)
+    place = np.stack([0.03 * np.arange(20) - 0.3, np.zeros(20)], -1)
+    center = (place - eyes[:, :2]) / 2 * F + [W / 2, H / 2]  # (20, 2) px
+    moving = np.stack([(np.abs(X - x) < 7) & (np.abs(Y - y) < 7) for x, y in center])
+    pairs = neighbors(20)
+    motions = [np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]
+    flow = np.stack(motions).astype(np.float32)
+    wall = np.full((20, H, W), 0.25, np.float32)
+    disparity, confidence = mover_depth(
+        posed_video(cameras_at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall
+    )
+    assert np.abs(disparity[moving] * 2 - 1).mean() < 0.03
+    assert (disparity[~moving] == 0.25).all()
+    assert confidence[~moving].max() == 0 and 0.4 < confidence[moving].mean() <= 0.5

@@ -1,0 +1,48 @@
+"""Groups of tracks that move as one, of known bodies."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from moving_bodies import body, tracked
+
+from hdr_nsff.priors.movers.rigid_groups import cut_graph, find_rigid_groups
+from hdr_nsff.priors.movers.tracks import Tracks
+from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING
+
+
+def test_two_bodies_that_touch_are_separate_groups() -> None:
+    one, _, _ = body(0, np.array([-0.4, 0, 3.0]), np.array([0.06, 0, 0]), 0.12)
+    two, _, _ = body(1, np.array([0.5, 0.1, 3.2]), np.array([-0.04, 0.01, 0]), -0.08)
+    groups = find_rigid_groups(tracked(np.concatenate([one, two]), noise=0.005))
+    assert len(groups) == 2
+    for group in groups:
+        share = (group.members < len(one)).mean()
+        assert min(share, 1 - share) < 0.05
+
+
+def test_a_group_below_the_least_share_is_dropped() -> None:
+    one, _, _ = body(0, np.array([-0.4, 0, 3.0]), np.array([0.06, 0, 0]), 0.12)
+    two, _, _ = body(1, np.array([0.5, 0.1, 3.2]), np.array([-0.04, 0.01, 0]), -0.08)
+    tracks = tracked(np.concatenate([one, two[:40]]), noise=0.005)
+    assert len(find_rigid_groups(tracks)) == 2  # the second has a quarter of the tracks
+    tuning = replace(RIGID_GROUPS_TUNING, min_group_share=0.5)
+    assert len(find_rigid_groups(tracks, tuning=tuning)) == 1
+
+
+def test_tracks_without_neighbors_are_parts_of_their_own() -> None:
+    points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1, count=12)
+    near = tracked(points)
+    far = [replace(near, pixels=near.pixels + 1000.0 * k) for k in range(12)]
+    columns = [np.concatenate([getattr(t, f.name) for t in far]) for f in fields(Tracks)]
+    assert len(np.unique(cut_graph(Tracks(*columns)))) == RIGID_GROUPS_TUNING.parts
+
+
+@pytest.mark.filterwarnings("error")
+def test_one_time_is_no_error() -> None:
+    points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1)
+    pixels = 200 * points[:, :1, :2] / points[:, :1, 2:] + 100
+    once = np.ones((len(points), 1))
+    tracks = Tracks(pixels, points[:, :1], once, once.astype(int), once.astype(int))
+    groups = find_rigid_groups(tracks)
+    assert len(groups) == 1 and abs(groups[0].translations).max() < 1e-12

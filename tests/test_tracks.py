@@ -1,0 +1,54 @@
+"""Tracks along flow: where they go and where they end."""
+
+import numpy as np
+import pytest
+
+from hdr_nsff.priors.movers.tracks import MovingView, advance, follow_moving_pixels, smooth_flow
+
+
+def test_a_track_ends_where_flow_is_invalid_or_leaves_the_moving_pixels() -> None:
+    moving = np.zeros((8, 8), bool)
+    moving[2:6, 2:6] = True
+    flow, valid = np.full((8, 8, 2), 1.0), np.ones((8, 8), bool)
+    valid[3, 3] = False
+    view = MovingView(moving, np.zeros((8, 8, 3)), np.ones((8, 8)), {1: flow}, {1: valid})
+    out = advance(view, view, 1, np.array([[2.5, 2.5], [3.5, 3.5], [5.5, 5.5], [np.nan, np.nan]]))
+    assert out[0].tolist() == [3.5, 3.5] and np.isnan(out[1:]).all()
+
+
+def test_flow_is_averaged_over_known_pixels_of_similar_motion() -> None:
+    flow = np.random.default_rng(0).normal(0, 0.3, (30, 40, 2)).astype(np.float32)
+    flow[:, 20:] += [9.0, 0.0]  # another object
+    known = np.ones((30, 40), bool)
+    known[10, 10], flow[10, 10] = False, 100
+    smooth = smooth_flow(flow, known)
+    assert np.isnan(smooth[10, 10]).all()
+    error = smooth - np.where(np.arange(40)[:, None] < 20, [0.0, 0.0], [9.0, 0.0])
+    assert np.nanstd(error) < 0.3 / 3 and np.nanmax(abs(error)) < 0.6  # nothing leaks across
+
+
+def test_tracks_follow_a_flow_between_pixels_and_count_their_steps() -> None:
+    moving = np.ones((20, 60), bool)
+    flow = np.full((20, 60, 2), [1.25, 0.0], np.float32)
+    both = {1: flow, -1: -flow}
+    trust = moving.astype(float)
+    view = MovingView(moving, np.zeros((20, 60, 3)), trust, both, {1: moving, -1: moving})
+    tracks = follow_moving_pixels([view] * 4)
+    begun = np.argmin(tracks.age, 1)
+    here = np.take_along_axis(tracks.pixels[..., 0], begun[:, None], 1)
+    expected = here + 1.25 * (np.arange(4) - begun[:, None])
+    visible = tracks.trust > 0
+    assert np.allclose(tracks.pixels[..., 0][visible], expected[visible], atol=1e-4)
+    assert np.array_equal(tracks.age, abs(np.arange(4) - begun[:, None]))
+
+
+def test_tracks_end_between_two_objects() -> None:
+    moving = np.ones((9, 40), bool)
+    right, left = np.float32([6.0, 0.0]), np.float32([-3.0, 0.0])
+    flow = np.where(np.arange(40)[None, :, None] < 20, right, left).repeat(9, 0)
+    view = MovingView(moving, np.zeros((9, 40, 3)), moving.astype(float), {1: flow}, {1: moving})
+    # the border is at x = 20
+    out = advance(view, view, 1, np.array([[19.0, 4.5], [20.0, 4.5], [21.2, 4.5]]))
+    assert out[0, 0] == pytest.approx(25)
+    assert np.isnan(out[1, 0])
+    assert out[2, 0] == pytest.approx(18.2)
