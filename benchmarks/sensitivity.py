@@ -106,6 +106,11 @@ CONSTANTS = (
     Constant("refined_flow", "least_squares.window_px", "flow"),
     Constant("refined_flow", "least_squares.max_correction_px", "flow"),
     Constant("refined_flow", "round_trip.max_error_px", "validity"),
+    Constant("movers", "groups.max_residual_ratio", "mover depth"),
+    Constant("movers", "bundle.flow_noise_px", "mover depth"),
+    Constant("movers", "bundle.path_sigma", "mover depth"),
+    Constant("movers", "segmentation.max_error", "mover depth"),
+    Constant("movers", "distance.prior_sigma", "mover depth"),
 )
 
 
@@ -125,13 +130,15 @@ def main() -> None:
     parser.add_argument("work", type=Path, help="folder for clips and scenes")
     parser.add_argument("--data", type=Path, help="folder of recorded clips; default: none")
     parser.add_argument("--only", metavar="NAME", help="constants whose name contains this")
+    names = [*RENDERED, *RECORDED]
+    parser.add_argument("--clips", nargs="+", choices=names, default=names)
     args = parser.parse_args()
     record = Record("sensitivity", args, seed=SEED)
     record.settings |= {"frames": FRAMES, "size": SIZE, "spp": SPP}
     if args.out.is_file():
         record.results = read_json(args.out)["results"]
     constants = [c for c in CONSTANTS if args.only is None or args.only in c.name]
-    clips = [*RENDERED, *(RECORDED if args.data else ())]
+    clips = [clip for clip in args.clips if args.data or clip in RENDERED]
     wanted = [m for clip in clips for m in measurements(clip, constants)]
     stored = {measurement_of(row) for row in record.results}
     measure([m for m in wanted if m not in stored], constants, record, args.work, args.data)

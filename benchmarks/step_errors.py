@@ -23,6 +23,7 @@ from hdr_nsff.geometry import alignment, pinhole
 from hdr_nsff.geometry.poses import Poses, project
 from hdr_nsff.geometry.round_trip import follow, valid_flow
 from hdr_nsff.prepare.steps.flow import Pair, learning_pairs
+from hdr_nsff.prepare.steps.movers import find_movers
 from hdr_nsff.prepare.steps.refined_flow import RefinedFlowTuning, Refiner, equalized
 from hdr_nsff.prepare.steps.response import response_view
 from hdr_nsff.prepare.work import Work
@@ -30,10 +31,12 @@ from hdr_nsff.priors.depth.geometric import DepthTuning, static_geometric_depth
 from hdr_nsff.priors.flow.sources import FlowTuning, flow_source
 from hdr_nsff.priors.masks.geometric import geometric_mask
 from hdr_nsff.priors.masks.geometric_tuning import GeometricMaskTuning
+from hdr_nsff.priors.movers.tuning import MoversTuning
 from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses
 from hdr_nsff.radiometry.exposure_cycle import ExposureCycleTuning, detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.radiometry.response import ResponseTuning, estimate_response
+from hdr_nsff.scene.movers import fill_mover_depth, read_movers
 
 CODES = 255  # of 8 bits
 RIGHT_FLOW_PX = 1.0  # end-point error up to which flow counts as right
@@ -102,6 +105,10 @@ METRICS = {
         "%",
         "pixels of the moving masks wrongly judged to stand still, or to move",
         "pixels of the moving masks judged otherwise than by the default",
+    ),
+    "mover depth": Metric(
+        "%",
+        "mean |ln(estimated / true)| of the depth of moving pixels that the masks mark, at most 1",
     ),
 }
 
@@ -392,6 +399,28 @@ def disparity_mismatch(clip: Clip, disparity: np.ndarray) -> float:
     return 100 * float(np.concatenate(errors).mean())
 
 
+def mover_errors(clip: Clip, tuning: MoversTuning) -> Errors:
+    """Of the steps `movers` and `depth`; recorded clips have no truth for them."""
+    work = clip.work
+    still = work.still()
+    if clip.exact is None or still is None:
+        return {}
+    result = find_movers(work, tuning)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "movers.npz"
+        result.files["movers.npz"](path)
+        movers = read_movers(path)
+    time_of = {int(index): t for t, index in enumerate(movers[0].frames)} if movers else {}
+    moving = work.masks & ~still
+    disparity, confidence = work.static_depth()
+    first = np.stack([result.maps["mover_disparity"][k] for k in range(len(disparity))])
+    disparity = np.where(moving, first, disparity)
+    for k, t in time_of.items():
+        c2w = work.camera(work.train[k])[1]
+        disparity[k], _ = fill_mover_depth(movers, t, moving[k], c2w, disparity[k], confidence[k])
+    return {"mover depth": depth_error(clip, disparity, clip.moving & work.masks)}
+
+
 STEPS = {
     "exposure": Step(ExposureCycleTuning(), exposure_errors),
     "flow": Step(FlowTuning(), flow_errors),
@@ -400,4 +429,5 @@ STEPS = {
     "static_depth": Step(DepthTuning(), depth_errors),
     "response": Step(ResponseTuning(), response_errors),
     "refined_flow": Step(RefinedFlowTuning(), refined_flow_errors),
+    "movers": Step(MoversTuning(), mover_errors),
 }
