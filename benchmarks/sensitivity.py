@@ -10,7 +10,9 @@ what the steps before it left, with one constant halved or doubled. `step_errors
 names the errors, and what recorded clips are compared with. Constants of `radiometry/`
 and of the round trip of flow, which the priors build on, are among them.
 
-A constant that changes no error of any clip by 1 % changes nothing here. Every
+A constant that changes no error of any clip by 1 % changes nothing here. Structure from
+motion is not repeatable: its default is run several times, and only errors outside of
+their range (in brackets) count as changes. Every
 measurement is stored as soon as it is done: the same command continues where a killed
 one was, and with everything done prints the table. `commit` is that of the last run.
 """
@@ -22,7 +24,7 @@ from typing import Any
 
 import numpy as np
 from record import Record, make_parser
-from step_errors import METRICS, STEPS, Clip
+from step_errors import METRICS, STEPS, Clip, Errors
 
 from hdr_nsff.core.io import read_json, write_npy
 from hdr_nsff.core.process import prepare_process
@@ -32,6 +34,7 @@ from hdr_nsff.prepare.engine import run_step
 from hdr_nsff.prepare.prepare import STEPS as PREPARE_STEPS
 from hdr_nsff.prepare.prepare import PrepareConfig, begin
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
 from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.settings import SynthConfig, parse_ev
@@ -56,13 +59,14 @@ class RecordedClip:
     path: str  # in the folder of recorded clips
     ev: tuple[float, ...]  # of one cycle, stops
     stride: int = 1
+    reexposed: bool = False  # it has one exposure, and is recorded again with these
     max_size: int = 256  # pixels
 
 
-# A backpack rig walks over a lawn: BorealHDR, of whose six exposures every second one
-# is used. A panning camera and people: DeepHDRVideo-Dataset.
+# A hand moves over books, a handheld camera around them (nonrigid_nerf); a camera that
+# pans, and people (DeepHDRVideo-Dataset), recorded with two exposures in turn.
 RECORDED = {
-    "boreal_walk": RecordedClip("boreal_walk/frames", (-2, 0, 2), stride=2),
+    "hand_books": RecordedClip("hand_books/images", (-2, 0, 2), stride=3, reexposed=True),
     "park_walkers": RecordedClip("alternating/park_walkers_2exp_3stop.mp4", (0, 3)),
 }
 
@@ -182,8 +186,9 @@ def measure(
         tuning, value = step.tuning, None
         if m.constant:
             tuning, value = scaled(step.tuning, path_of[m.constant], m.factor)
-        errors = {name: digits(error) for name, error in step.errors(clip, tuning).items()}
-        record.add(asdict(m) | {"value": value, "errors": errors}, show=False)
+        repeats = 1 if m.constant else step.repeats
+        runs = [step.errors(clip, tuning) for _ in range(repeats)]
+        record.add(asdict(m) | {"value": value} | summary(runs), show=False)
         record.save(show=False)
         left = progress_of(done, len(missing), time.monotonic() - start)
         say(f"sensitivity: {done}{left}; {m.clip}, {m.constant or m.step} x{m.factor:g}")
@@ -202,9 +207,16 @@ def scaled(tuning: Any, path: list[str], factor: float) -> tuple[Any, float]:
     return replace(tuning, **{name: new}), new
 
 
-def digits(error: float) -> float:
-    """An error in five digits; infinite where the step failed (null in JSON)."""
-    return float(f"{error:.5g}")
+def summary(runs: list[Errors]) -> dict[str, dict[str, Any]]:
+    """The median errors of equal runs, and the range of each where there are several;
+    infinite where the step failed (null in JSON).
+    """
+    values = {name: [float(f"{run[name]:.5g}") for run in runs] for name in runs[0]}
+    summarized: dict[str, dict[str, Any]] = {}
+    summarized["errors"] = {name: sorted(v)[len(v) // 2] for name, v in values.items()}
+    if len(runs) > 1:
+        summarized["range"] = {name: [min(v), max(v)] for name, v in values.items()}
+    return summarized
 
 
 # Clips
@@ -217,16 +229,35 @@ def open_clip(name: str, work: Path, data: Path | None) -> Clip:
         return open_rendered(name, work / f"{name}_clip", scene)
     assert data is not None
     recorded = RECORDED[name]
+    frames = slice(0, FRAMES * recorded.stride, recorded.stride)
+    clip = data / recorded.path
+    if recorded.reexposed:
+        clip = record_again(recorded, clip, work / f"{name}_clip", frames)
+        frames = slice(0, FRAMES, 1)
     config = PrepareConfig(
-        data / recorded.path,
+        clip,
         scene,
         exposures="auto",
         hold_out=0,
         max_size=recorded.max_size,
-        end=FRAMES * recorded.stride,
-        stride=recorded.stride,
+        end=frames.stop,
+        stride=frames.step,
     )
     return Clip(name, prepared(config), recorded.ev)
+
+
+def record_again(recorded: RecordedClip, clip: Path, out: Path, frames: slice) -> Path:
+    """The frames of a clip recorded with alternating exposures, as footage."""
+    settings = ReexposeConfig(
+        clip,
+        out,
+        ev=",".join(f"{ev:g}" for ev in recorded.ev),
+        max_size=recorded.max_size,
+        end=frames.stop,
+        stride=frames.step,
+        seed=SEED,
+    )
+    return reexpose(settings) / "clip"
 
 
 def prepared(config: PrepareConfig) -> Work:
@@ -283,13 +314,15 @@ def table(constants: list[Constant], rows: list[dict[str, Any]]) -> str:
     ]
     for c in constants:
         for clip in dict.fromkeys(row["clip"] for row in rows):
-            errors = errors_of(c, clip, rows)
-            if errors is None or c.metric not in errors["default"]:
+            found = rows_of(c, clip, rows)
+            if found is None or c.metric not in found["default"]["errors"]:
                 continue  # not measured on this clip
-            cells = [number(errors[key].get(c.metric)) for key in FACTORS]
-            lines.append(
-                f"| {c.name} | {clip} | {c.metric} | {' | '.join(cells)} | {unit(c, clip)} |"
-            )
+            cells = [number(found[key]["errors"].get(c.metric)) for key in FACTORS]
+            spread = found["default"].get("range", {}).get(c.metric)
+            if spread is not None and spread[0] != spread[1]:
+                cells[1] += f" ({number(spread[0])} to {number(spread[1])})"
+            row = [c.name, clip, c.metric, *cells, unit(c, clip)]
+            lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines)
 
 
@@ -304,40 +337,47 @@ def number(value: float | None) -> str:
     return "fails" if value is None else f"{value:.3g}"
 
 
-def errors_of(
+def rows_of(
     constant: Constant, clip: str, rows: list[dict[str, Any]]
-) -> dict[str, dict[str, float | None]] | None:
-    """The errors by the names of `FACTORS`; None where some are not measured."""
-    found = {measurement_of(row): row["errors"] for row in rows}
-    errors = {}
+) -> dict[str, dict[str, Any]] | None:
+    """The results by the names of `FACTORS`; None where some are not measured."""
+    by_measurement = {measurement_of(row): row for row in rows}
+    found = {}
     for key, factor in FACTORS.items():
         name = "" if key == "default" else constant.name
         measurement = Measurement(clip, constant.step, name, factor)
-        if measurement not in found:
+        if measurement not in by_measurement:
             return None
-        errors[key] = found[measurement]
-    return errors
+        found[key] = by_measurement[measurement]
+    return found
 
 
 def changes_anything(constant: Constant, rows: list[dict[str, Any]]) -> bool:
-    """Whether half or double changes any error of any clip."""
+    """Whether half or double changes any error of any clip by more than equal runs
+    differ.
+    """
     for clip in {row["clip"] for row in rows}:
-        errors = errors_of(constant, clip, rows)
-        if errors is None:
+        found = rows_of(constant, clip, rows)
+        if found is None:
             continue
-        for metric, default in errors["default"].items():
+        default = found["default"]
+        for metric, error in default["errors"].items():
+            low, high = default.get("range", {}).get(metric, (error, error))
             for key in ("half", "double"):
-                if differs(errors[key].get(metric), default):
+                if differs(found[key]["errors"].get(metric), low, high):
                     return True
     return False
 
 
-def differs(value: float | None, default: float | None) -> bool:
-    """Whether an error differs from the default's; None stands for a failed step."""
-    if value is None or default is None:
-        return value is not default
-    limit = MIN_CHANGE * abs(default) if default else MIN_CHANGE_PERCENT
-    return abs(value - default) > limit
+def differs(value: float | None, low: float | None, high: float | None) -> bool:
+    """Whether an error lies outside the range of the default's; None stands for a
+    failed step.
+    """
+    if value is None or low is None or high is None:
+        return (value is None) != (low is None)
+    below = MIN_CHANGE * low if low else MIN_CHANGE_PERCENT
+    above = MIN_CHANGE * high if high else MIN_CHANGE_PERCENT
+    return not low - below <= value <= high + above
 
 
 if __name__ == "__main__":

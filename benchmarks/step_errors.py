@@ -149,6 +149,7 @@ class Step:
 
     tuning: Any
     errors: Callable[[Clip, Any], Errors]
+    repeats: int = 1  # runs of the default, of a step that is not repeatable
 
 
 # Exposures
@@ -277,8 +278,8 @@ def validity_error(
 
 
 def pose_errors(clip: Clip, tuning: PosesTuning) -> Errors:
-    """Of the step `poses`, in one round with the final masks; one thread, so that the
-    same constants give the same poses.
+    """Of the step `poses`, in one round with the final masks. On one thread incremental
+    mapping is repeatable; global mapping is not.
     """
     video, clipped = clip.work.equalized
     with TemporaryDirectory() as folder:
@@ -424,7 +425,7 @@ def mover_errors(clip: Clip, tuning: MoversTuning) -> Errors:
 STEPS = {
     "exposure": Step(ExposureCycleTuning(), exposure_errors),
     "flow": Step(FlowTuning(), flow_errors),
-    "poses": Step(PosesTuning(), pose_errors),
+    "poses": Step(PosesTuning(), pose_errors, repeats=3),
     "masks": Step(GeometricMaskTuning(), mask_errors),
     "static_depth": Step(DepthTuning(), depth_errors),
     "response": Step(ResponseTuning(), response_errors),

@@ -42,10 +42,21 @@ def test_whole_numbers_stay_whole_and_positive(sensitivity: ModuleType) -> None:
     assert value == 1 and changed.votes == 1
 
 
-def test_an_error_differs_from_one_percent_on_or_when_one_run_fails(
+def test_an_error_differs_beyond_one_percent_of_the_range_of_the_default(
     sensitivity: ModuleType,
 ) -> None:
-    assert not sensitivity.differs(2.01, 2.0)
-    assert sensitivity.differs(2.03, 2.0)
-    assert sensitivity.differs(None, 2.0) and not sensitivity.differs(None, None)
-    assert not sensitivity.differs(0.9, 0.0), "1 % of the pixels, where the default is 0"
+    assert not sensitivity.differs(2.01, 2.0, 2.0)
+    assert sensitivity.differs(2.03, 2.0, 2.0)
+    assert not sensitivity.differs(2.5, 2.0, 3.0)
+    assert not sensitivity.differs(0.9, 0.0, 0.0), "1 % of the pixels, where the default is 0"
+
+
+def test_a_failed_step_differs_from_one_that_works(sensitivity: ModuleType) -> None:
+    assert sensitivity.differs(None, 2.0, 2.0)
+    assert sensitivity.differs(2.0, None, None)
+    assert not sensitivity.differs(None, None, None)
+
+
+def test_equal_runs_are_summarized_by_median_and_range(sensitivity: ModuleType) -> None:
+    runs = [{"pose": 3.0}, {"pose": 1.0}, {"pose": 2.0}]
+    assert sensitivity.summary(runs) == {"errors": {"pose": 2.0}, "range": {"pose": [1.0, 3.0]}}
