@@ -108,7 +108,6 @@ CONSTANTS = (
     Constant("refined_flow", "local_motion.trusted_round_trip_px", "flow"),
     Constant("refined_flow", "local_motion.unlike_motion_px", "flow"),
     Constant("refined_flow", "least_squares.window_px", "flow"),
-    Constant("refined_flow", "least_squares.max_correction_px", "flow"),
     Constant("refined_flow", "round_trip.max_error_px", "validity"),
     Constant("movers", "groups.max_residual_ratio", "mover depth"),
     Constant("movers", "bundle.flow_noise_px", "mover depth"),
