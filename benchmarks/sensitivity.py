@@ -95,7 +95,6 @@ CONSTANTS = (
     Constant("flow", "semantic.reach", "flow"),
     Constant("flow", "dense.smoothness", "flow"),
     Constant("poses", "min_rotation_share", "pose"),
-    Constant("poses", "reconstruction.max_point_error_px", "points"),
     Constant("poses", "reconstruction.sfm.max_free_focal_error_share", "pose"),
     Constant("poses", "reconstruction.sfm.trimming.drop_factor", "pose"),
     Constant("masks", "certain", "mask"),
