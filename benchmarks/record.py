@@ -84,8 +84,8 @@ class Record:
         if show:
             print(json.dumps(self.results[-1], ensure_ascii=False), flush=True)
 
-    def save(self) -> Path:
-        """Write the file, atomically."""
+    def save(self, show: bool = True) -> Path:
+        """Write the file, atomically; `show` prints where it is."""
         machine = this_machine().model_dump(exclude={"commit"})
         machine["gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
         commit, dirty = code_version()
@@ -100,7 +100,8 @@ class Record:
             "results": self.results,
         }
         write_json(self.out, document)
-        print(f"results: {self.out}")
+        if show:
+            print(f"results: {self.out}")
         return self.out
 
 
