@@ -159,5 +159,6 @@ def test_shared_options_have_the_same_help(capsys: pytest.CaptureFixture[str]) -
         lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
         shown[verb] = " ".join(" ".join(lines).split())
     for option in ("--flow", "--masks", "--depth", "--matcher", "--start", "--end", "--stride"):
-        found = shown["prepare"].index(f"{option} ")
-        assert shown["prepare"][found : found + 100] in shown["run"], option
+        start = shown["prepare"].index(f"{option} ")
+        end = shown["prepare"].index(" --", start)  # of the next option
+        assert shown["prepare"][start:end][:100] in shown["run"], option
