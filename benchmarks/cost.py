@@ -1,45 +1,49 @@
-"""What a step of training and a picture cost, against Gaussians, pixels, frames of the
-clip and processor cores.
+"""The cost of a training step and of a picture of `splat`, against four quantities.
 
-    python benchmarks/cost.py SCENE [--plot PLOT.png] [--steps 60] [--only
-    gaussians,pixels,frames,cores]
+    python benchmarks/cost.py SCENE --plot docs/images/cost.png
 
-SCENE is a prepared clip; its frames are resized, left out or played again backwards in
-memory. One thing at a time varies, the others stay at 240x136 pixels, 20,000 Gaussians,
-all frames and all cores. Prints one JSON line per measurement: the median milliseconds
-of a step with all its losses and of a picture (radiance, depth, motion share,
-tone-mapped), and the peak memory of that measurement's own process.
+One of Gaussians, pixels, frames of the clip and processor cores varies at a time. The
+others stay at 20,000 Gaussians, 240 pixels of width, all frames and all cores. SCENE is
+a prepared clip: its frames are resized, dropped, or repeated backwards in memory.
+Every measurement runs in a new process. It holds the median milliseconds of a step with
+all its losses and of a picture (radiance, depth, motion share, tone-mapped), and the
+peak memory of the process.
 """
 
-import argparse
-import json
+from __future__ import annotations
+
 import multiprocessing
-import os
 import resource
 import statistics
 import tempfile
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 import numba
+import numpy as np
 import torch
+from record import Record, make_parser, restart_prepared
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.process import limit_torch_threads, prepare_process
+from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
-MOVING = 0.2  # of all Gaussians
-WARM_UP = 20  # steps
-CORES = os.cpu_count() or 1
-USUAL = {"gaussians": 20_000, "width": 240, "frames": 0, "cores": CORES}  # 0: all
+MOVING_SHARE = 0.2  # of all Gaussians; hand-chosen, near that of trained scenes
+WARM_UP_STEPS = 20  # before the timed ones: kernels are compiled and memory is touched
+CORES = numba.config.NUMBA_NUM_THREADS  # that numba may use
+DEFAULTS = {"gaussians": 20_000, "width": 240, "frames": 0, "cores": CORES}  # 0: all frames
+# Axis: the setting that varies, and its values.
 AXES: dict[str, tuple[str, list[int]]] = {
     "gaussians": ("gaussians", [5_000, 10_000, 20_000, 40_000, 80_000]),
     "pixels": ("width", [120, 240, 480, 720, 960]),
@@ -49,52 +53,54 @@ AXES: dict[str, tuple[str, list[int]]] = {
 
 
 def main() -> None:
-    prepare_process()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    parser = make_parser(__doc__, "cost")
+    parser.add_argument("scene", type=Path, help="a prepared scene")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves to this PNG")
+    parser.add_argument("--steps", type=int, default=60, help="steps and pictures that are timed")
+    parser.add_argument(
+        "--only", nargs="+", choices=AXES, default=list(AXES), help="the axes to measure"
     )
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("--plot", type=Path)
-    parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--only", default=",".join(AXES), help="the axes to measure")
     args = parser.parse_args()
-    rows = []
-    for axis in args.only.split(","):
+    restart_prepared()
+    record = Record("cost", args, seed=TrainConfig.seed)
+    for axis in args.only:
         setting, values = AXES[axis]
         for value in values:
             if setting == "cores" and value > CORES:
                 continue
-            with multiprocessing.get_context("spawn").Pool(
-                1
-            ) as process:  # a process of its own, for its peak memory
-                rows.append(
-                    {"axis": axis}
-                    | process.apply(measured, (args.scene, USUAL | {setting: value}, args.steps))
-                )
-            print(json.dumps(rows[-1]), flush=True)
+            settings = DEFAULTS | {setting: value}
+            # A new process for every measurement: its peak memory counts from zero.
+            with multiprocessing.get_context("spawn").Pool(1) as pool:
+                row = pool.apply(measure, (args.scene, settings, args.steps))
+            record.add({"axis": axis} | row)
+    record.save()
     if args.plot:
-        plot(rows, args.plot)
+        plot(record.results, args.plot)
 
 
-def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any]:
+def measure(folder: Path, settings: dict[str, int], steps: int) -> dict[str, Any]:
     """Median milliseconds of a step and of a picture, and peak memory."""
     scene = Scene.open(folder)
     camera = scene.train[0].camera
-    width, height = setting["width"], round(setting["width"] * camera.height / camera.width)
-    frames = at_length(scene.train, setting["frames"] or len(scene.train))
-    scene = replace(scene, train=[resized(f, width, height) for f in frames], test=[])
-    moving = round(MOVING * setting["gaussians"])
+    width = settings["width"]
+    height = round(width * camera.height / camera.width)
+    frames = repeat_frames(scene.train, settings["frames"] or len(scene.train))
+    shown = [frame.index for frame in frames]
+    scale = np.array([width / camera.width, height / camera.height])
+    resized = [resize_frame(frame, width, height) for frame in frames]
+    scene = replace(
+        scene,
+        train=[replace(frame, index=t) for t, frame in enumerate(resized)],
+        test=[],
+        movers=tuple(repeat_mover(mover, shown, scale) for mover in scene.movers),
+    )
+    moving = round(MOVING_SHARE * settings["gaussians"])
+    field = SplatConfig(static=settings["gaussians"] - moving, moving=moving)
+    budget = Budget(steps=100 * steps, minutes=None)
     with tempfile.TemporaryDirectory() as out:
-        field = SplatConfig(static=setting["gaussians"] - moving, moving=moving)
-        config = replace(
-            PRESETS["splat"],
-            field=field,
-            scene=folder,
-            out=Path(out),
-            budget=Budget(steps=100 * steps, minutes=None),
-        )
+        config = replace(PRESETS["splat"], field=field, scene=folder, out=Path(out), budget=budget)
         trainer = Trainer(config, scene, torch.device("cpu"), distributed.Ranks())
-        numba.set_num_threads(setting["cores"])
+        numba.set_num_threads(settings["cores"])
 
         def step() -> None:
             trainer.step()
@@ -106,71 +112,87 @@ def measured(folder: Path, setting: dict[str, int], steps: int) -> dict[str, Any
             render = trainer.field.render(frame.camera, frame.time, scene_flow=False)
             trainer.tonemapper.develop(render.radiance, 0.0)
 
-        spent = {"step_ms": timed(step, steps), "picture_ms": timed(picture, steps)}
-    about = {
-        "gaussians": setting["gaussians"],
+        step_ms = median_milliseconds(step, steps)
+        picture_ms = median_milliseconds(picture, steps)
+    return {
+        "gaussians": settings["gaussians"],
         "pixels": width * height,
         "frames": len(frames),
-        "cores": setting["cores"],
+        "cores": settings["cores"],
+        "step_ms": step_ms,
+        "picture_ms": picture_ms,
+        "peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
     }
-    return (
-        about
-        | spent
-        | {"peak_memory_gb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2)}
-    )
 
 
-def timed(do: Any, times: int) -> float:
-    """Median milliseconds."""
-    spent = []
-    for i in range(WARM_UP + times):
+def median_milliseconds(action: Callable[[], None], repeats: int) -> float:
+    """Median time of `action` over `repeats` calls, after a warm-up."""
+    times = []
+    for i in range(WARM_UP_STEPS + repeats):
         start = perf_counter()
-        do()
-        if i >= WARM_UP:
-            spent.append(perf_counter() - start)
-    return round(1e3 * statistics.median(spent), 2)
+        action()
+        if i >= WARM_UP_STEPS:
+            times.append(perf_counter() - start)
+    return round(1e3 * statistics.median(times), 2)
 
 
-def at_length(frames: list[Frame], count: int) -> list[Frame]:
-    """The first `count` frames; where there are too few, the clip goes on backwards and
-    forwards again, without flow.
+def repeat_frames(frames: list[Frame], count: int) -> list[Frame]:
+    """The first `count` frames; a shorter clip continues backwards and forwards again.
+
+    Frames after the clip's end have no flow.
     """
-    there_and_back = [*frames, *reversed(frames)]
-    longer = []
+    back_and_forth = [*frames, *reversed(frames)]
+    result = []
     for t in range(count):
-        f = there_and_back[t % len(there_and_back)]
-        near = {o: t + o for o in (1, -1) if 0 <= t + o < count}
-        told = {o for o in near if o in f.flow} if t < len(frames) else set()
-        flow, valid = {o: f.flow[o] for o in told}, {o: f.flow_valid[o] for o in told}
-        longer.append(replace(f, time=float(t), neighbors=near, flow=flow, flow_valid=valid))
-    return longer
+        frame = back_and_forth[t % len(back_and_forth)]
+        neighbors = {offset: t + offset for offset in (1, -1) if 0 <= t + offset < count}
+        with_flow = {o for o in neighbors if o in frame.flow} if t < len(frames) else set()
+        flow = {offset: frame.flow[offset] for offset in with_flow}
+        flow_valid = {offset: frame.flow_valid[offset] for offset in with_flow}
+        result.append(
+            replace(frame, time=float(t), neighbors=neighbors, flow=flow, flow_valid=flow_valid)
+        )
+    return result
 
 
-def resized(frame: Frame, width: int, height: int) -> Frame:
-    """The frame and its priors with another number of pixels."""
+def resize_frame(frame: Frame, width: int, height: int) -> Frame:
+    """The frame and its priors at another size, by nearest neighbors."""
     scale = torch.tensor([width / frame.camera.width, height / frame.camera.height])
 
-    def nearest(image: Tensor | None) -> Any:
+    def resize(image: Tensor | None) -> Any:
         if image is None:
             return None
-        layers = (
-            image[None, None].float() if image.ndim == 2 else image.permute(2, 0, 1)[None].float()
-        )
-        other = interpolate(layers, (height, width), mode="nearest")[0]
-        return (other[0] if image.ndim == 2 else other.permute(1, 2, 0).contiguous()).to(
-            image.dtype
-        )
+        channels = image[..., None] if image.ndim == 2 else image
+        planes = channels.permute(2, 0, 1)[None].float()  # (1, C, H, W)
+        resized = interpolate(planes, (height, width), mode="nearest")[0].permute(1, 2, 0)
+        return resized.reshape(height, width, *image.shape[2:]).contiguous().to(image.dtype)
 
     return replace(
         frame,
         camera=frame.camera.resized(width, height),
-        image=nearest(frame.image),
-        moving=nearest(frame.moving),
-        outline=nearest(frame.outline),
-        disparity=nearest(frame.disparity),
-        disparity_confidence=nearest(frame.disparity_confidence),
-        flow={o: nearest(f) * scale for o, f in frame.flow.items()},
-        flow_valid={o: nearest(v) for o, v in frame.flow_valid.items()},
+        image=resize(frame.image),
+        moving=resize(frame.moving),
+        outline=resize(frame.outline),
+        disparity=resize(frame.disparity),
+        disparity_confidence=resize(frame.disparity_confidence),
+        flow={offset: resize(flow) * scale for offset, flow in frame.flow.items()},
+        flow_valid={offset: resize(valid) for offset, valid in frame.flow_valid.items()},
+    )
+
+
+def repeat_mover(mover: Mover, shown: list[int], scale: np.ndarray) -> Mover:
+    """The mover in a clip whose frames show those of the indices `shown`, resized."""
+    time_of = {int(index): t for t, index in enumerate(mover.frames)}
+    frames = [t for t, index in enumerate(shown) if index in time_of]
+    times = [time_of[shown[t]] for t in frames]
+    return replace(
+        mover,
+        frames=np.array(frames),
+        pixels=mover.pixels[:, times] * scale,
+        trust=mover.trust[:, times],
+        rotations=mover.rotations[times],
+        translations=mover.translations[times],
+        known=mover.known[times],
     )
 
 
@@ -181,28 +203,30 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    axes_measured = list(dict.fromkeys(r["axis"] for r in rows))
+    axes = list(dict.fromkeys(row["axis"] for row in rows))
     figure, panels = plt.subplots(
-        1, len(axes_measured), figsize=(3.4 * len(axes_measured), 3.2), sharey=True, squeeze=False
+        1, len(axes), figsize=(3.4 * len(axes), 3.2), sharey=True, squeeze=False
     )
-    for axis, panel in zip(axes_measured, panels[0], strict=True):
-        some = [r for r in rows if r["axis"] == axis]
-        for what, label in (("step_ms", "a training step"), ("picture_ms", "a picture")):
-            panel.plot([r[axis] for r in some], [r[what] for r in some], marker="o", label=label)
-        values = [r[axis] for r in some]
+    for axis, panel in zip(axes, panels[0], strict=True):
+        of_axis = [row for row in rows if row["axis"] == axis]
+        values = [row[axis] for row in of_axis]
+        for key, label in (("step_ms", "a training step"), ("picture_ms", "a picture")):
+            panel.plot(values, [row[key] for row in of_axis], marker="o", label=label)
         panel.set(xlabel=axis, xscale="log", yscale="log")
-        panel.set_xticks(
-            values, [f"{round(v / 1000)}k" if v >= 1000 else str(v) for v in values], fontsize=8
-        )
+        panel.set_xticks(values, [short_number(value) for value in values], fontsize=8)
         panel.minorticks_off()
         panel.grid(alpha=0.3)
+    ticks = [2, 5, 10, 20, 50, 100, 200]
     panels[0][0].set_ylabel("milliseconds")
-    panels[0][0].set_yticks(
-        [2, 5, 10, 20, 50, 100, 200], ["2", "5", "10", "20", "50", "100", "200"]
-    )
+    panels[0][0].set_yticks(ticks, [str(tick) for tick in ticks])
     panels[0][0].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=110)
+
+
+def short_number(value: int) -> str:
+    """A number for a tick: thousands as k."""
+    return f"{round(value / 1000)}k" if value >= 1000 else str(value)
 
 
 if __name__ == "__main__":

@@ -1,17 +1,14 @@
-"""How well flow holds when the exposure changes: end-point error on rendered scenes,
-whose flow is exact, for EV differences of one's choice.
+"""Errors of optical flow when the exposure changes, on scenes whose flow is exact.
 
-    hdr-nsff synth SCENE
+    hdr-nsff synth lamp SCENE
     python benchmarks/flow.py SCENE [SCENE ...] --flows prepared dis gmflow
-    raft-finetuned --finetuned TUNED
 
-The frames' exact radiance (SCENE/exact/clip_*.exr) is recorded again, as a clip whose
-two exposures alternate: the same pairs of neighbors, with nothing changed between rows
-but how many stops apart they are. `raw` matches what was recorded; `equalized` what
-`prepare` makes of it. `prepared` is the flow of a scene that `prepare` made of those
-frames, nothing else given: the default, with the masks that it found itself. Errors are
-those of pixels that both frames show, in both directions, clipped or not; seconds are
-CPU seconds per pair, both directions.
+The exact radiance of the frames (SCENE/exact/clip_*.exr) is recorded again, as clips
+whose two exposures alternate. The pairs of neighbors stay the same; only their
+difference of exposure (--ev) varies. `raw` matches the recorded frames, `equalized` the
+frames as `prepare` equalizes them. `prepared` is the flow that training reads after
+`prepare` with its defaults, masks included. Errors count pixels that both frames show,
+in both directions, clipped or not. Seconds are CPU seconds of a pair, both directions.
 """
 
 from __future__ import annotations
@@ -21,14 +18,15 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import torch
+from record import Record, make_parser, restart_prepared
 
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_mask, write_png
-from hdr_nsff.core.io import read_npy, write_json
-from hdr_nsff.core.process import prepare_process
+from hdr_nsff.core.io import read_npy
 from hdr_nsff.geometry.round_trip import valid_flow
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.priors.flow.dense import (
@@ -46,114 +44,122 @@ from hdr_nsff.radiometry.recording import Noise, record, response_curve
 from hdr_nsff.scene.manifest import Manifest
 
 FLOWS = ("prepared", "dis", "semantic", "gmflow", "raft", "raft-finetuned")
+SEED = 0  # of the recorded noise
+
+Flows = tuple[np.ndarray, np.ndarray]  # flow (P, H, W, 2) px of pairs, valid (P, H, W)
+# (recorded video (T, H, W, 3), bracket of each frame, pairs (P, 2)) -> flow
+Matcher = Callable[[np.ndarray, list[int], np.ndarray], Flows]
 
 
 def main() -> None:
-    prepare_process()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scenes", type=Path, nargs="+")
+    parser = make_parser(__doc__, "flow")
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE", help="`synth` wrote it")
     parser.add_argument("--flows", nargs="+", choices=FLOWS, default=["dis"])
     parser.add_argument(
         "--weights", type=Path, help="of gmflow or raft; default: where weights are kept"
     )
-    parser.add_argument("--finetuned", type=Path, help="what `finetune-flow` wrote")
+    parser.add_argument("--finetuned", type=Path, help="the folder that `finetune-flow` wrote")
     parser.add_argument(
         "--ev", nargs="+", type=float, default=[0, 2, 4], help="stops between neighbors"
     )
     parser.add_argument(
         "--pairs", type=int, default=4, help="pairs of neighbors per scene, evenly over the clip"
     )
-    parser.add_argument("--only", choices=("raw", "equalized"))
-    parser.add_argument("--json", type=Path)
+    parser.add_argument("--only", choices=("raw", "equalized"), help="match only these frames")
     args = parser.parse_args()
+    restart_prepared()
     torch.set_num_threads(1)
-    rows = []
+    results = Record("flow", args, seed=SEED)
     for scene in args.scenes:
         frames = [read_exr(path) for path in sorted((scene / "exact").glob("clip_*.exr"))]
-        assert len(frames) > args.pairs, f"{scene}: {len(frames)} frames in exact/"
-        pairs = neighbors(len(frames), args.pairs)
-        print(
-            f"\n{scene.name}, {len(pairs)} pairs of {frames[0]['Z'].shape[1]}x{frames[0]['Z'].shape[0]}\n\n{HEADER}"
-        )
+        if len(frames) < 2:
+            parser.error(f"{scene}/exact holds {len(frames)} frames clip_*.exr; 2 are needed")
+        pairs = neighbor_pairs(len(frames), args.pairs)
+        height, width = frames[0]["Z"].shape
+        print(f"\n{scene.name}, {len(pairs)} pairs of {width}x{height}\n\n{HEADER}")
         for name in args.flows:
-            network = (
-                None if name in ("dis", "prepared") else named(name, args.weights, args.finetuned)
-            )
-            both = (
-                ("equalized",) if name in ("prepared", "semantic") else ("raw", "equalized")
-            )  # these two equalize by themselves
-            for treated in both if args.only is None else (args.only,):
-                for stops in args.ev:
-                    rows.append({"scene": scene.name, "flow": name, "frames": treated, "ev": stops})
-                    rows[-1] |= measure(
-                        frames,
-                        pairs,
-                        stops,
-                        as_prepared if name == "prepared" else prior(network, treated),
-                    )
-                    print(line(rows[-1]), flush=True)
-    if args.json:
-        write_json(args.json, rows)
+            measure_flow(name, scene.name, frames, pairs, args, results)
+    results.save()
 
 
-def named(name: str, weights: Path | None, finetuned: Path | None) -> object:
-    """A loaded network, or the features of `--flow semantic` as they are: fitting them
-    to a clip moved no median by 0.01 px.
+def measure_flow(
+    name: str,
+    scene: str,
+    frames: list[dict[str, np.ndarray]],
+    pairs: np.ndarray,
+    args: argparse.Namespace,
+    results: Record,
+) -> None:
+    """One flow on one scene, for all inputs and differences of exposure."""
+    network = load_flow(name, args.weights, args.finetuned)
+    # `prepared` and `semantic` equalize the frames themselves.
+    inputs = ("equalized",) if name in ("prepared", "semantic") else ("raw", "equalized")
+    if args.only is not None:
+        inputs = (args.only,)
+    for kind in inputs:
+        match = prepared_flow if name == "prepared" else matcher(network, kind)
+        for stops in args.ev:
+            row = {"scene": scene, "flow": name, "frames": kind, "ev": stops}
+            row |= measure(frames, pairs, stops, match)
+            results.add(row, show=False)
+            print(table_line(row), flush=True)
+
+
+def load_flow(name: str, weights: Path | None, finetuned: Path | None) -> Any:
+    """The network of a flow; None where it needs none.
+
+    `semantic` compares its features as they are: fitting them to a clip changed no
+    median by 0.01 px.
     """
-    if name == "semantic":
-        return semantic_flow(SemanticConfig(steps=0), weights, (), ())
-    return (
-        load_network(None, finetuned) if name == "raft-finetuned" else load_network(name, weights)
-    )  # type: ignore[arg-type]
+    match name:
+        case "prepared" | "dis":
+            return None
+        case "semantic":
+            return semantic_flow(SemanticConfig(steps=0), weights, (), ())
+        case "raft-finetuned":
+            return load_network(None, finetuned)
+        case "gmflow" | "raft":
+            return load_network(name, weights)
+        case _:
+            raise ValueError(name)
 
 
-def neighbors(frames: int, count: int) -> np.ndarray:
-    """`count` pairs (count, 2) of neighbors, evenly over the clip."""
+def neighbor_pairs(frames: int, count: int) -> np.ndarray:
+    """At most `count` pairs (P, 2) of neighbors, evenly over the clip."""
     first = np.unique(np.linspace(0, frames - 2, count).round().astype(int))
     return np.stack([first, first + 1], -1)
 
 
-def prior(network, treated: str) -> Callable:
-    """(recorded video, groups, pairs (P, 2)) -> flow and where it is believed."""
+def matcher(network: Any, kind: str) -> Matcher:
+    """The flow of `network`, or of dense inverse search, on raw or equalized frames."""
 
-    def on_raw(
-        video: np.ndarray, groups: list[int], pairs: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        def match(i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
+    def on_raw(video: np.ndarray, brackets: list[int], pairs: np.ndarray) -> Flows:
+        def match(i: int, j: int) -> Flows:
             if network is not None:
                 assert not isinstance(network, SemanticFlow)
                 return predict_both_directions(network, video[i], video[j])
             a, b = (np.rint(255 * (video[k] @ LUMA)).astype(np.uint8) for k in (i, j))
             return dense_inverse_search(a, b), dense_inverse_search(b, a)
 
-        return match_pairs(match, np.zeros(video.shape[:3], bool), pairs, threads=1)
+        clipped = np.zeros(video.shape[:3], bool)
+        return match_pairs(match, clipped, pairs, threads=1)
 
-    def on_equalized(
-        video: np.ndarray, groups: list[int], pairs: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        frames = equalize(video, groups)
+    def on_equalized(video: np.ndarray, brackets: list[int], pairs: np.ndarray) -> Flows:
+        frames = equalize(video, brackets)
         if isinstance(network, SemanticFlow):
-            network.features = None  # of another clip
-            found, valid = network(*frames, pairs)
+            network.features = None  # those of the last clip
+            flow, valid = network(*frames, pairs)
+        elif network is None:
+            flow, valid = dense_flow(*frames, pairs)
         else:
-            found, valid = (
-                dense_flow(*frames, pairs)
-                if network is None
-                else network_flow(network, *frames, pairs)
-            )
-        return completed(found, *frames, pairs), valid
+            flow, valid = network_flow(network, *frames, pairs)
+        return refine(flow, *frames, pairs), valid
 
-    return on_raw if treated == "raw" else on_equalized
+    return on_raw if kind == "raw" else on_equalized
 
 
-def as_prepared(
-    video: np.ndarray, groups: list[int], pairs: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """The flow that training sees of a clip, by all steps of `prepare` with their
-    defaults, and where it is believed.
-    """
+def prepared_flow(video: np.ndarray, brackets: list[int], pairs: np.ndarray) -> Flows:
+    """The flow that training reads, by all steps of `prepare` with their defaults."""
     with TemporaryDirectory() as folder:
         clip, scene = Path(folder) / "clip", Path(folder) / "scene"
         clip.mkdir()
@@ -162,72 +168,81 @@ def as_prepared(
         prepare(PrepareConfig(clip, scene, hold_out=0))
         frames = Manifest.load(scene).frames
         files = [frames[i].flow[int(j)] for i, j in pairs]
-        found = [read_npy(scene / one.flow).astype(np.float32) for one in files]
-        return np.stack(found), np.stack([read_mask(scene / one.valid) for one in files])
+        flow = [read_npy(scene / of_pair.flow).astype(np.float32) for of_pair in files]
+        valid = [read_mask(scene / of_pair.valid) for of_pair in files]
+        return np.stack(flow), np.stack(valid)
 
 
-def completed(
-    found: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+def refine(
+    flow: np.ndarray, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
 ) -> np.ndarray:
-    """The flow (P, H, W, 2) px of pairs and their reverses, ended as the step
-    `refined_flow` of `prepare` does, without its masks: where it is not sure told by
-    what is around, and both ways met halfway.
+    """The flow (P, H, W, 2) px of pairs and their reverses, refined without masks.
+
+    As the step `refined_flow` of `prepare` does it: uncertain pixels are filled from
+    their neighborhood, and both directions are averaged.
     """
     ranges = [recorded_range(*frame) for frame in zip(video, clipped, strict=True)]
-    one_way = {(int(i), int(j)): one for (i, j), one in zip(pairs, found, strict=True)}
-    still = np.zeros(clipped.shape[1:], bool)
-    ended = {
-        (i, j): fill_uncertain_flow(
-            one, one_way[j, i], *common_gray(video, ranges, i, j), clipped[i], clipped[j], still
+    by_pair = {(int(i), int(j)): one for (i, j), one in zip(pairs, flow, strict=True)}
+    nothing_moves = np.zeros(clipped.shape[1:], bool)
+    filled = {}
+    for (i, j), one in by_pair.items():
+        gray = common_gray(video, ranges, i, j)
+        filled[i, j] = fill_uncertain_flow(
+            one, by_pair[j, i], *gray, clipped[i], clipped[j], nothing_moves
         )
-        for (i, j), one in one_way.items()
-    }
-    return np.stack([average_with_reverse(one, ended[j, i]) for (i, j), one in ended.items()])
+    return np.stack([average_with_reverse(one, filled[j, i]) for (i, j), one in filled.items()])
 
 
 def measure(
-    frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float, match: Callable
-) -> dict:
-    """Errors at a difference of `stops` EV, moving and still pixels apart."""
-    groups = [k % 2 if stops else 0 for k in range(len(frames))]
-    rng, camera = np.random.default_rng(0), response_curve("film")
-    video = np.stack(
-        [
-            record(f["RGB"], (g - 0.5) * stops, (1, 1, 1), camera, Noise(), rng)
-            for f, g in zip(frames, groups, strict=True)
-        ]
-    )
+    frames: list[dict[str, np.ndarray]], pairs: np.ndarray, stops: float, match: Matcher
+) -> dict[str, Any]:
+    """Errors of moving and of static pixels at a difference of `stops` EV."""
+    brackets = [k % 2 if stops else 0 for k in range(len(frames))]
+    video = record_clip(frames, brackets, stops)
     both = np.concatenate([pairs, pairs[:, ::-1]])
     start = time.process_time()
-    found, valid = match(video, groups, both)
+    flow, valid = match(video, brackets, both)
     seconds = (time.process_time() - start) / len(pairs)
-    nothing = np.zeros(video.shape[1:3], bool)
+    nothing_clipped = np.zeros(video.shape[1:3], bool)
     errors, moving, seen = [], [], []
-    for (i, j), one in zip(both, found, strict=True):
-        there, back = (exact(frames[a], b - a) for a, b in ((i, j), (j, i)))
-        errors.append(np.linalg.norm(one - there, axis=-1))
+    for (i, j), of_pair in zip(both, flow, strict=True):
+        forward, backward = exact_flow(frames[i], j - i), exact_flow(frames[j], i - j)
+        errors.append(np.linalg.norm(of_pair - forward, axis=-1))
         moving.append(frames[i]["body"] > 0)
-        seen.append(valid_flow(there, back, nothing, nothing))
-    error, moves, counts = np.stack(errors), np.stack(moving), np.stack(seen)
+        seen.append(valid_flow(forward, backward, nothing_clipped, nothing_clipped))
+    error, is_moving, is_seen = np.stack(errors), np.stack(moving), np.stack(seen)
     return {
-        "moving": summary(error[counts & moves]),
-        "still": summary(error[counts & ~moves]),
-        "believed": {
-            "share": float(valid[counts].mean()),
-            "mean": float(error[counts & valid].mean()),
+        "moving": summarize(error[is_seen & is_moving]),
+        "static": summarize(error[is_seen & ~is_moving]),
+        "valid": {
+            "share": float(valid[is_seen].mean()),
+            "mean": float(error[is_seen & valid].mean()),
         },
         "seconds": seconds,
     }
 
 
-def exact(frame: dict[str, np.ndarray], side: int) -> np.ndarray:
+def record_clip(
+    frames: list[dict[str, np.ndarray]], brackets: list[int], stops: float
+) -> np.ndarray:
+    """The video (T, H, W, 3) that a camera with two alternating exposures records."""
+    rng = np.random.default_rng(SEED)
+    response = response_curve("film")
+    video = []
+    for frame, bracket in zip(frames, brackets, strict=True):
+        ev = (bracket - 0.5) * stops
+        video.append(record(frame["RGB"], ev, (1, 1, 1), response, Noise(), rng))
+    return np.stack(video)
+
+
+def exact_flow(frame: dict[str, np.ndarray], offset: int) -> np.ndarray:
     """The exact flow (H, W, 2) px to the next or previous frame."""
-    name = "forward" if side > 0 else "backward"
-    return np.stack([frame[f"{name}.u"], frame[f"{name}.v"]], -1)
+    direction = "forward" if offset > 0 else "backward"
+    return np.stack([frame[f"{direction}.u"], frame[f"{direction}.v"]], -1)
 
 
-def summary(error: np.ndarray) -> dict[str, float]:
-    """Mean and median in pixels, shares within 1 and 3 px."""
+def summarize(error: np.ndarray) -> dict[str, float]:
+    """Mean and median in pixels, shares below 1 and 3 px."""
     return {
         "mean": float(error.mean()),
         "median": float(np.median(error)),
@@ -236,24 +251,30 @@ def summary(error: np.ndarray) -> dict[str, float]:
     }
 
 
-HEADER = """| flow | frames | EV | moving: mean, median px | < 1, < 3 px | still: mean, median px | < 1, < 3 px | believed: share, mean px | s |
-|---|---|---|---|---|---|---|---|---|"""
+COLUMNS = (
+    "flow",
+    "frames",
+    "EV",
+    "moving: mean, median px",
+    "< 1, < 3 px",
+    "static: mean, median px",
+    "< 1, < 3 px",
+    "valid: share, mean px",
+    "s",
+)
+HEADER = f"| {' | '.join(COLUMNS)} |\n|{len(COLUMNS) * '---|'}"
 
 
-def line(row: dict) -> str:
+def table_line(row: dict[str, Any]) -> str:
     """One line of the table."""
-    m, s, b = row["moving"], row["still"], row["believed"]
     cells = [row["flow"], row["frames"], f"{row['ev']:g}"]
-    for part in (m, s):
-        cells += [
-            f"{part['mean']:.2f}, {part['median']:.2f}",
-            f"{part['within1']:.0%}, {part['within3']:.0%}",
-        ]
-    return (
-        "| "
-        + " | ".join([*cells, f"{b['share']:.0%}, {b['mean']:.2f}", f"{row['seconds']:.1f}"])
-        + " |"
-    )
+    for part in (row["moving"], row["static"]):
+        cells.append(f"{part['mean']:.2f}, {part['median']:.2f}")
+        cells.append(f"{part['within1']:.0%}, {part['within3']:.0%}")
+    valid = row["valid"]
+    cells.append(f"{valid['share']:.0%}, {valid['mean']:.2f}")
+    cells.append(f"{row['seconds']:.1f}")
+    return f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":

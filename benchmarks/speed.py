@@ -1,87 +1,78 @@
-"""Training speed and memory on a prepared scene: rays and steps per second with every
-loss, after culling has settled.
+"""Training speed and memory of presets on a prepared scene.
 
-    python benchmarks/speed.py SCENE [--preset grid] [--steps 100] [--device cpu]
-    [--bf16]
+    python benchmarks/speed.py SCENE --preset grid splat --steps 100
 
-Prints one JSON line. For `paper` it also says how long the published 250,000 steps
-would take at that pace (published: 15 h).
+Counts steps and rays per second with every loss, after enough steps that kernels are
+compiled and culling no longer changes. `--bf16` measures every preset once more in
+bfloat16. For `paper` it extrapolates to the published 250,000 steps (published: 15 h).
 """
 
+from __future__ import annotations
+
 import argparse
-import json
 import platform
 import resource
 import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from record import Record, make_parser, restart_prepared
 
 from hdr_nsff.core import distributed
-from hdr_nsff.core.process import prepare_process
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import Trainer
 
+PUBLISHED_STEPS = 250_000
+
 
 def main() -> None:
-    prepare_process()
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("scene", type=Path)
-    parser.add_argument("--preset", default="grid", choices=PRESETS)
+    parser = make_parser(__doc__, "speed")
+    parser.add_argument("scene", type=Path, help="a prepared scene")
+    parser.add_argument("--preset", nargs="+", default=["grid"], choices=PRESETS)
     parser.add_argument("--steps", type=int, default=100, help="steps that are timed")
-    parser.add_argument(
-        "--warm-up",
-        type=int,
-        default=150,
-        help="steps before, so that kernels are compiled and culling has settled",
-    )
-    parser.add_argument("--device", default="auto")
+    parser.add_argument("--warm-up", type=int, default=150, help="steps before these")
+    parser.add_argument("--device", default="auto", help="auto, cpu, cuda or cuda:N")
     parser.add_argument(
         "--rays", type=int, help="uniform rays of a batch, and no others, instead of the preset's"
     )
-    parser.add_argument("--bf16", action="store_true")
+    parser.add_argument("--bf16", action="store_true", help="measure in bfloat16 as well")
     args = parser.parse_args()
+    restart_prepared()
+    precisions = (False, True) if args.bf16 else (False,)
+    scene = Scene.open(args.scene)
+    record = Record("speed", args, seed=TrainConfig.seed)
+    for preset in args.preset:
+        for bf16 in precisions:
+            record.add(measure(preset, bf16, scene, args))
+    record.save()
+
+
+def measure(preset: str, bf16: bool, scene: Scene, args: argparse.Namespace) -> dict[str, Any]:
+    """Steps and rays per second of one preset, and the process's peak memory so far."""
     device = pick_device(args.device)
-    total = args.warm_up + args.steps
+    budget = Budget(steps=2 * (args.warm_up + args.steps), minutes=None)
     with tempfile.TemporaryDirectory() as folder:
         config = replace(
-            PRESETS[args.preset],
-            scene=args.scene,
-            out=Path(folder),
-            budget=Budget(steps=2 * total, minutes=None),
-            bf16=args.bf16,
+            PRESETS[preset], scene=args.scene, out=Path(folder), budget=budget, bf16=bf16
         )
         if args.rays is not None:
             config = replace(config, rays=args.rays, moving_rays=0)
-        trainer = Trainer(config, Scene.open(args.scene), device, distributed.Ranks())
-
-        def run(steps: int) -> float:
-            start = time.perf_counter()
-            for _ in range(steps):
-                trainer.step()
-                trainer.clock = replace(trainer.clock, step=trainer.clock.step + 1)
-            if device.type == "cuda":
-                torch.cuda.synchronize()
-            return time.perf_counter() - start
-
-        run(args.warm_up)
-        seconds = run(args.steps)
-    rays = (
-        config.rays + config.moving_rays or trainer.scene.train[0].image[..., 0].numel()
-    ) * config.batches
+        trainer = Trainer(config, scene, device, distributed.Ranks())
+        train_steps(trainer, args.warm_up, device)
+        seconds = train_steps(trainer, args.steps, device)
+    whole_frame = scene.train[0].camera.width * scene.train[0].camera.height
+    rays = (config.rays + config.moving_rays or whole_frame) * config.batches
     result = {
-        "preset": args.preset,
-        "device": torch.cuda.get_device_name()
-        if device.type == "cuda"
-        else f"{platform.machine()}, {torch.get_num_threads()} threads",
-        "torch": torch.__version__,
+        "preset": preset,
+        "bf16": bf16,
+        "device": device_name(device),
         "samples": getattr(config.field, "samples", None),  # Gaussians have none
         "steps_per_second": round(args.steps / seconds, 3),
         "rays_per_second": round(rays * args.steps / seconds),
@@ -89,9 +80,28 @@ def main() -> None:
     }
     if device.type == "cuda":
         result["peak_gpu_gb"] = round(torch.cuda.max_memory_allocated() / 2**30, 2)
-    if args.preset == "paper":
-        result["hours_for_250k_steps"] = round(250_000 * seconds / args.steps / 3600, 2)
-    print(json.dumps(result))
+    if preset == "paper":
+        hours = PUBLISHED_STEPS * seconds / args.steps / 3600
+        result["hours_for_250k_steps"] = round(hours, 2)
+    return result
+
+
+def train_steps(trainer: Trainer, count: int, device: torch.device) -> float:
+    """Seconds of `count` steps."""
+    start = time.perf_counter()
+    for _ in range(count):
+        trainer.step()
+        trainer.clock = replace(trainer.clock, step=trainer.clock.step + 1)
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+    return time.perf_counter() - start
+
+
+def device_name(device: torch.device) -> str:
+    """The GPU's name, or the processor and the threads that torch uses."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_name()
+    return f"{platform.machine()}, {torch.get_num_threads()} threads"
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Keeps the numbers of a finished `hdr-nsff bench` as benchmarks/results/bench-NAME.json.
+"""Keeps a finished `hdr-nsff bench` as benchmarks/results/bench-NAME.json.
 
     hdr-nsff bench OUT --scenes ... --methods ...
     python benchmarks/take_bench.py NAME OUT

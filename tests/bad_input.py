@@ -1,5 +1,6 @@
-"""Commands that cannot work, for the tests of bad input: exit code 2, one sentence that
-names the place, never a traceback, and nothing that was there is lost.
+"""Commands that have to fail well, for the tests of bad input.
+
+Exit code 2, one sentence that names the place, no traceback, and no file is lost.
 """
 
 from __future__ import annotations
@@ -32,18 +33,16 @@ def call(*arguments: object) -> int:
 
 
 def refused(capsys: Capture, *arguments: object) -> str:
-    """The one sentence with which the command line refuses."""
+    """The sentence with which the command line refuses."""
     capsys.readouterr()
     assert call(*arguments) == 2, arguments
     error = capsys.readouterr().err
-    said = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
-    assert (
-        "Traceback" not in error
-        and len(said) == 1
-        and error.strip().endswith(said[0])
-        and len(said[0]) < 600
-    ), error
-    return said[0]
+    sentences = [line for line in error.splitlines() if line.startswith("hdr-nsff: ")]
+    assert "Traceback" not in error, error
+    assert len(sentences) == 1, error
+    assert error.strip().endswith(sentences[0]), error
+    assert len(sentences[0]) < 600, error
+    return sentences[0]
 
 
 def verbs_with(setting: str) -> list[str]:
@@ -60,15 +59,13 @@ FOOTAGE_VERBS = verbs_with("clip")  # that read footage
 RUN_VERBS = verbs_with("run")  # that read a run
 # Verbs that write something.
 WORKING_VERBS = [v for v in cli.VERBS if v not in ("weights", "doctor")]
-
-
 CPU = ["--device", "cpu"]
 
 
 def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
-    """Every working verb on `run` (with its scene beside it) or `footage`; all but
-    `evaluate` write to `out`. `finetune-flow` wants the fixture `flow_data` beside the
-    run.
+    """Every working verb on `run`, whose scene lies next to it, or on `footage`.
+
+    All but `evaluate` write to `out`. `finetune-flow` needs the fixture `flow_data`.
     """
     scene = run.parent / "scene"
     small = ["--path", "fixed", "--scale", 0.3]
@@ -166,7 +163,7 @@ def cut(path: Path) -> None:
 
 
 def edit(path: Path, change: Callable[[dict], object]) -> None:
-    """Change a JSON file as a hand would."""
+    """Change the content of a JSON file."""
     data = json.loads(path.read_text())
     change(data)
     path.write_text(json.dumps(data))

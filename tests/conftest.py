@@ -1,4 +1,4 @@
-"""What several tests share."""
+"""Fixtures that several test files share."""
 
 import json
 import shutil
@@ -17,7 +17,7 @@ from hdr_nsff.synth.pathtracer import Tracer
 from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
 
-prepare_process()  # as the command line does
+prepare_process()  # as the command line does, before a test imports numba
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +34,7 @@ def toy(toy_folder: Path) -> Scene:
 
 @pytest.fixture(scope="session")
 def trained(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two steps with its own copy of the scene beside it (read only)."""
+    """A run of two steps next to a copy of its scene (read only)."""
     from bad_input import call, training
 
     out = tmp_path_factory.mktemp("a run, é 日")
@@ -45,7 +45,7 @@ def trained(toy_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run_folder(trained: Path, tmp_path: Path) -> Path:
-    """A copy of that run to damage, scene and all."""
+    """A copy of that run and its scene, which a test may damage."""
     shutil.copytree(trained.parent, tmp_path / "ü b")
     config = json.loads((tmp_path / "ü b/run/config.json").read_text())
     (tmp_path / "ü b/run/config.json").write_text(
@@ -56,9 +56,7 @@ def run_folder(trained: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def flow_data(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Beside the run, what `finetune-flow` wants: five pairs whose flow is known, and a
-    tiny network.
-    """
+    """The input of `finetune-flow`, next to the run: five pairs and a tiny network."""
     from test_flow_sets import synth
 
     monkeypatch.setattr(flow_networks, "GMFlow", lambda bf16: GMFlow(8, 1))
@@ -68,7 +66,7 @@ def flow_data(run_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def flat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SynthConfig:
-    """Settings of a tiny `synth`, which renders an even wall instead of its scene."""
+    """Settings of a small `synth` that renders an even wall instead of its scene."""
     monkeypatch.setattr("hdr_nsff.synth.synth.Tracer", Flat)
     Flat.rendered = 0
     return SynthConfig("interior", tmp_path / "room", size="16x16", frames=12, noise=0, oracle=True)
@@ -76,6 +74,6 @@ def flat(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> SynthConfig:
 
 @pytest.fixture(scope="session")
 def tracer() -> Tracer:
-    """The synthetic room, for Mitsuba's slow variant that is always there."""
+    """The synthetic room, for the slow variant of Mitsuba that needs no LLVM."""
     pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
     return Tracer(INTERIOR, 0, "scalar_rgb")

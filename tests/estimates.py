@@ -1,4 +1,4 @@
-"""What `prepare` estimates of a scene in memory, for tests that change its frames."""
+"""The estimates of `prepare` for scenes in memory, for tests that change frames."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -59,16 +59,14 @@ def video_of(scene: Scene) -> tuple[PosedVideo, np.ndarray, np.ndarray, np.ndarr
 
 
 def with_movers(scene: Scene) -> Scene:
-    """The scene with its movers estimated anew."""
+    """The scene with movers estimated from its present maps."""
     return replace(scene, movers=movers_of(scene))
 
 
 def geometric_depth(
     clip: PosedVideo, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Disparity, confidence, near and far, as the steps from `static_depth` to `depth`
-    find them one after the other.
-    """
+    """Disparity, confidence, near and far, by the steps `static_depth` to `depth`."""
     disparity, confidence, still = static_geometric_depth(clip, flow, valid, pairs, points)
     clip = replace(clip, moving=clip.moving & ~still)
     found, trust = mover_depth(clip, flow, valid, pairs, disparity)

@@ -1,5 +1,6 @@
-"""A closed-form scene for tests: a bright disc that moves before a wall of horizontal
-gradient, seen by cameras that slide along x.
+"""A closed-form scene: a bright disc moves before a wall with a horizontal gradient.
+
+Cameras slide along x.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ EV = (-4.0, -2.0, 0.0)
 
 
 def views_of(frames: list[Frame]) -> list[ResponseView]:
-    """The frames as the response is estimated from them."""
+    """The frames as input of the estimation of the response."""
     return [
         ResponseView(f.image.numpy(), f.bracket, f.time, np.eye(3), np.eye(3, 4), np.ones((H, W)))
         for f in frames
@@ -43,9 +44,10 @@ def camera(x: float = 0.0) -> Camera:
 
 
 class DiscBeforeWall:
-    """The scene as a field: samples on two planes. `layered` fields show them; `wall`
-    false leaves the disc alone; `empty_moves` lets the empty samples around the disc
-    flow with it.
+    """The scene as a field, with samples on two planes.
+
+    Without `wall` there is the disc alone. With `empty_moves`, empty samples around the
+    disc have its scene flow.
     """
 
     def __init__(
@@ -117,8 +119,10 @@ def fake_run(
     held_out: int = 0,
     field: DiscBeforeWall | None = None,
 ) -> Run:
-    """A run whose field is the truth itself and whose camera records through gamma 2.2
-    at EV -4, -2, 0 in turn; the last `held_out` frames are test frames.
+    """A run whose field is the exact scene.
+
+    Its camera records with gamma 2.2 at EV -4, -2, 0 in turn. The last `held_out`
+    frames are test frames.
     """
     field = field or DiscBeforeWall(speed=SPEED / 4, red=3.0)
     spacing = 0.05 if parallax == "full" else 0.0
@@ -134,11 +138,18 @@ def fake_run(
         frames.append(Frame(i, float(i), c, 0, i % 3, rgb, moving=moving))
     entries = [
         FrameEntry(
-            index=f.index, image=f"images/{f.index:05d}.png", source="made", time=f.time, bracket=f.bracket, ev=EV[f.bracket],
-            K=f.camera.K.tolist(), c2w=f.camera.c2w.tolist(), split="test" if f.index >= num_frames - held_out else "train",
+            index=f.index,
+            image=f"images/{f.index:05d}.png",
+            source="made",
+            time=f.time,
+            bracket=f.bracket,
+            ev=EV[f.bracket],
+            K=f.camera.K.tolist(),
+            c2w=f.camera.c2w.tolist(),
+            split="test" if f.index >= num_frames - held_out else "train",
         )
         for f in frames
-    ]  # fmt: skip
+    ]
     steps = {
         "exposure": StepRecord(
             done=True, provenance="given", note="EV -4, -2, 0 from --ev", seconds=0.1
@@ -147,9 +158,20 @@ def fake_run(
         "depth": StepRecord(done=True, provenance="absent", note="no parallax"),
     }
     manifest = Manifest(
-        source="made up <clip>", width=W, height=H, fps=12, cycle=3, reference_bracket=2, bracket_ev=list(EV),
-        exposure_given=True, parallax=parallax, near=1.0, far=8.0, frames=entries, steps=steps,
-    )  # fmt: skip
+        source="made up <clip>",
+        width=W,
+        height=H,
+        fps=12,
+        cycle=3,
+        reference_bracket=2,
+        bracket_ev=list(EV),
+        exposure_given=True,
+        parallax=parallax,
+        near=1.0,
+        far=8.0,
+        frames=entries,
+        steps=steps,
+    )
     cut = num_frames - held_out
     scene = Scene(
         folder=folder / "scene",

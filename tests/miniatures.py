@@ -46,7 +46,7 @@ def opengl(c2w: np.ndarray) -> list[list[float]]:
 
 
 def dot_pixel(c2w: np.ndarray, scale: float = 1.0) -> np.ndarray:
-    """Where a camera sees the dot (2,), by hand."""
+    """The projection (2,) px of the dot, without the code under test."""
     x, y, z = c2w[:, :3].T @ (DOT - c2w[:, 3])
     return scale * np.array([W / 2 + FOCAL * x / z, H / 2 + FOCAL * y / z])
 

@@ -1,5 +1,6 @@
 """Damaged files for the tests of readers: seeded mutations of bytes and of JSON.
-Whatever a reader makes of them, it ends in a result or in one short InputError.
+
+A reader has to end in a result or in one short InputError for each of them.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 
-# what a JSON holds that was edited by hand or by a careless program
+# Values that a user or another program may leave in a JSON file.
 ODD_VALUES = (
     None, True, "", "\0", "\ud800", "../up", "x" * 5000, -1, 0, 1e308, -1e308, 1e-320,
     float("nan"), float("inf"), 10**400, [], {}, [[]], [{}], {"a": 1}, [1, "2"], "1e400",
@@ -65,8 +66,9 @@ def containers(value: Any) -> Iterator[Any]:
 
 
 def check_reader(path: Path, read: Callable[[], object], count: int, seed: int = 0) -> None:
-    """`read` ends in a result or an InputError of under 600 characters for `count`
-    damaged versions of the file `path`, which is restored afterwards.
+    """Call `read` on `count` damaged versions of the file `path`, then restore it.
+
+    It has to end in a result or in an InputError of under 600 characters.
     """
     whole, rng = path.read_bytes(), np.random.default_rng(seed)
     for _ in range(count):
@@ -76,7 +78,7 @@ def check_reader(path: Path, read: Callable[[], object], count: int, seed: int =
 
 
 def check_json_reader(path: Path, read: Callable[[], object], count: int, seed: int = 0) -> None:
-    """The same for odd values in the JSON file `path`."""
+    """As `check_reader`, with odd values in the JSON file `path`."""
     text, rng = path.read_text(), np.random.default_rng(seed)
     for _ in range(count):
         path.write_text(json.dumps(mutate_json(json.loads(text), rng)))

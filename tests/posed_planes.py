@@ -1,5 +1,6 @@
-"""Textured planes seen by cameras that all look along +z: video, depth and flow in
-closed form.
+"""Textured planes before cameras that look along +z, in closed form.
+
+Video, depth and flow of a clip are computed from its poses.
 """
 
 import cv2
@@ -29,9 +30,7 @@ def texture(seed: int = 0) -> np.ndarray:
 
 
 def plane(c2w: np.ndarray, z0: float, slope: float, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """The plane z = z0 + slope x seen by untilted cameras: video (T, H, W, 3) and true
-    z-depth (T, H, W).
-    """
+    """Video (T, H, W, 3) and z-depth (T, H, W) of the plane z = z0 + slope x."""
     video, depth = [], []
     for ex, ey, ez in c2w[:, :, 3]:
         z = (z0 + slope * ex - ez) / (1 - slope * RAYS[..., 0])

@@ -1,6 +1,4 @@
-"""The presets, shrunk so that a test trains each in seconds: the same code paths, fewer
-numbers.
-"""
+"""Small versions of the presets: the same code paths, trained in seconds."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +22,16 @@ from hdr_nsff.training.train import Trainer, train
 GRID = GridConfig(finest=4.0, depth_cells=16, levels=2, max_rows=2**12)
 MLP = MlpConfig(layers=3, width=32, skip_after=1, octaves=4, direction_octaves=2)
 HEXPLANE = HexPlaneConfig(
-    density_components=3, appearance_components=4, coarsest=8, finest=16, grow_every=3, width=16, samples=12, render_samples=16, cull_after=4
-)  # fmt: skip
+    density_components=3,
+    appearance_components=4,
+    coarsest=8,
+    finest=16,
+    grow_every=3,
+    width=16,
+    samples=12,
+    render_samples=16,
+    cull_after=4,
+)
 NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
     "splat": SplatConfig(static=400, moving=150, bases=2),
     "grid": GRID,
@@ -67,7 +73,7 @@ def small(
 
 
 def random_field(preset: str, scene: Scene, seed: int = 0) -> AnyField:
-    """An untrained field with something in every branch."""
+    """An untrained field whose branches all contribute."""
     torch.manual_seed(seed)
     field = build_field(small(preset).field, scene)
     if isinstance(field, Splat):
@@ -84,22 +90,22 @@ def random_field(preset: str, scene: Scene, seed: int = 0) -> AnyField:
     for p in field.parameters():
         p.data.add_(0.3 * torch.randn_like(p))
     if isinstance(field, HexPlane):
-        field.to_density.weight.data.mul_(10)  # something to see, in spite of the shift
+        field.to_density.weight.data.mul_(10)  # visible, in spite of the density's shift
         return field
     assert isinstance(field, TwoBranches)
     if isinstance(field.branches, GridBranches):
-        field.branches.dynamic_grid.table.data[:, 3] += 1.5  # movers that cover something
+        field.branches.dynamic_grid.table.data[:, 3] += 1.5  # opaque movers
     return field
 
 
 def trainer(config: TrainConfig, scene: Scene) -> Trainer:
-    """Ready for its first step, alone."""
+    """A trainer before its first step, in one process."""
     open_folder(config)
     return Trainer(config, scene, torch.device("cpu"), distributed.Ranks())
 
 
 def interrupted_at(stop: int, settings: TrainConfig, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Train up to step `stop`, where somebody presses Ctrl-C."""
+    """Train up to step `stop`, as if Ctrl-C were pressed there."""
     step = Trainer.step
 
     def stopping(self: Trainer) -> dict[str, float]:

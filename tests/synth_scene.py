@@ -1,4 +1,4 @@
-"""What tests of `synth` share: a scene without Mitsuba."""
+"""A scene without Mitsuba for the tests of `synth`."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ def plane(height: int = 12, width: int = 16, depth: float = 2.0, bodies: int = R
 
 
 class Flat:
-    """Replaces Mitsuba: an even wall 3 m away, whatever the camera."""
+    """Replaces Mitsuba: every camera sees an even wall 3 m away."""
 
     rendered = 0
 
@@ -39,5 +39,5 @@ class Flat:
     def radiance(
         self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int], spp: int, seed: int
     ) -> np.ndarray:
-        Flat.rendered += spp > PASS_SPP  # but for the estimate of time
+        Flat.rendered += spp > PASS_SPP  # the estimate of time is not counted
         return np.full((size[1], size[0], 3), 0.25, np.float32)

@@ -1,4 +1,4 @@
-"""Arrays of other programs: whatever their files hold ends in numbers or a sentence."""
+"""Arrays of other programs: every file is read as numbers or refused in a sentence."""
 
 import io
 import zipfile
@@ -13,7 +13,7 @@ from hdr_nsff.footage import arrays
 from hdr_nsff.footage.arrays import read_array, read_arrays
 
 
-def test_numbers_come_back_in_the_type_asked_for(tmp_path: Path) -> None:
+def test_numbers_are_returned_in_the_requested_type(tmp_path: Path) -> None:
     np.save(tmp_path / "a.npy", np.array([[1, 2], [3, 4]], np.int16))
     found = read_array(tmp_path / "a.npy", np.float64)
     assert found.dtype == np.float64

@@ -23,8 +23,9 @@ from hdr_nsff.core.video import write_video
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:
-    """The sentence with which `prepare` refuses to make the folder `scene` beside the
-    footage; it leaves the rest alone.
+    """The sentence with which `prepare` refuses to write `scene` next to the footage.
+
+    No other file may change.
     """
 
     def rest() -> dict[Path, bytes]:
@@ -150,7 +151,7 @@ def test_footage_that_cannot_be_is_named(
     assert not list(tmp_path.rglob(".partial-*"))
 
 
-def test_nothing_but_the_sentence_is_printed_for_an_exr_cut_short(
+def test_a_truncated_exr_prints_one_sentence_alone(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     footage = one_bad(tmp_path / "clip", cut, ".exr")
@@ -272,7 +273,9 @@ def test_an_end_beyond_the_clip_is_the_end(tmp_path: Path, capsys: Capture) -> N
     assert "0 frames to use" in prepared(capsys, folder, "--start", 10**30, "--redo", "frames")
 
 
-def test_flow_and_masks_of_the_wrong_size_or_number(tmp_path: Path, capsys: Capture) -> None:
+def test_flow_and_masks_of_the_wrong_size_or_number_are_refused(
+    tmp_path: Path, capsys: Capture
+) -> None:
     folder = clip(tmp_path / "clip")
     for i in range(FRAMES):
         write_png(tmp_path / f"masks/{i}.png", np.zeros((34, 59), bool))
@@ -311,7 +314,9 @@ def test_output_in_which_no_step_was_finished_is_free(tmp_path: Path, capsys: Ca
     )
 
 
-def test_output_that_is_a_file_or_holds_something_else(tmp_path: Path, capsys: Capture) -> None:
+def test_output_that_is_a_file_or_holds_other_files_is_refused(
+    tmp_path: Path, capsys: Capture
+) -> None:
     folder = clip(tmp_path / "clip")
     (tmp_path / "scene").write_text("mine")
     assert "is a file" in prepared(capsys, folder)
@@ -328,7 +333,7 @@ def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> Non
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)
         assert (tmp_path / "scene/scene.json").read_text() == text
-    # What the sentence offers starts anew.
+    # The command that the sentence suggests starts from the beginning.
     assert "at least 3" in prepared(capsys, folder, "--redo", "frames")
 
 

@@ -113,7 +113,7 @@ gc.collect()
 """
 
 
-def test_a_map_that_could_not_be_written_leaves_nothing_that_crashes_python_later(
+def test_a_failed_write_of_a_map_does_not_crash_python_later(
     tmp_path: Path,
 ) -> None:
     path = os.pathsep.join([str(Path(cli.__file__).parents[1]), *sys.path])
@@ -147,7 +147,7 @@ def test_ctrl_c_loses_nothing_and_the_same_command_continues(
     assert "Traceback" not in error and "the same command continues where it was" in error
     suffixes = {".png", ".exr", ".npy", ".ply"}
     if verb == "evaluate":
-        suffixes.remove(".png")  # it draws its comparisons anew
+        suffixes.remove(".png")  # it always draws its comparisons
     files = [p for p in tmp_path.rglob("*") if p.suffix in suffixes]
     kept = {p: p.stat().st_mtime_ns for p in files}
     assert kept and not list(tmp_path.rglob(".partial-*"))

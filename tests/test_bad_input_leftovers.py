@@ -1,5 +1,6 @@
-"""What earlier verbs have left, damaged or edited by hand: it is made again with a word
-about it, or named in one sentence.
+"""Damaged or edited files of earlier verbs.
+
+They are written again with a note about it, or named in one sentence.
 """
 
 from __future__ import annotations
@@ -43,7 +44,13 @@ def other_version(path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("damage", [cut, other_version])
+def one_bit_flipped(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[-100] ^= 64  # of a number: nothing but a checksum notices
+    path.write_bytes(data)
+
+
+@pytest.mark.parametrize("damage", [cut, other_version, one_bit_flipped])
 def test_a_bad_checkpoint_gives_way_to_the_one_before_for_every_verb(
     damage: Callable[[Path], None], run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
@@ -169,9 +176,7 @@ def test_notes_cut_short_are_made_again(text: str, worked: Path, capsys: Capture
 
 
 @pytest.mark.parametrize("name", [PLAN, VIEWS, SEQUENCE, EXPORTED])
-def test_a_json_file_of_the_users_own_is_no_note_and_stays(
-    name: str, worked: Path, capsys: Capture
-) -> None:
+def test_a_json_file_of_the_user_is_kept(name: str, worked: Path, capsys: Capture) -> None:
     kept = (worked / name).read_bytes()
     for text in ('{"takes": 3}', "[1, 2]", "7"):
         (worked / name).write_text(text)
@@ -276,7 +281,7 @@ def test_a_config_edited_into_nonsense_is_named_by_every_verb_that_reads_it(
         "--batches=0",
     ],
 )
-def test_settings_that_cannot_be_are_named_before_anything_is_written(
+def test_invalid_settings_are_named_before_anything_is_written(
     option: str, toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     assert option.partition("=")[0] in refused(

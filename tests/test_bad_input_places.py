@@ -21,6 +21,7 @@ from bad_input import (
     snapshot,
     training,
 )
+from toy_scene import ToyScene
 
 from hdr_nsff.core.io import write_text
 
@@ -103,7 +104,7 @@ def test_a_report_replaces_reports_only(run_folder: Path, tmp_path: Path, capsys
 
 
 @pytest.mark.parametrize("name", ["fixed.mp4", "fixed/00001.png", "fixed/7.exr", "fixed_sheet.png"])
-def test_pictures_of_the_users_own_are_not_replaced(
+def test_pictures_of_the_user_are_not_replaced(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     write_text(tmp_path / "mine" / name, "mine")
@@ -111,7 +112,7 @@ def test_pictures_of_the_users_own_are_not_replaced(
     assert snapshot(tmp_path / "mine") == {tmp_path / "mine" / name: b"mine"}
 
 
-def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
+def test_the_standard_set_replaces_no_depth_maps_of_the_user(
     run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     write_text(tmp_path / "mine/depth/00000.png", "mine")
@@ -122,7 +123,7 @@ def test_the_standard_set_replaces_no_depth_maps_of_the_users_own(
 
 
 @pytest.mark.parametrize("name", ["00001.ply", "7.ply", "sequence.json"])
-def test_files_of_the_users_own_are_not_replaced_by_gaussians(
+def test_files_of_the_user_are_not_replaced_by_gaussians(
     name: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     write_text(tmp_path / "mine" / name, '{"takes": 3}')
@@ -164,6 +165,24 @@ def test_a_run_with_other_settings_stays_as_it_is(run_folder: Path, capsys: Capt
     assert snapshot(run_folder) == before
 
 
+def test_a_run_learns_where_its_scene_has_moved_to(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    moved = (run_folder.parent / "scene").rename(tmp_path / "elsewhere")
+    assert "its scene is not at" in refused(capsys, "report", run_folder)
+    assert call(*training(moved, run_folder, 2)) == 0
+    assert call("report", run_folder) == 0
+
+
+def test_a_run_is_not_continued_on_another_scene(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    other = ToyScene(frames=5).write(tmp_path / "other")
+    before = snapshot(run_folder)
+    assert "on another scene" in refused(capsys, *training(other, run_folder, 2))
+    assert snapshot(run_folder) == before
+
+
 def test_checkpoints_without_their_config_are_not_taken_over(
     run_folder: Path, capsys: Capture, tmp_path: Path
 ) -> None:
@@ -175,9 +194,7 @@ def test_checkpoints_without_their_config_are_not_taken_over(
     assert snapshot(lone) == before
 
 
-def test_a_room_is_not_rendered_into_a_folder_of_something_else(
-    capsys: Capture, tmp_path: Path
-) -> None:
+def test_synth_refuses_a_folder_of_other_files(capsys: Capture, tmp_path: Path) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip" / "00000.png").write_bytes(b"mine")
     assert "holds other files" in refused(

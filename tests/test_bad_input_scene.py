@@ -1,6 +1,4 @@
-"""A scene folder edited by hand into nonsense: one sentence each that names the file
-and what to do, never a traceback.
-"""
+"""Invalid scene folders: one sentence names the file and the fix, with no traceback."""
 
 import shutil
 from collections.abc import Callable
@@ -25,12 +23,12 @@ Change = Callable[[dict[str, Any]], object]
 
 @pytest.fixture
 def folder(toy_folder: Path, tmp_path: Path) -> Path:
-    """A copy to damage."""
+    """A copy of the scene, which a test may damage."""
     return shutil.copytree(toy_folder, tmp_path / "scene")
 
 
 def sentence(folder: Path) -> str:
-    """What opening the scene, or making its tone mapper, says; one line."""
+    """The error of opening the scene or of making its tone mapper; one line."""
     with pytest.raises(InputError) as caught:
         tone_mapper_for(ToneMapConfig(), Scene.open(folder))
     text = str(caught.value)
@@ -187,6 +185,11 @@ MAPS: dict[str, tuple[str, Callable[[Path], None], str]] = {
     "a depth with NaN": (
         "disparity/00002.npy",
         lambda p: write_npy(p, np.full((H, W), np.nan)),
+        "NaN or Inf",
+    ),
+    "a depth beyond single precision": (
+        "disparity/00002.npy",
+        lambda p: write_npy(p, np.full((H, W), 1e300)),
         "NaN or Inf",
     ),
     "a flow with Inf": (

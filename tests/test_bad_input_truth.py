@@ -1,6 +1,4 @@
-"""A truth folder edited by hand into nonsense: one sentence each, and nothing is
-written.
-"""
+"""Invalid truth folders are refused in one sentence, before anything is written."""
 
 from __future__ import annotations
 

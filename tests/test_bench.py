@@ -183,7 +183,7 @@ def statuses(out: Path) -> list[str]:
     return [row["status"] for row in rows(out).values()]
 
 
-def test_a_run_that_fails_is_shown_and_the_others_go_on(
+def test_a_failed_run_is_shown_and_the_others_continue(
     scenes: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     out, methods = tmp_path / "out", f"bad=tiny {SMALL},a=tiny {SMALL}"
@@ -221,7 +221,7 @@ def test_an_error_of_ours_is_kept_with_its_kind(
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_killed_in_the_middle_the_same_command_goes_on(
+def test_a_killed_bench_continues_with_the_same_command(
     number: signal.Signals, scenes: Path, tmp_path: Path
 ) -> None:
     """And the training ends with the process that waits for it, however that ended."""

@@ -51,7 +51,7 @@ def test_a_truth_folder_in_or_beside_a_scene_is_found(
     assert parse(scene).truth == tmp_path / place
 
 
-def test_a_given_truth_folder_comes_first(toy_folder: Path, tmp_path: Path) -> None:
+def test_a_given_truth_folder_takes_precedence(toy_folder: Path, tmp_path: Path) -> None:
     scene = shutil.copytree(toy_folder, tmp_path / "a/scene")
     truth(tmp_path / "a/truth")
     truth(tmp_path / "b")

@@ -25,26 +25,24 @@ def test_a_half_step_measured_to_the_point_stays_one():
     assert likely_factor([0, 1 / 3, 2 / 3]) == pytest.approx(1)
 
 
-def test_order_and_offset_mean_nothing():
+def test_order_and_offset_do_not_change_the_factor():
     ev = np.array([-2.36, 0, 2.35])
     for other in (ev[::-1], ev[[1, 2, 0]], ev + 5, np.repeat(ev, 2)):
         assert likely_factor(other) == pytest.approx(likely_factor(ev))
 
 
 @pytest.mark.parametrize("ev", [[0.0], [0.0, 0.0], [1.0, 1.1]])
-def test_where_there_is_no_step_nothing_changes(ev):
+def test_without_a_step_the_factor_is_one(ev):
     assert likely_factor(ev) == 1.0
 
 
-def test_the_factor_stays_near_one_whatever_the_steps():
+def test_the_factor_stays_near_one_for_any_steps():
     for step in np.linspace(0.25, 20, 80):
         assert 0.3 < likely_factor([0, step]) < 2
 
 
 def test_usual_steps_are_chances():
     chances = usual_steps()
-    assert (
-        sum(chances.values()) == pytest.approx(1)
-        and min(chances.values()) > 0
-        and max(chances, key=chances.get) == 2
-    )
+    assert sum(chances.values()) == pytest.approx(1)
+    assert min(chances.values()) > 0
+    assert max(chances, key=chances.get) == 2

@@ -137,14 +137,14 @@ def test_version_and_help_answer_at_once(option: str) -> None:
     assert min(seconds) < 0.3
 
 
-def test_an_unknown_verb_is_one_sentence_with_the_one_that_was_meant(capsys: Capture) -> None:
+def test_an_unknown_verb_suggests_the_closest_one(capsys: Capture) -> None:
     assert call("trian") == 2
     sentence = one_sentence(capsys.readouterr().err)
     assert "no verb 'trian'; did you mean train?" in sentence
     assert all(verb in sentence for verb in cli.VERBS)
 
 
-def test_an_unknown_verb_like_no_other_gets_the_list_alone(capsys: Capture) -> None:
+def test_an_unknown_verb_unlike_any_other_gets_the_list(capsys: Capture) -> None:
     assert call("quux") == 2
     assert "did you mean" not in one_sentence(capsys.readouterr().err)
 
@@ -234,14 +234,16 @@ def test_bad_input_is_one_sentence_and_exit_code_2(act: Act, capsys: Capture) ->
     assert one_sentence(capsys.readouterr().err) == "hdr-nsff: x.png: cut short; copy it again"
 
 
-def test_ctrl_c_exits_with_130_and_says_how_to_continue(act: Act, capsys: Capture) -> None:
+def test_ctrl_c_exits_with_130_and_explains_how_to_continue(act: Act, capsys: Capture) -> None:
     act(raising(KeyboardInterrupt()))
     assert call("evaluate", "run") == 130
     assert "the same command continues" in one_sentence(capsys.readouterr().err)
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EACCES, errno.EROFS])
-def test_a_disk_that_takes_nothing_is_one_sentence(number: int, act: Act, capsys: Capture) -> None:
+def test_a_disk_that_cannot_be_written_is_one_sentence(
+    number: int, act: Act, capsys: Capture
+) -> None:
     act(raising(OSError(number, os.strerror(number), "out/a.exr")))
     assert call("evaluate", "run") == 2
     said = one_sentence(capsys.readouterr().err)
@@ -251,7 +253,7 @@ def test_a_disk_that_takes_nothing_is_one_sentence(number: int, act: Act, capsys
 @pytest.mark.parametrize(
     "error", [RuntimeError("ours"), OSError(errno.EBADF, "ours"), AssertionError("ours")]
 )
-def test_our_own_mistakes_are_not_hidden(error: Exception, act: Act) -> None:
+def test_errors_of_the_program_keep_their_traceback(error: Exception, act: Act) -> None:
     act(raising(error))
     with pytest.raises(type(error), match="ours"):
         call("evaluate", "run")
@@ -312,7 +314,7 @@ def training(scene: Path, out: Path, steps: int, limit: int | None = None) -> su
     )
 
 
-def test_a_full_disk_ends_training_with_a_sentence_and_room_lets_it_go_on(
+def test_a_full_disk_ends_training_with_a_sentence_and_it_continues_later(
     toy_folder: Path, tmp_path: Path
 ) -> None:
     process = training(toy_folder, tmp_path / "run", 3, limit=65536)

@@ -16,7 +16,7 @@ def test_srgb_decoding_undoes_encoding():
     assert (np.diff(encoded) > 0).all()
 
 
-def test_known_points_of_the_standards():
+def test_reference_values_of_the_standards():
     assert color.srgb_encode(np.array(0.18)) == pytest.approx(0.4614, abs=1e-4)
     assert color.pu21_encode(np.array(100.0)) == pytest.approx(256, abs=1)
     assert color.mu_law(np.array(0.1), mu=50.0) == pytest.approx(np.log(6) / np.log(51))

@@ -49,7 +49,7 @@ def test_the_maximum_of_a_parabola_is_found():
     assert torch.allclose(found, top, atol=1e-3)
 
 
-def test_nothing_is_found_beyond_reach():
+def test_no_match_lies_beyond_the_search_range():
     search = Search(reach=3, radius=0, temperature=0.03)
     found = feature_motion(shifted(0, 0), shifted(6, 0), search)
     assert found.abs().max() <= 3

@@ -236,9 +236,16 @@ def exported_nerfstudio(root: Path, names: dict[str, Any]) -> Path:
         for k, f in enumerate(document["frames"])
     }
     document["hdr_nsff"] = {
-        "fps": 24, "reference_bracket": 0, "bracket_ev": [0.0], "exposure_given": True,
-        "near": 1.0, "far": 9.0, "depth_kind": "scene", "frames": frames, **top,
-    }  # fmt: skip
+        "fps": 24,
+        "reference_bracket": 0,
+        "bracket_ev": [0.0],
+        "exposure_given": True,
+        "near": 1.0,
+        "far": 9.0,
+        "depth_kind": "scene",
+        "frames": frames,
+        **top,
+    }
     mini.write_json(root / "transforms.json", document)
     return root
 

@@ -124,7 +124,7 @@ def test_moving_pixels_count_alone_at_all_exposures_of_a_view(tmp_path: Path) ->
         assert view[moving] > 60 and view[score] < 20, score
 
 
-def test_a_view_is_seen_through_a_lens_of_its_own(tmp_path: Path) -> None:
+def test_a_view_is_rendered_through_its_lens(tmp_path: Path) -> None:
     """Recorded with twice the focal length. The clip's own focal length is not that of
     the view.
     """

@@ -1,11 +1,8 @@
-"""Data sets through `prepare`: what they give is used and recorded as given, held-out
-views land in a truth folder, and nothing else.
-"""
+"""`prepare` on the HDR-GoPro tree: its priors are used, held-out views become truth."""
 
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,9 +13,7 @@ import pytest
 from miniatures import EV, H, W
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import read_exr
-from hdr_nsff.core.images import read_image, read_mask, write_png
-from hdr_nsff.core.io import write_npy
+from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.datasets.capture import SparseDepth
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
@@ -38,22 +33,7 @@ def gopro(tmp_path: Path) -> PrepareConfig:
     return PrepareConfig(mini.gopro(tmp_path / "set"), tmp_path / "scene")
 
 
-def still(tmp_path: Path, count: int, root: Path) -> PrepareConfig:
-    """A set that gives no masks and depth, with both from elsewhere, so that it is
-    quick.
-    """
-    for k in range(count):
-        write_png(tmp_path / f"masks/{k}.png", mini.left(3))
-        write_npy(tmp_path / f"depth/{k}.npy", np.full((H, W), 4.0, np.float32))
-    return PrepareConfig(
-        root, tmp_path / "scene", masks=tmp_path / "masks", depth=tmp_path / "depth"
-    )
-
-
-# HDR-GoPro / NSFF
-
-
-def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
+def test_a_complete_gopro_tree_needs_few_estimates(
     gopro: PrepareConfig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     scene = Scene.open(prepare(gopro))
@@ -79,7 +59,7 @@ def test_a_whole_gopro_tree_needs_no_estimate_but_the_exposure_cycle(
     assert f.moving.sum() == 3 * H
 
 
-def test_masks_beside_dense_show_moving_pixels_in_black(gopro: PrepareConfig) -> None:
+def test_masks_next_to_dense_mark_moving_pixels_in_black(gopro: PrepareConfig) -> None:
     shutil.rmtree(gopro.clip / "dense/motion_masks")
     moving = Scene.open(prepare(gopro)).train[0].moving
     assert moving is not None
@@ -97,16 +77,15 @@ def test_semantic_flow_is_preferred(gopro: PrepareConfig) -> None:
     assert (Scene.open(prepare(gopro)).train[0].flow[1] == 7).all()
 
 
-def test_metric_depth_is_brought_to_the_units_of_the_poses(gopro: PrepareConfig) -> None:
+def test_metric_depth_is_scaled_to_the_units_of_the_poses(gopro: PrepareConfig) -> None:
     rng = np.random.default_rng(0)
     points = np.concatenate([rng.uniform(-0.6, 0.6, (40, 2)), np.full((40, 1), mini.WALL)], 1)
     mini.colmap(gopro.clip / "dense", points)
     scene = Scene.open(prepare(gopro))
-    # the map says 2 everywhere, the points lie about 4 away
+    # The map holds 2 everywhere; the points lie about 4 away.
     depth = [((points - c2w[:, 3]) @ c2w[:, 2]) for c2w in map(mini.gopro_pose, range(3))]
-    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(
-        float(np.median(depth)), rel=2e-3
-    )
+    aligned = float(1 / scene.train[0].disparity[0, 0])
+    assert aligned == pytest.approx(float(np.median(depth)), rel=2e-3)
     assert "360 static points" in Manifest.load(gopro.out).steps["depth"].note
     assert np.allclose(scene.points, points, atol=1e-6)
 
@@ -144,7 +123,7 @@ def test_maps_of_another_size_are_resampled_and_flow_is_scaled(tmp_path: Path) -
         prepare(PrepareConfig(root, tmp_path / "other"))
 
 
-def test_cameras_that_saw_the_same_times_are_the_truth(gopro: PrepareConfig) -> None:
+def test_other_cameras_at_the_training_times_become_the_truth(gopro: PrepareConfig) -> None:
     prepare(gopro)
     folder = held_out_truth(gopro)
     assert folder == gopro.out.with_name("scene_truth")
@@ -155,12 +134,7 @@ def test_cameras_that_saw_the_same_times_are_the_truth(gopro: PrepareConfig) -> 
     assert truth.bracket_frame == [0, 1, 2]
     view = next(v for v in truth.views if v.name == "t00004.0_camera3")
     # the pose and exposure of training frame 2
-    assert (view.time, view.anchor, view.c2w, view.bracket) == (
-        4.0,
-        2,
-        None,
-        2,
-    )
+    assert (view.time, view.anchor, view.c2w, view.bracket) == (4.0, 2, None, 2)
     exact, pictures = true_pictures(truth, view, folder)
     assert exact is None
     assert (pictures[2] == np.float32(mini.see(mini.gopro_pose(2), EV[2]))).all()
@@ -169,7 +143,7 @@ def test_cameras_that_saw_the_same_times_are_the_truth(gopro: PrepareConfig) -> 
     assert next(v for v in truth.views if v.name == "t00004.5_camera2").time == 4.5
 
 
-def test_every_second_frame_leaves_the_others_to_be_tested(gopro: PrepareConfig) -> None:
+def test_a_stride_of_two_holds_out_the_other_frames(gopro: PrepareConfig) -> None:
     prepare(replace(gopro, stride=2))
     scene, truth = Scene.open(gopro.out), Truth.open(gopro.out.with_name("scene_truth"))
     assert [f.time for f in scene.train] == [0, 1, 2, 3, 4]
@@ -181,12 +155,7 @@ def test_a_protocol_splits_a_data_set_and_keeps_its_times(gopro: PrepareConfig) 
     prepare(replace(gopro, protocol="novel-view-time"))
     scene, truth = Scene.open(gopro.out), Truth.open(gopro.out.with_name("scene_truth"))
     assert [f.time for f in scene.train] == [0, 2, 4, 6, 8]
-    assert [f.time for f in scene.test] == [
-        1,
-        3,
-        5,
-        7,
-    ]
+    assert [f.time for f in scene.test] == [1, 3, 5, 7]
     assert scene.manifest.protocol == "novel-view-time"
     # all: `evaluate` sorts them by protocol
     assert {v.time for v in truth.views} == {t / 2 for t in range(0, 17)}
@@ -198,20 +167,12 @@ def test_a_protocol_splits_a_data_set_and_keeps_its_times(gopro: PrepareConfig) 
 
 
 def test_a_truth_of_other_settings_does_not_stay(gopro: PrepareConfig) -> None:
-    """The first three frames are of cameras 1 to 3; when only these times are used,
-    views later than that go.
-    """
+    """With the first three times alone, later views are removed."""
     prepare(gopro)
     prepare(replace(gopro, end=3, redo=("frames",)))
     folder = held_out_truth(gopro)
     assert folder is not None
-    assert {v.time for v in Truth.open(folder).views} == {
-        0.0,
-        0.5,
-        1.0,
-        1.5,
-        2.0,
-    }
+    assert {v.time for v in Truth.open(folder).views} == {0.0, 0.5, 1.0, 1.5, 2.0}
 
 
 def test_parts_can_be_estimated_although_they_are_given(gopro: PrepareConfig) -> None:
@@ -245,12 +206,9 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
 
 def test_held_out_pixels_change_nothing_in_the_scene(tmp_path: Path) -> None:
     one, other = mini.gopro(tmp_path / "one/set"), mini.gopro(tmp_path / "other/set")
-    for path in [
-        p
-        for n in ("mv_images", "mv_images_time", "mv_masks")
-        for p in (other / "dense" / n).rglob("*.png")
-    ]:
-        write_png(path, np.random.default_rng(0).random((H, W, 3)))
+    for name in ("mv_images", "mv_images_time", "mv_masks"):
+        for path in (other / "dense" / name).rglob("*.png"):
+            write_png(path, np.random.default_rng(0).random((H, W, 3)))
     scenes = [prepare(PrepareConfig(root, root.with_name("scene"))) for root in (one, other)]
     files = [
         {p.relative_to(s).as_posix(): p.read_bytes() for p in s.rglob("*") if p.is_file()}
@@ -285,202 +243,3 @@ def test_a_folder_of_other_files_is_not_overwritten_with_truth(
     with pytest.raises(InputError, match="not made by prepare"):
         prepare(replace(gopro, truth_out=tmp_path / "mine"))
     assert (tmp_path / "mine/photo.png").is_file()
-
-
-# Blender
-
-
-@pytest.mark.parametrize("kind", ["hexplane", "hdr4d"])
-def test_stored_exposures_are_known_in_stops(kind: str, tmp_path: Path) -> None:
-    config = still(tmp_path, 8, mini.blender(tmp_path / "set", kind))
-    m = Manifest.load(prepare(config))
-    assert m.exposure_given
-    assert m.steps["exposure"].details["source"] == "data set"
-    gauge = m.frames[0].ev  # of EV[0]
-    assert gauge is not None
-    assert [round(f.ev - gauge, 6) for f in m.frames if f.ev is not None] == [
-        EV[t % 3] - EV[0] for t in (0, 1, 2, 3, 5, 6, 7, 9)
-    ]
-    assert [f.time for f in m.frames] == [0, 1, 2, 3, 5, 6, 7, 9]
-    truth = Truth.open(config.out.with_name("scene_truth"))
-    assert [v.time for v in truth.views] == [4, 8]
-    evs = [truth.bracket_ev[v.bracket] for v in truth.views]
-    assert [ev - gauge for ev in evs if ev is not None] == pytest.approx(
-        [EV[1] - EV[0], EV[2] - EV[0]]
-    )
-
-
-def test_fractional_times_count_frames(tmp_path: Path) -> None:
-    config = still(tmp_path, 8, mini.blender(tmp_path / "set", "dnerf"))
-    m = Manifest.load(prepare(config))
-    assert [f.time for f in m.frames] == [0, 1, 2, 3, 5, 6, 7, 9]
-    assert m.cycle == 1
-    assert [v.time for v in Truth.open(config.out.with_name("scene_truth")).views] == [4, 8]
-
-
-def test_transparent_pixels_are_white(tmp_path: Path) -> None:
-    prepare(still(tmp_path, 8, mini.blender(tmp_path / "set")))
-    seen, shown = (
-        np.float32(mini.see(mini.blender_pose(0), EV[0])),
-        read_image(tmp_path / "scene/images/00000.png"),
-    )
-    quarter = 64 / 255
-    assert np.allclose(shown[:-2], seen[:-2], atol=1e-6)
-    assert np.allclose(shown[-2:], quarter * seen[-2:] + 1 - quarter, atol=2e-5)
-    view = Truth.open(tmp_path / "scene_truth").views[0]
-    held_out = read_image(tmp_path / "scene_truth" / view.recorded[view.bracket])
-    assert np.allclose(
-        held_out[-2:], quarter * mini.see(mini.blender_pose(4), EV[1])[-2:] + 1 - quarter, atol=2e-5
-    )
-
-
-def test_exact_radiance_of_held_out_views_is_kept(tmp_path: Path) -> None:
-    prepare(still(tmp_path, 8, mini.blender(tmp_path / "set", "hdr4d")))
-    truth = Truth.open(tmp_path / "scene_truth")
-    for view, t in zip(truth.views, (4, 8), strict=True):
-        assert view.radiance is not None
-        assert (
-            read_exr(tmp_path / "scene_truth" / view.radiance)["RGB"]
-            == mini.radiance(mini.blender_pose(t))
-        ).all()
-    assert not list((tmp_path / "scene").rglob("*.exr"))  # nor that of training pictures
-
-
-def test_a_time_outside_the_training_pictures_cannot_be_compared(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = mini.blender(tmp_path / "set")
-    path = root / "transforms_test.json"
-    path.write_text(path.read_text().replace('"time": 8', '"time": 12'))
-    prepare(still(tmp_path, 8, root))
-    assert [v.time for v in Truth.open(tmp_path / "scene_truth").views] == [4]
-    assert "1 of 2 held-out views" in capsys.readouterr().err
-
-
-def test_several_pictures_of_one_time_become_cameras(tmp_path: Path) -> None:
-    root = mini.blender(tmp_path / "set", "dnerf")
-    path = root / "transforms_train.json"
-    document = json.loads(path.read_text())
-    for k, frame in enumerate(document["frames"]):
-        frame["time"] = (k // 2) / 3
-    path.write_text(json.dumps(document))
-    m = Manifest.load(
-        prepare(replace(still(tmp_path, 8, root), masks=None, depth=None, max_size=32))
-    )
-    assert [(f.camera_id, f.time) for f in m.frames] == [
-        (0, 0),
-        (0, 1),
-        (0, 2),
-        (0, 3),
-        (1, 0),
-        (1, 1),
-        (1, 2),
-        (1, 3),
-    ]
-
-
-# HDR-NeRF and nerfstudio
-
-
-def reference_of_rounds(m: Manifest) -> float:
-    """The EV of the first picture of a still scene whose first, third and fifth
-    exposures, all given, come in turn.
-    """
-    gauge = m.frames[0].ev
-    assert gauge is not None
-    assert [f.ev - gauge for f in m.frames if f.ev is not None] == pytest.approx([0, 4, 8, 0, 4, 8])
-    assert m.steps["masks"].provenance == "given"
-    assert m.exposure_given
-    return gauge
-
-
-def test_a_still_scene_trains_on_one_of_five_exposures_per_view(tmp_path: Path) -> None:
-    config = replace(still(tmp_path, 6, mini.hdr_nerf(tmp_path / "set")), masks=None)
-    m = Manifest.load(prepare(config))
-    assert [f.source for f in m.frames] == [f"train/r_{n}_{(0, 2, 4)[n % 3]}.png" for n in range(6)]
-    reference_of_rounds(m)
-    assert not any(f.moving.any() for f in Scene.open(config.out).train if f.moving is not None)
-
-
-def test_all_five_exposures_of_a_held_out_view_are_kept(tmp_path: Path) -> None:
-    config = replace(still(tmp_path, 6, mini.hdr_nerf(tmp_path / "set")), masks=None)
-    m = Manifest.load(prepare(config))
-    truth = Truth.open(tmp_path / "scene_truth")
-    view = truth.views[0]
-    assert len(view.recorded) == 5
-    assert view.radiance is not None
-    # two exposures that nothing was trained on
-    assert sum(f is None for f in truth.bracket_frame or []) == 2
-    zero = m.frames[0].ev
-    assert zero is not None
-    for bracket, name in view.recorded.items():
-        ev = truth.bracket_ev[bracket]
-        assert ev is not None
-        expected = mini.see(mini.pose(0.3), ev - zero - 4)
-        assert (read_image(tmp_path / "scene_truth" / name) == np.float32(expected)).all()
-
-
-def test_every_second_pose_of_a_real_hdr_nerf_scene_is_held_out(tmp_path: Path) -> None:
-    config = replace(still(tmp_path, 6, mini.hdr_nerf_real(tmp_path / "set")), masks=None)
-    m = Manifest.load(prepare(config))
-    assert [f.source for f in m.frames] == [
-        f"input_images/{2 * k:03d}_{(0, 2, 4)[k % 3]}.png" for k in range(6)
-    ]
-    gauge = reference_of_rounds(m)
-    assert all(
-        np.allclose(f.c2w, mini.pose(0.2 * k)) for k, f in enumerate(m.frames) if f.c2w is not None
-    )
-    folder = tmp_path / "scene_truth"
-    truth = Truth.open(folder)
-    assert len(truth.views) == 6
-    assert sum(f is None for f in truth.bracket_frame or []) == 2
-    for k, view in enumerate(truth.views):
-        assert len(view.recorded) == 5
-        assert np.allclose(view.c2w, mini.pose(0.1 * (2 * k + 1)))
-        for bracket, name in view.recorded.items():
-            ev = truth.bracket_ev[bracket]
-            assert ev is not None
-            expected = mini.see(mini.pose(0.1 * (2 * k + 1)), ev - gauge - 4)
-            assert (read_image(folder / name) == np.float32(expected)).all()
-
-
-def test_nerfstudio_pictures_go_by_name_and_depth_is_in_millimeters(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = PrepareConfig(mini.nerfstudio(tmp_path / "set"), tmp_path / "scene", max_size=W)
-    m = Manifest.load(prepare(config))
-    assert [f.source for f in m.frames] == [
-        f"images/frame_{n:05d}.png" for n in (0, 1, 2, 3, 5, 6, 7)
-    ]
-    assert [f.time for f in m.frames] == [0, 1, 2, 3, 5, 6, 7]
-    assert float(1 / Scene.open(config.out).train[0].disparity[0, 0]) == pytest.approx(
-        mini.WALL, rel=1e-3
-    )
-    assert provenance(config.out)["masks"] == "estimated"
-    assert "not moving ones: not used" in " ".join(capsys.readouterr().err.split())
-    view = Truth.open(tmp_path / "scene_truth").views[0]
-    assert (view.name, view.time) == ("images_frame_00004", 4.0)
-
-
-def test_depth_in_16_bit_pictures_is_in_millimeters_too(tmp_path: Path) -> None:
-    root = mini.nerfstudio(tmp_path / "set")
-    for path in (root / "depth").glob("*.npy"):
-        write_png(path.with_suffix(".png"), np.full((H, W, 3), 1000 * mini.WALL / 65535), bits=16)
-    text = (root / "transforms.json").read_text()
-    (root / "transforms.json").write_text(re.sub(r"depth/(\d)\.npy", r"depth/\1.png", text))
-    scene = Scene.open(prepare(PrepareConfig(root, tmp_path / "scene", max_size=W)))
-    assert float(1 / scene.train[0].disparity[0, 0]) == pytest.approx(mini.WALL, rel=1e-3)
-
-
-def test_a_list_of_held_out_names_that_is_wrong_is_one_sentence(tmp_path: Path) -> None:
-    root = mini.nerfstudio(tmp_path / "set", test_filenames=["images/frame_00009.png"])
-    with pytest.raises(InputError, match=r"frame_00009\.png is listed as held out"):
-        prepare(PrepareConfig(root, tmp_path / "scene"))
-
-
-def test_a_data_set_that_holds_nothing_out_has_no_truth(tmp_path: Path) -> None:
-    config = PrepareConfig(mini.gopro(tmp_path / "set", held_out=False), tmp_path / "scene")
-    prepare(config)
-    assert held_out_truth(config) is None
-    assert not (tmp_path / "scene_truth").exists()
-    assert len(Scene.open(config.out).test) == 1  # every eighth frame, as of any footage

@@ -33,7 +33,7 @@ def points(curve, ev, num=700, outliers=0.0, seed=0):
 
 @pytest.mark.parametrize("outliers", [0.0, 0.1])
 @pytest.mark.parametrize("curve", [GAMMA22, SRGB, S_CURVE], ids=["gamma", "srgb", "s-curve"])
-def test_the_response_comes_back_from_known_exposures(curve, outliers):
+def test_the_response_is_recovered_from_known_exposures(curve, outliers):
     fit = debevec(points(curve, EV, outliers=outliers), EV, reference=2)
     assert rmse(fit.x, fit.y, curve) < 0.02
     np.testing.assert_allclose(fit.ev, EV)
@@ -45,7 +45,7 @@ def test_two_exposures_suffice():
     assert rmse(fit.x, fit.y, S_CURVE) < 0.02
 
 
-def test_unknown_exposures_of_a_typical_camera_come_back():
+def test_unknown_exposures_of_a_typical_camera_are_recovered():
     fit = debevec(points(SRGB, EV, outliers=0.05), [None, None, None], reference=2)
     assert fit.guessed
     np.testing.assert_allclose(fit.ev, EV, atol=0.15)
@@ -56,20 +56,20 @@ def test_unknown_exposures_of_a_typical_camera_come_back():
 @pytest.mark.parametrize(
     "ev", [EV, [-3.0, 0.0], [0.0, 1.0, 2.0]], ids=["2 stops", "3 stops", "1 stop"]
 )
-def test_unknown_exposures_in_whole_stops_come_back_whatever_the_curve(curve, ev):
+def test_unknown_exposures_in_whole_stops_are_recovered_for_any_curve(curve, ev):
     fit = debevec(points(curve, ev), [None] * len(ev), reference=len(ev) - 1)
     np.testing.assert_allclose(fit.ev, np.array(ev) - ev[-1], atol=0.08)
     assert rmse(fit.x, fit.y, curve) < 0.03
 
 
-def test_the_proportions_of_unknown_exposures_are_measured_whatever_the_curve():
+def test_ratios_of_unknown_exposures_are_measured_for_any_curve():
     ev = [-4.0, -1.0, 0.0]
     for curve in (GAMMA22, SRGB, S_CURVE):
         fit = debevec(points(curve, ev), [None, None, None], reference=2)
         assert fit.ev[1] / fit.ev[0] == pytest.approx(0.25, abs=0.02)
 
 
-def test_one_known_exposure_settles_the_factor():
+def test_one_known_exposure_fixes_the_factor():
     fit = debevec(points(S_CURVE, EV), [-4.0, None, 0.0], reference=2)
     assert not fit.guessed
     assert fit.ev[1] == pytest.approx(-2.0, abs=0.06)

@@ -58,7 +58,7 @@ def test_directions_that_agree_are_averaged_and_others_stay():
     assert np.allclose(average_with_reverse(forward, backward), 1.9)
     assert np.allclose(average_with_reverse(backward, forward), -1.9)
     assert np.array_equal(average_with_reverse(forward, -forward), forward)
-    # one direction of these is wrong, and nothing says which
+    # One direction of these is wrong; which one is unknown.
     assert np.array_equal(average_with_reverse(forward, -forward + 1), forward)
 
 

@@ -89,7 +89,7 @@ def test_a_moving_region_has_low_confidence_and_is_never_behind_the_scene():
     assert disparity[moving].min() > 0.98 / 4.0
 
 
-def test_cameras_at_one_instant_see_movers_stand_still():
+def test_movers_are_at_rest_between_cameras_of_one_time():
     """Five cameras, one time: the 'moving' region has exact parallax."""
     c2w = SWEEPING[1:6]
     video, depth = plane(c2w, 4.0, 0.0)
@@ -100,7 +100,7 @@ def test_cameras_at_one_instant_see_movers_stand_still():
     assert np.median(confidence[moving]) > 0.6
 
 
-def test_without_parallax_everything_is_at_distance_one_and_a_message_says_so(monkeypatch):
+def test_without_parallax_all_depth_is_one_and_a_message_reports_it(monkeypatch):
     messages = []
     monkeypatch.setattr(depth_module, "say", messages.append)
     c2w = cameras_at(*[(0.001 * t, 0, 0) for t in range(4)])
@@ -110,7 +110,7 @@ def test_without_parallax_everything_is_at_distance_one_and_a_message_says_so(mo
     assert "parallax" in messages[0]
 
 
-def test_frames_without_anything_to_match_do_not_crash():
+def test_clipped_frames_have_depth_of_low_confidence():
     """All is clipped: only structure from motion's points are left; confidence
     is low.
     """

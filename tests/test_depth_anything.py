@@ -41,13 +41,13 @@ def frames_of(
 CHANGING = np.stack([0.1 + 0.01 * np.arange(6), 0.05 + 0.02 * np.sin(np.arange(6))], 1)
 
 
-def test_a_scale_and_shift_per_frame_come_back_exactly():
+def test_scale_and_shift_of_every_frame_are_recovered_exactly():
     lines, errors = align(frames_of(CHANGING), with_shift=True)
     np.testing.assert_allclose(lines, CHANGING, rtol=1e-6)
     assert errors.max() < 1e-6
 
 
-def test_thirty_percent_outliers_hardly_move_them():
+def test_thirty_percent_outliers_hardly_change_the_fit():
     lines, _ = align(frames_of(CHANGING, outliers=0.3, noise=0.005), with_shift=True)
     at = np.linspace(1, 9, 5)[:, None]
     made, true = (x[:, 0] * at + x[:, 1] for x in (lines, CHANGING))
@@ -61,7 +61,7 @@ def test_a_metric_network_needs_one_scale_per_frame_and_gets_no_shift():
     np.testing.assert_allclose(lines[:, 0], scales[:, 0], rtol=0.01)
 
 
-def test_a_frame_without_points_takes_the_middle_of_its_neighbors():
+def test_a_frame_without_points_takes_the_mean_fit_of_its_neighbors():
     seen = frames_of(np.array([[0.1, 0.2], [0.1, 0.2], [0.14, 0.1]]))
     seen[1] = seen[1][:0]
     lines, errors = align(seen, with_shift=True)
@@ -69,7 +69,7 @@ def test_a_frame_without_points_takes_the_middle_of_its_neighbors():
     assert np.isfinite(errors).all()
 
 
-def test_a_frame_at_the_end_without_points_takes_that_of_the_frame_before():
+def test_a_last_frame_without_points_takes_the_fit_of_the_frame_before():
     seen = frames_of(CHANGING[:3])
     seen[2] = seen[2][:0]
     np.testing.assert_allclose(align(seen, with_shift=True)[0][2], CHANGING[1], rtol=1e-4)
@@ -138,7 +138,7 @@ def test_predictions_that_do_not_fit_the_points_have_low_confidence_and_are_neve
     assert confidence.max() < 0.6
 
 
-def test_without_points_there_is_one_sentence():
+def test_without_points_the_network_is_refused_in_a_sentence():
     clip, true, _ = slanted()
     with pytest.raises(InputError, match="static points"):
         anchored_depth(true, "relative", clip, np.zeros((0, 3)), *NONE)

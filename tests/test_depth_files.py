@@ -24,3 +24,10 @@ def test_damaged_depth_is_read_or_refused(tmp_path: Path, suffix: str) -> None:
         case _:
             write_png(path, DEPTH / 5, bits=16)
     check_reader(path, lambda: read_depth_files([path], "metric", DEPTH.shape), 100)
+
+
+def test_a_depth_too_small_for_a_disparity_is_no_measurement(tmp_path: Path) -> None:
+    path = tmp_path / "depth.npy"
+    np.save(path, np.where(DEPTH > 3, DEPTH, 1e-30))
+    disparity, confidence = read_depth_files([path], "metric", DEPTH.shape)
+    assert disparity.max() < 1 / 3 and np.array_equal(confidence[0] > 0, DEPTH > 3)

@@ -1,4 +1,4 @@
-"""`hdr-nsff doctor` describes an installation, whatever state it is in."""
+"""`hdr-nsff doctor` describes an installation in any state."""
 
 import importlib.metadata
 import sys
@@ -129,7 +129,7 @@ def test_a_cuda_device_is_named_with_what_gsplat_can_do(monkeypatch: pytest.Monk
     assert not report.problems  # the CPU still works
 
 
-def test_the_driver_is_asked_for_where_there_is_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_driver_is_queried_where_it_exists(monkeypatch: pytest.MonkeyPatch) -> None:
     answer = SimpleNamespace(stdout="570.86\n570.86\n")
     monkeypatch.setattr(doctor.subprocess, "run", lambda *words, **options: answer)
     assert doctor.driver() == "570.86"

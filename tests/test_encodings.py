@@ -118,7 +118,7 @@ def test_frequencies_hold_identity_sines_and_cosines() -> None:
     torch.testing.assert_close(out[0], torch.from_numpy(expected).float())
 
 
-def test_loading_a_state_keeps_the_grids_own_marks() -> None:
+def test_loading_a_state_keeps_the_marks_of_touched_rows() -> None:
     p, marks = torch.ones(1, 4, requires_grad=True), marked(1)
     optimizer = TouchedAdam([{"params": [p], "touched": [marks]}], lr=0.1)
     optimizer.load_state_dict(optimizer.state_dict())

@@ -87,7 +87,7 @@ def test_the_scene_is_what_was_filmed(out: Path) -> None:
             assert abs(float(np.median(disparity[~moving])) * WALL - 1) < 0.1
 
 
-def test_radiance_comes_out_linear_unclipped_and_at_the_right_scale(out: Path) -> None:
+def test_radiance_is_linear_unclipped_and_at_the_right_scale(out: Path) -> None:
     run, scene = Run.open(out / "run"), made_scene()
     files = sorted((out / "render/training").glob("*.exr"))
     assert len(files) == len(run.scene.train) == 12
@@ -130,7 +130,7 @@ def test_held_out_frames_are_predicted_better_than_by_one_gray(out: Path) -> Non
     assert metrics["headline"]["psnr"] > gray + 1
 
 
-def test_the_report_is_one_page_that_needs_nothing_else(out: Path) -> None:
+def test_the_report_is_one_self_contained_page(out: Path) -> None:
     page = (out / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/") >= 5 and "PSNR" in page
     for attribute, scheme in product(("src", "href"), ("http:", "https:", "file:", "/")):
@@ -169,7 +169,7 @@ def psnr_of(run: Path) -> float:
     return json.loads((run / "metrics.json").read_text())["headline"]["psnr"]
 
 
-def test_gaussians_trained_on_the_same_scene_come_closer_and_move_between_frames(
+def test_gaussians_of_the_same_scene_are_closer_to_it_and_move_between_frames(
     out: Path, tmp_path: Path
 ) -> None:
     run = tmp_path / "run"

@@ -58,7 +58,7 @@ def test_a_pan_gives_its_angles_and_focal_length(tmp_path):
     assert np.degrees(across) == pytest.approx(24, rel=0.03)
 
 
-def test_a_tripod_stands_still(tmp_path):
+def test_a_tripod_has_no_camera_motion(tmp_path):
     noise = np.random.default_rng(0).normal(size=(9, H, W, 3))
     video = np.repeat(panning(np.zeros(1)), 9, 0) + 0.01 * noise
     for t in range(9):

@@ -48,7 +48,7 @@ def test_the_tone_mapper_starts_there_and_is_held_from_the_first_step(measured: 
     assert t.anchored and rmse(x.numpy(), y.numpy(), S_CURVE) < 0.01
 
 
-def test_it_falls_back_on_brightness_and_says_so() -> None:
+def test_without_static_points_it_falls_back_on_brightness_and_reports_it() -> None:
     rng = np.random.default_rng(0)
     views = [wall_view(i, GAMMA22, rng) for i in range(6)]
     for view in views:
@@ -78,7 +78,7 @@ def test_the_papers_tone_mapper_is_left_as_published(measured: Response) -> None
     assert (t.gains() == 0).all()
 
 
-def test_white_balance_of_a_second_camera_comes_back() -> None:
+def test_white_balance_of_a_second_camera_is_recovered() -> None:
     rng = np.random.default_rng(0)
     gains = np.array([0.8, 1.0, 1.25])
     cameras = [(i // 3) % 2 for i in range(18)]
@@ -93,7 +93,7 @@ def test_white_balance_of_a_second_camera_comes_back() -> None:
     torch.testing.assert_close(stops.detach().double(), torch.from_numpy(response.white_balance[1]))
 
 
-def test_offsets_of_cameras_come_back_through_a_chain() -> None:
+def test_offsets_of_cameras_are_recovered_through_a_chain() -> None:
     rng = np.random.default_rng(0)
     camera, true = np.array([0, 1, 2]), np.array([0.0, 0.5, -0.25])
     stops = rng.normal(size=(600, 1)) + true + 0.01 * rng.normal(size=(600, 3))

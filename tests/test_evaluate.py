@@ -38,7 +38,7 @@ def true_pose(c2w: Tensor) -> list[list[float]]:
 
 
 def write_truth(folder: Path, run: Run, field: DiscBeforeWall, **changes: Any) -> Path:
-    """Exact views: a clip pose at another time, one between frames, one off the path."""
+    """Exact views: a clip pose at another time, between frames, and off the path."""
     views = []
     for name, time, anchor, off in (
         ("a", 3.0, 1, None),
@@ -121,7 +121,7 @@ def test_metrics_and_pictures_are_written_and_a_restart_renders_nothing(tmp_path
     assert field_of(run).calls == before and again["headline"] == result["headline"]
 
 
-def test_a_scale_of_the_radiance_is_aligned_away_and_reported(tmp_path: Path) -> None:
+def test_a_scale_of_the_radiance_is_aligned_and_reported(tmp_path: Path) -> None:
     field = Scaled(speed=SPEED / 4, red=3.0)
     run = fake_run(tmp_path / "run", field=field)
     truth = write_truth(tmp_path / "truth", run, DiscBeforeWall(speed=SPEED / 4, red=3.0))
@@ -173,7 +173,7 @@ def test_brackets_are_matched_by_rank_of_exposure() -> None:
     assert match_brackets([-4, -2, 0], [0.0, -2.1]) == {0: 1, 1: 1, 2: 0}
 
 
-def test_learned_exposures_are_known_up_to_a_power(tmp_path: Path) -> None:
+def test_learned_exposures_are_compared_up_to_a_power(tmp_path: Path) -> None:
     run = fake_run(tmp_path / "run")
     truth = write_truth(tmp_path / "truth", run, field_of(run), bracket_ev=[-2.0, -1.0, 0.0])
     camera = evaluate_run(run, truth)["camera"]

@@ -92,7 +92,9 @@ def test_the_vertices_follow_the_common_layout(run: Run, tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("time", [0.0, 2.0, 3.4])
-def test_the_file_renders_the_fields_own_picture(run: Run, tmp_path: Path, time: float) -> None:
+def test_the_file_renders_the_same_picture_as_the_field(
+    run: Run, tmp_path: Path, time: float
+) -> None:
     v = ply.read(export_one(run, tmp_path / "a.ply", time, LINEAR))
     camera = run.scene.train[2].camera
     parts = (v.means, v.quaternions, v.scales, v.opacities, v.colors)

@@ -123,7 +123,7 @@ def test_cameras_of_a_rig_that_start_elsewhere_in_the_cycle_share_brackets():
     assert second[:3] == [1, 2, 0]
 
 
-def test_cameras_share_brackets_where_a_cycle_goes_up_and_down_again():
+def test_cameras_share_the_brackets_of_a_cycle_that_rises_and_falls():
     a, b = detect_cycle(clip([-2, 0, 2, 0])), detect_cycle(clip([0, 2, 0, -2]))
     assert [brackets[:4] for brackets in common_brackets([a, b])] == [[0, 1, 2, 1], [1, 2, 1, 0]]
 
@@ -145,7 +145,7 @@ def test_equal_values_share_a_bracket():
     assert ev == [-2, 0, 2]
 
 
-def test_a_right_list_raises_no_doubts_and_wrong_ones_do():
+def test_a_correct_list_causes_no_warning_and_wrong_ones_do():
     video = clip([-2, 0, 2])
     assert contradictions(video, [-2, 0, 2] * 8) == []
     assert "go the way" in contradictions(video, [2, 0, -2] * 8)[0]

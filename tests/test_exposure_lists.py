@@ -1,4 +1,4 @@
-"""Exposures that somebody wrote down: on the command line, in a CSV, in EXIF."""
+"""Exposures that the user gives: on the command line, in a CSV, in EXIF."""
 
 import math
 from pathlib import Path

@@ -26,7 +26,7 @@ def test_radiance_beyond_half_precision_is_kept(tmp_path: Path) -> None:
     assert np.array_equal(read_exr(tmp_path / "a.exr")["RGB"], np.float32(1e6) * RGB)
 
 
-def test_arrays_that_are_not_contiguous_are_written_right(tmp_path: Path) -> None:
+def test_arrays_that_are_not_contiguous_are_written_correctly(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", {"RGB": RGB[:, ::-1]}, half=False)
     assert np.array_equal(read_exr(tmp_path / "a.exr")["RGB"], RGB[:, ::-1])
 
@@ -48,3 +48,15 @@ def test_files_that_are_missing_or_cut_short_are_refused(tmp_path: Path) -> None
     (tmp_path / "a.exr").write_bytes((tmp_path / "a.exr").read_bytes()[:-40])
     with pytest.raises(InputError, match="copy it again"):
         read_exr(tmp_path / "a.exr")
+
+
+def test_nothing_is_printed_of_damaged_pixels(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "a.exr"
+    write_exr(path, {"RGB": np.tile(RGB, (9, 9, 1))})
+    data = path.read_bytes()
+    path.write_bytes(data[:-40] + b"\xff" * 40)  # OpenEXR warns of what it cannot decode
+    with pytest.raises(InputError, match="damaged"):
+        read_exr(path)
+    assert capfd.readouterr() == ("", "")

@@ -115,7 +115,7 @@ def test_time_is_continuous_at_and_between_training_times(field: AnyField, toy: 
     assert float((half - at).abs().max()) > 1e-3
 
 
-def test_outside_its_times_the_field_stands_still(field: AnyField, toy: Scene) -> None:
+def test_outside_its_times_the_field_is_at_rest(field: AnyField, toy: Scene) -> None:
     camera, last = toy.train[0].camera, toy.train[-1].time
     torch.testing.assert_close(
         field.render(camera, last + 3).radiance, field.render(camera, last).radiance
@@ -163,7 +163,7 @@ def test_a_training_pass_has_warps_and_regularizers(nsff: NSFF, toy: Scene) -> N
     assert all(v.requires_grad and torch.isfinite(v).all() for v in own.values())
 
 
-def test_a_pass_is_told_by_its_seed(nsff: NSFF, toy: Scene) -> None:
+def test_a_pass_is_determined_by_its_seed(nsff: NSFF, toy: Scene) -> None:
     batch = draw_pixels(toy, 3, 40, 0, torch.Generator().manual_seed(0))
     nsff.train()
     one, same, other = (nsff(replace(batch, seed=s))[0].radiance for s in (1, 1, 2))

@@ -117,7 +117,7 @@ def test_a_few_steps_lower_the_loss(config: FinetuneConfig):
     assert losses[-1] < 0.8 * losses[0]
 
 
-def test_the_result_is_half_way_from_where_it_started(config: FinetuneConfig):
+def test_the_result_is_half_way_between_start_and_end(config: FinetuneConfig):
     start = torch.load(str(config.weights), weights_only=True)
     half = load_file(finetune_flow(config))
     trained = load_file(config.out / "checkpoints/step_00000004.safetensors")

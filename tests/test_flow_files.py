@@ -45,6 +45,7 @@ def test_a_folder_in_the_public_layout_is_read(tmp_path):
         (lambda d: None, "no flow from frame 0 to frame 1"),
         (lambda d: write_npy(d / "00000_00001.npy", np.zeros((H, W - 1, 2))), "shape"),
         (lambda d: write_npy(d / "00000_00001.npy", np.full((H, W, 2), np.nan)), "NaN"),
+        (lambda d: write_npy(d / "00000_00001.npy", constant(1e30, 0)), "more than 1e"),
         (lambda d: (d / "00000_00001.npy").write_text("no array"), "not a readable"),
         (lambda d: (d / "00000_fwd.npz").write_text("no archive"), "not a flow file"),
         (

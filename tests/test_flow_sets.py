@@ -94,7 +94,7 @@ def test_sintel_has_forward_flow_and_masks_unknown_pixels(tmp_path: Path):
     assert flow_pairs(tmp_path / "training") == pairs
 
 
-def test_flyingthings_has_both_eyes_and_both_ways(tmp_path: Path):
+def test_flyingthings_has_both_cameras_and_both_directions(tmp_path: Path):
     pairs = flow_pairs(things(tmp_path))
     assert [p.first.parent.name for p in pairs] == ["left", "right"]
     assert len({p.scene for p in pairs}) == 1
@@ -113,7 +113,7 @@ def test_rendered_scenes_are_pairs_of_neighbors(tmp_path: Path):
     assert (sample.flow[1] == [-1, 0]).all()
 
 
-def test_unknown_flow_is_not_known(tmp_path: Path):
+def test_unknown_flow_is_marked_as_unknown(tmp_path: Path):
     pairs = flow_pairs(sintel(tmp_path))
     flow = FLOW.copy()
     flow[4, 4] = 1e9  # as the Middlebury format marks it
@@ -164,7 +164,7 @@ def sample(height: int = 60, width: int = 80) -> Sample:
     return Sample(np.stack([ramp, ramp]), flow.copy(), np.ones((2, height, width), bool))
 
 
-def test_exposures_are_as_far_apart_as_asked():
+def test_exposures_differ_by_the_requested_stops():
     """Around the median 2^-2.5 recorded at 0.18 in the middle, 4 EV apart: the halves
     of one ramp clip at different ends.
     """
@@ -176,7 +176,7 @@ def test_exposures_are_as_far_apart_as_asked():
     assert np.abs(same[0] - same[1]).mean() < 0.02
 
 
-def test_equalized_pairs_look_alike():
+def test_equalizing_brings_pairs_closer_in_brightness():
     raw, equal = (recorded_pair(sample().radiance, 4, e) for e in (False, True))
     assert np.abs(equal[0] - equal[1]).mean() < 0.3 * np.abs(raw[0] - raw[1]).mean()
 

@@ -92,7 +92,7 @@ def test_a_linear_response_commutes_with_compositing(toy: Scene) -> None:
     torch.testing.assert_close(render.rgb, render.radiance)
 
 
-def test_a_single_radiance_along_an_opaque_ray_is_recorded_alike_both_ways(toy: Scene) -> None:
+def test_a_constant_radiance_along_an_opaque_ray_is_recorded_equally_both_ways(toy: Scene) -> None:
     field, batch = veil_and_wall(toy, 2.0, 2.0)
     seen = field(replace(batch, recorder=Recorder(lambda e: e / (1 + e), (0,))))[0]
     torch.testing.assert_close(seen.rgb, torch.full_like(seen.rgb, 2 / 3), atol=2e-3, rtol=0)

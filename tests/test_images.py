@@ -1,4 +1,4 @@
-"""Images of 8 and 16 bits, masks, and pictures of maps, with values worked by hand."""
+"""Images of 8 and 16 bits, masks and pictures of maps, against computed values."""
 
 from __future__ import annotations
 

@@ -159,7 +159,7 @@ LEARNERS = [
 
 
 @pytest.mark.parametrize("module", LEARNERS)
-def test_nothing_that_learns_or_prepares_can_reach_held_out_truth(module: str):
+def test_preparation_and_training_cannot_import_held_out_truth(module: str):
     assert not knows_the_truth(reached(module))
     assert (
         knows_the_truth(reached("evaluation.evaluate")) >= {"scene.truth", "evaluation.targets"}

@@ -48,7 +48,7 @@ def all_frames(path: Path, **choice) -> list:
     )
 
 
-def test_frames_come_in_the_order_of_their_numbers(tmp_path):
+def test_frames_are_sorted_by_their_numbers(tmp_path):
     frames = all_frames(folder_of(tmp_path, [0.1 * k for k in range(1, 12)]))
     assert [f.source for f in frames] == [f"f{i}.png" for i in range(1, 12)]
     assert np.allclose([f.rgb.mean() for f in frames[:5]], [0.1, 0.2, 0.3, 0.4, 0.5], atol=0.01)
@@ -146,7 +146,7 @@ def test_damaged_videos_are_read_or_refused(tmp_path):
     check_reader(path, lambda: all_frames(path), 60)
 
 
-def test_held_out_frames_go_through_all_exposures():
+def test_held_out_frames_cover_all_exposures():
     chosen = hold_out_every(100, 8, 4)
     assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
     assert {k % 4 for k in chosen} == {0, 1, 2, 3}
@@ -159,6 +159,11 @@ def test_held_out_frames_go_through_all_exposures():
 def test_a_file_that_cannot_be_read_is_named():
     with pytest.raises(InputError, match="/proc/self/mem: cannot be read"):
         hash_file(Path("/proc/self/mem"))
+
+
+def test_pipes_and_devices_are_not_read_without_end():
+    with pytest.raises(InputError, match="/dev/zero: missing, or no ordinary file"):
+        hash_file(Path("/dev/zero"))
 
 
 def write_dng(path: Path, level: float) -> None:

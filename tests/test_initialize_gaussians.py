@@ -112,7 +112,7 @@ def test_the_rest_is_invisible_and_the_background_typical(field: Splat) -> None:
     assert int((~seen(field.static)).sum()) >= 0.05 * 400
 
 
-def test_a_start_is_told_in_a_sentence_and_is_the_same_again(field: Splat, toy: Scene) -> None:
+def test_the_start_is_reported_in_a_sentence_and_reproducible(field: Splat, toy: Scene) -> None:
     again, told = seeded(toy)
     still, moving = int(seen(field.static).sum()), int(seen(field.moving).sum())
     assert (
@@ -126,7 +126,7 @@ def test_movers_are_never_more_than_bases(toy: Scene, bases: int) -> None:
     started, told = seeded(toy, replace(CONFIG, bases=bases))
     assert 1 <= int(told.split(" on ")[1].split()[0]) <= bases
     mixture = started.mixture_logits.detach()[:, : int(seen(started.moving).sum())].softmax(0)
-    assert float(mixture.amax(0).min()) > 1 / bases - 1e-6  # everyone has a basis of its own
+    assert float(mixture.amax(0).min()) > 1 / bases - 1e-6  # each has one basis
     assert moving_at(started, 4.0)[:, :2].mean(0).numpy() == pytest.approx(
         card_offset(4.0), abs=0.05
     )
@@ -141,14 +141,12 @@ def test_without_movers_all_is_static(toy: Scene, none: Tensor | None) -> None:
     )  # the card as well
 
 
-def test_where_everything_moves_nothing_is_static(toy: Scene) -> None:
+def test_where_everything_moves_no_gaussian_is_static(toy: Scene) -> None:
     every = torch.ones(34, 60, dtype=torch.bool)
     started, told = seeded(changed(toy, lambda f: replace(f, moving=every)))
-    assert (
-        told.startswith("0 static Gaussians")
-        and not seen(started.static).any()
-        and seen(started.moving).any()
-    )
+    assert told.startswith("0 static Gaussians")
+    assert not seen(started.static).any()
+    assert seen(started.moving).any()
 
 
 def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Scene) -> None:
@@ -158,11 +156,9 @@ def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Sc
     assert torch.equal(surely_moving(replace(toy.train[0], moving=mask, outline=None)), mask)
     sure = surely_moving(replace(toy.train[0], moving=mask, outline=outline(mask)))
     inner = sure[:, :20].nonzero()
-    assert (
-        inner.amin(0).tolist() == [6, 6]
-        and inner.amax(0).tolist() == [13, 13]
-        and sure[:, 25].sum() == 12
-    )
+    assert inner.amin(0).tolist() == [6, 6]
+    assert inner.amax(0).tolist() == [13, 13]
+    assert sure[:, 25].sum() == 12
 
 
 def test_without_flow_movers_drift_with_their_middle(toy: Scene) -> None:
@@ -174,13 +170,12 @@ def test_without_flow_movers_drift_with_their_middle(toy: Scene) -> None:
         )
 
 
-def test_flow_that_is_never_believed_is_no_flow(toy: Scene) -> None:
+def test_flow_without_valid_pixels_counts_as_no_flow(toy: Scene) -> None:
     doubted = {o: torch.zeros(34, 60, dtype=torch.bool) for o in (-1, 1)}
     one = seeded(changed(toy, lambda f: replace(f, flow_valid={o: doubted[o] for o in f.flow})))[0]
     none = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))[0]
-    assert torch.equal(one.moving.means, none.moving.means) and torch.equal(
-        one.trajectories.translations, none.trajectories.translations
-    )
+    assert torch.equal(one.moving.means, none.moving.means)
+    assert torch.equal(one.trajectories.translations, none.trajectories.translations)
 
 
 @pytest.mark.parametrize("given", [True, False])
@@ -190,9 +185,8 @@ def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given
     assert "random places" in told and "depth prior" in told
     at = started.static.means.detach()[seen(started.static)]
     assert len(at) >= 390 and not seen(started.moving).any()
-    assert (
-        toy.near * 0.99 < float(at[:, 2].min()) < 2.2 and 4 < float(at[:, 2].max()) < toy.far * 1.01
-    )
+    assert toy.near * 0.99 < float(at[:, 2].min()) < 2.2
+    assert 4 < float(at[:, 2].max()) < toy.far * 1.01
     assert float(started.static.log_radiance.detach()[seen(started.static)].unique()) == -1.0
 
 
@@ -242,7 +236,7 @@ def test_frozen_footage(toy: Scene) -> None:
     torch.testing.assert_close(moving_at(started, 0.0), moving_at(started, 5.0), atol=1e-4, rtol=0)
 
 
-def test_movers_are_hidden_while_nothing_of_them_is_seen(toy: Scene) -> None:
+def test_movers_are_hidden_at_times_without_observations(toy: Scene) -> None:
     hidden = torch.zeros(34, 60, dtype=torch.bool)
     started, _ = seeded(changed(toy, lambda f: replace(f, moving=hidden) if f.time < 3 else f))
     share = [

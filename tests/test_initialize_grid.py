@@ -96,7 +96,7 @@ def test_without_depth_or_without_grids_nothing_is_initialized(toy: Scene) -> No
     assert not grid.branches.static_grid.table.any()
 
 
-def test_every_frame_is_inverted_by_its_own_recording(toy: Scene) -> None:
+def test_every_frame_is_inverted_by_its_recording(toy: Scene) -> None:
     calls = []
 
     def to_radiance(rgb: torch.Tensor, frame: int) -> torch.Tensor:

@@ -40,7 +40,7 @@ def test_a_disc_at_constant_velocity_lands_at_the_closed_form_place(
     assert abs(seen.motion.sum() - truth.motion.sum()) < 9  # the disc keeps its 79 pixels
 
 
-def test_unmoved_wall_is_exact_and_nothing_tears_open() -> None:
+def test_a_wall_at_rest_is_exact_and_has_no_holes() -> None:
     seen = render_at(DiscBeforeWall(), CAMERA, 0.5, [0.0, 1.0])
     wall = DiscBeforeWall().layers(CAMERA, 0.0).radiance[:, 1]
     offset = CAMERA.pixel_grid() - torch.tensor([20.0, 13.0])
@@ -91,7 +91,7 @@ def test_spreading_samples_leave_no_cracks() -> None:
     assert torch.allclose(moved.color[:, 0], moved.opacity[:, 0], atol=1e-5)
 
 
-def test_a_mover_over_empty_samples_stays_opaque_and_leaves_nothing_behind() -> None:
+def test_a_mover_over_empty_samples_stays_opaque_and_leaves_no_trace() -> None:
     inside = torch.zeros(H, W)
     inside[8:16, 8:16] = 1
     shift = inside.view(-1, 1) * torch.tensor([4.0, 0.0])
@@ -100,7 +100,7 @@ def test_a_mover_over_empty_samples_stays_opaque_and_leaves_nothing_behind() -> 
     assert alpha.sum().item() == pytest.approx(64, abs=0.01)
 
 
-def test_where_both_times_are_empty_the_nearer_one_is_shown_unmoved() -> None:
+def test_where_both_times_are_empty_the_nearer_one_is_shown_without_motion() -> None:
     class Fleeing(DiscBeforeWall):
         """One opaque layer whose right half leaves the picture from either side."""
 

@@ -10,10 +10,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from mutations import check_reader
 
 from hdr_nsff import core
 from hdr_nsff.core.errors import InputError
@@ -25,6 +28,7 @@ from hdr_nsff.core.io import (
     is_leftover,
     read_json,
     read_npy,
+    write_half,
     write_json,
     write_npy,
     write_text,
@@ -94,7 +98,7 @@ def test_a_file_that_the_user_named_so_stays(name: str, tmp_path: Path) -> None:
     assert (tmp_path / name).read_text() == "mine"
 
 
-def test_leftovers_below_the_folder_stay_until_their_own_is_written_to(tmp_path: Path) -> None:
+def test_leftovers_in_a_subfolder_stay_until_it_is_written_to(tmp_path: Path) -> None:
     (tmp_path / "below").mkdir()
     path = leftover(tmp_path / "below")
     write_text(tmp_path / "a.txt", "whole")
@@ -123,6 +127,14 @@ def test_errors_of_the_disk_are_one_sentence_that_names_the_place(code: int, wor
     assert str(refusal.value).startswith("out: ")
     with pytest.raises(InputError, match=r"^other/file: "), writing_to("out"):
         raise OSError(code, os.strerror(code), "other/file")
+
+
+@pytest.mark.parametrize(
+    "allocate", [lambda: np.zeros(2**50), lambda: torch.zeros(2**50), lambda: bytearray(2**62)]
+)
+def test_too_little_memory_is_one_sentence(allocate: Callable[[], object], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="the memory does not suffice"), writing_to(tmp_path):
+        allocate()
 
 
 def test_an_error_in_a_temporary_file_names_its_folder(tmp_path: Path) -> None:
@@ -157,6 +169,22 @@ def test_json_that_is_none_is_a_value_error(tmp_path: Path) -> None:
 def test_arrays_that_are_missing_or_damaged_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="missing; run `hdr-nsff prepare` again"):
         read_npy(tmp_path / "none.npy")
+    os.mkfifo(tmp_path / "pipe.npy")
+    with pytest.raises(InputError, match="missing"):
+        read_npy(tmp_path / "pipe.npy")
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY")
     with pytest.raises(InputError, match=r"not a readable \.npy array"):
         read_npy(tmp_path / "a.npy")
+
+
+def test_values_beyond_half_precision_are_kept(tmp_path: Path) -> None:
+    for largest, dtype in ((100, np.float16), (70_000, np.float32)):
+        write_half(tmp_path / "a.npy", np.array([1.0, largest]))
+        found = read_npy(tmp_path / "a.npy")
+        assert found.dtype == dtype and found[1] == largest
+
+
+def test_damaged_arrays_are_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
+    write_npy(path, np.zeros(3))  # little but a header
+    check_reader(path, lambda: np.array(read_npy(path)), 300)

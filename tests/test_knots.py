@@ -46,7 +46,7 @@ def test_linear_motion_is_reproduced_also_at_the_ends(curve: Curve, count: int) 
 
 
 @every_curve
-def test_a_single_value_stands_still(curve: Curve) -> None:
+def test_a_single_value_is_constant(curve: Curve) -> None:
     v = values(1)
     assert torch.equal(curve(v, 0.0), v[0])
 

@@ -21,7 +21,7 @@ from hdr_nsff.priors.poses.lightglue import check_matcher, match_images
 from hdr_nsff.priors.weights import KNOWN, locate
 
 
-def test_given_matches_are_what_poses_come_from(tmp_path, monkeypatch):
+def test_poses_come_from_the_given_matches(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap")
     points = np.random.default_rng(0).uniform([-1.5, -0.9, 2.5], [1.5, 0.9, 5], (300, 3))
     # towards the middle: this fixes the focal length
@@ -92,7 +92,7 @@ def random_weights(request, tmp_path, monkeypatch):
     return request.param, tmp_path, glue
 
 
-def test_weights_arrive_in_the_networks_whatever_their_names(random_weights):
+def test_all_weights_are_loaded_into_the_networks(random_weights):
     matcher, _, glue = random_weights
     filled = lightglue.load_networks(matcher, torch.device("cpu"))[1].state_dict()
     assert all(torch.equal(filled[k], v) for k, v in glue.items())
@@ -103,16 +103,14 @@ def test_keypoints_lie_where_they_may_and_matches_name_their_rows(random_weights
     right = np.tile(np.arange(96) >= 48, (64, 1))
     points, matches = match_images(list(pictures), [right, right], [(0, 1)], random_weights[0])
     for xy in points:
-        assert (
-            len(xy) > 5
-            and (xy[:, 0] >= 47.9).all()
-            and (xy[:, 0] <= 96).all()
-            and (xy[:, 1] <= 64).all()
-        )
+        assert len(xy) > 5
+        assert (xy[:, 0] >= 47.9).all()
+        assert (xy[:, 0] <= 96).all()
+        assert (xy[:, 1] <= 64).all()
     assert matches[0].shape[1:] == (2,) and (matches[0] < [len(p) for p in points]).all()
 
 
-def test_weights_that_lack_something_are_refused(random_weights, monkeypatch):
+def test_incomplete_weights_are_refused(random_weights, monkeypatch):
     matcher, root, glue = random_weights
     path = root / f"{matcher}-lightglue" / str(KNOWN[f"{matcher}-lightglue"].file)
     torch.save({k: v for k, v in glue.items() if "log_assignment" not in k}, path)

@@ -50,7 +50,7 @@ def error(a: np.ndarray, b: np.ndarray, margin: int = 0) -> np.ndarray:
 
 
 def refit(flow: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """All of `flow` filled anew."""
+    """`flow` with every pixel filled."""
     return fill_flow(flow, trust, ALL > 0, ALL_UNKNOWN)
 
 

@@ -1,4 +1,4 @@
-"""Two processes never work in one output at once, and a killed one blocks nobody."""
+"""Two processes never write one output at once; a killed one leaves no lock."""
 
 import os
 import signal
@@ -71,7 +71,7 @@ def test_locks_nest_in_one_process_and_the_outermost_one_counts(tmp_path: Path) 
         assert (tmp_path / ".out.lock").is_file()
 
 
-def test_an_output_that_was_never_written_leaves_nothing(tmp_path: Path) -> None:
+def test_an_output_that_was_never_written_leaves_no_files(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="bad"), lock_output(tmp_path / "a/b/out"):
         assert (tmp_path / "a/b/.out.lock").is_file()
         raise InputError("bad")
@@ -97,7 +97,7 @@ def test_beside_an_unwritable_place_the_lock_is_in_the_temporary_folder(
         assert len(list((tmp_path / "temporary").iterdir())) == 1
 
 
-def test_where_no_lock_can_be_taken_work_goes_on(
+def test_work_continues_on_a_file_system_without_locks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def no_locks(file: object) -> None:

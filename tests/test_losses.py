@@ -1,4 +1,4 @@
-"""The objective's terms, worked by hand."""
+"""The terms of the objective against values computed by hand."""
 
 import math
 
@@ -64,7 +64,7 @@ def test_optical_flow_counts_valid_pixels_only_and_caps_outliers() -> None:
     assert float(losses.optical_flow(flow, target, valid, limit=20.0)) == (2 + 20) / 2
 
 
-def test_a_correct_motion_mask_costs_next_to_nothing() -> None:
+def test_a_correct_motion_mask_costs_almost_nothing() -> None:
     moving = torch.tensor([True, False])
     correct = losses.motion_mask(torch.tensor([1.0, 0.0]), moving)
     wrong = losses.motion_mask(torch.tensor([0.0, 1.0]), moving)

@@ -12,7 +12,7 @@ from hdr_nsff.priors.poses.matching import (
 )
 
 
-def test_keypoints_keep_away_from_ignored_pixels():
+def test_no_keypoint_lies_near_ignored_pixels():
     ignore = np.zeros((1, H, W), bool)
     ignore[0, :, : W // 2] = True
     found = detect_keypoints(panning(np.zeros(1)), ignore)[0]
@@ -35,7 +35,7 @@ def test_small_frames_are_doubled_with_their_masks():
     assert (keypoint_mask(ignore, 2, margin=0) == 0).sum() == 4
 
 
-def test_every_frame_meets_its_own_exposure():
+def test_pairs_include_frames_of_equal_exposure():
     pairs = spread_pairs(20)
     assert [j for i, j in pairs if i == 0] == [1, 2, 3, 4, 6, 8, 12, 16]
     assert all(i < j < 20 for i, j in pairs)

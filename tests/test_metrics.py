@@ -2,7 +2,7 @@
 AlexNet written out).
 """
 
-import importlib.util
+import importlib
 import math
 import pickle
 from pathlib import Path
@@ -29,6 +29,11 @@ def test_psnr_of_a_known_error():
     assert metrics.psnr(a, a + 0.1) == pytest.approx(20.0)  # 10 log10(1 / 0.01)
     assert metrics.psnr(a, a + 1.0, peak=10.0) == pytest.approx(20.0)
     assert metrics.psnr(a, a) == pytest.approx(100.0)
+
+
+def test_psnr_of_an_infinite_error_is_its_limit():
+    a = torch.zeros(4, 4, 3)
+    assert metrics.psnr(a + math.inf, a) == -math.inf
 
 
 def test_psnr_on_a_mask_sees_only_the_mask():
@@ -317,16 +322,14 @@ def test_lpips_agrees_with_a_network_written_out(tmp_path):
     assert metrics.Lpips(tmp_path / "w.pth")(a, b) == pytest.approx(slow.item(), rel=1e-5)
 
 
-def lpips_weights():
+@pytest.fixture
+def lpips_weights(monkeypatch):
     """benchmarks/lpips_weights.py as a module."""
-    path = Path(__file__).parents[1] / "benchmarks/lpips_weights.py"
-    spec = importlib.util.spec_from_file_location("lpips_weights", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module("lpips_weights")
 
 
-def test_weights_as_flax_lays_them_out_give_the_same_distance(tmp_path):
+def test_weights_in_the_layout_of_flax_give_the_same_distance(lpips_weights, tmp_path, monkeypatch):
     net, linear = alexnet_weights()
     torch.save(net | linear, tmp_path / "theirs.pth")
     params = {"AlexNet_0": {}}
@@ -338,16 +341,18 @@ def test_weights_as_flax_lays_them_out_give_the_same_distance(tmp_path):
         params["AlexNet_0"][f"Conv_{i}"] = {"kernel": kernel, "bias": bias}
         params[f"NetLinLayer_{i}"] = {"Conv_0": {"kernel": importance}}
     (tmp_path / "flax.ckpt").write_bytes(pickle.dumps(params))
-    lpips_weights().main(str(tmp_path / "flax.ckpt"), str(tmp_path / "ours.pth"))
+    files = [str(tmp_path / "flax.ckpt"), str(tmp_path / "ours.pth")]
+    monkeypatch.setattr("sys.argv", ["lpips_weights.py", *files])
+    lpips_weights.main()
     a, b = (p.float() for p in pictures(80, 96))
     ours, theirs = metrics.Lpips(tmp_path / "ours.pth"), metrics.Lpips(tmp_path / "theirs.pth")
     assert ours(a, b) == theirs(a, b) > 0
 
 
-def test_nothing_but_arrays_is_unpickled(tmp_path):
+def test_nothing_but_arrays_is_unpickled(lpips_weights, tmp_path):
     (tmp_path / "evil.ckpt").write_bytes(pickle.dumps({"AlexNet_0": Path("x")}))
     with pytest.raises(pickle.UnpicklingError, match="is no array"):
-        lpips_weights().read(tmp_path / "evil.ckpt")
+        lpips_weights.read_checkpoint(tmp_path / "evil.ckpt")
 
 
 def test_lpips_on_a_mask_averages_maps_of_the_pictures_size(tmp_path):

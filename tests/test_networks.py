@@ -47,7 +47,7 @@ def test_frames_are_matched_near_640_pixels():
     assert working_size(30, 40) == (128, 128)  # the least a network takes
 
 
-def test_flow_comes_back_in_pixels_of_the_frame():
+def test_flow_is_returned_in_pixels_of_the_frame():
     """60 x 90 is seen as 192 x 256: 4 px of 256 are 4 * 90 / 256 of 90."""
     network = Constant()
     there, back = predict_both_directions(network, *np.zeros((2, 60, 90, 3), np.float32))
@@ -72,7 +72,7 @@ def test_a_network_is_a_flow_prior_that_checks_itself():
     assert not valid[0, :, -1].any()  # leaves the frame
 
 
-def test_the_search_corrects_flow_that_is_nearly_right_and_no_other():
+def test_the_search_corrects_only_flow_that_is_nearly_right():
     """Noise that slides by (3, 0): from (3.4, 0) it is found; from (9, 6), the result
     stays within half a pixel.
     """

@@ -1,4 +1,4 @@
-"""`prepare` with networks: tiny ones, on a clip whose camera, flow and mover are known."""
+"""`prepare` with tiny networks, on a clip whose camera, flow and mover are known."""
 
 import json
 import shutil
@@ -76,7 +76,7 @@ def test_the_motion_mask_finds_the_square(motion):
         assert mask[square(t)].mean() > 0.8 and mask.mean() < 0.3
 
 
-def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it_outlines_something_else(
+def test_sam2_gets_points_of_the_square_and_its_wrong_outlines_are_rejected(
     clip, motion, tmp_path, capsys
 ):
     before = masks(motion)
@@ -96,7 +96,7 @@ def test_sam2_is_asked_about_the_square_in_a_training_frame_and_doubted_where_it
         assert inside[int(p["y"]), int(p["x"])] == bool(p["label"])
     assert "the motion mask is kept" in capsys.readouterr().err  # random weights outline anything
     for t in train:
-        assert (masks(scene)[t] == before[t]).mean() > 0.98  # the same thing, without specks
+        assert (masks(scene)[t] == before[t]).mean() > 0.98  # equal but for specks
 
 
 def test_a_points_file_is_for_sam2_alone(clip, tmp_path):
@@ -125,7 +125,7 @@ def test_points_in_held_out_frames_are_refused(clip, motion, tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["relative", "metric"])
-def test_depth_anything_is_laid_onto_points_and_its_kind_is_recorded(kind, clip, motion, tmp_path):
+def test_depth_anything_is_aligned_to_points_and_its_kind_is_recorded(kind, clip, motion, tmp_path):
     scene = shutil.copytree(motion, tmp_path / "scene")
     weights = str(tiny_depth_anything(tmp_path / "network", kind))
     prepare(replace(clip, out=scene, depth="depth-anything", depth_weights=weights))
@@ -141,10 +141,10 @@ def test_depth_anything_is_laid_onto_points_and_its_kind_is_recorded(kind, clip,
         wall = ~read_mask(scene / str(f.mask))
         assert np.median(read_npy(scene / str(f.disparity))[wall]) == pytest.approx(
             0.5, rel=0.1
-        )  # z = 2, whatever was answered
+        )  # z = 2, whatever the network predicts
 
 
-def test_weights_that_are_not_there_stop_it_at_the_door(clip, tmp_path, monkeypatch):
+def test_missing_weights_are_refused_before_anything_is_written(clip, tmp_path, monkeypatch):
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     for chosen, words in (
@@ -184,7 +184,7 @@ def test_a_step_is_done_again_where_its_weights_changed_under_their_name(
     assert attempts() == before | {n: before[n] + 1 for n in CHANGED}
 
 
-def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
+def test_every_step_hashes_the_weights_it_reads(clip, tmp_path, monkeypatch):
     monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path / "cache"))
     for name in ("gmflow", "raft", "xfeat", "aliked", "aliked-lightglue"):
         monkeypatch.setitem(KNOWN, name, replace(KNOWN[name], sha256=None, inside=""))
@@ -194,12 +194,17 @@ def test_every_step_knows_the_weights_it_reads(clip, tmp_path, monkeypatch):
         for file in ("config.json", "model.safetensors"):
             write_text(tmp_path / "cache" / name / file, name)
     tuned = {"flow": "raft-finetuned", "flow_weights": tmp_path / "tuned"}
+    dinov2 = SemanticConfig(features="dinov2-small")
     read = {
-        "gmflow": ("flow", {"flow": "gmflow"}), "raft": ("flow", {"flow": "raft"}), "xfeat": ("flow", {"flow": "semantic"}),
-        "dinov2-small": ("flow", {"flow": "semantic", "semantic": SemanticConfig(features="dinov2-small")}), "tuned": ("flow", tuned),
-        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}), "sam2": ("masks", {"masks": "sam2"}),
+        "gmflow": ("flow", {"flow": "gmflow"}),
+        "raft": ("flow", {"flow": "raft"}),
+        "xfeat": ("flow", {"flow": "semantic"}),
+        "dinov2-small": ("flow", {"flow": "semantic", "semantic": dinov2}),
+        "tuned": ("flow", tuned),
+        "aliked-lightglue": ("poses", {"matcher": "aliked", "poses": None}),
+        "sam2": ("masks", {"masks": "sam2"}),
         "depth-anything": ("static_depth", {"depth": "depth-anything"}),
-    }  # fmt: skip
+    }
     for name, (step, chosen) in read.items():
         config = replace(clip, **chosen)
         found = weights_of(config, step)

@@ -330,7 +330,7 @@ def test_motion_lies_in_the_dilated_moving_masks(toy: Scene) -> None:
     assert float(motion[f.moving].mean()) > 0.02 and float(motion[far].max()) == 0
 
 
-def test_a_clip_in_which_nothing_moves_trains(toy: Scene) -> None:
+def test_a_clip_without_movers_trains(toy: Scene) -> None:
     still = replace(toy, train=[replace(f, moving=torch.zeros_like(f.moving)) for f in toy.train])
     field = random_field("grid", still)
     render, own, _ = train_pass(field, still)

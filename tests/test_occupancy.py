@@ -14,7 +14,7 @@ def test_cells_are_counted_x_fastest_and_slices_slowest() -> None:
     assert grid.cell_index(coords, 0.8).tolist() == [24 + 21, 24, 47]  # the nearest slice
 
 
-def test_centers_lie_in_their_own_cells_in_order() -> None:
+def test_centers_lie_in_their_cells_in_order() -> None:
     grid = Occupancy((4, 3, 2))
     assert grid.cell_index(grid.cell_centers()).tolist() == list(range(24))
 
@@ -48,7 +48,7 @@ def test_exploration_selects_its_share_of_the_other_allowed_cells() -> None:
     assert 0.09 < share < 0.11
 
 
-def test_a_forbidden_cell_stays_culled_whatever_its_weight() -> None:
+def test_a_forbidden_cell_stays_culled_at_any_weight() -> None:
     grid = Occupancy((10, 10, 10))
     grid.allowed[0, 4, 4, 4] = False
     grid.observe(CENTER, torch.tensor([1.0]))

@@ -9,6 +9,7 @@ import math
 
 import pytest
 import torch
+from mutations import check_json_reader, check_reader
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry import paths
@@ -115,6 +116,8 @@ BAD = {
     "positive focal": json.dumps([{**GOOD, "K": [[0, 0, 1], [0, 0, 1], [0, 0, 1]]}]),
     "time must be one finite": json.dumps([{**GOOD, "time": "soon"}]),
     "ev must be one finite": json.dumps([{**GOOD, "ev": [1, 2]}]),
+    "time must be one finite number up to 1e": json.dumps([{**GOOD, "time": 10**400}]),
+    "K must be 3x3 finite numbers up to": json.dumps([{**GOOD, "K": [[1e300] * 3] * 3}]),
 }
 
 
@@ -123,6 +126,13 @@ def test_bad_path_files_are_refused_in_a_sentence(tmp_path, sentence: str) -> No
     (tmp_path / "path.json").write_text(BAD[sentence])
     with pytest.raises(InputError, match=sentence):
         paths.read_path(tmp_path / "path.json", camera())
+
+
+def test_damaged_path_files_are_read_or_refused(tmp_path) -> None:
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps([GOOD, {**GOOD, "K": K.tolist(), "ev": -2}]))
+    check_reader(file, lambda: paths.read_path(file, camera()), 200)
+    check_json_reader(file, lambda: paths.read_path(file, camera()), 200)
 
 
 def test_missing_and_binary_path_files_are_refused(tmp_path) -> None:

@@ -1,4 +1,4 @@
-"""The size of a picture by its header, in every format and whatever its pixels are."""
+"""The size of a picture is read from its header, in every format."""
 
 import io
 import struct

@@ -39,7 +39,7 @@ def test_pixel_centers_are_at_halves_x_before_y():
     assert centers.shape == (2, 3, 2) and centers[1, 2].tolist() == [2.5, 1.5]
 
 
-def test_numpy_and_torch_cameras_project_alike():
+def test_numpy_and_torch_cameras_project_equally():
     c2w = random_poses()
     camera = Camera(torch.from_numpy(K), torch.from_numpy(c2w), 64, 48)
     points = 3 * random_points(200) - [0, 0, 8]

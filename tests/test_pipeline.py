@@ -96,7 +96,7 @@ def test_beside_a_truth_of_other_places_or_times_all_frames_are_trained_on(tmp_p
         assert held_out_every(replace(config, truth=truth_of(tmp_path / name, *views))) == 0
 
 
-def test_what_the_user_asks_for_counts_before_the_truth(tmp_path: Path) -> None:
+def test_settings_of_the_user_take_precedence_over_the_truth(tmp_path: Path) -> None:
     config = RunConfig(tmp_path, tmp_path, truth=truth_of(tmp_path / "truth", (4.0, 4), (12.0, 12)))
     assert held_out_every(config) == 8
     assert held_out_every(replace(config, hold_out=3)) == 3
@@ -122,9 +122,19 @@ def test_a_truth_counts_all_frames_of_the_clip(tmp_path: Path) -> None:
 
 def test_every_option_of_prepare_reaches_it(tmp_path: Path) -> None:
     config = RunConfig(
-        tmp_path / "clip", tmp_path, ev="-2,0", start=3, end=9, stride=2, flow="dis",
-        masks="motion", depth="geometric", matcher="disk", redo=("poses",), hold_out=4,
-    )  # fmt: skip
+        tmp_path / "clip",
+        tmp_path,
+        ev="-2,0",
+        start=3,
+        end=9,
+        stride=2,
+        flow="dis",
+        masks="motion",
+        depth="geometric",
+        matcher="disk",
+        redo=("poses",),
+        hold_out=4,
+    )
     passed = prepare_settings(config)
     assert passed.out == tmp_path / "scene"
     for f in fields(PrepareConfig):
@@ -149,5 +159,6 @@ def test_shared_options_have_the_same_help(capsys: pytest.CaptureFixture[str]) -
         lines = [line.strip("│ ") for line in capsys.readouterr().out.splitlines()]
         shown[verb] = " ".join(" ".join(lines).split())
     for option in ("--flow", "--masks", "--depth", "--matcher", "--start", "--end", "--stride"):
-        found = shown["prepare"].index(f"{option} ")
-        assert shown["prepare"][found : found + 100] in shown["run"], option
+        start = shown["prepare"].index(f"{option} ")
+        end = shown["prepare"].index(" --", start)  # of the next option
+        assert shown["prepare"][start:end][:100] in shown["run"], option

@@ -110,13 +110,15 @@ def test_settings_that_exclude_each_other(
     assert "leave --jobs out" in bad(capsys, tmp_path, *both, scenes=toy_folder)
 
 
-def test_a_run_that_was_not_asked_for(toy_folder: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_a_run_outside_the_plan_is_refused(
+    toy_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
     command = [*bench_words(tmp_path, toy_folder), "--only", "../tiny"]
     assert "scene/tiny" in refused(capsys, *command)
     assert not (tmp_path / "runs").exists()
 
 
-def test_a_folder_of_something_else_is_left_alone(
+def test_a_folder_of_other_files_is_left_alone(
     toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     (tmp_path / "mine").mkdir()

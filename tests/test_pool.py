@@ -23,12 +23,14 @@ def test_threads_are_shared_between_processes() -> None:
     assert slots(16, None)[0]["NUMBA_NUM_THREADS"] == "1"
 
 
-def test_every_process_has_a_device_of_its_own() -> None:
+def test_every_process_has_another_device() -> None:
     assert [slot["CUDA_VISIBLE_DEVICES"] for slot in slots(1, "0, 3")] == ["0", "3"]
     assert "CUDA_VISIBLE_DEVICES" not in slots(1, None)[0]
 
 
-def test_the_users_number_of_threads_comes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_threads_of_the_user_takes_precedence(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "5")
     slot = slots(4, None)[0]
     assert slot["OMP_NUM_THREADS"] == slot["NUMBA_NUM_THREADS"] == "5"

@@ -152,7 +152,8 @@ def test_a_camera_has_the_gradient_of_its_picture(
     step = 1e-4  # of the picture's width: 0.006 pixels
     if isinstance(field, NSFF):
         field.config = replace(field.config, cull=False, density_noise=0.0)
-    else:  # the wall's Gaussians are all equally deep: their order would change with the smallest turn
+    else:
+        # The wall's Gaussians share one depth: any turn would change their order.
         field.static.means.data.add_(
             0.4 * torch.randn(len(field.static), 3, generator=torch.Generator().manual_seed(1))
         )
@@ -216,7 +217,7 @@ def test_a_common_similarity_is_taken_out_of_the_corrections(toy: Scene) -> None
     torch.testing.assert_close(corrections.twists(), kept, atol=1e-6, rtol=1e-4)
 
 
-def test_a_parameter_moves_the_picture_by_its_own_size_whatever_it_is(toy: Scene) -> None:
+def test_a_parameter_is_the_rms_motion_of_the_picture(toy: Scene) -> None:
     corrections, f = PoseCorrections(toy), toy.train[2]
     assert f.disparity is not None
     rays = f.camera.rays(f.camera.pixel_grid())
@@ -252,7 +253,7 @@ def test_frames_of_one_camera_keep_one_pose(tmp_path: Path) -> None:
     )
 
 
-def test_without_it_no_camera_has_a_gradient_and_nothing_is_saved_of_it(
+def test_without_corrections_no_camera_has_a_gradient_and_no_state_is_saved(
     toy: Scene, toy_folder: Path, tmp_path: Path
 ) -> None:
     assert not any(c.refine_poses for c in PRESETS.values())
@@ -303,7 +304,7 @@ def test_a_run_gives_back_the_cameras_it_found(tmp_path: Path) -> None:
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3), atol=1e-5, rtol=0)
 
 
-def test_a_camera_that_stands_still_is_refused_and_one_that_turns_only_turns(toy: Scene) -> None:
+def test_a_camera_at_rest_is_refused_and_a_turning_one_only_turns(toy: Scene) -> None:
     still, turning = (
         replace(toy, manifest=toy.manifest.model_copy(update={"parallax": p}))
         for p in ("none", "rotation")
@@ -319,7 +320,7 @@ def test_a_camera_that_stands_still_is_refused_and_one_that_turns_only_turns(toy
     assert float(twists[:, :3].mean(0).abs().max()) < 1e-5
 
 
-def test_a_known_perturbation_is_found_back(wrong: Path, toy: Scene, tmp_path: Path) -> None:
+def test_a_known_perturbation_is_recovered(wrong: Path, toy: Scene, tmp_path: Path) -> None:
     field = SplatConfig(static=1200, moving=300, bases=2)
     settings = replace(refining(wrong, tmp_path / "run", "splat", 240), field=field, pose_lr=1e-3)
     state = load_file(max((train(settings) / "checkpoints").glob("*")))

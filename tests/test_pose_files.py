@@ -189,7 +189,7 @@ def test_a_frame_that_colmap_left_out_lies_between_its_neighbors(tmp_path):
     assert "did not register" in poses.notes[-1]
 
 
-def test_still_cameras_have_no_parallax(tmp_path):
+def test_cameras_at_rest_have_no_parallax(tmp_path):
     document = transforms()
     for frame in document["frames"]:
         frame["transform_matrix"] = opengl(np.concatenate([C2W[0][:, :3], C2W[0][:, 3:]], 1))

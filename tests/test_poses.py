@@ -61,7 +61,7 @@ def test_a_camera_without_registered_frames_is_refused_in_a_sentence():
         interpolate(poses, [[0, 2], [1, 3]])
 
 
-def test_every_point_is_projected_into_its_own_frame():
+def test_every_point_is_projected_into_its_frame():
     c2w = np.tile(np.eye(4)[:3], (2, 1, 1))
     c2w[1, 0, 3] = 1.0  # one unit to the right: half a focal length at depth 2
     poses = Poses(np.tile(K, (2, 1, 1)), c2w, np.ones(2, bool), "full")

@@ -103,7 +103,7 @@ def test_footage_becomes_a_scene_that_opens(config):
     assert (middle.disparity == 0.5).all()
 
 
-def test_the_manifest_says_where_everything_came_from(config):
+def test_the_manifest_records_the_provenance_of_every_step(config):
     m = Manifest.load(prepare(config))
     assert {name: step.provenance for name, step in m.steps.items()} == {
         "frames": "given",
@@ -260,7 +260,7 @@ def test_moved_footage_is_the_same_footage(config, tmp_path):
     assert stamps(config.out) == before
 
 
-def test_killed_at_any_moment_it_goes_on_to_the_same_scene(config, tmp_path):
+def test_killed_at_any_moment_it_continues_to_the_same_scene(config, tmp_path):
     whole = prepare(replace(config, out=tmp_path / "whole"))
     kills = 0
     for delay in (0.02, 0.05, 0.1, 0.15, 0.2, 0.3):
@@ -310,7 +310,7 @@ def test_lists_count_from_the_first_frame_of_the_footage(config, tmp_path):
     assert [f.ev - first for f in m.frames] == [0, -2, 2, 0, -2, 2]
 
 
-def test_held_out_frames_feed_nothing_of_training(config):
+def test_held_out_frames_do_not_reach_training(config):
     scene = Scene.open(prepare(replace(config, hold_out=4)))
     assert [f.index for f in scene.test] == [2, 6, 10]
     assert [f.time for f in scene.train] == [0, 1, 3, 4, 5, 7, 8, 9, 11]
@@ -336,9 +336,13 @@ def test_a_rig_has_one_camera_per_folder(tmp_path):
             shutil.copytree(one[kind], tmp_path / kind / name)
     write_npy(tmp_path / "poses_bounds.npy", np.load(one["poses"])[[*range(6)] * 2])
     config = PrepareConfig(
-        tmp_path / "rig", tmp_path / "scene", hold_out=0,
-        poses=tmp_path / "poses_bounds.npy", masks=tmp_path / "masks", depth=tmp_path / "depth",
-    )  # fmt: skip
+        tmp_path / "rig",
+        tmp_path / "scene",
+        hold_out=0,
+        poses=tmp_path / "poses_bounds.npy",
+        masks=tmp_path / "masks",
+        depth=tmp_path / "depth",
+    )
     scene = Scene.open(prepare(config))
     assert [f.camera_id for f in scene.train] == [0] * 6 + [1] * 6
     assert [f.time for f in scene.train] == [*range(6)] * 2
@@ -348,7 +352,7 @@ def test_a_rig_has_one_camera_per_folder(tmp_path):
     assert abs(float(scene.train[2].flow[1][8:-8, 8:-8, 0].median()) + 2) < 0.5
 
 
-def test_a_clip_from_a_tripod_needs_nothing_but_itself(tmp_path):
+def test_a_clip_from_a_tripod_is_prepared_without_other_input(tmp_path):
     wall = np.kron(np.random.default_rng(0).random((12, 16, 3)), np.ones((6, 6, 1))) * 0.2 + 0.05
     for t in range(9):
         world = wall.copy()

@@ -26,7 +26,7 @@ def work_on(folder: Path, video: np.ndarray, **settings: object) -> Work:
     return work
 
 
-def test_a_cycle_that_goes_up_and_down_again_has_three_exposures(tmp_path: Path) -> None:
+def test_a_cycle_that_rises_and_falls_has_three_exposures(tmp_path: Path) -> None:
     work = work_on(tmp_path, clip([-2, 0, 2, 0], frames=20))
     assert exposure_step(work).note.startswith("cycle of 4, 3 exposures (brightness)")
     assert [f.bracket for f in work.manifest.frames] == [0, 1, 2, 1] * 5

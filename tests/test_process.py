@@ -1,4 +1,4 @@
-"""The process is set up by the command line, and importing the package changes nothing."""
+"""The command line sets up the process; importing the package changes nothing."""
 
 import subprocess
 import sys
@@ -21,7 +21,7 @@ for _ in range(20):
     pictures()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
-FRESH_PAGES = 20 * 1000  # page faults where every picture gets its memory anew
+FRESH_PAGES = 20 * 1000  # page faults where every picture allocates fresh memory
 
 
 def output_of(code: str) -> str:
@@ -36,7 +36,7 @@ def page_faults(setup: str) -> int:
 
 
 @pytest.mark.skipif(not keep_memory(), reason="not glibc's allocator")
-def test_a_prepared_process_asks_the_system_for_memory_once() -> None:
+def test_a_prepared_process_requests_memory_once() -> None:
     prepare = "from hdr_nsff.core.process import prepare_process; prepare_process()"
     assert page_faults(prepare) < 1000
     assert page_faults("") > FRESH_PAGES  # otherwise there is nothing to keep
@@ -57,7 +57,7 @@ print(dict(os.environ) == before)
     assert output_of(compare) == "True\n"
 
 
-def test_idle_threads_sleep_unless_the_user_says_otherwise() -> None:
+def test_idle_threads_sleep_unless_the_user_sets_otherwise() -> None:
     wait = "import os; from hdr_nsff.core.process import prepare_process; prepare_process()"
     show = "\nprint(os.environ['OMP_WAIT_POLICY'])"
     assert output_of(wait + show) == "PASSIVE\n"

@@ -1,6 +1,7 @@
-"""The protocols split the clip as the published tables do, and what is held out stays
-out: `prepare` and `train` beside a truth folder that is poisoned. (What they import is
-in test_imports.py.)
+"""Protocols split the clip as the published tables do, and held-out views stay unread.
+
+`prepare` and `train` run next to a poisoned truth folder. test_imports.py checks that
+they cannot import its reader.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ sys.addaudithook(watch)
 
 
 def made(root: Path) -> Path:
-    """Footage with its truth beside it, as `synth` leaves them."""
+    """Footage next to its truth, as `synth` writes them."""
     footage(root / "clip")
     wall = np.ones((32, 48, 3), np.float32)
     write_exr(root / "truth/radiance/a.exr", {"RGB": wall})

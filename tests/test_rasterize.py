@@ -150,7 +150,7 @@ def at_depths(view: Camera, z: tuple[float, float], wide: float, size: float = 1
     return [means, quaternions, scales, opacities, features]
 
 
-def test_nothing_behind_the_camera_is_seen_or_has_a_gradient() -> None:
+def test_gaussians_behind_the_camera_are_hidden_and_have_no_gradient() -> None:
     view = camera()
     seen = compare(at_depths(view, (-2.0, 0.0), 1.0), view)
     assert float(seen.abs().max()) == 0  # and so is the largest gradient of plain torch

@@ -29,9 +29,17 @@ def without_kernels(*gaussians: Tensor, **options: object) -> Any:
 
 
 def by_plain_torch(
-    means: Tensor, quaternions: Tensor, scales: Tensor, opacities: Tensor, features: Tensor,
-    views: Tensor, Ks: Tensor, width: int, height: int, **options: object,
-) -> tuple[Tensor, Tensor, dict[str, Any]]:  # fmt: skip
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    views: Tensor,
+    Ks: Tensor,
+    width: int,
+    height: int,
+    **options: object,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """What gsplat draws, by the slow twin; only for a camera at the origin."""
     camera = Camera(Ks[0], torch.eye(4)[:3], width, height)
     seen = dense(means, quaternions, scales, opacities, features, camera)
@@ -43,7 +51,7 @@ def by_plain_torch(
 
 
 def too_faint(*gaussians: Tensor, **options: Any) -> tuple[Tensor, Tensor, dict[str, Any]]:
-    """Kernels that run and draw the wrong thing."""
+    """Kernels that run and draw a wrong picture."""
     seen, alpha, rest = by_plain_torch(*gaussians, **options)
     return seen, alpha * 0.5, rest
 
@@ -75,7 +83,7 @@ def test_a_gsplat_without_kernels_is_a_sentence_with_the_fix(
     assert "CameraModelType" in reason and "or the CUDA toolkit" in reason
 
 
-def test_a_gsplat_that_draws_something_else_is_not_used(gsplat: Callable[[Draw], None]) -> None:
+def test_a_gsplat_that_draws_a_wrong_picture_is_not_used(gsplat: Callable[[Draw], None]) -> None:
     gsplat(too_faint)
     reason = rasterize_gsplat.fault("cpu")
     assert reason is not None and "alpha of 0.375 instead of 0.75" in reason
@@ -90,7 +98,7 @@ def test_a_missing_gsplat_is_a_sentence_with_the_fix(monkeypatch: pytest.MonkeyP
 
 @pytest.fixture
 def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A CUDA device on which gsplat cannot draw; what the user is told."""
+    """A CUDA device on which gsplat cannot draw, and the messages to the user."""
     said: list[str] = []
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
@@ -104,7 +112,7 @@ def test_gaussians_fall_back_to_the_cpu_loudly(broken_cuda: list[str]) -> None:
     assert len(broken_cuda) == 1 and "using the CPU" in broken_cuda[0]
 
 
-def test_gaussians_on_cuda_are_refused_where_that_was_asked_for(broken_cuda: list[str]) -> None:
+def test_gaussians_on_cuda_are_refused_where_cuda_was_requested(broken_cuda: list[str]) -> None:
     with pytest.raises(InputError, match="--device cuda: gsplat cannot draw, or use --device cpu"):
         device_for(SplatConfig(), "cuda")
 
@@ -114,10 +122,13 @@ def test_other_fields_need_no_rasterizer(broken_cuda: list[str]) -> None:
 
 
 @pytest.mark.parametrize("verb", ["run", "train"])
-def test_nothing_is_prepared_or_trained_before_gsplat_was_tried(
-    verb: str, broken_cuda: list[str], toy_folder: Path, tmp_path: Path,
+def test_gsplat_is_tried_before_anything_is_prepared_or_trained(
+    verb: str,
+    broken_cuda: list[str],
+    toy_folder: Path,
+    tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+) -> None:
     out = str(tmp_path / "out")
     arguments = {
         "run": ["run", str(toy_folder / "images"), out],

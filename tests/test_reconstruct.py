@@ -15,7 +15,7 @@ from hdr_nsff.priors.poses.reconstruct import (
 )
 
 
-def test_cameras_of_a_rig_that_stand_still_share_one_view():
+def test_cameras_of_a_rig_at_rest_share_one_view():
     rng = np.random.default_rng(0)
     left, right = panning(np.zeros(1))[0], panning(np.array([20.0]))[0]
     video = np.stack([f + 0.005 * rng.normal(size=f.shape) for f in [left, right] * 6]).astype(

@@ -59,7 +59,7 @@ def in_corner(field: Splat) -> int:
     return int(((pixels > low) & (pixels < high)).all(1).sum())
 
 
-def test_unseen_gaussians_go_where_the_error_is() -> None:
+def test_unseen_gaussians_move_to_where_the_error_is() -> None:
     field = card_field()
     field.static.opacity_logits.data[::20] = -10.0  # faded away; others lie outside the picture
     before = in_corner(field)

@@ -76,7 +76,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Path]:
     return run, folder
 
 
-def test_a_finished_run_has_every_section_and_nothing_is_missing(
+def test_the_report_of_a_finished_run_has_every_section(
     finished: tuple[Run, Path],
 ) -> None:
     run, folder = finished

@@ -66,7 +66,8 @@ def test_the_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
         "step_00000100.safetensors",
     ]
     found = latest_checkpoint(tmp_path)
-    assert found is not None and (found.step, found.seconds, found.tensors["a"].tolist()) == (
+    assert found is not None
+    assert (found.step, found.seconds, found.tensors["a"].tolist()) == (
         100,
         50.0,
         [100.0, 100.0],
@@ -108,30 +109,27 @@ DAMAGE = {"cut short or damaged": cut, "another version": other_version, "cut sh
 
 
 @pytest.mark.parametrize("what", DAMAGE)
-def test_a_bad_checkpoint_gives_way_to_the_one_before_and_that_is_said(
+def test_a_bad_checkpoint_is_replaced_by_the_one_before_and_reported(
     what: str, run: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     DAMAGE[what](newest(run))
     opened = Run.open(run)
     said = " ".join(capsys.readouterr().err.split())
-    assert (
-        opened.step == 0
-        and what in said
-        and "using the one before, of step 0" in said
-        and newest(run).name in said
-    )
+    assert opened.step == 0
+    assert what in said
+    assert "using the one before, of step 0" in said
+    assert newest(run).name in said
 
 
 @pytest.mark.parametrize("what", DAMAGE)
-def test_training_goes_on_from_the_one_before_too(
+def test_training_continues_from_the_checkpoint_before_a_bad_one(
     what: str, run: Path, toy_folder: Path, finished: Path
 ) -> None:
     DAMAGE[what](newest(run))
     train(replace(small("tiny", toy_folder, run)))
     ours, theirs = read_checkpoint(newest(run)), read_checkpoint(newest(finished))
-    assert ours.step == 2 and all(
-        torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items()
-    )
+    assert ours.step == 2
+    assert all(torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items())
 
 
 def test_no_readable_checkpoint_is_an_error(run: Path) -> None:
@@ -184,7 +182,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         Run.open(tmp_path)
 
 
-def test_a_scene_that_moved_away_is_named(run: Path) -> None:
+def test_a_scene_that_was_moved_is_named(run: Path) -> None:
     nowhere = {"scene": "/nowhere/scene", "scene_from_run": "../nowhere"}
     change_config(run, lambda d: d.update(nowhere))
     with pytest.raises(InputError, match="its scene is not at /nowhere/scene any more"):

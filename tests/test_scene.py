@@ -19,7 +19,7 @@ def entry(index: int, time: float, camera: int = 0) -> FrameEntry:
     return FrameEntry(index=index, image="", source="", time=time, camera_id=camera, bracket=0)
 
 
-def test_neighbors_are_the_frames_before_and_after_in_time_whatever_the_order() -> None:
+def test_neighbors_are_the_frames_before_and_after_in_time_in_any_order() -> None:
     assert neighbors([entry(0, 2.0), entry(1, 0.0), entry(2, 1.0)]) == [
         {-1: 2},
         {1: 2},
@@ -69,9 +69,8 @@ def test_a_scene_holds_what_was_written(toy: Scene) -> None:
 def test_the_outline_of_a_mask_is_two_pixels_on_either_side() -> None:
     mask = torch.zeros(12, 12, dtype=torch.bool)
     mask[:, 6:] = True
-    assert outline(mask).any(0).nonzero()[:, 0].tolist() == [4, 5, 6, 7] and torch.equal(
-        outline(mask), outline(~mask)
-    )
+    assert outline(mask).any(0).nonzero()[:, 0].tolist() == [4, 5, 6, 7]
+    assert torch.equal(outline(mask), outline(~mask))
     assert not outline(torch.ones(8, 8, dtype=torch.bool)).any()  # the picture's edge is no outline
 
 
@@ -97,9 +96,8 @@ def test_held_out_frames_lend_no_map_to_training(toy_folder: Path, tmp_path: Pat
         Scene.open(folder)
     write_movers(folder / "movers.npz", [])
     scene = Scene.open(folder)
-    assert [f.index for f in scene.train] == [0, 1, 3, 4, 5] and [f.index for f in scene.test] == [
-        2
-    ]
+    assert [f.index for f in scene.train] == [0, 1, 3, 4, 5]
+    assert [f.index for f in scene.test] == [2]
     assert scene.test[0].flow == {} and scene.test[0].neighbors == {}
     assert scene.train[1].neighbors == {-1: 0, 1: 2} and set(scene.train[1].flow) == {
         -1

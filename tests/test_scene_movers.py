@@ -1,10 +1,12 @@
 """Movers as files, and the depth that their shapes give."""
 
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mutations import check_reader
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
@@ -36,7 +38,7 @@ def mover(pixels: list[list[float]], points: list[list[float]], error: float = 0
     )
 
 
-def test_canonical_places_come_back_from_any_time() -> None:
+def test_canonical_points_are_recovered_from_any_time() -> None:
     turning = Rotation.from_rotvec([[0, 0, 0], [0.1, 0.2, 0], [0, 0.5, 0.3]]).as_matrix()
     m = mover([[1, 1], [2, 2]], [[0.5, 0, 3], [0, 0.5, 4]])
     m = replace(m, rotations=turning, translations=np.eye(3), center=np.array([1.0, 2, 3]))
@@ -117,4 +119,16 @@ def test_a_file_that_was_cut_short_is_refused_in_a_sentence(cut: int, tmp_path: 
     write_movers(path, [mover([[1, 1]], [[0, 0, 1]])])
     path.write_bytes(path.read_bytes()[:cut])
     with pytest.raises(InputError, match="--redo movers"):
+        read_movers(path)
+
+
+def test_damaged_movers_are_read_or_refused(tmp_path: Path) -> None:
+    path = tmp_path / "movers.npz"
+    write_movers(path, (mover([[1, 1], [2, 2]], [[0.5, 0, 3], [0, 0.5, 4]]),))
+    check_reader(path, lambda: read_movers(path), 200)
+    with zipfile.ZipFile(path, "w") as archive:  # zipfile itself has a RuntimeError for it
+        entry = zipfile.ZipInfo("0/frames.npy")
+        archive.writestr(entry, b"secret")
+        entry.flag_bits |= 1
+    with pytest.raises(InputError, match="damaged"):
         read_movers(path)

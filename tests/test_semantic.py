@@ -134,7 +134,7 @@ def test_points_of_equal_exposure_are_followed_over_two_cycles():
     assert np.allclose(np.median((track.end - track.start)[on_patch], 0), [3, 0], atol=0.1)
 
 
-def test_fitting_to_the_clip_repeats_itself_and_keeps_flow_right():
+def test_fitting_to_the_clip_is_reproducible_and_keeps_flow_correct():
     video, mask = passing()
     prior, twin = (SemanticFlow(source, [(0, 1), (1, 2)], [(0, 2)], steps=20) for _ in range(2))
     flow, valid = prior(video, none_clipped(video), PAIR)

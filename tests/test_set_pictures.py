@@ -1,4 +1,4 @@
-"""Which exposures the pictures of the standard set are developed at."""
+"""The exposures at which pictures of the standard set are developed."""
 
 from __future__ import annotations
 

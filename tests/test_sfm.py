@@ -19,7 +19,7 @@ from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.trimming import TrimmingTuning
 
 
-def test_a_worker_that_breaks_down_reports_why(tmp_path):
+def test_a_worker_that_crashes_reports_why(tmp_path):
     pytest.importorskip("pycolmap")
     (tmp_path / "images").mkdir()
     job = sfm.Job(str(tmp_path), [["missing.png"]], [], 100.0, "nonsense")  # type: ignore[arg-type]
@@ -62,7 +62,7 @@ pathlib.Path.write_text = write_text
 """
 
 
-def test_a_worker_on_a_full_disk_ends_in_one_sentence_that_says_so(tmp_path, monkeypatch, capsys):
+def test_a_worker_on_a_full_disk_reports_it_in_one_sentence(tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap")
     (tmp_path / "inject").mkdir()
     # Python imports it first: in the worker only
@@ -93,7 +93,7 @@ def test_a_disk_without_free_space_is_full_however_the_worker_ended(tmp_path):
     assert full.value.errno in FULL and not list(tmp_path.iterdir())
 
 
-def test_a_job_survives_its_way_to_the_worker(tmp_path):
+def test_a_job_reaches_the_worker_unchanged(tmp_path):
     tuning = sfm.SfmTuning(max_features=99, trimming=TrimmingTuning(max_rounds=3))
     job = sfm.Job(str(tmp_path), [["a.png"]], [], 100.0, "global", tuning=tuning)
     (tmp_path / "job.json").write_text(json.dumps(asdict(job)))

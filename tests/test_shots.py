@@ -59,7 +59,7 @@ def test_an_ev_is_developed_by_the_learned_camera(tmp_path: Path) -> None:
     assert np.allclose(picture.reshape(-1, 3), expected, atol=0.01)
 
 
-def test_rendering_again_asks_the_field_for_missing_views_only(tmp_path: Path) -> None:
+def test_rendering_again_renders_only_missing_views(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
     shot = shot_of(0.0, 1.0, 2.0, 3.0)
     render_shot(run, shot, tmp_path, Output())

@@ -37,7 +37,7 @@ def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "weights"
 
 
-def test_without_weights_the_default_is_dense_inverse_search_and_a_note_says_so(bare: Path):
+def test_without_weights_the_default_is_dense_inverse_search_and_a_note_reports_it(bare: Path):
     assert resolve_source(None, "xfeat") == "dis"
     assert "hdr-nsff weights xfeat" in fallback_note(None, "xfeat")
     assert fallback_note("dis", "xfeat") == "" and flow_weights(None, None, SemanticConfig()) == []

@@ -99,7 +99,7 @@ def test_scene_flow_at_the_card_is_its_step() -> None:
 
 
 @pytest.mark.parametrize("time", [0.0, 9.0, 8.5, 0.5])
-def test_at_the_ends_of_the_clip_scene_flow_goes_straight_on(time: float) -> None:
+def test_at_the_ends_of_the_clip_scene_flow_continues_straight(time: float) -> None:
     render = card_field().render(CAMERA, time)
     at = pixel_of(torch.tensor([0.0, 0, 2]) + time * STEP)
     torch.testing.assert_close(render.scene_flow[1][at], STEP, atol=1e-3, rtol=0)
@@ -388,8 +388,8 @@ def test_flow_has_a_gradient_to_the_neighbors_pose() -> None:
     assert pose.grad is not None and float(pose.grad[0, 3]) < 0
 
 
-def test_neighbors_that_mix_alike_are_rigid_and_others_cost() -> None:
-    field = card_field()  # all mixtures alike; a grid of 11 x 11 Gaussians
+def test_neighbors_with_equal_mixtures_are_rigid_and_others_cost() -> None:
+    field = card_field()  # equal mixtures; a grid of 11 x 11 Gaussians
     field.find_neighbors()
     assert set(field.neighbors[60].tolist()) == {49, 59, 61, 71}  # the middle one's four
     assert float(field.rigidity().detach()) == 0

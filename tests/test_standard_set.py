@@ -42,7 +42,7 @@ def test_the_set_is_complete_and_restarts_without_work(tmp_path: Path) -> None:
     assert run.field.calls - before <= 1  # the focus depth of bullet time
 
 
-def test_without_parallax_the_set_goes_on_without_bullet_time(tmp_path: Path) -> None:
+def test_without_parallax_the_set_leaves_out_bullet_time(tmp_path: Path) -> None:
     results = render_all(fake_run(tmp_path, parallax="none"), tmp_path / "out")
     assert "bullet time" not in results and results["fixed camera"].exists()
 

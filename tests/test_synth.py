@@ -50,7 +50,7 @@ def test_truth_and_video_hold_what_was_rendered(flat: SynthConfig) -> None:
 
 
 @pytest.mark.parametrize("views", ["mono", "rig"])
-def test_oracle_is_a_scene_that_says_what_it_is(flat: SynthConfig, views: Views) -> None:
+def test_an_oracle_is_a_scene_that_is_marked_as_one(flat: SynthConfig, views: Views) -> None:
     synth(replace(flat, views=views))
     scene = Scene.open(flat.out / "oracle")
     assert {s.note for s in scene.manifest.steps.values()} == {"oracle: from truth"}

@@ -48,7 +48,7 @@ def oracle(out: Path, noise: OracleNoise) -> list[Frame]:
     return Scene.open(out / "oracle").train
 
 
-def test_a_still_pixel_carried_by_its_depth_lands_where_the_flow_says(tmp_path: Path) -> None:
+def test_a_static_pixel_reprojected_by_its_depth_agrees_with_its_flow(tmp_path: Path) -> None:
     frames = oracle(tmp_path, EXACT)
     pixels = np.stack(np.meshgrid(np.arange(SIZE[0]) + 0.5, np.arange(SIZE[1]) + 0.5), -1)
     for k, frame in enumerate(frames):
@@ -80,7 +80,7 @@ def test_cameras_of_a_rig_are_neighbors_in_time_and_share_one_response(tmp_path:
 @pytest.mark.parametrize(
     "noise", [OracleNoise(), OracleNoise(0.0, 0.05, 0.5), OracleNoise(0.03, 0.03, 0.5)]
 )
-def test_depth_and_flow_are_as_noisy_as_asked(tmp_path: Path, noise: OracleNoise) -> None:
+def test_depth_and_flow_have_the_requested_noise(tmp_path: Path, noise: OracleNoise) -> None:
     exact, noisy = oracle(tmp_path / "exact", EXACT), oracle(tmp_path / "noisy", noise)
     error = np.stack([np.log(n.disparity / e.disparity) for n, e in zip(noisy, exact, strict=True)])
     # the smooth part is interpolated between 8 x 8 values, which costs it up to a third
@@ -111,7 +111,7 @@ def test_the_seed_decides_the_noise(tmp_path: Path) -> None:
     assert not a.disparity.isclose(c.disparity, rtol=1e-3).all() and not a.flow[1].equal(c.flow[1])
 
 
-def test_a_mover_has_the_depth_of_where_it_goes() -> None:
+def test_a_mover_has_the_depth_of_its_new_position() -> None:
     """Two cameras that look straight at the box, ten frames apart: the middle of three
     pixels shows its center.
     """
@@ -123,7 +123,7 @@ def test_a_mover_has_the_depth_of_where_it_goes() -> None:
     )
 
 
-def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
+def test_a_point_that_approaches_the_next_camera_stays_visible() -> None:
     """A camera two thirds of a meter nearer sees the wall a quarter nearer: other
     depth, same surface. A pole hides it.
     """
@@ -137,7 +137,7 @@ def test_what_comes_nearer_the_next_camera_is_still_seen_by_it() -> None:
     assert not visible(still, expected, np.full(SIZE[::-1], 2.0)).any()
 
 
-def test_visible_is_false_out_of_the_frame_and_behind_something() -> None:
+def test_visible_is_false_outside_of_the_frame_and_behind_surfaces() -> None:
     """Everything moves two pixels to the right, where a pole now stands in columns 4
     and 5 of eight.
     """

@@ -121,7 +121,7 @@ def test_depth_is_along_the_ray_through_the_pixel_center(
 
 @pytest.mark.parametrize("views", ["mono", "rig"])
 @pytest.mark.parametrize("name", NAMES)
-def test_every_mover_is_seen_in_most_frames_and_the_rest_of_the_picture_stands_still(
+def test_every_mover_is_visible_in_most_frames_and_other_pixels_are_static(
     tracers, name, views
 ) -> None:
     """In four of five frames at least. Geometry fills every picture: `surface` sees to

@@ -17,14 +17,14 @@ class Pair:
     name: str
 
 
-def test_a_function_reaches_every_tensor_and_nothing_else() -> None:
+def test_a_function_is_applied_to_every_tensor_and_nothing_else() -> None:
     pair = Pair(torch.tensor(1.0), {"a": (torch.tensor(2.0), torch.tensor(3.0))}, "pair")
     doubled = tree_map(lambda t: 2 * t, pair)
     assert (doubled.first, doubled.others, doubled.name) == (2.0, {"a": (4.0, 6.0)}, "pair")
 
 
 def with_cuda_devices(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """A torch that sees so many CUDA devices."""
+    """A torch that reports `count` CUDA devices."""
     monkeypatch.setattr(torch.cuda, "is_available", lambda: count > 0)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: count)
 

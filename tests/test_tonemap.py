@@ -330,7 +330,7 @@ def test_a_look_is_the_recording_and_names_the_images_it_resembles():
     torch.testing.assert_close(t.recorder_at(-3.9).rgb(grid()), t.develop(grid(), -3.9))
 
 
-def test_black_and_saturated_pixels_tell_nothing():
+def test_black_and_saturated_pixels_are_not_informative():
     rgb = torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 1.0], [0.0, 0.5, 0.5]])
     assert informative(rgb).tolist() == [True, False, False]
 

@@ -95,10 +95,13 @@ def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
 
 
 def command(settings: TrainConfig, *launcher: str) -> subprocess.Popen[bytes]:
-    """`hdr-nsff train` in processes of its own."""
+    """`hdr-nsff train` in other processes."""
     script = settings.out.parent / "again.py"
     script.write_text(
-        "import json, sys\nfrom hdr_nsff.training.config import TrainConfig\nfrom hdr_nsff.training import run_folder\nfrom hdr_nsff.training.train import train\n"
+        "import json, sys\n"
+        "from hdr_nsff.training.config import TrainConfig\n"
+        "from hdr_nsff.training import run_folder\n"
+        "from hdr_nsff.training.train import train\n"
         "run_folder.write_preview = lambda *_: None\n"
         "train(TrainConfig.from_json(json.loads(open(sys.argv[1]).read())))\n"
     )
@@ -210,7 +213,7 @@ def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:
     assert run.step > 3 and 1.5 <= run.seconds < 10
 
 
-def test_snapshots_are_kept_on_the_way_and_change_nothing(
+def test_snapshots_are_kept_during_training_and_do_not_change_it(
     unbroken: Path, toy_folder: Path, tmp_path: Path
 ) -> None:
     run = train(config(toy_folder, tmp_path / "run"), keep_at=(0.5, 0.125), previews=False)
@@ -245,7 +248,7 @@ def test_a_resumed_run_keeps_the_snapshots_that_are_still_to_come(
     )
 
 
-def test_the_clock_stands_still_while_something_is_written(
+def test_the_clock_stops_while_files_are_written(
     toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(RunWriter, "save_snapshot", lambda self, clock, share: time.sleep(3.0))

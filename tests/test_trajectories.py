@@ -29,7 +29,7 @@ def about_z(angle: float) -> Tensor:
     return torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
-def test_nothing_moves_before_training() -> None:
+def test_trajectories_are_at_rest_before_training() -> None:
     t, points, quaternions = Trajectories(3, KNOTS), random(20, 3), random(20, 4)
     t.centers[:] = random(3, 3, seed=1)
     mixture = random(3, 20, seed=2).softmax(0)

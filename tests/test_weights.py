@@ -53,7 +53,7 @@ def test_an_unknown_name_lists_the_known_ones():
         find("gmflwo")
 
 
-def test_the_cache_comes_before_the_package_and_a_given_path_before_both(tmp_path, monkeypatch):
+def test_a_given_path_precedes_the_cache_which_precedes_the_package(tmp_path, monkeypatch):
     known(monkeypatch, b"tensors", package="a_package_with_weights")
     monkeypatch.syspath_prepend(tmp_path / "site")
     put(tmp_path / "site/a_package_with_weights/__init__.py", b"raise RuntimeError('imported')")
@@ -95,7 +95,7 @@ def test_every_entry_has_a_source_a_license_and_a_size():
         assert entry.license and entry.megabytes > 0 and entry.purpose
 
 
-def test_a_download_that_fails_is_a_sentence_and_leaves_nothing(tmp_path, monkeypatch):
+def test_a_failed_download_is_one_sentence_and_leaves_no_files(tmp_path, monkeypatch):
     monkeypatch.delenv("HF_HUB_OFFLINE")
     monkeypatch.setitem(KNOWN, "raft", replace(KNOWN["raft"], url=(tmp_path / "nowhere").as_uri()))
     with pytest.raises(InputError, match="cannot be downloaded"):

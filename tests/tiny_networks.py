@@ -1,5 +1,6 @@
-"""SAM 2 and Depth Anything of a few thousand random weights, saved as folders: what
-they answer means nothing, how they are asked does.
+"""SAM 2 and Depth Anything with a few thousand random weights, saved as folders.
+
+Their predictions are meaningless; tests check their inputs and what is done with them.
 """
 
 from pathlib import Path
@@ -9,14 +10,20 @@ import torch
 
 
 def tiny_sam2(folder: Path) -> Path:
-    """A Sam2VideoModel that sees 64 x 64 pixels."""
+    """A Sam2VideoModel for 64 x 64 pixels."""
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     backbone = dict(
-        model_type="sam2_hiera_det_model", hidden_size=8, embed_dim_per_stage=[8, 16, 32, 64], blocks_per_stage=[1, 1, 2, 1],
+        model_type="sam2_hiera_det_model",
+        hidden_size=8,
+        embed_dim_per_stage=[8, 16, 32, 64],
+        blocks_per_stage=[1, 1, 2, 1],
         num_attention_heads_per_stage=[1, 1, 2, 2],
-        window_size_per_stage=[4, 4, 4, 2], global_attention_blocks=[3], image_size=[64, 64], window_positional_embedding_background_size=[2, 2],
-    )  # fmt: skip
+        window_size_per_stage=[4, 4, 4, 2],
+        global_attention_blocks=[3],
+        image_size=[64, 64],
+        window_positional_embedding_background_size=[2, 2],
+    )
     vision = dict(
         backbone_config=backbone,
         backbone_channel_list=[64, 32, 16, 8],
@@ -26,31 +33,54 @@ def tiny_sam2(folder: Path) -> Path:
     config = transformers.Sam2VideoConfig(
         vision_config=vision,
         prompt_encoder_config=dict(hidden_size=128, image_size=64),
-        mask_decoder_config=dict(hidden_size=128, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32),
-        image_size=64, memory_attention_hidden_size=128, memory_attention_num_layers=1, memory_attention_feed_forward_hidden_size=128,
-        memory_attention_rope_feat_sizes=[4, 4], memory_encoder_hidden_size=128, memory_encoder_output_channels=64,
-        mask_downsampler_embed_dim=128, memory_fuser_embed_dim=128, memory_fuser_intermediate_dim=32,
-    )  # fmt: skip
+        mask_decoder_config=dict(
+            hidden_size=128, mlp_dim=32, num_attention_heads=2, iou_head_hidden_dim=32
+        ),
+        image_size=64,
+        memory_attention_hidden_size=128,
+        memory_attention_num_layers=1,
+        memory_attention_feed_forward_hidden_size=128,
+        memory_attention_rope_feat_sizes=[4, 4],
+        memory_encoder_hidden_size=128,
+        memory_encoder_output_channels=64,
+        mask_downsampler_embed_dim=128,
+        memory_fuser_embed_dim=128,
+        memory_fuser_intermediate_dim=32,
+    )
     transformers.Sam2VideoModel(config).save_pretrained(folder)
     return folder
 
 
 def tiny_depth_anything(folder: Path, kind: str) -> Path:
-    """A DepthAnythingForDepthEstimation ("relative" or "metric", up to 20 m) with 28
-    pixels on the shorter side.
+    """A DepthAnythingForDepthEstimation for 28 pixels on the shorter side.
+
+    `kind` is "relative", or "metric" up to 20 m.
     """
     transformers = pytest.importorskip("transformers")
     torch.manual_seed(0)
     backbone = transformers.Dinov2Config(
-        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, mlp_ratio=2, image_size=28, patch_size=14,
-        out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
-    )  # fmt: skip
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        mlp_ratio=2,
+        image_size=28,
+        patch_size=14,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+        apply_layernorm=True,
+    )
     config = transformers.DepthAnythingConfig(
-        backbone_config=backbone, patch_size=14, reassemble_hidden_size=16, neck_hidden_sizes=[4, 8, 12, 16], fusion_hidden_size=8,
-        head_hidden_size=4, depth_estimation_type=kind, max_depth=20,
-    )  # fmt: skip
+        backbone_config=backbone,
+        patch_size=14,
+        reassemble_hidden_size=16,
+        neck_hidden_sizes=[4, 8, 12, 16],
+        fusion_hidden_size=8,
+        head_hidden_size=4,
+        depth_estimation_type=kind,
+        max_depth=20,
+    )
     network = transformers.DepthAnythingForDepthEstimation(config)
-    with torch.no_grad():  # as initialized, all answers are nearly the same
+    with torch.no_grad():  # the initial weights predict nearly constant depth
         for weights in (*network.neck.parameters(), *network.head.parameters()):
             weights.normal_(0, 0.3)
     network.save_pretrained(folder)

@@ -1,5 +1,6 @@
-"""A scene folder in closed form: a textured wall at z = 4, a textured card at z = 2.5
-that moves, a camera that moves, three exposures.
+"""A scene folder in closed form, with a moving camera and three exposures.
+
+A textured card moves at z = 2.5 before a textured wall at z = 4.
 """
 
 from pathlib import Path
@@ -90,9 +91,16 @@ class ToyScene:
     def write(self, folder: Path) -> Path:
         """The scene folder."""
         m = Manifest(
-            source="toy", width=self.width, height=self.height, cycle=3, reference_bracket=1, bracket_ev=list(EV), exposure_given=True,
-            near=1.8, far=5.0,
-        )  # fmt: skip
+            source="toy",
+            width=self.width,
+            height=self.height,
+            cycle=3,
+            reference_bracket=1,
+            bracket_ev=list(EV),
+            exposure_given=True,
+            near=1.8,
+            far=5.0,
+        )
         for t in range(self.frames):
             radiance, mask, z = self.see(t)
             name = f"{t:05d}"
@@ -103,9 +111,17 @@ class ToyScene:
             write_png(folder / f"masks/{name}.png", mask)
             write_npy(folder / f"disparity/{name}.npy", (1 / z).astype(np.float16))
             entry = FrameEntry(
-                index=t, image=f"images/{name}.png", source="toy", time=t, bracket=t % 3, ev=EV[t % 3], K=self.K.tolist(),
-                c2w=np.c_[np.eye(3), camera_center(t)].tolist(), mask=f"masks/{name}.png", disparity=f"disparity/{name}.npy",
-            )  # fmt: skip
+                index=t,
+                image=f"images/{name}.png",
+                source="toy",
+                time=t,
+                bracket=t % 3,
+                ev=EV[t % 3],
+                K=self.K.tolist(),
+                c2w=np.c_[np.eye(3), camera_center(t)].tolist(),
+                mask=f"masks/{name}.png",
+                disparity=f"disparity/{name}.npy",
+            )
             for o in (-1, 1):
                 if 0 <= t + o < self.frames:
                     pair = f"raw_flow/{name}_{t + o:05d}"

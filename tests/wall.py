@@ -1,4 +1,4 @@
-"""A wall in closed form, recorded by cameras beside each other, for the response."""
+"""A wall in closed form, recorded by several cameras, for tests of the response."""
 
 import math
 

@@ -41,9 +41,9 @@ class RunConfig(PrepareConfig):
     out: Positional[Path]
     """Folder for everything: scene/, run/, render/, report.html."""
     hold_out: int | None = None
-    """Keep every this many frames for `evaluate`. Default: 8; with a truth folder, or
-    where a data set brings held-out views, 0, or those frames of the clip that are the
-    truth's views.
+    """Keep every N-th frame out of training, for `evaluate`; 0 keeps all in. Default
+    8; with a truth folder or a data set's held-out views 0, or those frames of the clip
+    that are the truth's views.
     """
     preset: Literal["splat", "grid", "paper", "tiny"] = "splat"
     """splat: 4D Gaussians, minutes on a CPU; grid: a scene flow field on grids,

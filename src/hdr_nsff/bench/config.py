@@ -32,9 +32,9 @@ MAX_NAME_LENGTH = 60  # letters of a folder's name
 class BenchConfig:
     """Train and measure methods on scenes; tables, curves and pictures side by side.
 
-    Every pair is a run of its own. Killed, the same command continues where it was; with
-    more scenes or methods it adds theirs. A run that fails is shown with its reason,
-    the others go on, and the exit code is 1.
+    Every pair is a run of its own. Killed, the same command continues where it was;
+    with more scenes or methods it adds theirs. A run that fails is shown with its
+    reason, the others go on, and the exit code is 1.
     """
 
     out: Positional[Path]

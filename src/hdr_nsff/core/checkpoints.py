@@ -6,6 +6,7 @@ Tensors are named `MODULE.PARAMETER` and `optimizer.NAME.INDEX.FIELD`, in one fl
 
 from __future__ import annotations
 
+import zlib
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,10 +49,25 @@ def checkpoint_files(folder: Path) -> list[Path]:
 
 def write_checkpoint(path: Path, step: int, seconds: float, tensors: dict[str, Tensor]) -> None:
     """Write one checkpoint file."""
-    metadata = {"format": FORMAT, "step": str(step), "seconds": repr(seconds)}
     on_cpu = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    metadata = {
+        "format": FORMAT,
+        "step": str(step),
+        "seconds": repr(seconds),
+        "checksum": checksum(step, seconds, on_cpu),
+    }
     with atomic(path) as temporary:
         save_file(on_cpu, temporary, metadata=metadata)
+
+
+def checksum(step: int, seconds: float, tensors: dict[str, Tensor]) -> str:
+    """CRC-32 of what a checkpoint holds, by which a damaged file is noticed."""
+    value = zlib.crc32(f"{step} {seconds!r}".encode())
+    for name in sorted(tensors):
+        value = zlib.crc32(name.encode(), value)
+        flat = tensors[name].reshape(-1).view(torch.uint8)
+        value = zlib.crc32(flat.numpy().data, value)
+    return f"{value:08x}"
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -66,7 +82,11 @@ def read_checkpoint(path: Path) -> Checkpoint:
                 raise InputError(f"{path}: written by another version ({version})")
             names = file.keys()
             tensors = {name: file.get_tensor(name) for name in names}
-        return Checkpoint(int(metadata["step"]), float(metadata["seconds"]), tensors)
+        step, seconds = int(metadata["step"]), float(metadata["seconds"])
+        written = metadata.get("checksum")  # older files have none
+        if written is not None and written != checksum(step, seconds, tensors):
+            raise ValueError("other bytes than were written")
+        return Checkpoint(step, seconds, tensors)
     except InputError:
         raise
     except (SafetensorError, OSError, KeyError, ValueError) as error:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -64,12 +65,13 @@ def to_pixels(array: np.ndarray, half: bool) -> np.ndarray:
 
 
 @contextmanager
-def quiet_stderr() -> Iterator[None]:
-    """Keeps what the C library prints to stderr away from the terminal.
+def quiet() -> Iterator[None]:
+    """Keeps what OpenEXR prints of a damaged file away from the terminal: warnings on
+    Python's stdout, errors of its C library on stderr. Not for several threads at once.
 
     The error that it raises names the same problem.
     """
-    with open(os.devnull, "wb") as nowhere:
+    with open(os.devnull, "wb") as nowhere, redirect_stdout(StringIO()):
         stderr = os.dup(2)
         os.dup2(nowhere.fileno(), 2)
         try:
@@ -88,10 +90,10 @@ def read_exr(path: Path | str) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise InputError(f"{path}: no such file; put it back or correct the name")
     try:
-        with quiet_stderr(), OpenEXR.File(str(path), header_only=True) as file:
+        with quiet(), OpenEXR.File(str(path), header_only=True) as file:
             (left, top), (right, bottom) = file.header()["dataWindow"]
         check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
-        with quiet_stderr(), OpenEXR.File(str(path)) as file:
+        with quiet(), OpenEXR.File(str(path)) as file:
             if not file.parts:
                 raise InputError(f"{path}: the EXR is cut short or damaged; copy it again")
             channels = {n: np.array(c.pixels, dtype=np.float32) for n, c in file.channels().items()}

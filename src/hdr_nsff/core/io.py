@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 
 # Who writes a temporary file: the machine, the process, and a token of that process,
 # since a restarted container gives the same numbers to other processes.
@@ -109,10 +109,10 @@ BROKEN = (errno.EIO,)
 
 @contextmanager
 def writing_to(place: Path | str) -> Iterator[None]:
-    """Turns errors of the disk and of the path into an InputError.
+    """Turns errors of the disk, the path and the memory into an InputError.
 
-    A full disk, and a place that cannot or may not be read or written. Complete files
-    stay; nothing is half-written.
+    A full disk, a place that cannot or may not be read or written, and memory that does
+    not suffice. Complete files stay; nothing is half-written.
     """
     try:
         yield
@@ -123,10 +123,23 @@ def writing_to(place: Path | str) -> Iterator[None]:
             f"{place}: a file name that is no UTF-8 text ({error.object[:80]!r}); rename the file"
         ) from error
     except Exception as error:  # OpenEXR, FFmpeg and safetensors have types of their own for it
-        sentence = describe_disk_error(error, place)
+        sentence = describe_memory_error(error) or describe_disk_error(error, place)
         if sentence is None:
             raise
         raise InputError(sentence) from error
+
+
+def describe_memory_error(error: Exception) -> str | None:
+    """The sentence for an `error` whose cause is too little memory, None for others.
+
+    torch and OpenCV raise errors of other types than Python and numpy.
+    """
+    reason = " ".join(str(error).split())
+    words = ("out of memory", "can't allocate memory", "Insufficient memory")
+    if not isinstance(error, MemoryError) and not any(word in reason for word in words):
+        return None
+    advice = "free some, or ask for less: smaller frames or pictures, fewer rays or Gaussians"
+    return f"the memory does not suffice ({shorten(reason, 200)}); {advice}"
 
 
 def describe_disk_error(error: Exception, place: Path | str) -> str | None:
@@ -195,13 +208,22 @@ def write_npy(path: Path | str, array: np.ndarray) -> None:
         temporary.write_bytes(buffer.getvalue())
 
 
+def write_half(path: Path | str, array: np.ndarray) -> None:
+    """Write a map in half precision, or in single where it holds larger values."""
+    with np.errstate(over="ignore"):
+        half = array.astype(np.float16)
+    overflows = np.isinf(half).any()
+    write_npy(path, array.astype(np.float32) if overflows else half)
+
+
 def read_npy(path: Path | str) -> np.ndarray:
     """An array as it was written, memory-mapped, read-only."""
+    if not Path(path).is_file():  # a pipe would be waited for
+        raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it")
     try:
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it") from error
-    except (ValueError, EOFError, OSError) as error:
+        return np.lib.format.open_memmap(path, mode="r")
+    except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
-            f"{path}: not a readable .npy array ({error}); run `hdr-nsff prepare` with `--redo`"
+            f"{path}: not a readable .npy array ({shorten(error)}); "
+            "run `hdr-nsff prepare` with `--redo`"
         ) from error

@@ -17,6 +17,8 @@ from hdr_nsff.geometry.fill import fill
 # shift
 DepthKind = Literal["metric", "disparity", "relative"]
 
+MIN_DEPTH = 1e-6  # of metric maps: what is nearer is no measurement, and has no disparity
+
 
 def read_depth_files(
     files: list[Path], kind: DepthKind, size: tuple[int, int]
@@ -40,7 +42,8 @@ def read_depth_files(
             raise InputError(
                 f"{path}: the depth map holds NaN or Inf; write 0 where depth is unknown"
             )
-        known = values > 0
+        least = MIN_DEPTH if kind == "metric" else 0
+        known = values > least
         if kind != "relative" and not known.any():
             raise InputError(
                 f"{path}: no depth above 0 in this map; check that its kind is {kind!r}"

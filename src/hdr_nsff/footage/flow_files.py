@@ -18,6 +18,8 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.footage.arrays import read_array, read_arrays
 from hdr_nsff.geometry.round_trip import valid_flow
 
+MAX_FLOW_PX = 1e6  # beyond any frame: a larger value is a mistake
+
 
 def read_flow_files(
     folder: Path | str, pairs: Iterable[tuple[int, int]], size: tuple[int, int]
@@ -107,11 +109,17 @@ def read_pair(
             f"{path}: its mask has shape {mask.shape}, the frames need {size}; "
             "make it at the size of the frames"
         )
-    if not np.isfinite(flow).all():
-        raise InputError(
-            f"{path}: the flow holds NaN or Inf; write 0 there and mask those pixels out"
-        )
+    check_flow(path, flow)
     return flow, mask
+
+
+def check_flow(path: Path, flow: np.ndarray) -> None:
+    """InputError where flow in pixels holds NaN, Inf or impossible values."""
+    if not (np.abs(flow) <= MAX_FLOW_PX).all():
+        raise InputError(
+            f"{path}: the flow holds NaN, Inf or more than {MAX_FLOW_PX:g} pixels; "
+            "write 0 there and mask those pixels out"
+        )
 
 
 def read_npz(path: Path) -> tuple[np.ndarray, np.ndarray]:

@@ -143,6 +143,8 @@ def sorted_folders(folder: Path) -> list[Path]:
 
 def hash_file(path: Path) -> str:
     """The sha256 of a file, in hexadecimal; InputError where it cannot be read."""
+    if not path.is_file():  # pipes and devices may never end
+        raise InputError(f"{path}: missing, or no ordinary file; copy it again")
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()

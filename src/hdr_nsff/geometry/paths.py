@@ -26,12 +26,13 @@ import torch
 from scipy.spatial.transform import Rotation, Slerp
 from torch import Tensor
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.geometry.cameras import Camera
 
 REQUIRED_KEYS = {"time", "c2w"}
 KNOWN_KEYS = REQUIRED_KEYS | {"K", "ev"}
+MAX_NUMBER = 1e9  # of a path file: beyond it single precision has nothing to render
 REACH_QUANTILES = (0.1, 0.9)  # hand-chosen: single outliers among the poses do not count
 ROTATION_TOLERANCE = 1e-3  # per entry of R R^T: poses may be written with few digits
 
@@ -155,7 +156,7 @@ def read_path(path: Path | str, like: Camera) -> list[PathView]:
         ) from error
     except ValueError as error:
         raise InputError(
-            f"{path}: not a JSON file ({error}); write a list of {{time, c2w}} objects"
+            f"{path}: not a JSON file ({shorten(error)}); write a list of {{time, c2w}} objects"
         ) from error
     if not isinstance(entries, list) or not entries:
         raise InputError(
@@ -172,7 +173,7 @@ def parse_view(entry: Any, where: str, like: Camera) -> PathView:
     unknown = sorted(set(entry) - KNOWN_KEYS)
     if unknown:
         raise InputError(
-            f"{where} has the unknown key {unknown[0]!r}; known are time, c2w, K and ev"
+            f"{where} has the unknown key {shorten(unknown[0])!r}; known are time, c2w, K and ev"
         )
     missing = sorted(REQUIRED_KEYS - set(entry))
     if missing:
@@ -213,12 +214,12 @@ def parse_intrinsics(value: Any, where: str) -> np.ndarray:
 
 
 def parse_numbers(value: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
-    """`value` as finite float64 of `shape`, or an InputError that `what` is wrong."""
+    """`value` as float64 of `shape`, or an InputError that `what` is wrong."""
     try:
         array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         array = np.full(1, np.nan)
-    if array.shape != shape or not np.isfinite(array).all():
+    if array.shape != shape or not (np.abs(array) <= MAX_NUMBER).all():
         size = "x".join(map(str, shape)) + " finite numbers" if shape else "one finite number"
-        raise InputError(f"{what} must be {size}")
+        raise InputError(f"{what} must be {size} up to {MAX_NUMBER:g}")
     return array

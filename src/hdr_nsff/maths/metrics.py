@@ -49,11 +49,14 @@ FLIP_TARGET = 0.85
 def psnr(a: Tensor, b: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
     """Peak signal-to-noise ratio in dB, over pixels of `mask` and channels.
 
-    `10 log10(peak^2 / mean square error)`; at most 100, for equal pictures.
+    `10 log10(peak^2 / mean square error)`; at most 100, for equal pictures, and -inf
+    for an infinite error.
     """
     assert a.shape == b.shape, (a.shape, b.shape)
     error = (a.double() - b.double()).square()
     mse = float(error.mean() if mask is None else error[mask].mean())
+    if math.isinf(mse):
+        return -math.inf
     least_mse = 10 ** (-MAX_PSNR_DB / 10) * peak**2
     return 10 * math.log10(peak**2 / max(mse, least_mse))
 

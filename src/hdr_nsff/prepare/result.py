@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.images import write_png
-from hdr_nsff.core.io import write_npy
+from hdr_nsff.core.io import write_half
 from hdr_nsff.scene.manifest import Manifest, Provenance
 
 
@@ -43,11 +43,6 @@ class MapKind:
     def name(self, index: int) -> str:
         """The file of frame `index`."""
         return f"{self.folder}/{index:05d}{self.suffix}"
-
-
-def write_half(path: Path, array: np.ndarray) -> None:
-    """A map in half precision."""
-    write_npy(path, array.astype(np.float16))
 
 
 MAPS = {

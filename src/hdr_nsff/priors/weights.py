@@ -19,7 +19,7 @@ import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import atomic
 from hdr_nsff.core.progress import say
 from hdr_nsff.priors.known_weights import KNOWN, Weights
@@ -75,7 +75,7 @@ def entry(name: str) -> Weights:
         purpose, license = "a use of your choice", "see its page on the hub"
         return Weights(name.replace("/", "--"), purpose, license, 0, hub=name)
     raise InputError(
-        f"weights {name!r}: not known; there are {', '.join(KNOWN)}, "
+        f"weights {shorten(name)!r}: not known; there are {', '.join(KNOWN)}, "
         "or OWNER/MODEL of the Hugging Face hub"
     )
 

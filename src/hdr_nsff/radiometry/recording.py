@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.maths.color import srgb_encode
 
@@ -72,7 +72,7 @@ def response_curve(name: str) -> Curve:
         case "log":
             y = np.stack([np.log1p(LOG_GAIN * x) / np.log1p(LOG_GAIN)] * 3)
         case _:
-            raise InputError(f"response {name!r}: unknown; use film, log, gamma or srgb")
+            raise InputError(f"--response {shorten(name)!r}: unknown; use film, log, gamma or srgb")
     return Curve(x, y)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.geometry import paths
 from hdr_nsff.geometry.paths import PathView
@@ -56,8 +56,11 @@ def plan_shot(
             return Shot(path, paths.slow_motion(cameras, times, factor), fps)
     if not path.endswith(".json"):
         known = "training, fixed, bullet, slowmo, all or a .json file"
-        raise InputError(f"path {path!r}: not known; use {known}")
+        raise InputError(f"--path {shorten(path)!r}: not known; use {known}")
     views = paths.read_path(path, start.camera)
+    if len(views) > MAX_VIEWS:
+        limit = f"a shot has at most {MAX_VIEWS:,}; write fewer"
+        raise InputError(f"{path}: {len(views):,} views; {limit}")
     check_views(run, path, views)
     return Shot(Path(path).stem, views, fps)
 

@@ -246,9 +246,11 @@ class MapReader:
             raise InputError(f"{place} holds no numbers; {again}")
         if array.dtype == bool:
             return torch.from_numpy(array)
-        if not np.isfinite(array).all():
+        with np.errstate(over="ignore"):
+            values = array.astype(np.float32)
+        if not np.isfinite(values).all():
             raise InputError(f"{place} holds NaN or Inf; {again}")
-        return torch.from_numpy(array.astype(np.float32))
+        return torch.from_numpy(values)
 
 
 def outline(mask: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,6 +32,7 @@ from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import PoseCorrections
 
 CONFIG = "config.json"
+MANIFEST = "scene.json"  # of the scene folder
 SCENE_FROM_RUN = "scene_from_run"  # key of config.json: the scene's path from the run folder
 
 
@@ -99,19 +101,19 @@ class Run:
 
 
 def open_folder(config: TrainConfig) -> None:
-    """Start a run folder, or check that an existing one has these settings.
+    """Start a run folder, or check that an existing one has these settings and scene.
 
     The path of a scene that has moved is updated.
     """
     out = config.out
     if (out / CONFIG).exists():
-        before = read_config(out)
-        before = replace(before, scene=config.scene, out=out, device=config.device)
-        if before != config:
+        before, places = stored_config(out)
+        if replace(before, scene=config.scene, out=out, device=config.device) != config:
             raise InputError(
                 f"{out}: holds a run with other settings; "
                 "choose another --out, or delete it to start over"
             )
+        refuse_another_scene(config, places)
     elif any((out / "checkpoints").glob("step_*.safetensors")):
         raise InputError(
             f"{out}: holds checkpoints but no {CONFIG}; "
@@ -120,11 +122,42 @@ def open_folder(config: TrainConfig) -> None:
     write_config(out, config)
 
 
+def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:
+    """InputError where a run is to go on with another scene.
+
+    `places` are where its own scene may be. The scene of `config` is another one where
+    it is neither of them, nor a copy, and one of them still exists.
+    """
+    known = [place / MANIFEST for place in places if (place / MANIFEST).is_file()]
+    given = config.scene / MANIFEST
+    same = any(given.samefile(path) or given.read_bytes() == path.read_bytes() for path in known)
+    if known and not same:
+        raise InputError(
+            f"{config.out}: holds a run on another scene, {known[0].parent}; "
+            "choose another --out, or delete it to start over"
+        )
+
+
 def read_config(folder: Path) -> TrainConfig:
     """The config of a run folder, with its scene where it now is.
 
-    The scene is looked for at its path relative to the run folder first, so that a
-    folder with both can be moved or copied; then at its absolute path.
+    InputError where the scene is at none of the places that the run knows.
+    """
+    config, places = stored_config(folder)
+    for scene in places:
+        if (scene / MANIFEST).is_file():
+            return replace(config, scene=scene)
+    raise InputError(
+        f"{folder}: its scene is not at {config.scene} any more; put it back, or say where it is: "
+        f"`hdr-nsff train` with the same settings, --scene and --out {folder}"
+    )
+
+
+def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
+    """The config of a run folder as it was written, and where its scene may be.
+
+    Its path relative to the run folder comes first, so that a folder with both can be
+    moved or copied; then its absolute path.
     """
     path = Path(folder) / CONFIG
     if not path.is_file():
@@ -139,16 +172,10 @@ def read_config(folder: Path) -> TrainConfig:
         ) from error
     beside = data.pop(SCENE_FROM_RUN, None) if isinstance(data, dict) else None
     config = TrainConfig.from_json(data)
-    candidates = [config.scene]
-    if isinstance(beside, str):
-        candidates.insert(0, (Path(folder).resolve() / beside).resolve())
-    for scene in candidates:
-        if (scene / "scene.json").is_file():
-            return replace(config, scene=scene)
-    raise InputError(
-        f"{folder}: its scene is not at {config.scene} any more; put it back, or say where it is: "
-        f"`hdr-nsff train` with the same settings, --scene and --out {folder}"
-    )
+    places = [config.scene]
+    if isinstance(beside, str) and "\0" not in beside:
+        places.insert(0, (Path(folder).resolve() / beside).resolve())
+    return config, places
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

@@ -20,7 +20,7 @@ from hdr_nsff.core.images import read_mask
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
 from hdr_nsff.footage.depth_files import read_map
-from hdr_nsff.footage.flow_files import read_npz
+from hdr_nsff.footage.flow_files import check_flow, read_npz
 from hdr_nsff.geometry.fill import fill
 
 MAX_ASPECT_ERROR = 0.02  # by which the shape of a map may differ from the frames'
@@ -76,10 +76,7 @@ def flow_map(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
             f"{path}: expected flow (H, W, 2) with a mask (H, W), found {flow.shape} and "
             f"{valid.shape}; copy it again"
         )
-    if not np.isfinite(flow).all():
-        raise InputError(
-            f"{path}: the flow holds NaN or Inf; write 0 there and mask those pixels out"
-        )
+    check_flow(path, flow)
     height, width = size
     scale = np.array([width / flow.shape[1], height / flow.shape[0]], np.float32)
     valid = fit_mask(path, valid, size)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.images import read_mask, write_png
-from hdr_nsff.core.io import write_npy
+from hdr_nsff.core.io import write_half
 from hdr_nsff.core.progress import track
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult
@@ -71,7 +71,7 @@ def stored(work: Work, files: FlowFiles) -> bool:
 
 def write_flow(work: Work, names: FlowFiles, flow: np.ndarray, valid: np.ndarray) -> None:
     """Write flow (H, W, 2) px and where it is believed (H, W)."""
-    write_npy(work.folder / names.flow, flow.astype(np.float16))
+    write_half(work.folder / names.flow, flow)
     write_png(work.folder / names.valid, valid)
 
 

@@ -7,20 +7,37 @@ in from its neighborhood. Given flow stays as it is.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.parallel import map_in_threads
-from hdr_nsff.geometry.round_trip import valid_flow
+from hdr_nsff.geometry.round_trip import RoundTripTuning, valid_flow
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.flow import Pair, flow_files, flow_is_given, stored, write_flow
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.flow.dense import average_with_reverse
-from hdr_nsff.priors.flow.local_motion import fill_uncertain_flow
-from hdr_nsff.priors.flow.masked_least_squares import refine_mover_flow
+from hdr_nsff.priors.flow.local_motion import LocalMotionTuning, fill_uncertain_flow
+from hdr_nsff.priors.flow.masked_least_squares import (
+    MaskedLeastSquaresTuning,
+    refine_mover_flow,
+)
 from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
 from hdr_nsff.radiometry.response import at_one_exposure
 from hdr_nsff.scene.response import read_response
+
+
+@dataclass(frozen=True)
+class RefinedFlowTuning:
+    """Tuning constants of the parts of this step."""
+
+    least_squares: MaskedLeastSquaresTuning = field(default_factory=MaskedLeastSquaresTuning)
+    local_motion: LocalMotionTuning = field(default_factory=LocalMotionTuning)
+    round_trip: RoundTripTuning = field(default_factory=RoundTripTuning)
+
+
+REFINED_FLOW_TUNING = RefinedFlowTuning()
 
 
 def refine_flow(work: Work) -> StepResult:
@@ -72,9 +89,12 @@ def equalized(work: Work) -> tuple[np.ndarray, str]:
 class Refiner:
     """Refines the flow of one pair of frames at a time."""
 
-    def __init__(self, work: Work, video: np.ndarray) -> None:
+    def __init__(
+        self, work: Work, video: np.ndarray, tuning: RefinedFlowTuning = REFINED_FLOW_TUNING
+    ) -> None:
         """`video` (T, H, W, 3): all frames at one brightness, in [0, 1]."""
         self.work, self.video = work, video
+        self.tuning = tuning
         self.clipped = work.equalized[1]
         self.moving = work.masks
         frames = zip(video, self.clipped, strict=True)
@@ -83,17 +103,20 @@ class Refiner:
     def predict_both_directions(self, i: int, j: int) -> list[tuple[Pair, np.ndarray, np.ndarray]]:
         """((from, to), flow (H, W, 2) px, valid (H, W)) of the pair, there and back."""
         there, back = self.least_squares(i, j), self.least_squares(j, i)
-        valid_there = valid_flow(there, back, self.clipped[i], self.clipped[j])
-        valid_back = valid_flow(back, there, self.clipped[j], self.clipped[i])
+        tolerance = self.tuning.round_trip
+        valid_there = valid_flow(there, back, self.clipped[i], self.clipped[j], tolerance)
+        valid_back = valid_flow(back, there, self.clipped[j], self.clipped[i], tolerance)
         here_gray, there_gray = common_gray(self.video, self.ranges, i, j)
         filled = (
             fill_uncertain_flow(
                 there, back, here_gray, there_gray,
                 self.clipped[i], self.clipped[j], self.moving[i],
+                self.tuning.local_motion,
             ),
             fill_uncertain_flow(
                 back, there, there_gray, here_gray,
                 self.clipped[j], self.clipped[i], self.moving[j],
+                self.tuning.local_motion,
             ),
         )  # fmt: skip
         there, back = filled
@@ -107,4 +130,5 @@ class Refiner:
         files = self.work.manifest.frames[i].raw_flow[j]
         matched = read_npy(self.work.folder / files.flow).astype(np.float32)
         pictures = common_rgb(self.video, self.ranges, i, j)
-        return refine_mover_flow(*pictures, matched, self.moving[i] & ~self.clipped[i])
+        unclipped = self.moving[i] & ~self.clipped[i]
+        return refine_mover_flow(*pictures, matched, unclipped, self.tuning.least_squares)

@@ -7,8 +7,8 @@ pair differ only where one of them is clipped; both are limited to their common 
 
 Flow is in pixels: `flow[row, column]` is the position in the other frame minus the
 position in this one, x then y. A valid pixel agrees forward and backward within
-`geometry.round_trip.max_round_trip`, ends inside the other frame, and is clipped at neither
-end of its motion.
+`geometry.round_trip.max_round_trip`, ends inside the other frame, and is clipped at
+neither end of its motion.
 """
 
 from __future__ import annotations

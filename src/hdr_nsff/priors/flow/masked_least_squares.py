@@ -37,9 +37,9 @@ class MaskedLeastSquaresTuning:
     without texture is not corrected.
     """
     max_step_px: float = 0.5
-    """Largest change of the flow in one step, in x and in y."""
-    max_correction_px: float = 1.5
-    """Total correction from which on the flow is left as it was."""
+    """Largest change of the flow in one step, in x and in y. Times `iterations` it
+    bounds the whole correction.
+    """
 
 
 MASKED_LEAST_SQUARES_TUNING = MaskedLeastSquaresTuning()
@@ -67,8 +67,7 @@ def refine_mover_flow(
         step = np.clip(step, -tuning.max_step_px, tuning.max_step_px)
         smoothed = masked_mean((correction + step) * mask, mask, tuning.smoothing_px)
         correction = mask * smoothed
-    small = np.linalg.norm(correction, axis=-1, keepdims=True) < tuning.max_correction_px
-    return np.where(small, flow + correction, flow)
+    return flow + correction
 
 
 def lucas_kanade_step(

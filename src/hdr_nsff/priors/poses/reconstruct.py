@@ -55,7 +55,6 @@ class ReconstructionTuning:
     enough_registered: float = 0.9  # share of the views that ends the search for a model
     min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
     min_track_views: int = 3  # of a point that is kept
-    max_point_error_px: float = 2.0  # mean reprojection error of such a point
     min_points: int = 10
     # near and far: these percentiles of the points' depths, times these factors
     near_percentile: float = 1.0
@@ -306,7 +305,7 @@ def poses_from_model(
         c2w[t] = image_of[int(views.of_frame[t])].c2w
     tracks = gather_tracks(model, views, scale)
     poses = Poses(K, c2w, registered, "full", model.points, model.errors / scale, tracks)
-    poses = trusted_points(poses, tuning.min_track_views, tuning.max_point_error_px)
+    poses = trusted_points(poses, tuning.min_track_views)
     frame_groups = [np.flatnonzero(np.isin(views.of_frame, g)).tolist() for g in views.groups]
     poses = interpolate(normalize_world(poses, tuning), frame_groups)
     return replace(poses, notes=(*poses.notes, summary(poses)))
