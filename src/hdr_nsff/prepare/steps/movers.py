@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
+from scipy import ndimage
 
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
-from hdr_nsff.scene.movers import Mover, write_movers
+from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
+from hdr_nsff.scene.posed_video import PosedVideo
+from hdr_nsff.scene.scene import OUTLINE_PX
 
 
 def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
@@ -32,10 +37,41 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         maps["mover_disparity"] = dict(zip(indices.tolist(), found, strict=True))
         maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
+    if still is not None and any(mover.has_shape for mover in movers):
+        # once more, from the depth that the shapes give, on tracks inside of the outlines
+        disparity, confidence = with_shapes(movers, clip, disparity, confidence)
+        if work.manifest.steps["masks"].provenance == "estimated":
+            clip = replace(clip, moving=within_outlines(clip.moving))
+        movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
     shapes = sum(mover.has_shape for mover in movers)
     note = f"{len(movers)} found, {shapes} with a shape" if movers else "none found"
     return result(movers, maps, note)
+
+
+def within_outlines(moving: np.ndarray) -> np.ndarray:
+    """The masks (T, H, W) without pixels next to their outline; small movers stay whole."""
+    kernel = np.ones((2 * OUTLINE_PX + 1, 2 * OUTLINE_PX + 1), np.uint8)
+    inside = np.zeros_like(moving)
+    for t, mask in enumerate(moving):
+        sure = cv2.erode(mask.astype(np.uint8), kernel) > 0
+        labels, count = ndimage.label(mask)
+        whole = ~np.isin(np.arange(count + 1), np.unique(labels[sure]))
+        inside[t] = sure | (mask & whole[labels])
+    return inside
+
+
+def with_shapes(
+    movers: tuple[Mover, ...], clip: PosedVideo, disparity: np.ndarray, confidence: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """`disparity` and `confidence` (T, H, W) with moving pixels where the shapes are."""
+    disparity, confidence = disparity.copy(), confidence.copy()
+    for t, k in enumerate(movers[0].frames.tolist()):
+        filled = fill_mover_depth(
+            movers, t, clip.moving[k], clip.c2w[k], disparity[k], confidence[k]
+        )
+        disparity[k], confidence[k] = filled[0], lower_confidence_at_edges(*filled)
+    return disparity, confidence
 
 
 def result(
