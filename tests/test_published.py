@@ -1,4 +1,4 @@
-"""The preset `paper` against the published formulas, term by term: slow oracles in plain
+"""The preset `paper` against the published formulas: slow oracles in plain
 loops and float64, on a random field of the published kind.
 """
 
@@ -27,7 +27,7 @@ RAYS = 5
 
 @dataclass
 class Case:
-    """A random field of the preset `paper` in float64, a batch and its training pass."""
+    """A random field of the preset `paper` in float64, a batch and its pass."""
 
     field: NSFF
     batch: PixelBatch

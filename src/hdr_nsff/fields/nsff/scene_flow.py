@@ -141,7 +141,7 @@ class SceneFlowPass:
         return rays.origins + depth[:, None] * rays.directions + scene_flow / opacity
 
     def published_point(self, offset: int) -> Tensor:
-        """The weighted sum (N, 3) of the displaced samples, by the dynamic branch alone.
+        """The weighted sum (N, 3) of displaced samples, by the dynamic branch alone.
 
         It is summed in the cube, as the publication does in NDC; light that no sample
         stops counts as the ray's last sample.
