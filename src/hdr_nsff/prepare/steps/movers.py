@@ -38,7 +38,7 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
-        # once more, from the depth that the shapes give, on tracks inside of the outlines
+        # once more, from the shapes' depth, on tracks inside of the outlines
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
         if work.manifest.steps["masks"].provenance == "estimated":
             clip = replace(clip, moving=within_outlines(clip.moving))
@@ -50,7 +50,7 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
 
 
 def within_outlines(moving: np.ndarray) -> np.ndarray:
-    """The masks (T, H, W) without pixels next to their outline; small movers stay whole."""
+    """The masks (T, H, W) without their outlines; thin and small movers stay whole."""
     kernel = np.ones((2 * OUTLINE_PX + 1, 2 * OUTLINE_PX + 1), np.uint8)
     inside = np.zeros_like(moving)
     for t, mask in enumerate(moving):
@@ -64,7 +64,7 @@ def within_outlines(moving: np.ndarray) -> np.ndarray:
 def with_shapes(
     movers: tuple[Mover, ...], clip: PosedVideo, disparity: np.ndarray, confidence: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`disparity` and `confidence` (T, H, W) with moving pixels where the shapes are."""
+    """Disparity and confidence (T, H, W) with moving pixels where the shapes are."""
     disparity, confidence = disparity.copy(), confidence.copy()
     for t, k in enumerate(movers[0].frames.tolist()):
         filled = fill_mover_depth(
