@@ -209,7 +209,7 @@ class TwoBranches(nn.Module):
         return self.scatter(raw, index, shape, self.density_bias(static=False)), raw_motion
 
     def scatter(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> BranchOutput:
-        """Raw numbers (M, 4 or 5) of samples `index` (M,), as rays of `shape`.
+        """Raw numbers (M, 4 or 5) of samples `index`, as rays of `shape` (N, S)."""
         total = shape[0] * shape[1]
         density = raw.new_zeros(total).index_copy(0, index, self.to_density(raw[:, 3], bias))
         radiance = raw.new_zeros(total, 3).index_copy(0, index, self.to_radiance(raw[:, :3]))
