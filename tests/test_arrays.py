@@ -1,6 +1,7 @@
 """Arrays of other programs: every file is read as numbers or refused in a sentence."""
 
 import io
+import os
 import zipfile
 from pathlib import Path
 
@@ -43,6 +44,7 @@ def claim(path: Path, shape: tuple[int, ...]) -> None:
         (lambda p: np.save(p, np.array([None]), allow_pickle=True), "not a readable"),
         (lambda p: p.write_bytes(b""), "not a readable"),
         (lambda p: p.unlink(missing_ok=True), "missing"),
+        (lambda p: (p.unlink(missing_ok=True), os.mkfifo(p)), "missing"),
     ],
 )
 def test_a_file_without_numbers_is_one_sentence(tmp_path: Path, write, words: str) -> None:

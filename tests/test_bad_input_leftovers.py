@@ -6,6 +6,7 @@ They are written again with a note about it, or named in one sentence.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -44,13 +45,18 @@ def other_version(path: Path) -> None:
     )
 
 
+def pipe(path: Path) -> None:
+    path.unlink()
+    os.mkfifo(path)
+
+
 def one_bit_flipped(path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[-100] ^= 64  # of a number: nothing but a checksum notices
     path.write_bytes(data)
 
 
-@pytest.mark.parametrize("damage", [cut, other_version, one_bit_flipped])
+@pytest.mark.parametrize("damage", [cut, other_version, one_bit_flipped, pipe])
 def test_a_bad_checkpoint_gives_way_to_the_one_before_for_every_verb(
     damage: Callable[[Path], None], run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:

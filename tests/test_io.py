@@ -164,6 +164,9 @@ def test_json_that_is_none_is_a_value_error(tmp_path: Path) -> None:
         (tmp_path / "a.json").write_text(text)
         with pytest.raises(ValueError):
             read_json(tmp_path / "a.json")
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(ValueError, match="no ordinary file"):
+        read_json(tmp_path / "pipe.json")
 
 
 def test_arrays_that_are_missing_or_damaged_are_refused(tmp_path: Path) -> None:

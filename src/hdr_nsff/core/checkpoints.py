@@ -74,6 +74,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Read one checkpoint file. InputError where it is cut short or from another
     version.
     """
+    if not Path(path).is_file():  # a pipe would be waited for
+        raise InputError(f"{path}: missing, or no ordinary file; restore it")
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}

@@ -25,11 +25,10 @@ def read_array(path: Path, dtype: type = np.float32) -> np.ndarray:
 
     InputError for a file that is missing, no `.npy`, cut short, or not of numbers.
     """
+    check_file(path)
     try:
         # mapped, so that what the header claims is compared with the file's length
         array = np.lib.format.open_memmap(path, mode="r")
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing; copy it again") from error
     except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
             f"{path}: not a readable .npy array ({shorten(error)}); copy it again"
@@ -42,17 +41,22 @@ def read_arrays(path: Path, names: Sequence[str], kind: str) -> list[np.ndarray]
 
     InputError as in `read_array`; `kind` is what it calls the file.
     """
+    check_file(path)
     try:
         with zipfile.ZipFile(path) as archive:
             arrays = [read_member(archive, f"{name}.npy") for name in names]
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: missing; copy it again") from error
     except Exception as error:  # of zipfile, zlib and numpy: many unrelated types
         wanted = " and ".join(f"`{name}`" for name in names)
         raise InputError(
             f"{path}: not a {kind} with {wanted} ({shorten(error)}); copy it again"
         ) from error
     return [convert_numbers(path, array, np.float32) for array in arrays]
+
+
+def check_file(path: Path) -> None:
+    """InputError where there is no file; a pipe would be waited for."""
+    if not path.is_file():
+        raise InputError(f"{path}: missing; copy it again")
 
 
 def read_member(archive: zipfile.ZipFile, name: str) -> np.ndarray:
