@@ -175,7 +175,7 @@ def test_smoothness_is_the_sum_of_squared_second_differences():
     y = t.response.values(slice(None)).detach()
     slow = sum(
         (y[:, :, k + 1] - 2 * y[:, :, k] + y[:, :, k - 1]) ** 2 for k in range(1, 255)
-    ).mean()
+    ).sum()  # over images and channels too, as eq. 15 is printed
     torch.testing.assert_close(t.regularizers()["response_smoothness"].detach(), slow)
 
 
