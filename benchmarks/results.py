@@ -74,9 +74,10 @@ def number(value: float | None, digits: int) -> str:
 def origin(document: Document) -> str:
     """The machine, commit and seed of a file, in a line."""
     machine = document["machine"]
-    commits = document.get("commits") or [document["commit"] or "unknown"]
+    trained = dict.fromkeys(run["commit"] for run in document["results"] if run.get("commit"))
+    commits = list(trained) or document.get("commits") or [document["commit"] or "unknown"]
     commit = ", ".join(name[:9] for name in commits)
-    changed = ", with changes" if document["dirty"] else ""
+    changed = ", with changes" if document["dirty"] and not trained else ""
     day = document["date"][:10]
     note = f" {document['note']}" if "note" in document else ""
     return (
