@@ -287,6 +287,16 @@ def test_numbers_that_no_camera_has_are_one_short_sentence(tmp_path, change):
     assert len(str(error.value)) < 400
 
 
+@pytest.mark.filterwarnings("error")
+def test_poses_with_nan_and_inf_are_one_sentence_without_warnings(tmp_path):
+    for value in (np.nan, np.inf):
+        table = llff_table()
+        table[2, 3] = value
+        np.save(tmp_path / "poses_bounds.npy", table)
+        with pytest.raises(InputError, match="hold NaN, Inf"):
+            import_poses(tmp_path, NAMES, (H, W))
+
+
 def test_damaged_poses_are_read_or_refused(tmp_path):
     def read(folder):
         return lambda: import_poses(folder, NAMES, (H, W))

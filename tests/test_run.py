@@ -74,6 +74,13 @@ def test_the_newest_two_checkpoints_are_kept(tmp_path: Path) -> None:
     )
 
 
+def test_a_checkpoint_of_numbers_that_are_none_gives_way_to_the_one_before(tmp_path: Path) -> None:
+    for step, value in ((1, 1.0), (2, float("nan"))):
+        save_checkpoint(tmp_path, step, 0.0, {"a": torch.tensor([value])})
+    found = latest_checkpoint(tmp_path)
+    assert found is not None and found.step == 1
+
+
 def test_a_failed_write_leaves_the_checkpoints_as_they_were(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -88,6 +88,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
         written = metadata.get("checksum")  # older files have none
         if written is not None and written != checksum(step, seconds, tensors):
             raise ValueError("other bytes than were written")
+        if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
+            raise ValueError("NaN or Inf")
         return Checkpoint(step, seconds, tensors)
     except InputError:
         raise

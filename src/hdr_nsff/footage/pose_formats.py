@@ -144,7 +144,8 @@ def llff_poses(matrices: np.ndarray, bounds: np.ndarray, columns: np.ndarray) ->
     K[:, 0, 2] = widths / 2
     K[:, 1, 2] = heights / 2
     K[:, 2, 2] = 1
-    c2w = np.concatenate([matrices[:, :, :3] @ columns, matrices[:, :, 3:4]], 2)
+    with np.errstate(invalid="ignore"):  # NaN and Inf are refused afterwards
+        c2w = np.concatenate([matrices[:, :, :3] @ columns, matrices[:, :, 3:4]], 2)
     # a single stray point makes a bound of one frame useless: not the minimum, as is
     # usual, but what nine frames in ten agree on
     near = float(0.8 * np.percentile(bounds[:, 0], 10))
@@ -208,7 +209,8 @@ def parse_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
         raise InputError(f"{path}: no frames in it; export the poses again")
     lenses = [parse_intrinsics(path, {**document, **frame}) for frame in frames]
     matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)[:, :3]
-    c2w = np.concatenate([matrices[:, :, :3] @ FROM_OPENGL, matrices[:, :, 3:4]], 2)
+    with np.errstate(invalid="ignore"):  # NaN and Inf are refused afterwards
+        c2w = np.concatenate([matrices[:, :, :3] @ FROM_OPENGL, matrices[:, :, 3:4]], 2)
     near, far = parse_range(path, document)
     return GivenPoses(
         names=[str(frame["file_path"]) for frame in frames],
