@@ -24,6 +24,7 @@ from bad_input import (
 from toy_scene import ToyScene
 
 from hdr_nsff.core.io import write_text
+from hdr_nsff.core.lock import absolute, acquire, release
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
@@ -87,6 +88,36 @@ def test_a_place_that_cannot_be_written_is_named(
     sentence = refused(capsys, *commands(run_folder, footage, out)[verb])
     assert place.partition("/")[0][:40] in sentence
     assert (tmp_path / "file").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("flow_data")
+@pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v not in ("evaluate", "report")])
+def test_a_place_that_is_a_link_to_itself_is_named(
+    verb: str, run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = tmp_path / "loop"
+    out.symlink_to(out)
+    footage = clip(tmp_path / "clip", recorded(3))
+    assert "loop" in refused(capsys, *commands(run_folder, footage, out)[verb])
+
+
+# Two at once: `report` writes one file in one go and needs no lock
+
+
+@pytest.mark.usefixtures("flow_data")
+@pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v != "report"])
+def test_a_place_in_which_another_one_works_is_left_alone(
+    verb: str, run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    footage, out = clip(tmp_path / "clip"), tmp_path / "out"
+    busy = run_folder / "evaluation" if verb == "evaluate" else out
+    file = acquire(absolute(busy), wait=False)  # as another process would
+    assert file is not None
+    before = snapshot(tmp_path)
+    command = commands(run_folder, footage, out)[verb]
+    assert "another hdr-nsff works in" in refused(capsys, *command)
+    assert snapshot(tmp_path) == before
+    release(file)
 
 
 # Output that is there already

@@ -245,6 +245,23 @@ def test_a_lost_file_is_made_again_and_the_others_stay(config):
     }
 
 
+def test_lost_frames_are_read_again_and_everything_else_is_as_before(config):
+    config = replace(config, poses=None, masks=None)  # estimated in two rounds
+
+    def maps():
+        files = [p for p in config.out.rglob("*") if p.suffix in (".npy", ".npz", ".png")]
+        return {p: p.read_bytes() for p in files if p.parent.name != "poses"}
+
+    prepare(config)
+    before = maps()
+    (config.out / "images/00003.png").unlink()
+    prepare(config)
+    assert maps() == before
+    shutil.rmtree(config.out / "images")
+    prepare(config)
+    assert maps() == before
+
+
 def test_a_changed_frame_of_the_same_footage_starts_over(config):
     prepare(config)
     write_png(config.clip / "004.png", np.full((H, W, 3), 0.5))
