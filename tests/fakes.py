@@ -136,6 +136,31 @@ def fake_run(
         rgb = tonemapper(seen.radiance, i % 3, 0, leaky=False).detach().reshape(H, W, 3)
         moving = seen.motion.reshape(H, W) > 0.5
         frames.append(Frame(i, float(i), c, 0, i % 3, rgb, moving=moving))
+    cut = num_frames - held_out
+    scene = Scene(
+        folder=folder / "scene",
+        train=frames[:cut],
+        test=frames[cut:],
+        near=1.0,
+        far=8.0,
+        points=torch.zeros(0, 3),
+        response=from_brightness(views_of(frames), EV, 2, 1, "brightness", "made up"),
+        movers=(),
+        manifest=fake_manifest(frames, cut, parallax),
+    )
+    return Run(
+        folder,
+        TrainConfig(scene=folder / "scene", out=folder),
+        scene,
+        field,
+        tonemapper,
+        step=7,
+        seconds=3.0,
+    )
+
+
+def fake_manifest(frames: list[Frame], cut: int, parallax: Any) -> Manifest:
+    """The manifest of these frames, those from `cut` on held out."""
     entries = [
         FrameEntry(
             index=f.index,
@@ -146,7 +171,7 @@ def fake_run(
             ev=EV[f.bracket],
             K=f.camera.K.tolist(),
             c2w=f.camera.c2w.tolist(),
-            split="test" if f.index >= num_frames - held_out else "train",
+            split="test" if f.index >= cut else "train",
         )
         for f in frames
     ]
@@ -157,7 +182,7 @@ def fake_run(
         "poses": StepRecord(done=True, note="6 of 6 frames registered", seconds=12.5),
         "depth": StepRecord(done=True, provenance="absent", note="no parallax"),
     }
-    manifest = Manifest(
+    return Manifest(
         source="made up <clip>",
         width=W,
         height=H,
@@ -171,25 +196,4 @@ def fake_run(
         far=8.0,
         frames=entries,
         steps=steps,
-    )
-    cut = num_frames - held_out
-    scene = Scene(
-        folder=folder / "scene",
-        train=frames[:cut],
-        test=frames[cut:],
-        near=1.0,
-        far=8.0,
-        points=torch.zeros(0, 3),
-        response=from_brightness(views_of(frames), EV, 2, 1, "brightness", "made up"),
-        movers=(),
-        manifest=manifest,
-    )
-    return Run(
-        folder,
-        TrainConfig(scene=folder / "scene", out=folder),
-        scene,
-        field,
-        tonemapper,
-        step=7,
-        seconds=3.0,
     )

@@ -53,7 +53,8 @@ def exported_scene(folder: Path) -> Path:
 
 def round_trip(scene: Path, layout: str) -> Path:
     """The scene folder that `prepare` makes of the exported one."""
-    out = export(ExportConfig(scene, scene.with_name(layout), layout=layout))  # type: ignore[arg-type]
+    place = scene.with_name(layout)
+    out = export(ExportConfig(scene, place, layout=layout))  # type: ignore[arg-type]
     return prepare(PrepareConfig(out, scene.with_name(f"again_{layout}"), hold_out=0))
 
 

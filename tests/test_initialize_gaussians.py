@@ -42,10 +42,10 @@ def seeded(
 ) -> tuple[Splat, str]:
     """A field started from a scene, none of whose numbers is NaN; and what was said."""
     field = Splat(config, scene.times, scene.near, scene.far, 60 * 34)
-    told = initialize_gaussians(field, scene, recorded, -1.0, from_priors)
+    note = initialize_gaussians(field, scene, recorded, -1.0, from_priors)
     assert all(torch.isfinite(v).all() for v in field.state_dict().values())
     assert all(torch.isfinite(field.positions(k)).all() for k in (0.0, 0.5, len(scene.times) - 1.0))
-    return field, told
+    return field, note
 
 
 def changed(scene: Scene, change: Callable[[Frame], Frame], frames: int = 6) -> Scene:
@@ -113,18 +113,18 @@ def test_the_rest_is_invisible_and_the_background_typical(field: Splat) -> None:
 
 
 def test_the_start_is_reported_in_a_sentence_and_reproducible(field: Splat, toy: Scene) -> None:
-    again, told = seeded(toy)
+    again, note = seeded(toy)
     still, moving = int(seen(field.static).sum()), int(seen(field.moving).sum())
     assert (
-        told == f"{still} static Gaussians from the depth prior; {moving} moving ones on 1 movers"
+        note == f"{still} static Gaussians from the depth prior; {moving} moving ones on 1 movers"
     )
     assert all(torch.equal(v, field.state_dict()[k]) for k, v in again.state_dict().items())
 
 
 @pytest.mark.parametrize("bases", [1, 2, 6])
 def test_movers_are_never_more_than_bases(toy: Scene, bases: int) -> None:
-    started, told = seeded(toy, replace(CONFIG, bases=bases))
-    assert 1 <= int(told.split(" on ")[1].split()[0]) <= bases
+    started, note = seeded(toy, replace(CONFIG, bases=bases))
+    assert 1 <= int(note.split(" on ")[1].split()[0]) <= bases
     mixture = started.mixture_logits.detach()[:, : int(seen(started.moving).sum())].softmax(0)
     assert float(mixture.amax(0).min()) > 1 / bases - 1e-6  # each has one basis
     assert moving_at(started, 4.0)[:, :2].mean(0).numpy() == pytest.approx(
@@ -134,8 +134,8 @@ def test_movers_are_never_more_than_bases(toy: Scene, bases: int) -> None:
 
 @pytest.mark.parametrize("none", [None, torch.zeros(34, 60, dtype=torch.bool)])
 def test_without_movers_all_is_static(toy: Scene, none: Tensor | None) -> None:
-    started, told = seeded(changed(toy, lambda f: replace(f, moving=none)))
-    assert told.endswith("0 moving ones on 0 movers") and not seen(started.moving).any()
+    started, note = seeded(changed(toy, lambda f: replace(f, moving=none)))
+    assert note.endswith("0 moving ones on 0 movers") and not seen(started.moving).any()
     assert (
         float(started.static.means.detach()[seen(started.static), 2].min()) < 2.6
     )  # the card as well
@@ -143,8 +143,8 @@ def test_without_movers_all_is_static(toy: Scene, none: Tensor | None) -> None:
 
 def test_where_everything_moves_no_gaussian_is_static(toy: Scene) -> None:
     every = torch.ones(34, 60, dtype=torch.bool)
-    started, told = seeded(changed(toy, lambda f: replace(f, moving=every)))
-    assert told.startswith("0 static Gaussians")
+    started, note = seeded(changed(toy, lambda f: replace(f, moving=every)))
+    assert note.startswith("0 static Gaussians")
     assert not seen(started.static).any()
     assert seen(started.moving).any()
 
@@ -162,8 +162,8 @@ def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Sc
 
 
 def test_without_flow_movers_drift_with_their_middle(toy: Scene) -> None:
-    started, told = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))
-    assert told.endswith("on 1 movers")
+    started, note = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))
+    assert note.endswith("on 1 movers")
     for t in (1.0, 2.0, 3.0, 4.0):  # smoothing shortens the ends
         assert moving_at(started, t)[:, :2].mean(0).numpy() == pytest.approx(
             card_offset(t), abs=0.12
@@ -181,8 +181,8 @@ def test_flow_without_valid_pixels_counts_as_no_flow(toy: Scene) -> None:
 @pytest.mark.parametrize("given", [True, False])
 def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given: bool) -> None:
     scene = changed(toy, lambda f: replace(f, disparity=None)) if given else toy
-    started, told = seeded(scene, from_priors=given)
-    assert "random places" in told and "depth prior" in told
+    started, note = seeded(scene, from_priors=given)
+    assert "random places" in note and "depth prior" in note
     at = started.static.means.detach()[seen(started.static)]
     assert len(at) >= 390 and not seen(started.moving).any()
     assert toy.near * 0.99 < float(at[:, 2].min()) < 2.2
@@ -192,8 +192,8 @@ def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given
 
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_few_training_frames(toy: Scene, frames: int) -> None:
-    started, told = seeded(changed(toy, lambda f: f, frames))
-    assert started.trajectories.num_knots == frames and " 0 movers" not in told
+    started, note = seeded(changed(toy, lambda f: f, frames))
+    assert started.trajectories.num_knots == frames and " 0 movers" not in note
     assert moving_at(started, 0.0)[:, :2].mean(0).numpy() == pytest.approx(
         card_offset(0.0), abs=0.05
     )

@@ -84,6 +84,7 @@ def test_other_processes_of_torchrun_share_the_lock_of_the_first(
     first = holder(tmp_path / "out")
     monkeypatch.setenv("RANK", "1")
     with lock_output(tmp_path / "out"):
+        assert first.poll() is None  # the first still holds it
         first.kill()
     first.wait()
 
@@ -104,8 +105,10 @@ def test_work_continues_on_a_file_system_without_locks(
         raise OSError(os.strerror(38), 38)
 
     monkeypatch.setattr(lock, "take_lock", no_locks)
+    entered = False
     with lock_output(tmp_path / "out"):
-        pass
+        entered = True
+    assert entered
 
 
 APPEND = """

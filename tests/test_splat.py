@@ -16,8 +16,9 @@ from toy_scene import CARD, card_offset
 
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import initialize_field
+from hdr_nsff.fields.outputs import select_pixels
 from hdr_nsff.fields.splat.gaussians import MAX_LOG_RADIANCE, Gaussians
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig, select_pixels
+from hdr_nsff.fields.splat.splat import Splat, SplatConfig
 from hdr_nsff.fields.splat.trajectories import WINDOW
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame

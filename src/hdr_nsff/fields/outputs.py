@@ -1,6 +1,7 @@
-"""What is read from a trained field besides renders: recordings, layers, Gaussians.
+"""What is read from a field besides whole renders: recordings, layers, Gaussians, and
+some pixels of a render.
 
-Training needs none of this. Every field can be recorded. Layers serve interpolation in
+Every field can be recorded. Layers serve interpolation in
 time, Gaussians the export; a field that has them offers a method of that name.
 """
 
@@ -11,7 +12,8 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from hdr_nsff.fields.base import RadianceField, RecordingField
+from hdr_nsff.core.tensors import tree_map
+from hdr_nsff.fields.base import RadianceField, RecordingField, Render
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Recorder
 
@@ -60,3 +62,15 @@ def record_pixels(
     if radiance is None:
         radiance = field.render(camera, time, scene_flow=False).radiance
     return [recorder.rgb(radiance) for recorder in recorders]
+
+
+def select_pixels(render: Render, camera: Camera, pixels: Tensor) -> Render:
+    """The render of a whole frame at `pixels` (S, 2) alone.
+
+    The whole frame in order is returned as it is.
+    """
+    index = pixels[:, 1].long() * camera.width + pixels[:, 0].long()
+    whole = len(index) == camera.width * camera.height
+    if whole and bool((index.diff() == 1).all()):
+        return render
+    return tree_map(lambda values: values[index], render)

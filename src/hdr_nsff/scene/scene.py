@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -259,3 +260,13 @@ def outline(mask: Tensor) -> Tensor:
     grown = max_pool2d(image, width, 1, OUTLINE_PX)[0, 0] > 0
     kept = -max_pool2d(-image, width, 1, OUTLINE_PX)[0, 0] > 0
     return grown & ~kept
+
+
+def without_outline(moving: Tensor, outline: Tensor) -> Tensor:
+    """(H, W) bool: a moving mask without its doubtful outline; small and thin objects
+    stay whole.
+    """
+    objects, count = ndimage.label(moving.numpy())
+    sure = moving & ~outline
+    whole = ~np.isin(np.arange(count + 1), np.unique(objects[sure.numpy()]))
+    return sure | (moving & torch.from_numpy(whole[objects]))

@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy import ndimage
 from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -32,7 +31,7 @@ from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
-from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.scene.scene import Frame, Scene, without_outline
 
 # a cell is this many times longer along the view than across, as shares of the frustum
 DEPTH_CELLS = 12.0
@@ -196,17 +195,10 @@ def mover_points(
 
 
 def surely_moving(f: Frame) -> Tensor:
-    """(H, W) bool: the moving mask without its doubtful outline; small and thin objects
-    stay whole.
-    """
+    """(H, W) bool: the moving mask, as far as it is certain."""
     if f.moving is None:
         return torch.zeros(f.image.shape[:2], dtype=torch.bool)
-    if f.outline is None:
-        return f.moving
-    objects, count = ndimage.label(f.moving.numpy())
-    sure = f.moving & ~f.outline
-    whole = ~np.isin(np.arange(count + 1), np.unique(objects[sure.numpy()]))
-    return sure | (f.moving & torch.from_numpy(whole[objects]))
+    return f.moving if f.outline is None else without_outline(f.moving, f.outline)
 
 
 def with_mover_depth(f: Frame, t: int, movers: Sequence[Mover]) -> Frame:

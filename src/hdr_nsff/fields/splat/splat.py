@@ -22,7 +22,7 @@ from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.base import FrameError, ParamGroup, Render, Warp
 from hdr_nsff.fields.knots import interpolate_linear, knot_of
-from hdr_nsff.fields.outputs import GaussianCloud
+from hdr_nsff.fields.outputs import GaussianCloud, select_pixels
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import relocate
@@ -447,15 +447,3 @@ class Splat(nn.Module):
 def mean_square(values: Tensor) -> Tensor:
     """Mean of the squares; 0 of no values."""
     return values.square().sum() / max(values.numel(), 1)
-
-
-def select_pixels(render: Render, camera: Camera, pixels: Tensor) -> Render:
-    """The render of a whole frame at `pixels` (S, 2) alone.
-
-    The whole frame in order is returned as it is.
-    """
-    index = pixels[:, 1].long() * camera.width + pixels[:, 0].long()
-    whole = len(index) == camera.width * camera.height
-    if whole and bool((index.diff() == 1).all()):
-        return render
-    return tree_map(lambda values: values[index], render)

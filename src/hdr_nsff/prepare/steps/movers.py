@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
-from scipy import ndimage
+import torch
 
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
@@ -16,7 +15,7 @@ from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
 from hdr_nsff.scene.posed_video import PosedVideo
-from hdr_nsff.scene.scene import OUTLINE_PX
+from hdr_nsff.scene.scene import outline, without_outline
 
 
 def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
@@ -51,14 +50,8 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
 
 def within_outlines(moving: np.ndarray) -> np.ndarray:
     """The masks (T, H, W) without their outlines; thin and small movers stay whole."""
-    kernel = np.ones((2 * OUTLINE_PX + 1, 2 * OUTLINE_PX + 1), np.uint8)
-    inside = np.zeros_like(moving)
-    for t, mask in enumerate(moving):
-        sure = cv2.erode(mask.astype(np.uint8), kernel) > 0
-        labels, count = ndimage.label(mask)
-        whole = ~np.isin(np.arange(count + 1), np.unique(labels[sure]))
-        inside[t] = sure | (mask & whole[labels])
-    return inside
+    masks = [torch.from_numpy(mask) for mask in moving]
+    return np.stack([without_outline(mask, outline(mask)).numpy() for mask in masks])
 
 
 def with_shapes(
