@@ -12,6 +12,7 @@ from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.priors.movers.rigidity import judge_rigidity
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
 from hdr_nsff.scene.posed_video import PosedVideo
@@ -28,7 +29,12 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     clip = work.training_clip()
     indices = np.array([f.index for f in work.train])
     maps = {}
-    if still is not None:  # the depth is that of the static scene, without movers
+    if without_parallax(work):
+        nearer = disparity / np.float32(tuning.depth_share_without_parallax)
+        disparity = np.where(clip.moving, nearer, disparity)
+        maps["mover_disparity"] = dict(zip(indices.tolist(), disparity, strict=True))
+        maps["mover_confidence"] = dict(zip(indices.tolist(), confidence, strict=True))
+    elif still is not None:  # the depth is that of the static scene, without movers
         clip = replace(clip, moving=clip.moving & ~still)
         found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
         disparity = np.where(clip.moving, found, disparity)
@@ -42,10 +48,21 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         if work.manifest.steps["masks"].provenance == "estimated":
             clip = replace(clip, moving=within_outlines(clip.moving))
         movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
+    movers = judge_rigidity(movers, clip, *flow, disparity, tuning.rigidity)
     movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
     shapes = sum(mover.has_shape for mover in movers)
-    note = f"{len(movers)} found, {shapes} with a shape" if movers else "none found"
+    rigid = sum(mover.rigid for mover in movers)
+    note = "none found"
+    if movers:
+        note = f"{len(movers)} found, {shapes} with a shape, {rigid} rigid"
     return result(movers, maps, note)
+
+
+def without_parallax(work: Work) -> bool:
+    """Whether everything was put at one distance, as there is no parallax."""
+    sources = {"geometric", "depth-anything"}
+    source = work.manifest.steps["static_depth"].details.get("source")
+    return work.manifest.parallax != "full" and source in sources
 
 
 def within_outlines(moving: np.ndarray) -> np.ndarray:
@@ -75,7 +92,13 @@ def result(
     errors = [round(mover.error, 3) if mover.has_shape else None for mover in movers]
     return StepResult(
         note=note,
-        details={"tracks": sizes, "errors": errors},
+        details={
+            "tracks": sizes,
+            "errors": errors,
+            "rigid": [mover.rigid for mover in movers],
+            "flow_residuals_px": [round(mover.flow_residual, 3) for mover in movers],
+            "flow_uncertainty_px": round(movers[0].flow_uncertainty, 3) if movers else None,
+        },
         manifest={"movers": "movers.npz"},
         frames={"mover_disparity": {}, "mover_confidence": {}},
         maps=maps,
