@@ -116,9 +116,9 @@ def test_the_rest_is_invisible_and_the_background_typical(field: Splat) -> None:
 def test_the_start_is_reported_in_a_sentence_and_reproducible(field: Splat, toy: Scene) -> None:
     again, note = seeded(toy)
     still, moving = int(seen(field.static).sum()), int(seen(field.moving).sum())
-    assert (
-        note
-        == f"{still} static Gaussians from the depth prior; {moving} moving ones on 1 rigid movers; 0 time-local ones"
+    assert note == (
+        f"{still} static Gaussians from the depth prior; "
+        f"{moving} moving ones on 1 rigid movers; 0 time-local ones"
     )
     assert all(torch.equal(v, field.state_dict()[k]) for k, v in again.state_dict().items())
 
