@@ -20,13 +20,19 @@ from hdr_nsff.scene.scene import outline, without_outline
 
 
 def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
-    """The movers of the training frames, from flow, masks and a first depth."""
+    """The movers of the training frames, from flow, masks and a first depth.
+
+    Where the depth is that of the static scene, there are two rounds, on pixels that
+    parallax does not explain. The first one places the movers. The second one starts
+    from the depth of their shapes, inside the outlines of the masks.
+    """
     if work.manifest.depth_kind == "relative":
         return result((), {}, "not estimated: depth is known up to scale and shift only")
     flow = work.training_flows(work.refined_flows)
     disparity, confidence = work.static_depth()
     still = work.still()
     clip = work.training_clip()
+    masks = clip.moving
     indices = np.array([f.index for f in work.train])
     maps = {}
     if without_parallax(work):
@@ -35,7 +41,7 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         maps["mover_disparity"] = dict(zip(indices.tolist(), disparity, strict=True))
         maps["mover_confidence"] = dict(zip(indices.tolist(), confidence, strict=True))
     elif still is not None:  # the depth is that of the static scene, without movers
-        clip = replace(clip, moving=clip.moving & ~still)
+        clip = replace(clip, moving=masks & ~still)
         found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
         disparity = np.where(clip.moving, found, disparity)
         confidence = np.where(clip.moving, trust, confidence)
@@ -43,10 +49,10 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
-        # once more, from the shapes' depth, on tracks inside of the outlines
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
         if work.manifest.steps["masks"].provenance == "estimated":
-            clip = replace(clip, moving=within_outlines(clip.moving))
+            # outlines of the whole masks: static pixels along them would count twice
+            clip = replace(clip, moving=within_outlines(masks) & ~still)
         movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     movers = judge_rigidity(movers, clip, *flow, disparity, tuning.rigidity)
     movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
@@ -60,9 +66,9 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
 
 def without_parallax(work: Work) -> bool:
     """Whether everything was put at one distance, as there is no parallax."""
-    sources = {"geometric", "depth-anything"}
-    source = work.manifest.steps["static_depth"].details.get("source")
-    return work.manifest.parallax != "full" and source in sources
+    if work.manifest.parallax == "full":
+        return False
+    return work.manifest.steps["static_depth"].provenance == "estimated"
 
 
 def within_outlines(moving: np.ndarray) -> np.ndarray:
