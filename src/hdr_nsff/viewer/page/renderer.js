@@ -1,0 +1,404 @@
+// Draws a scene with WebGL2: Gaussians to linear maps in half floats, maps to the screen.
+
+import { POSE_FLOATS, knotOf, posesAt } from "./motion.js";
+import { CURVES, curveTable } from "./curves.js";
+
+export const VIEWS = ["radiance", "depth", "motion", "flow"];
+const FEATURES = { radiance: 0, depth: 1, motion: 1, flow: 2 };
+const TABLE_WIDTH = 2048; // texels in a row of every table, as in splat.vert
+const MAX_GROUPS = 4; // as in splat.vert
+const MAX_FLOW_SHARE = 0.05; // of the picture's width: flow shown in full color
+
+/** A WebGL2 context that can blend half floats; throws a sentence where there is none. */
+export function openContext(canvas) {
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
+  if (!gl) throw new Error("This browser offers no WebGL 2.");
+  if (!gl.getExtension("EXT_color_buffer_float")) throw new Error("This graphics driver cannot draw to half floats.");
+  return gl;
+}
+
+/** The name of the graphics driver, as far as the browser tells it. */
+export function driverName(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  return gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER) ?? "";
+}
+
+export class Renderer {
+  /** `shaders` are sources by file name, `sorterSource` the text of the worker. */
+  constructor(gl, scene, shaders, sorterSource) {
+    this.gl = gl;
+    this.scene = scene;
+    this.count = scene.groups.reduce((sum, group) => sum + group.count, 0);
+    this.splat = new Program(gl, shaders["splat.vert"], shaders["splat.frag"]);
+    this.screen = new Program(gl, shaders["picture.vert"], shaders["develop.frag"]);
+    this.tables = makeTables(gl, scene);
+    this.responses = scene.responses.map((entry) => makeTable(gl, gl.RGBA32F, 4, curveTable(entry), 1024));
+    this.targets = new Map(); // offscreen pictures by name
+    this.orderBuffer = gl.createBuffer();
+    this.vertices = gl.createVertexArray();
+    gl.bindVertexArray(this.vertices);
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.enableVertexAttribArray(0);
+    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
+    gl.vertexAttribDivisor(0, 1);
+    gl.bindVertexArray(null);
+    this.sorter = new Sorter(scene, sorterSource);
+    this.visible = 0;
+  }
+
+  /** Sort for a view; resolves once its order is on the GPU. */
+  async sort(view) {
+    const { order, milliseconds } = await this.sorter.sort(view.time, this.poses(view.time), depthRow(view.c2w));
+    const { gl } = this;
+    gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
+    gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
+    this.visible = order.length;
+    this.sortMilliseconds = milliseconds;
+  }
+
+  poses(time) {
+    const { bases, times } = this.scene;
+    return posesAt(bases, times.length, knotOf(times, time));
+  }
+
+  /**
+   * Composite a view, { time, c2w, K, width, height, show }, into the picture `name` of
+   * RGBA16F: linear radiance, or sums of other features, premultiplied by opacity.
+   */
+  composite(view, name) {
+    const { gl, scene, splat } = this;
+    const target = this.target(name, view.width, view.height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
+    gl.viewport(0, 0, view.width, view.height);
+    const background = view.show === "radiance" ? scene.background : [0, 0, 0];
+    gl.clearBufferfv(gl.COLOR, 0, [...background, 0]);
+    splat.use();
+    this.setScene();
+    this.setTime(view.time);
+    this.setCamera(view);
+    splat.set("u_feature", FEATURES[view.show]);
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this.vertices);
+    gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this.visible);
+    gl.bindVertexArray(null);
+    gl.disable(gl.BLEND);
+    return target;
+  }
+
+  setScene() {
+    const { scene, splat, tables } = this;
+    const units = ["gaussians", "colorOffsets", "opacityOffsets", "mixture", "sh1"];
+    units.forEach((name, unit) => splat.texture(`u_${name}`, unit, tables[name]));
+    tables.groups.forEach((group, i) => {
+      splat.set(`u_place[${i}]`, group.place);
+      splat.set(`u_knots[${i}]`, group.knots);
+      splat.set(`u_motion[${i}]`, scene.groups[i].motion);
+    });
+    splat.set("u_bases", scene.bases?.count ?? 0);
+    splat.set("u_bounded", scene.radiance === "sigmoid" ? 1 : 0);
+    splat.set("u_viewDependent", tables.viewDependent ? 1 : 0);
+  }
+
+  setTime(time) {
+    const { gl, scene, splat } = this;
+    const { times } = scene;
+    const knot = knotOf(times, time);
+    const last = Math.max(times.length - 1, 1);
+    const forward = knot + 1 <= times.length - 1;
+    const flowKnot = Math.max(forward ? knot + 1 : knot - 1, 0);
+    const low = Math.min(Math.floor(flowKnot), Math.max(times.length - 2, 0));
+    const flowTime = times[low] + (flowKnot - low) * ((times[low + 1] ?? times[low]) - times[low]);
+    splat.set("u_time", time);
+    splat.set("u_share", knot / last);
+    splat.set("u_flowTime", flowTime);
+    splat.set("u_flowSign", forward ? 1 : -1);
+    const poses = this.poses(time);
+    const both = new Float32Array(2 * poses.length);
+    both.set(poses);
+    both.set(posesAt(scene.bases, times.length, flowKnot), poses.length);
+    this.poseTable ??= gl.createTexture();
+    gl.activeTexture(gl.TEXTURE5);
+    gl.bindTexture(gl.TEXTURE_2D, this.poseTable);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, poses.length / 4, 2, 0, gl.RGBA, gl.FLOAT, both);
+    setNearest(gl, gl.TEXTURE_2D);
+    splat.texture("u_poses", 5, { kind: gl.TEXTURE_2D, texture: this.poseTable });
+  }
+
+  setCamera({ c2w, K, width, height }) {
+    const { splat } = this;
+    const center = c2w.map((row) => row[3]);
+    // columns of world to camera are rows of camera to world
+    const rotation = c2w.flatMap((row) => row.slice(0, 3));
+    const translation = [0, 1, 2].map((i) => -c2w.reduce((sum, row, k) => sum + row[i] * center[k], 0));
+    splat.set("u_rotation", rotation);
+    splat.set("u_translation", translation);
+    splat.set("u_eye", center);
+    splat.set("u_camera", [K[0][0], K[1][1], K[0][2], K[1][2]]);
+    splat.set("u_size", [width, height]);
+  }
+
+  /** Show a composited picture on the canvas, or in the picture `into`. */
+  develop(target, look, into = null) {
+    const { gl, screen, scene } = this;
+    const [width, height] = into ? [into.width, into.height] : [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    gl.bindFramebuffer(gl.FRAMEBUFFER, into ? into.framebuffer : null);
+    gl.viewport(0, 0, width, height);
+    screen.use();
+    screen.texture("u_maps", 0, { kind: gl.TEXTURE_2D, texture: target.texture });
+    screen.texture("u_response", 1, this.responses[look.camera]);
+    screen.set("u_view", VIEWS.indexOf(look.show));
+    screen.set("u_curve", CURVES.findIndex((curve) => curve.id === look.curve));
+    screen.set("u_gain", gains(scene.responses[look.camera], look));
+    screen.set("u_clipping", look.clipping ? 1 : 0);
+    screen.set("u_falseColor", look.falseColor ? 1 : 0);
+    screen.set("u_depthRange", [scene.near, scene.far]);
+    screen.set("u_maxFlow", MAX_FLOW_SHARE * target.width);
+    gl.bindVertexArray(this.vertices);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+    gl.bindVertexArray(null);
+  }
+
+  /** Numbers of a picture as float32 RGBA, row by row from the top. */
+  read(target) {
+    const { gl } = this;
+    const { width, height } = target;
+    const upward = new Float32Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, target.framebuffer);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, upward);
+    const downward = new Float32Array(upward.length);
+    for (let y = 0; y < height; y++) {
+      downward.set(upward.subarray(4 * width * y, 4 * width * (y + 1)), 4 * width * (height - 1 - y));
+    }
+    return downward;
+  }
+
+  /** An offscreen picture, made anew where its size has changed. */
+  target(name, width, height, format = this.gl.RGBA16F) {
+    const { gl } = this;
+    const found = this.targets.get(name);
+    if (found && found.width === width && found.height === height) return found;
+    if (found) {
+      gl.deleteTexture(found.texture);
+      gl.deleteFramebuffer(found.framebuffer);
+    }
+    const texture = gl.createTexture();
+    gl.activeTexture(gl.TEXTURE0);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, format, width, height);
+    setNearest(gl, gl.TEXTURE_2D);
+    const framebuffer = gl.createFramebuffer();
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0, gl.TEXTURE_2D, texture, 0);
+    const made = { texture, framebuffer, width, height };
+    this.targets.set(name, made);
+    return made;
+  }
+}
+
+/** The factors (3) from radiance to what a curve takes. */
+export function gains(response, look) {
+  const balance = look.curve === "camera" ? response.white_balance : response.neutral;
+  return balance.map((value) => value * 2 ** look.ev);
+}
+
+/** The third row of world to camera, which gives z-depth. */
+function depthRow(c2w) {
+  const forward = c2w.map((row) => row[2]);
+  return [...forward, -c2w.reduce((sum, row) => sum + row[2] * row[3], 0)];
+}
+
+/** The worker that sorts. One view at a time: callers wait for the answer. */
+class Sorter {
+  constructor(scene, source) {
+    const address = URL.createObjectURL(new Blob([source], { type: "text/javascript" }));
+    this.worker = new Worker(address);
+    this.pending = new Map();
+    this.next = 0;
+    this.worker.onmessage = ({ data }) => {
+      this.pending.get(data.id)(data);
+      this.pending.delete(data.id);
+    };
+    const groups = scene.groups.map((group) => ({
+      count: group.count,
+      means: group.means.data,
+      mixture: group.mixture?.data,
+      velocities: group.velocities?.data,
+      centers: group.centers?.data,
+      logDurations: group.log_durations?.data,
+    }));
+    this.worker.postMessage({ groups });
+  }
+
+  sort(time, poses, row) {
+    const id = this.next++;
+    return new Promise((resolve) => {
+      this.pending.set(id, resolve);
+      this.worker.postMessage({ id, time, poses, row });
+    });
+  }
+}
+
+/** A shader program whose uniforms are set by name. */
+class Program {
+  constructor(gl, vertexSource, fragmentSource) {
+    this.gl = gl;
+    this.program = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source.trimStart());
+      gl.compileShader(shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
+      gl.attachShader(this.program, shader);
+    }
+    gl.linkProgram(this.program);
+    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program));
+    this.uniforms = new Map();
+    const count = gl.getProgramParameter(this.program, gl.ACTIVE_UNIFORMS);
+    for (let i = 0; i < count; i++) {
+      const { name, type, size } = gl.getActiveUniform(this.program, i);
+      for (let k = 0; k < size; k++) {
+        const entry = size > 1 || name.endsWith("[0]") ? name.replace("[0]", `[${k}]`) : name;
+        this.uniforms.set(entry, { type, place: gl.getUniformLocation(this.program, entry) });
+      }
+    }
+  }
+
+  use() {
+    this.gl.useProgram(this.program);
+  }
+
+  set(name, value) {
+    const { gl } = this;
+    const uniform = this.uniforms.get(name);
+    if (!uniform) return; // not used by this program
+    const { type, place } = uniform;
+    switch (type) {
+      case gl.FLOAT: return gl.uniform1f(place, value);
+      case gl.FLOAT_VEC2: return gl.uniform2fv(place, value);
+      case gl.FLOAT_VEC3: return gl.uniform3fv(place, value);
+      case gl.FLOAT_VEC4: return gl.uniform4fv(place, value);
+      case gl.FLOAT_MAT3: return gl.uniformMatrix3fv(place, false, value);
+      case gl.INT_VEC4: return gl.uniform4iv(place, value);
+      default: return gl.uniform1i(place, value);
+    }
+  }
+
+  texture(name, unit, { kind, texture }) {
+    this.gl.activeTexture(this.gl.TEXTURE0 + unit);
+    this.gl.bindTexture(kind, texture);
+    this.set(name, unit);
+  }
+}
+
+/** Everything that the vertex shader reads of the scene, as textures. */
+function makeTables(gl, scene) {
+  const { groups } = scene;
+  if (groups.length > MAX_GROUPS) throw new Error(`This scene has more than ${MAX_GROUPS} groups of Gaussians.`);
+  const total = groups.reduce((sum, group) => sum + group.count, 0);
+  const rows = Math.max(Math.ceil(total / TABLE_WIDTH), 1);
+  const layers = new Float32Array(5 * 4 * TABLE_WIDTH * rows);
+  const layer = (k) => layers.subarray(k * 4 * TABLE_WIDTH * rows);
+  const colors = [], opacities = [], weights = [], directions = [];
+  const viewDependent = groups.some((group) => group.sh1);
+  const places = [];
+  let first = 0, firstColor = 0, firstOpacity = 0, firstWeight = 0;
+  groups.forEach((group, k) => {
+    const { count } = group;
+    const at = 4 * first;
+    interleave(layer(0).subarray(at), 4, [[group.means.data, 3], [group.opacity_logits.data, 1]]);
+    interleave(layer(1).subarray(at), 4, [[group.quaternions.data, 4]]);
+    interleave(layer(2).subarray(at), 4, [[group.log_scales.data, 3], [new Float32Array(count).fill(k), 1]]);
+    const centers = group.centers?.data ?? new Float32Array(count);
+    interleave(layer(3).subarray(at), 4, [[group.log_radiance.data, 3], [centers, 1]]);
+    if (group.velocities) {
+      interleave(layer(4).subarray(at), 4, [[group.velocities.data, 3], [group.log_durations.data, 1]]);
+    }
+    const colorKnots = group.color_offsets?.shape[0] ?? 0;
+    const opacityKnots = group.opacity_offsets?.shape[0] ?? 0;
+    if (colorKnots) colors.push(asColors(group.color_offsets));
+    if (opacityKnots) opacities.push(group.opacity_offsets.data);
+    if (group.mixture) weights.push(group.mixture.data);
+    if (viewDependent) directions.push(asTriples(group.sh1?.data ?? new Float32Array(9 * count)));
+    places.push({
+      place: [first, count, group.mixture ? firstWeight : -1, group.velocities ? 1 : 0],
+      knots: [firstColor, colorKnots, firstOpacity, opacityKnots],
+    });
+    first += count;
+    firstColor += colorKnots * count;
+    firstOpacity += opacityKnots * count;
+    firstWeight += group.mixture?.data.length ?? 0;
+  });
+  const gaussians = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D_ARRAY, gaussians);
+  gl.texImage3D(gl.TEXTURE_2D_ARRAY, 0, gl.RGBA32F, TABLE_WIDTH, rows, 5, 0, gl.RGBA, gl.FLOAT, layers);
+  setNearest(gl, gl.TEXTURE_2D_ARRAY);
+  return {
+    gaussians: { kind: gl.TEXTURE_2D_ARRAY, texture: gaussians },
+    colorOffsets: makeTable(gl, gl.RGBA16F, 4, concatenate(colors)),
+    opacityOffsets: makeTable(gl, gl.R32F, 1, concatenate(opacities)),
+    mixture: makeTable(gl, gl.R32F, 1, concatenate(weights)),
+    sh1: makeTable(gl, gl.RGBA32F, 4, concatenate(directions)),
+    groups: places,
+    viewDependent,
+  };
+}
+
+/** A texture of `values` with `channels` numbers a texel, row after row. */
+function makeTable(gl, format, channels, values, width = TABLE_WIDTH) {
+  const rows = Math.max(Math.ceil(values.length / (channels * width)), 1);
+  const padded = new Float32Array(channels * width * rows);
+  padded.set(values);
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  const layout = channels === 1 ? gl.RED : gl.RGBA;
+  gl.texImage2D(gl.TEXTURE_2D, 0, format, width, rows, 0, layout, gl.FLOAT, padded);
+  setNearest(gl, gl.TEXTURE_2D);
+  return { kind: gl.TEXTURE_2D, texture };
+}
+
+function setNearest(gl, kind) {
+  gl.texParameteri(kind, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+  gl.texParameteri(kind, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+  gl.texParameteri(kind, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+  gl.texParameteri(kind, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+}
+
+/** Columns of several arrays side by side, `stride` numbers a row. */
+function interleave(out, stride, parts) {
+  let column = 0;
+  for (const [values, width] of parts) {
+    for (let i = 0; i < values.length / width; i++) {
+      for (let c = 0; c < width; c++) out[i * stride + column + c] = values[i * width + c];
+    }
+    column += width;
+  }
+}
+
+/** Offsets of log radiance (K, N, 1 or 3) with four numbers an entry. */
+function asColors({ shape, data }) {
+  const channels = shape[2];
+  const entries = shape[0] * shape[1];
+  const out = new Float32Array(4 * entries);
+  for (let i = 0; i < entries; i++) {
+    for (let c = 0; c < 3; c++) out[4 * i + c] = data[channels * i + (channels === 3 ? c : 0)];
+  }
+  return out;
+}
+
+/** Triples with a fourth number. */
+function asTriples(data) {
+  const out = new Float32Array((4 * data.length) / 3);
+  interleave(out, 4, [[data, 3]]);
+  return out;
+}
+
+function concatenate(arrays) {
+  const out = new Float32Array(arrays.reduce((sum, array) => sum + array.length, 0));
+  let first = 0;
+  for (const array of arrays) {
+    out.set(array, first);
+    first += array.length;
+  }
+  return out;
+}
