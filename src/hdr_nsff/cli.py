@@ -59,7 +59,7 @@ VERBS = {
     "export": Verb(
         "hdr_nsff.rendering.export:export",
         "hdr_nsff.rendering.export:ExportConfig",
-        "Write Gaussians as PLY, or a scene in a public data layout, for other programs.",
+        "Write a page that plays the run, Gaussians as PLY, or a public data layout.",
     ),
     "evaluate": Verb(
         "hdr_nsff.evaluation.evaluate:evaluate",

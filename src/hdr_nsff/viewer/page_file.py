@@ -20,6 +20,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parent / "page"
 SHADERS = ("splat.vert", "splat.frag", "picture.vert", "develop.frag")
 ENTRY, WORKER = "main.js", "sorter.js"
+MARK = '<meta name="generator" content="hdr-nsff">'  # of a page that was made here
 IMPORT = re.compile(r'^import\s*\{[^}]*\}\s*from\s*"\./([\w.]+)";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export\s+(?=(async\s+)?(function|class|const|let)\b)", re.MULTILINE)
 # what the page may load: nothing, but what it holds itself
