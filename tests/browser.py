@@ -137,11 +137,11 @@ class Page:
 
     def click(self, selector: str) -> None:
         """Click the middle of the element that a selector finds."""
+        element = f"document.querySelector({json.dumps(selector)})"
+        frame = "new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))"
+        self.run(f"{element}.scrollIntoView({{block: 'nearest'}}), {frame}")
         box = self.run(
-            f"(() => {{ const e = document.querySelector({json.dumps(selector)});"
-            "e.scrollIntoView({block: 'nearest'});"
-            "const {x, y, width, height} = e.getBoundingClientRect();"
-            "return [x + width / 2, y + height / 2]; })()"
+            f"(r => [r.x + r.width / 2, r.y + r.height / 2])({element}.getBoundingClientRect())"
         )
         self.drag((box[0], box[1]), (box[0], box[1]))
 
