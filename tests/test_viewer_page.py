@@ -7,6 +7,7 @@ from __future__ import annotations
 import base64
 import json
 import struct
+import threading
 import warnings
 import zlib
 from collections.abc import Iterator
@@ -18,14 +19,17 @@ import numpy as np
 import pytest
 import torch
 from browser import Page, browser, find_browser
+from test_served_run import save_run
 from viewer_scenes import local_gaussians, render, scene_file, trained
 
 from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.geometry import paths
 from hdr_nsff.maths.metrics import mu_law_psnr
+from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.viewer.page_file import PageSettings, make_page
 from hdr_nsff.viewer.scene_file import SceneFile, to_bytes
+from hdr_nsff.viewer.server import ViewerServer
 
 SIZE = (160, 90)
 TO_BASE64 = """a => {
@@ -306,3 +310,43 @@ def test_the_picture_and_the_controls_fit_the_window(
         left, top, right, bottom = tab.run(f"(r => [r.left, r.top, r.right, r.bottom])({rect})")
         assert left >= 0 and top >= 0 and right <= width + 1 and bottom <= height + 1
         assert right - left > 20 and bottom - top > 20
+
+
+# With a server
+
+
+@pytest.fixture
+def address(toy: Scene, toy_folder: Path, tmp_path: Path) -> Iterator[str]:
+    save_run(toy, toy_folder, tmp_path / "run")
+    with ViewerServer(ServedRun(tmp_path / "run", "cpu")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.address
+        server.shutdown()
+
+
+def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: str) -> None:
+    tab.goto(address, 500, 300)
+    tab.wait("!document.getElementById('frame').hidden")
+    tab.press("ArrowRight")
+    tab.drag((120, 100), (160, 110))
+    tab.press("v")
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 2")
+    width = tab.run("document.getElementById('frame').naturalWidth")
+    assert width == tab.run("viewer.canvas.width")  # the finest, after coarse ones
+    assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
+    assert all(asked.startswith(address) for asked in tab.requests())
+    assert tab.problems() == []
+
+
+def test_a_served_page_can_draw_and_follows_the_run(
+    tab: Page, address: str, tmp_path: Path
+) -> None:
+    tab.goto(f"{address}#draw", 500, 300)
+    assert tab.run("viewer.renderer.visible") > 400
+    tab.press("ArrowRight")
+    (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
+    checkpoint.rename(checkpoint.with_name("step_00000009.safetensors"))
+    tab.run("globalThis.scene = viewer.scene")
+    tab.wait("viewer.scene !== scene")
+    assert state(tab, "time") == 1
+    assert tab.problems() == []

@@ -56,6 +56,11 @@ VERBS = {
         "hdr_nsff.rendering.render:RenderConfig",
         "Render views of a trained run: EXR, PNG, video; any path, time and exposure.",
     ),
+    "view": Verb(
+        "hdr_nsff.view:view",
+        "hdr_nsff.view:ViewConfig",
+        "Look around in a trained run, in the browser.",
+    ),
     "export": Verb(
         "hdr_nsff.rendering.export:export",
         "hdr_nsff.rendering.export:ExportConfig",

@@ -2,6 +2,7 @@
 
 import { CURVES } from "./curves.js";
 import { MODES } from "./cameras.js";
+import { SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
 import { VIEWS } from "./renderer.js";
 
 const NO_PARALLAX = {
@@ -13,6 +14,7 @@ const BANDS = [ // of false color: from stops, and its color, as in develop.frag
   ["+1", "#bfb899"], ["+2.5", "#fad933"], ["+4", "#f2801a"], ["+6", "#e61a1a"],
 ];
 const PLAY = "M7 4v16l13-8z", PAUSE = "M6 4h4v16H6zm8 0h4v16h-4z";
+const CURVE_IDS = CURVES.map((curve) => curve.id);
 const NOTE_SECONDS = 4;
 const WHEEL_STEP = 0.0006; // near distances per unit of scrolling
 const FLY_KEYS = ["w", "a", "s", "d", "q", "e"];
@@ -32,7 +34,16 @@ export function connectControls(player) {
   refresh();
 }
 
-/** A message that goes away; `link` is { href, text }. */
+/** Leave what frames of a server can show. */
+export function limitControls() {
+  for (const option of find("curve").options) {
+    option.disabled = !SERVER_CURVES.includes(option.value.split(" ")[0]);
+  }
+  for (const option of find("show").options) option.disabled = !SERVER_VIEWS.includes(option.value);
+  for (const id of ["clipping", "false-color", "save-8", "save-16"]) find(id).disabled = true;
+}
+
+/** A message that goes away after some seconds; 0: it stays. */
 export function note(text, seconds = NOTE_SECONDS) {
   const place = find("note");
   place.textContent = text;
@@ -173,8 +184,8 @@ function connectKeyboard(player) {
       Home: () => player.set({ time: player.first }),
       End: () => player.set({ time: player.last }),
       "?": () => find("help").showModal(),
-      v: () => player.set({ show: after(VIEWS, state.show) }),
-      c: () => player.set({ curve: after(CURVES.map((curve) => curve.id), state.curve) }),
+      v: () => player.set({ show: after(player.frames ? SERVER_VIEWS : VIEWS, state.show) }),
+      c: () => player.set({ curve: after(player.frames ? SERVER_CURVES : CURVE_IDS, state.curve) }),
       x: () => player.set({ split: !state.split }),
       r: () => player.resetCamera(),
       k: () => addView(player),

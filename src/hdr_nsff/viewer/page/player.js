@@ -2,12 +2,15 @@
 
 import { filmedCamera, interpolate, meanDown, moved, orbit, pointAhead, scaleK } from "./cameras.js";
 import { encodePng16 } from "./png.js";
+import { Renderer } from "./renderer.js";
 
 const STILL_VIEWS = 24; // of a camera path between two views at the same time
 const MAX_PIXEL_RATIO = 2; // picture pixels per CSS pixel
 const FLY_SPEED = 0.5; // near distances per second
 const RADIANS_PER_PICTURE = 2.0; // turn for a drag across the picture
 const MAX_EV = 8;
+const MEASURED_FRAMES = 20; // in a row, that tell the frame rate
+const SLOW_FRAMES_PER_SECOND = 10;
 
 export class Player {
   constructor(scene, canvas) {
@@ -107,6 +110,19 @@ export class Player {
     this.set({ mode: "filmed" });
   }
 
+  /** Show another state of the same scene: a run that is training. */
+  async replace(scene) {
+    this.scene = scene;
+    if (this.renderer) {
+      const old = this.renderer;
+      const renderer = new Renderer(old.gl, scene, ...old.sources);
+      await renderer.sort(this.view());
+      this.renderer = renderer;
+      old.dispose();
+    }
+    this.set({});
+  }
+
   /** Draw again. */
   touch() {
     this.dirty = true;
@@ -167,18 +183,27 @@ export class Player {
         this.dirty = true;
       });
     }
-    if (!this.dirty) return;
+    if (!this.dirty) {
+      this.frameTimes = []; // at rest, time says nothing about speed
+      return;
+    }
     this.dirty = false;
     const target = this.renderer.composite(view, "screen");
     this.renderer.develop(target, this.state);
     this.frameTimes.push(now);
-    while (this.frameTimes.length > 30) this.frameTimes.shift();
+    if (this.frameTimes.length > MEASURED_FRAMES) this.frameTimes.shift();
+    const count = this.frameTimes.length - 1;
+    if (count > 0) this.rate = (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]);
   }
 
-  /** Pictures drawn per second, over the last ones. */
+  /** Pictures drawn per second, when last they were drawn one after the other. */
   framesPerSecond() {
-    const count = this.frameTimes.length - 1;
-    return count > 0 ? (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]) : 0;
+    return this.rate ?? 0;
+  }
+
+  /** Whether this browser has just drawn too slowly to be of use. */
+  isSlow() {
+    return this.frameTimes.length === MEASURED_FRAMES && this.rate < SLOW_FRAMES_PER_SECOND;
   }
 
   /**

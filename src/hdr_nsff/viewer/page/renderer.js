@@ -7,7 +7,7 @@ export const VIEWS = ["radiance", "depth", "motion", "flow"];
 const FEATURES = { radiance: 0, depth: 1, motion: 1, flow: 2 };
 const TABLE_WIDTH = 2048; // texels in a row of every table, as in splat.vert
 const MAX_GROUPS = 4; // as in splat.vert
-const MAX_FLOW_SHARE = 0.05; // of the picture's width: flow shown in full color
+const MAX_FLOW_SHARE = 0.02; // of the picture's width: flow shown in full color
 
 /** A WebGL2 context that can blend half floats; throws a sentence where there is none. */
 export function openContext(canvas) {
@@ -28,6 +28,7 @@ export class Renderer {
   constructor(gl, scene, shaders, sorterSource) {
     this.gl = gl;
     this.scene = scene;
+    this.sources = [shaders, sorterSource];
     this.count = scene.groups.reduce((sum, group) => sum + group.count, 0);
     this.splat = new Program(gl, shaders["splat.vert"], shaders["splat.frag"]);
     this.screen = new Program(gl, shaders["picture.vert"], shaders["develop.frag"]);
@@ -44,6 +45,20 @@ export class Renderer {
     gl.bindVertexArray(null);
     this.sorter = new Sorter(scene, sorterSource);
     this.visible = 0;
+  }
+
+  /** Give back what the GPU holds. */
+  dispose() {
+    const { gl, tables } = this;
+    const textures = ["gaussians", "colorOffsets", "opacityOffsets", "mixture", "sh1"].map((name) => tables[name].texture);
+    for (const { texture } of this.responses) textures.push(texture);
+    for (const { texture, framebuffer } of this.targets.values()) {
+      textures.push(texture);
+      gl.deleteFramebuffer(framebuffer);
+    }
+    for (const texture of [...textures, this.poseTable]) gl.deleteTexture(texture ?? null);
+    gl.deleteBuffer(this.orderBuffer);
+    this.sorter.worker.terminate();
   }
 
   /** Sort for a view; resolves once its order is on the GPU. */
