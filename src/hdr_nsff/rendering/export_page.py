@@ -25,8 +25,7 @@ VIDEOS = {"training": "Video", "bullet": "Bullet time", "slowmo": "Slow motion"}
 
 def export_page(run: Run, path: Path) -> Path:
     """Write the run's scene to `path`, as a page or bare, by its ending; `path`."""
-    if path.exists() and not is_ours(path):
-        raise InputError(f"{path}: {NOT_OURS}; choose another name")
+    check_place(path)
     scene = run_scene(run)
     if not scene.groups:
         problem = "its field is not made of Gaussians, so no page can play it"
@@ -41,6 +40,12 @@ def export_page(run: Run, path: Path) -> Path:
     size = path.stat().st_size / 1e6
     say(f"{path}: {scene.count()} Gaussians over {len(scene.times)} times, {size:.1f} MB")
     return path
+
+
+def check_place(path: Path) -> None:
+    """InputError where writing a page to `path` would destroy something else."""
+    if path.exists() and not is_ours(path):
+        raise InputError(f"{path}: {NOT_OURS}; choose another name")
 
 
 def run_scene(run: Run) -> SceneFile:
