@@ -315,15 +315,19 @@ def test_the_picture_and_the_controls_fit_the_window(
 # With a server
 
 
-@pytest.fixture
-def address(toy: Scene, toy_folder: Path, tmp_path: Path) -> Iterator[str]:
-    save_run(toy, toy_folder, tmp_path / "run")
+@pytest.fixture(params=["splat"])
+def address(
+    request: pytest.FixtureRequest, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> Iterator[str]:
+    """Where a run of a preset is served."""
+    save_run(toy, toy_folder, tmp_path / "run", request.param)
     with ViewerServer(ServedRun(tmp_path / "run", "cpu")) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server.address
         server.shutdown()
 
 
+@pytest.mark.parametrize("address", ["splat", "grid"], indirect=True)
 def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: str) -> None:
     tab.goto(address, 500, 300)
     tab.wait("!document.getElementById('frame').hidden")

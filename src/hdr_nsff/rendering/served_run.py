@@ -14,6 +14,7 @@ import torch
 from hdr_nsff.core.checkpoints import checkpoint_files
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import colorize
+from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
@@ -40,8 +41,9 @@ class ServedRun:
 
     def open(self) -> None:
         """Open the newest checkpoint."""
-        self.opened = newest_checkpoint(self.folder)
+        newest = newest_checkpoint(self.folder)
         self.run = Run.open(self.folder, self.device)
+        self.opened = newest
         scene = run_scene(self.run)
         self.title, self.data = scene.title, to_bytes(scene)
 
@@ -56,7 +58,10 @@ class ServedRun:
     def version(self) -> str:
         with self.lock:
             if newest_checkpoint(self.folder) != self.opened:
-                self.open()
+                try:
+                    self.open()
+                except InputError as error:  # replaced while it was read: look again later
+                    say(f"{self.folder}: {error}")
             return self.opened
 
     def frame(self, request: FrameRequest) -> bytes:

@@ -109,9 +109,10 @@ function showVideos(videos) {
 function showStats(player) {
   const { renderer, frames, canvas } = player;
   const thousands = (count) => count.toLocaleString("en");
+  const rate = player.framesPerSecond();
   const lines = renderer
     ? [
-        `${player.framesPerSecond().toFixed(0)} frames/s at ${canvas.width} × ${canvas.height}`,
+        `${rate === null ? "At rest" : `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`}, ${canvas.width} × ${canvas.height}`,
         `${thousands(renderer.visible)} of ${thousands(renderer.count)} Gaussians`,
         `sorted in ${(renderer.sortMilliseconds ?? 0).toFixed(1)} ms`,
       ]

@@ -2,7 +2,7 @@
 
 import { filmedCamera, interpolate, meanDown, moved, orbit, pointAhead, scaleK } from "./cameras.js";
 import { encodePng16 } from "./png.js";
-import { Renderer } from "./renderer.js";
+import { BLUR, Renderer } from "./renderer.js";
 
 const STILL_VIEWS = 24; // of a camera path between two views at the same time
 const MAX_PIXEL_RATIO = 2; // picture pixels per CSS pixel
@@ -10,6 +10,7 @@ const FLY_SPEED = 0.5; // near distances per second
 const RADIANS_PER_PICTURE = 2.0; // turn for a drag across the picture
 const MAX_EV = 8;
 const MEASURED_FRAMES = 20; // in a row, that tell the frame rate
+const LEAST_FRAMES = 5;
 const SLOW_FRAMES_PER_SECOND = 10;
 
 export class Player {
@@ -77,7 +78,10 @@ export class Player {
     const { c2w, K } = this.camera();
     const { width, height } = this.canvas;
     const { time, show } = this.state;
-    return { time, c2w, K: scaleK(K, width / this.scene.width), width, height, show };
+    const scale = width / this.scene.width;
+    // pixels of the clip's size, as in training: sharper ones would show needles
+    const blur = BLUR * Math.max(scale * scale, 1);
+    return { time, c2w, K: scaleK(K, scale), width, height, show, blur };
   }
 
   /** Turn by a drag, in shares of the picture's width. */
@@ -193,12 +197,12 @@ export class Player {
     this.frameTimes.push(now);
     if (this.frameTimes.length > MEASURED_FRAMES) this.frameTimes.shift();
     const count = this.frameTimes.length - 1;
-    if (count > 0) this.rate = (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]);
+    if (count >= LEAST_FRAMES) this.rate = (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]);
   }
 
-  /** Pictures drawn per second, when last they were drawn one after the other. */
+  /** Pictures drawn per second, when last they were drawn one after the other; or null. */
   framesPerSecond() {
-    return this.rate ?? 0;
+    return this.rate ?? null;
   }
 
   /** Whether this browser has just drawn too slowly to be of use. */

@@ -7,6 +7,7 @@ export const VIEWS = ["radiance", "depth", "motion", "flow"];
 const FEATURES = { radiance: 0, depth: 1, motion: 1, flow: 2 };
 const TABLE_WIDTH = 2048; // texels in a row of every table, as in splat.vert
 const MAX_GROUPS = 4; // as in splat.vert
+export const BLUR = 0.3; // pixels^2 added to 2D variances, as `render` does
 const MAX_FLOW_SHARE = 0.02; // of the picture's width: flow shown in full color
 
 /** A WebGL2 context that can blend half floats; throws a sentence where there is none. */
@@ -140,7 +141,7 @@ export class Renderer {
     splat.texture("u_poses", 5, { kind: gl.TEXTURE_2D, texture: this.poseTable });
   }
 
-  setCamera({ c2w, K, width, height }) {
+  setCamera({ c2w, K, width, height, blur = BLUR }) {
     const { splat } = this;
     const center = c2w.map((row) => row[3]);
     // columns of world to camera are rows of camera to world
@@ -151,6 +152,7 @@ export class Renderer {
     splat.set("u_eye", center);
     splat.set("u_camera", [K[0][0], K[1][1], K[0][2], K[1][2]]);
     splat.set("u_size", [width, height]);
+    splat.set("u_blur", blur);
   }
 
   /** Show a composited picture on the canvas, or in the picture `into`. */

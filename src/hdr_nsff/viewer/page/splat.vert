@@ -9,7 +9,6 @@ precision highp sampler2DArray;
 const int MAX_GROUPS = 4;
 const int WIDTH = 2048; // texels in a row of every table
 const float NEAREST = 0.01; // z-depth, scene units
-const float BLUR = 0.3; // pixels^2 added to 2D variances
 const float MARGIN = 0.3; // of half the picture: beyond, the projection is linearized at its edge
 const float MAX_LOG_RADIANCE = 16.0;
 const float MAX_VIEW_LOG_FACTOR = 2.0;
@@ -41,6 +40,7 @@ uniform vec3 u_translation;
 uniform vec3 u_eye;
 uniform vec4 u_camera; // fx, fy, cx, cy in pixels
 uniform vec2 u_size; // pixels
+uniform float u_blur; // pixels^2 added to 2D variances
 uniform int u_feature;
 
 flat out vec4 v_feature; // and opacity
@@ -161,10 +161,10 @@ void main() {
   mat3 spread = u_rotation * rotation(quaternion);
   vec3 scale = exp(scaleGroup.xyz);
   vec3 vx = (rowX * spread) * scale, vy = (rowY * spread) * scale;
-  float xx = dot(vx, vx) + BLUR, xy = dot(vx, vy), yy = dot(vy, vy) + BLUR;
-  // (xx - BLUR)(yy - BLUR) - xy^2 is |vx x vy|^2: exact for needles as well
+  float xx = dot(vx, vx) + u_blur, xy = dot(vx, vy), yy = dot(vy, vy) + u_blur;
+  // (xx - u_blur)(yy - u_blur) - xy^2 is |vx x vy|^2: exact for needles as well
   vec3 area = cross(vx, vy);
-  float det = dot(area, area) + BLUR * (xx + yy) - BLUR * BLUR;
+  float det = dot(area, area) + u_blur * (xx + yy) - u_blur * u_blur;
   if (!(det > 0.0)) return;
   float across = sqrt(0.5 * xx / det);
   v_conic = vec3(sqrt(0.5 / xx), -xy / xx * across, across);
