@@ -20,7 +20,7 @@ from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.rendering.export_page import find_videos, run_scene
 from hdr_nsff.rendering.shot_views import check_views
-from hdr_nsff.rendering.shots import Still, render_still
+from hdr_nsff.rendering.shots import Still, develop_view, render_still
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import jpeg
 from hdr_nsff.viewer.page_file import PageSettings, make_page
@@ -69,7 +69,7 @@ class ServedRun:
             view = self.view_of(request)
             check_views(self.run, "frame", [view])
             still = render_still(self.run, view, "direct", motion=False)
-            return jpeg(self.picture(request, still))
+            return jpeg(self.picture(request, view, still))
 
     def view_of(self, request: FrameRequest) -> PathView:
         """The view that a request asks for."""
@@ -78,7 +78,7 @@ class ServedRun:
         c2w = torch.from_numpy(request.c2w).to(like.c2w)
         return PathView(Camera(K, c2w, request.width, request.height), request.time)
 
-    def picture(self, request: FrameRequest, still: Still) -> np.ndarray:
+    def picture(self, request: FrameRequest, view: PathView, still: Still) -> np.ndarray:
         """What a request shows of a rendered view: rgb (H, W, 3) in [0, 1]."""
         near, far = self.run.scene.near, self.run.scene.far
         match request.show:
@@ -88,20 +88,20 @@ class ServedRun:
             case "motion":
                 share = still.motion[..., None].clip(0, 1)
                 return STILL_COLOR + share * (np.array(MOTION_COLOR) - STILL_COLOR)
-        return self.develop(request, still.radiance)
+        return self.develop(request, view, still.radiance)
 
-    def develop(self, request: FrameRequest, radiance: np.ndarray) -> np.ndarray:
-        """Radiance (H, W, 3) through the curve of a request."""
-        tonemapper, exposure = self.run.tonemapper, 2.0**request.ev
-        if not 0 <= request.camera_id < tonemapper.num_cameras:
-            raise InputError(f"frame: camera {request.camera_id} is not known")
-        if request.curve == "camera":
-            values = torch.from_numpy(radiance).to(tonemapper.knots)
-            return tonemapper.develop(values, request.ev, request.camera_id).cpu().numpy()
-        neutral = tonemapper.neutral(request.camera_id).detach().cpu().numpy()
-        if request.curve == "clip":
-            return color.srgb_encode(radiance * neutral * exposure)
-        return color.display(radiance * neutral, exposure)
+    def develop(self, request: FrameRequest, view: PathView, radiance: np.ndarray) -> np.ndarray:
+        """Radiance (H, W, 3) of a view through the curve of a request."""
+        camera_id, exposure = request.camera_id, 2.0**request.ev
+        if not 0 <= camera_id < self.run.tonemapper.num_cameras:
+            raise InputError(f"frame: camera {camera_id} is not known")
+        match request.curve:
+            case "camera":
+                return develop_view(self.run, view, radiance, request.ev, camera_id, 1.0)
+            case "clip":
+                neutral = self.run.tonemapper.neutral(camera_id).detach().cpu().numpy()
+                return color.srgb_encode(radiance * neutral * exposure)
+        return develop_view(self.run, view, radiance, None, camera_id, exposure)
 
 
 def newest_checkpoint(folder: Path) -> str:

@@ -9,7 +9,8 @@ export function filmedCamera(views, time) {
   let after = own.findIndex((view) => view.time >= time);
   if (after < 0) after = own.length - 1;
   const before = Math.max(after - 1, 0);
-  const a = own[before], b = own[after];
+  const a = own[before],
+    b = own[after];
   const share = b.time > a.time ? Math.min(Math.max((time - a.time) / (b.time - a.time), 0), 1) : 1;
   return interpolate(a, b, share);
 }
@@ -28,12 +29,23 @@ export function orbit(c2w, pivot, down, yaw, pitch) {
   const turn = multiply(axisAngle(down, yaw), axisAngle(right, pitch));
   const arm = c2w.map((row, i) => row[3] - pivot[i]);
   const center = apply(turn, arm).map((value, i) => value + pivot[i]);
-  return poseOf(multiply(turn, c2w.map((row) => row.slice(0, 3))), center);
+  return poseOf(
+    multiply(
+      turn,
+      c2w.map((row) => row.slice(0, 3)),
+    ),
+    center,
+  );
 }
 
 /** A pose moved along its own axes: right, down, forward in scene units. */
 export function moved(c2w, offset) {
-  return c2w.map((row) => [row[0], row[1], row[2], row[3] + row[0] * offset[0] + row[1] * offset[1] + row[2] * offset[2]]);
+  return c2w.map((row) => [
+    row[0],
+    row[1],
+    row[2],
+    row[3] + row[0] * offset[0] + row[1] * offset[1] + row[2] * offset[2],
+  ]);
 }
 
 /** The point `depth` in front of a pose. */
@@ -62,7 +74,9 @@ function apply(matrix, vector) {
 }
 
 function multiply(a, b) {
-  return a.map((row) => [0, 1, 2].map((k) => row[0] * b[0][k] + row[1] * b[1][k] + row[2] * b[2][k]));
+  return a.map((row) =>
+    [0, 1, 2].map((k) => row[0] * b[0][k] + row[1] * b[1][k] + row[2] * b[2][k]),
+  );
 }
 
 function axisAngle([x, y, z], angle) {
@@ -85,9 +99,16 @@ function quaternionOf(m) {
   const largest = diagonal.indexOf(Math.max(...diagonal));
   if (largest === 0) {
     const w = Math.sqrt(1 + trace) / 2;
-    return [w, (m[2][1] - m[1][2]) / (4 * w), (m[0][2] - m[2][0]) / (4 * w), (m[1][0] - m[0][1]) / (4 * w)];
+    return [
+      w,
+      (m[2][1] - m[1][2]) / (4 * w),
+      (m[0][2] - m[2][0]) / (4 * w),
+      (m[1][0] - m[0][1]) / (4 * w),
+    ];
   }
-  const i = largest - 1, j = (i + 1) % 3, k = (i + 2) % 3;
+  const i = largest - 1,
+    j = (i + 1) % 3,
+    k = (i + 2) % 3;
   const q = [0, 0, 0, 0];
   const length = Math.sqrt(1 + m[i][i] - m[j][j] - m[k][k]) / 2;
   q[0] = (m[k][j] - m[j][k]) / (4 * length);
@@ -104,6 +125,8 @@ function slerp(a, b, share) {
   cosine = Math.min(Math.abs(cosine), 1);
   const angle = Math.acos(cosine);
   if (angle < 1e-6) return a;
-  const [from, to] = [Math.sin((1 - share) * angle), Math.sin(share * angle)].map((value) => value / Math.sin(angle));
+  const [from, to] = [Math.sin((1 - share) * angle), Math.sin(share * angle)].map(
+    (value) => value / Math.sin(angle),
+  );
   return a.map((value, i) => from * value + to * end[i]);
 }

@@ -6,14 +6,27 @@ import { SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
 import { VIEWS } from "./renderer.js";
 
 const NO_PARALLAX = {
-  rotation: "The camera of this clip only turned. Without parallax there is no depth, so the view stays where it was filmed.",
-  none: "The camera of this clip stood still. Without parallax there is no depth, so the view stays where it was filmed.",
+  rotation:
+    "The camera of this clip only turned. " +
+    "Without parallax there is no depth, so the view stays where it was filmed.",
+  none:
+    "The camera of this clip stood still. " +
+    "Without parallax there is no depth, so the view stays where it was filmed.",
 };
-const BANDS = [ // of false color: from stops, and its color, as in develop.frag
-  ["−8", "#29004d"], ["−6", "#1a40bf"], ["−4", "#1a99cc"], ["−2", "#597366"], ["0", "#59bf4d"],
-  ["+1", "#bfb899"], ["+2.5", "#fad933"], ["+4", "#f2801a"], ["+6", "#e61a1a"],
+const BANDS = [
+  // of false color: from stops, and its color, as in develop.frag
+  ["−8", "#29004d"],
+  ["−6", "#1a40bf"],
+  ["−4", "#1a99cc"],
+  ["−2", "#597366"],
+  ["0", "#59bf4d"],
+  ["+1", "#bfb899"],
+  ["+2.5", "#fad933"],
+  ["+4", "#f2801a"],
+  ["+6", "#e61a1a"],
 ];
-const PLAY = "M7 4v16l13-8z", PAUSE = "M6 4h4v16H6zm8 0h4v16h-4z";
+const PLAY = "M7 4v16l13-8z",
+  PAUSE = "M6 4h4v16H6zm8 0h4v16h-4z";
 const CURVE_IDS = CURVES.map((curve) => curve.id);
 const NOTE_SECONDS = 4;
 const WHEEL_STEP = 0.0006; // near distances per unit of scrolling
@@ -61,9 +74,14 @@ function fillChoices(player) {
   const many = scene.responses.length > 1;
   for (const { id, label } of CURVES) {
     if (id !== "camera" || !many) find("curve").add(new Option(label, `${id} 0`));
-    else scene.responses.forEach((_, k) => find("curve").add(new Option(`${label} ${k}`, `camera ${k}`)));
+    else
+      scene.responses.forEach((_, k) =>
+        find("curve").add(new Option(`${label} ${k}`, `camera ${k}`)),
+      );
   }
-  const exposures = [...new Set(scene.exposures.map((ev) => Math.round(10 * ev) / 10))].sort((a, b) => a - b);
+  const exposures = [...new Set(scene.exposures.map((ev) => Math.round(10 * ev) / 10))].sort(
+    (a, b) => a - b,
+  );
   for (const ev of exposures) {
     const button = document.createElement("button");
     button.type = "button";
@@ -79,7 +97,8 @@ function fillChoices(player) {
     find("legend").append(band);
   }
   if (!player.free) {
-    for (const mode of ["orbit", "fly"]) document.querySelector(`[data-mode="${mode}"]`).disabled = true;
+    for (const mode of ["orbit", "fly"])
+      document.querySelector(`[data-mode="${mode}"]`).disabled = true;
     find("camera-note").textContent = NO_PARALLAX[scene.parallax] ?? NO_PARALLAX.none;
     find("camera-note").hidden = false;
   }
@@ -97,7 +116,8 @@ function connectInputs(player) {
   find("false-color").onchange = (event) => player.set({ falseColor: event.target.checked });
   find("show").onchange = (event) => player.set({ show: event.target.value });
   find("split").onchange = (event) => player.set({ split: event.target.checked });
-  find("modes").onclick = ({ target }) => target.dataset.mode && player.set({ mode: target.dataset.mode });
+  find("modes").onclick = ({ target }) =>
+    target.dataset.mode && player.set({ mode: target.dataset.mode });
   find("add-view").onclick = () => addView(player);
   find("clear-views").onclick = () => player.clearKeys();
   find("copy-path").onclick = () => copyPath(player);
@@ -141,10 +161,14 @@ function connectPointer(player) {
     else player.turn(x, y);
   };
   canvas.onpointerup = canvas.onpointercancel = (event) => fingers.delete(event.pointerId);
-  canvas.addEventListener("wheel", (event) => {
-    event.preventDefault();
-    player.move([0, 0, -WHEEL_STEP * event.deltaY]);
-  }, { passive: false });
+  canvas.addEventListener(
+    "wheel",
+    (event) => {
+      event.preventDefault();
+      player.move([0, 0, -WHEEL_STEP * event.deltaY]);
+    },
+    { passive: false },
+  );
 }
 
 function fingerSpread(fingers) {
@@ -209,7 +233,8 @@ function connectKeyboard(player) {
 /** Whether an element does something with a key itself. */
 function usesKey(element, key) {
   if (element.matches("select")) return true;
-  if (element.matches('input[type="range"]')) return key.startsWith("Arrow") || key === "Home" || key === "End";
+  if (element.matches('input[type="range"]'))
+    return key.startsWith("Arrow") || key === "Home" || key === "End";
   return key === " " && element.matches("button, a, input");
 }
 
@@ -220,7 +245,11 @@ function after(list, value) {
 function addView(player) {
   player.addKey();
   const count = player.keys.length;
-  note(count === 1 ? "One view in the camera path. Add another." : `${count} views in the camera path.`);
+  note(
+    count === 1
+      ? "One view in the camera path. Add another."
+      : `${count} views in the camera path.`,
+  );
 }
 
 async function copyPath(player) {
@@ -264,9 +293,12 @@ function show(player) {
   find("legend").hidden = !state.falseColor;
   find("show").value = state.show;
   find("split").checked = state.split;
-  for (const button of find("modes").children) button.ariaPressed = String(button.dataset.mode === state.mode);
+  for (const button of find("modes").children)
+    button.ariaPressed = String(button.dataset.mode === state.mode);
   find("clear-views").hidden = !player.keys.length;
-  find("add-view").textContent = player.keys.length ? `Add view (${player.keys.length})` : "Add view";
+  find("add-view").textContent = player.keys.length
+    ? `Add view (${player.keys.length})`
+    : "Add view";
   find("time").value = state.time;
   find("time-value").textContent = `${state.time.toFixed(1)} / ${player.last}`;
   find("play").ariaLabel = state.playing ? "Pause" : "Play";
@@ -280,11 +312,15 @@ function show(player) {
 
 function showSplit(player, scene, state) {
   const on = state.split && scene.recorded?.length > 0;
-  for (const id of ["recorded", "divider", "recorded-label", "rendered-label"]) find(id).hidden = !on;
+  for (const id of ["recorded", "divider", "recorded-label", "rendered-label"])
+    find(id).hidden = !on;
   if (!on) return;
   const nearest = scene.views.reduce((best, view) =>
-    Math.abs(view.time - state.time) < Math.abs(best.time - state.time) ? view : best);
-  nearest.address ??= URL.createObjectURL(new Blob([scene.recorded.subarray(...nearest.picture)], { type: "image/jpeg" }));
+    Math.abs(view.time - state.time) < Math.abs(best.time - state.time) ? view : best,
+  );
+  nearest.address ??= URL.createObjectURL(
+    new Blob([scene.recorded.subarray(...nearest.picture)], { type: "image/jpeg" }),
+  );
   if (find("recorded").src !== nearest.address) find("recorded").src = nearest.address;
   const percent = 100 * state.splitAt;
   find("recorded").style.clipPath = `inset(0 ${100 - percent}% 0 0)`;

@@ -18,7 +18,8 @@ export function curveTable({ x, y }) {
     const exposed = (i / (SIZE - 1)) ** GAMMA;
     while (right < x.length - 1 && x[right] < exposed) right++;
     const share = Math.min(Math.max((exposed - x[right - 1]) / (x[right] - x[right - 1]), 0), 1);
-    for (let c = 0; c < 3; c++) table[4 * i + c] = y[c][right - 1] + share * (y[c][right] - y[c][right - 1]);
+    for (let c = 0; c < 3; c++)
+      table[4 * i + c] = y[c][right - 1] + share * (y[c][right] - y[c][right - 1]);
   }
   return table;
 }

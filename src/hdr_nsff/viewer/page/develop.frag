@@ -17,7 +17,6 @@ uniform vec3 u_gain; // exposure times white balance
 uniform bool u_clipping, u_falseColor;
 uniform vec2 u_depthRange; // near, far
 uniform float u_maxFlow; // pixels
-uniform float u_fade; // of the picture under a view of motion
 
 in vec2 v_position;
 out vec4 color;
@@ -28,7 +27,8 @@ float luminance(vec3 rgb) {
 
 vec3 encode(vec3 linear) { // sRGB
   vec3 x = clamp(linear, 0.0, 1.0);
-  return mix(1.055 * pow(max(x, 0.0031308), vec3(1.0 / 2.4)) - 0.055, 12.92 * x, vec3(lessThanEqual(x, vec3(0.0031308))));
+  vec3 power = 1.055 * pow(max(x, 0.0031308), vec3(1.0 / 2.4)) - 0.055;
+  return mix(power, 12.92 * x, vec3(lessThanEqual(x, vec3(0.0031308))));
 }
 
 float response(float exposed, int channel) {
@@ -42,8 +42,14 @@ float response(float exposed, int channel) {
 // AgX by Troy Sobotka, in the polynomial form of Benjamin Wrensch with the Rec. 2020
 // matrices of Filament and three.js.
 vec3 agx(vec3 rgb) {
-  const mat3 TO_REC2020 = mat3(0.6274, 0.0691, 0.0164, 0.3293, 0.9195, 0.0880, 0.0433, 0.0113, 0.8956);
-  const mat3 FROM_REC2020 = mat3(1.6605, -0.1246, -0.0182, -0.5876, 1.1329, -0.1006, -0.0728, -0.0083, 1.1187);
+  const mat3 TO_REC2020 = mat3(
+    0.6274, 0.0691, 0.0164,
+    0.3293, 0.9195, 0.0880,
+    0.0433, 0.0113, 0.8956);
+  const mat3 FROM_REC2020 = mat3(
+    1.6605, -0.1246, -0.0182,
+    -0.5876, 1.1329, -0.1006,
+    -0.0728, -0.0083, 1.1187);
   const mat3 INSET = mat3(
     0.856627153315983, 0.137318972929847, 0.11189821299995,
     0.0951212405381588, 0.761241990602591, 0.0767994186031903,
@@ -56,7 +62,8 @@ vec3 agx(vec3 rgb) {
   vec3 x = INSET * (TO_REC2020 * max(rgb, 0.0));
   x = clamp((log2(max(x, 1e-10)) - MIN_EV) / (MAX_EV - MIN_EV), 0.0, 1.0);
   vec3 x2 = x * x, x4 = x2 * x2;
-  x = 15.5 * x4 * x2 - 40.14 * x4 * x + 31.96 * x4 - 6.868 * x2 * x + 0.4298 * x2 + 0.1191 * x - 0.00232;
+  x = 15.5 * x4 * x2 - 40.14 * x4 * x + 31.96 * x4 - 6.868 * x2 * x + 0.4298 * x2 + 0.1191 * x
+    - 0.00232;
   return clamp(FROM_REC2020 * pow(max(OUTSET * x, 0.0), vec3(2.2)), 0.0, 1.0);
 }
 
@@ -84,7 +91,8 @@ vec3 reinhard(vec3 rgb) {
 
 vec3 develop(vec3 exposed) {
   switch (u_curve) {
-    case CAMERA: return vec3(response(exposed.r, 0), response(exposed.g, 1), response(exposed.b, 2));
+    case CAMERA:
+      return vec3(response(exposed.r, 0), response(exposed.g, 1), response(exposed.b, 2));
     case AGX: return encode(agx(exposed));
     case PBR_NEUTRAL: return encode(pbrNeutral(exposed));
     case REINHARD: return encode(reinhard(exposed));
@@ -111,10 +119,13 @@ vec3 turbo(float x) {
   x = clamp(x, 0.0, 1.0);
   vec4 v = vec4(1.0, x, x * x, x * x * x);
   vec2 w = v.zw * v.z;
-  return clamp(vec3(
-    dot(v, vec4(0.13572138, 4.61539260, -42.66032258, 132.13108234)) + dot(w, vec2(-152.94239396, 59.28637943)),
-    dot(v, vec4(0.09140261, 2.19418839, 4.84296658, -14.18503333)) + dot(w, vec2(4.27729857, 2.82956604)),
-    dot(v, vec4(0.10667330, 12.64194608, -60.58204836, 110.36276771)) + dot(w, vec2(-89.90310912, 27.34824973))), 0.0, 1.0);
+  float red = dot(v, vec4(0.13572138, 4.61539260, -42.66032258, 132.13108234));
+  float green = dot(v, vec4(0.09140261, 2.19418839, 4.84296658, -14.18503333));
+  float blue = dot(v, vec4(0.10667330, 12.64194608, -60.58204836, 110.36276771));
+  red += dot(w, vec2(-152.94239396, 59.28637943));
+  green += dot(w, vec2(4.27729857, 2.82956604));
+  blue += dot(w, vec2(-89.90310912, 27.34824973));
+  return clamp(vec3(red, green, blue), 0.0, 1.0);
 }
 
 vec3 flowColor(vec2 flow) {
@@ -128,8 +139,9 @@ void main() {
   vec4 maps = texelFetch(u_maps, min(ivec2(v_position * vec2(size)), size - 1), 0);
   color.a = 1.0;
   if (u_view == VIEW_DEPTH) {
-    float depth = maps.a > 0.001 ? clamp(maps.r / maps.a, u_depthRange.x, u_depthRange.y) : u_depthRange.y;
-    color.rgb = turbo((1.0 / depth - 1.0 / u_depthRange.y) / (1.0 / u_depthRange.x - 1.0 / u_depthRange.y));
+    float near = u_depthRange.x, far = u_depthRange.y;
+    float depth = maps.a > 0.001 ? clamp(maps.r / maps.a, near, far) : far;
+    color.rgb = turbo((1.0 / depth - 1.0 / far) / (1.0 / near - 1.0 / far));
     return;
   }
   if (u_view == VIEW_MOTION) {

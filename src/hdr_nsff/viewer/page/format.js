@@ -2,8 +2,18 @@
 
 const KEY = "hdr4d";
 const ARRAYS = [
-  "means", "quaternions", "log_scales", "opacity_logits", "log_radiance", "color_offsets",
-  "opacity_offsets", "mixture", "velocities", "centers", "log_durations", "sh1",
+  "means",
+  "quaternions",
+  "log_scales",
+  "opacity_logits",
+  "log_radiance",
+  "color_offsets",
+  "opacity_offsets",
+  "mixture",
+  "velocities",
+  "centers",
+  "log_durations",
+  "sh1",
 ];
 
 /** The bytes of a base64 text that holds a gzip file. */
@@ -39,7 +49,9 @@ export function readScene(buffer) {
       shifts: read("bases.shifts").data,
     };
   }
-  scene.recorded = header.recorded ? new Uint8Array(buffer, 8 + length + header.recorded.data_offsets[0]) : null;
+  scene.recorded = header.recorded
+    ? new Uint8Array(buffer, 8 + length + header.recorded.data_offsets[0])
+    : null;
   return scene;
 }
 

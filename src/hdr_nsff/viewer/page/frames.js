@@ -46,7 +46,12 @@ export class Frames {
   async show(wanted, scale) {
     const width = Math.max(Math.round(wanted.width * scale), 1);
     const height = Math.max(Math.round(wanted.height * scale), 1);
-    const body = JSON.stringify({ ...wanted, K: scaleK(wanted.K, width / wanted.width), width, height });
+    const body = JSON.stringify({
+      ...wanted,
+      K: scaleK(wanted.K, width / wanted.width),
+      width,
+      height,
+    });
     const start = performance.now();
     try {
       const response = await fetch("frame", { method: "POST", body });

@@ -54,6 +54,9 @@ function draw(player, settings) {
     const software = SOFTWARE.test(player.driver);
     if (software && settings.server && !gpuWanted) return showFrames(player);
     player.renderer = new Renderer(gl, player.scene, shaderSources(), held(WORKER));
+    player.canvas.addEventListener("webglcontextlost", () =>
+      note("The graphics driver was reset. Reload the page.", 0),
+    );
     if (!software) return;
     const videos = settings.videos.length ? " The videos below the settings play smoothly." : "";
     note(`This browser draws without a GPU, so playback is slow.${videos}`, 8);
@@ -110,13 +113,17 @@ function showStats(player) {
   const { renderer, frames, canvas } = player;
   const thousands = (count) => count.toLocaleString("en");
   const rate = player.framesPerSecond();
+  const speed = rate === null ? "At rest" : `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`;
   const lines = renderer
     ? [
-        `${rate === null ? "At rest" : `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`}, ${canvas.width} × ${canvas.height}`,
+        `${speed}, ${canvas.width} × ${canvas.height}`,
         `${thousands(renderer.visible)} of ${thousands(renderer.count)} Gaussians`,
         `sorted in ${(renderer.sortMilliseconds ?? 0).toFixed(1)} ms`,
       ]
-    : [`${thousands(frames.shown)} frames from the server`, `${thousands(Math.round(frames.rate))} pixels/s`];
+    : [
+        `${thousands(frames.shown)} frames from the server`,
+        `${thousands(Math.round(frames.rate))} pixels/s`,
+      ];
   find("stats").textContent = [...lines, player.driver ?? ""].join("\n");
 }
 

@@ -36,16 +36,27 @@ export function catmullRom(count, position) {
     end += 2 * after;
     after = 0;
   }
-  const rows = [[low - 1, before], [low, start], [low + 1, end], [low + 2, after]];
+  const rows = [
+    [low - 1, before],
+    [low, start],
+    [low + 1, end],
+    [low + 2, after],
+  ];
   return rows.filter(([row]) => row >= 0 && row <= last);
 }
 
 /** The rotation matrix, row by row, of a unit quaternion w x y z. */
 export function rotationMatrix([w, x, y, z]) {
   return [
-    1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-    2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-    2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    1 - 2 * (y * y + z * z),
+    2 * (x * y - w * z),
+    2 * (x * z + w * y),
+    2 * (x * y + w * z),
+    1 - 2 * (x * x + z * z),
+    2 * (y * z - w * x),
+    2 * (x * z - w * y),
+    2 * (y * z + w * x),
+    1 - 2 * (x * x + y * y),
   ];
 }
 

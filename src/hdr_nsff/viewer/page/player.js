@@ -1,6 +1,14 @@
 // The state of the viewer, and the loop that draws it.
 
-import { filmedCamera, interpolate, meanDown, moved, orbit, pointAhead, scaleK } from "./cameras.js";
+import {
+  filmedCamera,
+  interpolate,
+  meanDown,
+  moved,
+  orbit,
+  pointAhead,
+  scaleK,
+} from "./cameras.js";
 import { encodePng16 } from "./png.js";
 import { BLUR, Renderer } from "./renderer.js";
 
@@ -56,8 +64,12 @@ export class Player {
     if ("time" in change) change.time = clamp(change.time, this.first, this.last);
     if ("ev" in change) change.ev = clamp(change.ev, -MAX_EV, MAX_EV);
     if (change.mode && !this.free && change.mode !== "filmed") change.mode = "fixed";
-    if (change.mode && change.mode !== "filmed" && this.state.mode === "filmed") this.pose = this.camera();
-    if (change.split || (this.state.split && !("split" in change) && change.mode && change.mode !== "filmed")) {
+    if (change.mode && change.mode !== "filmed" && this.state.mode === "filmed")
+      this.pose = this.camera();
+    if (
+      change.split ||
+      (this.state.split && !("split" in change) && change.mode && change.mode !== "filmed")
+    ) {
       // a recorded frame is compared from where it was filmed
       if (change.split) change.mode = "filmed";
       else change.split = false;
@@ -103,7 +115,8 @@ export class Player {
     if (this.state.mode !== "orbit" && this.state.mode !== "fly") this.set({ mode: "orbit" });
     const scaled = offset.map((value) => value * this.scene.near);
     this.pose = { ...this.pose, c2w: moved(this.pose.c2w, scaled) };
-    if (this.state.mode === "orbit") this.focus = Math.max(this.focus - scaled[2], 0.05 * this.scene.near);
+    if (this.state.mode === "orbit")
+      this.focus = Math.max(this.focus - scaled[2], 0.05 * this.scene.near);
     this.touch();
   }
 
@@ -197,7 +210,8 @@ export class Player {
     this.frameTimes.push(now);
     if (this.frameTimes.length > MEASURED_FRAMES) this.frameTimes.shift();
     const count = this.frameTimes.length - 1;
-    if (count >= LEAST_FRAMES) this.rate = (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]);
+    if (count >= LEAST_FRAMES)
+      this.rate = (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]);
   }
 
   /** Pictures drawn per second, when last they were drawn one after the other; or null. */
@@ -233,8 +247,8 @@ export class Player {
       this.renderer.develop(maps, this.state);
       return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
     }
-    const { RGBA32F } = this.renderer.gl;
-    const picture = this.renderer.target("png", view.width, view.height, RGBA32F);
+    const format = this.renderer.deepFormat();
+    const picture = this.renderer.target("png", view.width, view.height, format);
     this.renderer.develop(maps, this.state, picture);
     return encodePng16(this.renderer.read(picture), view.width, view.height);
   }
@@ -262,7 +276,12 @@ export class Player {
       ...(mode === "filmed" ? filmedCamera(this.scene.views, time) : this.pose),
     }));
     const exposed = curve === "camera" ? { ev } : {}; // others have no learned camera
-    return views.map(({ time, c2w, K }) => ({ time: round(time), c2w: rounded(c2w), K: rounded(K), ...exposed }));
+    return views.map(({ time, c2w, K }) => ({
+      time: round(time),
+      c2w: rounded(c2w),
+      K: rounded(K),
+      ...exposed,
+    }));
   }
 }
 

@@ -1,20 +1,26 @@
 // Draws a scene with WebGL2: Gaussians to linear maps in half floats, maps to the screen.
 
-import { POSE_FLOATS, knotOf, posesAt } from "./motion.js";
+import { knotOf, posesAt } from "./motion.js";
 import { CURVES, curveTable } from "./curves.js";
+import { Program } from "./program.js";
+import { makeTable, makeTables, setNearest } from "./tables.js";
 
 export const VIEWS = ["radiance", "depth", "motion", "flow"];
 const FEATURES = { radiance: 0, depth: 1, motion: 1, flow: 2 };
-const TABLE_WIDTH = 2048; // texels in a row of every table, as in splat.vert
-const MAX_GROUPS = 4; // as in splat.vert
 export const BLUR = 0.3; // pixels^2 added to 2D variances, as `render` does
 const MAX_FLOW_SHARE = 0.02; // of the picture's width: flow shown in full color
 
 /** A WebGL2 context that can blend half floats; throws a sentence where there is none. */
 export function openContext(canvas) {
-  const gl = canvas.getContext("webgl2", { alpha: false, antialias: false, powerPreference: "high-performance" });
+  const gl = canvas.getContext("webgl2", {
+    alpha: false,
+    antialias: false,
+    powerPreference: "high-performance",
+  });
   if (!gl) throw new Error("This browser offers no WebGL 2.");
-  if (!gl.getExtension("EXT_color_buffer_float")) throw new Error("This graphics driver cannot draw to half floats.");
+  const halves =
+    gl.getExtension("EXT_color_buffer_float") ?? gl.getExtension("EXT_color_buffer_half_float");
+  if (!halves) throw new Error("This graphics driver cannot draw to half floats.");
   return gl;
 }
 
@@ -34,7 +40,9 @@ export class Renderer {
     this.splat = new Program(gl, shaders["splat.vert"], shaders["splat.frag"]);
     this.screen = new Program(gl, shaders["picture.vert"], shaders["develop.frag"]);
     this.tables = makeTables(gl, scene);
-    this.responses = scene.responses.map((entry) => makeTable(gl, gl.RGBA32F, 4, curveTable(entry), 1024));
+    this.responses = scene.responses.map((entry) =>
+      makeTable(gl, gl.RGBA32F, 4, curveTable(entry), 1024),
+    );
     this.targets = new Map(); // offscreen pictures by name
     this.orderBuffer = gl.createBuffer();
     this.vertices = gl.createVertexArray();
@@ -51,7 +59,9 @@ export class Renderer {
   /** Give back what the GPU holds. */
   dispose() {
     const { gl, tables } = this;
-    const textures = ["gaussians", "colorOffsets", "opacityOffsets", "mixture", "sh1"].map((name) => tables[name].texture);
+    const textures = ["gaussians", "colorOffsets", "opacityOffsets", "mixture", "sh1"].map(
+      (name) => tables[name].texture,
+    );
     for (const { texture } of this.responses) textures.push(texture);
     for (const { texture, framebuffer } of this.targets.values()) {
       textures.push(texture);
@@ -64,7 +74,11 @@ export class Renderer {
 
   /** Sort for a view; resolves once its order is on the GPU. */
   async sort(view) {
-    const { order, milliseconds } = await this.sorter.sort(view.time, this.poses(view.time), depthRow(view.c2w));
+    const { order, milliseconds } = await this.sorter.sort(
+      view.time,
+      this.poses(view.time),
+      depthRow(view.c2w),
+    );
     const { gl } = this;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
@@ -146,7 +160,9 @@ export class Renderer {
     const center = c2w.map((row) => row[3]);
     // columns of world to camera are rows of camera to world
     const rotation = c2w.flatMap((row) => row.slice(0, 3));
-    const translation = [0, 1, 2].map((i) => -c2w.reduce((sum, row, k) => sum + row[i] * center[k], 0));
+    const translation = [0, 1, 2].map(
+      (i) => -c2w.reduce((sum, row, k) => sum + row[i] * center[k], 0),
+    );
     splat.set("u_rotation", rotation);
     splat.set("u_translation", translation);
     splat.set("u_eye", center);
@@ -158,14 +174,19 @@ export class Renderer {
   /** Show a composited picture on the canvas, or in the picture `into`. */
   develop(target, look, into = null) {
     const { gl, screen, scene } = this;
-    const [width, height] = into ? [into.width, into.height] : [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    const [width, height] = into
+      ? [into.width, into.height]
+      : [gl.drawingBufferWidth, gl.drawingBufferHeight];
     gl.bindFramebuffer(gl.FRAMEBUFFER, into ? into.framebuffer : null);
     gl.viewport(0, 0, width, height);
     screen.use();
     screen.texture("u_maps", 0, { kind: gl.TEXTURE_2D, texture: target.texture });
     screen.texture("u_response", 1, this.responses[look.camera]);
     screen.set("u_view", VIEWS.indexOf(look.show));
-    screen.set("u_curve", CURVES.findIndex((curve) => curve.id === look.curve));
+    screen.set(
+      "u_curve",
+      CURVES.findIndex((curve) => curve.id === look.curve),
+    );
     screen.set("u_gain", gains(scene.responses[look.camera], look));
     screen.set("u_clipping", look.clipping ? 1 : 0);
     screen.set("u_falseColor", look.falseColor ? 1 : 0);
@@ -174,6 +195,12 @@ export class Renderer {
     gl.bindVertexArray(this.vertices);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
+  }
+
+  /** The format of pictures with the most precision that this browser can draw. */
+  deepFormat() {
+    const { gl } = this;
+    return gl.getExtension("EXT_color_buffer_float") ? gl.RGBA32F : gl.RGBA16F;
   }
 
   /** Numbers of a picture as float32 RGBA, row by row from the top. */
@@ -185,7 +212,10 @@ export class Renderer {
     gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, upward);
     const downward = new Float32Array(upward.length);
     for (let y = 0; y < height; y++) {
-      downward.set(upward.subarray(4 * width * y, 4 * width * (y + 1)), 4 * width * (height - 1 - y));
+      downward.set(
+        upward.subarray(4 * width * y, 4 * width * (y + 1)),
+        4 * width * (height - 1 - y),
+      );
     }
     return downward;
   }
@@ -254,168 +284,4 @@ class Sorter {
       this.worker.postMessage({ id, time, poses, row });
     });
   }
-}
-
-/** A shader program whose uniforms are set by name. */
-class Program {
-  constructor(gl, vertexSource, fragmentSource) {
-    this.gl = gl;
-    this.program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, vertexSource], [gl.FRAGMENT_SHADER, fragmentSource]]) {
-      const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source.trimStart());
-      gl.compileShader(shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-      gl.attachShader(this.program, shader);
-    }
-    gl.linkProgram(this.program);
-    if (!gl.getProgramParameter(this.program, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(this.program));
-    this.uniforms = new Map();
-    const count = gl.getProgramParameter(this.program, gl.ACTIVE_UNIFORMS);
-    for (let i = 0; i < count; i++) {
-      const { name, type, size } = gl.getActiveUniform(this.program, i);
-      for (let k = 0; k < size; k++) {
-        const entry = size > 1 || name.endsWith("[0]") ? name.replace("[0]", `[${k}]`) : name;
-        this.uniforms.set(entry, { type, place: gl.getUniformLocation(this.program, entry) });
-      }
-    }
-  }
-
-  use() {
-    this.gl.useProgram(this.program);
-  }
-
-  set(name, value) {
-    const { gl } = this;
-    const uniform = this.uniforms.get(name);
-    if (!uniform) return; // not used by this program
-    const { type, place } = uniform;
-    switch (type) {
-      case gl.FLOAT: return gl.uniform1f(place, value);
-      case gl.FLOAT_VEC2: return gl.uniform2fv(place, value);
-      case gl.FLOAT_VEC3: return gl.uniform3fv(place, value);
-      case gl.FLOAT_VEC4: return gl.uniform4fv(place, value);
-      case gl.FLOAT_MAT3: return gl.uniformMatrix3fv(place, false, value);
-      case gl.INT_VEC4: return gl.uniform4iv(place, value);
-      default: return gl.uniform1i(place, value);
-    }
-  }
-
-  texture(name, unit, { kind, texture }) {
-    this.gl.activeTexture(this.gl.TEXTURE0 + unit);
-    this.gl.bindTexture(kind, texture);
-    this.set(name, unit);
-  }
-}
-
-/** Everything that the vertex shader reads of the scene, as textures. */
-function makeTables(gl, scene) {
-  const { groups } = scene;
-  if (groups.length > MAX_GROUPS) throw new Error(`This scene has more than ${MAX_GROUPS} groups of Gaussians.`);
-  const total = groups.reduce((sum, group) => sum + group.count, 0);
-  const rows = Math.max(Math.ceil(total / TABLE_WIDTH), 1);
-  const layers = new Float32Array(5 * 4 * TABLE_WIDTH * rows);
-  const layer = (k) => layers.subarray(k * 4 * TABLE_WIDTH * rows);
-  const colors = [], opacities = [], weights = [], directions = [];
-  const viewDependent = groups.some((group) => group.sh1);
-  const places = [];
-  let first = 0, firstColor = 0, firstOpacity = 0, firstWeight = 0;
-  groups.forEach((group, k) => {
-    const { count } = group;
-    const at = 4 * first;
-    interleave(layer(0).subarray(at), 4, [[group.means.data, 3], [group.opacity_logits.data, 1]]);
-    interleave(layer(1).subarray(at), 4, [[group.quaternions.data, 4]]);
-    interleave(layer(2).subarray(at), 4, [[group.log_scales.data, 3], [new Float32Array(count).fill(k), 1]]);
-    const centers = group.centers?.data ?? new Float32Array(count);
-    interleave(layer(3).subarray(at), 4, [[group.log_radiance.data, 3], [centers, 1]]);
-    if (group.velocities) {
-      interleave(layer(4).subarray(at), 4, [[group.velocities.data, 3], [group.log_durations.data, 1]]);
-    }
-    const colorKnots = group.color_offsets?.shape[0] ?? 0;
-    const opacityKnots = group.opacity_offsets?.shape[0] ?? 0;
-    if (colorKnots) colors.push(asColors(group.color_offsets));
-    if (opacityKnots) opacities.push(group.opacity_offsets.data);
-    if (group.mixture) weights.push(group.mixture.data);
-    if (viewDependent) directions.push(asTriples(group.sh1?.data ?? new Float32Array(9 * count)));
-    places.push({
-      place: [first, count, group.mixture ? firstWeight : -1, group.velocities ? 1 : 0],
-      knots: [firstColor, colorKnots, firstOpacity, opacityKnots],
-    });
-    first += count;
-    firstColor += colorKnots * count;
-    firstOpacity += opacityKnots * count;
-    firstWeight += group.mixture?.data.length ?? 0;
-  });
-  const gaussians = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D_ARRAY, gaussians);
-  gl.texImage3D(gl.TEXTURE_2D_ARRAY, 0, gl.RGBA32F, TABLE_WIDTH, rows, 5, 0, gl.RGBA, gl.FLOAT, layers);
-  setNearest(gl, gl.TEXTURE_2D_ARRAY);
-  return {
-    gaussians: { kind: gl.TEXTURE_2D_ARRAY, texture: gaussians },
-    colorOffsets: makeTable(gl, gl.RGBA16F, 4, concatenate(colors)),
-    opacityOffsets: makeTable(gl, gl.R32F, 1, concatenate(opacities)),
-    mixture: makeTable(gl, gl.R32F, 1, concatenate(weights)),
-    sh1: makeTable(gl, gl.RGBA32F, 4, concatenate(directions)),
-    groups: places,
-    viewDependent,
-  };
-}
-
-/** A texture of `values` with `channels` numbers a texel, row after row. */
-function makeTable(gl, format, channels, values, width = TABLE_WIDTH) {
-  const rows = Math.max(Math.ceil(values.length / (channels * width)), 1);
-  const padded = new Float32Array(channels * width * rows);
-  padded.set(values);
-  const texture = gl.createTexture();
-  gl.bindTexture(gl.TEXTURE_2D, texture);
-  const layout = channels === 1 ? gl.RED : gl.RGBA;
-  gl.texImage2D(gl.TEXTURE_2D, 0, format, width, rows, 0, layout, gl.FLOAT, padded);
-  setNearest(gl, gl.TEXTURE_2D);
-  return { kind: gl.TEXTURE_2D, texture };
-}
-
-function setNearest(gl, kind) {
-  gl.texParameteri(kind, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
-  gl.texParameteri(kind, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
-  gl.texParameteri(kind, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
-  gl.texParameteri(kind, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
-}
-
-/** Columns of several arrays side by side, `stride` numbers a row. */
-function interleave(out, stride, parts) {
-  let column = 0;
-  for (const [values, width] of parts) {
-    for (let i = 0; i < values.length / width; i++) {
-      for (let c = 0; c < width; c++) out[i * stride + column + c] = values[i * width + c];
-    }
-    column += width;
-  }
-}
-
-/** Offsets of log radiance (K, N, 1 or 3) with four numbers an entry. */
-function asColors({ shape, data }) {
-  const channels = shape[2];
-  const entries = shape[0] * shape[1];
-  const out = new Float32Array(4 * entries);
-  for (let i = 0; i < entries; i++) {
-    for (let c = 0; c < 3; c++) out[4 * i + c] = data[channels * i + (channels === 3 ? c : 0)];
-  }
-  return out;
-}
-
-/** Triples with a fourth number. */
-function asTriples(data) {
-  const out = new Float32Array((4 * data.length) / 3);
-  interleave(out, 4, [[data, 3]]);
-  return out;
-}
-
-function concatenate(arrays) {
-  const out = new Float32Array(arrays.reduce((sum, array) => sum + array.length, 0));
-  let first = 0;
-  for (const array of arrays) {
-    out.set(array, first);
-    first += array.length;
-  }
-  return out;
 }

@@ -72,10 +72,13 @@ function fillMixedDepths({ means, mixture, count }, poses, [rx, ry, rz, rw], dep
     }
   }
   for (let i = 0; i < count; i++) {
-    const x = means[3 * i], y = means[3 * i + 1], z = means[3 * i + 2];
+    const x = means[3 * i],
+      y = means[3 * i + 1],
+      z = means[3 * i + 2];
     let depth = 0;
     for (let b = 0, r = 0; b < bases; b++, r += 4) {
-      depth += mixture[i * bases + b] * (rows[r] * x + rows[r + 1] * y + rows[r + 2] * z + rows[r + 3]);
+      depth +=
+        mixture[i * bases + b] * (rows[r] * x + rows[r + 1] * y + rows[r + 2] * z + rows[r + 3]);
     }
     depths[i] = depth;
   }

@@ -173,7 +173,8 @@ void main() {
   float reach = sqrt(2.0 * log(opacity * 255.0 + 1e-6));
   float middle = 0.5 * (xx + yy), radius = length(vec2(0.5 * (xx - yy), xy));
   float major = middle + radius, minor = max(det / major, 0.0);
-  vec2 axis = abs(xy) > 1e-12 * major ? normalize(vec2(xy, major - xx)) : (xx >= yy ? vec2(1, 0) : vec2(0, 1));
+  vec2 axis = xx >= yy ? vec2(1.0, 0.0) : vec2(0.0, 1.0);
+  if (abs(xy) > 1e-12 * major) axis = normalize(vec2(xy, major - xx));
   vec2 corner = vec2(float(gl_VertexID & 1), float(gl_VertexID >> 1)) * 2.0 - 1.0;
   vec2 along = corner.x * reach * sqrt(major) * axis;
   vec2 beside = corner.y * reach * sqrt(minor) * vec2(-axis.y, axis.x);
