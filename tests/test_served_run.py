@@ -22,7 +22,6 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.run_folder import Run, write_config
-from hdr_nsff.view import ViewConfig, view
 from hdr_nsff.viewer.scene_file import from_bytes
 from hdr_nsff.viewer.server import FrameRequest
 
@@ -100,11 +99,6 @@ def test_the_newest_checkpoint_is_opened_again(
     save_step(run, 9)
     assert served.version() != before[0]
     assert from_bytes(served.scene()).background == pytest.approx([np.exp(-1)] * 3)
-
-
-def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="not a run folder"):
-        view(ViewConfig(tmp_path, browser=False, device="cpu"))
 
 
 def test_ctrl_c_ends_the_verb(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
