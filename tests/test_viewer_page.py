@@ -218,6 +218,17 @@ def test_space_plays_and_pauses(viewer: Page) -> None:
     assert state(viewer, "playing") is False
 
 
+def test_space_plays_after_a_click_on_another_button(viewer: Page) -> None:
+    viewer.click("#loop")
+    viewer.press(" ")
+    assert (state(viewer, "loop"), state(viewer, "playing")) == (False, True)
+    viewer.run("document.getElementById('time').focus()")
+    viewer.press(" ")
+    viewer.run("viewer.set({time: 1})")
+    viewer.press("ArrowRight")
+    assert (state(viewer, "playing"), state(viewer, "time")) == (False, 2)
+
+
 def test_arrows_step_through_time_and_exposure(viewer: Page) -> None:
     viewer.run("viewer.set({ev: 0, time: 1})")
     for key in ("ArrowRight", "ArrowRight", "ArrowLeft", "ArrowUp", "ArrowUp", "ArrowDown"):

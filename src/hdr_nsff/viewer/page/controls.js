@@ -13,17 +13,17 @@ const NO_PARALLAX = {
     "The camera of this clip stood still. " +
     "Without parallax there is no depth, so the view stays where it was filmed.",
 };
+// of false color: stops from mid gray and colors, as in develop.frag
 const BANDS = [
-  // of false color: from stops, and its color, as in develop.frag
-  ["−8", "#29004d"],
+  ["<−6", "#29004d"],
   ["−6", "#1a40bf"],
   ["−4", "#1a99cc"],
   ["−2", "#597366"],
   ["0", "#59bf4d"],
-  ["+1", "#bfb899"],
-  ["+2.5", "#fad933"],
+  ["+½", "#bfb899"],
+  ["+2", "#fad933"],
   ["+4", "#f2801a"],
-  ["+6", "#e61a1a"],
+  [">6", "#e61a1a"],
 ];
 const PLAY = "M7 4v16l13-8z",
   PAUSE = "M6 4h4v16H6zm8 0h4v16h-4z";
@@ -226,6 +226,17 @@ function connectKeyboard(player) {
     else return;
     event.preventDefault();
   });
+  // after a click, keys are for the player again
+  addEventListener("click", ({ detail, target }) => {
+    if (detail > 0) target.closest("button, label, input[type=checkbox]")?.blur();
+  });
+  let byPointer = false;
+  addEventListener("pointerdown", () => (byPointer = true), true);
+  addEventListener("keydown", () => (byPointer = false), true);
+  addEventListener(
+    "change",
+    ({ target }) => byPointer && target.matches("select") && target.blur(),
+  );
   addEventListener("keyup", (event) => player.held.delete(event.key.toLowerCase()));
   addEventListener("blur", () => player.held.clear());
 }
@@ -233,6 +244,7 @@ function connectKeyboard(player) {
 /** Whether an element does something with a key itself. */
 function usesKey(element, key) {
   if (element.matches("select")) return true;
+  if (element.id === "time") return false; // as elsewhere: frame by frame
   if (element.matches('input[type="range"]'))
     return key.startsWith("Arrow") || key === "Home" || key === "End";
   return key === " " && element.matches("button, a, input");

@@ -100,7 +100,7 @@ vec3 develop(vec3 exposed) {
   return encode(exposed);
 }
 
-// Stops from mid gray as colors, two stops a band.
+// Stops from mid gray as colors, about two stops a band.
 vec3 falseColor(vec3 exposed) {
   float stops = log2(max(luminance(exposed), 1e-9) / MID_GRAY);
   if (stops < -6.0) return vec3(0.16, 0.0, 0.3);
@@ -108,7 +108,7 @@ vec3 falseColor(vec3 exposed) {
   if (stops < -2.0) return vec3(0.1, 0.6, 0.8);
   if (stops < -0.5) return vec3(0.35, 0.45, 0.4);
   if (stops < 0.5) return vec3(0.35, 0.75, 0.3);
-  if (stops < 2.5) return vec3(0.75, 0.72, 0.6);
+  if (stops < 2.0) return vec3(0.75, 0.72, 0.6);
   if (stops < 4.0) return vec3(0.98, 0.85, 0.2);
   if (stops < 6.0) return vec3(0.95, 0.5, 0.1);
   return vec3(0.9, 0.1, 0.1);
