@@ -31,7 +31,7 @@ from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
 from hdr_nsff.core.process import limit_torch_threads
-from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.budget import Budget

@@ -27,7 +27,8 @@ from torch import Tensor
 
 from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.tonemap.base import Recordings, ToneMapConfig, ToneMapper
 from hdr_nsff.tonemap.build import build_tone_mapper

@@ -11,7 +11,8 @@ from hdr_nsff.fields.baselines.hexplane import HexPlane, HexPlaneConfig
 from hdr_nsff.fields.build import AnyField, build_field, initialize_field
 from hdr_nsff.fields.nsff.branches import GridBranches, GridConfig, MlpConfig
 from hdr_nsff.fields.nsff.two_branches import TwoBranches
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig

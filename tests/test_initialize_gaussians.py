@@ -13,6 +13,7 @@ from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
 from hdr_nsff.fields.point_cloud import PointCloud
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
     initialize_gaussians,
@@ -22,7 +23,7 @@ from hdr_nsff.fields.splat.initialize_gaussians import (
     spread_centers,
     surely_moving,
 )
-from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat, SplatConfig
+from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -115,8 +116,9 @@ def test_the_rest_is_invisible_and_the_background_typical(field: Splat) -> None:
 def test_the_start_is_reported_in_a_sentence_and_reproducible(field: Splat, toy: Scene) -> None:
     again, note = seeded(toy)
     still, moving = int(seen(field.static).sum()), int(seen(field.moving).sum())
-    assert (
-        note == f"{still} static Gaussians from the depth prior; {moving} moving ones on 1 movers"
+    assert note == (
+        f"{still} static Gaussians from the depth prior; "
+        f"{moving} moving ones on 1 rigid movers; 0 time-local ones"
     )
     assert all(torch.equal(v, field.state_dict()[k]) for k, v in again.state_dict().items())
 
@@ -135,7 +137,10 @@ def test_movers_are_never_more_than_bases(toy: Scene, bases: int) -> None:
 @pytest.mark.parametrize("none", [None, torch.zeros(34, 60, dtype=torch.bool)])
 def test_without_movers_all_is_static(toy: Scene, none: Tensor | None) -> None:
     started, note = seeded(changed(toy, lambda f: replace(f, moving=none)))
-    assert note.endswith("0 moving ones on 0 movers") and not seen(started.moving).any()
+    assert (
+        note.endswith("0 moving ones on 0 rigid movers; 0 time-local ones")
+        and not seen(started.moving).any()
+    )
     assert (
         float(started.static.means.detach()[seen(started.static), 2].min()) < 2.6
     )  # the card as well
@@ -163,7 +168,7 @@ def test_movers_start_inside_a_doubtful_outline_but_thin_ones_stay_whole(toy: Sc
 
 def test_without_flow_movers_drift_with_their_middle(toy: Scene) -> None:
     started, note = seeded(changed(toy, lambda f: replace(f, flow={}, flow_valid={})))
-    assert note.endswith("on 1 movers")
+    assert note.endswith("on 1 rigid movers; 0 time-local ones")
     for t in (1.0, 2.0, 3.0, 4.0):  # smoothing shortens the ends
         assert moving_at(started, t)[:, :2].mean(0).numpy() == pytest.approx(
             card_offset(t), abs=0.12

@@ -21,8 +21,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.nsff.nsff import NSFF
 from hdr_nsff.fields.splat import splat
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.rasterize import dense
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame
 from hdr_nsff.scene.manifest import Manifest

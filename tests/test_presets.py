@@ -9,7 +9,8 @@ from presets import random_field, small, trainer
 
 from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.build import build_field, initialize_field
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.batch import whole_frame
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig

@@ -16,8 +16,8 @@ from hdr_nsff.fields import build
 from hdr_nsff.fields.build import device_for
 from hdr_nsff.fields.nsff.nsff import NSFFConfig
 from hdr_nsff.fields.splat import rasterize_gsplat
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.rasterize import dense
-from hdr_nsff.fields.splat.splat import SplatConfig
 from hdr_nsff.geometry.cameras import Camera
 
 Draw = Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]

@@ -45,7 +45,7 @@ def test_scores_are_the_weights_of_the_slow_twin_times_the_error() -> None:
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
     one_hot = torch.eye(len(cloud.means))
     weights = dense(*(p.detach() for p in parts), one_hot, CAMERA).features  # (H, W, G)
-    times_error, alone = field.error_scores(frame_error(error)).unbind(1)
+    times_error, alone = field.error_scores(frame_error(error))[0].unbind(1)
     expected = (weights * error[..., None]).sum((0, 1))
     torch.testing.assert_close(times_error, expected, atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(alone, weights.sum((0, 1)), atol=1e-3, rtol=1e-3)
@@ -82,7 +82,7 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
     before = {n: p.detach().clone() for n, p in field.named_parameters()}
     errors = [frame_error(), frame_error(camera=away)]
     field.relocate(errors, torch.Generator().manual_seed(0))
-    seen = field.error_scores(frame_error())[: len(field.static), 1] > 1
+    seen = field.error_scores(frame_error())[0][: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
     limit = 2 * MAX_RELOCATED_SHARE * len(field.static)  # the halves and what they were cut from

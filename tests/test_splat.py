@@ -17,8 +17,9 @@ from toy_scene import CARD, card_offset
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import initialize_field
 from hdr_nsff.fields.outputs import select_pixels
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import MAX_LOG_RADIANCE, Gaussians
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.trajectories import WINDOW
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame
@@ -76,7 +77,8 @@ def scattered(
     seed: int = 0, static: int = 40, moving: int = 30, view_dependence: bool = False
 ) -> Splat:
     """Random Gaussians in view, no parameter of which is 0."""
-    config = SplatConfig(static=static, moving=moving, bases=3, view_dependence=view_dependence)
+    views = view_dependence
+    config = SplatConfig(static=static, moving=moving, local=20, bases=3, view_dependence=views)
     field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
     generator = torch.Generator().manual_seed(seed)
     for p in field.parameters():
@@ -86,6 +88,34 @@ def scattered(
         g.means.data = (place - 0.5) * torch.tensor([1.0, 0.8, 2.0]) + torch.tensor([0.0, 0, 3.0])
         g.log_scales.data.fill_(-2.0).add_(0.2 * torch.randn(len(g), 3, generator=generator))
         g.opacity_logits.data.fill_(0.0)
+    local = field.local
+    place = torch.rand(len(local), 3, generator=generator)
+    local.means.data[:, :3] = (place - 0.5) + torch.tensor([0.0, 0, 3.0])
+    local.means.data[:, 3] = 3.0
+    local.log_scales.data[:, :3].fill_(-2.0)
+    local.log_scales.data[:, 3] = 1.0
+    local.colors.data[:, 3] = 0.0
+    local.find_neighbors(1.0)
+    return field
+
+
+def local_field(count: int = 20) -> Splat:
+    """A wall, and time-local Gaussians before it that all move alike, born all over the
+    clip.
+    """
+    config = SplatConfig(static=33 * 25, moving=0, local=count)
+    field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
+    local = field.local
+    with torch.no_grad():
+        tile_plane(field.static, 33, 25, z=4.0, spacing=0.1)
+        local.means[:, :3] = torch.tensor([0.0, 0, 2.0])
+        local.means[:, 3] = torch.linspace(0, TIMES - 1, count)
+        local.velocities[:, :3] = torch.tensor([0.05, -0.02, 0.1])
+        local.means[:, :3] += (local.means[:, 3:] - 4.5) * local.velocities[:, :3]
+        local.log_scales[:, :3] = -2.0
+        local.log_scales[:, 3] = 0.0
+        local.colors[:, 3] = 3.0
+    local.find_neighbors(1.0)
     return field
 
 
@@ -181,6 +211,7 @@ def test_shares_stay_between_0_and_1(seed: int) -> None:
 def test_gradients_reach_every_parameter() -> None:
     field = scattered(view_dependence=True)
     render, own = field(batch_of(4, 1))
+    own |= field(replace(batch_of(4, 1), seed=1))[1]  # with rigidity and evenness
     flow = render.warps[0].flow
     linear, squared = (render.depth, render.motion), (render.radiance, flow)
     total = sum(v.sum() for v in linear) + sum(v.square().sum() for v in squared)
@@ -382,8 +413,8 @@ def test_flow_has_a_gradient_to_the_neighbors_pose() -> None:
     pose = BESIDE.c2w.clone().requires_grad_()
     learned = replace(batch, neighbors={1: BESIDE.moved(pose)})
     means = field.cloud(4.0).means
-    flow = field.flow_to_neighbor(learned, means, 4.0, 1)
-    torch.testing.assert_close(flow, field.flow_to_neighbor(batch, means, 4.0, 1))
+    flow = field.flow_to_neighbor(learned, means, field.alive(4.0), 4.0, 1)
+    torch.testing.assert_close(flow, field.flow_to_neighbor(batch, means, field.alive(4.0), 4.0, 1))
     flow[:, 0].sum().backward()
     # a camera that goes right sees everything go left
     assert pose.grad is not None and float(pose.grad[0, 3]) < 0

@@ -17,8 +17,10 @@ from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.point_cloud import ToRadiance
 from hdr_nsff.fields.space import build_space
 from hdr_nsff.fields.splat import rasterize_gsplat
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
-from hdr_nsff.fields.splat.splat import Splat, SplatConfig
+from hdr_nsff.fields.splat.initialize_local import count_local_pixels
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
 
 FieldConfig = Annotated[
@@ -48,7 +50,8 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     """An untrained field for a scene."""
     m, near, far = scene.manifest, scene.near, scene.far
     if isinstance(config, SplatConfig):
-        return Splat(config, scene.times, near, far, m.width * m.height)
+        local_pixels = count_local_pixels(scene)
+        return Splat(config, scene.times, near, far, m.width * m.height, local_pixels)
     space = build_space([f.camera for f in scene.train], near, far)
     match config:
         case NSFFConfig():

@@ -22,6 +22,14 @@ def knot_of(times: Tensor, time: float) -> float:
     return float(before + fraction.clamp(0, 1))
 
 
+def time_at(times: Tensor, knot: float) -> float:
+    """The time (in frames) at a position on the sorted training times (T,)."""
+    if len(times) == 1:
+        return float(times[0])
+    before = min(int(knot), len(times) - 2)
+    return float(torch.lerp(times[before], times[before + 1], knot - before))
+
+
 def interpolate_linear(values: Tensor, position: float) -> Tensor:
     """`values` (K, ...) at `position` in [0, K - 1], linear in between: (...)."""
     if len(values) == 1:

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
 
-VERSION = 1  # of movers.npz
+VERSION = 2  # of movers.npz
 NUM_NEAREST_TRACKS = 4  # tracks that a pixel's depth is interpolated from
 MAX_TRACK_DISTANCE_PX = 8.0  # pixels from the nearest track; half or twice was not measured
 TRACK_CONFIDENCE = 0.5  # at a track: its distance as a whole rests on priors
@@ -39,6 +39,11 @@ class Mover:
     center: np.ndarray  # (3,) canonical, scene units
     known: np.ndarray  # (T,) bool: enough of it was seen; motion between is interpolated
     error: float  # median reprojection error of the shape, in its sigmas; inf: no shape
+    # median distance in pixels between believed flow and what its motion explains, and
+    # the same of the static scene: the uncertainty of flow; 0 where there is no flow
+    flow_residual: float = 0.0
+    flow_uncertainty: float = 0.0
+    rigid: bool = True  # its motion explains its flow, within that uncertainty
 
     @property
     def has_shape(self) -> bool:
@@ -47,7 +52,11 @@ class Mover:
 
     def at(self, t: int) -> np.ndarray:
         """World points (N, 3) of its tracks at the t-th time."""
-        turned = (self.points - self.center) @ self.rotations[t].T
+        return self.world(self.points, t)
+
+    def world(self, points: np.ndarray, t: int) -> np.ndarray:
+        """World points (P, 3) at the t-th time of canonical `points` (P, 3)."""
+        turned = (points - self.center) @ self.rotations[t].T
         return turned + self.center + self.translations[t]
 
     def canonical(self, points: np.ndarray, t: int) -> np.ndarray:
@@ -160,7 +169,9 @@ def read_movers(path: Path) -> tuple[Mover, ...]:
 def mover_of(data: dict[str, np.ndarray], k: int) -> Mover:
     """The mover number `k` of a file's arrays; KeyError where an array is missing."""
     values: dict[str, Any] = {f.name: data[f"{k}/{f.name}"] for f in fields(Mover)}
-    values["error"] = float(values["error"])
+    for name in ("error", "flow_residual", "flow_uncertainty"):
+        values[name] = float(values[name])
+    values["rigid"] = bool(values["rigid"])
     return Mover(**values)
 
 

@@ -270,3 +270,10 @@ def without_outline(moving: Tensor, outline: Tensor) -> Tensor:
     sure = moving & ~outline
     whole = ~np.isin(np.arange(count + 1), np.unique(objects[sure.numpy()]))
     return sure | (moving & torch.from_numpy(whole[objects]))
+
+
+def surely_moving(frame: Frame) -> Tensor:
+    """(H, W) bool: the moving mask, as far as it is certain."""
+    if frame.moving is None:
+        return torch.zeros(frame.image.shape[:2], dtype=torch.bool)
+    return frame.moving if frame.outline is None else without_outline(frame.moving, frame.outline)

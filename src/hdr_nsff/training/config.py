@@ -25,7 +25,7 @@ from hdr_nsff.core.settings import (
 from hdr_nsff.fields.baselines.hexplane import HexPlaneConfig
 from hdr_nsff.fields.build import FieldConfig
 from hdr_nsff.fields.nsff.nsff import NSFFConfig
-from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.training.budget import Budget, Schedule
 from hdr_nsff.training.objective import LossWeights

@@ -12,7 +12,7 @@ from hdr_nsff.fields.baselines.hexplane import HexPlaneConfig
 from hdr_nsff.fields.baselines.nerf_wt import NerfWTConfig
 from hdr_nsff.fields.nsff.branches import GridConfig, MlpConfig
 from hdr_nsff.fields.nsff.nsff import NSFFConfig, SceneFlowLosses
-from hdr_nsff.fields.splat.splat import SplatConfig
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapLosses
 from hdr_nsff.training.budget import Budget, Schedule
 from hdr_nsff.training.config import TrainConfig
@@ -32,7 +32,7 @@ def splat() -> TrainConfig:
     """
     return TrainConfig(
         field=SplatConfig(),
-        loss=LossWeights(dynamic=0.0, depth=0.2, flow=0.02, mask=0.1),
+        loss=LossWeights(dynamic=0.0, depth=0.2, flow=0.02, mask=0.01),
         schedule=Schedule(lr_final=0.03),
         rays=0,
         moving_rays=0,

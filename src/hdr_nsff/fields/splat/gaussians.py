@@ -78,6 +78,17 @@ class Gaussians(nn.Module):
     def __len__(self) -> int:
         return len(self.means)
 
+    @torch.no_grad()
+    def copy(self, source: Tensor, target: Tensor) -> None:
+        """Make the Gaussians `target` (N,) like `source` (N,)."""
+        parameters = [self.means, self.quaternions, self.log_scales]
+        parameters += [self.log_radiance, self.opacity_logits]
+        if len(self.sh1):
+            parameters.append(self.sh1)
+        for parameter in parameters:
+            parameter[target] = parameter[source]
+        self.log_radiance_offsets[:, target] = self.log_radiance_offsets[:, source]
+
     def radiance(self, share: float) -> Tensor:
         """Radiance (G, 3) at a share in [0, 1] of the clip's time."""
         offset = interpolate_linear(

@@ -29,9 +29,10 @@ from hdr_nsff.fields.point_cloud import (
 )
 from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
+from hdr_nsff.fields.splat.initialize_local import local_mask, place_local
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
-from hdr_nsff.scene.scene import Frame, Scene, without_outline
+from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 # a cell is this many times longer along the view than across, as shares of the frustum
 DEPTH_CELLS = 12.0
@@ -68,9 +69,10 @@ def initialize_gaussians(
         )
         count = place(field.static, thin(static, scene, int(FILL * len(field.static))))
         num_movers, moving = place_movers(field, scene, to_radiance)
+        local = place_local(field.local, scene, to_radiance, field.unit)
         return (
             f"{count} static Gaussians from the depth prior; "
-            f"{moving} moving ones on {num_movers} movers"
+            f"{moving} moving ones on {num_movers} rigid movers; {local} time-local ones"
         )
 
 
@@ -143,11 +145,11 @@ def scatter(field: Splat, scene: Scene, typical: float) -> None:
 
 
 def place_movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, int]:
-    """Place moving Gaussians on the scene's movers and give these the shared motions.
+    """Place moving Gaussians on rigid movers and give these the shared motions.
 
     Returns the number of movers and of Gaussians.
     """
-    movers = scene.movers[: field.config.bases]
+    movers = [mover for mover in scene.movers if mover.rigid][: field.config.bases]
     if not movers:
         return 0, 0
     position = {f.index: i for i, f in enumerate(scene.train)}
@@ -179,11 +181,11 @@ def key_times(scene: Scene, frames: list[int]) -> list[int]:
 def mover_points(
     scene: Scene, i: int, t: int, movers: Sequence[Mover], to_radiance: ToRadiance
 ) -> tuple[PointCloud, Tensor]:
-    """The moving pixels of training frame `i` (the t-th time of `movers`) as points at
-    their canonical places, and the mover of each (P,).
+    """The pixels of rigid `movers` in training frame `i`, at the t-th time of these, as
+    points at their canonical places, and the mover of each (P,).
     """
     f = with_mover_depth(scene.train[i], t, movers)
-    moving = surely_moving(f)
+    moving = surely_moving(f) & ~local_mask(scene, i)
     points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
     y, x = np.nonzero(moving.numpy())
     owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
@@ -192,13 +194,6 @@ def mover_points(
         canonical[owner == k] = mover.canonical(canonical[owner == k], t)
     positions = torch.from_numpy(canonical).float()
     return replace(points, positions=positions), torch.from_numpy(owner)
-
-
-def surely_moving(f: Frame) -> Tensor:
-    """(H, W) bool: the moving mask, as far as it is certain."""
-    if f.moving is None:
-        return torch.zeros(f.image.shape[:2], dtype=torch.bool)
-    return f.moving if f.outline is None else without_outline(f.moving, f.outline)
 
 
 def with_mover_depth(f: Frame, t: int, movers: Sequence[Mover]) -> Frame:

@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.fields.splat.gaussians import Gaussians
+from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import rotation_matrices
 
 # pixels: a Gaussian whose weights add up to less in the mean frame is unseen
@@ -31,9 +32,34 @@ HALF_OFFSET = 0.5
 HALF_SCALE = 0.7
 
 
+class LocalScores:
+    """Scores of `count` time-local Gaussians over several frames.
+
+    Each one's mean is over the frames in which it was alive, or all would look unseen.
+    """
+
+    def __init__(self, count: int, device: torch.device) -> None:
+        self.totals = torch.zeros(count, 2, device=device)
+        self.num_frames = torch.zeros(count, 1, device=device)
+
+    def add(self, alive: Tensor, scores: Tensor) -> None:
+        """Count a frame's `scores` (A, 2) of the Gaussians `alive` (A,) in it."""
+        self.totals[alive] += scores
+        self.num_frames[alive] += 1
+
+    def mean(self) -> Tensor:
+        """Mean scores (G, 2); alive in no frame counts as seen and right."""
+        judged = self.totals / self.num_frames.clamp_min(1)
+        unjudged = self.totals.new_tensor([0.0, MIN_WEIGHT_PX])
+        return torch.where(self.num_frames > 0, judged, unjudged)
+
+
 @torch.no_grad()
 def relocate(
-    gaussians: Gaussians, scores: Tensor, companions: Sequence[Tensor], generator: torch.Generator
+    gaussians: Gaussians | LocalGaussians,
+    scores: Tensor,
+    companions: Sequence[Tensor],
+    generator: torch.Generator,
 ) -> int:
     """Cut the Gaussians of most error in two; unseen ones become the other halves.
 
@@ -51,41 +77,25 @@ def relocate(
         return 0
     whole = torch.multinomial(chance.cpu(), count, generator=generator).to(chance.device)
     half = unseen[:count]
-    copy_gaussians(gaussians, companions, whole, half)
+    gaussians.copy(whole, half)
+    for values in companions:
+        values[..., half] = values[..., whole]
     separate_halves(gaussians, whole, half)
     return count
 
 
-def copy_gaussians(
-    gaussians: Gaussians, companions: Sequence[Tensor], source: Tensor, target: Tensor
-) -> None:
-    """Make the Gaussians `target` (N,) like `source` (N,), companions included."""
-    for parameter in (
-        gaussians.means,
-        gaussians.quaternions,
-        gaussians.log_scales,
-        gaussians.log_radiance,
-        gaussians.opacity_logits,
-    ):
-        parameter[target] = parameter[source]
-    if len(gaussians.sh1):
-        gaussians.sh1[target] = gaussians.sh1[source]
-    offsets = gaussians.log_radiance_offsets.movedim(1, -1)  # (knots, channels, G)
-    for values in (offsets, *companions):
-        values[..., target] = values[..., source]
-
-
-def separate_halves(gaussians: Gaussians, one: Tensor, other: Tensor) -> None:
+def separate_halves(gaussians: Gaussians | LocalGaussians, one: Tensor, other: Tensor) -> None:
     """Turn equal pairs `one` (N,) and `other` (N,) into halves of the whole.
 
     They lie side by side along its longest axis.
     """
-    axis = gaussians.log_scales[one].argmax(1)
-    length = gaussians.log_scales[one, axis].exp()  # scene units
+    means, log_scales = gaussians.means[:, :3], gaussians.log_scales[:, :3]  # in space
+    axis = log_scales[one].argmax(1)
+    length = log_scales[one, axis].exp()  # scene units
     rotations = rotation_matrices(gaussians.quaternions[one])
     direction = rotations[torch.arange(len(one)), :, axis]
     offset = HALF_OFFSET * length[:, None] * direction
-    gaussians.means[other] += offset
-    gaussians.means[one] -= offset
+    means[other] += offset
+    means[one] -= offset
     for half in (other, one):
-        gaussians.log_scales[half, axis] += torch.tensor(HALF_SCALE).log()
+        log_scales[half, axis] += torch.tensor(HALF_SCALE).log()

@@ -1,5 +1,5 @@
-"""Dynamic radiance as 4D Gaussians in linear HDR: static ones, and moving ones on
-shared trajectories.
+"""Dynamic radiance as 4D Gaussians in linear HDR: static ones, moving ones on
+shared trajectories, and time-local ones for what moves without being rigid.
 
 Color is the exponential of a log radiance, unbounded (a sigmoid bounds it for the
 ablation). Colors of moving Gaussians change in time, and static ones brighten or darken
@@ -10,30 +10,25 @@ fade away draw nothing and cost next to nothing. docs/method.md, section "4D Gau
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field, replace
-from typing import Annotated, Literal
+from dataclasses import asdict, replace
 
 import torch
-from annotated_types import Ge, Le
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.base import FrameError, ParamGroup, Render, Warp
-from hdr_nsff.fields.knots import interpolate_linear, knot_of
+from hdr_nsff.fields.knots import interpolate_linear, knot_of, time_at
 from hdr_nsff.fields.outputs import GaussianCloud, select_pixels
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
+from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
-from hdr_nsff.fields.splat.relocate import relocate
+from hdr_nsff.fields.splat.relocate import LocalScores, relocate
 from hdr_nsff.fields.splat.trajectories import Trajectories
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
 
-# default number of Gaussians, per pixel of a frame and at most (hand-chosen on rendered
-# scenes, for minutes of training on a CPU)
-STATIC_PER_PIXEL, MAX_STATIC = 0.55, 80_000
-MOVING_PER_PIXEL, MAX_MOVING = 0.15, 20_000
 NUM_NEIGHBORS = 4  # of a moving Gaussian, for rigidity
 MAX_VIEW_LOG_FACTOR = 2.0  # by which log radiance may change with the direction of view
 RELOCATE_FRAMES = 24  # training frames whose errors decide what is relocated
@@ -42,105 +37,40 @@ MIN_ALPHA = 1e-3  # of a pixel: below, it has no depth of its own
 MIN_DEPTH_SHARE = 1e-3  # of `near`: the least z-depth that a pixel gets
 MAX_FLOW = 2.0  # picture widths: keeps the flow of Gaussians near the camera finite
 COLOR_OFFSET_SHARE = 0.01  # weight of color offsets relative to their changes in time
+VELOCITY_SHARE = 0.1  # learning rate of velocities per frame relative to positions
 ADAM_EPS = 1e-15  # as 3D Gaussian splatting has it (Kerbl et al. 2023)
-
-
-@dataclass(frozen=True)
-class SplatLosses:
-    """Weights of the field's own terms; 0 turns one off."""
-
-    opacity: Weight = 0.01
-    """Mean opacity: what is not needed fades and is used elsewhere."""
-    scale: Weight = 0.01
-    """Mean scale, in units of the near depth."""
-    trajectory: Weight = 30.0
-    """Third differences of the shared motions, in units of the near depth."""
-    brightness_drift: Weight = 0.01
-    """Changes of static Gaussians' log radiance in time."""
-    opacity_offsets: Weight = 1e-3
-    """Changes of moving Gaussians' opacity from one knot to the next."""
-    color_change: Weight = 0.01
-    """Changes of moving Gaussians' log radiance from one knot to the next."""
-    rigidity: Weight = 2.0
-    """Differences in how neighboring moving Gaussians mix the shared motions."""
-    sh1: Weight = 0.01
-    """Changes of log radiance with the direction of view."""
-
-
-@dataclass(frozen=True)
-class SplatConfig:
-    """A field of 4D Gaussians."""
-
-    type: Advanced[Literal["splat"]] = "splat"
-    loss: Advanced[SplatLosses] = field(default_factory=SplatLosses)
-    static: Annotated[int, Ge(1), Le(10**8)] | None = None
-    """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
-    moving: Annotated[int, Ge(0), Le(10**8)] | None = None
-    """Moving Gaussians; default: 0.15 for every pixel of a frame, at most 20,000."""
-    bases: Count = 6
-    """Shared rigid motions that the moving ones mix."""
-    color_knots: Advanced[Count] = 7
-    """Times at which a moving Gaussian has a color of its own."""
-    brightness_knots: Advanced[Count] = 5
-    """Times at which a static Gaussian has a brightness of its own (1: none)."""
-    opacity_knots: Advanced[Count] = 13
-    """Times at which a moving Gaussian has an opacity of its own, to appear and vanish.
-    """
-    view_dependence: bool = False
-    """Let colors change with the direction of view (to first order, in log radiance),
-    for shiny objects seen from many sides.
-    """
-    radiance: Literal["exp", "sigmoid"] = "exp"
-    """Unbounded radiance, or one below 1."""
-    relocate_every: Advanced[Number] = 200
-    """Steps after which unseen Gaussians are moved to where the picture is wrong (0:
-    never).
-    """
-    lr: Advanced[Rate] = 1.0
-    """Multiplies all learning rates below."""
-    position_lr: Advanced[Rate] = 2e-3
-    """Learning rate of positions, per typical length of the scene (its near depth)."""
-    pose_lr: Advanced[Rate] = 2e-3
-    """Learning rate of the shared motions."""
-    color_lr: Advanced[Rate] = 2e-2
-    """Learning rate of colors and of the mixtures of motions."""
-    shape_lr: Advanced[Rate] = 2e-2
-    """Learning rate of orientations and log scales."""
-    opacity_lr: Advanced[Rate] = 5e-2
-    """Learning rate of opacities."""
-
-    def counts(self, num_pixels: int) -> tuple[int, int]:
-        """How many static and moving Gaussians, for frames of `num_pixels`."""
-        static, moving = self.static, self.moving
-        if static is None:
-            static = min(round(STATIC_PER_PIXEL * num_pixels), MAX_STATIC)
-        if moving is None:
-            moving = min(round(MOVING_PER_PIXEL * num_pixels), MAX_MOVING)
-        return static, moving
 
 
 class Splat(nn.Module):
     """A field of 4D Gaussians.
 
     `times` (T,) are the training times; `near` and `far` are z-depths in scene units,
-    and `near` is the scene's typical length; frames have `num_pixels`.
+    and `near` is the scene's typical length; frames have `num_pixels`, and movers that
+    are not rigid `local_pixels` in all of them.
     """
 
     times: Tensor
     neighbors: Tensor
 
     def __init__(
-        self, config: SplatConfig, times: Tensor, near: float, far: float, num_pixels: int
+        self,
+        config: SplatConfig,
+        times: Tensor,
+        near: float,
+        far: float,
+        num_pixels: int,
+        local_pixels: int = 0,
     ) -> None:
         super().__init__()
         self.config, self.unit = config, near
         self.near, self.far = near, far
         self.register_buffer("times", times.double())
-        static, moving = config.counts(num_pixels)
+        static, moving, local = config.counts(num_pixels, local_pixels, len(times))
         self.bounded = config.radiance == "sigmoid"
         views, bounded = config.view_dependence, self.bounded
         self.static = Gaussians(static, config.brightness_knots, 1, views, bounded)
         self.moving = Gaussians(moving, config.color_knots, 3, views, bounded)
+        self.local = LocalGaussians(local, bounded)
         # added to the moving ones' opacity logits
         self.opacity_offsets = nn.Parameter(torch.zeros(config.opacity_knots, moving))
         self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
@@ -160,43 +90,65 @@ class Splat(nn.Module):
         """A knot as a share in [0, 1] of the clip."""
         return knot / max(len(self.times) - 1, 1)
 
+    def time(self, knot: float) -> float:
+        """The time (in frames) at a knot within the clip."""
+        return time_at(self.times, knot)
+
     def has_knot(self, knot: float) -> bool:
         """Whether a knot lies within the clip."""
         return 0 <= knot <= len(self.times) - 1
 
     # The Gaussians at a time
 
-    def cloud(self, knot: float) -> GaussianCloud:
-        """All Gaussians at a knot, static ones first, differentiable in everything."""
+    def alive(self, knot: float) -> Tensor:
+        """Indices (A,) of the time-local Gaussians that are alive at a knot."""
+        return self.local.alive(self.time(knot))
+
+    def cloud(self, knot: float, alive: Tensor | None = None) -> GaussianCloud:
+        """All Gaussians at a knot, differentiable in everything.
+
+        Static ones first, then moving ones, then the time-local ones `alive` (A,); by
+        default those alive at the knot.
+        """
+        alive = self.alive(knot) if alive is None else alive
+        time, local = self.time(knot), self.local
         mixture, share = self.mixture_logits.softmax(0), self.share(knot)
         static, moving = self.static, self.moving
         pose = self.trajectories.pose(knot)
         moved = self.trajectories.move(moving.means, mixture, pose)
         turned = self.trajectories.turn(moving.quaternions, mixture, pose)
         at_rest = static.means.new_zeros(len(static))
+        num_moving = len(moving) + len(alive)
+        log_scales = [static.log_scales, moving.log_scales, local.log_scales[alive, :3]]
+        radiance = [static.radiance(share), moving.radiance(share), local.radiance(alive)]
         return GaussianCloud(
-            means=torch.cat([static.means, moved]),
-            quaternions=torch.cat([static.quaternions, turned]),
-            scales=torch.cat([static.log_scales, moving.log_scales]).exp(),
-            opacities=self.opacities(share),
-            radiance=torch.cat([static.radiance(share), moving.radiance(share)]),
-            motion=torch.cat([at_rest, static.means.new_ones(len(moving))]),
+            means=torch.cat([static.means, moved, local.positions(alive, time)]),
+            quaternions=torch.cat([static.quaternions, turned, local.quaternions[alive]]),
+            scales=torch.cat(log_scales).exp(),
+            opacities=torch.cat([self.opacities(share), local.opacities(alive, time)]),
+            radiance=torch.cat(radiance),
+            motion=torch.cat([at_rest, static.means.new_ones(num_moving)]),
         )
 
     def opacities(self, share: float) -> Tensor:
-        """Opacities (G,) in [0, 1] at a share of the clip."""
+        """Opacities (G,) in [0, 1] of static and moving ones at a share of the clip."""
         position = share * (len(self.opacity_offsets) - 1)
         offsets = interpolate_linear(self.opacity_offsets, position)
         return torch.cat(
             [self.static.opacity_logits, self.moving.opacity_logits + offsets]
         ).sigmoid()
 
-    def positions(self, knot: float) -> Tensor:
-        """Means (G, 3) of all Gaussians at a knot."""
+    def positions(self, knot: float, alive: Tensor | None = None) -> Tensor:
+        """Means (G, 3) of the Gaussians of `cloud` at a knot.
+
+        The time-local ones are those `alive` (A,) at any knot; by default at this one.
+        """
+        alive = self.alive(knot) if alive is None else alive
         mixture = self.mixture_logits.softmax(0)
         pose = self.trajectories.pose(knot)
         moved = self.trajectories.move(self.moving.means, mixture, pose)
-        return torch.cat([self.static.means, moved])
+        lived = self.local.positions(alive, self.time(knot))
+        return torch.cat([self.static.means, moved, lived])
 
     @torch.no_grad()
     def gaussians(self, time: float) -> GaussianCloud:
@@ -204,7 +156,8 @@ class Splat(nn.Module):
 
         They are what `render` composites over the background.
         """
-        cloud = self.cloud(self.knot(time))
+        knot = self.knot(time)
+        cloud = self.cloud(knot)
         visible = cloud.opacities > MIN_OPACITY
         return tree_map(lambda t: t[visible], cloud)
 
@@ -227,7 +180,8 @@ class Splat(nn.Module):
         The directions are those to the `means` (G, 3): spherical harmonics of degree 1.
         """
         directions = nn.functional.normalize(means - camera.c2w[:, 3], dim=-1)
-        sh1 = torch.cat([self.static.sh1, self.moving.sh1])
+        same_everywhere = means.new_zeros(len(means) - len(self.static) - len(self.moving), 3, 3)
+        sh1 = torch.cat([self.static.sh1, self.moving.sh1, same_everywhere])
         change = (sh1 @ directions[..., None])[..., 0]
         return change.clamp(-MAX_VIEW_LOG_FACTOR, MAX_VIEW_LOG_FACTOR)
 
@@ -254,25 +208,28 @@ class Splat(nn.Module):
         later and earlier; at the clip's ends it continues in a straight line.
         """
         knot = self.knot(time)
-        cloud = self.cloud(knot)
+        alive = self.alive(knot)
+        cloud = self.cloud(knot, alive)
         offsets = (1, -1) if scene_flow else ()
-        steps = [self.displacement(cloud.means, knot, o) for o in offsets]
+        steps = [self.displacement(cloud.means, alive, knot, o) for o in offsets]
         render, drawn = self.composite(self.draw(camera, cloud, steps))
         flow = {o: drawn[:, 3 * i : 3 * i + 3] for i, o in enumerate(offsets)}
         depth = render.depth.clamp(self.near, self.far)
         render = replace(render, depth=depth, scene_flow=flow)
         return render if pixels is None else select_pixels(render, camera, pixels)
 
-    def displacement(self, means: Tensor, knot: float, offset: int) -> Tensor:
+    def displacement(self, means: Tensor, alive: Tensor, knot: float, offset: int) -> Tensor:
         """From `means` (G, 3) at a knot to the means one training interval away.
+
+        `alive` (A,) are the time-local ones among them.
 
         `offset` is +1 (later) or -1 (earlier). Beyond the clip's ends, the displacement
         of the other direction is continued.
         """
         if self.has_knot(knot + offset):
-            return self.positions(knot + offset) - means
+            return self.positions(knot + offset, alive) - means
         if self.has_knot(knot - offset):
-            return means - self.positions(knot - offset)
+            return means - self.positions(knot - offset, alive)
         return torch.zeros_like(means)
 
     # Training
@@ -281,13 +238,14 @@ class Splat(nn.Module):
         """A training render of the whole frame at the batch's pixels, and regularizers.
 
         Two expensive terms take turns, by the batch's seed: flow to one of the
-        neighbors, as a warp, and rigidity.
+        neighbors, as a warp, and rigidity and evenness.
         """
         knot = self.knot(batch.time)
         flow_turn = batch.seed % 2 == 0
         offsets = self.choose_neighbor(batch) if flow_turn else []
-        cloud = self.cloud(knot)
-        flows = [self.flow_to_neighbor(batch, cloud.means, knot, o) for o in offsets]
+        alive = self.alive(knot)
+        cloud = self.cloud(knot, alive)
+        flows = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
         render, drawn = self.composite(self.draw(batch.camera, cloud, flows))
         # features are premultiplied by opacity
         flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
@@ -295,9 +253,11 @@ class Splat(nn.Module):
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)
         self.trajectories.mark(knot)
+        self.local.mark(alive)
         terms = self.regularizers(cloud, knot)
         if not flow_turn:
             terms["rigidity"] = self.rigidity()
+            terms["evenness"] = self.local.unevenness(alive, self.unit)
         return select_pixels(render, batch.camera, batch.pixels), terms
 
     @staticmethod
@@ -308,15 +268,15 @@ class Splat(nn.Module):
         return offsets[turn : turn + 1]
 
     def flow_to_neighbor(
-        self, batch: PixelBatch, means: Tensor, knot: float, offset: int
+        self, batch: PixelBatch, means: Tensor, alive: Tensor, knot: float, offset: int
     ) -> Tensor:
         """Optical flow (G, 2) in pixels, from the batch's camera to a neighboring one.
 
-        From where the camera sees each Gaussian's mean (G, 3) to where the neighbor
-        sees it at its own time.
+        From where the camera sees each Gaussian's mean (G, 3), the time-local ones
+        `alive` (A,) among them, to where the neighbor sees it at its own time.
         """
         last_knot = len(self.times) - 1
-        moved = self.positions(min(max(knot + offset, 0), last_knot))
+        moved = self.positions(min(max(knot + offset, 0), last_knot), alive)
         camera, neighbor = batch.camera, batch.neighbors[offset]
         limit = MAX_FLOW * camera.width
         return (neighbor.project(moved)[0] - camera.project(means)[0]).clamp(-limit, limit)
@@ -399,7 +359,26 @@ class Splat(nn.Module):
             config.lr * config.pose_lr,
             row_marks=[t.rotations_touched, t.translations_touched],
         )
-        return [*groups, poses]
+        return [*groups, poses, *self.local_groups()]
+
+    def local_groups(self) -> list[ParamGroup]:
+        """One group for every table of the time-local Gaussians."""
+        config, local = self.config, self.local
+        rates = {
+            "means": config.position_lr * self.unit,
+            "velocities": VELOCITY_SHARE * config.position_lr * self.unit,
+            "quaternions": config.shape_lr,
+            "log_scales": config.shape_lr,
+            "colors": config.color_lr,
+        }
+        return [
+            ParamGroup(
+                [getattr(local, name)],
+                config.lr * rate,
+                row_marks=[getattr(local, f"{name}_touched")],
+            )
+            for name, rate in rates.items()
+        ]
 
     # Relocation
 
@@ -410,26 +389,38 @@ class Splat(nn.Module):
             return
         self.relocate(frame_errors(RELOCATE_FRAMES), torch.Generator().manual_seed(step))
         self.find_neighbors()
+        self.local.find_neighbors(self.unit)
 
     @torch.no_grad()
     def relocate(self, frame_errors: list[FrameError], generator: torch.Generator) -> int:
         """Move unseen Gaussians to those of most error; how many were moved.
 
-        Static and moving ones are relocated separately, see `relocate.py`.
+        Static, moving and time-local ones are relocated separately, see `relocate.py`.
         """
-        scores = torch.stack([self.error_scores(e) for e in frame_errors]).mean(0)
+        num_shared = len(self.static) + len(self.moving)
+        scores = torch.zeros(num_shared, 2, device=self.background.device)
+        local = LocalScores(len(self.local), self.background.device)
+        for frame_error in frame_errors:
+            of_frame, alive = self.error_scores(frame_error)
+            scores += of_frame[:num_shared] / len(frame_errors)
+            local.add(alive, of_frame[num_shared:])
         static, moving = scores.split([len(self.static), len(self.moving)])
         companions = [self.opacity_offsets, self.mixture_logits]
         count = relocate(self.static, static, [], generator)
-        return count + relocate(self.moving, moving, companions, generator)
+        count += relocate(self.moving, moving, companions, generator)
+        return count + relocate(self.local, local.mean(), [], generator)
 
     @torch.no_grad()
-    def error_scores(self, frame_error: FrameError) -> Tensor:
+    def error_scores(self, frame_error: FrameError) -> tuple[Tensor, Tensor]:
         """Every Gaussian's weights in a frame, times the error and alone: (G, 2).
 
-        Both are summed over the frame's pixels, as gradients of two drawn features.
+        The order is that of `cloud`, with the time-local ones `alive` (A,) that are
+        returned too. Both are summed over the frame's pixels, as gradients of two
+        drawn features.
         """
-        cloud = self.cloud(self.knot(frame_error.time))
+        knot = self.knot(frame_error.time)
+        alive = self.alive(knot)
+        cloud = self.cloud(knot, alive)
         features = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
         with torch.enable_grad():
             maps = self.draw(frame_error.camera, cloud, [features])
@@ -437,7 +428,7 @@ class Splat(nn.Module):
             error = frame_error.error(render.radiance.detach())
             pixel_weights = torch.stack([error, torch.ones_like(error)], 1)
             (scores,) = torch.autograd.grad((drawn * pixel_weights).sum(), features)
-        return scores
+        return scores, alive
 
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""

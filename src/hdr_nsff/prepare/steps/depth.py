@@ -22,9 +22,12 @@ def find_depth(work: Work) -> StepResult:
     details = {k: v for k, v in record.details.items() if k != "attempt"}  # the source
     still = work.still()
     if still is None:
+        # movers before the background where there is no parallax
         files = {
-            "disparity": {f.index: f.static_disparity for f in work.train},
-            "disparity_confidence": {f.index: f.static_confidence for f in work.train},
+            "disparity": {f.index: f.mover_disparity or f.static_disparity for f in work.train},
+            "disparity_confidence": {
+                f.index: f.mover_confidence or f.static_confidence for f in work.train
+            },
         }
         return StepResult(record.note, record.provenance, details, frames=files)
     disparity, confidence = depth_with_movers(work, work.training_masks() & ~still)

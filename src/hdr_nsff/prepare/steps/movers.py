@@ -12,6 +12,7 @@ from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.priors.movers.rigidity import judge_rigidity
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
 from hdr_nsff.scene.posed_video import PosedVideo
@@ -19,17 +20,28 @@ from hdr_nsff.scene.scene import outline, without_outline
 
 
 def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
-    """The movers of the training frames, from flow, masks and a first depth."""
+    """The movers of the training frames, from flow, masks and a first depth.
+
+    Where the depth is that of the static scene, there are two rounds, on pixels that
+    parallax does not explain. The first one places the movers. The second one starts
+    from the depth of their shapes, inside the outlines of the masks.
+    """
     if work.manifest.depth_kind == "relative":
         return result((), {}, "not estimated: depth is known up to scale and shift only")
     flow = work.training_flows(work.refined_flows)
     disparity, confidence = work.static_depth()
     still = work.still()
     clip = work.training_clip()
+    masks = clip.moving
     indices = np.array([f.index for f in work.train])
     maps = {}
-    if still is not None:  # the depth is that of the static scene, without movers
-        clip = replace(clip, moving=clip.moving & ~still)
+    if without_parallax(work):
+        nearer = disparity / np.float32(tuning.depth_share_without_parallax)
+        disparity = np.where(clip.moving, nearer, disparity)
+        maps["mover_disparity"] = dict(zip(indices.tolist(), disparity, strict=True))
+        maps["mover_confidence"] = dict(zip(indices.tolist(), confidence, strict=True))
+    elif still is not None:  # the depth is that of the static scene, without movers
+        clip = replace(clip, moving=masks & ~still)
         found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
         disparity = np.where(clip.moving, found, disparity)
         confidence = np.where(clip.moving, trust, confidence)
@@ -37,15 +49,26 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
-        # once more, from the shapes' depth, on tracks inside of the outlines
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
         if work.manifest.steps["masks"].provenance == "estimated":
-            clip = replace(clip, moving=within_outlines(clip.moving))
+            # outlines of the whole masks: static pixels along them would count twice
+            clip = replace(clip, moving=within_outlines(masks) & ~still)
         movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
+    movers = judge_rigidity(movers, clip, *flow, disparity, tuning.rigidity)
     movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
     shapes = sum(mover.has_shape for mover in movers)
-    note = f"{len(movers)} found, {shapes} with a shape" if movers else "none found"
+    rigid = sum(mover.rigid for mover in movers)
+    note = "none found"
+    if movers:
+        note = f"{len(movers)} found, {shapes} with a shape, {rigid} rigid"
     return result(movers, maps, note)
+
+
+def without_parallax(work: Work) -> bool:
+    """Whether everything was put at one distance, as there is no parallax."""
+    if work.manifest.parallax == "full":
+        return False
+    return work.manifest.steps["static_depth"].provenance == "estimated"
 
 
 def within_outlines(moving: np.ndarray) -> np.ndarray:
@@ -75,7 +98,13 @@ def result(
     errors = [round(mover.error, 3) if mover.has_shape else None for mover in movers]
     return StepResult(
         note=note,
-        details={"tracks": sizes, "errors": errors},
+        details={
+            "tracks": sizes,
+            "errors": errors,
+            "rigid": [mover.rigid for mover in movers],
+            "flow_residuals_px": [round(mover.flow_residual, 3) for mover in movers],
+            "flow_uncertainty_px": round(movers[0].flow_uncertainty, 3) if movers else None,
+        },
         manifest={"movers": "movers.npz"},
         frames={"mover_disparity": {}, "mover_confidence": {}},
         maps=maps,

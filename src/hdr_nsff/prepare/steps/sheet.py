@@ -15,6 +15,7 @@ from hdr_nsff.scene.manifest import FrameEntry
 from hdr_nsff.scene.movers import Mover, nearest_mover, read_movers
 
 NUM_COLUMNS = 6  # frames shown
+STRIPE_PX = 3  # width of the stripes on movers that are not rigid
 SHEET = "contact_sheet.png"
 
 
@@ -32,12 +33,12 @@ def draw_sheet(work: Work) -> StepResult:
         "recorded": [work.video[f.index] for f in frames],
         "equalized": [work.equalized[0][f.index] for f in frames],
         "moving": [moving_cell(work, f) for f in frames],
-        "movers in colors": [mover_cell(work, f, movers) for f in frames],
+        "movers in colors (striped: not rigid)": [mover_cell(work, f, movers) for f in frames],
         "flow (gray: not believed)": [flow_cell(work, f) for f in frames],
         "disparity": disparity_cells(work, frames),
     }
     if not movers:
-        rows.pop("movers in colors")
+        rows.pop("movers in colors (striped: not rigid)")
     if m.parallax != "full":
         rows.pop("disparity")  # the same everywhere
     cells = [[cell.astype(np.float32) for cell in row] for row in rows.values()]
@@ -56,7 +57,7 @@ def moving_cell(work: Work, f: FrameEntry) -> np.ndarray:
 
 def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray:
     """The frame in gray (H, W, 3), moving pixels in the color of their mover, tracks as
-    bright dots; a mover without a shape is drawn pale.
+    bright dots; a mover without a shape is drawn pale, one that is not rigid striped.
     """
     gray = np.repeat(work.equalized[0][f.index].mean(-1, keepdims=True), 3, axis=-1)
     times = movers[0].frames.tolist() if movers else []
@@ -66,6 +67,9 @@ def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray
     y, x = np.nonzero(read_mask(work.folder / str(f.mask)))
     owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
     colors = mover_colors(movers)
+    rigid = np.array([mover.rigid for mover in movers])
+    colored = rigid[owner] | ((x + y) // STRIPE_PX % 2 == 0)
+    y, x, owner = y[colored], x[colored], owner[colored]
     gray[y, x] = 0.4 * gray[y, x] + 0.6 * colors[owner]
     for mover, color in zip(movers, colors, strict=True):
         pixels = mover.pixels[:, t]

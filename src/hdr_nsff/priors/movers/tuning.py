@@ -35,6 +35,21 @@ TRACK_TUNING = TrackTuning()
 
 
 @dataclass(frozen=True)
+class RigidityTuning:
+    """Tuning constants of the test whether a mover is rigid."""
+
+    max_residual_ratio: float = 2.0
+    """Residual of a rigid mover's flow relative to that of the static scene. Chosen on
+    10 real clips and the demo: rendered boxes have 0.8 to 1.3, people 2.1 to 8."""
+    min_uncertainty_px: float = 0.1
+    """Flow is never taken to be surer than this, exact flow of a rendered scene
+    neither."""
+
+
+RIGIDITY_TUNING = RigidityTuning()
+
+
+@dataclass(frozen=True)
 class RigidGroupsTuning:
     """Tuning constants of groups and their motion, hand-chosen on rendered scenes."""
 
@@ -263,6 +278,12 @@ class MoversTuning:
     bundle: BundleTuning = BUNDLE_TUNING
     segmentation: MotionSegmentationTuning = MOTION_SEGMENTATION_TUNING
     distance: MoverDistanceTuning = MOVER_DISTANCE_TUNING
+    rigidity: RigidityTuning = RIGIDITY_TUNING
+    depth_share_without_parallax: float = 0.85
+    """Of the distance of everything, where movers stand when there is no parallax: in
+    front of the background, or it would shine through them. 0.8 and 0.9 are as good on
+    real clips, 1 costs 0.6 to 0.9 dB.
+    """
     fallback_smoothing_times: float = 1.0
     """Standard deviation of the Gaussian that smooths the path of all moving pixels
     together, where no tracks are found.

@@ -1,0 +1,219 @@
+"""Start time-local Gaussians on the movers that are not rigid, in every training frame.
+
+One per square cell of mask pixels. Its velocity is that of believed flow around it, its
+radiance that of its pixel and of where flow leads in the two neighboring frames, so
+that a value that clipped is taken from another exposure.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from hdr_nsff.fields.point_cloud import (
+    MIN_RADIANCE,
+    PointCloud,
+    ToRadiance,
+    concatenate,
+    exposure_trust,
+    merge_by_cell,
+    unproject_frame,
+)
+from hdr_nsff.fields.splat.gaussians import from_log_radiance
+from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
+from hdr_nsff.scene.movers import nearest_mover
+from hdr_nsff.scene.scene import Frame, Scene, surely_moving
+
+OVERLAP = 0.5  # standard deviation relative to the side of a cell (hand-chosen on real clips)
+OPACITY = 0.7
+FILL = 0.95  # of the places are used at once
+NEIGHBOR_TRUST = 0.5  # of a color that flow brought, relative to the pixel's own
+NUM_FLOW_PIXELS = 24  # nearest ones with believed flow, whose median is a velocity
+# standard deviation of a life in cycles of exposures and at least, in frames: every
+# exposure sees it, and little bends meanwhile (0.5 to 1 cycle is best on real clips)
+
+DURATION_CYCLES, MIN_DURATION = 0.7, 1.4
+
+
+@dataclass(frozen=True)
+class LocalSeeds:
+    """Seeds of one training frame."""
+
+    points: PointCloud  # P of them
+    velocities: Tensor  # (P, 3) scene units a frame
+    time: float  # in frames
+
+
+def local_mask(scene: Scene, i: int) -> Tensor:
+    """(H, W) bool: pixels of training frame `i` that surely are of non-rigid movers.
+
+    Where there are no movers, of everything that moves.
+    """
+    f = scene.train[i]
+    moving = surely_moving(f)
+    rigid = [mover.rigid for mover in scene.movers]
+    if not any(rigid):
+        return moving
+    if all(rigid):
+        return torch.zeros_like(moving)
+    t = time_of(scene, i)
+    y, x = np.nonzero(moving.numpy())
+    owner = nearest_mover(scene.movers, t, np.stack([x, y], -1) + 0.5)
+    result = torch.zeros_like(moving)
+    result[y, x] = torch.from_numpy(~np.array(rigid)[owner])
+    return result
+
+
+def time_of(scene: Scene, i: int) -> int:
+    """The position of a training frame's time among the movers' times."""
+    return int(torch.searchsorted(scene.times, scene.train[i].time))
+
+
+def count_local_pixels(scene: Scene) -> int:
+    """Pixels of non-rigid movers in all training frames."""
+    return sum(int(local_mask(scene, i).sum()) for i in range(len(scene.train)))
+
+
+def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, unit: float) -> int:
+    """Place the Gaussians; how many. `unit` is the scene's typical length."""
+    masks = [local_mask(scene, i) for i in range(len(scene.train))]
+    num_pixels = sum(int(mask.sum()) for mask in masks)
+    if not num_pixels or not len(local):
+        return 0
+    side = math.sqrt(max(num_pixels / (FILL * len(local)), 1.0))
+    while sum(count_cells(mask, side) for mask in masks) > len(local):
+        side *= 1.01
+    seeds = [
+        frame_seeds(scene, i, mask, side, to_radiance) for i, mask in enumerate(masks) if mask.any()
+    ]
+    points = concatenate([seed.points for seed in seeds])
+    n = len(points)
+    times = torch.cat([torch.full((len(seed.points),), seed.time) for seed in seeds])
+    local.means[:n, :3] = points.positions
+    local.means[:n, 3] = times
+    local.velocities[:n, :3] = torch.cat([seed.velocities for seed in seeds])
+    local.log_scales[:n, :3] = (OVERLAP * side * points.footprint).log()[:, None]
+    local.log_scales[:, 3] = math.log(start_duration(scene))
+    local.colors[:n, :3] = from_log_radiance(points.log_radiance, local.bounded)
+    local.colors[:n, 3] = math.log(OPACITY / (1 - OPACITY))
+    local.find_neighbors(unit)
+    return n
+
+
+def start_duration(scene: Scene) -> float:
+    """Standard deviation of a life, in frames."""
+    times = scene.times
+    step = float(times.diff().median()) if len(times) > 1 else 1.0
+    cycle = scene.manifest.num_brackets * step
+    return max(DURATION_CYCLES * cycle, MIN_DURATION * step)
+
+
+def cells_of(mask: Tensor, side: float) -> Tensor:
+    """The square cell (P,) of every pixel of a mask (H, W), row by row."""
+    y, x = mask.nonzero().unbind(1)
+    return (y / side).long() * mask.shape[1] + (x / side).long()
+
+
+def count_cells(mask: Tensor, side: float) -> int:
+    """How many square cells a mask (H, W) occupies."""
+    return len(torch.unique(cells_of(mask, side)))
+
+
+def frame_seeds(
+    scene: Scene, i: int, mask: Tensor, side: float, to_radiance: ToRadiance
+) -> LocalSeeds:
+    """One seed per square cell of `mask` (H, W) in training frame `i`."""
+    f = scene.train[i]
+    points = unproject_frame(f, i, mask.reshape(-1), scene.near, scene.far, to_radiance)
+    colors = [points.log_radiance]
+    trusts = [exposure_trust(f.image[mask])]
+    for offset in f.flow:
+        color, trust = colors_along_flow(scene, f, mask, offset, to_radiance)
+        colors.append(color)
+        trusts.append(NEIGHBOR_TRUST * trust)
+    weight = torch.stack(trusts)[..., None]  # (1 to 3, P, 1)
+    mean = (weight * torch.stack(colors)).sum(0) / weight.sum(0)
+    points = PointCloud(points.positions, mean, weight.sum(0)[:, 0], points.footprint)
+    cells = cells_of(mask, side)
+    pixels = mask.nonzero().flip(1) + 0.5
+    centers = mean_by_cell(pixels, cells)
+    velocities = velocities_around(centers, *flow_velocities(scene, f, mask, points.positions))
+    return LocalSeeds(merge_by_cell(points, cells), velocities, f.time)
+
+
+def mean_by_cell(values: Tensor, cells: Tensor) -> Tensor:
+    """The mean (C, K) of `values` (P, K) in each distinct cell of `cells` (P,)."""
+    _, index, counts = torch.unique(cells, return_inverse=True, return_counts=True)
+    sums = torch.zeros(len(counts), values.shape[1]).index_add_(0, index, values)
+    return sums / counts[:, None]
+
+
+def landing(scene: Scene, f: Frame, mask: Tensor, offset: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Where flow leads the pixels of a mask in a neighbor.
+
+    Pixels (P, 2) with centers at +0.5, the integer pixels (P, 2) that hold them, and
+    whether the flow is believed (P,).
+    """
+    target = mask.nonzero().flip(1) + 0.5 + f.flow[offset][mask]
+    height, width = mask.shape
+    cell = target.floor().long()
+    inside = (cell >= 0).all(1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+    cell = cell.clamp_min(0).minimum(torch.tensor([width - 1, height - 1]))
+    return target, cell, inside & f.flow_valid[offset][mask]
+
+
+def colors_along_flow(
+    scene: Scene, f: Frame, mask: Tensor, offset: int, to_radiance: ToRadiance
+) -> tuple[Tensor, Tensor]:
+    """Log radiance (P, 3) that a neighbor recorded of them, and its trust (P,)."""
+    j = f.neighbors[offset]
+    _, cell, believed = landing(scene, f, mask, offset)
+    rgb = scene.train[j].image[cell[:, 1], cell[:, 0]]
+    log = to_radiance(rgb, j).clamp_min(MIN_RADIANCE).log()
+    return log, exposure_trust(rgb) * believed
+
+
+def flow_velocities(
+    scene: Scene, f: Frame, mask: Tensor, positions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Pixels (Q, 2) with believed flow and their velocities (Q, 3), units a frame.
+
+    From the pixels' `positions` (P, 3) to where the neighbors' depth puts what flow
+    finds there; the mean of both sides.
+    """
+    total = torch.zeros_like(positions)
+    count = torch.zeros(len(positions))
+    for offset in f.flow:
+        neighbor = scene.train[f.neighbors[offset]]
+        if neighbor.disparity is None:
+            continue
+        target, cell, believed = landing(scene, f, mask, offset)
+        column, row = cell.unbind(1)
+        if neighbor.moving is not None:  # else it landed on what is behind
+            believed = believed & neighbor.moving[row, column]
+        disparity = neighbor.disparity[row, column].clamp(1 / scene.far, 1 / scene.near)
+        rays = neighbor.camera.rays(target)
+        points = rays.origins + rays.directions / disparity[:, None]
+        step = (points - positions) / (neighbor.time - f.time)
+        total += torch.where(believed[:, None], step, torch.zeros_like(step))
+        count += believed
+    known = count > 0
+    pixels = mask.nonzero().flip(1)[known] + 0.5
+    return pixels, total[known] / count[known, None]
+
+
+def velocities_around(centers: Tensor, pixels: Tensor, velocities: Tensor) -> Tensor:
+    """The median (P, 3) of the `velocities` (Q, 3) at the `pixels` (Q, 2) nearest to
+    each of `centers` (P, 2); 0 where there are none.
+    """
+    if not len(pixels):
+        return torch.zeros(len(centers), 3)
+    num = min(NUM_FLOW_PIXELS, len(pixels))
+    _, nearest = cKDTree(pixels.numpy()).query(centers.numpy(), num)
+    of_nearest = velocities[torch.from_numpy(nearest.reshape(len(centers), num))]
+    return of_nearest.median(1).values

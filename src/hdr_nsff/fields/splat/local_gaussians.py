@@ -1,0 +1,120 @@
+"""Time-local Gaussians: what moves without being rigid, as many short lives.
+
+Each one is born at its center time, moves at a constant velocity and fades on either
+side: x(t) = x + v (t - t0), opacity times exp(-(t - t0)^2 / (2 s^2)). People and cloth
+are made of them; no motion is shared, so none is needed that explains an arm and a leg
+(space-time Gaussians, Li et al. 2024, with straight paths). Only those alive at a time
+are drawn, and only they are updated. Colors are constant: lives are short.
+
+What belongs to one Gaussian stands in tables of four columns, as `TouchedAdam` takes
+them.
+"""
+
+from __future__ import annotations
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor, nn
+
+from hdr_nsff.fields.splat.gaussians import START_LOG_SCALE, START_LOGIT, to_radiance
+
+MIN_WINDOW = 0.02  # below this share of its opacity, a Gaussian is not alive: 2.8 durations
+NUM_NEIGHBORS = 4  # whose velocities are compared
+# scene lengths (in units of the near depth) that count as far as one frame, for
+# neighbors in space and time
+LENGTHS_PER_FRAME = 0.01
+
+
+class LocalGaussians(nn.Module):
+    """`count` (G) time-local Gaussians. Times are in frames."""
+
+    neighbors: Tensor
+
+    def __init__(self, count: int, bounded: bool = False) -> None:
+        super().__init__()
+        self.bounded = bounded
+        # position at the center time in scene units, and the center time, which is not
+        # learned
+        self.means = nn.Parameter(torch.zeros(count, 4))
+        # scene units a frame, and an unused column
+        self.velocities = nn.Parameter(torch.zeros(count, 4))
+        self.quaternions = nn.Parameter(torch.tensor([1.0, 0, 0, 0]).repeat(count, 1))
+        # log of standard deviations in scene units, and of the duration in frames
+        self.log_scales = nn.Parameter(torch.full((count, 4), START_LOG_SCALE))
+        # log radiance (or log odds) and the logit of opacity
+        self.colors = nn.Parameter(torch.tensor([0.0, 0, 0, START_LOGIT]).repeat(count, 1))
+        itself = torch.arange(count, dtype=torch.int32)[:, None]
+        self.register_buffer("neighbors", itself.repeat(1, NUM_NEIGHBORS))
+        for name in self.table_names():
+            marks = torch.zeros(count, dtype=torch.uint8)
+            self.register_buffer(f"{name}_touched", marks, persistent=False)
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @staticmethod
+    def table_names() -> tuple[str, ...]:
+        """The tables (G, 4) that are learned."""
+        return "means", "velocities", "quaternions", "log_scales", "colors"
+
+    def mark(self, alive: Tensor) -> None:
+        """Mark the rows `alive` (A,) as the only ones that this step may change."""
+        for name in self.table_names():
+            getattr(self, f"{name}_touched")[alive] = 1
+
+    @torch.no_grad()
+    def copy(self, source: Tensor, target: Tensor) -> None:
+        """Make the Gaussians `target` (N,) like `source` (N,), times included."""
+        for name in self.table_names():
+            table = getattr(self, name)
+            table[target] = table[source]
+
+    # At a time
+
+    @torch.no_grad()
+    def alive(self, time: float) -> Tensor:
+        """Indices (A,) of the Gaussians that are alive at a time."""
+        return (self.window(self.means, self.log_scales, time) > MIN_WINDOW).nonzero()[:, 0]
+
+    @staticmethod
+    def window(means: Tensor, log_scales: Tensor, time: float) -> Tensor:
+        """Share (A,) of their opacity that Gaussians have at a time."""
+        ages = (time - means[:, 3]) / log_scales[:, 3].exp()
+        return (-0.5 * ages.square()).exp()
+
+    def positions(self, alive: Tensor, time: float) -> Tensor:
+        """Where the Gaussians `alive` (A,) are at a time: (A, 3)."""
+        means = self.means[alive]
+        ages = (time - means[:, 3:]).detach()
+        return means[:, :3] + ages * self.velocities[alive, :3]
+
+    def opacities(self, alive: Tensor, time: float) -> Tensor:
+        """Opacities (A,) in [0, 1] at a time."""
+        window = self.window(self.means[alive].detach(), self.log_scales[alive], time)
+        return window * self.colors[alive, 3].sigmoid()
+
+    def radiance(self, alive: Tensor) -> Tensor:
+        """Linear HDR radiance (A, 3)."""
+        return to_radiance(self.colors[alive, :3], self.bounded)
+
+    # Evenness of motion
+
+    def unevenness(self, alive: Tensor, unit: float) -> Tensor:
+        """Mean square difference of the velocities of neighbors, in `unit` a frame.
+
+        The neighbors' velocities count as given.
+        """
+        own = self.velocities[alive, None, :3]
+        others = self.velocities[self.neighbors[alive].long(), :3].detach()
+        differences = (own - others) / unit
+        return differences.square().sum() / max(differences.numel(), 1)
+
+    @torch.no_grad()
+    def find_neighbors(self, unit: float) -> None:
+        """Find the nearest Gaussians in space and time of each one anew."""
+        if len(self) <= NUM_NEIGHBORS:
+            return
+        scales = self.means.new_tensor([1, 1, 1, LENGTHS_PER_FRAME * unit])
+        places = (self.means * scales).cpu().numpy()
+        _, nearest = cKDTree(places).query(places, NUM_NEIGHBORS + 1)
+        self.neighbors.copy_(torch.from_numpy(nearest[:, 1:]))  # the first is itself

@@ -1,0 +1,104 @@
+"""Which movers are rigid: those whose motion explains believed flow as well as the
+cameras explain that of the static scene.
+
+Flow is uncertain, and so are the cameras. How far both together are off shows in the
+static scene, so the test asks for nothing that the clip cannot give: the median
+distance between flow and motion in the mover's pixels may be a small multiple of the
+same in pixels that stand still.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hdr_nsff.geometry import pinhole
+from hdr_nsff.priors.movers.regions import FlowStep, flow_steps
+from hdr_nsff.priors.movers.tuning import RIGIDITY_TUNING, RigidityTuning
+from hdr_nsff.scene.movers import Mover, nearest_mover
+from hdr_nsff.scene.posed_video import PosedVideo
+
+STATIC_STRIDE = 4  # pixels, in x and in y, of the static samples
+
+
+def judge_rigidity(
+    movers: Sequence[Mover],
+    clip: PosedVideo,
+    flow: np.ndarray,
+    valid: np.ndarray,
+    pairs: np.ndarray,
+    disparity: np.ndarray,
+    tuning: RigidityTuning = RIGIDITY_TUNING,
+) -> tuple[Mover, ...]:
+    """The movers with the residuals of their flow, and whether each is rigid.
+
+    `movers` have frames that are positions in the clip; the other arguments are those
+    of `estimate_movers`. A mover without believed flow stays as it is.
+    """
+    if not movers:
+        return ()
+    frames = movers[0].frames.tolist()
+    steps = {(s.start, s.end): s for s in flow_steps(clip.times, flow, valid, pairs)}
+    residuals: list[list[np.ndarray]] = [[] for _ in movers]
+    static: list[np.ndarray] = []
+    for t, (start, end) in enumerate(itertools.pairwise(frames)):
+        step = steps.get((start, end))
+        if step is None:
+            continue
+        static.append(static_residuals(clip, step, disparity[start]))
+        y, x = np.nonzero(clip.moving[start] & step.valid)
+        pixels = np.stack([x, y], -1) + 0.5
+        owner = nearest_mover(movers, t, pixels)
+        points = clip.unproject(start, pixels, disparity[start][y, x].astype(np.float64))
+        for k, mover in enumerate(movers):
+            own = owner == k
+            moved = mover.world(mover.canonical(points[own], t), t + 1)
+            found = step.flow[y[own], x[own]]
+            residuals[k].append(flow_residuals(clip, end, pixels[own], moved, found))
+    uncertainty = median(static)
+    allowed = tuning.max_residual_ratio * max(uncertainty, tuning.min_uncertainty_px)
+    result = []
+    for mover, own in zip(movers, residuals, strict=True):
+        residual = median(own)
+        result.append(
+            replace(
+                mover,
+                flow_residual=residual,
+                flow_uncertainty=uncertainty,
+                rigid=residual <= allowed,
+            )
+        )
+    return tuple(result)
+
+
+def static_residuals(clip: PosedVideo, step: FlowStep, disparity: np.ndarray) -> np.ndarray:
+    """Distances (P,) px between flow and the cameras' motion, in static samples.
+
+    `disparity` (H, W) is that of the step's first frame.
+    """
+    samples = np.zeros(clip.size, bool)
+    samples[::STATIC_STRIDE, ::STATIC_STRIDE] = True
+    y, x = np.nonzero(samples & step.valid & ~clip.moving[step.start])
+    pixels = np.stack([x, y], -1) + 0.5
+    points = clip.unproject(step.start, pixels, disparity[y, x].astype(np.float64))
+    return flow_residuals(clip, step.end, pixels, points, step.flow[y, x])
+
+
+def flow_residuals(
+    clip: PosedVideo, end: int, pixels: np.ndarray, points: np.ndarray, flow: np.ndarray
+) -> np.ndarray:
+    """Distances (P,) px between where `flow` (P, 2) leads `pixels` (P, 2), and where
+    frame `end` sees the `points` (P, 3).
+    """
+    seen, depth = pinhole.project(points, clip.K[end], clip.c2w[end])
+    distances = np.linalg.norm(seen - pixels - flow, axis=-1)
+    return distances[np.isfinite(distances) & (depth > pinhole.MIN_DEPTH)]
+
+
+def median(parts: list[np.ndarray]) -> float:
+    """The median of all values; 0 where there are none."""
+    values = np.concatenate([np.zeros(0), *parts])
+    return float(np.median(values)) if len(values) else 0.0
