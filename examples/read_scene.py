@@ -94,6 +94,7 @@ def gaussians(document, arrays, time, eye):
             since = time - g["centers"]
             means = means + g["velocities"] * since[:, None]
             window = np.exp(-0.5 * (since / np.exp(g["log_durations"])) ** 2)
+            window = np.where(window > 0.02, window, 0)
         roots = rotations(quaternions) * np.exp(g["log_scales"])[:, None]
         if "sh1" in g:  # the color changes with the direction of view
             directions = (means - eye) / np.linalg.norm(means - eye, axis=1, keepdims=True)

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from viewer_scenes import local_gaussians, render, scene_file, trained
+from viewer_scenes import render, scene_file, trained, trained_local
 
-from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.maths.metrics import mu_law_psnr
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.viewer.field_scene import scene_of
 from hdr_nsff.viewer.page_file import PageSettings, make_page
 from hdr_nsff.viewer.scene_file import to_bytes
 
@@ -41,23 +40,10 @@ def test_the_reader_draws_what_render_does(toy: Scene, tmp_path: Path, preset: s
         assert mu_law_psnr(found, expected, float(expected.max())) > 50
 
 
-def test_the_reader_draws_local_gaussians(toy: Scene, tmp_path: Path) -> None:
-    group, time = local_gaussians(), 1.7
+def test_the_reader_draws_time_local_gaussians(toy: Scene, tmp_path: Path) -> None:
+    field, tonemapper = trained_local(toy)
     path = tmp_path / "local.hdr4d"
-    path.write_bytes(to_bytes(replace(scene_file(toy), groups=[group], background=[0.1] * 3)))
-    assert group.velocities is not None and group.centers is not None
-    assert group.log_durations is not None
-    since = time - group.centers
-    window = np.exp(-0.5 * (since / np.exp(group.log_durations)) ** 2)
-    arrays = (
-        group.means + group.velocities * since[:, None],
-        group.quaternions,
-        np.exp(group.log_scales),
-        window / (1 + np.exp(-group.opacity_logits)),
-        np.exp(group.log_radiance),
-    )
-    tensors = [torch.from_numpy(a.astype(np.float32)) for a in arrays]
-    maps = rasterize(*tensors, toy.train[1].camera.resized(*SIZE))
-    expected = maps.features + (1 - maps.alpha)[..., None] * 0.1
-    found = torch.from_numpy(draw(path, toy, time))
+    path.write_bytes(to_bytes(scene_of(field, tonemapper, toy, "Toy", 1.0)))
+    expected = render(field, toy, 1, 1.7, SIZE)
+    found = torch.from_numpy(draw(path, toy, 1.7))
     assert mu_law_psnr(found, expected, float(expected.max())) > 50

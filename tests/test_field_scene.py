@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import torch
 from presets import random_field
-from viewer_scenes import local_gaussians, scene_file, trained
+from viewer_scenes import local_gaussians, scene_file, trained, trained_local
 
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.viewer.field_scene import drop_invisible, scene_of
@@ -20,7 +20,7 @@ def test_all_visible_gaussians_are_kept(toy: Scene) -> None:
         field.opacity_offsets[:, :7] = 0.0
         field.opacity_offsets[3, 2] = 12.0  # the third one appears for a while
     scene = scene_of(field, tonemapper, toy, "Toy", 1.0)
-    static, moving = scene.groups
+    static, moving = scene.groups[:2]
     assert len(static) == len(field.static) - 5
     assert len(moving) == len(field.moving) - 6
     np.testing.assert_array_equal(moving.means[0], field.moving.means[2].detach())
@@ -28,12 +28,20 @@ def test_all_visible_gaussians_are_kept(toy: Scene) -> None:
     np.testing.assert_allclose(moving.mixture.sum(1), 1, rtol=1e-6)
 
 
-def test_gaussians_that_are_not_finite_are_left_out() -> None:
-    group = local_gaussians(count=6)
+def test_gaussians_that_are_not_finite_are_left_out(toy: Scene) -> None:
+    group = local_gaussians(toy)
     group.means[2, 1] = np.nan
     kept = drop_invisible(group)
-    assert len(kept) == 5 and kept.centers is not None
+    assert len(kept) == len(group) - 1
+    assert kept.centers is not None and group.centers is not None
     np.testing.assert_array_equal(kept.centers, np.delete(group.centers, 2))
+
+
+def test_time_local_gaussians_are_a_group_of_their_own(toy: Scene) -> None:
+    field, tonemapper = trained_local(toy)
+    (group,) = scene_of(field, tonemapper, toy, "Toy", 1.0).groups
+    assert (group.name, group.mixture, len(group)) == ("local", None, len(field.local))
+    assert group.velocities is not None and group.velocities.shape == (len(group), 3)
 
 
 def test_recorded_pictures_are_those_of_the_frames(toy: Scene) -> None:

@@ -22,7 +22,7 @@ from hdr_nsff.viewer.scene_file import (
 
 def test_a_scene_is_read_back(toy: Scene) -> None:
     scene = scene_file(toy)
-    scene = replace(scene, groups=[*scene.groups, local_gaussians()])
+    scene = replace(scene, groups=[*scene.groups, local_gaussians(toy)])
     found = from_bytes(to_bytes(scene))
     assert replace(found, groups=[], bases=None) == replace(scene, groups=[], bases=None)
     for before, after in zip(scene.groups, found.groups, strict=True):
@@ -54,6 +54,6 @@ def test_a_file_of_another_version_is_refused(toy: Scene) -> None:
         from_bytes(data)
 
 
-def test_a_group_with_a_part_of_the_local_arrays_is_a_mistake() -> None:
+def test_a_group_with_a_part_of_the_local_arrays_is_a_mistake(toy: Scene) -> None:
     with pytest.raises(AssertionError):
-        check_group(replace(local_gaussians(), velocities=None))
+        check_group(replace(local_gaussians(toy), velocities=None))

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from presets import random_field
 
+from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
-from hdr_nsff.viewer.field_scene import local_group, scene_of
+from hdr_nsff.viewer.field_scene import local_of, scene_of
 from hdr_nsff.viewer.scene_file import GaussianGroup, SceneFile
 
 
@@ -26,19 +26,32 @@ def scene_file(scene: Scene, preset: str = "splat") -> SceneFile:
     return scene_of(*trained(scene, preset), scene, "Toy", display_exposure=1.0)
 
 
-def local_gaussians(count: int = 60, seed: int = 4) -> GaussianGroup:
-    """Time-local Gaussians in front of the toy scene's cameras."""
-    draw = np.random.default_rng(seed)
-    return local_group(
-        means=draw.uniform([-1.5, -1, 2], [1.5, 1, 4], (count, 3)),
-        velocities=draw.normal(0, 0.2, (count, 3)),
-        quaternions=draw.normal(size=(count, 4)),
-        log_scales=draw.uniform(-3, -1.5, (count, 3)),
-        opacity_logits=draw.uniform(0, 4, count),
-        log_radiance=draw.normal(0, 1.5, (count, 3)),
-        centers=draw.uniform(0, 4, count),
-        log_durations=draw.uniform(-0.5, 1.5, count),
-    )
+def trained_local(scene: Scene, count: int = 60, seed: int = 4) -> tuple[Splat, ToneMapper]:
+    """The same with time-local Gaussians in front of the cameras, and these alone."""
+    field, tonemapper = trained(scene)
+    local = LocalGaussians(count)
+    draw = torch.Generator().manual_seed(seed)
+
+    def uniform(low: list[float], high: list[float]) -> torch.Tensor:
+        span = torch.tensor(high) - torch.tensor(low)
+        return torch.tensor(low) + span * torch.rand(count, len(low), generator=draw)
+
+    with torch.no_grad():
+        local.means.copy_(uniform([-1.5, -1, 2, 0], [1.5, 1, 4, 4]))
+        local.velocities.copy_(uniform([-0.3] * 4, [0.3] * 4))
+        local.quaternions.copy_(uniform([-1.0] * 4, [1.0] * 4))
+        local.log_scales.copy_(uniform([-3, -3, -3, -0.5], [-1.5, -1.5, -1.5, 1.5]))
+        local.colors.copy_(uniform([-2, -2, -2, 0], [2, 2, 2, 4]))
+        for gaussians in (field.static, field.moving):
+            gaussians.opacity_logits.fill_(-20.0)
+        field.opacity_offsets.zero_()
+    field.local = local
+    return field, tonemapper
+
+
+def local_gaussians(scene: Scene) -> GaussianGroup:
+    """The time-local Gaussians of that field."""
+    return local_of(trained_local(scene)[0].local)
 
 
 def render(

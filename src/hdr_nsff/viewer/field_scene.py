@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.splat.gaussians import Gaussians, to_radiance
+from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
@@ -84,7 +85,7 @@ def add_gaussians(shell: SceneFile, field: Splat) -> SceneFile:
         opacity_offsets=to_numpy(field.opacity_offsets),
         mixture=to_numpy(field.mixture_logits.softmax(0).T),
     )
-    groups = [drop_invisible(group) for group in (static, moving)]
+    groups = [drop_invisible(group) for group in (static, moving, local_of(field.local))]
     return replace(
         shell,
         groups=[group for group in groups if len(group)],
@@ -110,35 +111,21 @@ def group_of(gaussians: Gaussians, name: str, motion: float) -> GaussianGroup:
     )
 
 
-def local_group(
-    means: Array,
-    velocities: Array,
-    quaternions: Array,
-    log_scales: Array,
-    opacity_logits: Array,
-    log_radiance: Array,
-    centers: Array,
-    log_durations: Array,
-    name: str = "local",
-) -> GaussianGroup:
-    """Time-local Gaussians as a group, from arrays of N rows.
-
-    Each lives around its center time (N,) in frames, for about its duration, and moves
-    in a straight line at its velocity (N, 3) in scene units per frame.
-    """
-    return drop_invisible(
-        GaussianGroup(
-            name=name,
-            motion=1.0,
-            means=means.astype(np.float32),
-            quaternions=unit(quaternions.astype(np.float32)),
-            log_scales=log_scales.astype(np.float32),
-            opacity_logits=opacity_logits.astype(np.float32),
-            log_radiance=log_radiance.astype(np.float32),
-            velocities=velocities.astype(np.float32),
-            centers=centers.astype(np.float32),
-            log_durations=log_durations.astype(np.float32),
-        )
+def local_of(gaussians: LocalGaussians) -> GaussianGroup:
+    """Time-local Gaussians as a group."""
+    means, log_scales = to_numpy(gaussians.means), to_numpy(gaussians.log_scales)
+    colors = to_numpy(gaussians.colors)
+    return GaussianGroup(
+        name="local",
+        motion=1.0,
+        means=means[:, :3],
+        quaternions=unit(to_numpy(gaussians.quaternions)),
+        log_scales=log_scales[:, :3],
+        opacity_logits=colors[:, 3],
+        log_radiance=colors[:, :3],
+        velocities=to_numpy(gaussians.velocities)[:, :3],
+        centers=means[:, 3],
+        log_durations=log_scales[:, 3],
     )
 
 
@@ -148,9 +135,10 @@ def drop_invisible(group: GaussianGroup) -> GaussianGroup:
     if group.opacity_offsets is not None:
         logits = logits + group.opacity_offsets.max(0)
     kept = logits > np.log(MIN_OPACITY / (1 - MIN_OPACITY))
-    per_gaussian = ["means", "quaternions", "log_scales", "log_radiance"]
-    for name in per_gaussian:
-        kept &= np.isfinite(getattr(group, name)).all(1)
+    for name in ("means", "quaternions", "log_scales", "log_radiance", "velocities"):
+        values = getattr(group, name)
+        if values is not None:
+            kept &= np.isfinite(values).all(1)
     chosen: dict[str, Any] = {}
     for entry in fields(group):
         values = getattr(group, entry.name)

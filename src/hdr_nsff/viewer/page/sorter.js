@@ -3,7 +3,7 @@
 import { POSE_FLOATS } from "./motion.js";
 
 const NEAREST = 0.01; // z-depth, scene units: nothing nearer is drawn
-const MAX_WINDOW = 5.6; // exp(-5.6) < 1/255: the exponent at which a window hides anything
+const MAX_AGE = 2.8; // durations from its center time at which a Gaussian is alive
 const BUCKETS = 65536;
 
 let groups = [];
@@ -57,7 +57,7 @@ function fillDepths(group, time, poses, row, depths) {
     const since = time - centers[i];
     const share = since / Math.exp(logDurations[i]);
     const speed = rx * velocities[k] + ry * velocities[k + 1] + rz * velocities[k + 2];
-    depths[i] = 0.5 * share * share > MAX_WINDOW ? 0 : depths[i] + speed * since;
+    depths[i] = Math.abs(share) > MAX_AGE ? 0 : depths[i] + speed * since;
   }
 }
 

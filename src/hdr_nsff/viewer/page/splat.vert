@@ -13,6 +13,7 @@ const float MARGIN = 0.3; // of half the picture: beyond, the projection is line
 const float MAX_LOG_RADIANCE = 16.0;
 const float MAX_VIEW_LOG_FACTOR = 2.0;
 const float MIN_LENGTH = 1e-12;
+const float MIN_WINDOW = 0.02; // of a time-local Gaussian: below, it is not alive
 const int RADIANCE = 0, GEOMETRY = 1, FLOW = 2; // what is composited
 
 layout(location = 0) in uint index;
@@ -139,7 +140,8 @@ void main() {
     vec4 velocity = gaussian(i, 4);
     float since = u_time - gaussian(i, 3).w;
     float share = since / exp(velocity.w);
-    opacity *= exp(-0.5 * share * share);
+    float window = exp(-0.5 * share * share);
+    opacity *= window > MIN_WINDOW ? window : 0.0;
     mean += velocity.xyz * since;
     next += velocity.xyz * (since + u_flowTime - u_time);
   }
