@@ -26,7 +26,16 @@ KEY = "hdr4d"  # of the document in the file's metadata
 VERSION = 1
 MAX_INT16, MAX_UINT16 = 32767, 65535
 # how arrays are stored: half precision, or integers times a factor
-HALF = {"log_scales", "opacity_logits", "log_radiance", "color_offsets", "opacity_offsets", "sh1"}
+HALF = {
+    "log_scales",
+    "opacity_logits",
+    "log_radiance",
+    "color_offsets",
+    "opacity_offsets",
+    "velocities",
+    "log_durations",
+    "sh1",
+}
 SCALED: dict[str, tuple[type, float]] = {
     "quaternions": (np.int16, 1 / MAX_INT16),
     "mixture": (np.uint16, 1 / MAX_UINT16),
