@@ -334,7 +334,7 @@ def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: 
     tab.press("v")
     tab.wait("!viewer.frames.busy && viewer.frames.shown > 2")
     width = tab.run("document.getElementById('frame').naturalWidth")
-    assert width == tab.run("viewer.canvas.width")  # the finest, after coarse ones
+    assert width == tab.run("viewer.scene.width")  # the finest, after coarse ones
     assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
     assert all(asked.startswith(address) for asked in tab.requests())
     assert tab.problems() == []

@@ -10,9 +10,14 @@ const START_RATE = 3e5; // pixels per second, before any was measured
 const SMALLEST_WIDTH = 32; // pixels
 
 export class Frames {
-  /** Shows frames in `image`; calls `failed` with a sentence where none come. */
-  constructor(image, failed) {
+  /**
+   * Shows frames in `image`, at most `maxWidth` pixels wide: those of the clip, as finer
+   * ones would take longer and show nothing more. Calls `failed` with a sentence where
+   * none come.
+   */
+  constructor(image, maxWidth, failed) {
     this.image = image;
+    this.maxWidth = maxWidth;
     this.failed = failed;
     this.rate = START_RATE;
     this.wanted = null; // the newest request that is not answered yet
@@ -32,11 +37,12 @@ export class Frames {
       const wanted = this.wanted;
       this.wanted = null;
       const affordable = Math.sqrt((this.rate * FIRST_SECONDS) / (wanted.width * wanted.height));
-      let scale = Math.min(Math.max(affordable, SMALLEST_WIDTH / wanted.width), 1);
+      const finest = Math.min(this.maxWidth / wanted.width, 1);
+      let scale = Math.min(Math.max(affordable, SMALLEST_WIDTH / wanted.width), finest);
       while (!this.wanted) {
         if (!(await this.show(wanted, scale))) break;
-        if (scale === 1) break;
-        scale = Math.min(2 * scale, 1);
+        if (scale === finest) break;
+        scale = Math.min(2 * scale, finest);
       }
     }
     this.busy = false;

@@ -75,7 +75,7 @@ function shaderSources() {
 function showFrames(player) {
   player.renderer?.dispose();
   player.renderer = null;
-  player.frames = new Frames(find("frame"), (problem) => note(problem, 0));
+  player.frames = new Frames(find("frame"), player.scene.width, (problem) => note(problem, 0));
   const { curve, show } = player.state;
   player.set({
     curve: SERVER_CURVES.includes(curve) ? curve : "reinhard",
