@@ -21,6 +21,7 @@ from hdr_nsff.core.checkpoints import pack, save_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.run_folder import Run, write_config
 from hdr_nsff.viewer.scene_file import from_bytes
 from hdr_nsff.viewer.server import FrameRequest
@@ -29,6 +30,7 @@ from hdr_nsff.viewer.server import FrameRequest
 def save_run(toy: Scene, scene_folder: Path, folder: Path, preset: str = "splat") -> Run:
     """A run folder with one checkpoint."""
     run = make_run(toy, folder, preset)
+    run = replace(run, tonemapper=tone_mapper_for(run.config.tonemap, toy))
     write_config(folder, replace(run.config, scene=scene_folder, out=folder))
     save_step(run, 7)
     return run
@@ -76,6 +78,16 @@ def test_a_frame_is_what_the_camera_would_record(
     assert np.abs(found - expected.numpy()).mean() < 0.06  # noise, as a JPEG
     for change in ({"curve": "clip"}, {"curve": "reinhard"}, {"show": "depth"}, {"show": "motion"}):
         assert decode(served.frame(request_of(toy, **change))).shape == found.shape
+
+
+@pytest.mark.parametrize("preset", ["hdr-hexplane", "nerf-wt"])
+def test_fields_that_record_by_themselves_are_served(
+    toy: Scene, toy_folder: Path, tmp_path: Path, preset: str
+) -> None:
+    save_run(toy, toy_folder, tmp_path / "run", preset)
+    served = ServedRun(tmp_path / "run", "cpu")
+    found = decode(served.frame(request_of(toy, ev=-1.0)))
+    assert found.shape == (toy.train[0].camera.height, toy.train[0].camera.width, 3)
 
 
 def test_requests_beyond_the_clip_are_refused(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:

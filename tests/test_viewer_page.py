@@ -152,8 +152,7 @@ def test_the_camera_curve_records_as_the_tone_mapper_does(viewer: Page, toy: Sce
     _, tonemapper = trained(toy)
     viewer.run("viewer.set({curve: 'camera', ev: 0.5})")
     found = read_png(base64.b64decode(viewer.run(png_text(16))))
-    shown = "{...viewer.view(), time: viewer.state.time}"
-    text = viewer.run(f"viewer.readLinear({shown}).then({TO_BASE64})")
+    text = viewer.run(f"viewer.readLinear(viewer.view(viewer.fullSize)).then({TO_BASE64})")
     exposed = np.frombuffer(base64.b64decode(text), np.float32).reshape(*found.shape[:2], 4)
     radiance = torch.from_numpy(exposed[..., :3] * 2**-0.5)
     expected = tonemapper.develop(radiance, 0.5).numpy()
@@ -168,8 +167,8 @@ def png_text(bits: int) -> str:
     )
 
 
-def read_png(data: bytes) -> np.ndarray:
-    """RGB (H, W, 3) in [0, 1] of a PNG of 16 bits without filters, by its own rules."""
+def read_png(data: bytes, bits: int = 16) -> np.ndarray:
+    """RGB (H, W, 3) in [0, 1] of a PNG without filters, by its own rules."""
     assert data[:8] == b"\x89PNG\r\n\x1a\n"
     place, body, header = 8, b"", b""
     while place < len(data):
@@ -180,12 +179,19 @@ def read_png(data: bytes) -> np.ndarray:
         body += chunk if kind == b"IDAT" else b""
         header = chunk if kind == b"IHDR" else header
         place += 12 + length
-    width, height, bits, color = struct.unpack(">IIBB", header[:10])
-    assert (bits, color) == (16, 2)
-    rows = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, 1 + 6 * width)
+    width, height, *depth_and_color = struct.unpack(">IIBB", header[:10])
+    assert depth_and_color == [bits, 2]
+    rows = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, -1)
     assert not rows[:, 0].any()  # no filter
-    samples = rows[:, 1:].reshape(height, width, 3, 2).astype(np.float64)
-    return (256 * samples[..., 0] + samples[..., 1]) / 65535
+    samples = rows[:, 1:].copy().view(">u2" if bits == 16 else "u1")
+    return samples.reshape(height, width, 3) / (2**bits - 1)
+
+
+def test_pictures_of_8_bits_are_those_of_16_bits(viewer: Page) -> None:
+    fine = read_png(base64.b64decode(viewer.run(png_text(16))))
+    coarse = read_png(base64.b64decode(viewer.run(png_text(8))), bits=8)
+    np.testing.assert_allclose(coarse, fine, atol=0.51 / 255)
+    assert fine.shape[1] == viewer.run("viewer.fullSize.width")
 
 
 # Controls
@@ -255,6 +261,31 @@ def test_a_drag_orbits_and_keeps_a_rotation(viewer: Page) -> None:
     np.testing.assert_allclose(c2w[:, :3] @ c2w[:, :3].T, np.eye(3), atol=1e-9)
     viewer.press("r")
     assert state(viewer, "mode") == "filmed"
+
+
+def test_one_finger_orbits_and_two_move_closer(viewer: Page) -> None:
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        touches = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        viewer.call("Input.dispatchTouchEvent", type=kind, touchPoints=touches)
+
+    viewer.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    touch("touchStart", (100, 90))
+    touch("touchMove", (140, 90))
+    touch("touchEnd")
+    assert state(viewer, "mode") == "orbit"
+    before = np.array(viewer.run("viewer.camera().c2w"))
+    touch("touchStart", (100, 90), (120, 90))
+    touch("touchMove", (80, 90), (120, 90))
+    touch("touchMove", (80, 90), (140, 90))
+    touch("touchEnd")
+    step = np.array(viewer.run("viewer.camera().c2w"))[:, 3] - before[:, 3]
+    assert step @ before[:, 2] > 0.01
+    viewer.call("Emulation.setTouchEmulationEnabled", enabled=False)
+
+
+def test_the_path_is_copied_with_a_hint(viewer: Page) -> None:
+    viewer.click("#copy-path")
+    viewer.wait("document.getElementById('note').textContent.includes('--path path.json')")
 
 
 def test_buttons_work_by_pointer(viewer: Page) -> None:

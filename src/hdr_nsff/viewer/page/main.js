@@ -38,6 +38,7 @@ async function start() {
     player.tick(now);
     if (player.state.stats) showStats(player);
     if (settings.server && player.isSlow()) showFrames(player);
+    else player.easeOff();
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);

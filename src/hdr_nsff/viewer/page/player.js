@@ -9,7 +9,7 @@ import {
   pointAhead,
   scaleK,
 } from "./cameras.js";
-import { encodePng16 } from "./png.js";
+import { encodePng } from "./png.js";
 import { BLUR, Renderer } from "./renderer.js";
 
 const STILL_VIEWS = 24; // of a camera path between two views at the same time
@@ -20,6 +20,7 @@ const MAX_EV = 8;
 const MEASURED_FRAMES = 20; // in a row, that tell the frame rate
 const LEAST_FRAMES = 5;
 const SLOW_FRAMES_PER_SECOND = 10;
+const SMOOTH_FRAMES_PER_SECOND = 24;
 
 export class Player {
   constructor(scene, canvas) {
@@ -53,6 +54,7 @@ export class Player {
       stats: false,
     };
     this.state.ev = clamp(this.state.ev, -MAX_EV, MAX_EV);
+    this.maxRatio = MAX_PIXEL_RATIO; // less where drawing is slow
     this.frameTimes = [];
     this.dirty = true;
     this.sorting = false;
@@ -85,10 +87,9 @@ export class Player {
     return mode === "filmed" ? filmedCamera(this.scene.views, time) : this.pose;
   }
 
-  /** What is drawn now. */
-  view() {
+  /** What is drawn now, on the canvas or at another size. */
+  view({ width, height } = this.canvas) {
     const { c2w, K } = this.camera();
-    const { width, height } = this.canvas;
     const { time, show } = this.state;
     const scale = width / this.scene.width;
     // pixels of the clip's size, as in training: sharper ones would show needles
@@ -147,15 +148,31 @@ export class Player {
 
   /** Fit the picture, of the clip's aspect, into `width` x `height` CSS pixels. */
   fit(width, height) {
-    const scale = Math.min(width / this.scene.width, height / this.scene.height);
-    const shown = [this.scene.width * scale, this.scene.height * scale];
-    const ratio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
-    const pixels = shown.map((side) => Math.max(Math.round(side * ratio), 1));
-    if (this.canvas.width !== pixels[0] || this.canvas.height !== pixels[1]) {
-      [this.canvas.width, this.canvas.height] = pixels;
+    const { scene, canvas } = this;
+    this.room = [width, height];
+    const scale = Math.min(width / scene.width, height / scene.height);
+    const shown = [scene.width * scale, scene.height * scale];
+    const fullRatio = Math.min(devicePixelRatio || 1, MAX_PIXEL_RATIO);
+    const ratio = Math.min(fullRatio, Math.max(this.maxRatio, 1 / scale));
+    const sizeAt = (r) => shown.map((side) => Math.max(Math.round(side * r), 1));
+    const [fullWidth, fullHeight] = sizeAt(fullRatio);
+    this.fullSize = { width: fullWidth, height: fullHeight };
+    const pixels = sizeAt(ratio);
+    if (canvas.width !== pixels[0] || canvas.height !== pixels[1]) {
+      [canvas.width, canvas.height] = pixels;
     }
     this.touch();
     return shown;
+  }
+
+  /** Draw fewer pixels from now on where drawing is not smooth, down to the clip's. */
+  easeOff() {
+    const { canvas, scene } = this;
+    const measured = this.frameTimes.length === MEASURED_FRAMES;
+    if (!measured || this.rate > SMOOTH_FRAMES_PER_SECOND || canvas.width <= scene.width) return;
+    this.maxRatio = Math.min(this.maxRatio, devicePixelRatio || 1) / 2;
+    this.frameTimes = [];
+    this.fit(...this.room);
   }
 
   /** One turn of the loop, at `now` in milliseconds. */
@@ -238,19 +255,16 @@ export class Player {
     return values;
   }
 
-  /** The picture that is shown as a PNG file of 8 or 16 bits. */
+  /** What is shown as a PNG file of 8 or 16 bits, as fine as the screen. */
   async png(bits) {
-    const view = this.view();
-    await this.renderer.sort(view);
-    const maps = this.renderer.composite(view, "screen");
-    if (bits === 8) {
-      this.renderer.develop(maps, this.state);
-      return new Promise((resolve) => this.canvas.toBlob(resolve, "image/png"));
-    }
-    const format = this.renderer.deepFormat();
-    const picture = this.renderer.target("png", view.width, view.height, format);
-    this.renderer.develop(maps, this.state, picture);
-    return encodePng16(this.renderer.read(picture), view.width, view.height);
+    const { renderer } = this;
+    const view = this.view(this.fullSize);
+    await renderer.sort(view);
+    const maps = renderer.composite(view, "read");
+    const picture = renderer.target("png", view.width, view.height, renderer.deepFormat());
+    renderer.develop(maps, this.state, picture);
+    this.sortedFor = ""; // what is shown is sorted again
+    return encodePng(renderer.read(picture), view.width, view.height, bits);
   }
 
   /** Remember the camera and time of now for a path. */

@@ -1,16 +1,21 @@
-// Writes PNG files with 16 bits a channel, which a canvas cannot.
+// Writes PNG files, with 16 bits a channel too, which a canvas cannot.
 
 const SIGNATURE = [137, 80, 78, 71, 13, 10, 26, 10];
 
-/** A PNG file of rgb in [0, 1], `stride` numbers a pixel, row by row from the top. */
-export async function encodePng16(values, width, height, stride = 4) {
-  const rowBytes = 1 + 6 * width; // filter type 0, then three big-endian samples a pixel
+/** A PNG file of 8 or 16 bits of rgb in [0, 1], four numbers a pixel, from the top. */
+export async function encodePng(values, width, height, bits) {
+  const bytes = bits / 8;
+  const largest = 2 ** bits - 1;
+  const rowBytes = 1 + 3 * bytes * width; // filter type 0, then three samples a pixel
   const raw = new DataView(new ArrayBuffer(rowBytes * height));
   for (let y = 0; y < height; y++) {
     for (let x = 0; x < width; x++) {
       for (let c = 0; c < 3; c++) {
-        const value = Math.min(Math.max(values[stride * (y * width + x) + c], 0), 1);
-        raw.setUint16(y * rowBytes + 1 + 6 * x + 2 * c, Math.round(65535 * value));
+        const value = Math.min(Math.max(values[4 * (y * width + x) + c], 0), 1);
+        const place = y * rowBytes + 1 + bytes * (3 * x + c);
+        const sample = Math.round(largest * value);
+        if (bits === 16) raw.setUint16(place, sample);
+        else raw.setUint8(place, sample);
       }
     }
   }
@@ -19,7 +24,7 @@ export async function encodePng16(values, width, height, stride = 4) {
   const header = new DataView(new ArrayBuffer(13));
   header.setUint32(0, width);
   header.setUint32(4, height);
-  header.setUint8(8, 16); // bits
+  header.setUint8(8, bits);
   header.setUint8(9, 2); // rgb
   const parts = [
     Uint8Array.from(SIGNATURE),
