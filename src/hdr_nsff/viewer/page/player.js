@@ -17,8 +17,9 @@ const MAX_PIXEL_RATIO = 2; // picture pixels per CSS pixel
 const FLY_SPEED = 0.5; // near distances per second
 const RADIANS_PER_PICTURE = 2.0; // turn for a drag across the picture
 const MAX_EV = 8;
-const MEASURED_FRAMES = 20; // in a row, that tell the frame rate
-const LEAST_FRAMES = 5;
+const MEASURED_FRAMES = 20; // in a row, at most, that tell the frame rate
+const LEAST_FRAMES = 6;
+const LEAST_MILLISECONDS = 1000; // that a frame rate is measured over before it has effects
 const SLOW_FRAMES_PER_SECOND = 10;
 const SMOOTH_FRAMES_PER_SECOND = 24;
 
@@ -168,8 +169,7 @@ export class Player {
   /** Draw fewer pixels from now on where drawing is not smooth, down to the clip's. */
   easeOff() {
     const { canvas, scene } = this;
-    const measured = this.frameTimes.length === MEASURED_FRAMES;
-    if (!measured || this.rate > SMOOTH_FRAMES_PER_SECOND || canvas.width <= scene.width) return;
+    if (!this.isBelow(SMOOTH_FRAMES_PER_SECOND) || canvas.width <= scene.width) return;
     this.maxRatio = Math.min(this.maxRatio, devicePixelRatio || 1) / 2;
     this.frameTimes = [];
     this.fit(...this.room);
@@ -226,9 +226,9 @@ export class Player {
     this.renderer.develop(target, this.state);
     this.frameTimes.push(now);
     if (this.frameTimes.length > MEASURED_FRAMES) this.frameTimes.shift();
-    const count = this.frameTimes.length - 1;
-    if (count >= LEAST_FRAMES)
-      this.rate = (1000 * count) / (this.frameTimes[count] - this.frameTimes[0]);
+    if (this.frameTimes.length >= LEAST_FRAMES) {
+      this.rate = (1000 * (this.frameTimes.length - 1)) / (now - this.frameTimes[0]);
+    }
   }
 
   /** Pictures drawn per second, when last they were drawn one after the other; or null. */
@@ -236,9 +236,17 @@ export class Player {
     return this.rate ?? null;
   }
 
+  /** Whether pictures were drawn one after the other at less than `rate` per second. */
+  isBelow(rate) {
+    const { frameTimes } = this;
+    const span = frameTimes[frameTimes.length - 1] - frameTimes[0];
+    const measured = frameTimes.length >= LEAST_FRAMES && span >= LEAST_MILLISECONDS;
+    return measured && this.rate < rate;
+  }
+
   /** Whether this browser has just drawn too slowly to be of use. */
   isSlow() {
-    return this.frameTimes.length === MEASURED_FRAMES && this.rate < SLOW_FRAMES_PER_SECOND;
+    return this.isBelow(SLOW_FRAMES_PER_SECOND);
   }
 
   /**
