@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
+import pytest
 import torch
 from presets import random_field
 from viewer_scenes import local_gaussians, scene_file, trained, trained_local
 
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.viewer import field_scene
 from hdr_nsff.viewer.field_scene import drop_invisible, scene_of
 
 
@@ -54,6 +56,18 @@ def test_recorded_pictures_are_those_of_the_frames(toy: Scene) -> None:
         difference = bgr[..., ::-1] / 255 - frame.image.numpy()
         assert np.abs(difference.mean(-1)).mean() < 0.06  # noise, as a JPEG
         assert view.time == frame.time
+
+
+def test_recorded_pictures_of_large_clips_are_made_smaller(
+    toy: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    width, height = toy.train[0].camera.width, toy.train[0].camera.height
+    monkeypatch.setattr(field_scene, "MAX_RECORDED_PIXELS", len(toy.train) * width * height / 4)
+    scene = scene_file(toy)
+    assert scene.views[0].picture is not None
+    first, last = scene.views[0].picture
+    picture = cv2.imdecode(np.frombuffer(scene.recorded[first:last], np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape[:2] == (height // 2, width // 2)
 
 
 def test_a_field_without_gaussians_gives_cameras_and_responses(toy: Scene) -> None:

@@ -6,6 +6,7 @@ time, and those with numbers that are not finite, are left out.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
@@ -29,7 +30,7 @@ from hdr_nsff.viewer.scene_file import (
     SceneFile,
 )
 
-MAX_PICTURE_SIDE = 960  # pixels of a recorded picture in the file
+MAX_RECORDED_PIXELS = 24e6  # of all recorded pictures in a file: about 4 MB of JPEG
 PICTURE_QUALITY = 85  # of its JPEG
 MIN_LENGTH = 1e-12  # of a quaternion
 Array = np.ndarray
@@ -150,10 +151,15 @@ def drop_invisible(group: GaussianGroup) -> GaussianGroup:
 
 
 def filmed_views(frames: Sequence[Frame]) -> tuple[list[FilmedView], bytes]:
-    """The recorded frames in order of time, and their pictures as JPEG files."""
+    """The recorded frames in order of time, and their pictures as JPEG files.
+
+    The pictures of long and large clips are made smaller.
+    """
+    num_pixels = sum(frame.camera.width * frame.camera.height for frame in frames)
+    scale = min(1.0, math.sqrt(MAX_RECORDED_PIXELS / num_pixels))
     views, pictures, length = [], [], 0
     for frame in frames:
-        picture = jpeg(to_numpy(frame.image), MAX_PICTURE_SIDE)
+        picture = jpeg(shrink(to_numpy(frame.image), scale))
         view = FilmedView(
             time=float(frame.time),
             K=rows(frame.camera.K),
@@ -168,13 +174,17 @@ def filmed_views(frames: Sequence[Frame]) -> tuple[list[FilmedView], bytes]:
     return views, b"".join(pictures)
 
 
-def jpeg(rgb: Array, max_side: int | None = None) -> bytes:
-    """A JPEG file of rgb (H, W, 3) in [0, 1], at most `max_side` pixels a side."""
+def shrink(rgb: Array, scale: float) -> Array:
+    """A picture (H, W, 3) with `scale` <= 1 times the pixels along each side."""
+    if scale == 1:
+        return rgb
     height, width = rgb.shape[:2]
-    scale = 1.0 if max_side is None else min(1.0, max_side / max(height, width))
-    if scale < 1:
-        size = round(width * scale), round(height * scale)
-        rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+    size = max(round(width * scale), 1), max(round(height * scale), 1)
+    return cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
+
+
+def jpeg(rgb: Array) -> bytes:
+    """A JPEG file of rgb (H, W, 3) in [0, 1]."""
     bgr = np.rint(np.clip(rgb[..., ::-1], 0, 1) * 255).astype(np.uint8)
     options = [cv2.IMWRITE_JPEG_QUALITY, PICTURE_QUALITY]
     ok, buffer = cv2.imencode(".jpg", np.ascontiguousarray(bgr), options)
