@@ -15,14 +15,17 @@ from typing import Literal
 
 import numpy as np
 
+from hdr_nsff.radiometry.bracketing import FACTORS, StepScale
+from hdr_nsff.radiometry.brightness import brightness_ev
 from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
     DebevecTuning,
     ResponseFit,
+    ScaleEvidence,
     brackets_linked,
-    brightness_ev,
     debevec,
 )
+from hdr_nsff.radiometry.sensor_noise import SensorNoiseTuning, noise_log_likelihood
 from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
 
 GAMMA = 2.2  # of the fallback
@@ -39,6 +42,7 @@ class ResponseTuning:
     num_samples: int = 4000  # static points
     median_rounds: int = 20  # of the robust fit of white balance
     debevec: DebevecTuning = field(default_factory=DebevecTuning)
+    noise: SensorNoiseTuning = field(default_factory=SensorNoiseTuning)
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,16 @@ class Response:
     guessed: bool  # the common factor of all `ev` is the likeliest one, not measured
     own_curves: tuple[int, ...]  # cameras with a curve of their own, of several cameras
     problem: str = ""  # why not from static points, in words
+    # where no exposure was known: the common factor that would turn all `ev` into what
+    # the recordings alone say, and its 95 % interval; else 1
+    measured_scale: float = 1.0
+    scale_low: float = 1.0
+    scale_high: float = 1.0
+
+    @property
+    def moved_stops(self) -> float:
+        """By how much the widest range of exposures was moved to usual steps."""
+        return abs(1 - self.measured_scale) * float(np.ptp(self.ev))
 
 
 def estimate_response(
@@ -68,12 +82,14 @@ def estimate_response(
     reference: int,
     num_cameras: int,
     tuning: ResponseTuning = ResponseTuning(),
+    lossless: bool = False,
 ) -> Response:
     """Response and exposures from recorded frames with depth and poses.
 
     `views` are the training frames, `view_cameras` their physical cameras; `ev` (B,)
     holds the known log2 exposures, None where unknown. `views` without a usable
-    disparity (all 0) contribute brightness only.
+    disparity (all 0) contribute brightness only. `lossless`: the frames were never
+    compressed with loss, so that they show the noise of the sensor.
     """
     brackets = {v.bracket for v in views}
     if len(brackets) == 1:
@@ -83,12 +99,14 @@ def estimate_response(
     if not brackets_linked(samples, brackets, tuning.debevec):
         problem = "too few static points seen in several exposures"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
-    fit = debevec(samples, ev, reference, tuning.debevec)
+    evidence = evidence_of_noise(views, tuning) if lossless else None
+    fit = debevec(samples, ev, reference, tuning.debevec, evidence)
     if fit.misfit >= MAX_MISFIT:
         problem = f"static points differ by {fit.misfit:.2f} stops"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
     own = camera_fits(views, view_cameras, fit, reference, tuning) if num_cameras > 1 else {}
     y = np.stack([own[c].y if c in own else fit.y for c in range(num_cameras)])
+    scale = fit.scale or StepScale(1.0, 1.0, 1.0, 1.0)
     return Response(
         x=fit.x,
         y=y,
@@ -99,7 +117,20 @@ def estimate_response(
         num_points=len(samples.rgb),
         guessed=fit.guessed,
         own_curves=tuple(sorted(own)),
+        measured_scale=scale.measured / scale.factor,
+        scale_low=scale.low / scale.factor,
+        scale_high=scale.high / scale.factor,
     )
+
+
+def evidence_of_noise(views: Sequence[ResponseView], tuning: ResponseTuning) -> ScaleEvidence:
+    """What the noise of the recorded frames says of the common factor of all EVs."""
+    images, brackets = [v.image for v in views], [v.bracket for v in views]
+
+    def evidence(x: np.ndarray, y: np.ndarray, ev: np.ndarray) -> np.ndarray | None:
+        return noise_log_likelihood(images, brackets, x, y, ev, FACTORS, tuning.noise)
+
+    return evidence
 
 
 def camera_fits(
@@ -236,13 +267,22 @@ def describe(response: Response, given_ev: Sequence[float | None]) -> str:
                 how += f", {curves}"
             unknown = "unknown ones estimated with it"
             if response.guessed:
-                unknown = (
-                    "the likeliest steps, as recordings leave a common factor open: "
-                    "give `--ev` if you know them"
-                )
+                unknown = describe_scale(response)
     if all(e is not None for e in given_ev):
         unknown = "as given"
     return f"{how}; EV {steps} ({unknown})"
+
+
+def describe_scale(response: Response) -> str:
+    """How well the common factor of guessed EVs is known, and whether it was moved."""
+    span = float(np.ptp(response.ev))
+    low, high = response.scale_low * span, response.scale_high * span
+    measured = response.measured_scale * span
+    interval = f"the recordings alone give {measured:.2f} from darkest to brightest"
+    interval += f", {low:.2f} to {high:.2f} with 95 % confidence"
+    if response.moved_stops > 0:
+        interval += f"; moved by {response.moved_stops:.2f} to usual steps"
+    return f"{interval}; give `--ev` if you know them"
 
 
 def at_one_exposure(

@@ -19,10 +19,22 @@ def find_response(work: Work) -> StepResult:
     m = work.manifest
     views = [response_view(work, f) for f in work.train]
     cameras = [f.camera_id for f in work.train]
-    response = estimate_response(views, cameras, m.known_ev, m.reference_bracket, m.num_cameras)
+    response = estimate_response(
+        views,
+        cameras,
+        m.known_ev,
+        m.reference_bracket,
+        m.num_cameras,
+        lossless=work.footage.lossless,
+    )
     return StepResult(
         note=describe(response, m.known_ev),
-        details={"misfit": response.misfit, "ev": response.ev.round(4).tolist()},
+        details={
+            "misfit": response.misfit,
+            "ev": response.ev.round(4).tolist(),
+            "measured_scale": round(response.measured_scale, 4),
+            "scale_interval": [round(response.scale_low, 4), round(response.scale_high, 4)],
+        },
         manifest={"response": "response.json"},
         files={"response.json": lambda path: write_response(path, response)},
     )
