@@ -2,6 +2,7 @@
 
     python benchmarks/exposure_cycles.py CLIP [CLIP ...]
     python benchmarks/exposure_cycles.py --steps WORK --data DATA [--scenes SCENE ...]
+    python benchmarks/exposure_cycles.py --drift SCENE TRUTH [--drift SCENE TRUTH ...]
 
 CLIP is a video or a folder of frames. For every clip the file holds the cycle that
 `prepare` detects, and the share of short pieces in which the same cycle is detected.
@@ -14,6 +15,10 @@ the brackets in DATA (tripod, true exposures by EXIF), and in the prepared scene
 --scenes of clips named like `pan_3exp_2stop.mp4`. Every line of the file holds the true
 exposures (EV), those found and those measured before they were moved to usual steps,
 the 95 % interval of the largest one, and the largest error of a step in EV.
+
+With --drift, the exposure of every training frame of a prepared scene is compared with
+the truth of its clip (`reexpose --exposure auto`), as lossless frames and as others:
+errors of the EV relative to the mean of all, and the same at the best common factor.
 """
 
 from __future__ import annotations
@@ -41,6 +46,7 @@ from hdr_nsff.radiometry.recording import record, response_curve
 from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.truth import Truth
 from hdr_nsff.synth.settings import sensor_noise
 
 MAX_SIDE_PX = 640  # of the frames; brightness needs no more
@@ -67,6 +73,9 @@ def main() -> None:
     parser.add_argument("--steps", type=Path, metavar="WORK", help="folder for prepared clips")
     parser.add_argument("--data", type=Path, help="folder of recorded clips and brackets")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], metavar="SCENE")
+    parser.add_argument(
+        "--drift", type=Path, nargs=2, action="append", default=[], metavar=("SCENE", "TRUTH")
+    )
     args = parser.parse_args()
     if (args.steps is None) != (args.data is None):
         parser.error("--steps and --data belong together")
@@ -75,6 +84,9 @@ def main() -> None:
         record_of_run.add({"clip": name_of(clip)} | measure(clip))
     for scene in args.scenes:
         record_of_run.add(measure_scene(scene))
+    for scene, truth in args.drift:
+        for lossless in (True, False):
+            record_of_run.add(measure_drift(scene, Truth.open(truth), lossless))
     if args.data is not None:
         for folder in sorted((args.data / "brackets").iterdir()):
             for result in measure_bracket(folder):
@@ -136,7 +148,7 @@ def measure_steps(
 def measure_scene(scene: Path) -> dict[str, Any]:
     """A prepared scene of a clip whose steps are in its name."""
     m = Manifest.load(scene)
-    clip = Work(PrepareConfig(scene / "images", scene), open_footage(scene / "images"), m)
+    clip = work_on(scene, m)
     nominal = NOMINAL.search(m.source)
     if nominal is None:
         raise InputError(f"{scene}: no steps in the name of its footage ({m.source})")
@@ -146,6 +158,43 @@ def measure_scene(scene: Path) -> dict[str, Any]:
     rank = np.argsort(np.argsort(brightness))
     true = [float(k) * int(nominal[2]) for k in rank]
     return {"clip": name_of(scene)} | measure_steps(views, true, m.reference_bracket)
+
+
+def work_on(scene: Path, manifest: Manifest) -> Work:
+    """A prepared scene, without its footage."""
+    images = scene / "images"
+    return Work(PrepareConfig(images, scene), open_footage(images), manifest)
+
+
+def measure_drift(scene: Path, truth: Truth, lossless: bool) -> dict[str, Any]:
+    """The exposures of the frames of a prepared scene, against those of `reexpose`."""
+    m = Manifest.load(scene)
+    clip = work_on(scene, m)
+    views = [response_view(clip, f) for f in clip.train]
+    cameras = [0] * len(views)
+    found = estimate_response(views, cameras, m.known_ev, m.reference_bracket, 1, lossless=lossless)
+    drift = np.zeros(len(views)) if found.drift is None else found.drift
+    exposures = np.array([found.ev[v.bracket] for v in views]) + drift
+    assert truth.clip_drift is not None
+    cycle = [0.0 if ev is None else ev for ev in truth.bracket_ev]
+    true = [cycle[f.index % len(cycle)] + truth.clip_drift[f.index] for f in clip.train]
+    exposures, true_exposures = exposures - exposures.mean(), np.array(true) - np.mean(true)
+    factor = float(exposures @ true_exposures / max(exposures @ exposures, 1e-9))
+    error = np.abs(exposures - true_exposures)
+    error_at_best = np.abs(factor * exposures - true_exposures)
+    return {
+        "clip": name_of(scene),
+        "lossless": lossless,
+        "frames": len(views),
+        "drift_found": found.drift is not None,
+        "range_ev": round(float(np.ptp(true_exposures)), 2),
+        "median_error": round(float(np.median(error)), 3),
+        "error_95": round(float(np.quantile(error, 0.95)), 3),
+        "best_factor": round(factor, 3),
+        "factor_interval": [round(found.scale_low, 3), round(found.scale_high, 3)],
+        "median_error_at_best_factor": round(float(np.median(error_at_best)), 3),
+        "error_95_at_best_factor": round(float(np.quantile(error_at_best, 0.95)), 3),
+    }
 
 
 def measure_bracket(folder: Path) -> Iterator[dict[str, Any]]:

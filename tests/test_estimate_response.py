@@ -13,9 +13,9 @@ from hdr_nsff.radiometry.response import (
     Response,
     alternating_medians,
     at_one_exposure,
-    describe,
     estimate_response,
 )
+from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.scene.response import read_response, write_response
 from hdr_nsff.tonemap.base import ToneMapper
 

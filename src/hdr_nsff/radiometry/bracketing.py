@@ -20,7 +20,7 @@ interval leaves no other one.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.special import logsumexp
@@ -99,13 +99,9 @@ def likely_scale(
     steps, step_deviations = steps[is_step], step_deviations[is_step]
     if not len(steps):
         return StepScale(1.0, 1.0, 1.0, 1.0)
-    log_evidence = curve_log_prior(tuning)
-    if noise_log_likelihood is not None:
-        log_evidence = log_evidence + noise_log_likelihood
-    log_evidence = log_evidence - logsumexp(log_evidence)
+    log_evidence = log_evidence_of_factor(noise_log_likelihood, tuning)
+    scale = measured_scale(noise_log_likelihood, tuning)
     evidence = np.exp(log_evidence)
-    measured = float(np.exp(evidence @ np.log(FACTORS)))
-    low, high = np.interp(INTERVAL, np.cumsum(evidence), FACTORS).tolist()
     limits = INTERVAL if noise_log_likelihood is None else NARROW_INTERVAL
     lowest, highest = np.interp(limits, np.cumsum(evidence), FACTORS).tolist()
     intended = usual_assignment(steps, step_deviations, log_evidence, tuning)
@@ -113,9 +109,29 @@ def likely_scale(
         factor = float(steps @ intended / (steps @ steps))
         off = np.abs(factor * steps - intended) / step_deviations
         agrees = lowest <= factor <= highest and off.max() <= tuning.max_deviations
-        if agrees and are_distinct(intended, low * steps, high * steps):
-            return StepScale(factor, measured, low, high)
+        if agrees and are_distinct(intended, scale.low * steps, scale.high * steps):
+            return replace(scale, factor=factor)
+    return scale
+
+
+def measured_scale(
+    noise_log_likelihood: np.ndarray | None = None, tuning: BracketingTuning = BracketingTuning()
+) -> StepScale:
+    """The factor without any knowledge of usual steps, where there are none."""
+    evidence = np.exp(log_evidence_of_factor(noise_log_likelihood, tuning))
+    measured = float(np.exp(evidence @ np.log(FACTORS)))
+    low, high = np.interp(INTERVAL, np.cumsum(evidence), FACTORS).tolist()
     return StepScale(measured, measured, low, high)
+
+
+def log_evidence_of_factor(
+    noise_log_likelihood: np.ndarray | None, tuning: BracketingTuning = BracketingTuning()
+) -> np.ndarray:
+    """The logarithm of the chance of each of `FACTORS`, from curves and noise."""
+    log_evidence = curve_log_prior(tuning)
+    if noise_log_likelihood is not None:
+        log_evidence = log_evidence + noise_log_likelihood
+    return log_evidence - logsumexp(log_evidence)
 
 
 def are_distinct(intended: np.ndarray, low: np.ndarray, high: np.ndarray) -> bool:

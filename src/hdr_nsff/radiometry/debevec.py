@@ -80,6 +80,8 @@ class Samples:
     valid: np.ndarray  # (P, B, 3) bool: seen there, and away from black and saturation
     saturated: np.ndarray  # (P, B, 3) bool: seen there, and saturated
     frame: np.ndarray | None = None  # (P,) where the point was chosen; None: unknown
+    # (P, B) stops by which a recording's exposure exceeds its bracket's; None: 0
+    offset: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -155,6 +157,8 @@ def debevec(
         channel_equations(samples.rgb[..., c], samples.valid[..., c], log_exposure, free, tuning)
         for c in range(3)
     ]
+    if samples.offset is not None:
+        equations = [replace(e, target=e.target + LN2 * samples.offset) for e in equations]
     log_exposure[free] = [LN2 * brightness_ratio(samples, b, reference) for b in free]
     curves = np.zeros((3, UNKNOWNS))
     curves[:, -2:] = TYPICAL  # a typical camera reveals the worst outliers
@@ -370,12 +374,14 @@ def levels_from_darker(
     recorded = np.where(valid, basis(samples.rgb[..., channel]) @ curve, np.nan)  # (P, B)
     saturated, unsaturated = [np.zeros(0)], [np.zeros(0)]
     misfits = [np.zeros(0)]
+    levels = np.broadcast_to(log_exposure, valid.shape)  # (P, B)
+    if samples.offset is not None:
+        levels = levels + LN2 * samples.offset
     for dark, light in itertools.permutations(range(valid.shape[1]), 2):
-        if log_exposure[dark] >= log_exposure[light]:
-            continue
-        predicted = recorded[:, dark] - log_exposure[dark] + log_exposure[light]
-        both = valid[:, dark] & valid[:, light]
-        saturated.append(predicted[valid[:, dark] & is_saturated[:, light]])
+        is_darker = levels[:, dark] < levels[:, light]
+        predicted = recorded[:, dark] - levels[:, dark] + levels[:, light]
+        both = valid[:, dark] & valid[:, light] & is_darker
+        saturated.append(predicted[valid[:, dark] & is_saturated[:, light] & is_darker])
         unsaturated.append(predicted[both])
         misfits.append(np.abs(predicted - recorded[:, light])[both])
     misfit = np.concatenate(misfits)
