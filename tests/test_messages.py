@@ -38,8 +38,8 @@ TEXTS = [text for p in sorted((ROOT / "src").rglob("*.py")) for text in sentence
 
 @cache
 def options(verb: str) -> set[str]:
-    """The options of a verb, from its help; those of two presets of `train`."""
-    starts = [["train", "splat"], ["train", "grid"]] if verb == "train" else [[verb]]
+    """The options of a verb, from its help; with those of two presets of `train`."""
+    starts = [["train"], ["train", "splat"], ["train", "grid"]] if verb == "train" else [[verb]]
     output = StringIO()
     for start in starts:
         with redirect_stdout(output), pytest.raises(SystemExit):

@@ -119,7 +119,11 @@ def test_ctrl_c_ends_the_verb(toy: Scene, toy_folder: Path, tmp_path: Path) -> N
     command = [sys.executable, "-c", code, "view", str(tmp_path / "run"), "--no-browser"]
     environment = {**os.environ, "COLUMNS": "200"}
     both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
-    process = subprocess.Popen(command, text=True, env=environment, **both)
+
+    def listen() -> None:  # tests that run in the background ignore Ctrl-C
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+    process = subprocess.Popen(command, text=True, env=environment, preexec_fn=listen, **both)
     assert process.stdout is not None
     assert "http://127.0.0.1:" in process.stdout.readline()
     process.send_signal(signal.SIGINT)
