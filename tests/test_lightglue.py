@@ -29,7 +29,7 @@ def test_poses_come_from_the_given_matches(tmp_path, monkeypatch):
     turns = towards_middle.as_matrix().reshape(-1, 3, 3)
     asked = {}
 
-    def exact(images, masks, pairs, matcher, tuning):
+    def exact(images, masks, pairs, matcher, tuning, device):
         """Projections of 300 points into images of twice the size, each point the same
         row everywhere.
         """

@@ -62,7 +62,7 @@ class RunConfig(PrepareConfig):
     """
     seed: int = 0
     device: str = "auto"
-    """auto, cpu or cuda."""
+    """Where networks of `prepare`, training and rendering run: auto, cpu or cuda."""
 
 
 def run_all(config: RunConfig) -> None:

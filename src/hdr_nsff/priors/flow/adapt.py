@@ -205,8 +205,11 @@ class TrainingClip:
         are not learned from.
         """
         self.maps = features.maps
-        self.colors = cell_colors(video, features, tuning.colors_per_cell)
-        self.tracks = tracks
+        self.device = features.maps.device
+        self.colors = cell_colors(video, features, tuning.colors_per_cell).to(self.device)
+        self.tracks = [
+            Track(t.frames, t.start.to(self.device), t.end.to(self.device)) for t in tracks
+        ]
         self.neighbors = neighbors
         self.search = search
         self.tuning = tuning
@@ -236,7 +239,7 @@ class TrainingClip:
         h, w = refined.shape[-2:]
         # between cells, so that snapping to cells costs
         drawn = rng.random((self.tuning.points_per_step, 2)) * [w - 1, h - 1]
-        start = torch.from_numpy(drawn).float()
+        start = torch.from_numpy(drawn).float().to(self.device)
         there = locate(sample_features(refined[0], start), start, refined[1], self.search)
         back = locate(sample_features(refined[1], there), there, refined[0], self.search)
         return cycle_loss(start, back, self.tuning)
@@ -248,7 +251,7 @@ class TrainingClip:
 
         `refined` (2, C, h, w) are the features of both frames.
         """
-        chosen = torch.from_numpy(rng.integers(len(cells), size=self.tuning.points_per_step))
+        chosen = self.draw(len(cells), rng)
         queries = refined[0].flatten(1).T[cells[chosen]]
         return buddies_loss(queries, refined[1], buddies[chosen], self.search.temperature)
 
@@ -260,11 +263,15 @@ class TrainingClip:
         Each is searched within reach of its true end.
         """
         a, b = self.refine(network, list(track.frames))
-        count = self.tuning.points_per_step
-        chosen = torch.from_numpy(rng.integers(len(track.start), size=count))
+        chosen = self.draw(len(track.start), rng)
         end = track.end[chosen]
         found = locate(sample_features(a, track.start[chosen]), end, b, self.search)
         return trajectory_loss(found, end, self.tuning)
+
+    def draw(self, count: int, rng: np.random.Generator) -> Tensor:
+        """Random numbers below `count`, one for each point of a step."""
+        drawn = rng.integers(count, size=self.tuning.points_per_step)
+        return torch.from_numpy(drawn).to(self.device)
 
     def refine(self, network: ResidualNetwork, frames: list[int]) -> Tensor:
         """The corrected features of some frames."""
@@ -280,6 +287,7 @@ def adapt_features(clip: TrainingClip, steps: int, seed: int) -> Tensor:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = ResidualNetwork(clip.maps.shape[1], clip.feature_norm, tuning)
+    network.to(clip.device)
     rng = np.random.default_rng(seed)
     optimizer = torch.optim.Adam(network.parameters(), tuning.learning_rate)
     weights = tuning.weights()

@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.round_trip import follow, round_trip
 from hdr_nsff.priors.flow.adapt import (
     AdaptTuning,
@@ -110,18 +111,22 @@ def semantic_flow(
     equal: Pairs,
     tuning: SemanticTuning = SEMANTIC_TUNING,
     dense: DenseFlowTuning = DENSE_FLOW_TUNING,
+    device: torch.device = CPU,
 ) -> SemanticFlow:
     """The flow prior of these settings.
 
     `weights` are of the features, None for where weights are kept; pairs as in
-    `SemanticFlow`. InputError for settings out of range.
+    `SemanticFlow`. Features are computed, fitted and searched for on `device`.
+    InputError for settings out of range.
     """
     steps = config.steps
     if steps is None:
         steps = 0 if config.features == "xfeat" else DINOV2_STEPS
     if steps < 0:
         raise InputError(f"--semantic.steps {steps}: must be 0 or more")
-    source = feature_source(config.features, weights, config.layer, config.stride, tuning.features)
+    source = feature_source(
+        config.features, weights, config.layer, config.stride, tuning.features, device
+    )
     return SemanticFlow(source, neighbors, equal, steps, config.seed, tuning, dense)
 
 
@@ -220,8 +225,8 @@ def coarse_flow(
     search = tuning.search(features, video)
     maps = features.maps
     with torch.no_grad():
-        forward = feature_motion(maps[i], maps[j], search).numpy()
-        backward = feature_motion(maps[j], maps[i], search).numpy()
+        forward = feature_motion(maps[i], maps[j], search).cpu().numpy()
+        backward = feature_motion(maps[j], maps[i], search).cpu().numpy()
         cell_rgb = cell_colors(video[[i, j]], features, 1).permute(0, 2, 3, 1).numpy()
 
     def to_pixels(
