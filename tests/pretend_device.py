@@ -1,5 +1,5 @@
-"""A pretend accelerator: its tensors are CPU tensors in a wrapper that says it is another
-device, and operations refuse to mix the two as CUDA does.
+"""A pretend accelerator: its tensors are CPU tensors in a wrapper that claims another
+device. Operations refuse to mix the two, as CUDA does.
 
     with pretend_device() as device:
         x = torch.ones(3, device=device)
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import torch
@@ -76,6 +76,11 @@ class PretendMode(TorchDispatchMode):
     def __torch_dispatch__(
         self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
     ) -> Any:
+        if torch.is_inference_mode_enabled():  # which takes no operation apart by itself
+            with self:
+                result = func.decompose(*args, **(kwargs or {}))
+            if result is not NotImplemented:
+                return result
         return execute(func, args, kwargs or {})
 
 
@@ -100,8 +105,9 @@ def execute(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     if kwargs.get("pin_memory"):
         kwargs = kwargs | {"pin_memory": False}
     inner_args, inner_kwargs = tree_map(unwrap, (args, kwargs))
-    result = func(*inner_args, **inner_kwargs)
-    return tree_map(lambda x: rewrap(x, args, kwargs, on_device), result)
+    with torch.inference_mode(False), torch.no_grad():
+        result = func(*inner_args, **inner_kwargs)
+        return tree_map(lambda x: rewrap(x, args, kwargs, on_device), result)
 
 
 def check_devices(func: Any, args: tuple[Any, ...], tensors: list[Tensor]) -> None:
@@ -137,10 +143,9 @@ class Backend(_DummyBackendModule):
         return [torch.bfloat16]
 
 
-@cache
 def register() -> torch.library.Library:
-    """Make torch know the device, once. Operations that no mode sees, as where torch
-    copies numbers of Python lists, come to the same place.
+    """Make torch know the device, before its first gradient. Operations that no mode
+    sees, as where torch copies numbers of Python lists, come to the same place.
     """
     _setup_privateuseone_for_python_backend(NAME, Backend())
     library = torch.library.Library("aten", "IMPL")
@@ -154,9 +159,11 @@ def call(func: Any, *args: Any, **kwargs: Any) -> Any:
     return execute(func, args, kwargs)
 
 
+LIBRARY = register()
+
+
 @contextmanager
 def pretend_device() -> Iterator[torch.device]:
     """The device, for as long as the context lasts."""
-    register()
     with PretendMode():
         yield torch.device(NAME, 0)

@@ -9,55 +9,60 @@ import pytest
 import torch
 from pretend_device import pretend_device
 from test_adapt import sliding
-from test_features import dino, random_state  # noqa: F401
-from test_lightglue import random_weights  # noqa: F401
-from tiny_networks import tiny_depth_anything, tiny_sam2
+from test_features import random_state
+from tiny_networks import random_lightglue, tiny_depth_anything, tiny_dinov2, tiny_sam2
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.prepare.prepare import prepare
 from hdr_nsff.prepare.steps.neural import load_network
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.priors.depth.depth_anything import network_disparity
+from hdr_nsff.priors.flow.features import FeatureName, FeatureTuning
 from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.priors.flow.networks import predict_both_directions
-from hdr_nsff.priors.flow.semantic import SemanticConfig, SemanticFlow, semantic_flow
+from hdr_nsff.priors.flow.semantic import (
+    SemanticConfig,
+    SemanticFlow,
+    SemanticTuning,
+    semantic_flow,
+)
 from hdr_nsff.priors.masks.prompts import Prompt, PromptedObject
 from hdr_nsff.priors.masks.sam2 import track_object
-from hdr_nsff.priors.poses.lightglue import match_images
+from hdr_nsff.priors.poses.lightglue import Matcher, match_images
 from hdr_nsff.priors.pretrained import pretrained
 
 CPU = torch.device("cpu")
+SMALL = SemanticTuning(features=FeatureTuning(dino_longer_side_px=112))
 
 
 def noise(*shape: int) -> np.ndarray:
     return np.random.default_rng(0).random(shape).astype(np.float32)
 
 
+@pytest.mark.parametrize("name", ["xfeat", "dinov2-small"])
 def test_features_their_fit_and_the_search_run_on_the_device(
-    dino: Path,  # noqa: F811
-    tmp_path: Path,
+    name: FeatureName, tmp_path: Path
 ) -> None:
-    torch.save(random_state(), tmp_path / "xfeat.pt")
+    weights = tmp_path / "xfeat.pt"
+    if name == "xfeat":
+        torch.save(random_state(), weights)
+    else:
+        weights = tiny_dinov2(tmp_path / "dino")
     video = sliding(4)
     clipped = np.zeros(video.shape[:3], bool)
     pairs = np.array([[0, 1], [1, 0], [2, 3]])
-    cases = {
-        "xfeat": tmp_path / "xfeat.pt",
-        "dinov2-small": dino,
-    }
-    for name, weights in cases.items():
-        config = SemanticConfig(name, steps=3)  # type: ignore[arg-type]
+
+    def prior(device: torch.device) -> SemanticFlow:
         neighbors, equal = [(0, 1), (1, 2), (2, 3)], [(0, 2), (1, 3)]
+        config = SemanticConfig(name, steps=3)
+        return semantic_flow(config, weights, neighbors, equal, SMALL, device=device)
 
-        def flow(device: torch.device) -> tuple[SemanticFlow, np.ndarray]:
-            prior = semantic_flow(config, weights, neighbors, equal, device=device)  # noqa: B023
-            return prior, prior(video, clipped, pairs)[0]
-
-        _, expected = flow(CPU)
-        with pretend_device() as device:
-            prior, found = flow(device)
-            assert prior.features is not None and prior.features.maps.device == device
-        np.testing.assert_allclose(found, expected, atol=1e-3)
+    expected, _ = prior(CPU)(video, clipped, pairs)
+    with pretend_device() as device:
+        there = prior(device)
+        found, _ = there(video, clipped, pairs)
+    assert there.features is not None and there.features.maps.device == device
+    np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
 def test_a_flow_network_runs_on_the_device() -> None:
@@ -70,11 +75,17 @@ def test_a_flow_network_runs_on_the_device() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-3)
 
 
-def test_learned_matches_are_those_of_the_cpu(random_weights) -> None:  # noqa: F811
+@pytest.mark.parametrize("matcher", ["aliked", "disk"])
+def test_learned_matches_are_those_of_the_cpu(
+    matcher: Matcher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    random_lightglue(matcher, tmp_path, monkeypatch)
+    thresholds = pytest.importorskip("kornia.feature").LightGlue.pruning_keypoint_thresholds
+    monkeypatch.setitem(thresholds, "pretend", thresholds["cpu"])
     images, everywhere = list(noise(2, 64, 96, 3)), [np.ones((64, 96))] * 2
-    expected = match_images(images, everywhere, [(0, 1)], random_weights[0])
+    expected = match_images(images, everywhere, [(0, 1)], matcher)
     with pretend_device() as device:
-        found = match_images(images, everywhere, [(0, 1)], random_weights[0], device=device)
+        found = match_images(images, everywhere, [(0, 1)], matcher, device=device)
     np.testing.assert_allclose(found[0][0], expected[0][0], atol=1e-3)
     np.testing.assert_array_equal(found[1][0], expected[1][0])
 

@@ -18,7 +18,6 @@ from torch import Tensor
 from torch.nn import functional
 
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.core.tensors import to_device
 from hdr_nsff.priors.masks.prompts import PromptedObject, iou
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD, architecture
 
@@ -128,7 +127,6 @@ def track_object(network: Any, video: np.ndarray, prompted: PromptedObject) -> n
         inputs = prompt_inputs(
             prompt.points, prompt.labels, prompt.box, (height, width), network.image_size
         )
-        inputs = to_device(inputs, network.device)
         session.add_point_inputs(index, prompt.frame, inputs)
         session.obj_with_new_inputs = [prompted.number]
         network(inference_session=session, frame_idx=prompt.frame)
