@@ -17,6 +17,7 @@ from hdr_nsff.prepare.prepare import prepare
 from hdr_nsff.prepare.steps.neural import load_network
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.priors.depth.depth_anything import network_disparity
+from hdr_nsff.priors.flow.adapt import Refiner
 from hdr_nsff.priors.flow.features import FeatureName, FeatureTuning
 from hdr_nsff.priors.flow.gmflow import GMFlow
 from hdr_nsff.priors.flow.networks import predict_both_directions
@@ -54,7 +55,8 @@ def test_features_their_fit_and_the_search_run_on_the_device(
 
     def prior(device: torch.device) -> SemanticFlow:
         neighbors, equal = [(0, 1), (1, 2), (2, 3)], [(0, 2), (1, 3)]
-        config = SemanticConfig(name, steps=3)
+        refiner: Refiner = "small" if name == "xfeat" else "published"
+        config = SemanticConfig(name, steps=3, refiner=refiner)
         return semantic_flow(config, weights, neighbors, equal, SMALL, device=device)
 
     expected, _ = prior(CPU)(video, clipped, pairs)

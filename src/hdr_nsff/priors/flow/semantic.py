@@ -13,7 +13,7 @@ Cells are those of `Features`; flow is in pixels, x then y, as in `dense`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,12 @@ from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.round_trip import follow, round_trip
 from hdr_nsff.priors.flow.adapt import (
     AdaptTuning,
+    Refiner,
     Track,
     TrainingClip,
     adapt_features,
     cell_colors,
+    with_published_network,
 )
 from hdr_nsff.priors.flow.correlation import Search, feature_motion
 from hdr_nsff.priors.flow.dense import (
@@ -67,6 +69,10 @@ class SemanticConfig:
     steps: int | None = None
     """Steps of fitting the features to the clip; 0 leaves them as they are. Default: 0
     for XFeat, which did not gain by it, 300 for DINOv2.
+    """
+    refiner: Refiner = "small"
+    """The network that is fitted. small: seconds on a CPU; published: the paper's, with
+    its rate (it ran 10,000 steps).
     """
     seed: int = 0
     """Random seed of that fitting."""
@@ -124,6 +130,8 @@ def semantic_flow(
         steps = 0 if config.features == "xfeat" else DINOV2_STEPS
     if steps < 0:
         raise InputError(f"--semantic.steps {steps}: must be 0 or more")
+    if config.refiner == "published":
+        tuning = replace(tuning, adapt=with_published_network(tuning.adapt))
     source = feature_source(
         config.features, weights, config.layer, config.stride, tuning.features, device
     )
