@@ -227,7 +227,7 @@ SECTIONS = (
         "Alternating exposures as filmed (`hand_books`: re-exposed), nothing given but the "
         "poses of `hand_books`; every eighth frame held out. Moving pixels are those of the "
         "estimated masks.",
-        "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 2000 --views 0",
+        "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --views 0",
         bench_clips,
     ),
     Section(

@@ -55,10 +55,10 @@ def verbs_with(setting: str) -> list[str]:
     return verbs
 
 
-FOOTAGE_VERBS = verbs_with("clip")  # that read footage
-RUN_VERBS = verbs_with("run")  # that read a run
 # Verbs that write something.
-WORKING_VERBS = [v for v in cli.VERBS if v not in ("weights", "doctor")]
+WORKING_VERBS = [v for v in cli.VERBS if v not in ("weights", "doctor", "view")]
+FOOTAGE_VERBS = verbs_with("clip")  # that read footage
+RUN_VERBS = [v for v in verbs_with("run") if v in WORKING_VERBS]  # that read a run
 CPU = ["--device", "cpu"]
 
 

@@ -1,44 +1,88 @@
-"""The usual steps between exposures settle the common factor that recordings leave
-open.
-"""
+"""Measured steps move to usual ones only where the evidence agrees."""
 
 import numpy as np
 import pytest
 
-from hdr_nsff.radiometry.bracketing import likely_factor, usual_steps
+from hdr_nsff.radiometry.bracketing import FACTORS, likely_scale, usual_steps
+
+
+def known_to(deviation: float, factor: float = 1.0) -> np.ndarray:
+    """Evidence of the sensor's noise for a factor, with this relative deviation."""
+    return -((np.log(FACTORS / factor) / deviation) ** 2) / 2
 
 
 @pytest.mark.parametrize("measured, meant", [
-    ([-2.36, 0, 2.35], [-2, 0, 2]),  # a contrasty film curve
-    ([-3.66, 0, 3.51], [-3, 0, 3]),  # the same, three stops
     ([0, 1.92, 3.84], [0, 2, 4]),  # real video
     ([0, 2.88], [0, 3]),
     ([0, 1.07], [0, 1]),
-    ([0, 1.18, 3.54], [0, 1, 3]),  # steps that differ
+    ([-2.36, 0, 2.35], [-2, 0, 2]),  # a contrasty film curve
 ])  # fmt: skip
 def test_whole_stops_are_found_behind_a_curve_that_is_not_typical(measured, meant):
-    np.testing.assert_allclose(np.array(measured) * likely_factor(measured), meant, atol=0.08)
+    scale = likely_scale(measured)
+    np.testing.assert_allclose(np.array(measured) * scale.factor, meant, atol=0.08)
+    assert scale.is_moved and scale.low < scale.factor < scale.high
 
 
-def test_a_half_step_measured_to_the_point_stays_one():
-    assert likely_factor([0, 1.5]) == pytest.approx(1)
-    assert likely_factor([0, 1 / 3, 2 / 3]) == pytest.approx(1)
+@pytest.mark.parametrize("true", [1.5, 1.7, 2.3, 2.4, 2.5])
+def test_good_evidence_of_other_steps_is_not_overruled(true):
+    evidence = known_to(0.03)
+    assert likely_scale([-true, 0, true], None, evidence).factor == pytest.approx(1, abs=0.04)
+
+
+def test_a_curve_alone_says_that_two_stops_may_be_something_else():
+    scale = likely_scale([0.0, 2.36])
+    assert scale.low * 2.36 < 2 and scale.high * 2.36 > 2.7
+
+
+def test_whole_stops_outside_of_the_interval_are_not_chosen():
+    scale = likely_scale([0.0, 1.75], None, known_to(0.03))
+    assert not scale.is_moved and scale.high * 1.75 < 2
+
+
+def test_thirds_are_known_steps_where_the_interval_leaves_no_other_one():
+    fine = likely_scale([0, 1.655, 3.31], None, known_to(0.01))
+    assert fine.is_moved and fine.factor * 1.655 == pytest.approx(5 / 3, abs=0.002)
+    coarse = likely_scale([0, 1.655, 3.31], None, known_to(0.1))
+    assert coarse.factor == coarse.measured or coarse.factor * 1.655 == pytest.approx(2, abs=0.02)
+
+
+def test_steps_in_no_usual_proportion_stay_as_measured():
+    scale = likely_scale([-1.7, 0, 1.3], None, known_to(0.03))
+    assert scale.factor == scale.measured == pytest.approx(1, abs=0.02)
+
+
+def test_steps_that_points_disagree_on_are_not_held_against_usual_ones():
+    measured = [0, 1.85, 4]
+    assert not likely_scale(measured, None, known_to(0.03)).is_moved
+    assert likely_scale(measured, [0.1, 0.1, 0.1], known_to(0.03)).is_moved
+
+
+def test_more_evidence_makes_the_interval_narrower():
+    with_noise = likely_scale([0.0, 2.0], None, known_to(0.03))
+    without = likely_scale([0.0, 2.0])
+    assert with_noise.high - with_noise.low < 0.5 * (without.high - without.low)
+
+
+def test_evidence_of_the_noise_wins_against_a_curve_like_no_other():
+    assert likely_scale([0.0, 1.6], None, known_to(0.03, 1.5)).measured == pytest.approx(
+        1.5, abs=0.05
+    )
 
 
 def test_order_and_offset_do_not_change_the_factor():
     ev = np.array([-2.36, 0, 2.35])
     for other in (ev[::-1], ev[[1, 2, 0]], ev + 5, np.repeat(ev, 2)):
-        assert likely_factor(other) == pytest.approx(likely_factor(ev))
+        assert likely_scale(other).factor == pytest.approx(likely_scale(ev).factor)
 
 
 @pytest.mark.parametrize("ev", [[0.0], [0.0, 0.0], [1.0, 1.1]])
 def test_without_a_step_the_factor_is_one(ev):
-    assert likely_factor(ev) == 1.0
+    assert likely_scale(ev).factor == 1.0
 
 
 def test_the_factor_stays_near_one_for_any_steps():
     for step in np.linspace(0.25, 20, 80):
-        assert 0.3 < likely_factor([0, step]) < 2
+        assert 0.75 < likely_scale([0, step]).factor < 1.3
 
 
 def test_usual_steps_are_chances():

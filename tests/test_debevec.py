@@ -2,6 +2,8 @@
 outliers do not matter.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from wall import EV, GAMMA22, S_CURVE, SRGB, record, rmse
@@ -12,7 +14,6 @@ from hdr_nsff.radiometry.debevec import (
     SATURATED,
     Samples,
     brackets_linked,
-    brightness_ev,
     debevec,
     response_of,
     saturation,
@@ -127,10 +128,12 @@ def test_brackets_without_common_points_are_not_linked():
     assert brackets_linked(samples, [1, 2]) and not brackets_linked(samples, [0, 1, 2])
 
 
-def test_brightness_alone_gives_gamma_exposures():
-    rng = np.random.default_rng(0)
-    radiance = 2 ** rng.uniform(-5, 1, (40, 50, 3))
-    images = [record(radiance * 2.0**ev, GAMMA22, rng) for ev in EV]
-    assert brightness_ev(images, [0, 1, 2], reference=2, num_brackets=3) == pytest.approx(
-        EV, abs=0.15
-    )
+def test_the_spread_between_frames_is_the_uncertainty_of_an_exposure():
+    samples = points(SRGB, EV, num=2000)
+    frame = np.arange(2000) % 10
+    steady = debevec(replace(samples, frame=frame), [None] * 3, reference=2).scale
+    drifting = samples.rgb * (1 + 0.15 * np.sin(frame))[:, None, None] ** [[[0], [1], [0]]]
+    valid = samples.valid & (drifting < HIGH)
+    unsteady = Samples(drifting, valid, samples.saturated, frame)
+    fit = debevec(unsteady, [None] * 3, reference=2)
+    assert steady.low < 1 < steady.high and fit.ev[1] == pytest.approx(-2, abs=0.2)

@@ -189,7 +189,8 @@ def flags() -> dict[str, set[str]]:
 def calls_of(verb: str) -> list[list[str]]:
     if verb != "train":
         return [[verb, "--help"]]
-    return [[verb, preset, "--help"] for preset in ("splat", "grid", "paper", "hdr-hexplane")]
+    presets = ("splat", "grid", "paper", "hdr-hexplane")
+    return [[verb, "--help"], *([verb, preset, "--help"] for preset in presets)]
 
 
 def flags_in(arguments: list[str]) -> set[str]:

@@ -13,9 +13,9 @@ from hdr_nsff.radiometry.response import (
     Response,
     alternating_medians,
     at_one_exposure,
-    describe,
     estimate_response,
 )
+from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.scene.response import read_response, write_response
 from hdr_nsff.tonemap.base import ToneMapper
 
@@ -39,6 +39,17 @@ def test_the_curve_is_found_through_noisy_depth(measured: Response) -> None:
     assert measured.source == "static points" and not measured.guessed
     assert rmse(measured.x, measured.y[0], S_CURVE) < 0.01
     assert "static points" in describe(measured, EV) and "as given" in describe(measured, EV)
+
+
+def test_unknown_exposures_come_with_their_interval() -> None:
+    rng = np.random.default_rng(0)
+    views = [wall_view(i, S_CURVE, rng) for i in range(18)]
+    response = estimate_response(views, [0] * 18, UNKNOWN, reference=2, num_cameras=1)
+    np.testing.assert_allclose(response.ev, EV, atol=0.1)
+    assert response.scale_low < 1 < response.scale_high
+    words = describe(response, UNKNOWN)
+    assert "95 % confidence" in words and "--ev" in words
+    assert response.moved_stops == 0 or "moved by" in words
 
 
 def test_the_tone_mapper_starts_there_and_is_held_from_the_first_step(measured: Response) -> None:

@@ -139,3 +139,31 @@ def test_exif_of_an_impossible_exposure_holds_none(tmp_path, value):
     exif.get_ifd(0x8769).update({0x829A: value, 0x8827: 400})
     Image.new("RGB", (8, 8)).save(tmp_path / "a.jpg", exif=exif)
     assert read_exif_ev(tmp_path / "a.jpg") is None
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "ev"),
+    [
+        ("exposure_s", "1/4", -2),
+        ("exposure_us", "250000", -2),
+        ("exposure_ns", "250000000", -2),
+        ("exposure_us,iso", "250000,400", 0),
+        ("exposure_s,gain_db", "1/4,12.0412", 0),
+        ("exposure_s,aperture", "1/4,2", -4),
+        ("exposure,iso,gain_db,aperture", "1/4,200,6.0206,4", -4),
+        ("ev,iso", "-1,400", -1),
+    ],
+)
+def test_a_csv_holds_times_in_any_unit_and_gains(columns, cells, ev, tmp_path):
+    write_frames(tmp_path, 1)
+    (tmp_path / "exposures.csv").write_text(f"file,{columns}\nf1.png,{cells}\n")
+    _, rows = read_exposure_csv(open_footage(tmp_path))
+    assert rows["f1.png"] == pytest.approx(ev, abs=1e-4)
+
+
+@pytest.mark.parametrize("column", ["iso", "aperture"])
+def test_a_gain_that_is_not_above_zero_is_refused(column, tmp_path):
+    write_frames(tmp_path, 1)
+    (tmp_path / "exposures.csv").write_text(f"file,exposure,{column}\nf1.png,1/4,0\n")
+    with pytest.raises(InputError, match=f"{column} 0 is not above 0"):
+        read_exposure_csv(open_footage(tmp_path))

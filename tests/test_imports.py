@@ -22,6 +22,7 @@ VERBS = {
     "flow_training.finetune_flow",
     "prepare.weights",
     "doctor",
+    "view",
 }
 # who reads it, for `evaluate` and for `export --truth`, and the last three, which write
 # it

@@ -56,3 +56,30 @@ def test_exposures_beyond_all_light_are_one_sentence(tmp_path: Path) -> None:
     work = work_on(tmp_path, clip([-2, 0, 2], frames=12))
     with pytest.raises(InputError, match=r"exposures\.csv: bracket_ev holds"):
         exposure_step(work)
+
+
+def test_a_list_of_drifting_exposures_gives_one_bracket_and_a_drift(tmp_path: Path) -> None:
+    ev = np.linspace(-1, 1, 20)
+    rows = "".join(f"{t:03d}.png,{e}\n" for t, e in enumerate(ev))
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text(f"file,ev\n{rows}")
+    work = work_on(tmp_path, clip([0], frames=20))
+    result = exposure_step(work)
+    frames, manifest = work.manifest.frames, work.manifest
+    assert manifest.bracket_ev == [0.0] and manifest.exposure_given
+    np.testing.assert_allclose([f.drift for f in frames], ev, atol=1e-9)
+    assert result.details["drift_given"] and "drift" in result.details["doubts"][0]
+
+
+def test_a_listed_alternation_with_drift_on_top_keeps_its_brackets(tmp_path: Path) -> None:
+    drift = np.linspace(-0.5, 0.5, 20)
+    ev = np.tile([-2.0, 0.0], 10) + drift
+    rows = "".join(f"{t:03d}.png,{e}\n" for t, e in enumerate(ev))
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text(f"file,ev\n{rows}")
+    work = work_on(tmp_path, clip([-2, 0], frames=20))
+    exposure_step(work)
+    frames = work.manifest.frames
+    assert [f.bracket for f in frames] == [0, 1] * 10
+    found = [work.manifest.bracket_ev[f.bracket] + f.drift for f in frames]
+    np.testing.assert_allclose(np.diff(found), np.diff(ev), atol=1e-9)

@@ -182,3 +182,20 @@ def test_too_few_poses_are_named(tmp_path):
                 poses=tmp_path / "poses_bounds.npy",
             )
         )
+
+
+def test_auto_exposure_drifts_and_is_kept_as_truth(tmp_path):
+    clip = ordinary_clip(tmp_path / "in")
+    settings = ReexposeConfig(clip, tmp_path / "out", ev="-1", exposure="auto", noise=0)
+    out = reexpose(settings)
+    drift = np.array(Truth.open(out / "truth").clip_drift)
+    files = sorted((out / "clip").glob("*.png"))
+    assert len(drift) == len(files) == 20
+    assert np.mean(drift) == pytest.approx(0, abs=1e-9) and 2 < np.ptp(drift) < 4
+    brightness = [np.median(read_image(f)) for f in files]
+    assert np.corrcoef(brightness, drift)[0, 1] > 0.8
+
+
+def test_without_auto_exposure_no_drift_is_kept(tmp_path):
+    out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out"))
+    assert Truth.open(out / "truth").clip_drift is None

@@ -18,7 +18,7 @@ from test_scores import truth_of, with_flow
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.evaluation.evaluate import evaluate_run
-from hdr_nsff.evaluation.report import ReportConfig, report, write_report
+from hdr_nsff.evaluation.report import ReportConfig, find_viewer, report, write_report
 from hdr_nsff.evaluation.report.plots import moving_average
 from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.training.run_folder import Run
@@ -164,6 +164,17 @@ def test_long_videos_are_linked_by_relative_path(
     monkeypatch.setattr("hdr_nsff.evaluation.report.pictures.MAX_EMBEDDED_BYTES", 10)
     text = write_report(run, folder / "report.html", folder / "render").read_text()
     assert 'href="render/bullet.mp4"' in text and "<video" not in text
+
+
+def test_the_page_of_the_viewer_is_linked_where_it_is(tmp_path: Path) -> None:
+    run = fake_run(tmp_path / "run")
+    assert find_viewer(run, tmp_path) is None
+    run.folder.mkdir(exist_ok=True)
+    (run.folder / "scene.html").touch()
+    assert find_viewer(run, tmp_path) == "run/scene.html"
+    (tmp_path / "scene.html").touch()
+    assert find_viewer(run, tmp_path) == "scene.html"
+    assert find_viewer(run, tmp_path / "elsewhere") is None
 
 
 def test_a_moving_average_keeps_length_and_constants() -> None:

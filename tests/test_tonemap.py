@@ -11,7 +11,8 @@ from estimates import tone_mapper
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.radiometry.response import Response
-from hdr_nsff.tonemap.base import informative
+from hdr_nsff.tonemap.base import Recordings, ToneMapConfig, informative
+from hdr_nsff.tonemap.build import build_tone_mapper
 from hdr_nsff.tonemap.curve import GAMMA, leaky_ends, piecewise_linear
 
 EV = [-4.0, -2.0, 0.0]
@@ -65,6 +66,14 @@ def test_residuals_cannot_carry_scale():
     )
     assert residual.abs().max() > 0.1
     torch.testing.assert_close(residual.mean(0), torch.zeros(3), atol=1e-6, rtol=0)
+
+
+def test_drift_is_a_known_offset_of_single_frames():
+    recordings = Recordings((0, 0, 1), (0, 0, 0), (-2.0, 0.0), 1, 1, drift=(0.5, -0.5, 0.0))
+    t = build_tone_mapper(ToneMapConfig(), recordings)
+    torch.testing.assert_close(t.gains().mean(-1), torch.tensor([-1.5, -2.5, 0.0]))
+    assert t.exposures().tolist() == [-2.0, 0.0]
+    assert t.log_gain(0, 0, None)[0].item() == pytest.approx(-2 * np.log(2), abs=1e-5)
 
 
 def test_known_exposures_are_exact_and_not_learned():

@@ -11,6 +11,7 @@ try:
     import os
     import sys
     from collections.abc import Sequence
+    from contextlib import nullcontext
     from dataclasses import dataclass
     from importlib import import_module
     from typing import Any, NoReturn
@@ -23,6 +24,7 @@ except KeyboardInterrupt:  # Ctrl-C before `main` is reached
 
 INTERRUPTED = 130  # exit code by convention: 128 + SIGINT
 CLOSED_PIPE = 141  # 128 + SIGPIPE
+VIEW = "--view"  # of `train`: show the field in the browser while it trains
 MAX_MESSAGE = 560  # characters of a sentence about bad input
 
 
@@ -56,10 +58,15 @@ VERBS = {
         "hdr_nsff.rendering.render:RenderConfig",
         "Render views of a trained run: EXR, PNG, video; any path, time and exposure.",
     ),
+    "view": Verb(
+        "hdr_nsff.view:view",
+        "hdr_nsff.view:ViewConfig",
+        "Look around in a trained run, in the browser.",
+    ),
     "export": Verb(
         "hdr_nsff.rendering.export:export",
         "hdr_nsff.rendering.export:ExportConfig",
-        "Write Gaussians as PLY, or a scene in a public data layout, for other programs.",
+        "Write a page that plays the run, Gaussians as PLY, or a public data layout.",
     ),
     "evaluate": Verb(
         "hdr_nsff.evaluation.evaluate:evaluate",
@@ -162,9 +169,11 @@ def run_verb(name: str, verb: Verb, options: list[str]) -> None:
     function, config = load(verb.function), load(verb.config)
     from hdr_nsff.core.io import writing_to
 
+    with_viewer = name == "train" and VIEW in options
     try:
-        settings = parse(name, config, options)
-        with writing_to("output"):
+        settings = parse(name, config, [o for o in options if not (with_viewer and o == VIEW)])
+        viewer = load("hdr_nsff.view:viewer_beside")(settings.out) if with_viewer else nullcontext()
+        with writing_to("output"), viewer:
             function(settings)
     except InputError as error:
         fail(str(error))
@@ -219,7 +228,7 @@ def parse_preset(name: str, presets: dict[str, Any], options: Sequence[str]) -> 
     about = (
         f"{inspect.getdoc(TrainConfig)} Ablations of ours: `grid-NAME` and `splat-NAME` with NAME "
         f"one of {', '.join(ABLATIONS)} (no-saturation of `grid` alone); docs/baselines.md "
-        "describes them."
+        f"describes them. `{VIEW}` shows the field in the browser while it trains."
     )
     return tyro.extras.overridable_config_cli(
         {preset: (text, presets[preset]) for preset, text in shown.items()},

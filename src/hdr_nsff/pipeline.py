@@ -20,6 +20,8 @@ from hdr_nsff.evaluation.report import check_place, write_report
 from hdr_nsff.fields.build import device_for
 from hdr_nsff.footage.ingest import hold_out_spacing
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
+from hdr_nsff.rendering import export_page
+from hdr_nsff.rendering.export_gaussians import GaussianField
 from hdr_nsff.rendering.render import render_all
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig, check_config
@@ -33,13 +35,13 @@ class RunConfig(PrepareConfig):
     """Alternating-exposure footage in; linear HDR novel views at novel times out.
 
     Does everything: exposures, poses, flow, masks and depth (`prepare`), training
-    (`train`), EXR sequence, videos and LDR views (`render`), held-out quality
-    (`evaluate`), report.html. Killed? The same command continues where it was. Every
-    option of `prepare` works here too.
+    (`train`), EXR sequence, videos and LDR views (`render`), a page to look around in
+    (`export`), held-out quality (`evaluate`), report.html. Killed? The same command
+    continues where it was. Every option of `prepare` works here too.
     """
 
     out: Positional[Path]
-    """Folder for everything: scene/, run/, render/, report.html."""
+    """Folder for everything: scene/, run/, render/, scene.html, report.html."""
     hold_out: int | None = None
     """Keep every N-th frame out of training, for `evaluate`; 0 keeps all in. Default
     8; with a truth folder or a data set's held-out views 0, or those frames of the clip
@@ -72,6 +74,7 @@ def run_all(config: RunConfig) -> None:
     device = str(device_for(settings.field, config.device))
     check_truth(config)
     check_place(config.out / "report.html")
+    export_page.check_place(config.out / "scene.html")
     check_config(settings)
     footage = prepare_settings(config)
     with writing_to(config.out), lock_output(config.out):
@@ -80,6 +83,8 @@ def run_all(config: RunConfig) -> None:
         folder = train(replace(settings, scene=scene, device=device))
         run = Run.open(folder, device)
         results = render_all(run, config.out / "render")
+        if isinstance(run.field, GaussianField):
+            results["viewer"] = export_page.export_page(run, config.out / "scene.html")
         evaluate_run(run, truth)
         results["report"] = write_report(run, config.out / "report.html", config.out / "render")
     say(f"done in {(time.monotonic() - start) / 60:.1f} minutes; results:")

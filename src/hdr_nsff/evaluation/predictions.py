@@ -131,6 +131,10 @@ def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
     By the learned camera, at every bracket that the target has.
     """
     brackets = list(target.rgb)
+    if target.drift:
+        exposures = run.tonemapper.exposures()
+        evs = [float(exposures[b]) + target.drift for b in brackets]
+        return dict(zip(brackets, recordings_at(run, target, radiance, evs), strict=True))
     recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]
     return dict(zip(brackets, record(run, target, radiance, recorders), strict=True))
 

@@ -57,6 +57,7 @@ class Target:
     geometry: GeometryFile | None = None  # where known
     # {EV: (H, W, 3)} recorded, at exposures of no frame of the clip
     novel: dict[float, Tensor] = field(default_factory=dict)
+    drift: float = 0.0  # stops by which its exposure differs from its bracket's
 
     def protocol(self, times: Sequence[float]) -> Protocol | None:
         """The published comparison that the view belongs to; None if it was trained on.
@@ -131,6 +132,7 @@ def frame_targets(frames: Sequence[Frame], group: str) -> list[Target]:
             rgb={frame.bracket: frame.image.cpu()},
             radiance=None,
             moving=frame.moving,
+            drift=frame.drift,
         )
         for frame in frames
     ]

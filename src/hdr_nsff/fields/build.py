@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, assert_never
 
 import torch
@@ -51,6 +52,8 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     m, near, far = scene.manifest, scene.near, scene.far
     if isinstance(config, SplatConfig):
         local_pixels = count_local_pixels(scene)
+        if config.moving is None and not any(mover.rigid for mover in scene.movers):
+            config = replace(config, moving=0)  # there is nothing for them to draw
         return Splat(config, scene.times, near, far, m.width * m.height, local_pixels)
     space = build_space([f.camera for f in scene.train], near, far)
     match config:

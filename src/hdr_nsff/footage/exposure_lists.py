@@ -19,6 +19,10 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.footage.ingest import Footage, check_number
 from hdr_nsff.scene.manifest import MAX_EV
 
+# columns of a CSV: times, and the seconds of their unit
+TIMES = {"exposure": 1.0, "exposure_s": 1.0, "exposure_us": 1e-6, "exposure_ns": 1e-9}
+GAINS = ("iso", "gain_db", "aperture")  # count where a time is given
+DB_PER_STOP = 20 * math.log10(2)
 EXAMPLE = "write times like 1/250 and EV like -2"
 
 
@@ -77,8 +81,8 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     """The CSV beside the frames and its EV by frame; None where there is none.
 
     Frames go by file name or `#number`. Columns: `file` (or `frame`, a number from 0),
-    and `exposure` (seconds) or `ev`. InputError that names the line of what is not
-    understood.
+    and `ev` or a time (`TIMES`), with those of `GAINS`. InputError that names the line
+    of what is not understood.
     """
     path = footage.path / "exposures.csv"
     if footage.video:
@@ -87,16 +91,15 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
         return None
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
     try:
-        name, value = find_columns(path, reader.fieldnames or [])
-        read = log2_seconds if value == "exposure" else parse_number
+        name, values = find_columns(path, reader.fieldnames or [])
         rows = {}
         for row in reader:
             where = f"{path}, line {reader.line_num}"
-            check_cells(row, (name, value), where)
+            check_cells(row, (name, *values), where)
             key = row[name].strip()
             if name == "frame":
                 key = f"#{key}"
-            rows[key] = read(row[value], where)
+            rows[key] = sum(ev_of_cell(column, row[column], where) for column in values)
     except csv.Error as error:
         line = reader.line_num + 1
         raise InputError(
@@ -120,17 +123,36 @@ def read_utf8(path: Path) -> str:
         ) from error
 
 
-def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, str]:
-    """The columns that name the frame and hold its exposure; InputError without."""
+def ev_of_cell(column: str, text: str, where: str) -> float:
+    """What a cell adds to the EV of its frame, log2 of light times gain."""
+    if column == "ev":
+        return parse_number(text, where)
+    if column in TIMES:
+        return log2_seconds(text, where) + math.log2(TIMES[column])
+    value = parse_number(text, where)
+    if column == "gain_db":
+        return value / DB_PER_STOP
+    if value <= 0:
+        raise InputError(f"{where}: {column} {shorten(text)} is not above 0; correct it")
+    if column == "iso":
+        return math.log2(value / 100)
+    return -2 * math.log2(value)  # f-number
+
+
+def find_columns(path: Path, columns: Sequence[str]) -> tuple[str, list[str]]:
+    """The columns that name the frame, and those that make its exposure; InputError
+    without.
+    """
     name = next((c for c in ("file", "frame") if c in columns), None)
-    value = next((c for c in ("exposure", "ev") if c in columns), None)
+    value = next((c for c in (*TIMES, "ev") if c in columns), None)
     if name is None or value is None:
         found = shorten(", ".join(columns)) or "none"
         raise InputError(
             f"{path}: its columns are {found}; it needs `file` or `frame`, "
-            "and `exposure` (seconds) or `ev`, separated by commas"
+            "and `exposure` (seconds), `exposure_us`, `exposure_ns` or `ev`, separated by commas"
         )
-    return name, value
+    gains = [c for c in GAINS if c in columns and value != "ev"]
+    return name, [value, *gains]
 
 
 def check_cells(row: Mapping[str | Any, Any], columns: Sequence[str], where: str) -> None:

@@ -31,6 +31,7 @@ ACCEPTED = (
     "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, "
     "or a folder of such folders (one per camera)"
 )
+LOSSY = {".jpg", ".jpeg"}  # formats of frames
 GAMMA = 2.2  # linear footage is encoded as x^(1 / GAMMA)
 WHITE_PERCENTILE = 99.9  # of linear radiance, becomes 1 (hand-chosen)
 FOLDER_FPS = 24.0  # frames per second assumed for a folder of frames
@@ -61,6 +62,12 @@ class Footage:
         """Every file by its name relative to the footage."""
         root = self.path.parent if self.video else self.path
         return {f.relative_to(root).as_posix(): f for files in self.cameras for f in files}
+
+    @property
+    def lossless(self) -> bool:
+        """Whether all frames are of formats that keep the noise of the sensor."""
+        suffixes = {f.suffix.lower() for files in self.cameras for f in files}
+        return not self.video and not suffixes & LOSSY
 
 
 @dataclass(frozen=True)

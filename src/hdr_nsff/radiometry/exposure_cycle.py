@@ -130,7 +130,11 @@ def detect_cycle(video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleT
     with the best Bayesian information criterion (Schwarz 1978) under Laplace noise
     wins, so a multiple of the true length, which fits no better, loses.
     """
-    steps = brightness_steps(video, tuning)
+    return cycle_of_steps(brightness_steps(video, tuning), tuning)
+
+
+def cycle_of_steps(steps: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()) -> Cycle:
+    """The exposure cycle of EV `steps` (T-1,) between frames, as `detect_cycle`."""
     count = len(steps)
     longest = min(tuning.max_cycle, (count + 1) // 2)
     lengths = range(1, max(1, longest) + 1)
@@ -151,7 +155,7 @@ def detect_cycle(video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleT
     ev = [float(levels[bracket_of_phase == b].mean()) for b in range(bracket_of_phase.max() + 1)]
     return Cycle(
         length=length,
-        brackets=[int(bracket_of_phase[t % length]) for t in range(len(video))],
+        brackets=[int(bracket_of_phase[t % length]) for t in range(count + 1)],
         order=np.argsort(ev, kind="stable").tolist(),
         ev=ev,
         confidence=1 - misfit / misfit_without,

@@ -15,19 +15,32 @@ from typing import Literal
 
 import numpy as np
 
+from hdr_nsff.radiometry.bracketing import FACTORS, StepScale, likely_scale, measured_scale
+from hdr_nsff.radiometry.brightness import brightness_ev
 from hdr_nsff.radiometry.debevec import (
     MAX_MISFIT,
     DebevecTuning,
     ResponseFit,
+    ScaleEvidence,
     brackets_linked,
-    brightness_ev,
     debevec,
 )
+from hdr_nsff.radiometry.frame_exposures import (
+    FrameExposuresTuning,
+    drift_within_brackets,
+    fit_curve_and_exposures,
+    frame_log_exposures,
+    is_determined,
+    read_points,
+)
+from hdr_nsff.radiometry.sensor_noise import SensorNoiseTuning, noise_log_likelihood
 from hdr_nsff.radiometry.static_samples import ResponseView, static_samples
 
 GAMMA = 2.2  # of the fallback
 NUM_KNOTS = 256
+LEVEL_EV = 0.4  # frames this close in exposure count as one where noise is measured
 SEED = 0  # of the choice of static points
+DRIFTING_SHARE = 0.95  # quantile of the frames that has to drift for any to count
 
 Source = Literal["static points", "brightness", "one exposure"]
 
@@ -39,6 +52,8 @@ class ResponseTuning:
     num_samples: int = 4000  # static points
     median_rounds: int = 20  # of the robust fit of white balance
     debevec: DebevecTuning = field(default_factory=DebevecTuning)
+    noise: SensorNoiseTuning = field(default_factory=SensorNoiseTuning)
+    frames: FrameExposuresTuning = field(default_factory=FrameExposuresTuning)
 
 
 @dataclass(frozen=True)
@@ -59,6 +74,19 @@ class Response:
     guessed: bool  # the common factor of all `ev` is the likeliest one, not measured
     own_curves: tuple[int, ...]  # cameras with a curve of their own, of several cameras
     problem: str = ""  # why not from static points, in words
+    # where no exposure was known: the common factor that would turn all `ev` into what
+    # the recordings alone say, and its 95 % interval; else 1
+    measured_scale: float = 1.0
+    scale_low: float = 1.0
+    scale_high: float = 1.0
+    # (V,) stops by which the views differ from their brackets, mean 0 over a bracket;
+    # None: not at all. `prepare` writes it to the frames of scene.json.
+    drift: np.ndarray | None = None
+
+    @property
+    def moved_stops(self) -> float:
+        """By how much the widest range of exposures was moved to usual steps."""
+        return abs(1 - self.measured_scale) * float(np.ptp(self.ev))
 
 
 def estimate_response(
@@ -68,13 +96,164 @@ def estimate_response(
     reference: int,
     num_cameras: int,
     tuning: ResponseTuning = ResponseTuning(),
+    lossless: bool = False,
+    drift: np.ndarray | None = None,
 ) -> Response:
     """Response and exposures from recorded frames with depth and poses.
 
     `views` are the training frames, `view_cameras` their physical cameras; `ev` (B,)
     holds the known log2 exposures, None where unknown. `views` without a usable
-    disparity (all 0) contribute brightness only.
+    disparity (all 0) contribute brightness only. `lossless`: the frames were never
+    compressed with loss, so that they show the noise of the sensor. Where single frames
+    differ from their brackets, `drift` of the response is by how much; `drift` (V,) is
+    given where it is known.
     """
+    response = bracket_response(views, view_cameras, ev, reference, num_cameras, tuning, lossless)
+    if num_cameras > 1:
+        return response
+    if drift is not None:
+        return with_given_drift(response, views, ev, drift, tuning)
+    return with_drift(response, views, ev, reference, tuning, lossless)
+
+
+def with_given_drift(
+    response: Response,
+    views: Sequence[ResponseView],
+    ev: Sequence[float | None],
+    drift: np.ndarray,
+    tuning: ResponseTuning = ResponseTuning(),
+) -> Response:
+    """The response where the exposures `ev` (B,) of brackets and the `drift` (V,) of
+    frames are given; gamma 2.2 where points are too few.
+    """
+    readings = read_points(views, np.random.default_rng(SEED), tuning.frames)
+    response = replace(response, drift=drift)
+    if not is_determined(readings, len(views), tuning.frames):
+        return response
+    exposures = np.array([float(ev[v.bracket] or 0.0) for v in views]) + drift
+    samples = replace(readings.samples, offset=exposures[readings.frame])
+    fit = debevec(samples, [0.0] * readings.frame.shape[1], 0, tuning.debevec)
+    if fit.misfit >= MAX_MISFIT:
+        return response
+    brackets = np.array([v.bracket for v in views])
+    seen = frame_log_exposures(readings, fit.x, fit.y, brackets, tuning.frames)
+    off = np.abs(seen - seen.mean() - exposures + exposures.mean())
+    problem = ""
+    if np.quantile(off, DRIFTING_SHARE) > tuning.frames.min_drift:
+        problem = f"the pixels disagree with given exposures by up to {off.max():.2f} EV"
+    return replace(
+        response,
+        x=fit.x,
+        y=fit.y[None],
+        source="static points",
+        misfit=fit.misfit,
+        num_points=len(readings.frame),
+        guessed=False,
+        problem=problem,
+    )
+
+
+def with_drift(
+    response: Response,
+    views: Sequence[ResponseView],
+    ev: Sequence[float | None],
+    reference: int,
+    tuning: ResponseTuning = ResponseTuning(),
+    lossless: bool = False,
+) -> Response:
+    """The response with the exposure of every frame, where these drift; else as it is.
+
+    Without drift nothing new is learned, and the first estimate stays.
+    """
+    ordered = sorted(range(len(views)), key=lambda i: views[i].time)
+    in_time = [views[i] for i in ordered]
+    brackets = np.array([v.bracket for v in in_time])
+    readings = read_points(in_time, np.random.default_rng(SEED), tuning.frames)
+    if not is_determined(readings, len(views), tuning.frames):
+        return response
+    exposures = frame_log_exposures(readings, response.x, response.y[0], brackets, tuning.frames)
+    drift = drift_within_brackets(exposures, brackets)
+    if np.quantile(np.abs(drift), DRIFTING_SHARE) < tuning.frames.min_drift:
+        return response
+    x, y, exposures, misfit = fit_curve_and_exposures(
+        readings, response.x, response.y[0], brackets, tuning.debevec, tuning.frames
+    )
+    if misfit >= MAX_MISFIT:
+        return response
+    drift = drift_within_brackets(exposures, brackets)
+    level = exposures - drift  # (V,) of the frame's bracket
+    found = np.zeros(len(ev))
+    for bracket in np.unique(brackets):
+        found[bracket] = level[brackets == bracket][0]
+    found = found - found[reference]
+    scale = drift_scale(in_time, x, y, exposures, found, ev, tuning, lossless)
+    in_order = np.zeros(len(views))
+    in_order[ordered] = drift * scale.factor
+    knots = np.linspace(0, 1, NUM_KNOTS) ** GAMMA
+    curves = np.stack([np.interp(knots, x**scale.factor, channel) for channel in y])
+    return Response(
+        x=knots,
+        y=curves[None],
+        ev=np.array([f * scale.factor if e is None else e for f, e in zip(found, ev, strict=True)]),
+        white_balance=np.zeros((1, 3)),
+        source="static points",
+        misfit=misfit * scale.factor,
+        num_points=len(readings.frame),
+        guessed=len([e for e in ev if e is not None]) < 2,
+        own_curves=(),
+        measured_scale=scale.measured / scale.factor,
+        scale_low=scale.low / scale.factor,
+        scale_high=scale.high / scale.factor,
+        drift=in_order,
+    )
+
+
+def drift_scale(
+    views: Sequence[ResponseView],
+    x: np.ndarray,
+    y: np.ndarray,
+    exposures: np.ndarray,
+    found: np.ndarray,
+    ev: Sequence[float | None],
+    tuning: ResponseTuning,
+    lossless: bool,
+) -> StepScale:
+    """The common factor on the `exposures` (V,) of frames and the EVs `found` (B,) of
+    brackets: from known ones, else from noise, curve and usual steps.
+    """
+    known = np.array([e is not None for e in ev])
+    true = np.array([0.0 if e is None else e for e in ev])
+    if np.abs(true[known]).max(initial=0.0) > 0:
+        factor = float(true[known] @ found[known] / (found[known] @ found[known]))
+        return StepScale(factor, factor, factor, factor)
+    log_likelihood = None
+    if lossless:
+        levels = np.round((exposures - exposures.min()) / LEVEL_EV).astype(int)
+        images = [v.image for v in views]
+        log_likelihood = noise_log_likelihood(
+            images,
+            levels.tolist(),
+            x,
+            y,
+            exposures.min() + LEVEL_EV * np.arange(levels.max() + 1),
+            FACTORS,
+            tuning.noise,
+        )
+    if len(found) == 1:
+        return measured_scale(log_likelihood, tuning.debevec.bracketing)
+    return likely_scale(found, None, log_likelihood, tuning.debevec.bracketing)
+
+
+def bracket_response(
+    views: Sequence[ResponseView],
+    view_cameras: Sequence[int],
+    ev: Sequence[float | None],
+    reference: int,
+    num_cameras: int,
+    tuning: ResponseTuning = ResponseTuning(),
+    lossless: bool = False,
+) -> Response:
+    """The response where all frames of a bracket have one exposure."""
     brackets = {v.bracket for v in views}
     if len(brackets) == 1:
         return from_brightness(views, ev, reference, num_cameras, "one exposure", "")
@@ -83,12 +262,14 @@ def estimate_response(
     if not brackets_linked(samples, brackets, tuning.debevec):
         problem = "too few static points seen in several exposures"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
-    fit = debevec(samples, ev, reference, tuning.debevec)
+    evidence = evidence_of_noise(views, tuning) if lossless else None
+    fit = debevec(samples, ev, reference, tuning.debevec, evidence)
     if fit.misfit >= MAX_MISFIT:
         problem = f"static points differ by {fit.misfit:.2f} stops"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
     own = camera_fits(views, view_cameras, fit, reference, tuning) if num_cameras > 1 else {}
     y = np.stack([own[c].y if c in own else fit.y for c in range(num_cameras)])
+    scale = fit.scale or StepScale(1.0, 1.0, 1.0, 1.0)
     return Response(
         x=fit.x,
         y=y,
@@ -99,7 +280,20 @@ def estimate_response(
         num_points=len(samples.rgb),
         guessed=fit.guessed,
         own_curves=tuple(sorted(own)),
+        measured_scale=scale.measured / scale.factor,
+        scale_low=scale.low / scale.factor,
+        scale_high=scale.high / scale.factor,
     )
+
+
+def evidence_of_noise(views: Sequence[ResponseView], tuning: ResponseTuning) -> ScaleEvidence:
+    """What the noise of the recorded frames says of the common factor of all EVs."""
+    images, brackets = [v.image for v in views], [v.bracket for v in views]
+
+    def evidence(x: np.ndarray, y: np.ndarray, ev: np.ndarray) -> np.ndarray | None:
+        return noise_log_likelihood(images, brackets, x, y, ev, FACTORS, tuning.noise)
+
+    return evidence
 
 
 def camera_fits(
@@ -216,43 +410,20 @@ def from_brightness(
     )
 
 
-def describe(response: Response, given_ev: Sequence[float | None]) -> str:
-    """How the response was found, in one sentence."""
-    steps = ", ".join(f"{e:+.2f}" for e in response.ev)
-    match response.source:
-        case "one exposure":
-            return "gamma 2.2: a single exposure does not determine the response"
-        case "brightness":
-            how = "gamma 2.2"
-            if response.problem:
-                how += f" ({response.problem})"
-            unknown = "unknown ones from the brightness of the frames"
-        case "static points":
-            how = f"{response.num_points} static points, misfit {response.misfit:.3f} stops"
-            if len(response.y) > 1:
-                curves = "one curve for all cameras"
-                if response.own_curves:
-                    curves = f"own curves for cameras {list(response.own_curves)}"
-                how += f", {curves}"
-            unknown = "unknown ones estimated with it"
-            if response.guessed:
-                unknown = (
-                    "the likeliest steps, as recordings leave a common factor open: "
-                    "give `--ev` if you know them"
-                )
-    if all(e is not None for e in given_ev):
-        unknown = "as given"
-    return f"{how}; EV {steps} ({unknown})"
-
-
 def at_one_exposure(
-    video: np.ndarray, brackets: np.ndarray, cameras: np.ndarray, response: Response
+    video: np.ndarray,
+    brackets: np.ndarray,
+    cameras: np.ndarray,
+    response: Response,
+    drift: np.ndarray | None = None,
 ) -> np.ndarray:
     """`video` (T, H, W, 3) recorded in [0, 1] at one brightness, in [0, 1].
 
     Every pixel becomes the mean of what it would be in all brackets (T,) that its
-    camera (T,) used, which keeps contrast wherever any of them has some.
+    camera (T,) used, which keeps contrast wherever any of them has some. `drift` (T,):
+    stops by which frames differ from their brackets.
     """
+    drift = np.zeros(len(video)) if drift is None else drift
     result = np.empty(video.shape, np.float32)
     value = np.linspace(0, 1, 1025)  # recorded values that are tabulated
     for t, (own, camera) in enumerate(zip(brackets, cameras, strict=True)):
@@ -260,7 +431,7 @@ def at_one_exposure(
         for c in range(3):
             y = response.y[camera, c]
             exposure = np.interp(value, y, response.x)
-            gains = [2.0 ** (response.ev[b] - response.ev[own]) for b in used]
+            gains = [2.0 ** (response.ev[b] - response.ev[own] - drift[t]) for b in used]
             images = [np.interp(exposure * gain, response.x, y) for gain in gains]
             result[t, ..., c] = np.interp(video[t, ..., c], value, np.mean(images, axis=0))
     return result

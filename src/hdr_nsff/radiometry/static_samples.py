@@ -83,6 +83,7 @@ def static_samples(
         np.concatenate([p.rgb for p in parts]),
         np.concatenate([p.valid for p in parts]),
         np.concatenate([p.saturated for p in parts]),
+        np.repeat(np.arange(len(parts)), [len(p.rgb) for p in parts]),
     )
 
 

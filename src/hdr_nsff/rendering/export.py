@@ -1,6 +1,7 @@
-"""The verb `export`: Gaussians as PLY files, or a scene in a public data layout.
+"""The verb `export`: a page that plays in a browser, Gaussians as PLY files, or a scene
+in a public data layout.
 
-Both are for other programs. The writers of layouts are in `footage/layouts/`.
+The last two are for other programs. The writers of layouts are in `footage/layouts/`.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.footage.layouts import held_out, llff, nerfstudio
 from hdr_nsff.footage.layouts.writer import Source
 from hdr_nsff.rendering.export_gaussians import ColorTransform, export_one, export_sequence
+from hdr_nsff.rendering.export_page import BARE, PAGE, export_page
 from hdr_nsff.training.run_folder import Run, read_config
 
 Layout = Literal["hdr-gopro", "nerfstudio"]
@@ -26,7 +28,10 @@ MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Gaussians of a splat run for viewers, or a scene in a public data layout.
+    """A page to look around in, Gaussians for viewers, or a scene in a public layout.
+
+    One HTML file that plays in every browser, without a network:
+    hdr-nsff export out/run scene.html
 
     Gaussians at a time: hdr-nsff export out/run frame.ply --ply --time 12.5
 
@@ -46,8 +51,8 @@ class ExportConfig:
     """Run folder; for --layout a scene folder, or a run folder, whose scene is meant.
     """
     out: tyro.conf.Positional[Path]
-    """The output: a file NAME.ply with --ply, a folder with --ply-sequence and
-    --layout.
+    """The output: NAME.html for a page, NAME.hdr4d for its scene alone, a file NAME.ply
+    with --ply, a folder with --ply-sequence and --layout.
     """
     layout: Layout | None = None
     """The scene's frames, poses, masks, depth and flow as HDR-GoPro / NSFF (LLFF), one
@@ -77,6 +82,8 @@ def export(config: ExportConfig) -> Path:
         return export_scene(config.run, config.out, config.layout, config.truth)
     run = Run.open(config.run, config.device)
     with writing_to(config.out), lock_output(config.out):
+        if is_page(config.out):
+            return export_page(run, config.out)
         if config.ply_sequence:
             return export_sequence(run, config.out, config.colors)
         time = config.time
@@ -86,11 +93,19 @@ def export(config: ExportConfig) -> Path:
         return export_one(run, config.out, time, config.colors)
 
 
+def is_page(out: Path) -> bool:
+    """Whether an output is a page or a scene file, by its ending."""
+    return out.suffix.lower() in (PAGE, BARE)
+
+
 def check_settings(config: ExportConfig) -> None:
     """InputError for settings that make no sense, whatever the run is."""
-    if config.ply + config.ply_sequence + (config.layout is not None) != 1:
+    others = config.ply + config.ply_sequence + (config.layout is not None)
+    if is_page(config.out):
+        check_page(config, others)
+    elif others != 1:
         choices = "one of --ply (a file), --ply-sequence and --layout NAME (a folder)"
-        raise InputError(f"export: choose what to write, {choices}")
+        raise InputError(f"export: choose what to write, NAME.html or {choices}")
     check_output(config)
     check_colors(config.colors)
     if config.layout is not None:
@@ -103,6 +118,19 @@ def check_settings(config: ExportConfig) -> None:
     if config.ply_sequence and config.time is not None:
         advice = "use --ply for one time"
         raise InputError(f"--time: --ply-sequence writes every training time; {advice}")
+
+
+def check_page(config: ExportConfig, others: int) -> None:
+    """InputError for options that a page has no use for; `others` counts outputs."""
+    out = config.out
+    if others:
+        problem = "a file with this ending is a page"
+        raise InputError(f"{out}: {problem}; name another output, or leave the option out")
+    if config.time is not None or config.colors != ColorTransform():
+        problem = "a page holds all times and linear radiance"
+        raise InputError(f"{out}: {problem}; leave --time, --ev, --linear and --camera-id out")
+    if out.is_dir():
+        raise InputError(f"{out}: is a folder; name a file")
 
 
 def check_output(config: ExportConfig) -> None:

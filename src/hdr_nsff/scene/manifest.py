@@ -53,6 +53,8 @@ class FrameEntry(Strict):
     camera_id: int = Field(default=0, ge=0)  # physical camera: owns a response curve
     bracket: int = Field(ge=0)  # which exposure of the cycle
     ev: float | None = None  # log2 exposure relative to the reference bracket, if known
+    # stops by which it differs from its bracket's (auto exposure), None: not at all
+    drift: float | None = None
     split: Split = "train"
     K: list[list[float]] | None = None  # 3x3 px
     c2w: list[list[float]] | None = None  # 3x4 OpenCV, scene units

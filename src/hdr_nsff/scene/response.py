@@ -35,6 +35,9 @@ class ResponseFile(BaseModel):
     guessed: bool
     own_curves: list[int]
     problem: str = ""
+    measured_scale: float = 1.0
+    scale_low: float = 1.0
+    scale_high: float = 1.0
 
 
 def write_response(path: Path, response: Response) -> None:
@@ -50,6 +53,9 @@ def write_response(path: Path, response: Response) -> None:
         guessed=response.guessed,
         own_curves=list(response.own_curves),
         problem=response.problem,
+        measured_scale=response.measured_scale,
+        scale_low=response.scale_low,
+        scale_high=response.scale_high,
     )
     write_json(path, file.model_dump())
 
@@ -86,4 +92,7 @@ def read_response(path: Path, num_cameras: int, num_brackets: int) -> Response:
         guessed=file.guessed,
         own_curves=tuple(file.own_curves),
         problem=file.problem,
+        measured_scale=file.measured_scale,
+        scale_low=file.scale_low,
+        scale_high=file.scale_high,
     )

@@ -40,6 +40,7 @@ class Frame:
     camera_id: int
     bracket: int
     image: Tensor  # (H, W, 3) recorded rgb in [0, 1]
+    drift: float = 0.0  # stops by which its exposure differs from its bracket's
     # {+-1: position in `Scene.train`} of the neighbors in time, same physical camera
     neighbors: dict[int, int] = field(default_factory=dict)
     moving: Tensor | None = None  # (H, W) bool
@@ -207,6 +208,7 @@ def load_frame(
         camera_id=entry.camera_id,
         bracket=entry.bracket,
         image=image,
+        drift=entry.drift or 0.0,
         neighbors=positions,
         moving=moving,
         outline=outline(moving) if moving is not None and estimated else None,

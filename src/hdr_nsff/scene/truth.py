@@ -119,6 +119,8 @@ class Truth(Strict):
     settings: dict[str, str | int | float | bool] | None = None  # of what made it, for the record
     # true poses of the clip's frames, for pose errors and for the transfer of views
     clip_c2w: list[list[list[float]]] | None = None
+    # EV by which every frame of the clip deviates from its bracket (auto exposure)
+    clip_drift: list[float] | None = None
     views: list[TruthView]
 
     @property

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from tyro.conf import Positional
@@ -53,6 +53,10 @@ class ReexposeConfig:
     """Folder to write `clip/` and `truth/` to."""
     ev: str = "-2,0,2"
     """log2 exposures of one cycle; 0 records white of the clip as white."""
+    exposure: Literal["fixed", "auto"] = "fixed"
+    """fixed: every frame has an exposure of the cycle; auto: all of them drift on top,
+    as with auto exposure (`--ev 0`: nothing but the drift).
+    """
     noise: float = 1.0
     """Sensor noise: 1 is a small sensor of 6000 electrons, 0 none."""
     response: str = "film"
@@ -83,6 +87,10 @@ class ReexposeConfig:
 
 GAMMA = 2.2  # by which the clip is linearized
 MIN_FRAMES = 3  # of the footage
+# Auto exposure: stops of its smooth drift, and how it hunts (hand-chosen)
+DRIFT_RANGE = 3.0
+NUM_HUNTS = 3
+HUNT_EV, HUNT_FRAMES = 0.3, 8
 
 
 @dataclass(frozen=True)
@@ -132,9 +140,12 @@ def reexpose(config: ReexposeConfig) -> Path:
         masks = {}
         if config.masks is not None:
             masks = frame_masks(config.masks, plan.test, numbers, size)
+        drift = np.zeros(len(numbers))
+        if config.exposure == "auto":
+            drift = auto_exposure(plan, config.seed)
         claim(config, footage)  # once nothing can be wrong with the settings any more
-        write_frames(config, footage, plan, evs, response)
-        write_truth(config.out, plan, evs, response, poses, masks)
+        write_frames(config, footage, plan, evs, drift, response)
+        write_truth(config.out, plan, evs, drift, response, poses, masks)
         given = f"--hold-out {config.hold_out}"
         if poses is not None:
             path = config.out / "poses_bounds.npy"
@@ -241,11 +252,32 @@ def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePla
     return FramePlan(bracket, test, kept)
 
 
+def auto_exposure(plan: FramePlan, seed: int) -> np.ndarray:
+    """EV by which auto exposure moves every frame (T,), mean 0 over the footage.
+
+    A smooth random curve over `DRIFT_RANGE`, and hunting: after a few random frames it
+    overshoots and swings in.
+    """
+    rng = np.random.default_rng([seed, len(plan.bracket)])
+    time = np.arange(len(plan.bracket))
+    drift = np.zeros(len(time))
+    for waves in range(1, 4):
+        phase = rng.uniform(0, 2 * np.pi)
+        drift += np.sin(2 * np.pi * waves * time / (1.5 * len(time)) + phase) / waves
+    drift *= DRIFT_RANGE / max(float(np.ptp(drift)), 1e-6)
+    for start in rng.choice(len(time), min(NUM_HUNTS, len(time)), replace=False):
+        since = np.maximum(time - start, 0)
+        swing = np.exp(-since / HUNT_FRAMES) * np.sin(2 * np.pi * since / HUNT_FRAMES)
+        drift += HUNT_EV * rng.choice([-1, 1]) * swing
+    return drift - drift[plan.kept].mean()
+
+
 def write_frames(
     config: ReexposeConfig,
     footage: ingest.Footage,
     plan: FramePlan,
     evs: list[float],
+    drift: np.ndarray,
     response: Curve,
 ) -> None:
     """Write the recorded frames and the radiance of the held-out ones, as far as they
@@ -260,7 +292,7 @@ def write_frames(
             image = config.out / f"clip/{places[k]:05d}.png"
             if not image.is_file():
                 rng = np.random.default_rng([config.seed, k])
-                ev = evs[plan.bracket[k]]
+                ev = evs[plan.bracket[k]] + drift[k]
                 write_png(image, record(radiance, ev, white_balance, response, noise, rng))
         if k in plan.test:
             exr = config.out / f"truth/radiance/{k:05d}.exr"
@@ -272,6 +304,7 @@ def write_truth(
     out: Path,
     plan: FramePlan,
     evs: list[float],
+    drift: np.ndarray,
     response: Curve,
     poses: Poses | None,
     masks: dict[int, np.ndarray],
@@ -300,6 +333,7 @@ def write_truth(
         response_y=response.y.tolist(),
         K=K,
         clip_c2w=[c2w[k] for k in plan.kept] if c2w else None,
+        clip_drift=drift[plan.kept].tolist() if drift.any() else None,
         views=views,
     )
     write_json(out / "truth/truth.json", truth.model_dump())

@@ -92,6 +92,9 @@ class Recordings:
     ev: tuple[float | None, ...]  # of every bracket, None where it is to be learned
     reference: int  # bracket
     num_cameras: int
+    # stops by which every training frame differs from its bracket (auto exposure);
+    # empty: none does
+    drift: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         assert len(self.brackets) == len(self.cameras), (self.brackets, self.cameras)

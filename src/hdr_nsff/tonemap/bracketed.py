@@ -16,9 +16,11 @@ from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
 
 
 class BracketGain(nn.Module):
-    """Log gain: the bracket's exposure + white balance + the frame's residual.
+    """Log gain: exposure + white balance + the frame's drift and residual.
 
-    The white balance is the camera's. See docs/method.md#eq-9 and #eq-10.
+    The exposure is the bracket's, the white balance the camera's. Drift is that of auto
+    exposure, as `prepare` estimated it; residuals are learned. See
+    docs/method.md#eq-9 and #eq-10.
 
     Known exposures are buffers and stay exactly what they are; unknown ones are
     parameters.
@@ -26,6 +28,7 @@ class BracketGain(nn.Module):
 
     known: Tensor  # (B,) EV, 0 where unknown
     unknown: Tensor  # (U,) brackets to learn
+    drift: Tensor  # (frames,) natural log, of every training frame
 
     def __init__(self, recordings: Recordings, with_residuals: bool) -> None:
         super().__init__()
@@ -35,6 +38,8 @@ class BracketGain(nn.Module):
         self.register_buffer("known", known, persistent=False)
         self.register_buffer("unknown", torch.tensor(unknown, dtype=torch.int64), persistent=False)
         self.learned_ev = nn.Parameter(torch.zeros(len(unknown)), requires_grad=bool(unknown))
+        drift = torch.tensor(recordings.drift or [0.0] * len(recordings.brackets))
+        self.register_buffer("drift", drift.float() * LN2, persistent=False)
         others = recordings.num_cameras - 1
         self.white_balance = nn.Parameter(  # natural log
             torch.zeros(others, 3), requires_grad=others > 0
@@ -54,6 +59,8 @@ class BracketGain(nn.Module):
     def forward(self, bracket: int, camera_id: int, frame: int | None) -> Tensor:
         """Natural log gain (3,)."""
         log_gain = self.ev()[bracket] * LN2 + self.log_white_balance(camera_id)
+        if frame is not None:
+            log_gain = log_gain + self.drift[frame]
         if frame is not None and self.residual is not None:
             # Their mean is 0: the residuals cannot carry scale.
             log_gain = log_gain + self.residual[frame] - self.residual.mean(0)

@@ -39,6 +39,7 @@ def tone_mapper_for(config: ToneMapConfig, scene: Scene) -> ToneMapper:
         cameras=tuple(f.camera_id for f in scene.train),
         ev=tuple(m.known_ev),
         reference=m.reference_bracket,
+        drift=tuple(f.drift for f in scene.train),
         num_cameras=max(f.camera_id for f in everyone) + 1,
     )
     return build_tone_mapper(config, recordings)

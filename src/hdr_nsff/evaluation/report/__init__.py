@@ -36,6 +36,7 @@ from hdr_nsff.evaluation.report.score_tables import headline_of, quality_tables
 from hdr_nsff.training.run_folder import Run
 
 MARK = b"HDR-NSFF report"  # in the title of every page
+VIEWER = "scene.html"  # the page that `run` and `export` write
 MARK_BYTES = 1000  # of a file, within which the title stands
 
 
@@ -79,6 +80,7 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
         facts=facts_of(run),
         headline=headline_of(metrics),
         videos=find_videos(renders, path.parent),
+        viewer=find_viewer(run, path.parent),
         side_by_side=side_by_side(run, renders),
         held_out=held_out_views(run.folder / "evaluation", metrics),
         quality=quality_tables(metrics),
@@ -91,6 +93,19 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
     )
     write_text(path, page)
     return path
+
+
+def find_viewer(run: Run, folder: Path) -> str | None:
+    """The address, from `folder`, of the viewer's page; None without one.
+
+    It lies in `folder` or in the run folder.
+    """
+    base = folder.resolve()
+    for place in (base, run.folder.resolve()):
+        page = place / VIEWER
+        if page.is_file() and page.is_relative_to(base):
+            return page.relative_to(base).as_posix()
+    return None
 
 
 def check_place(path: Path) -> None:

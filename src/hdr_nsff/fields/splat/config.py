@@ -52,7 +52,9 @@ class SplatConfig:
     static: Annotated[int, Ge(1), Le(10**8)] | None = None
     """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
     moving: Annotated[int, Ge(0), Le(10**8)] | None = None
-    """Moving Gaussians; default: 0.15 for every pixel of a frame, at most 20,000."""
+    """Moving Gaussians, for rigid movers; default: 0.15 for every pixel of a frame, at
+    most 20,000; none where no mover is rigid.
+    """
     local: Annotated[int, Ge(0), Le(10**8)] | None = None
     """Time-local Gaussians, for movers that are not rigid; default: one for every two
     of their pixels in all frames, at most 0.03 for every pixel, and 400,000.

@@ -31,7 +31,7 @@ from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 OVERLAP = 0.5  # standard deviation relative to the side of a cell (hand-chosen on real clips)
 OPACITY = 0.7
-FILL = 0.95  # of the places are used at once
+NEVER = -1e6  # center time, in frames, of a Gaussian without a place
 NEIGHBOR_TRUST = 0.5  # of a color that flow brought, relative to the pixel's own
 NUM_FLOW_PIXELS = 24  # nearest ones with believed flow, whose median is a velocity
 # standard deviation of a life in cycles of exposures and at least, in frames: every
@@ -85,7 +85,7 @@ def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, un
     num_pixels = sum(int(mask.sum()) for mask in masks)
     if not num_pixels or not len(local):
         return 0
-    side = math.sqrt(max(num_pixels / (FILL * len(local)), 1.0))
+    side = math.sqrt(max(num_pixels / len(local), 1.0))
     while sum(count_cells(mask, side) for mask in masks) > len(local):
         side *= 1.01
     seeds = [
@@ -96,6 +96,7 @@ def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, un
     times = torch.cat([torch.full((len(seed.points),), seed.time) for seed in seeds])
     local.means[:n, :3] = points.positions
     local.means[:n, 3] = times
+    local.means[n:, 3] = NEVER
     local.velocities[:n, :3] = torch.cat([seed.velocities for seed in seeds])
     local.log_scales[:n, :3] = (OVERLAP * side * points.footprint).log()[:, None]
     local.log_scales[:, 3] = math.log(start_duration(scene))

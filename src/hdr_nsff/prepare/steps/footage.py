@@ -124,6 +124,7 @@ class FrameExposures:
     estimated: bool  # the brackets were found by brightness
     reference: int | None = None  # bracket; None: the best exposed one
     notes: tuple[str, ...] = ()  # sentences for people
+    drift: tuple[float, ...] = ()  # given, per frame: stops from its bracket; empty: none
 
 
 def exposure_step(work: Work) -> StepResult:
@@ -149,6 +150,7 @@ def exposure_step(work: Work) -> StepResult:
     for frame, bracket in zip(m.frames, found.brackets, strict=True):
         frame.bracket = bracket
         frame.ev = m.bracket_ev[bracket]
+        frame.drift = found.drift[frame.index] if found.drift else None
         frame.split = "test" if frame.index in held_out else "train"
     cycle = "no alternation"
     if m.cycle > 1:
@@ -156,7 +158,11 @@ def exposure_step(work: Work) -> StepResult:
     return StepResult(
         provenance="estimated" if found.estimated else "given",
         note=f"{cycle} ({found.source}); {len(held_out)} frames held out",
-        details={"source": found.source, "doubts": list(found.notes)},
+        details={
+            "source": found.source,
+            "doubts": list(found.notes),
+            "drift_given": bool(found.drift),
+        },
     )
 
 
@@ -183,11 +189,30 @@ def frame_exposures(work: Work) -> FrameExposures:
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         notes = cycle_notes(work, cycles)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
+    if len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE and len(cameras) == 1:
+        return drifting_exposures(source, given)
     brackets, known = exposure.brackets_by_ev(given)
     doubts = []
     for own in cameras:
         doubts += exposure.contradictions(work.video[own], [given[i] for i in own])
     return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
+
+
+def drifting_exposures(source: str, given: list[float]) -> FrameExposures:
+    """Given EVs of frames that are too many for a cycle: brackets of one where they
+    alternate, and the drift of every frame from its bracket.
+    """
+    brackets = exposure.cycle_of_steps(np.diff(given)).brackets
+    known: list[float | None] = []
+    drift = np.array(given)
+    for bracket in range(max(brackets) + 1):
+        own = np.array(brackets) == bracket
+        known.append(float(drift[own].mean()))
+        drift[own] -= drift[own].mean()
+    note = f"given exposures drift by {drift.min():+.2f} to {drift.max():+.2f} EV"
+    return FrameExposures(
+        source, brackets, known, True, False, notes=(note,), drift=tuple(drift.tolist())
+    )
 
 
 def given_exposures(work: Work) -> tuple[str, list[float] | None]:
@@ -295,7 +320,10 @@ def cycle_note(cycle: exposure.Cycle, change: float) -> str:
             f"brightness changes by {change:.1f} EV from frame to frame, but in no cycle of up "
             f"to {exposure.MAX_CYCLE} frames; list the exposures in a CSV if they were set"
         )
-    return "no alternation of exposures found; treated as an ordinary clip of one exposure"
+    return (
+        "no alternation of exposures found; treated as an ordinary clip of one exposure, "
+        "unless static points show that it drifts"
+    )
 
 
 # Frames to hold out

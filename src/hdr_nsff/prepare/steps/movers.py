@@ -61,6 +61,8 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     note = "none found"
     if movers:
         note = f"{len(movers)} found, {shapes} with a shape, {rigid} rigid"
+        if rigid < len(movers):
+            note += "; from new viewpoints, the others are guesses beyond what a cycle shows"
     return result(movers, maps, note)
 
 

@@ -82,7 +82,8 @@ def equalized(work: Work) -> tuple[np.ndarray, str]:
         return work.equalized[0], "on frames equalized by brightness"
     brackets = np.array([f.bracket for f in m.frames])
     cameras = np.array([f.camera_id for f in m.frames])
-    video = at_one_exposure(work.video, brackets, cameras, response)
+    drift = np.array([f.drift or 0.0 for f in m.frames])
+    video = at_one_exposure(work.video, brackets, cameras, response, drift)
     return video, "on frames at one exposure through the response"
 
 

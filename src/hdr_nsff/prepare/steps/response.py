@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.radiometry.response import describe, estimate_response
+from hdr_nsff.radiometry.response import estimate_response
+from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry
 from hdr_nsff.scene.response import write_response
@@ -19,13 +22,52 @@ def find_response(work: Work) -> StepResult:
     m = work.manifest
     views = [response_view(work, f) for f in work.train]
     cameras = [f.camera_id for f in work.train]
-    response = estimate_response(views, cameras, m.known_ev, m.reference_bracket, m.num_cameras)
+    response = estimate_response(
+        views,
+        cameras,
+        m.known_ev,
+        m.reference_bracket,
+        m.num_cameras,
+        lossless=work.footage.lossless,
+        drift=given_drift(work),
+    )
     return StepResult(
         note=describe(response, m.known_ev),
-        details={"misfit": response.misfit, "ev": response.ev.round(4).tolist()},
+        details={
+            "misfit": response.misfit,
+            "ev": response.ev.round(4).tolist(),
+            "measured_scale": round(response.measured_scale, 4),
+            "scale_interval": [round(response.scale_low, 4), round(response.scale_high, 4)],
+        },
         manifest={"response": "response.json"},
+        frames={"drift": drift_of_frames(work, response.drift)},
         files={"response.json": lambda path: write_response(path, response)},
     )
+
+
+def given_drift(work: Work) -> np.ndarray | None:
+    """The drift (V,) of the training frames where the step `exposure` had it given."""
+    exposure = work.manifest.steps.get("exposure")
+    if exposure is None or not exposure.details.get("drift_given", False):
+        return None
+    return np.array([f.drift or 0.0 for f in work.train])
+
+
+def drift_of_frames(work: Work, drift: np.ndarray | None) -> dict[int, float]:
+    """The drift of every frame by its index, from that of the training frames (V,).
+
+    Frames that are held out lie between their neighbors of the same bracket.
+    """
+    if drift is None:
+        return {}
+    if given_drift(work) is not None:
+        return {f.index: f.drift for f in work.manifest.frames if f.drift is not None}
+    found = {}
+    for f in work.manifest.frames:
+        same = [k for k, other in enumerate(work.train) if other.bracket == f.bracket]
+        times = [work.train[k].time for k in same]
+        found[f.index] = round(float(np.interp(f.time, times, drift[same])), 5)
+    return found
 
 
 def response_view(work: Work, f: FrameEntry) -> ResponseView:

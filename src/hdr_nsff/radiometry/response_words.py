@@ -1,0 +1,55 @@
+"""What `prepare` prints of a response."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from hdr_nsff.radiometry.response import Response
+
+
+def describe(response: Response, given_ev: Sequence[float | None]) -> str:
+    """How the response was found, in one sentence."""
+    steps = ", ".join(f"{e:+.2f}" for e in response.ev)
+    match response.source:
+        case "one exposure":
+            return "gamma 2.2: a single exposure does not determine the response"
+        case "brightness":
+            how = "gamma 2.2"
+            if response.problem:
+                how += f" ({response.problem})"
+            unknown = "unknown ones from the brightness of the frames"
+        case "static points":
+            how = f"{response.num_points} static points, misfit {response.misfit:.3f} stops"
+            if response.problem:
+                how += f", {response.problem}"
+            if len(response.y) > 1:
+                curves = "one curve for all cameras"
+                if response.own_curves:
+                    curves = f"own curves for cameras {list(response.own_curves)}"
+                how += f", {curves}"
+            unknown = "unknown ones estimated with it"
+            if response.guessed:
+                unknown = describe_scale(response)
+    if all(e is not None for e in given_ev) and not response.guessed:
+        unknown = "as given"
+    sentence = f"{how}; EV {steps} ({unknown})"
+    if response.drift is not None:
+        low, high = response.drift.min(), response.drift.max()
+        sentence += f"; single frames drift by {low:+.2f} to {high:+.2f} EV (auto exposure)"
+    return sentence
+
+
+def describe_scale(response: Response) -> str:
+    """How well the common factor of guessed EVs is known, and whether it was moved."""
+    span = float(np.ptp(response.ev))
+    if response.drift is not None:
+        span = max(span, float(np.ptp(response.drift)))
+    low, high = response.scale_low * span, response.scale_high * span
+    measured = response.measured_scale * span
+    interval = f"the recordings alone give {measured:.2f} from darkest to brightest"
+    interval += f", {low:.2f} to {high:.2f} with 95 % confidence"
+    if response.moved_stops > 0:
+        interval += f"; moved by {response.moved_stops:.2f} to usual steps"
+    return f"{interval}; give `--ev` if you know them"

@@ -1,0 +1,136 @@
+// Opens the scene of this page and starts the viewer.
+
+import { readScene, unpack } from "./format.js";
+import { Renderer, driverName, openContext } from "./renderer.js";
+import { Player } from "./player.js";
+import { Frames, SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
+import { connectControls, find, limitControls, note } from "./controls.js";
+
+const WORKER = "sorter.js";
+const FOLLOW_MILLISECONDS = 5000; // between two looks at the version of the scene
+const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
+
+/** The page's settings, or the text of a source file that the page holds. */
+function held(id) {
+  return document.getElementById(id)?.textContent;
+}
+
+async function loadScene() {
+  const text = held("scene");
+  if (text) return readScene(await unpack(text));
+  const response = await fetch("scene.hdr4d");
+  if (!response.ok) throw new Error(`The server has no scene (${response.status}).`);
+  return readScene(await response.arrayBuffer());
+}
+
+async function start() {
+  const settings = JSON.parse(held("settings"));
+  const scene = await loadScene();
+  const player = new Player(scene, find("canvas"));
+  globalThis.viewer = player; // for scripts and tests
+  connectControls(player);
+  showVideos(settings.videos);
+  if (scene.groups.length) draw(player, settings);
+  else showFrames(player);
+  if (player.renderer) await player.renderer.sort(player.view());
+  find("loading").hidden = true;
+  const loop = (now) => {
+    player.tick(now);
+    if (player.state.stats) showStats(player);
+    if (settings.server && player.isSlow()) showFrames(player);
+    else player.easeOff();
+    requestAnimationFrame(loop);
+  };
+  requestAnimationFrame(loop);
+  if (settings.server) followVersion(player);
+  document.body.dataset.ready = "yes";
+}
+
+/** Draw in this browser, if it can; else have the server render. */
+function draw(player, settings) {
+  const gpuWanted = location.hash === "#draw"; // to see what a browser without a GPU does
+  try {
+    const gl = openContext(player.canvas);
+    player.driver = driverName(gl);
+    const software = SOFTWARE.test(player.driver);
+    if (software && settings.server && !gpuWanted) return showFrames(player);
+    player.renderer = new Renderer(gl, player.scene, shaderSources(), held(WORKER));
+    player.canvas.addEventListener("webglcontextlost", () =>
+      note("The graphics driver was reset. Reload the page.", 0),
+    );
+    if (!software) return;
+    const videos = settings.videos.length ? " The videos below the settings play smoothly." : "";
+    note(`This browser draws without a GPU, so playback is slow.${videos}`, 8);
+  } catch (error) {
+    if (!settings.server) throw error;
+    showFrames(player);
+  }
+}
+
+function shaderSources() {
+  const names = ["splat.vert", "splat.frag", "picture.vert", "develop.frag"];
+  return Object.fromEntries(names.map((name) => [name, held(name)]));
+}
+
+/** From now on, frames that the server renders. */
+function showFrames(player) {
+  player.renderer?.dispose();
+  player.renderer = null;
+  player.frames = new Frames(find("frame"), player.scene.width, (problem) => note(problem, 0));
+  const { curve, show } = player.state;
+  player.set({
+    curve: SERVER_CURVES.includes(curve) ? curve : "reinhard",
+    show: SERVER_VIEWS.includes(show) ? show : "radiance",
+    clipping: false,
+    falseColor: false,
+  });
+  limitControls();
+}
+
+/** Load the scene again whenever the server has a newer one: a run that is training. */
+async function followVersion(player) {
+  let version = null;
+  for (;;) {
+    try {
+      const found = await (await fetch("version")).text();
+      if (version !== null && found !== version) await player.replace(await loadScene());
+      version = found;
+    } catch {
+      return; // the server has stopped; the scene is here already
+    }
+    await new Promise((done) => setTimeout(done, FOLLOW_MILLISECONDS));
+  }
+}
+
+function showVideos(videos) {
+  for (const { href, text } of videos) {
+    const link = document.createElement("a");
+    Object.assign(link, { href, textContent: text, target: "_blank" });
+    find("videos").append(link);
+  }
+}
+
+function showStats(player) {
+  const { renderer, frames, canvas } = player;
+  const thousands = (count) => count.toLocaleString("en");
+  const rate = player.framesPerSecond();
+  const speed = rate === null ? "At rest" : `${rate.toFixed(rate < 10 ? 1 : 0)} frames/s`;
+  const lines = renderer
+    ? [
+        `${speed}, ${canvas.width} × ${canvas.height}`,
+        `${thousands(renderer.visible)} of ${thousands(renderer.count)} Gaussians`,
+        `sorted in ${(renderer.sortMilliseconds ?? 0).toFixed(1)} ms`,
+      ]
+    : [
+        `${thousands(frames.shown)} frames from the server`,
+        `${thousands(Math.round(frames.rate))} pixels/s`,
+      ];
+  find("stats").textContent = [...lines, player.driver ?? ""].join("\n");
+}
+
+start().catch((error) => {
+  find("loading").textContent = error.message;
+  find("loading").hidden = false;
+  document.body.dataset.ready = "no";
+  throw error;
+});

@@ -1,0 +1,170 @@
+"""A server for the viewer's page on this machine alone: 127.0.0.1, standard library.
+
+It answers four addresses: the page, its scene file, the version of both, and frames
+that this machine renders for browsers without a GPU. What it serves is a `Source`.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any, Protocol
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.paths import parse_intrinsics, parse_numbers, parse_pose
+
+HOST = "127.0.0.1"
+MAX_PIXELS = 4_000_000  # of a frame
+MAX_REQUEST_BYTES = 10_000
+MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
+CURVES = ("camera", "reinhard", "clip")  # that this machine develops frames with
+VIEWS = ("radiance", "depth", "motion")  # that it renders
+
+
+@dataclass(frozen=True)
+class FrameRequest:
+    """A frame that a page asks for."""
+
+    time: float  # in frames
+    c2w: np.ndarray  # (3, 4) OpenCV camera to world, scene units
+    K: np.ndarray  # (3, 3) pixels of the frame
+    width: int
+    height: int
+    ev: float  # relative to the reference exposure
+    curve: str  # one of CURVES
+    camera_id: int  # whose response develops the frame
+    show: str  # one of VIEWS
+
+
+class Source(Protocol):
+    """What a server shows. Methods are called by several threads."""
+
+    def page(self) -> str:
+        """The HTML of the page."""
+        ...
+
+    def scene(self) -> bytes:
+        """The scene file."""
+        ...
+
+    def version(self) -> str:
+        """A text that changes with the scene."""
+        ...
+
+    def frame(self, request: FrameRequest) -> bytes:
+        """A rendered frame as a JPEG file. InputError where it cannot be rendered."""
+        ...
+
+
+class ViewerServer(ThreadingHTTPServer):
+    """Serves a source at a port; 0 takes a free one."""
+
+    daemon_threads = True
+
+    def __init__(self, source: Source, port: int = 0) -> None:
+        try:
+            super().__init__((HOST, port), Handler)
+        except (OSError, OverflowError) as error:
+            problem = "this port is not free"
+            raise InputError(f"--port {port}: {problem}; leave the option out") from error
+        self.source = source
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server_port}/"
+
+
+class Handler(BaseHTTPRequestHandler):
+    """One request."""
+
+    server: ViewerServer
+
+    def do_GET(self) -> None:
+        source = self.server.source
+        match self.path.partition("?")[0]:
+            case _ if not self.is_local():
+                self.answer(HTTPStatus.FORBIDDEN, "text/plain", b"not from this machine")
+            case "/":
+                self.answer(HTTPStatus.OK, "text/html; charset=utf-8", source.page().encode())
+            case "/scene.hdr4d":
+                self.answer(HTTPStatus.OK, "application/octet-stream", source.scene())
+            case "/version":
+                self.answer(HTTPStatus.OK, "text/plain", source.version().encode())
+            case _:
+                self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"nothing here")
+
+    def do_POST(self) -> None:
+        if not self.is_local() or self.path != "/frame":
+            self.answer(HTTPStatus.FORBIDDEN, "text/plain", b"not from this machine")
+            return
+        length = int(self.headers.get("Content-Length") or 0)
+        try:
+            request = parse_request(self.rfile.read(min(length, MAX_REQUEST_BYTES)))
+            frame = self.server.source.frame(request)
+        except InputError as error:
+            self.answer(HTTPStatus.BAD_REQUEST, "text/plain; charset=utf-8", str(error).encode())
+        else:
+            self.answer(HTTPStatus.OK, "image/jpeg", frame)
+
+    def is_local(self) -> bool:
+        """Whether the address was this machine's.
+
+        Pages of other sites that let their name point to 127.0.0.1 have another one.
+        """
+        port = self.server.server_port
+        return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}")
+
+    def answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+        """Send an answer; a browser that has gone away is no fault."""
+        try:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            self.wfile.write(body)
+        except ConnectionError:
+            self.close_connection = True
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Nothing: requests are not of interest at the terminal."""
+
+
+def parse_request(data: bytes) -> FrameRequest:
+    """The request in a JSON text. InputError for anything else."""
+    try:
+        entries = json.loads(data)
+    except ValueError as error:
+        raise InputError("frame: not JSON") from error
+    if not isinstance(entries, dict):
+        raise InputError("frame: not a JSON object")
+    width, height = (round(number(entries, name)) for name in ("width", "height"))
+    if not (width > 0 and height > 0 and width * height <= MAX_PIXELS):
+        raise InputError(f"frame: {width} x {height} pixels; at most {MAX_PIXELS:,} are rendered")
+    ev = number(entries, "ev")
+    if abs(ev) > MAX_EV:
+        raise InputError(f"frame: ev {ev:g} is beyond {MAX_EV:g} stops")
+    for name, known in (("curve", CURVES), ("show", VIEWS)):
+        if entries.get(name) not in known:
+            raise InputError(f"frame: {name} must be one of {', '.join(known)}")
+    return FrameRequest(
+        time=number(entries, "time"),
+        c2w=parse_pose(entries.get("c2w"), "frame"),
+        K=parse_intrinsics(entries.get("K"), "frame"),
+        width=width,
+        height=height,
+        ev=ev,
+        curve=entries["curve"],
+        camera_id=round(number(entries, "camera")),
+        show=entries["show"],
+    )
+
+
+def number(entries: dict[str, Any], name: str) -> float:
+    """A number of a request."""
+    return float(parse_numbers(entries.get(name), (), f"frame: {name}"))

@@ -1,0 +1,56 @@
+"""A run as one HTML file or as a scene file; refusals are sentences."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from test_export_gaussians import make_run
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.rendering.export import ExportConfig, check_settings
+from hdr_nsff.rendering.export_page import export_page, find_videos, run_title
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.viewer.scene_file import from_bytes
+
+
+def test_a_page_and_its_bare_scene_are_written_and_replaced(toy: Scene, tmp_path: Path) -> None:
+    run = make_run(toy, tmp_path / "clip" / "run")
+    for _ in range(2):
+        page = export_page(run, tmp_path / "scene.html")
+        bare = export_page(run, tmp_path / "scene.hdr4d")
+    scene = from_bytes(bare.read_bytes())
+    assert scene.title == "clip" and scene.count() > 400
+    assert "<title>clip</title>" in page.read_text()
+
+
+def test_a_file_of_someone_else_is_left_alone(toy: Scene, tmp_path: Path) -> None:
+    mine = tmp_path / "index.html"
+    mine.write_text("<p>mine</p>")
+    with pytest.raises(InputError, match="was not made by export"):
+        export_page(make_run(toy, tmp_path / "run"), mine)
+    assert mine.read_text() == "<p>mine</p>"
+
+
+def test_a_field_without_gaussians_has_no_page(toy: Scene, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="hdr-nsff view"):
+        export_page(make_run(toy, tmp_path / "run", "grid"), tmp_path / "scene.html")
+
+
+def test_videos_below_the_page_are_linked(toy: Scene, tmp_path: Path) -> None:
+    run = make_run(toy, tmp_path / "run")
+    (tmp_path / "render").mkdir()
+    (tmp_path / "render" / "training.mp4").write_bytes(b"")
+    assert [link.href for link in find_videos(run, tmp_path)] == ["render/training.mp4"]
+    assert find_videos(run, tmp_path / "elsewhere") == []
+
+
+@pytest.mark.parametrize("options", [{"ply": True}, {"time": 1.0}, {"layout": "nerfstudio"}])
+def test_options_that_a_page_has_no_use_for_are_refused(options: dict) -> None:
+    with pytest.raises(InputError, match="a page"):
+        check_settings(ExportConfig(Path("run"), Path("scene.html"), **options))
+
+
+def test_titles_come_from_the_folder_around_a_run() -> None:
+    assert run_title(Path("/out/garden/run")) == "garden"
+    assert run_title(Path("/out/garden")) == "garden"

@@ -1,0 +1,115 @@
+"""The exposures of single frames come back from a wall in closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from wall import S_CURVE, SRGB, wall_view
+
+from hdr_nsff.radiometry.debevec import DebevecTuning, Samples
+from hdr_nsff.radiometry.frame_exposures import (
+    Readings,
+    drift_within_brackets,
+    frame_log_exposures,
+    read_points,
+    second_differences,
+    steepness_factor,
+)
+from hdr_nsff.radiometry.response import estimate_response
+from hdr_nsff.radiometry.response_words import describe
+from hdr_nsff.radiometry.static_samples import ResponseView
+
+NUM = 24
+
+
+def drifting_views(
+    curve: np.ndarray, drift: np.ndarray, cycle: tuple[int, ...]
+) -> list[ResponseView]:
+    """Views of the wall in brackets of `cycle`, each frame with a drift in stops."""
+    rng = np.random.default_rng(0)
+    views = []
+    for t in range(NUM):
+        # `wall_view` takes the bracket from its number: 0 to 2 are -4, -2 and 0 EV
+        bracket = cycle[t % len(cycle)]
+        view = wall_view(3 * t + bracket, curve, rng, shift=0.02, gain=2 ** drift[t])
+        views.append(replace(view, bracket=cycle.index(bracket), time=float(t)))
+    return views
+
+
+def smooth_drift(stops: float) -> np.ndarray:
+    return stops / 2 * np.sin(np.arange(NUM) / 4)
+
+
+def test_auto_exposure_is_found_where_no_cycle_is():
+    drift = smooth_drift(3.0)
+    views = drifting_views(SRGB, drift, (1,))
+    response = estimate_response(views, [0] * NUM, [None], reference=0, num_cameras=1)
+    assert response.source == "static points" and response.drift is not None
+    scale = response.drift @ (drift - drift.mean()) / (response.drift @ response.drift)
+    assert response.scale_low < scale < response.scale_high
+    error = np.abs(scale * response.drift - drift + drift.mean())
+    assert np.median(error) < 0.05 and np.quantile(error, 0.95) < 0.15
+    assert "auto exposure" in describe(response, [None])
+
+
+def test_drift_on_top_of_alternation_is_found():
+    drift = smooth_drift(1.0)
+    views = drifting_views(S_CURVE, drift, (0, 2))
+    response = estimate_response(views, [0] * NUM, [-4.0, 0.0], reference=1, num_cameras=1)
+    assert response.ev.tolist() == [-4, 0] and response.drift is not None
+    truth = drift_within_brackets(drift, np.arange(NUM) % 2)
+    assert np.median(np.abs(response.drift - truth)) < 0.05
+    assert response.drift[1::2].mean() == pytest.approx(0, abs=1e-9)  # the gauge
+
+
+@pytest.mark.parametrize("cycle, ev", [((0, 1, 2), [None] * 3), ((1,), [None])])
+def test_a_constant_clip_is_left_alone(cycle, ev):
+    views = drifting_views(SRGB, np.zeros(NUM), cycle)
+    response = estimate_response(views, [0] * NUM, ev, reference=len(ev) - 1, num_cameras=1)
+    assert response.drift is None
+    assert response.source == ("static points" if len(ev) > 1 else "one exposure")
+
+
+def test_a_given_drift_is_kept_and_the_curve_fitted_to_it():
+    drift = smooth_drift(3.0)
+    views = drifting_views(S_CURVE, drift, (1,))
+    response = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=drift)
+    np.testing.assert_array_equal(response.drift, drift)
+    assert response.source == "static points" and not response.problem
+
+
+def test_pixels_that_disagree_with_a_given_drift_are_reported():
+    views = drifting_views(SRGB, smooth_drift(3.0), (1,))
+    wrong = smooth_drift(3.0).copy()
+    wrong[5:8] += 1.0
+    response = estimate_response(views, [0] * NUM, [0.0], 0, 1, drift=wrong)
+    assert "disagree" in response.problem
+    np.testing.assert_array_equal(response.drift, wrong)
+
+
+def test_exposures_are_the_offsets_between_readings():
+    """Two frames that read the same points a stop apart, through a linear camera."""
+    rgb = np.random.default_rng(0).uniform(0.1, 0.4, (200, 1, 3)) * [[[1.0]], [[2.0]]][1]
+    rgb = np.concatenate([rgb / 2, rgb], 1)
+    samples = Samples(rgb, np.ones(rgb.shape, bool), np.zeros(rgb.shape, bool))
+    readings = Readings(samples, np.tile([0, 1], (200, 1)))
+    x = np.linspace(0, 1, 9)
+    found = frame_log_exposures(readings, x, np.tile(x, (3, 1)), np.zeros(2, int))
+    np.testing.assert_allclose(found, [-0.5, 0.5], atol=1e-3)
+
+
+def test_frames_of_one_bracket_are_smooth_in_time():
+    rows = second_differences(np.array([0, 1, 0, 1, 0, 1]))
+    assert rows.tolist() == [[1, 0, -2, 0, 1, 0], [0, 1, 0, -2, 0, 1]]
+
+
+def test_points_are_read_in_their_own_frame_and_its_neighbors():
+    views = drifting_views(SRGB, np.zeros(NUM), (2,))
+    readings = read_points(views, np.random.default_rng(0))
+    assert readings.samples.valid.any(-1)[:, 0].mean() > 0.6
+    assert readings.frame.min() == 0 and readings.frame.max() == NUM - 1
+
+
+def test_a_power_of_srgb_is_undone():
+    x = np.linspace(0, 1, 2001) ** 2.2
+    assert steepness_factor(x**1.5, SRGB, DebevecTuning()) == pytest.approx(1 / 1.5, rel=1e-3)

@@ -1,0 +1,64 @@
+"""The common power of exposures comes back from the noise of a simulated sensor."""
+
+import numpy as np
+import pytest
+
+from hdr_nsff.radiometry.bracketing import FACTORS
+from hdr_nsff.radiometry.recording import Curve, Noise, record, response_curve
+from hdr_nsff.radiometry.sensor_noise import measure_noise, noise_log_likelihood
+
+EV = np.array([-2.0, 0.0, 2.0])
+
+
+NOISE = Noise()
+
+
+def recordings(curve: Curve, noise: Noise | None = NOISE) -> list[np.ndarray]:
+    """A smooth pattern over five stops, recorded with three exposures."""
+    y, x = np.mgrid[:160, :240] / 60
+    level = 2 ** (2.5 * np.sin(x + 0.5 * y) - 2.5)
+    radiance = level[..., None] * [1.0, 0.8, 0.6]
+    rng = np.random.default_rng(0)
+    return [record(radiance, ev, (1, 1, 1), curve, noise, rng) for ev in EV]
+
+
+def log_likelihood(images: list[np.ndarray], curve: Curve, power: float) -> np.ndarray | None:
+    """Of every factor, relative to the best, where curve and EVs were measured as their
+    power.
+    """
+    x, y, ev = curve.x**power, curve.y, EV * power
+    found = noise_log_likelihood(images, [0, 1, 2], x, y, ev, FACTORS)
+    return None if found is None else found - found.max()
+
+
+@pytest.mark.parametrize("name", ["film", "srgb", "gamma"])
+@pytest.mark.parametrize("power", [0.85, 1.0, 1.2])
+def test_a_wrong_power_of_the_curve_is_undone(name: str, power: float) -> None:
+    curve = response_curve(name)
+    found = log_likelihood(recordings(curve), curve, power)
+    assert np.interp(1 / power, FACTORS, found) > -4.5  # within three deviations
+    assert np.interp(0.7 / power, FACTORS, found) < -5
+    assert np.interp(1.5 / power, FACTORS, found) < -5
+
+
+def test_noise_that_no_sensor_makes_says_nothing() -> None:
+    curve = response_curve("film")
+    images = recordings(curve, None)
+    rng = np.random.default_rng(0)
+    noisy = [np.clip(i + rng.normal(0, 0.03, i.shape) * (1 - i), 0, 1) for i in images]
+    assert log_likelihood(noisy, curve, 1.0) is None
+
+
+def test_without_flat_places_nothing_is_measured() -> None:
+    curve = response_curve("film")
+    images = [np.ones((20, 20, 3), np.float32)] * 3
+    assert log_likelihood(images, curve, 1.0) is None
+    assert not measure_noise(images, [0, 1, 2], curve.x, curve.y, EV).count.size
+
+
+def test_measured_noise_is_that_of_the_sensor() -> None:
+    curve = response_curve("gamma")
+    bins = measure_noise(recordings(curve), [0, 1, 2], curve.x, curve.y, EV)
+    exposure = np.exp(bins.log_exposure)
+    expected = (NOISE.read**2 + NOISE.shot * exposure) / exposure**2 + bins.rounding
+    np.testing.assert_allclose(np.median(bins.variance / expected), 1, atol=0.1)

@@ -1,0 +1,128 @@
+"""A run as the viewer's server shows it: frames as `render` makes them, and the newest
+checkpoint.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from test_export_gaussians import make_run
+
+from hdr_nsff.core.checkpoints import pack, save_checkpoint
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.rendering.served_run import ServedRun
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.build import tone_mapper_for
+from hdr_nsff.training.run_folder import Run, write_config
+from hdr_nsff.viewer.scene_file import from_bytes
+from hdr_nsff.viewer.server import FrameRequest
+
+
+def save_run(toy: Scene, scene_folder: Path, folder: Path, preset: str = "splat") -> Run:
+    """A run folder with one checkpoint."""
+    run = make_run(toy, folder, preset)
+    run = replace(run, tonemapper=tone_mapper_for(run.config.tonemap, toy))
+    write_config(folder, replace(run.config, scene=scene_folder, out=folder))
+    save_step(run, 7)
+    return run
+
+
+def save_step(run: Run, step: int) -> None:
+    assert isinstance(run.field, torch.nn.Module)
+    save_checkpoint(
+        run.folder, step, 1.0, pack({"field": run.field, "tonemapper": run.tonemapper}, {})
+    )
+
+
+def request_of(toy: Scene, **change: object) -> FrameRequest:
+    """The first frame's view at its own size, as recorded at EV 0."""
+    camera = toy.train[0].camera
+    request = FrameRequest(
+        time=1.0,
+        c2w=camera.c2w.double().numpy(),
+        K=camera.K.double().numpy(),
+        width=camera.width,
+        height=camera.height,
+        ev=0.0,
+        curve="camera",
+        camera_id=0,
+        show="radiance",
+    )
+    return replace(request, **change)  # type: ignore[arg-type]
+
+
+def decode(jpeg: bytes) -> np.ndarray:
+    bgr = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_COLOR)
+    return bgr[..., ::-1] / 255
+
+
+@pytest.mark.parametrize("preset", ["splat", "grid"])
+def test_a_frame_is_what_the_camera_would_record(
+    toy: Scene, toy_folder: Path, tmp_path: Path, preset: str
+) -> None:
+    run = save_run(toy, toy_folder, tmp_path / "run", preset)
+    served = ServedRun(tmp_path / "run", "cpu")
+    camera = toy.train[0].camera
+    radiance = run.field.render(camera, 1.0, scene_flow=False).radiance
+    expected = run.tonemapper.develop(radiance, 0.0).view(camera.height, camera.width, 3)
+    found = decode(served.frame(request_of(toy)))
+    assert np.abs(found - expected.numpy()).mean() < 0.06  # noise, as a JPEG
+    for change in ({"curve": "clip"}, {"curve": "reinhard"}, {"show": "depth"}, {"show": "motion"}):
+        assert decode(served.frame(request_of(toy, **change))).shape == found.shape
+
+
+@pytest.mark.parametrize("preset", ["hdr-hexplane", "nerf-wt"])
+def test_fields_that_record_by_themselves_are_served(
+    toy: Scene, toy_folder: Path, tmp_path: Path, preset: str
+) -> None:
+    save_run(toy, toy_folder, tmp_path / "run", preset)
+    served = ServedRun(tmp_path / "run", "cpu")
+    found = decode(served.frame(request_of(toy, ev=-1.0)))
+    assert found.shape == (toy.train[0].camera.height, toy.train[0].camera.width, 3)
+
+
+def test_requests_beyond_the_clip_are_refused(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+    save_run(toy, toy_folder, tmp_path / "run")
+    served = ServedRun(tmp_path / "run", "cpu")
+    with pytest.raises(InputError, match="outside the clip"):
+        served.frame(request_of(toy, time=99.0))
+    with pytest.raises(InputError, match="camera 3 is not known"):
+        served.frame(request_of(toy, camera_id=3))
+
+
+def test_the_newest_checkpoint_is_opened_again(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    run = save_run(toy, toy_folder, tmp_path / "run")
+    served = ServedRun(tmp_path / "run", "cpu")
+    before = served.version(), from_bytes(served.scene())
+    assert served.version() == before[0]
+    with torch.no_grad():
+        run.field.get_parameter("background").fill_(-1.0)  # type: ignore[attr-defined]
+    save_step(run, 9)
+    assert served.version() != before[0]
+    assert from_bytes(served.scene()).background == pytest.approx([np.exp(-1)] * 3)
+
+
+def test_ctrl_c_ends_the_verb(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
+    save_run(toy, toy_folder, tmp_path / "run")
+    code = "import sys; from hdr_nsff.cli import main; main(sys.argv[1:])"
+    command = [sys.executable, "-c", code, "view", str(tmp_path / "run"), "--no-browser"]
+    environment = {**os.environ, "COLUMNS": "200"}
+    both = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    process = subprocess.Popen(command, text=True, env=environment, **both)
+    assert process.stdout is not None
+    assert "http://127.0.0.1:" in process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    rest, _ = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "viewer closed" in rest

@@ -1,0 +1,108 @@
+"""The viewer's server: what it answers, to whom, and what it refuses."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.viewer.server import FrameRequest, ViewerServer, parse_request
+
+REQUEST = {
+    "time": 1.5,
+    "c2w": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]],
+    "K": [[40, 0, 24], [0, 40, 16], [0, 0, 1]],
+    "width": 48,
+    "height": 32,
+    "ev": -1,
+    "curve": "camera",
+    "camera": 0,
+    "show": "radiance",
+}
+
+
+class Fake:
+    """A source that answers with short texts."""
+
+    def page(self) -> str:
+        return "<p>page</p>"
+
+    def scene(self) -> bytes:
+        return b"scene"
+
+    def version(self) -> str:
+        return "7"
+
+    def frame(self, request: FrameRequest) -> bytes:
+        if request.time > 4:
+            raise InputError("outside the clip")
+        return f"{request.width} x {request.height}".encode()
+
+
+@pytest.fixture
+def port() -> Iterator[int]:
+    with ViewerServer(Fake()) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.server_port
+        server.shutdown()
+
+
+def ask(port: int, method: str, path: str, body: str = "", host: str = "") -> tuple[int, bytes]:
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request(method, path, body or None, {"Host": host} if host else {})
+    answer = connection.getresponse()
+    result = answer.status, answer.read()
+    connection.close()
+    return result
+
+
+def test_page_scene_version_and_frames_are_served(port: int) -> None:
+    assert ask(port, "GET", "/") == (200, b"<p>page</p>")
+    assert ask(port, "GET", "/scene.hdr4d") == (200, b"scene")
+    assert ask(port, "GET", "/version") == (200, b"7")
+    assert ask(port, "POST", "/frame", json.dumps(REQUEST)) == (200, b"48 x 32")
+    assert ask(port, "GET", "/etc/passwd")[0] == 404
+
+
+def test_a_frame_that_cannot_be_rendered_is_a_sentence(port: int) -> None:
+    answer = ask(port, "POST", "/frame", json.dumps({**REQUEST, "time": 9}))
+    assert answer == (400, b"outside the clip")
+
+
+def test_other_names_for_this_machine_are_refused(port: int) -> None:
+    assert ask(port, "GET", "/scene.hdr4d", host=f"evil.example:{port}")[0] == 403
+    assert ask(port, "POST", "/frame", json.dumps(REQUEST), host="evil.example")[0] == 403
+    assert ask(port, "GET", "/version", host=f"localhost:{port}")[0] == 200
+
+
+def test_a_port_that_is_taken_is_one_sentence(port: int) -> None:
+    with pytest.raises(InputError, match="not free"):
+        ViewerServer(Fake(), port)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"time": "now"}, "time must be one finite number"),
+        ({"width": 100_000, "height": 100_000}, "at most 4,000,000"),
+        ({"height": 0}, "48 x 0 pixels"),
+        ({"ev": 1000}, "beyond 60 stops"),
+        ({"curve": "agx"}, "curve must be one of"),
+        ({"show": None}, "show must be one of"),
+        ({"c2w": [[2, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]}, "not a rotation"),
+        ({"K": [[0, 0, 0], [0, 1, 0], [0, 0, 1]]}, "K must be"),
+    ],
+)
+def test_requests_that_make_no_sense_are_refused(change: dict, word: str) -> None:
+    with pytest.raises(InputError, match=word):
+        parse_request(json.dumps({**REQUEST, **change}).encode())
+
+
+@pytest.mark.parametrize("data", [b"", b"{", b"[]", b"\xff"])
+def test_requests_that_are_no_objects_are_refused(data: bytes) -> None:
+    with pytest.raises(InputError, match="not"):
+        parse_request(data)

@@ -1,0 +1,385 @@
+"""The page in headless Chromium: it sees what `render` sees, and does what its controls
+say. Skipped, in a loud line, where there is no Chromium.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import struct
+import threading
+import warnings
+import zlib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browser import Page, browser, find_browser
+from test_served_run import save_run
+from viewer_scenes import render, scene_file, trained, trained_local
+
+from hdr_nsff.fields.splat.rasterize import rasterize
+from hdr_nsff.geometry import paths
+from hdr_nsff.maths.metrics import mu_law_psnr
+from hdr_nsff.rendering.served_run import ServedRun
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.viewer.field_scene import scene_of
+from hdr_nsff.viewer.page_file import PageSettings, make_page
+from hdr_nsff.viewer.scene_file import SceneFile, to_bytes
+from hdr_nsff.viewer.server import ViewerServer
+
+SIZE = (160, 90)
+TO_BASE64 = """a => {
+  const bytes = new Uint8Array(a.buffer);
+  let text = "";
+  for (let i = 0; i < bytes.length; i += 8192)
+    text += String.fromCharCode(...bytes.subarray(i, i + 8192));
+  return btoa(text);
+}"""
+
+if find_browser() is None:
+    MISSING = "NO CHROMIUM: THE VIEWER'S PAGE IS NOT TESTED; install it, or set CHROMIUM"
+    warnings.warn(MISSING, stacklevel=1)
+    pytest.skip(MISSING, allow_module_level=True)
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def viewer(tab: Page, toy: Scene, tmp_path: Path) -> Iterator[Page]:
+    """The tab with the toy scene's page, newly loaded; the console must stay empty."""
+    open_page(tab, tmp_path / "scene.html", scene_file(toy))
+    yield tab
+    assert tab.problems() == []
+
+
+def open_page(tab: Page, path: Path, scene: SceneFile, width: int = 500, height: int = 300) -> None:
+    path.write_text(make_page(scene.title, to_bytes(scene), PageSettings()))
+    tab.goto(path.as_uri(), width, height)
+
+
+def view_of(scene: Scene, frame: int, time: float) -> dict[str, Any]:
+    """A view for `readLinear`."""
+    camera = scene.train[frame].camera.resized(*SIZE)
+    pose = {"c2w": camera.c2w.tolist(), "K": camera.K.tolist()}
+    return {"time": time, **pose, "width": SIZE[0], "height": SIZE[1]}
+
+
+def read_linear(tab: Page, view: dict[str, Any]) -> torch.Tensor:
+    """The page's exposed linear radiance and opacity (H, W, 4)."""
+    text = tab.run(f"viewer.readLinear({json.dumps(view)}).then({TO_BASE64})")
+    values = np.frombuffer(base64.b64decode(text), np.float32)
+    return torch.from_numpy(values.copy()).view(view["height"], view["width"], 4)
+
+
+def state(tab: Page, name: str) -> Any:
+    return tab.run(f"viewer.state.{name}")
+
+
+# Pictures
+
+
+@pytest.mark.parametrize("preset", ["splat", "splat-sigmoid"])
+def test_the_page_sees_what_render_sees(tab: Page, toy: Scene, tmp_path: Path, preset: str) -> None:
+    field, _ = trained(toy, preset)
+    open_page(tab, tmp_path / "scene.html", scene_file(toy, preset))
+    tab.run("viewer.set({ev: 0})")
+    for frame in (0, 2, len(toy.train) - 1):
+        for time in (0.0, 1.37, 3.5):
+            expected = render(field, toy, frame, time, SIZE)
+            found = read_linear(tab, view_of(toy, frame, time))[..., :3]
+            assert mu_law_psnr(found, expected, float(expected.max())) > 45
+
+
+def test_the_page_draws_time_local_gaussians(tab: Page, toy: Scene, tmp_path: Path) -> None:
+    field, tonemapper = trained_local(toy)
+    open_page(tab, tmp_path / "scene.html", scene_of(field, tonemapper, toy, "Toy", 1.0))
+    tab.run("viewer.set({ev: 0})")
+    for time in (0.0, 1.7, 4.0):
+        expected = render(field, toy, 1, time, SIZE)
+        found = read_linear(tab, view_of(toy, 1, time))[..., :3]
+        assert mu_law_psnr(found, expected, float(expected.max())) > 45
+
+
+def test_depth_and_motion_are_those_of_render(viewer: Page, toy: Scene) -> None:
+    field, _ = trained(toy)
+    maps = read_linear(viewer, {**view_of(toy, 1, 1.37), "show": "depth"})
+    camera = toy.train[1].camera.resized(*SIZE)
+    expected = field.render(camera, 1.37, scene_flow=False)
+    opacity = expected.opacity.view(SIZE[1], SIZE[0])
+    solid = opacity > 0.5
+    depth = (maps[..., 0] / maps[..., 3]).clamp(field.near, field.far)
+    torch.testing.assert_close(
+        depth[solid], expected.depth.view(SIZE[1], SIZE[0])[solid], rtol=0.02, atol=0.02
+    )
+    motion = expected.motion.view(SIZE[1], SIZE[0])
+    torch.testing.assert_close(maps[..., 1], motion, rtol=0, atol=0.02)
+
+
+def test_scene_flow_is_the_motion_until_the_next_frame(viewer: Page, toy: Scene) -> None:
+    field, _ = trained(toy)
+    camera, time = toy.train[1].camera.resized(*SIZE), 1.37
+    cloud = field.cloud(field.knot(time))
+    with torch.no_grad():
+        moved = field.positions(field.knot(time) + 1)
+        flow = camera.project(moved)[0] - camera.project(cloud.means)[0]
+        gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
+        expected = rasterize(*gaussians, flow.clamp(-320, 320), camera).features
+    found = read_linear(viewer, {**view_of(toy, 1, time), "show": "flow"})[..., :2]
+    largest = float(expected.abs().max())
+    torch.testing.assert_close(found, expected, rtol=0.02, atol=0.01 * largest)
+
+
+def test_one_stop_on_the_slider_doubles_the_read_back(viewer: Page, toy: Scene) -> None:
+    view = view_of(toy, 0, 1.0)
+    viewer.run("viewer.set({ev: 0})")
+    before = read_linear(viewer, view)
+    slide = "(() => { const e = document.getElementById('ev'); e.value = 1; "
+    viewer.run(slide + "e.dispatchEvent(new Event('input')); })()")
+    assert state(viewer, "ev") == 1
+    torch.testing.assert_close(read_linear(viewer, view)[..., :3], 2 * before[..., :3])
+
+
+def test_the_camera_curve_records_as_the_tone_mapper_does(viewer: Page, toy: Scene) -> None:
+    _, tonemapper = trained(toy)
+    viewer.run("viewer.set({curve: 'camera', ev: 0.5})")
+    found = read_png(base64.b64decode(viewer.run(png_text(16))))
+    text = viewer.run(f"viewer.readLinear(viewer.view(viewer.fullSize)).then({TO_BASE64})")
+    exposed = np.frombuffer(base64.b64decode(text), np.float32).reshape(*found.shape[:2], 4)
+    radiance = torch.from_numpy(exposed[..., :3] * 2**-0.5)
+    expected = tonemapper.develop(radiance, 0.5).numpy()
+    np.testing.assert_allclose(found, expected, atol=0.004)
+
+
+def png_text(bits: int) -> str:
+    """An expression: the base64 text of the picture's PNG."""
+    return (
+        f"viewer.png({bits}).then(blob => blob.arrayBuffer())"
+        f".then(data => new Uint8Array(data)).then({TO_BASE64})"
+    )
+
+
+def read_png(data: bytes, bits: int = 16) -> np.ndarray:
+    """RGB (H, W, 3) in [0, 1] of a PNG without filters, by its own rules."""
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    place, body, header = 8, b"", b""
+    while place < len(data):
+        length, kind = struct.unpack(">I4s", data[place : place + 8])
+        chunk = data[place + 8 : place + 8 + length]
+        (crc,) = struct.unpack(">I", data[place + 8 + length : place + 12 + length])
+        assert crc == zlib.crc32(kind + chunk)
+        body += chunk if kind == b"IDAT" else b""
+        header = chunk if kind == b"IHDR" else header
+        place += 12 + length
+    width, height, *depth_and_color = struct.unpack(">IIBB", header[:10])
+    assert depth_and_color == [bits, 2]
+    rows = np.frombuffer(zlib.decompress(body), np.uint8).reshape(height, -1)
+    assert not rows[:, 0].any()  # no filter
+    samples = rows[:, 1:].copy().view(">u2" if bits == 16 else "u1")
+    return samples.reshape(height, width, 3) / (2**bits - 1)
+
+
+def test_pictures_of_8_bits_are_those_of_16_bits(viewer: Page) -> None:
+    fine = read_png(base64.b64decode(viewer.run(png_text(16))))
+    coarse = read_png(base64.b64decode(viewer.run(png_text(8))), bits=8)
+    np.testing.assert_allclose(coarse, fine, atol=0.51 / 255)
+    assert fine.shape[1] == viewer.run("viewer.fullSize.width")
+
+
+# Controls
+
+
+def test_the_single_file_asks_the_network_for_nothing(viewer: Page) -> None:
+    viewer.run("viewer.set({split: true, time: 2})")
+    asked = viewer.requests()
+    assert len(asked) == 1 and asked[0].startswith("file://")
+
+
+def test_space_plays_and_pauses(viewer: Page) -> None:
+    viewer.press(" ")
+    assert state(viewer, "playing") is True
+    viewer.wait("viewer.state.time > 0")
+    viewer.press(" ")
+    assert state(viewer, "playing") is False
+
+
+def test_space_plays_after_a_click_on_another_button(viewer: Page) -> None:
+    viewer.click("#loop")
+    viewer.press(" ")
+    assert (state(viewer, "loop"), state(viewer, "playing")) == (False, True)
+    viewer.run("document.getElementById('time').focus()")
+    viewer.press(" ")
+    viewer.run("viewer.set({time: 1})")
+    viewer.press("ArrowRight")
+    assert (state(viewer, "playing"), state(viewer, "time")) == (False, 2)
+
+
+def test_arrows_step_through_time_and_exposure(viewer: Page) -> None:
+    viewer.run("viewer.set({ev: 0, time: 1})")
+    for key in ("ArrowRight", "ArrowRight", "ArrowLeft", "ArrowUp", "ArrowUp", "ArrowDown"):
+        viewer.press(key)
+    assert (state(viewer, "time"), state(viewer, "ev")) == (2, 0.5)
+    viewer.press("End")
+    assert state(viewer, "time") == viewer.run("viewer.last")
+
+
+def test_the_question_mark_opens_help_and_escape_closes_it(viewer: Page) -> None:
+    viewer.press("?")
+    assert viewer.run("document.getElementById('help').open") is True
+    viewer.press(" ")
+    assert state(viewer, "playing") is False
+    viewer.press("Escape")
+    viewer.wait("!document.getElementById('help').open")
+
+
+def test_keys_choose_view_curve_camera_and_split(viewer: Page) -> None:
+    viewer.press("v")
+    viewer.press("c")
+    assert (state(viewer, "show"), state(viewer, "curve")) == ("depth", "clip")
+    viewer.press("3")
+    assert state(viewer, "mode") == "orbit"
+    viewer.press("x")  # compares from where it was filmed
+    assert (state(viewer, "split"), state(viewer, "mode")) == (True, "filmed")
+    viewer.press("2")
+    assert state(viewer, "split") is False
+
+
+def test_a_drag_orbits_and_keeps_a_rotation(viewer: Page) -> None:
+    before = viewer.run("viewer.camera().c2w")
+    viewer.drag((120, 100), (160, 110))
+    assert state(viewer, "mode") == "orbit"
+    c2w = np.array(viewer.run("viewer.camera().c2w"))
+    assert not np.allclose(c2w, before)
+    np.testing.assert_allclose(c2w[:, :3] @ c2w[:, :3].T, np.eye(3), atol=1e-9)
+    viewer.press("r")
+    assert state(viewer, "mode") == "filmed"
+
+
+def test_one_finger_orbits_and_two_move_closer(viewer: Page) -> None:
+    def touch(kind: str, *points: tuple[float, float]) -> None:
+        touches = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(points)]
+        viewer.call("Input.dispatchTouchEvent", type=kind, touchPoints=touches)
+
+    viewer.call("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
+    touch("touchStart", (100, 90))
+    touch("touchMove", (140, 90))
+    touch("touchEnd")
+    assert state(viewer, "mode") == "orbit"
+    before = np.array(viewer.run("viewer.camera().c2w"))
+    touch("touchStart", (100, 90), (120, 90))
+    touch("touchMove", (80, 90), (120, 90))
+    touch("touchMove", (80, 90), (140, 90))
+    touch("touchEnd")
+    step = np.array(viewer.run("viewer.camera().c2w"))[:, 3] - before[:, 3]
+    assert step @ before[:, 2] > 0.01
+    viewer.call("Emulation.setTouchEmulationEnabled", enabled=False)
+
+
+def test_the_path_is_copied_with_a_hint(viewer: Page) -> None:
+    viewer.click("#copy-path")
+    viewer.wait("document.getElementById('note').textContent.includes('--path path.json')")
+
+
+def test_buttons_work_by_pointer(viewer: Page) -> None:
+    viewer.click("#play")
+    assert state(viewer, "playing") is True
+    viewer.click("#play")
+    viewer.click("#brackets button")
+    darkest = viewer.run("Math.min(...viewer.scene.exposures)")
+    assert (state(viewer, "curve"), state(viewer, "ev")) == ("camera", darkest)
+    viewer.click("[data-mode=fly]")
+    assert state(viewer, "mode") == "fly"
+    viewer.click("#stats-button")
+    viewer.wait("document.getElementById('stats').textContent.includes('Gaussians')")
+
+
+def test_the_copied_path_is_one_that_render_reads(viewer: Page, toy: Scene, tmp_path: Path) -> None:
+    viewer.run("viewer.set({curve: 'camera', ev: -1})")
+    viewer.press("k")
+    viewer.press("End")
+    viewer.drag((120, 100), (150, 100))
+    viewer.press("k")
+    file = tmp_path / "path.json"
+    file.write_text(json.dumps(viewer.run("viewer.cameraPath()")))
+    views = paths.read_path(file, toy.train[0].camera)
+    assert [v.time for v in views] == list(range(len(views))) and len(views) > 2
+    assert {v.ev for v in views} == {-1}
+    torch.testing.assert_close(views[0].camera.c2w, toy.train[0].camera.c2w, atol=1e-5, rtol=0)
+
+
+def test_without_parallax_the_camera_stays_where_it_filmed(
+    tab: Page, toy: Scene, tmp_path: Path
+) -> None:
+    open_page(tab, tmp_path / "scene.html", replace(scene_file(toy), parallax="rotation"))
+    before = tab.run("viewer.camera().c2w")
+    tab.drag((120, 100), (160, 110))
+    for key in ("3", "4", "w"):
+        tab.press(key)
+    assert tab.run("viewer.camera().c2w") == before
+    assert tab.run("document.querySelector('[data-mode=orbit]').disabled") is True
+    assert "only turned" in tab.run("document.getElementById('camera-note').textContent")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844), (844, 390)])
+def test_the_picture_and_the_controls_fit_the_window(
+    tab: Page, toy: Scene, tmp_path: Path, width: int, height: int
+) -> None:
+    open_page(tab, tmp_path / "scene.html", scene_file(toy), width, height)
+    assert tab.run("document.documentElement.scrollWidth") <= width
+    for name in ("picture", "timeline", "play", "help-button"):
+        rect = f"document.getElementById('{name}').getBoundingClientRect()"
+        left, top, right, bottom = tab.run(f"(r => [r.left, r.top, r.right, r.bottom])({rect})")
+        assert left >= 0 and top >= 0 and right <= width + 1 and bottom <= height + 1
+        assert right - left > 20 and bottom - top > 20
+
+
+# With a server
+
+
+@pytest.fixture(params=["splat"])
+def address(
+    request: pytest.FixtureRequest, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> Iterator[str]:
+    """Where a run of a preset is served."""
+    save_run(toy, toy_folder, tmp_path / "run", request.param)
+    with ViewerServer(ServedRun(tmp_path / "run", "cpu")) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield server.address
+        server.shutdown()
+
+
+@pytest.mark.parametrize("address", ["splat", "grid"], indirect=True)
+def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: str) -> None:
+    tab.goto(address, 500, 300)
+    tab.wait("!document.getElementById('frame').hidden")
+    tab.press("ArrowRight")
+    tab.drag((120, 100), (160, 110))
+    tab.press("v")
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 2")
+    width = tab.run("document.getElementById('frame').naturalWidth")
+    assert width == tab.run("viewer.scene.width")  # the finest, after coarse ones
+    assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
+    assert all(asked.startswith(address) for asked in tab.requests())
+    assert tab.problems() == []
+
+
+def test_a_served_page_can_draw_and_follows_the_run(
+    tab: Page, address: str, tmp_path: Path
+) -> None:
+    tab.goto(f"{address}#draw", 500, 300)
+    assert tab.run("viewer.renderer.visible") > 400
+    tab.press("ArrowRight")
+    (checkpoint,) = (tmp_path / "run" / "checkpoints").iterdir()
+    checkpoint.rename(checkpoint.with_name("step_00000009.safetensors"))
+    tab.run("globalThis.scene = viewer.scene")
+    tab.wait("viewer.scene !== scene")
+    assert state(tab, "time") == 1
+    assert tab.problems() == []
