@@ -15,10 +15,12 @@ from hdr_nsff.priors.flow.adapt import (
     adapt_features,
     best_buddies,
     buddies_loss,
+    build_refiner,
     cell_colors,
     closeness_loss,
     cycle_loss,
     trajectory_loss,
+    with_published_network,
 )
 from hdr_nsff.priors.flow.correlation import Search, cell_positions
 from hdr_nsff.priors.flow.features import Features
@@ -54,6 +56,30 @@ def test_the_network_starts_as_the_identity():
     maps = torch.randn(2, 5, 6, 7)
     colors = torch.rand(2, 3 * ADAPT_TUNING.colors_per_cell**2, 6, 7)
     assert torch.equal(ResidualNetwork(5, 2.0)(maps, colors), maps)
+
+
+def test_the_published_network_has_its_size_and_starts_as_the_identity():
+    tuning = with_published_network(ADAPT_TUNING)
+    network = build_refiner(1024, 2.0, tuning)
+    weights = [layer.weight for layer in network.layers]
+    assert [w.shape[0] for w in weights] == [64, 128, 256, 1024]
+    assert {tuple(w.shape[2:]) for w in weights} == {(5, 5)}
+    maps, colors = torch.randn(1, 1024, 4, 5), torch.rand(1, 3 * 8**2, 4, 5)
+    assert torch.equal(network(maps, colors), maps)
+
+
+def test_the_published_network_keeps_cells_in_place():
+    """Colors of one cell change the features around it alone: within four cells."""
+    torch.manual_seed(0)
+    network = build_refiner(6, 1.0, with_published_network(ADAPT_TUNING))
+    torch.nn.init.normal_(network.layers[-1].weight)
+    maps, colors = torch.zeros(1, 6, 13, 15), torch.full((1, 3 * 8**2, 13, 15), 0.5)
+    changed = colors.clone()
+    changed[:, :, 6, 8] = 1.0
+    difference = (network(maps, changed) - network(maps, colors)).abs().sum(1)[0]
+    center = (cell_positions(13, 15) * difference.reshape(-1, 1)).sum(0) / difference.sum()
+    assert center.tolist() == pytest.approx([8, 6], abs=0.3)
+    assert float(difference[0].max()) == 0 and float(difference[6, 8]) > 0
 
 
 def test_colors_are_read_at_the_centers_of_cells():

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from tiny_networks import tiny_dinov2
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.priors.flow.correlation import cosines
@@ -47,22 +48,8 @@ def noise(*shape: int) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def dino(tmp_path_factory):
-    """A folder with a tiny DINOv2: 4 layers of 16 channels, patches of 14 pixels, 4 x 4
-    positions.
-    """
-    transformers = pytest.importorskip("transformers")
-    torch.manual_seed(0)
-    config = transformers.Dinov2Config(
-        hidden_size=16,
-        num_hidden_layers=4,
-        num_attention_heads=2,
-        mlp_ratio=2,
-        image_size=56,
-        patch_size=14,
-    )
-    folder = tmp_path_factory.mktemp("dino")
-    transformers.Dinov2Model(config).save_pretrained(folder)
-    return folder
+    """A folder with a tiny DINOv2."""
+    return tiny_dinov2(tmp_path_factory.mktemp("dino"))
 
 
 def test_a_folded_normalization_is_convolution_then_batch_norm():

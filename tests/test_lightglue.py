@@ -2,16 +2,14 @@
 with random weights, and with real ones where they are.
 """
 
-import hashlib
-import re
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 from posed_clips import FOCAL, PLACES, H, W, sliding
 from scipy.spatial.transform import Rotation
+from tiny_networks import random_lightglue
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.alignment import umeyama
@@ -29,7 +27,7 @@ def test_poses_come_from_the_given_matches(tmp_path, monkeypatch):
     turns = towards_middle.as_matrix().reshape(-1, 3, 3)
     asked = {}
 
-    def exact(images, masks, pairs, matcher, tuning):
+    def exact(images, masks, pairs, matcher, tuning, device):
         """Projections of 300 points into images of twice the size, each point the same
         row everywhere.
         """
@@ -66,30 +64,8 @@ def test_missing_weights_and_a_missing_library_are_one_sentence(tmp_path, monkey
 
 @pytest.fixture(params=["aliked", "disk"])
 def random_weights(request, tmp_path, monkeypatch):
-    """Random weights of both networks where the real ones would be, LightGlue's under
-    its authors' first names.
-    """
-    kf = pytest.importorskip("kornia.feature")
-    torch.manual_seed(0)
-    extractor = kf.ALIKED("aliked-n16") if request.param == "aliked" else kf.DISK()
-    state = extractor.state_dict()
-    glue = kf.LightGlue(None, input_dim=128).state_dict()
-    old = {
-        re.sub(r"transformers\.(\d+)\.(self_attn|cross_attn)\.", r"\2.\1.", k): v
-        for k, v in glue.items()
-    }
-    for name, content in (
-        (request.param, state if request.param == "aliked" else {"extractor": state}),
-        (f"{request.param}-lightglue", old),
-    ):
-        path = tmp_path / name / str(KNOWN[name].file)
-        path.parent.mkdir()
-        torch.save(content, path)
-        monkeypatch.setitem(
-            KNOWN, name, replace(KNOWN[name], sha256=hashlib.sha256(path.read_bytes()).hexdigest())
-        )
-    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
-    return request.param, tmp_path, glue
+    """A matcher, the folder of its random weights, and LightGlue's."""
+    return request.param, tmp_path, random_lightglue(request.param, tmp_path, monkeypatch)
 
 
 def test_all_weights_are_loaded_into_the_networks(random_weights):

@@ -1,12 +1,17 @@
-"""SAM 2 and Depth Anything with a few thousand random weights, saved as folders.
+"""Networks with random weights, most of them tiny, saved where they are looked for.
 
 Their predictions are meaningless; tests check their inputs and what is done with them.
 """
 
+import hashlib
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
+
+from hdr_nsff.priors.weights import KNOWN
 
 
 def tiny_sam2(folder: Path) -> Path:
@@ -85,3 +90,47 @@ def tiny_depth_anything(folder: Path, kind: str) -> Path:
             weights.normal_(0, 0.3)
     network.save_pretrained(folder)
     return folder
+
+
+def tiny_dinov2(folder: Path) -> Path:
+    """A Dinov2Model: 4 layers of 16 channels, patches of 14 pixels, 4 x 4 positions."""
+    transformers = pytest.importorskip("transformers")
+    torch.manual_seed(0)
+    config = transformers.Dinov2Config(
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        mlp_ratio=2,
+        image_size=56,
+        patch_size=14,
+    )
+    transformers.Dinov2Model(config).save_pretrained(folder)
+    return folder
+
+
+def random_lightglue(
+    matcher: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, torch.Tensor]:
+    """Random weights of both networks of a matcher where the real ones would be, in
+    `folder`, LightGlue's under its authors' first names. Returns those by kornia's.
+    """
+    kf = pytest.importorskip("kornia.feature")
+    torch.manual_seed(0)
+    extractor = kf.ALIKED("aliked-n16") if matcher == "aliked" else kf.DISK()
+    state = extractor.state_dict()
+    glue = kf.LightGlue(None, input_dim=128).state_dict()
+    old = {
+        re.sub(r"transformers\.(\d+)\.(self_attn|cross_attn)\.", r"\2.\1.", k): v
+        for k, v in glue.items()
+    }
+    for name, content in (
+        (matcher, state if matcher == "aliked" else {"extractor": state}),
+        (f"{matcher}-lightglue", old),
+    ):
+        path = folder / name / str(KNOWN[name].file)
+        path.parent.mkdir()
+        torch.save(content, path)
+        sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+        monkeypatch.setitem(KNOWN, name, replace(KNOWN[name], sha256=sha256))
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(folder))
+    return dict(glue)

@@ -111,9 +111,9 @@ VERBS = {
 }
 
 PRESET_HELP = {
-    "splat": "4D Gaussians: minutes on a CPU, tens of small frames a second; the default of `run`.",
+    "splat": "4D Gaussians: minutes on a CPU; the default of `run`.",
     "grid": "A scene flow field on additive grids: minutes on a CPU.",
-    "paper": "The published network, losses and schedules: hours on a GPU.",
+    "paper": "The published network, losses and schedules: 250,000 steps, for a GPU.",
     "tiny": "Seconds on a CPU, to try things out.",
     "nsff": "Baseline: NSFF, which knows one exposure, on the grids of `grid`.",
     "nsff-paper": "Baseline: NSFF at its published size, for a GPU.",

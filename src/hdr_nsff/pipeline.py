@@ -49,8 +49,8 @@ class RunConfig(PrepareConfig):
     """
     preset: Literal["splat", "grid", "paper", "tiny"] = "splat"
     """splat: 4D Gaussians, minutes on a CPU; grid: a scene flow field on grids,
-    likewise; paper: the published network (hours on a GPU); tiny: seconds, to try
-    things out.
+    likewise; paper: the published network, 250,000 steps, for a GPU; tiny: seconds,
+    to try things out.
     """
     minutes: float | None = None
     """Training time instead of the preset's."""
@@ -64,7 +64,7 @@ class RunConfig(PrepareConfig):
     """
     seed: int = 0
     device: str = "auto"
-    """auto, cpu or cuda."""
+    """Where networks of `prepare`, training and rendering run: auto, cpu or cuda."""
 
 
 def run_all(config: RunConfig) -> None:

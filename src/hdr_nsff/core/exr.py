@@ -1,7 +1,6 @@
 """OpenEXR: linear maps of any range, channel by channel, float32 in memory.
 
-Reading checks and refuses in one sentence (`InputError`); writing never clamps. RGB is
-in Rec. 709 primaries with the white point D65 unless the header says otherwise.
+Reading checks and refuses in one sentence (`InputError`); writing never clamps.
 """
 
 from __future__ import annotations
@@ -34,8 +33,8 @@ def write_exr(
     """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped.
 
     NaN and Inf are an error. With `half`, channels take 16 bits, but depth `Z` and
-    radiance beyond 65504 keep 32. Header defaults: ZIP compression, Rec. 709
-    chromaticities. Extra keys (str, float) become attributes.
+    radiance beyond 65504 keep 32. Keys of `header` (str, float, tuples) become
+    attributes; without `chromaticities`, the file claims none. Compression is ZIP.
     """
     arrays = {}
     for name, array in channels.items():
@@ -44,7 +43,6 @@ def write_exr(
     full = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,
-        "chromaticities": REC709,
         **(header or {}),
     }
     with atomic(path) as temporary, OpenEXR.File(full, arrays) as file:

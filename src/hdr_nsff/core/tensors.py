@@ -16,6 +16,8 @@ from hdr_nsff.core.errors import InputError
 
 T = TypeVar("T")
 
+CPU = torch.device("cpu")
+
 
 def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
     """`value` with `function` applied to every tensor in it. Dataclasses, dicts, lists
@@ -49,7 +51,7 @@ def pick_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     if name == "cpu":
-        return torch.device("cpu")
+        return CPU
     match = re.fullmatch(r"cuda(?::(\d{1,3}))?", name, re.ASCII)
     if match is None:
         raise InputError(f"--device {name:.40}: no such device; choose auto, cpu, cuda or cuda:N")

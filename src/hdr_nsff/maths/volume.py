@@ -3,7 +3,7 @@ samples along a ray, weights from density, compositing.
 
 Shapes are (N rays, S samples). Densities are per unit of the step lengths `deltas`,
 and both are >= 0. Two contents, static and dynamic, share a ray: `blend` is eq. 6-7 of
-HDR-NSFF, `add` is ours.
+HDR-NSFF, `superpose` is NeRF-W, `add` is ours.
 """
 
 from __future__ import annotations
@@ -65,8 +65,8 @@ class Weights:
     def opacity(self) -> Tensor:
         """Of each ray (N,), in [0, 1].
 
-        The clamp is for eq. 6-7, in which two contents in one place may add up to more
-        than 1.
+        The clamp is for `blend` and `superpose`, in which two contents in one place may
+        add up to more than 1.
         """
         return (self.static + self.dynamic).sum(-1).clamp(max=1)
 
@@ -95,6 +95,19 @@ def add(static_density: Tensor, dynamic_density: Tensor, deltas: Tensor) -> Weig
     weights = single(total, deltas)
     dynamic = weights * (dynamic_density / total.clamp_min(1e-12))
     return Weights(weights - dynamic, dynamic)
+
+
+def superpose(static_density: Tensor, dynamic_density: Tensor, deltas: Tensor) -> Weights:
+    """NeRF in the Wild (Martin-Brualla et al. 2021, eq. 4-5): each content has its own
+    alpha, and both densities together attenuate what lies behind.
+
+    The two alphas of a sample may add up to more than 1.
+    """
+    through = transmittance(alpha_from_density(static_density + dynamic_density, deltas))
+    return Weights(
+        through * alpha_from_density(static_density, deltas),
+        through * alpha_from_density(dynamic_density, deltas),
+    )
 
 
 def single(density: Tensor, deltas: Tensor) -> Tensor:

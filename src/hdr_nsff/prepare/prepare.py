@@ -17,6 +17,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import is_leftover, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
@@ -163,6 +164,7 @@ def check_settings(config: PrepareConfig) -> None:
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "
             "choose a place outside"
         )
+    pick_device(config.device)
     check_flow(config.flow, config.flow_weights)
     given = {
         "poses": config.poses,

@@ -142,6 +142,8 @@ class PrepareConfig:
     """
     redo: tuple[StepName, ...] = ()
     """Steps to redo although they are done."""
+    device: str = "auto"
+    """Where networks and the search for their features run: auto, cpu or cuda."""
 
 
 @dataclass

@@ -18,7 +18,8 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import colorize, colorize_flow, contact_sheet, read_image, write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.shots import Shot, develop_view, fingerprint
+from hdr_nsff.rendering.exr_header import unbalance
+from hdr_nsff.rendering.shots import Output, Shot, develop_view, fingerprint
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 
@@ -43,10 +44,10 @@ class SequenceRanges:
     moves: bool  # whether the field has scene flow
 
 
-def write_pictures(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
+def write_pictures(run: Run, out: Path, shot: Shot, output: Output) -> dict[str, Path]:
     """Write the pictures of the training path `shot`; folders and files by name.
 
-    Its EXR sequence is in `out`/training.
+    Its EXR sequence, written as `output` says, is in `out`/training.
     """
     evs = three_exposures(run.tonemapper.exposures().tolist())
     results = {f"LDR at EV {ev:+.1f}": ldr_folder(out, ev) for ev in evs}
@@ -58,7 +59,10 @@ def write_pictures(run: Run, out: Path, shot: Shot) -> dict[str, Path]:
         sources = [out / "training" / f"{i:05d}.exr" for i in range(len(shot.views))]
         ranges = find_ranges(sources)
         for i, source in enumerate(track(sources, "LDR, depth and motion pictures")):
-            write_pictures_of_view(run, out, i, shot.views[i], read_exr(source), evs, ranges)
+            seen = read_exr(source)
+            balanced = output.white_balance, output.camera_id
+            seen["RGB"] = unbalance(run, seen["RGB"], *balanced)
+            write_pictures_of_view(run, out, i, shot.views[i], seen, evs, ranges)
         write_overview(run, out, shot, evs, ranges.moves)
         done = notes.PictureRanges(
             key=key,

@@ -36,6 +36,7 @@ from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
+from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
 from hdr_nsff.rendering.interpolate import Mode, render_at
 from hdr_nsff.training.run_folder import Run
 
@@ -59,7 +60,14 @@ class Output:
     display.
     """
     camera_id: int = 0
-    """Whose learned response and white balance develop the picture (with --ev)."""
+    """Whose learned response and white balance develop the picture (with --ev), and
+    whose neutral --white-balance takes.
+    """
+    white_balance: WhiteBalance = "camera"
+    """Radiance in EXR files. camera: in the run's unit of each channel; neutral: times
+    the gains that make gray neutral. The header has these gains either way. PNG and
+    video are neutral anyhow.
+    """
     between: Mode = "auto"
     """Times between frames: splat along the scene flow, or ask the field directly; auto
     splats where the field can.
@@ -318,20 +326,12 @@ def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure
     still = render_still(run, view, output.between, motion=with_exr)
     ev = ev_of(view, output)
     if with_exr:
-        header = exposure_header(run)
+        header = radiance_header(run, output.white_balance, output.camera_id)
         if ev is None:
             header["displayExposure"] = exposure
         else:
             header["developedEV"] = float(ev)
-        write_still(exr, still, view, output.exr == "half", header)
+        stored = balance(run, still.radiance, output.white_balance, output.camera_id)
+        stored_still = replace(still, radiance=stored)
+        write_still(exr, stored_still, view, output.exr == "half", header)
     write_png(picture, develop_view(run, view, still.radiance, ev, output.camera_id, exposure))
-
-
-def exposure_header(run: Run) -> dict[str, Any]:
-    """EXR attributes that say what a radiance of 1 means."""
-    brackets = " ".join(f"{ev:+.3f}" for ev in run.tonemapper.exposures().tolist())
-    meaning = (
-        "linear radiance; `exposure` is its EV relative to the reference bracket, where 1 "
-        "saturates; bracketEV: the clip's"
-    )
-    return {"exposure": 0.0, "bracketEV": brackets, "comments": meaning}

@@ -71,7 +71,7 @@ def render_all(
         if shot.name == "training":
             video = render_shot(run, shot, out, output)
             results["EXR sequence"] = out / "training"
-            results |= write_pictures(run, out, shot)
+            results |= write_pictures(run, out, shot, output)
         else:
             video = render_shot(run, shot, out, replace(output, exr="none"))
         results[LABELS[shot.name]] = video

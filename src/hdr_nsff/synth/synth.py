@@ -33,7 +33,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr, write_exr
+from hdr_nsff.core.exr import MOTION_DIRECTIONS, REC709, read_exr, write_exr
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json, write_text, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -60,6 +60,7 @@ from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 __all__ = ["SynthConfig", "synth"]
 
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
+TRACED_HEADER = {"chromaticities": REC709}  # Mitsuba's rgb variants are linear Rec. 709
 
 
 def synth(config: SynthConfig) -> None:
@@ -144,7 +145,7 @@ def render(
         surface = tracer.surface(view.time, K, view.c2w, size)
         channels = geometry_channels(scene, surface, view, K, config.views)
         channels["RGB"] = tracer.radiance(view.time, K, view.c2w, size, view.spp, view.seed)
-        write_exr(exact_path(config.out, view), channels, half=False)
+        write_exr(exact_path(config.out, view), channels, TRACED_HEADER, half=False)
         spent[view.spp].append(clock.monotonic() - start)
     costs = [
         f"{np.mean(seconds):.1f} s per picture at {spp} paths per pixel"
@@ -253,7 +254,8 @@ def write_truth(
     for k, view in enumerate(held_out):
         channels = exact(config.out, view)
         geometry = view_geometry(scene, channels, view.time, K, view.c2w)
-        write_exr(folder / "radiance" / f"{view.name}.exr", {"RGB": channels["RGB"]})
+        radiance = {"RGB": channels["RGB"]}
+        write_exr(folder / "radiance" / f"{view.name}.exr", radiance, TRACED_HEADER)
         write_png(folder / "masks" / f"{view.name}.png", channels["body"] > 0)
         write_exr(folder / "geometry" / f"{view.name}.exr", geometry, half=False)
         entry = TruthView(

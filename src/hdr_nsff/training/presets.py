@@ -24,6 +24,9 @@ PUBLISHED_SCHEDULE = Schedule(period=0.0, prior_fade=0.1, lr_final=0.0)
 PUBLISHED_STEPS = Budget(steps=250_000, minutes=None)
 # the published fields: networks, no culling, ReLU densities with noise
 PUBLISHED_SAMPLES = 128
+# NeRF-W weighs mean transient density by 0.01 and squared errors by 1 / (2 beta^2).
+# This is the ratio of the two at beta's minimum, 0.03: beta itself is left out.
+NERF_W_TRANSIENT = 0.01 * 2 * 0.03**2
 
 
 def splat() -> TrainConfig:
@@ -127,10 +130,12 @@ def nerf_wt_paper() -> TrainConfig:
     """NeRF-W with time at the size of its public implementation."""
     field = NerfWTConfig(
         encoding=MlpConfig(),
+        transient=NERF_W_TRANSIENT,
+        transient_cost="density",
         samples=PUBLISHED_SAMPLES,
         render_samples=PUBLISHED_SAMPLES,
-        density="relu",
-        density_noise=1.0,
+        compositing="superpose",
+        density="softplus",
         opaque_end=True,
         cull=False,
     )

@@ -5,6 +5,9 @@ what changes with the camera from image to image. Moving content is in the trans
 branch, which depends on time and whose density adds up with the static one. There is no
 scene flow and no tone mapper: "radiance" is recorded rgb.
 
+On networks, the transient branch is the published one: four layers on the features of
+the static trunk and a code of the time, in place of a code of the image.
+
 A picture other than the training images borrows the mean code of the training images of
 its exposure (`Recorder.images`); radiance is rendered as the reference exposure looks.
 As published, only the static branch depends on the code: movers keep the exposure of
@@ -22,7 +25,9 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.settings import Advanced, Count, Rate, Weight
 from hdr_nsff.fields.base import ParamGroup, Render
+from hdr_nsff.fields.knots import interpolate_linear
 from hdr_nsff.fields.nsff.branches import (
+    DYNAMIC,
     GridBranches,
     GridConfig,
     MlpBranches,
@@ -37,6 +42,8 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import volume
 from hdr_nsff.scene.batch import PixelBatch, Recorder
 
+TRANSIENT_LAYERS = 4  # of half the trunk's width, as published
+
 
 @dataclass(frozen=True)
 class NerfWTConfig(BranchesConfig):
@@ -44,11 +51,15 @@ class NerfWTConfig(BranchesConfig):
 
     type: Advanced[Literal["nerf-wt"]] = "nerf-wt"
     transient: Weight = 0.01
-    """Loss: mean optical thickness of a sample of the transient branch."""
+    """Loss: what a sample of the transient branch costs on average."""
+    transient_cost: Advanced[Literal["thickness", "density"]] = "thickness"
+    """By its optical thickness, or by its density, as published."""
     radiance: Literal["exp", "sigmoid"] = "sigmoid"
     """Unbounded radiance, or the published one below 1."""
     code_size: Count = 48
     """Numbers of an image's appearance code."""
+    time_code_size: Advanced[Count] = 16
+    """Numbers of a training time's code, where networks are used."""
     head_width: Advanced[Count] = 128
     """Width of the network that turns a grid's values and the code into colors."""
     head_lr: Advanced[Rate] = 5e-3
@@ -123,19 +134,41 @@ class CodedGrids(GridBranches):
 class CodedMlp(MlpBranches):
     """The published network.
 
-    The static color head takes the code as further inputs, the dynamic trunk only the
-    time.
+    The static color head takes the image's code as further inputs. The transient head
+    sees no view direction: its inputs are features of the static trunk and the code of
+    the time, linear between training times.
     """
 
-    def __init__(self, config: MlpConfig, num_knots: int, codes: Codes) -> None:
+    def __init__(
+        self, config: MlpConfig, num_knots: int, codes: Codes, time_code_size: int
+    ) -> None:
         nn.Module.__init__(self)
         self.config, self.num_knots, self.codes = config, num_knots, codes
         self.static_trunk = Trunk(config, 3, 1, codes.table.shape[1])
-        self.dynamic_trunk = Trunk(config, 4, 0)
+        self.time_codes = nn.Parameter(torch.randn(num_knots, time_code_size))
+        narrow = config.width // 2
+        sizes = [config.width + time_code_size] + [narrow] * (TRANSIENT_LAYERS - 1)
+        self.transient_hidden = nn.ModuleList(nn.Linear(n, narrow) for n in sizes)
+        self.transient = nn.Linear(narrow, DYNAMIC)
 
     def static(self, coords: Tensor, directions: Tensor) -> Tensor:
         code = self.codes().expand(len(coords), -1)
         return super().static(coords, torch.cat([directions, code], -1))
+
+    def time_code(self, knot: float) -> Tensor:
+        """The code (time_code_size,) of a knot, linear between training times."""
+        return interpolate_linear(self.time_codes, knot)
+
+    def dynamic(
+        self, coords: Tensor, knot: float, directions: Tensor, motion: bool
+    ) -> tuple[Tensor, Tensor | None]:
+        assert not motion, "NeRF-W has no scene flow"
+        trunk = self.static_trunk
+        feature = trunk.feature(trunk.hidden_features(2 * coords - 1))
+        h = torch.cat([feature, self.time_code(knot).expand(len(coords), -1)], -1)
+        for layer in self.transient_hidden:
+            h = layer(h).relu()
+        return self.transient(h), None
 
 
 class NerfWT(TwoBranches):
@@ -148,7 +181,7 @@ class NerfWT(TwoBranches):
     config: NerfWTConfig
 
     def loss_weights(self) -> dict[str, float]:
-        """Of the transient branch's thickness."""
+        """Of what the transient branch costs."""
         return {"transient": self.config.transient}
 
     def __init__(
@@ -167,7 +200,7 @@ class NerfWT(TwoBranches):
             case GridConfig() as c:
                 branches: CodedGrids | CodedMlp = CodedGrids(c, *size, len(times), codes, config)
             case MlpConfig() as c:
-                branches = CodedMlp(c, len(times), codes)
+                branches = CodedMlp(c, len(times), codes, config.time_code_size)
         super().__init__(config, space, times, near, far, *size, branches=branches)
 
     @property
@@ -179,12 +212,14 @@ class NerfWT(TwoBranches):
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
         """A render of the batch's pixels as they were recorded, and `transient`.
 
-        That is the mean optical thickness of a sample of the transient branch.
+        That is what a sample of the transient branch costs on average.
         """
         assert batch.recorder is not None
         self.codes.images = batch.recorder.images
         base = self.query(batch, motion=False)
         render = self.compose(base.static, base.dynamic, base.weights, base.samples.depths)
+        if self.config.transient_cost == "density":
+            return render, {"transient": base.dynamic.density.mean()}
         # without the last interval, which has no length of its own where it is opaque
         thickness = base.dynamic.density[:, :-1] * base.samples.deltas[:, :-1]
         return render, {"transient": thickness.mean()}
@@ -194,11 +229,13 @@ class NerfWT(TwoBranches):
     ) -> Render:
         """The render of both branches along rays with samples at `depths` (N, S)."""
         both = weights.static + weights.dynamic
+        if self.config.compositing == "superpose":  # a ray may add up to more than 1
+            both = both / both.sum(-1, keepdim=True).clamp_min(1)
         return Render(
             radiance=volume.composite(weights, static.radiance, dynamic.radiance),
             depth=volume.expected_depth(both, depths, self.far),
             opacity=weights.opacity,
-            motion=weights.dynamic.sum(-1),
+            motion=weights.dynamic.sum(-1).clamp(max=1),
         )
 
     @torch.no_grad()

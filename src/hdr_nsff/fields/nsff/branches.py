@@ -186,16 +186,21 @@ class Trunk(nn.Module):
 
         `position` is (M, dims) in [-1, 1], `directions` (M, 3 + code_size).
         """
+        h = self.hidden_features(position)
+        views = frequencies(directions[:, :3], self.config.direction_octaves)
+        code = directions[:, 3:]
+        h_view = self.view(torch.cat([self.feature(h), views, code], -1)).relu()
+        return torch.cat([self.radiance(h_view), self.extra(h)], -1)
+
+    def hidden_features(self, position: Tensor) -> Tensor:
+        """The last hidden layer (M, width) at `position` (M, dims) in [-1, 1]."""
         encoded = frequencies(position, self.config.octaves)
         h = encoded
         for i, layer in enumerate(self.hidden):
             if i == self.config.skip_after:
                 h = torch.cat([encoded, h], -1)
             h = layer(h).relu()
-        views = frequencies(directions[:, :3], self.config.direction_octaves)
-        code = directions[:, 3:]
-        h_view = self.view(torch.cat([self.feature(h), views, code], -1)).relu()
-        return torch.cat([self.radiance(h_view), self.extra(h)], -1)
+        return h
 
 
 class MlpBranches(nn.Module):

@@ -70,18 +70,18 @@ class BranchesConfig:
     """Samples along a ray while training."""
     render_samples: Count = 64
     """Samples along a ray when rendering."""
-    compositing: Literal["add", "blend"] = "add"
-    """How static and dynamic content share a place: densities add up, or the blend
-    weight of eq. 7.
+    compositing: Literal["add", "blend", "superpose"] = "add"
+    """How static and dynamic content share a place: densities add up and share the
+    sample's weight, the blend weight of eq. 7, or NeRF-W's two alphas.
     """
     opaque_end: Advanced[bool] = False
     """The last interval of a ray is 1e10, as published: any density there ends it."""
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or the published one below 1."""
-    density: Advanced[Literal["exp", "relu"]] = "exp"
-    """Density as an exponential, or the published ReLU."""
+    density: Advanced[Literal["exp", "relu", "softplus"]] = "exp"
+    """Density as an exponential, or as published: ReLU (NSFF), softplus (NeRF-W)."""
     density_noise: Advanced[Weight] = 0.0
-    """Standard deviation added to raw densities while training (published: 1)."""
+    """Standard deviation added to raw densities while training (NSFF: 1)."""
     cull: Advanced[bool] = True
     """Skip samples in cells that never mattered."""
     cull_after: Advanced[Number] = 100
@@ -164,6 +164,8 @@ class TwoBranches(nn.Module):
             raw = raw + self.config.density_noise * noise
         if self.config.density == "exp":
             return (raw + bias).clamp(max=MAX_LOG_DENSITY).exp()
+        if self.config.density == "softplus":
+            return nn.functional.softplus(raw)
         return raw.relu()
 
     def density_bias(self, static: bool) -> float:
@@ -228,9 +230,14 @@ class TwoBranches(nn.Module):
         self, static: BranchOutput, dynamic: BranchOutput, deltas: Tensor
     ) -> volume.Weights:
         """Compositing weights of both branches."""
-        if self.config.compositing == "add":
-            return volume.add(static.density, dynamic.density, deltas)
-        return volume.blend(static.density, dynamic.density, 1 - static.blend, deltas)
+        match self.config.compositing:
+            case "add":
+                return volume.add(static.density, dynamic.density, deltas)
+            case "superpose":
+                return volume.superpose(static.density, dynamic.density, deltas)
+            case "blend":
+                share = 1 - static.blend
+                return volume.blend(static.density, dynamic.density, share, deltas)
 
     def select_samples(
         self, samples: RaySamples, knot: float, explore: float, generator: torch.Generator | None

@@ -10,6 +10,7 @@ import numpy as np
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import write_half
 from hdr_nsff.core.progress import track
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
@@ -32,7 +33,9 @@ def find_flow(work: Work) -> StepResult:
     given = store_given_flow(work, names)
     missing = [pair for pair in missing if pair not in given]
     from_folder = isinstance(c.flow, Path)
-    source = flow_source(c.flow, c.flow_weights, c.semantic, *learning_pairs(m.frames))
+    neighbors, equal = learning_pairs(m.frames)
+    device = pick_device(c.device)
+    source = flow_source(c.flow, c.flow_weights, c.semantic, neighbors, equal, device=device)
     size = max(len(missing), 1) if from_folder else FLOW_CHUNK
     chunks = [missing[k : k + size] for k in range(0, len(missing), size)]
     for chunk in track(chunks, "flow"):

@@ -8,11 +8,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_npy, write_json
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
 from hdr_nsff.priors.depth.depth_anything import Kind, anchored_depth, network_disparity
 from hdr_nsff.priors.flow.sources import flow_weights
@@ -67,10 +67,9 @@ def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
     return [content_hash(path) for path in paths]
 
 
-def load_network(network: str, weights: str) -> Any:
-    """The network, on the GPU where there is one."""
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    return pretrained(network, weights).to(device)
+def load_network(config: PrepareConfig, network: str, weights: str) -> Any:
+    """The network, on the device of the settings."""
+    return pretrained(network, weights).to(pick_device(config.device))
 
 
 def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
@@ -81,7 +80,7 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     """
     frames = work.manifest.frames
     given = given_points(work)
-    network = load_network(SAM2, work.config.mask_weights)
+    network = load_network(work.config, SAM2, work.config.mask_weights)
     video = work.equalized[0]
     outlined = np.zeros_like(moving)
     written: dict[str, list[Any]] = {"points": [], "boxes": []}
@@ -129,7 +128,7 @@ def network_depth(work: Work) -> tuple[np.ndarray, np.ndarray, float, float, Kin
     """
     m = work.manifest
     clip = work.training_clip()
-    network = load_network(DEPTH_ANYTHING, work.config.depth_weights)
+    network = load_network(work.config, DEPTH_ANYTHING, work.config.depth_weights)
     predicted, kind = network_disparity(network, clip.video)
     points = np.array(read_npy(work.folder / m.points)) if m.points else np.zeros((0, 3))
     flow = work.training_flows(work.raw_flows)

@@ -9,6 +9,7 @@ import numpy as np
 
 from hdr_nsff.core.io import atomic, write_npy
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.pose_files import fit_poses, import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.result import StepResult
@@ -103,7 +104,8 @@ def estimate(work: Work, moving: np.ndarray) -> Poses:
     video, clipped = work.equalized
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
-    return estimate_poses(video, moving, folder, clipped, cameras, matcher=work.config.matcher)
+    matcher, device = work.config.matcher, pick_device(work.config.device)
+    return estimate_poses(video, moving, folder, clipped, cameras, matcher=matcher, device=device)
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")

@@ -14,8 +14,9 @@ Positions and motions are in cells, as in `correlation`.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -34,11 +35,15 @@ from hdr_nsff.priors.flow.correlation import (
 )
 from hdr_nsff.priors.flow.features import Features
 
+Refiner = Literal["small", "published"]
+
 
 @dataclass(frozen=True)
 class AdaptTuning:
     """Tuning constants of the fit to a clip, hand-chosen on rendered scenes."""
 
+    refiner: Refiner = "small"
+    """The network that is fitted: see `ResidualNetwork` and `PublishedNetwork`."""
     colors_per_cell: int = 4
     """The network sees this many by this many colors of each cell."""
     hidden_channels: int = 32
@@ -71,6 +76,15 @@ class AdaptTuning:
 
 
 ADAPT_TUNING = AdaptTuning()
+PUBLISHED_CHANNELS = (3, 64, 128, 256)  # before those of the features
+PUBLISHED_KERNEL = 5
+
+
+def with_published_network(tuning: AdaptTuning) -> AdaptTuning:
+    """The tuning with DINO-Tracker's network and rate. Its three halvings lead from
+    8 x 8 colors to a cell.
+    """
+    return replace(tuning, refiner="published", colors_per_cell=8, learning_rate=0.01)
 
 
 class Track(NamedTuple):
@@ -110,6 +124,51 @@ class ResidualNetwork(nn.Module):
         x = functional.gelu(self.inner(inputs))
         x = functional.gelu(self.middle(x))
         return maps + self.feature_norm * self.outer(x)
+
+
+class PublishedNetwork(nn.Module):
+    """DINO-Tracker's correction (Tumanyan et al. 2024): four convolutions of the
+    colors alone, halved by blur-pooling (Zhang 2019) after each but the last, which
+    starts at zero. With 1024 features it has 7.6 million weights.
+    """
+
+    blur: Tensor
+
+    def __init__(self, channels: int, feature_norm: float, tuning: AdaptTuning) -> None:
+        """For features of `channels` whose mean length is `feature_norm`."""
+        super().__init__()
+        self.feature_norm = feature_norm
+        self.colors_per_cell = tuning.colors_per_cell
+        sizes = (*PUBLISHED_CHANNELS, channels)
+        self.layers = nn.ModuleList(
+            nn.Conv2d(a, b, PUBLISHED_KERNEL, padding="same", padding_mode="replicate")
+            for a, b in pairwise(sizes)
+        )
+        for parameter in self.layers[-1].parameters():
+            nn.init.zeros_(parameter)
+        binomial = torch.tensor([1.0, 3.0, 3.0, 1.0]) / 8
+        self.register_buffer("blur", torch.outer(binomial, binomial)[None, None])
+
+    def forward(self, maps: Tensor, colors: Tensor) -> Tensor:
+        """As `ResidualNetwork`, for colors of 8 x 8 to a cell."""
+        x = functional.pixel_shuffle(colors - 0.5, self.colors_per_cell)
+        for layer in list(self.layers)[:-1]:
+            x = self.halve(functional.relu(layer(x)))
+        return maps + self.feature_norm * self.layers[-1](x)
+
+    def halve(self, x: Tensor) -> Tensor:
+        """Maps (B, C, 2h, 2w) blurred and subsampled to (B, C, h, w)."""
+        channels = x.shape[1]
+        padded = functional.pad(x, (1, 1, 1, 1), mode="replicate")
+        kernel = self.blur.expand(channels, -1, -1, -1)
+        return functional.conv2d(padded, kernel, stride=2, groups=channels)
+
+
+def build_refiner(channels: int, feature_norm: float, tuning: AdaptTuning) -> RefinerNetwork:
+    """The network of the settings, which starts as the identity."""
+    if tuning.refiner == "published":
+        return PublishedNetwork(channels, feature_norm, tuning)
+    return ResidualNetwork(channels, feature_norm, tuning)
 
 
 def cell_colors(video: np.ndarray, features: Features, per_side: int) -> Tensor:
@@ -187,6 +246,9 @@ def closeness_loss(refined: Tensor, original: Tensor) -> Tensor:
     return angle + (length_ratio - 1) ** 2
 
 
+RefinerNetwork = ResidualNetwork | PublishedNetwork
+
+
 class TrainingClip:
     """Training data of one clip: features, colors, tracks and best buddies."""
 
@@ -205,8 +267,11 @@ class TrainingClip:
         are not learned from.
         """
         self.maps = features.maps
-        self.colors = cell_colors(video, features, tuning.colors_per_cell)
-        self.tracks = tracks
+        self.device = features.maps.device
+        self.colors = cell_colors(video, features, tuning.colors_per_cell).to(self.device)
+        self.tracks = [
+            Track(t.frames, t.start.to(self.device), t.end.to(self.device)) for t in tracks
+        ]
         self.neighbors = neighbors
         self.search = search
         self.tuning = tuning
@@ -216,7 +281,7 @@ class TrainingClip:
             (i, j): best_buddies(self.maps[i], self.maps[j], search.reach) for i, j in neighbors
         }
 
-    def losses(self, network: ResidualNetwork, rng: np.random.Generator) -> dict[str, Tensor]:
+    def losses(self, network: RefinerNetwork, rng: np.random.Generator) -> dict[str, Tensor]:
         """The mean losses of one step, over one pair of neighbors and one track."""
         i, j = self.neighbors[rng.integers(len(self.neighbors))]
         original = self.maps[[i, j]]
@@ -236,7 +301,7 @@ class TrainingClip:
         h, w = refined.shape[-2:]
         # between cells, so that snapping to cells costs
         drawn = rng.random((self.tuning.points_per_step, 2)) * [w - 1, h - 1]
-        start = torch.from_numpy(drawn).float()
+        start = torch.from_numpy(drawn).float().to(self.device)
         there = locate(sample_features(refined[0], start), start, refined[1], self.search)
         back = locate(sample_features(refined[1], there), there, refined[0], self.search)
         return cycle_loss(start, back, self.tuning)
@@ -248,25 +313,27 @@ class TrainingClip:
 
         `refined` (2, C, h, w) are the features of both frames.
         """
-        chosen = torch.from_numpy(rng.integers(len(cells), size=self.tuning.points_per_step))
+        chosen = self.draw(len(cells), rng)
         queries = refined[0].flatten(1).T[cells[chosen]]
         return buddies_loss(queries, refined[1], buddies[chosen], self.search.temperature)
 
-    def trajectory(
-        self, network: ResidualNetwork, track: Track, rng: np.random.Generator
-    ) -> Tensor:
+    def trajectory(self, network: RefinerNetwork, track: Track, rng: np.random.Generator) -> Tensor:
         """The trajectory loss (N,) of some points of a track.
 
         Each is searched within reach of its true end.
         """
         a, b = self.refine(network, list(track.frames))
-        count = self.tuning.points_per_step
-        chosen = torch.from_numpy(rng.integers(len(track.start), size=count))
+        chosen = self.draw(len(track.start), rng)
         end = track.end[chosen]
         found = locate(sample_features(a, track.start[chosen]), end, b, self.search)
         return trajectory_loss(found, end, self.tuning)
 
-    def refine(self, network: ResidualNetwork, frames: list[int]) -> Tensor:
+    def draw(self, count: int, rng: np.random.Generator) -> Tensor:
+        """Random numbers below `count`, one for each point of a step."""
+        drawn = rng.integers(count, size=self.tuning.points_per_step)
+        return torch.from_numpy(drawn).to(self.device)
+
+    def refine(self, network: RefinerNetwork, frames: list[int]) -> Tensor:
         """The corrected features of some frames."""
         return network(self.maps[frames], self.colors[frames])
 
@@ -279,7 +346,8 @@ def adapt_features(clip: TrainingClip, steps: int, seed: int) -> Tensor:
     tuning = clip.tuning
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = ResidualNetwork(clip.maps.shape[1], clip.feature_norm, tuning)
+        network = build_refiner(clip.maps.shape[1], clip.feature_norm, tuning)
+    network.to(clip.device)
     rng = np.random.default_rng(seed)
     optimizer = torch.optim.Adam(network.parameters(), tuning.learning_rate)
     weights = tuning.weights()

@@ -22,6 +22,7 @@ from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD, pretrained
 from hdr_nsff.priors.weights import find
 
@@ -83,34 +84,42 @@ def feature_source(
     layer: int | None = None,
     stride: int | None = None,
     tuning: FeatureTuning = FEATURE_TUNING,
+    device: torch.device = CPU,
 ) -> FeatureSource:
     """The features called `name`, with the `weights` given, or where weights are kept.
 
-    `layer` (layers that run) and `stride` (pixels from token to token) are of DINOv2
-    alone. InputError where weights are missing, or where XFeat is given one of the two.
+    They are computed on `device` and stay there. `layer` (layers that run) and `stride`
+    (pixels from token to token) are of DINOv2 alone. InputError where weights are
+    missing, or where XFeat is given one of the two.
     """
     if name != "xfeat":
-        network = pretrained("Dinov2Model", name, weights)
+        network = pretrained("Dinov2Model", name, weights).to(device)
         return partial(dinov2_features, network, layer=layer, stride=stride, tuning=tuning)
     if layer is not None or stride is not None:
         raise InputError(
             "--semantic.layer and --semantic.stride: apply to the features of DINOv2 only; "
             "leave them out with `xfeat`"
         )
-    return partial(xfeat_features, load_xfeat(find("xfeat", weights)), tuning=tuning)
+    xfeat = load_xfeat(find("xfeat", weights)).to(device)
+    return partial(xfeat_features, xfeat, tuning=tuning)
 
 
 def run_per_frame(
-    video: np.ndarray, scale: float, multiple: int, network: Callable[[Tensor], Tensor]
+    video: np.ndarray,
+    scale: float,
+    multiple: int,
+    network: Callable[[Tensor], Tensor],
+    device: torch.device,
 ) -> Tensor:
     """The maps (T, C, h, w) of `network` for each frame of `video` (T, H, W, 3).
 
-    The network sees frames `scale` times as large, padded to a `multiple` of pixels.
+    The network is on `device`. It sees frames `scale` times as large, padded to a
+    `multiple` of pixels.
     """
     maps = []
     with torch.no_grad():
         for frame in track(video, "features"):
-            maps.append(network(enlarge_and_pad(frame, scale, multiple)))
+            maps.append(network(enlarge_and_pad(frame, scale, multiple).to(device)))
     return torch.cat(maps)
 
 
@@ -207,7 +216,8 @@ def xfeat_features(
     """`FeatureSource` by XFeat: 64 channels every 8 pixels, every 4 of small frames."""
     height, width = video.shape[1:3]
     scale = 2 if height * width < tuning.doubled_below_pixels else 1
-    maps = run_per_frame(video, scale, XFEAT_MULTIPLE, network)
+    device = next(network.buffers()).device
+    maps = run_per_frame(video, scale, XFEAT_MULTIPLE, network, device)
     return Features(maps, XFEAT_STRIDE / scale, XFEAT_ORIGIN / scale)
 
 
@@ -237,7 +247,8 @@ def dinov2_features(
             f"--semantic.stride {stride}: the patches are {patch} pixels wide; choose 1 to {patch}"
         )
     scale = tuning.dino_longer_side_px / max(video.shape[1:3])
-    maps = run_per_frame(video, scale, patch, partial(patch_tokens, network, layer, stride))
+    tokens = partial(patch_tokens, network, layer, stride)
+    maps = run_per_frame(video, scale, patch, tokens, network.device)
     return Features(maps, stride / scale, patch / 2 / scale)
 
 
@@ -249,7 +260,7 @@ def patch_tokens(network: Any, layer: int, stride: int, rgb: Tensor) -> Tensor:
     """
     embeddings = network.embeddings
     projection = embeddings.patch_embeddings.projection
-    normalized = (rgb - IMAGENET_MEAN) / IMAGENET_STD
+    normalized = (rgb - IMAGENET_MEAN.to(rgb)) / IMAGENET_STD.to(rgb)
     patches = functional.conv2d(normalized, projection.weight, projection.bias, stride)
     size = list(patches.shape[-2:])  # (1, C, h, w)
 

@@ -13,20 +13,23 @@ Cells are those of `Features`; flow is in pixels, x then y, as in `dense`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.round_trip import follow, round_trip
 from hdr_nsff.priors.flow.adapt import (
     AdaptTuning,
+    Refiner,
     Track,
     TrainingClip,
     adapt_features,
     cell_colors,
+    with_published_network,
 )
 from hdr_nsff.priors.flow.correlation import Search, feature_motion
 from hdr_nsff.priors.flow.dense import (
@@ -66,6 +69,10 @@ class SemanticConfig:
     steps: int | None = None
     """Steps of fitting the features to the clip; 0 leaves them as they are. Default: 0
     for XFeat, which did not gain by it, 300 for DINOv2.
+    """
+    refiner: Refiner = "small"
+    """The network that is fitted. small: seconds on a CPU; published: the paper's, with
+    its rate (it ran 10,000 steps).
     """
     seed: int = 0
     """Random seed of that fitting."""
@@ -110,18 +117,24 @@ def semantic_flow(
     equal: Pairs,
     tuning: SemanticTuning = SEMANTIC_TUNING,
     dense: DenseFlowTuning = DENSE_FLOW_TUNING,
+    device: torch.device = CPU,
 ) -> SemanticFlow:
     """The flow prior of these settings.
 
     `weights` are of the features, None for where weights are kept; pairs as in
-    `SemanticFlow`. InputError for settings out of range.
+    `SemanticFlow`. Features are computed, fitted and searched for on `device`.
+    InputError for settings out of range.
     """
     steps = config.steps
     if steps is None:
         steps = 0 if config.features == "xfeat" else DINOV2_STEPS
     if steps < 0:
         raise InputError(f"--semantic.steps {steps}: must be 0 or more")
-    source = feature_source(config.features, weights, config.layer, config.stride, tuning.features)
+    if config.refiner == "published":
+        tuning = replace(tuning, adapt=with_published_network(tuning.adapt))
+    source = feature_source(
+        config.features, weights, config.layer, config.stride, tuning.features, device
+    )
     return SemanticFlow(source, neighbors, equal, steps, config.seed, tuning, dense)
 
 
@@ -220,8 +233,8 @@ def coarse_flow(
     search = tuning.search(features, video)
     maps = features.maps
     with torch.no_grad():
-        forward = feature_motion(maps[i], maps[j], search).numpy()
-        backward = feature_motion(maps[j], maps[i], search).numpy()
+        forward = feature_motion(maps[i], maps[j], search).cpu().numpy()
+        backward = feature_motion(maps[j], maps[i], search).cpu().numpy()
         cell_rgb = cell_colors(video[[i, j]], features, 1).permute(0, 2, 3, 1).numpy()
 
     def to_pixels(

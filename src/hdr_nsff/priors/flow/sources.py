@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.flow_files import read_flow_files
 from hdr_nsff.priors.flow.dense import DenseFlowTuning, FlowPrior, dense_flow
 from hdr_nsff.priors.flow.networks import (
@@ -107,11 +108,14 @@ def flow_source(
     neighbors: Pairs = (),
     equal: Pairs = (),
     tuning: FlowTuning = FLOW_TUNING,
+    device: torch.device = CPU,
 ) -> FlowPrior:
     """The flow prior that `--flow` chose, for the `video` and `pairs` of a whole clip.
 
     `SemanticFlow` uses the settings `semantic` (the defaults where None) and fits its
-    features to `neighbors` and `equal`. InputError where weights are missing.
+    features to `neighbors` and `equal`. Networks, and the search for their features,
+    run on `device`; dense inverse search runs on the CPU. InputError where weights are
+    missing.
     """
     semantic = semantic or SemanticConfig()
     match source := resolve_source(chosen, semantic.features):
@@ -120,11 +124,12 @@ def flow_source(
         case "dis":
             return partial(dense_flow, tuning=tuning.dense)
         case "semantic":
-            return semantic_flow(semantic, weights, neighbors, equal, tuning.semantic, tuning.dense)
+            tunings = tuning.semantic, tuning.dense
+            return semantic_flow(semantic, weights, neighbors, equal, *tunings, device)
         case "gmflow" | "raft":
-            network = load_network(source, weights, default_device())
+            network = load_network(source, weights, device)
         case "raft-finetuned":
-            network = load_network(None, weights, default_device())
+            network = load_network(None, weights, device)
         case _:
             assert_never(source)
     return partial(network_flow, network, tuning=tuning.network, dense=tuning.dense)
@@ -148,11 +153,6 @@ def flow_weights(
             return [weights_file(None, weights)]
         case _:
             assert_never(source)
-
-
-def default_device() -> torch.device:
-    """The GPU where there is one, else the CPU."""
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
 def flow_from_folder(

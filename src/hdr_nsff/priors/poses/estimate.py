@@ -13,9 +13,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import Poses, interpolate
 from hdr_nsff.priors.poses.lightglue import Matcher
@@ -59,14 +61,15 @@ def estimate_poses(
     threads: int = 0,
     matcher: Matcher = "sift",
     tuning: PosesTuning = PosesTuning(),
+    device: torch.device = CPU,
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
     `masks` (T, H, W) bool moving; `clipped` (T, H, W) bool without information;
     `camera_ids` (T,) the physical camera of each frame (each has its own focal length),
-    by default one. `matcher` finds and matches keypoints for structure from motion;
-    `threads` 0 uses all cores. Temporary files go into `workdir`. InputError where
-    poses cannot be estimated.
+    by default one. `matcher` finds and matches keypoints for structure from motion, a
+    learned one on `device`; `threads` 0 uses all cores. Temporary files go into
+    `workdir`. InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -86,7 +89,9 @@ def estimate_poses(
     if poses is None:
         views = sfm_views(video, ignore, groups, tuning.reconstruction)
         try:
-            model, scale = best_model(views, Path(workdir), threads, matcher, tuning.reconstruction)
+            model, scale = best_model(
+                views, Path(workdir), threads, matcher, tuning.reconstruction, device
+            )
             poses = poses_from_model(model, views, scale, video.shape[1:3], tuning.reconstruction)
         except InputError as error:
             if share is not None and share >= tuning.min_rotation_share_fallback:

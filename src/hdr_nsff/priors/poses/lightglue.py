@@ -20,6 +20,7 @@ from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.priors.weights import find
 
 Matcher = Literal["sift", "aliked", "disk"]
@@ -68,13 +69,13 @@ def match_images(
     pairs: Sequence[tuple[int, int]],
     matcher: Matcher,
     tuning: LightGlueTuning = LightGlueTuning(),
+    device: torch.device = CPU,
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """Keypoints (N, 2) of every image, and matches (M, 2) of every pair, rows of both.
 
     `images` (H, W, 3) rgb in [0, 1]; keypoints lie where `masks` (H, W) are above 0.
-    InputError where kornia or weights are missing.
+    The networks run on `device`. InputError where kornia or weights are missing.
     """
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     extractor, lightglue = load_networks(matcher, device, tuning)
     with torch.inference_mode():
         keypoints = [

@@ -14,11 +14,13 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import encode
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
@@ -146,9 +148,11 @@ def best_model(
     threads: int,
     matcher: Matcher,
     tuning: ReconstructionTuning = ReconstructionTuning(),
+    device: torch.device = CPU,
 ) -> tuple[ColmapModel, int]:
     """The best reconstruction of the views, and how many times larger than the views
-    its images were. InputError where none is good enough.
+    its images were. A learned `matcher` runs on `device`. InputError where no
+    reconstruction is good enough.
     """
     count = len(views.images)
     best: ColmapModel | None = None
@@ -161,7 +165,9 @@ def best_model(
     contrasts = {"leveled": True, "plain": False} if matcher == "sift" else {"plain": False}
     for contrast, level_contrast in contrasts.items():
         with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
-            job = write_job(Path(folder), views, scale, level_contrast, threads, matcher, tuning)
+            job = write_job(
+                Path(folder), views, scale, level_contrast, threads, matcher, tuning, device
+            )
             for mapping in ("incremental", "global"):
                 try:
                     models = [read_model(p) for p in sfm.run(replace(job, mapping=mapping))]
@@ -192,6 +198,7 @@ def write_job(
     threads: int,
     matcher: Matcher,
     tuning: ReconstructionTuning = ReconstructionTuning(),
+    device: torch.device = CPU,
 ) -> sfm.Job:
     """Write the images and masks, and learned matches if those are wanted, into a
     `folder`; the job that maps them.
@@ -206,7 +213,7 @@ def write_job(
     named_pairs = [(names[a], names[b]) for a, b in pairs]
     if matcher != "sift":
         images = [upsample(image, scale) for image in views.images]
-        keypoints, matches = match_images(images, masks, pairs, matcher, tuning.lightglue)
+        keypoints, matches = match_images(images, masks, pairs, matcher, tuning.lightglue, device)
         sfm.write_matches(folder, names, keypoints, named_pairs, matches)
     return sfm.Job(
         folder=str(folder),

@@ -1,0 +1,169 @@
+"""A pretend accelerator: its tensors are CPU tensors in a wrapper that claims another
+device. Operations refuse to mix the two, as CUDA does.
+
+    with pretend_device() as device:
+        x = torch.ones(3, device=device)
+        x + torch.ones(3)  # RuntimeError
+
+Allowed, as on CUDA: CPU scalars of no dimension, CPU tensors as indices, and copies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten, tree_map
+from torch.utils.backend_registration import (
+    _DummyBackendModule,
+    _setup_privateuseone_for_python_backend,
+)
+
+NAME = "pretend"
+aten = torch.ops.aten
+COPIES = {aten._to_copy.default, aten.copy_.default, aten._copy_from.default}
+INDEXED = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default}
+INDEXED |= {aten._index_put_impl_.default, aten._unsafe_index.Tensor}
+# what torch calls where no mode sees it, to copy the numbers of Python lists
+UNSEEN = [aten.empty_strided.default, aten.empty.memory_format, aten._copy_from.default]
+
+
+class PretendTensor(Tensor):
+    """A tensor on the pretend device; `inner` holds its numbers."""
+
+    inner: Tensor
+
+    @staticmethod
+    def __new__(cls, inner: Tensor) -> PretendTensor:
+        made = Tensor._make_wrapper_subclass(
+            cls,
+            inner.size(),
+            strides=inner.stride(),
+            storage_offset=inner.storage_offset(),
+            dtype=inner.dtype,
+            device=torch.device(NAME, 0),
+        )
+        made.inner = inner
+        return made
+
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+    def __repr__(self) -> str:  # type: ignore[override]
+        return f"PretendTensor({self.inner})"
+
+    def __format__(self, format_spec: str) -> str:
+        return format(self.inner, format_spec)
+
+    def tolist(self) -> Any:
+        """Numbers on the host; torch has none for subclasses."""
+        return self.inner.tolist()
+
+    @classmethod
+    def __torch_dispatch__(
+        cls, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        return execute(func, args, kwargs or {})
+
+
+class PretendMode(TorchDispatchMode):
+    """Sees every operation, those that make tensors from nothing included."""
+
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: Any = None
+    ) -> Any:
+        if torch.is_inference_mode_enabled():  # which takes no operation apart by itself
+            with self:
+                result = func.decompose(*args, **(kwargs or {}))
+            if result is not NotImplemented:
+                return result
+        return execute(func, args, kwargs or {})
+
+
+def execute(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+    """Run an operation on the numbers, once its devices agree."""
+    tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+    there = any(isinstance(x, PretendTensor) for x in tensors)
+    wanted = kwargs.get("device")
+    if there:
+        check_devices(func, args, tensors)
+    on_device = there if wanted is None else torch.device(wanted).type == NAME
+    if func is aten.copy_.default:
+        on_device = isinstance(args[0], PretendTensor)
+    if func is aten._copy_from.default:
+        args[1].inner.copy_(unwrap(args[0]))
+        return args[1]
+    generator = kwargs.get("generator")
+    if on_device and generator is not None and generator.device.type != NAME:
+        raise RuntimeError(f"{func}: a generator of the {generator.device} for a tensor elsewhere")
+    if wanted is not None:
+        kwargs = kwargs | {"device": torch.device("cpu")}
+    if kwargs.get("pin_memory"):
+        kwargs = kwargs | {"pin_memory": False}
+    inner_args, inner_kwargs = tree_map(unwrap, (args, kwargs))
+    with torch.inference_mode(False), torch.no_grad():
+        result = func(*inner_args, **inner_kwargs)
+        return tree_map(lambda x: rewrap(x, args, kwargs, on_device), result)
+
+
+def check_devices(func: Any, args: tuple[Any, ...], tensors: list[Tensor]) -> None:
+    """RuntimeError where tensors of both devices meet in an operation."""
+    if func in COPIES:
+        return
+    if func in INDEXED:
+        tensors = [args[0], *args[2:3]]
+    for x in tensors:
+        if isinstance(x, Tensor) and not isinstance(x, PretendTensor) and x.ndim > 0:
+            shapes = [tuple(t.shape) for t in tensors]
+            raise RuntimeError(f"{func}: tensors on the CPU and on {NAME} meet: {shapes}")
+
+
+def unwrap(x: Any) -> Any:
+    return x.inner if isinstance(x, PretendTensor) else x
+
+
+def rewrap(x: Any, args: tuple[Any, ...], kwargs: dict[str, Any], on_device: bool) -> Any:
+    """A result on the device; the argument itself where an operation was in place."""
+    if not isinstance(x, Tensor) or not on_device:
+        return x
+    for given in tree_flatten((args, kwargs))[0]:
+        if isinstance(given, PretendTensor) and given.inner is x:
+            return given
+    return PretendTensor(x)
+
+
+class Backend(_DummyBackendModule):
+    """What torch asks of a device's module."""
+
+    def get_amp_supported_dtype(self) -> list[torch.dtype]:
+        return [torch.bfloat16]
+
+
+def register() -> torch.library.Library:
+    """Make torch know the device, before its first gradient. Operations that no mode
+    sees, as where torch copies numbers of Python lists, come to the same place.
+    """
+    _setup_privateuseone_for_python_backend(NAME, Backend())
+    library = torch.library.Library("aten", "IMPL")
+    for func in UNSEEN:
+        library.impl(func, partial(call, func), "PrivateUse1")
+    return library
+
+
+def call(func: Any, *args: Any, **kwargs: Any) -> Any:
+    """`execute` of a call as it was written."""
+    return execute(func, args, kwargs)
+
+
+LIBRARY = register()
+
+
+@contextmanager
+def pretend_device() -> Iterator[torch.device]:
+    """The device, for as long as the context lasts."""
+    with PretendMode():
+        yield torch.device(NAME, 0)

@@ -1,0 +1,114 @@
+"""Every preset trains, renders and evaluates on another device than the CPU: a pretend
+one that refuses to mix devices (`pretend_device.py`). It computes what the CPU does.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from presets import random_field, small
+from pretend_device import PretendTensor, pretend_device
+from torch import nn
+
+from hdr_nsff.core import distributed
+from hdr_nsff.core.tensors import to_device
+from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.rendering.shot_views import plan_shot
+from hdr_nsff.rendering.shots import Output, Shot, render_shot
+from hdr_nsff.scene.batch import Recorder
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.presets import METHODS
+from hdr_nsff.training.run_folder import Run, open_folder
+from hdr_nsff.training.train import Trainer, train
+
+STEPS = 5
+EACH_FIELD = ["splat", "grid", "paper", "nerf-wt", "hdr-hexplane"]
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
+    with pretend_device() as found:
+        monkeypatch.setattr("hdr_nsff.fields.build.pick_device", lambda name: found)
+        yield found
+
+
+def test_the_pretend_device_refuses_tensors_of_the_cpu(device: torch.device) -> None:
+    there = torch.rand(3, device=device)
+    for mixed in (
+        lambda: there + torch.rand(3),
+        lambda: torch.cat([there, torch.rand(3)]),
+        lambda: nn.Linear(3, 2)(there),
+        lambda: torch.rand(3)[there > 0.5],
+    ):
+        with pytest.raises(RuntimeError, match=r"tensors on the CPU and on pretend meet"):
+            mixed()
+    with pytest.raises(RuntimeError, match="numpy"):
+        there.numpy()
+    with pytest.raises(RuntimeError, match="generator"):
+        torch.rand(3, device=device, generator=torch.Generator())
+
+
+def test_the_pretend_device_computes_gradients(device: torch.device) -> None:
+    there = torch.tensor([1.0, 2.0], device=device, requires_grad=True)
+    (there[[1, 0]] * torch.tensor(3.0)).square().sum().backward()
+    assert isinstance(there.grad, PretendTensor) and there.grad.tolist() == [18.0, 36.0]
+
+
+@pytest.mark.parametrize("preset", list(METHODS))
+def test_a_preset_trains_renders_and_evaluates(
+    preset: str, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    train(small(preset, toy_folder, tmp_path / "run", STEPS), previews=False)
+    run = Run.open(tmp_path / "run")
+    moved = [*run.field.parameters(), *run.tonemapper.parameters()]
+    assert run.step == STEPS and all(isinstance(p, PretendTensor) for p in moved)
+    at_time, between = plan_shot(run, "slowmo", factor=2).views[:2]
+    views = [replace(at_time, ev=-1.0).resized(0.5), between.resized(0.5)]
+    render_shot(run, Shot("some", views, 12), tmp_path, Output(video=False))
+    metrics = evaluate_run(run, None)
+    assert metrics["headline"]["psnr"] > 0
+
+
+@pytest.mark.parametrize("preset", ["splat", "grid"])
+def test_poses_are_corrected_on_the_device(
+    preset: str, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    train(replace(small(preset, toy_folder, tmp_path / "run", STEPS), refine_poses=True))
+    assert Run.open(tmp_path / "run").step == STEPS
+
+
+@pytest.mark.parametrize("preset", EACH_FIELD)
+def test_a_step_has_the_losses_of_the_cpu(
+    preset: str, toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    config = small(preset, toy_folder)
+
+    def first_step(out: Path, where: torch.device) -> dict[str, float]:
+        of_folder = replace(config, out=out)
+        open_folder(of_folder)
+        return Trainer(of_folder, toy, where, distributed.Ranks()).step()
+
+    expected = first_step(tmp_path / "cpu", torch.device("cpu"))
+    with pretend_device() as device:
+        found = first_step(tmp_path / "pretend", device)
+    assert found == pytest.approx(expected, rel=2e-3, abs=1e-5)
+
+
+@pytest.mark.parametrize("preset", EACH_FIELD)
+def test_a_picture_is_that_of_the_cpu(preset: str, toy: Scene) -> None:
+    field, camera = random_field(preset, toy).eval(), toy.train[2].camera
+    recorder = Recorder(lambda radiance: radiance.clamp(0, 1), (2,))
+    expected = field.record(camera, 2.5, [recorder]) if hasattr(field, "record") else []
+    radiance = field.render(camera, 2.5).radiance
+    with pretend_device() as device:
+        field.to(device)
+        there = to_device(camera, device)
+        found = field.render(there, 2.5).radiance
+        assert isinstance(found, PretendTensor)
+        # the CPU's kernel skips Gaussians that hardly show
+        torch.testing.assert_close(found.cpu(), radiance, rtol=1e-3, atol=2e-3)
+        recorded = field.record(there, 2.5, [recorder]) if expected else []
+        for a, b in zip(recorded, expected, strict=True):
+            torch.testing.assert_close(a.cpu(), b, rtol=1e-3, atol=2e-3)
