@@ -160,6 +160,32 @@ def bench_clips(document: Document) -> Lines:
     return table(["clip", "PSNR", "SSIM", "steps"], rows)
 
 
+def exposure_steps(document: Document) -> Lines:
+    """One line per clip: the largest errors of its steps, by what was recorded."""
+    kinds = {"with noise": True, "without": False, "as filmed": None}
+    clips = list(dict.fromkeys(run["clip"] for run in document["results"]))
+    rows = []
+    for clip in clips:
+        row = [f"`{clip}`"]
+        for noise in kinds.values():
+            runs = [r for r in document["results"] if r["clip"] == clip and r.get("noise") == noise]
+            worst = max((run["max_step_error"] for run in runs), default=None)
+            row += [f"{len(runs)}: {number(worst, 2)}" if runs else "-"]
+        rows.append(row)
+    return table(["clip", *kinds], rows)
+
+
+def exposure_drift(document: Document) -> Lines:
+    """One line per auto-exposed clip."""
+    rows = []
+    for run in document["results"]:
+        row = [run["clip"], "lossless" if run["lossless"] else "compressed"]
+        names = ("median_error", "error_95", "median_error_at_best_factor")
+        rows.append(row + [number(run[name], 3) for name in names])
+    header = ["clip", "frames", "median error", "95 %", "median but for a common factor"]
+    return table(header, rows)
+
+
 def bench_ablations(document: Document) -> Lines:
     """One line per ablation, one column per scene."""
     runs = [run for run in document["results"] if run["status"] == "done"]
@@ -229,6 +255,24 @@ SECTIONS = (
         "estimated masks.",
         "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --views 0",
         bench_clips,
+    ),
+    Section(
+        "exposure_cycles",
+        "Exposure steps, nothing given",
+        "Number of recordings, and the largest error of a step among them in EV. Five clips "
+        "are re-exposed at steps of 1.3 to 2.4 stops, with a sensor's noise and without; the "
+        "others are as filmed, against the exposures of their names or EXIF. The method's "
+        "constants were chosen on these clips.",
+        "python benchmarks/exposure_cycles.py --steps WORK --data DATA --scenes SCENE ...",
+        exposure_steps,
+    ),
+    Section(
+        "auto_exposure",
+        "Auto exposure",
+        "Errors of every frame's EV on clips re-exposed with `--exposure auto`, which drift "
+        "by 3 EV. Most of the error is one common factor, the power that recordings leave open.",
+        "python benchmarks/exposure_cycles.py --drift SCENE TRUTH ...",
+        exposure_drift,
     ),
     Section(
         "sensitivity",
