@@ -13,10 +13,12 @@ from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
 # scenes, for minutes of training on a CPU)
 STATIC_PER_PIXEL, MAX_STATIC = 0.55, 80_000
 MOVING_PER_PIXEL, MAX_MOVING = 0.15, 20_000
-# default number of time-local Gaussians, per pixel of their masks in all frames, and at
-# most, also per pixel of all frames: about 8 times that many are alive at a time
-# (hand-chosen on real clips with people)
-LOCAL_PER_PIXEL, LOCAL_PER_FRAME_PIXEL, MAX_LOCAL = 0.5, 0.03, 400_000
+# default number of time-local Gaussians, per pixel of their masks in all frames; at
+# most, per frame by its pixels and in all (8 times as many are alive at a time), and in
+# the clip (hand-chosen on real clips with people)
+LOCAL_PER_PIXEL = 0.5
+LOCAL_PER_FRAME_PIXEL, MAX_LOCAL_PER_FRAME = 0.03, 4_000
+MAX_LOCAL = 400_000
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,8 @@ class SplatConfig:
     """
     local: Annotated[int, Ge(0), Le(10**8)] | None = None
     """Time-local Gaussians, for movers that are not rigid; default: one for every two
-    of their pixels in all frames, at most 0.03 for every pixel, and 400,000.
+    of their pixels in all frames, at most 0.03 for every pixel of every frame, 4,000
+    for every frame, and 400,000.
     """
     bases: Count = 6
     """Shared rigid motions that the moving ones mix."""
@@ -103,6 +106,7 @@ class SplatConfig:
         if moving is None:
             moving = min(round(MOVING_PER_PIXEL * num_pixels), MAX_MOVING)
         if local is None:
-            at_most = round(LOCAL_PER_FRAME_PIXEL * num_pixels * num_frames)
-            local = min(round(LOCAL_PER_PIXEL * local_pixels), at_most, MAX_LOCAL)
+            per_frame = min(LOCAL_PER_FRAME_PIXEL * num_pixels, MAX_LOCAL_PER_FRAME)
+            at_most = min(round(per_frame * num_frames), MAX_LOCAL)
+            local = min(round(LOCAL_PER_PIXEL * local_pixels), at_most)
         return static, moving, local
