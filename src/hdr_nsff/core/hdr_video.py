@@ -118,7 +118,7 @@ def to_frame(planes: Planes, transfer: str) -> Any:
     for target, codes in zip(frame.planes, planes, strict=True):
         rows = np.zeros((codes.shape[0], target.line_size // 2), "<u2")
         rows[:, : codes.shape[1]] = codes
-        target.update(rows)
+        target.update(rows.tobytes())
     return frame
 
 
