@@ -63,7 +63,7 @@ class Output:
     1000.
     """
     hdr_codec: Codec = "hevc"
-    """Of HDR videos: hevc plays on more screens, av1 is free of patents."""
+    """Of HDR videos: hevc plays on more screens, av1 is royalty-free."""
     ev: float | None = None
     """Develop at this exposure, relative to the reference; default: tone-map for a
     display.
