@@ -9,6 +9,7 @@ from fakes import H, W, fake_run
 from test_shot_views import path_file
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import ENCODERS
 from hdr_nsff.core.images import read_image
 from hdr_nsff.rendering.render import RenderConfig, check_size, render
 from hdr_nsff.rendering.shots import Output
@@ -43,6 +44,21 @@ def test_settings_that_make_no_sense_are_refused_in_a_sentence(tmp_path: Path) -
     for sentence, config in requests.items():
         with pytest.raises(InputError, match=sentence):
             render(config)
+
+
+@pytest.mark.usefixtures("opened")
+def test_hdr_videos_alone_may_be_wanted(tmp_path: Path) -> None:
+    output = Output(exr="none", png=False, video=False, hdr_video=("hlg", "pq"), hdr_codec="av1")
+    found = render(RenderConfig(tmp_path, path_file(tmp_path, 0.1, 2.5), scale=2, output=output))
+    names = ["ride_hlg_av1.mp4", "ride_pq_av1.mp4", "ride_sheet.png"]
+    assert sorted(p.name for p in (tmp_path / "render").glob("ride_*")) == names
+    assert set(found.values()) == {tmp_path / "render" / name for name in names[:2]}
+
+
+def test_a_missing_hdr_encoder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(ENCODERS, "hevc", "libnone")
+    with pytest.raises(InputError, match="this PyAV has no encoder libnone"):
+        render(RenderConfig(tmp_path, output=Output(hdr_video=("pq",))))
 
 
 @pytest.mark.parametrize("count", [10_001, 10**9, 10**400])

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from hdr_nsff.core.exr import REC709
+from hdr_nsff.maths.hdr_signal import rgb_to_xyz
 from hdr_nsff.training.run_folder import Run
 
 WhiteBalance = Literal["camera", "neutral"]
@@ -77,7 +78,4 @@ def white_of(gains: np.ndarray) -> tuple[float, float]:
 
 def rec709_to_xyz() -> np.ndarray:
     """The matrix (3, 3) from linear Rec. 709 to CIE XYZ (SMPTE RP 177)."""
-    xy = np.reshape(REC709, (4, 2))
-    xyz = np.column_stack([xy, 1 - xy.sum(1)]) / xy[:, 1:]  # luminance 1
-    primaries, white = xyz[:3].T, xyz[3]
-    return primaries * np.linalg.solve(primaries, white)
+    return rgb_to_xyz(REC709)

@@ -10,11 +10,12 @@ from typing import Annotated
 import tyro
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import check_encoder
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.shot_views import MAX_VIEWS, plan_shot, short_count
-from hdr_nsff.rendering.shots import Output, Shot, render_shot
+from hdr_nsff.rendering.shots import Output, Shot, name_results, render_shot
 from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.training.run_folder import Run
 
@@ -69,7 +70,8 @@ def render(config: RenderConfig) -> dict[str, Path]:
             return render_all(run, out, config.budget, config.output)
         planned = plan_shot(run, config.path, config.frame, config.factor, config.views)
         shot = resize_shot(planned, config.scale, config.fps)
-        return {shot.name: render_shot(run, shot, out, config.output)}
+        result = render_shot(run, shot, out, config.output)
+        return name_results(out, shot, shot.name, config.output, result)
 
 
 def resize_shot(shot: Shot, scale: float, fps: float | None) -> Shot:
@@ -114,7 +116,9 @@ def check_settings(config: RenderConfig) -> None:
     if output.ev is not None and not abs(output.ev) < MAX_EV:
         meaning = "an exposure in stops relative to the reference, like -2 or 1.5"
         raise InputError(f"--ev {output.ev:g}: {meaning}")
-    if output.exr == "none" and not output.png and not output.video:
+    if output.hdr_video:
+        check_encoder(output.hdr_codec)
+    if output.exr == "none" and not (output.png or output.video or output.hdr_video):
         options = "--exr none --no-png --no-video"
         raise InputError(f"{options}: nothing left to write; leave one of them out")
 

@@ -26,6 +26,7 @@ import torch
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS, write_exr
+from hdr_nsff.core.hdr_video import Codec, check_side
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
 from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import say, track
@@ -36,7 +37,9 @@ from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
+from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
+from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, write_hdr_shot
 from hdr_nsff.rendering.interpolate import Mode, render_at
 from hdr_nsff.training.run_folder import Run
 
@@ -55,6 +58,12 @@ class Output:
     """8-bit PNG."""
     video: bool = True
     """8-bit H.264 MP4."""
+    hdr_video: tuple[Transfer, ...] = ()
+    """10-bit HDR MP4: hlg, pq (HDR10) or both. Diffuse white is 203 nits, the peak
+    1000.
+    """
+    hdr_codec: Codec = "hevc"
+    """Of HDR videos: hevc plays on more screens, av1 is royalty-free."""
     ev: float | None = None
     """Develop at this exposure, relative to the reference; default: tone-map for a
     display.
@@ -227,12 +236,17 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     if not 0 <= output.camera_id < cameras:
         problem = f"the run has learned cameras 0 to {cameras - 1}"
         raise InputError(f"camera {output.camera_id}: {problem}")
+    for path in hdr_files(out, shot.name, output):
+        camera = shot.views[0].camera
+        check_side(path, camera.width // 2 * 2, camera.height // 2 * 2)
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
     sheet = out / f"{shot.name}_sheet.png"
-    note = open_sequence(run, shot, folder, output, [video, sheet])
+    products = [video, sheet, *hdr_paths(out, shot.name)]
+    note = open_sequence(run, shot, folder, output, products)
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
-    if note.complete and all(p.exists() for p in wanted_files(pictures, video, output)):
+    wanted = [*wanted_files(pictures, video, output), *hdr_files(out, shot.name, output)]
+    if note.complete and all(path.exists() for path in wanted):
         say(f"{shot.name}: all {len(shot.views)} views are there already ({folder})")
         return result
     start = time.monotonic()
@@ -240,10 +254,13 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
         write_view(run, view, picture, output, note.display_exposure)
     if output.video:
         write_video(video, (read_image(p) for p in pictures), shot.fps)
+    write_hdr_videos(run, shot, pictures, out, output, note.display_exposure)
     write_sheet(sheet, pictures)
-    if not output.png:
-        for picture in pictures:
+    for picture in pictures:
+        if not output.png:
             picture.unlink(missing_ok=True)
+        if output.exr == "none":
+            picture.with_suffix(".exr").unlink(missing_ok=True)
     seconds = round(note.seconds + time.monotonic() - start, 2)
     done = note.model_copy(update={"complete": True, "seconds": seconds})
     notes.write(folder / "sequence.json", done)
@@ -260,6 +277,44 @@ def wanted_files(pictures: Sequence[Path], video: Path, output: Output) -> list[
     if output.video:
         wanted.append(video)
     return wanted
+
+
+def name_results(
+    out: Path, shot: Shot, label: str, output: Output, result: Path
+) -> dict[str, Path]:
+    """What a user gets of a shot: `result` of `render_shot` and the HDR videos."""
+    videos = hdr_files(out, shot.name, output)
+    named = {f"{label}, {t}": path for t, path in zip(output.hdr_video, videos, strict=True)}
+    with_pictures = output.video or output.png or output.exr != "none"
+    if not with_pictures:
+        return named
+    return {label: result, **named}
+
+
+def hdr_files(out: Path, name: str, output: Output) -> list[Path]:
+    """The HDR videos that `output` asks for."""
+    return hdr_paths(out, name, output.hdr_video, [output.hdr_codec])
+
+
+def write_hdr_videos(
+    run: Run,
+    shot: Shot,
+    pictures: Sequence[Path],
+    out: Path,
+    output: Output,
+    display_exposure: float,
+) -> None:
+    """The HDR videos of a shot, from the EXR files beside its `pictures`.
+
+    Exposed at the EV that was asked for, else as for a display.
+    """
+    files = [picture.with_suffix(".exr") for picture in pictures]
+    exposure = display_exposure if output.ev is None else 2.0**output.ev
+    balanced = output.white_balance, output.camera_id
+    for transfer in output.hdr_video:
+        path = hdr_path(out, shot.name, transfer, output.hdr_codec)
+        codec = output.hdr_codec
+        write_hdr_shot(run, files, path, transfer, codec, shot.fps, exposure, *balanced)
 
 
 def write_sheet(path: Path, pictures: Sequence[Path]) -> None:
@@ -279,7 +334,8 @@ def open_sequence(
     Pictures and `products` of other settings or of another checkpoint are removed.
     InputError for files that no `render` has written.
     """
-    key = fingerprint(run, shot.views, shot.fps, output)
+    pictures = replace(output, hdr_video=(), hdr_codec="hevc")  # HDR videos change none
+    key = fingerprint(run, shot.views, shot.fps, pictures)
     path = folder / "sequence.json"
     found = notes.read(path, notes.Sequence)
     if found is not None and found.key == key:
@@ -320,10 +376,11 @@ def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure
     `exposure` is that of the display.
     """
     exr = picture.with_suffix(".exr")
-    with_exr = output.exr != "none"
+    with_vectors = output.exr != "none"
+    with_exr = with_vectors or bool(output.hdr_video)  # HDR videos are made from EXR
     if picture.exists() and (exr.exists() or not with_exr):
         return
-    still = render_still(run, view, output.between, motion=with_exr)
+    still = render_still(run, view, output.between, motion=with_vectors)
     ev = ev_of(view, output)
     if with_exr:
         header = radiance_header(run, output.white_balance, output.camera_id)
@@ -333,5 +390,5 @@ def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure
             header["developedEV"] = float(ev)
         stored = balance(run, still.radiance, output.white_balance, output.camera_id)
         stored_still = replace(still, radiance=stored)
-        write_still(exr, stored_still, view, output.exr == "half", header)
+        write_still(exr, stored_still, view, output.exr != "float", header)
     write_png(picture, develop_view(run, view, still.radiance, ev, output.camera_id, exposure))

@@ -22,7 +22,14 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.set_pictures import write_pictures
 from hdr_nsff.rendering.shot_views import SHOTS, find_frame, plan_shot
-from hdr_nsff.rendering.shots import Output, Shot, fingerprint, render_shot, render_still
+from hdr_nsff.rendering.shots import (
+    Output,
+    Shot,
+    fingerprint,
+    name_results,
+    render_shot,
+    render_still,
+)
 from hdr_nsff.training.run_folder import Run
 
 LABELS = {
@@ -74,7 +81,7 @@ def render_all(
             results |= write_pictures(run, out, shot, output)
         else:
             video = render_shot(run, shot, out, replace(output, exr="none"))
-        results[LABELS[shot.name]] = video
+        results |= name_results(out, shot, LABELS[shot.name], output, video)
     return results
 
 

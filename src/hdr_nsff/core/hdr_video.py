@@ -1,0 +1,163 @@
+"""HDR video: planes of 10-bit codes to HEVC Main 10 or AV1 in MP4, through PyAV.
+
+The codes are Y, Cb and Cr of BT.2100, limited range, 4:2:0. Stream and frames are
+tagged; PQ carries the metadata of HDR10: the mastering display (SMPTE ST 2086) and the
+content's light levels (CTA-861.3).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import atomic
+
+Codec = Literal["hevc", "av1"]
+Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+ENCODERS = {"hevc": "libx265", "av1": "libsvtav1"}
+# Codes of H.273, the same in both codecs
+REC2020_PRIMARIES = 9
+REC2020_MATRIX = 9  # non-constant luminance
+LIMITED_RANGE = 1
+TRANSFERS = {"pq": 16, "hlg": 18}
+PIXELS = "yuv420p10le"
+# Constant quality (hand-chosen: a gray patch and a ramp keep their codes within 2)
+HEVC_CRF = 14
+AV1_CRF = 18
+AV1_PRESET = 6  # of 0 (slow) to 13
+MIN_SIDE_PX = 64  # x265 4.2 overruns its buffers at widths of 48 and less
+
+
+@dataclass(frozen=True)
+class LightLevels:
+    """Light levels of a video (CTA-861.3), in nits."""
+
+    max_cll: float  # the largest channel of any pixel
+    max_fall: float  # the largest mean over a frame of the pixels' largest channels
+
+
+def check_encoder(codec: Codec) -> None:
+    """InputError where the user's PyAV has no encoder for `codec`."""
+    import av
+
+    encoder = ENCODERS[codec]
+    try:
+        av.Codec(encoder, "w")
+    except (av.FFmpegError, ValueError) as error:
+        advice = "`pip install --force-reinstall av` installs one that has it"
+        raise InputError(f"HDR video: this PyAV has no encoder {encoder}; {advice}") from error
+
+
+def write_hdr_video(
+    path: Path | str,
+    frames: Iterable[Planes],
+    fps: float,
+    transfer: str,
+    codec: Codec = "hevc",
+    light: LightLevels | None = None,
+    peak_nits: float = 1000.0,
+) -> int:
+    """Write planes Y (H, W), Cb, Cr (H/2, W/2) uint16 as MP4, atomically; their number.
+
+    `transfer` is `pq` or `hlg`. With `light` and the mastering display's `peak_nits`
+    the file is HDR10. H and W are even.
+    """
+    import av
+
+    check_encoder(codec)
+    os.environ.setdefault("SVT_LOG", "1")  # errors only: SVT-AV1 prints banners otherwise
+    count = 0
+    with (
+        atomic(path) as temporary,
+        av.open(str(temporary), "w", options={"movflags": "+faststart"}) as container,
+    ):
+        stream: Any = None
+        for planes in frames:
+            if stream is None:
+                height, width = planes[0].shape
+                check_side(path, width, height)
+                rate = Fraction(fps).limit_denominator(1001)
+                options = encoder_options(codec, transfer, light, peak_nits)
+                stream = container.add_stream(ENCODERS[codec], rate=rate, options=options)
+                stream.width, stream.height = width, height
+                stream.pix_fmt = PIXELS
+                if codec == "hevc":  # Apple's players take no other tag
+                    stream.codec_context.codec_tag = "hvc1"
+                tag_rec2020(stream.codec_context, transfer)
+            container.mux(stream.encode(to_frame(planes, transfer)))
+            count += 1
+        if stream is None:
+            raise InputError(f"{path}: no frames to write")
+        container.mux(stream.encode())
+    return count
+
+
+def check_side(path: Path | str, width: int, height: int) -> None:
+    """InputError for pictures that the encoders do not take."""
+    if min(width, height) < MIN_SIDE_PX:
+        size = f"pictures of {width} x {height} pixels"
+        limit = f"HDR video takes at least {MIN_SIDE_PX} pixels a side; use a larger --scale"
+        raise InputError(f"{path}: {size}; {limit}")
+
+
+def to_frame(planes: Planes, transfer: str) -> Any:
+    """A tagged frame of PyAV with these planes."""
+    import av
+
+    height, width = planes[0].shape
+    frame = av.VideoFrame(width, height, PIXELS)
+    tag_rec2020(frame, transfer)
+    for target, codes in zip(frame.planes, planes, strict=True):
+        rows = np.zeros((codes.shape[0], target.line_size // 2), "<u2")
+        rows[:, : codes.shape[1]] = codes
+        target.update(rows.tobytes())
+    return frame
+
+
+def tag_rec2020(target: Any, transfer: str) -> None:
+    """Color tags of BT.2100 on a codec context or a frame."""
+    target.colorspace = REC2020_MATRIX
+    target.color_range = LIMITED_RANGE
+    target.color_primaries = REC2020_PRIMARIES
+    target.color_trc = TRANSFERS[transfer]
+
+
+def encoder_options(
+    codec: Codec, transfer: str, light: LightLevels | None, peak_nits: float
+) -> dict[str, str]:
+    """Options of FFmpeg for the encoder: quality, and the metadata of HDR10."""
+    levels = ""
+    if light is not None:
+        levels = f"{round(light.max_cll)},{round(light.max_fall)}"
+    if codec == "hevc":
+        parameters = ["log-level=error", "repeat-headers=1"]
+        if light is not None:
+            display = hevc_display(peak_nits)
+            parameters += ["hdr10=1", f"max-cll={levels}", f"master-display={display}"]
+        return {"crf": str(HEVC_CRF), "x265-params": ":".join(parameters)}
+    parameters = ["color-primaries=9", "matrix-coefficients=9"]
+    parameters += [f"transfer-characteristics={TRANSFERS[transfer]}", "color-range=0"]
+    if light is not None:
+        display = f"{AV1_PRIMARIES}L({peak_nits:g},{BLACK_NITS:g})"
+        parameters += [f"content-light={levels}", f"mastering-display={display}"]
+    options = {"crf": str(AV1_CRF), "preset": str(AV1_PRESET)}
+    return {**options, "svtav1-params": ":".join(parameters)}
+
+
+# The mastering display has the primaries of BT.2020 and white D65
+HEVC_PRIMARIES = "G(8500,39850)B(6550,2300)R(35400,14600)WP(15635,16450)"  # in 1/50000
+AV1_PRIMARIES = "G(0.17,0.797)B(0.131,0.046)R(0.708,0.292)WP(0.3127,0.329)"
+BLACK_NITS = 0.005
+
+
+def hevc_display(peak_nits: float) -> str:
+    """The mastering display in x265's words; light in 1/10000 nit."""
+    return f"{HEVC_PRIMARIES}L({round(peak_nits * 1e4)},{round(BLACK_NITS * 1e4)})"

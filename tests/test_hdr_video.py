@@ -1,0 +1,91 @@
+"""HDR videos are decoded again: tags, light levels, codes of a patch and of a ramp."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pytest
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import (
+    ENCODERS,
+    Codec,
+    LightLevels,
+    Planes,
+    check_encoder,
+    write_hdr_video,
+)
+from hdr_nsff.maths.hdr_signal import Transfer, encode, ycbcr_planes
+
+W, H = 704, 64
+kinds = pytest.mark.parametrize(
+    ("codec", "transfer"), [("hevc", "pq"), ("hevc", "hlg"), ("av1", "pq"), ("av1", "hlg")]
+)
+
+
+def ramp(transfer: Transfer) -> Planes:
+    """Diffuse white on the left, beside it a gray ramp from 0 to 1000 nits."""
+    signal = np.zeros((H, W, 3))
+    signal[:, :64] = encode(np.full(3, 203.0), transfer)
+    top = encode(np.full(3, 1000.0), transfer)[0]
+    signal[:, 64:] = np.linspace(0, top, W - 64)[:, None]
+    return ycbcr_planes(signal)
+
+
+def luma(frame: Any) -> np.ndarray:
+    """Y codes (H, W) of a decoded frame."""
+    plane = frame.planes[0]
+    rows = np.frombuffer(plane, "<u2").reshape(-1, plane.line_size // 2)
+    return rows[:, : frame.width].astype(int)
+
+
+def decoded(path: Path) -> tuple[Any, list[Any]]:
+    """Stream and frames of a video."""
+    with av.open(str(path)) as container:
+        frames = list(container.decode(video=0))
+        return container.streams.video[0], frames
+
+
+@kinds
+def test_tags_and_codes_are_read_back(tmp_path: Path, codec: Codec, transfer: Transfer) -> None:
+    path = tmp_path / "a.mp4"
+    planes = ramp(transfer)
+    assert write_hdr_video(path, [planes] * 3, 24, transfer, codec) == 3
+    stream, frames = decoded(path)
+    context = stream.codec_context
+    code = {"pq": 16, "hlg": 18}[transfer]
+    assert context.codec_tag == {"hevc": "hvc1", "av1": "av01"}[codec]
+    assert len(frames) == 3 and frames[0].format.name == "yuv420p10le"
+    for tagged in (context, *frames):
+        assert (tagged.color_primaries, tagged.color_trc) == (9, code)
+        assert (tagged.colorspace, tagged.color_range) == (9, 1)
+    seen = luma(frames[1])
+    assert np.abs(seen[:, 8:56] - {"pq": 573, "hlg": 721}[transfer]).max() <= 2
+    given = planes[0].astype(int)
+    assert np.abs(seen[:, 72:] - given[:, 72:]).max() <= 8
+    assert len(np.unique(seen[:, 64:])) >= 0.9 * len(np.unique(given[:, 64:]))  # no bands
+
+
+@pytest.mark.parametrize("codec", ["hevc", "av1"])
+def test_light_levels_of_hdr10_are_read_back(tmp_path: Path, codec: Codec) -> None:
+    path = tmp_path / "a.mp4"
+    write_hdr_video(path, [ramp("pq")] * 2, 24, "pq", codec, LightLevels(812.4, 97.6))
+    side_data = {data.type.name: bytes(data) for data in decoded(path)[1][0].side_data}
+    assert struct.unpack("<II", side_data["CONTENT_LIGHT_LEVEL"]) == (812, 98)
+    assert "MASTERING_DISPLAY_METADATA" in side_data
+
+
+def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: Any) -> None:
+    with pytest.raises(InputError, match="no frames to write"):
+        write_hdr_video(tmp_path / "a.mp4", [], 24, "pq")
+    small = ycbcr_planes(np.zeros((8, 8, 3)))
+    with pytest.raises(InputError, match="8 x 8 pixels; HDR video takes at least 64"):
+        write_hdr_video(tmp_path / "a.mp4", [small], 24, "pq")
+    monkeypatch.setitem(ENCODERS, "hevc", "libnone")
+    with pytest.raises(InputError, match="this PyAV has no encoder libnone"):
+        check_encoder("hevc")
+    assert not list(tmp_path.iterdir())
