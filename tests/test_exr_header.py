@@ -38,7 +38,8 @@ class GrayWorld(DiscBeforeWall):
 def tinted_run(folder: Path) -> Run:
     run = fake_run(folder)
     x = torch.linspace(0, 1, 256)
-    run.tonemapper.set_curve(x, torch.stack([x ** (1 / g) for g in GAMMAS]))  # type: ignore[attr-defined]
+    curves = torch.stack([x ** (1 / g) for g in GAMMAS])
+    run.tonemapper.set_curve(x, curves)  # type: ignore[attr-defined]
     return run
 
 

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from test_splat import BESIDE, CAMERA, batch_of, local_field
+from test_splat import BESIDE, CAMERA, TIMES, batch_of, tile_plane
 from torch import Tensor
 
 from hdr_nsff.fields.base import FrameError
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.local_gaussians import MIN_WINDOW, LocalGaussians
+from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.training.optimizers import Optimizers
 
 DURATION = 1.5  # frames
@@ -29,6 +31,26 @@ def three() -> LocalGaussians:
         local.log_scales[:, 3] = torch.tensor(DURATION).log()
         local.colors[:, 3] = 0.0
     return local
+
+
+def local_field(count: int = 20) -> Splat:
+    """A wall, and time-local Gaussians before it that all move alike, born all over the
+    clip.
+    """
+    config = SplatConfig(static=33 * 25, moving=0, local=count)
+    field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
+    local = field.local
+    with torch.no_grad():
+        tile_plane(field.static, 33, 25, z=4.0, spacing=0.1)
+        local.means[:, :3] = torch.tensor([0.0, 0, 2.0])
+        local.means[:, 3] = torch.linspace(0, TIMES - 1, count)
+        local.velocities[:, :3] = VELOCITY
+        local.means[:, :3] += (local.means[:, 3:] - 4.5) * local.velocities[:, :3]
+        local.log_scales[:, :3] = -2.0
+        local.log_scales[:, 3] = 0.0
+        local.colors[:, 3] = 3.0
+    local.find_neighbors(1.0)
+    return field
 
 
 def test_alive_are_those_whose_window_is_open() -> None:

@@ -99,26 +99,6 @@ def scattered(
     return field
 
 
-def local_field(count: int = 20) -> Splat:
-    """A wall, and time-local Gaussians before it that all move alike, born all over the
-    clip.
-    """
-    config = SplatConfig(static=33 * 25, moving=0, local=count)
-    field = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
-    local = field.local
-    with torch.no_grad():
-        tile_plane(field.static, 33, 25, z=4.0, spacing=0.1)
-        local.means[:, :3] = torch.tensor([0.0, 0, 2.0])
-        local.means[:, 3] = torch.linspace(0, TIMES - 1, count)
-        local.velocities[:, :3] = torch.tensor([0.05, -0.02, 0.1])
-        local.means[:, :3] += (local.means[:, 3:] - 4.5) * local.velocities[:, :3]
-        local.log_scales[:, :3] = -2.0
-        local.log_scales[:, 3] = 0.0
-        local.colors[:, 3] = 3.0
-    local.find_neighbors(1.0)
-    return field
-
-
 def test_scene_flow_at_the_card_is_its_step() -> None:
     render = card_field().render(CAMERA, 4.0)
     at = pixel_of(torch.tensor([0.0, 0, 2]) + 4 * STEP)

@@ -284,8 +284,11 @@ def test_one_finger_orbits_and_two_move_closer(viewer: Page) -> None:
 
 
 def test_the_path_is_copied_with_a_hint(viewer: Page) -> None:
+    note = "document.getElementById('note').textContent"
+    before = viewer.run(note)
     viewer.click("#copy-path")
-    viewer.wait("document.getElementById('note').textContent.includes('--path path.json')")
+    viewer.wait(f"{note}.includes('path.json')")
+    assert "--path path.json" in viewer.run(note) and "path.json" not in before
 
 
 def test_buttons_work_by_pointer(viewer: Page) -> None:

@@ -1,6 +1,8 @@
-"""Start a field of Gaussians from the prepared scene: static ones where the depth prior
-puts what stands still, moving ones on the rigid motions that flow and depth tell, in
-the radiance that the initial response recovers from what did not clip.
+"""Start a field of Gaussians from the prepared scene.
+
+Static ones start at the depth prior of static pixels, moving ones on the motions of
+rigid movers. Both start in the radiance that the response recovers from unclipped
+values. `initialize_local.py` starts the time-local ones.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Time-local Gaussians: what moves without being rigid, as many short lives.
+"""Time-local Gaussians, which model non-rigid motion as many short lives.
 
 Each one is born at its center time, moves at a constant velocity and fades on either
 side: x(t) = x + v (t - t0), opacity times exp(-(t - t0)^2 / (2 s^2)). People and cloth

@@ -1,5 +1,5 @@
 """Dynamic radiance as 4D Gaussians in linear HDR: static ones, moving ones on
-shared trajectories, and time-local ones for what moves without being rigid.
+shared trajectories, and time-local ones for non-rigid motion.
 
 Color is the exponential of a log radiance, unbounded (a sigmoid bounds it for the
 ablation). Colors of moving Gaussians change in time, and static ones brighten or darken
