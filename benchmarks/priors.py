@@ -10,6 +10,9 @@ The file holds, for every scene:
 - depth: median of |ln(estimated / true)| as a percentage, at the scale of the camera
   path (`metric`) and after the best scale of the clip (`aligned`), of moving and of
   static pixels; `known` is the share of pixels whose confidence is above 0.5;
+- distance of movers: of ln(estimated / true) at each moving body's median pixel, the
+  standard deviation over time (`distance_drift_percent`) and the absolute mean
+  (`distance_bias_percent`), averaged over bodies by their pixels;
 - poses: share of registered frames, ATE as a share of the path's extent after the best
   similarity, mean remaining rotation, error of the focal length;
 - flow to both neighbors: median and mean end-point error of valid pixels, and how much
@@ -31,6 +34,8 @@ from hdr_nsff.geometry import alignment
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 
 Truth = dict[int, dict[str, np.ndarray]]  # the channels of the exact frames, by index
+MIN_BODY_PX = 20  # of a body in a frame, to have a distance
+MIN_BODY_FRAMES = 4  # with such a distance
 KNOWN_CONFIDENCE = 0.5  # depth counts as known above this
 
 
@@ -83,6 +88,7 @@ def measure(scene: Path, clip: Path) -> dict[str, float]:
     with_maps = [f for f in registered if f.mask and f.disparity]  # held-out frames have none
     result |= mask_errors(scene, with_maps, exact)
     result |= depth_errors(scene, with_maps, exact, similarity.scale)
+    result |= distance_errors(scene, with_maps, exact, similarity.scale)
     result |= flow_errors(scene, with_maps, exact)
     return result
 
@@ -123,6 +129,31 @@ def depth_errors(
         result[f"depth_{name}_aligned_percent"] = 100 * aligned_error
         result[f"depth_{name}_known"] = float(is_known[part].mean())
     return result
+
+
+def distance_errors(
+    scene: Path, frames: list[FrameEntry], exact: Truth, scale: float
+) -> dict[str, float]:
+    """How the distance of every moving body is wrong over time, and on average."""
+    errors: dict[int, list[float]] = {}
+    pixels: dict[int, int] = {}
+    for frame in frames:
+        disparity = read_npy(scene / str(frame.disparity)).astype(np.float64)
+        z, body = exact[frame.index]["Z"], exact[frame.index]["body"].round().astype(int)
+        for index in np.unique(body[body > 0]).tolist():
+            part = (body == index) & np.isfinite(z) & (z > 0) & (disparity > 0)
+            if part.sum() >= MIN_BODY_PX:
+                log_error = -np.log(disparity[part] * z[part] * scale)
+                errors.setdefault(index, []).append(float(np.median(log_error)))
+                pixels[index] = pixels.get(index, 0) + int(part.sum())
+    often = [index for index, values in errors.items() if len(values) >= MIN_BODY_FRAMES]
+    weights = [pixels[index] for index in often]
+    drift = np.average([np.std(errors[index]) for index in often], weights=weights)
+    bias = np.average([abs(np.mean(errors[index])) for index in often], weights=weights)
+    return {
+        "distance_drift_percent": 100 * float(drift),
+        "distance_bias_percent": 100 * float(bias),
+    }
 
 
 def flow_errors(scene: Path, frames: list[FrameEntry], exact: Truth) -> dict[str, float]:

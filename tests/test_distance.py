@@ -4,8 +4,10 @@ import numpy as np
 from posed_planes import F, H, W, X, Y, cameras_at, neighbors, posed_video
 
 from hdr_nsff.priors.movers.distance import mover_depth, smoothest_path, third_differences
+from hdr_nsff.priors.movers.regions import FlowStep, region_growth
 
 FORWARD = np.tile([0.0, 0, 1], (24, 1))
+UNKNOWN_SIZE = np.stack([np.ones(24), np.arange(24)])  # every frame is a run by itself
 
 
 def path(shake: float, count: int = 24) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -34,7 +36,13 @@ def test_third_differences_vanish_on_parabolas_whatever_the_spacing() -> None:
 def test_a_shaking_camera_determines_the_distance_of_a_moving_point() -> None:
     z, eyes, rays = path(shake=0.02)
     found, sigma = smoothest_path(
-        eyes, FORWARD, rays, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
+        eyes,
+        FORWARD,
+        rays,
+        np.arange(24.0),
+        np.ones(23, bool),
+        prior=np.full(24, 3.5),
+        size=UNKNOWN_SIZE,
     )
     assert np.abs(found / z - 1).mean() < 0.03 and np.median(sigma) < 0.03
 
@@ -43,9 +51,43 @@ def test_a_smooth_camera_leaves_the_prior() -> None:
     _, eyes, rays = path(shake=0.0)
     noisy = rays + 0.003 * np.random.default_rng(1).standard_normal(rays.shape) * [1, 1, 0]
     found, sigma = smoothest_path(
-        eyes, FORWARD, noisy, np.arange(24.0), np.ones(23, bool), prior=np.full(24, 3.5)
+        eyes,
+        FORWARD,
+        noisy,
+        np.arange(24.0),
+        np.ones(23, bool),
+        prior=np.full(24, 3.5),
+        size=UNKNOWN_SIZE,
     )
     assert np.allclose(found, 3.5, rtol=0.02) and np.median(sigma) > 0.15
+
+
+def test_an_object_that_grows_in_the_picture_comes_nearer() -> None:
+    """From z = 4 to 2 before a camera at rest: the path determines nothing."""
+    z = np.linspace(4, 2, 24)
+    rays = np.tile([0.1, 0.0, 1.0], (24, 1))
+    size = np.stack([1 / z / np.mean(1 / z), np.zeros(24)])
+    fixed = np.zeros((24, 3)), FORWARD, rays, np.arange(24.0), np.ones(23, bool)
+    unknown, _ = smoothest_path(*fixed, prior=np.full(24, 3.0), size=UNKNOWN_SIZE)
+    found, _ = smoothest_path(*fixed, prior=np.full(24, 3.0), size=size)
+    assert np.ptp(np.log(unknown / z)) > 0.6 and np.ptp(np.log(found / z)) < 0.2
+
+
+def test_growth_is_read_from_flow_whose_limbs_move_otherwise() -> None:
+    """A square that grows by 4 % a frame; a quarter of it swings."""
+    center = np.array([W / 2, H / 2])
+    pixels = np.stack([X, Y], -1) + 0.5
+    flow = (0.04 * (pixels - center)).astype(np.float32)
+    flow[: H // 2, : W // 2] += [3, -2]
+    back = (-0.04 / 1.04 * (pixels - center)).astype(np.float32)
+    everywhere = np.ones((H, W), bool)
+    region = (np.abs(X - W / 2) < 14) & (np.abs(Y - H / 2) < 14)
+    step = FlowStep(0, 1, flow, everywhere, back, everywhere)
+    growth = region_growth(step, region, region)
+    assert growth is not None and abs(growth - np.log(1.04)) < 0.004
+    assert (
+        region_growth(FlowStep(0, 1, flow, ~everywhere, back, everywhere), region, region) is None
+    )
 
 
 def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None:

@@ -21,17 +21,27 @@ from hdr_nsff.training.start import start_field
 NAMES = [name for name in PRESETS if name not in METHODS]
 
 
+def base_and_change(name: str) -> tuple[str, str]:
+    """The preset of an ablation, and what it changes."""
+    preset = next(p for p in ("splat", "grid", "paper-small") if name.startswith(f"{p}-"))
+    return preset, name.removeprefix(f"{preset}-")
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_an_ablation_differs_from_its_preset_in_one_part(name: str) -> None:
-    base, changed = (asdict(PRESETS[n]) for n in (name.partition("-")[0], name))
+    preset, change = base_and_change(name)
+    base, changed = asdict(PRESETS[preset]), asdict(PRESETS[name])
     parts = {k for k in base if base[k] != changed[k]}
     expected = {
         "no-flow": {"loss"},
         "no-depth": {"loss", "from_priors"},
         "no-saturation": {"saturation"},
         "sigmoid": {"field"},
+        "no-split": {"field"},
     }
-    assert parts == expected.get(name.partition("-")[2], {"tonemap"})
+    if preset == "paper-small":
+        expected["no-depth"] = {"loss"}  # it starts at random anyway
+    assert parts == expected.get(change, {"tonemap"})
 
 
 def test_every_ablation_that_makes_sense_is_a_preset() -> None:
@@ -39,6 +49,29 @@ def test_every_ablation_that_makes_sense_is_a_preset() -> None:
     assert set(ABLATIONS) - {n.removeprefix("splat-") for n in NAMES if n.startswith("splat-")} == {
         "no-saturation"
     }
+
+
+def test_the_small_published_presets_change_sizes_alone() -> None:
+    """The terms, their weights, how they are formed and the tone mapper stay."""
+    for name in ("paper", "nsff-paper", "nerf-wt-paper"):
+        published, tiny = asdict(PRESETS[name]), asdict(PRESETS[f"{name}-small"])
+        resized = {k for k in published if published[k] != tiny[k]}
+        sizes = {"field", "budget", "schedule", "rays", "moving_rays"}
+        assert resized - sizes == {"tonemap_lr", "checkpoint_seconds"}
+        fields = published["field"], tiny["field"]
+        changed = {k for k in fields[0] if fields[0][k] != fields[1][k]}
+        assert changed == {"encoding", "samples", "render_samples"}
+
+
+def test_without_a_split_everything_is_dynamic(toy: Scene, toy_folder: Path) -> None:
+    config = small("paper-small-no-split", toy_folder)
+    t = trainer(config, toy)
+    batch = t.draw(0)
+    render, _ = t.field(batch)
+    assert torch.allclose(render.motion, render.opacity, atol=1e-6)
+    render.radiance.sum().backward()
+    static = t.field.branches.static_trunk.parameters()
+    assert not any(p.grad is not None and p.grad.abs().sum() > 0 for p in static)
 
 
 def test_without_flow_the_field_does_not_start_from_it(

@@ -80,7 +80,7 @@ def test_what_a_pixel_shows_is_carried_by_its_triangle(
     bulbs = {p.body for p in tracer.parts.values() if p.radius is not None}
     for index, body in enumerate(scene.bodies, 1):
         y, x = np.nonzero(surface.bodies == index)
-        assert len(y) > 0
+        assert len(y) > 0 or "-" in body.name  # a limb may be hidden
         for k in rng.choice(len(y), min(6, len(y)), replace=False):
             point, here = surface.points[y[k], x[k]], (y[k], x[k])
             if body.name in bulbs and surface_is_round(tracer, body.name, point, t):
@@ -124,15 +124,18 @@ def test_depth_is_along_the_ray_through_the_pixel_center(
 def test_every_mover_is_visible_in_most_frames_and_other_pixels_are_static(
     tracers, name, views
 ) -> None:
-    """In four of five frames at least. Geometry fills every picture: `surface` sees to
-    that.
+    """In four of five frames at least, by any of its limbs. Geometry fills every
+    picture: `surface` sees to that.
     """
     scene = SCENES[name]
     times = range(0, 36, 3)
     seen = [tracers[name].surface(t, K, scene.pose(views, t), SIZE).bodies for t in times]
+    movers: dict[str, list[int]] = {}
     for index, body in enumerate(scene.bodies, 1):
-        share = np.mean([(bodies == index).any() for bodies in seen])
-        assert share >= 0.8, f"{body.name} is seen in {share:.0%} of the frames"
+        movers.setdefault(body.name.partition("-")[0], []).append(index)
+    for mover, indices in movers.items():
+        share = np.mean([np.isin(bodies, indices).any() for bodies in seen])
+        assert share >= 0.8, f"{mover} is seen in {share:.0%} of the frames"
     assert 0.4 < np.mean([(bodies == 0).mean() for bodies in seen]) < 0.97
 
 
@@ -194,7 +197,8 @@ def test_the_moving_camera_sees_parallax_all_the_time(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "decades"), [("interior", 4.0), ("lamp", 4.0), ("night", 5.0), ("cloth", 3.0)]
+    ("name", "decades"),
+    [("interior", 4.0), ("lamp", 4.0), ("night", 5.0), ("cloth", 3.0), ("walk", 3.0)],
 )
 def test_radiance_spans_the_decades_that_are_promised(
     tracers: dict[str, Tracer], name: str, decades: float

@@ -24,10 +24,10 @@ class SynthConfig:
     """A path-traced scene filmed by a moving camera or a rig. `interior`: a room with a
     bright window, a tumbling box and a swinging ball. `lamp`: objects that rush past a
     lamp. `night`: an alley at night with lights that move. `cloth`: cloth and a dancing
-    tube in the wind.
+    tube in the wind. `walk`: somebody walks, and the camera follows.
     """
 
-    name: Positional[Literal["interior", "lamp", "night", "cloth"]]
+    name: Positional[Literal["interior", "lamp", "night", "cloth", "walk"]]
     """The scene."""
     out: Positional[Path]
     """Folder to write."""

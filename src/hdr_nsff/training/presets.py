@@ -24,6 +24,9 @@ PUBLISHED_SCHEDULE = Schedule(period=0.0, prior_fade=0.1, lr_final=0.0)
 PUBLISHED_STEPS = Budget(steps=250_000, minutes=None)
 # the published fields: networks, no culling, ReLU densities with noise
 PUBLISHED_SAMPLES = 128
+# the same on a CPU, see `small`
+SMALL_STEPS = 8000
+SMALL_SAMPLES = 40
 # NeRF-W weighs mean transient density by 0.01 and squared errors by 1 / (2 beta^2).
 # This is the ratio of the two at beta's minimum, 0.03: beta itself is left out.
 NERF_W_TRANSIENT = 0.01 * 2 * 0.03**2
@@ -86,6 +89,29 @@ def paper() -> TrainConfig:
         anchor_at=1.0,
         torch_threads=0,
         checkpoint_seconds=600.0,
+    )
+
+
+def small(published: TrainConfig) -> TrainConfig:
+    """A published network for 40 minutes on two CPU cores and frames of 120x68: the
+    same objective and code with narrower networks, fewer octaves than pixels can show,
+    fewer rays and samples, and faster rates for a thirtieth of the steps.
+    """
+    assert isinstance(published.field, NSFFConfig | NerfWTConfig)
+    return replace(
+        published,
+        field=replace(
+            published.field,
+            encoding=MlpConfig(layers=6, width=96, skip_after=3, octaves=7, lr=2e-3),
+            samples=SMALL_SAMPLES,
+            render_samples=SMALL_SAMPLES,
+        ),
+        budget=Budget(steps=SMALL_STEPS, minutes=None),
+        schedule=replace(published.schedule, period=0.144, lr_final=0.1),
+        rays=128,
+        moving_rays=min(64, published.moving_rays),
+        tonemap_lr=1e-2,
+        checkpoint_seconds=60.0,
     )
 
 
@@ -208,16 +234,23 @@ RESPONSES: dict[str, Literal["none", "fixed", "mlp", "per_image"]] = {
     "response-mlp": "mlp",
     "response-per-image": "per_image",
 }
-ABLATIONS = (*RESPONSES, "no-flow", "no-depth", "no-saturation", "sigmoid")
+OF_SPLAT = (*RESPONSES, "no-flow", "no-depth", "sigmoid")
+ABLATIONS = (*OF_SPLAT, "no-saturation")  # those of `grid`
+OF_PAPER_SMALL = ("no-split", "response-none", "response-fixed", "no-flow", "no-depth")
 
 
 def ablated(config: TrainConfig, name: str) -> TrainConfig:
-    """A preset with one thing changed; `name` is one of `ABLATIONS`."""
+    """A preset with one thing changed: `ABLATIONS`, or `no-split` of a scene flow
+    field.
+    """
     match name:
         case "no-flow":  # nor does the start use flow
             return replace(config, loss=replace(config.loss, flow=0.0))
         case "no-depth":
             return replace(config, loss=replace(config.loss, depth=0.0), from_priors=False)
+        case "no-split":
+            assert isinstance(config.field, NSFFConfig)
+            return replace(config, field=replace(config.field, split=False))
         case "no-saturation":
             return replace(config, saturation=False)
         case "sigmoid":
@@ -228,13 +261,16 @@ def ablated(config: TrainConfig, name: str) -> TrainConfig:
 
 
 def ablations() -> dict[str, TrainConfig]:
-    """By name, `grid-no-flow` and the like. Saturation weighs no term of Gaussians."""
-    presets = {"splat": splat(), "grid": TrainConfig()}
+    """By name, `grid-no-flow` and the like."""
+    changes = [
+        ("splat", splat(), OF_SPLAT),
+        ("grid", TrainConfig(), ABLATIONS),
+        ("paper-small", small(paper()), OF_PAPER_SMALL),
+    ]
     return {
         f"{preset}-{name}": ablated(config, name)
-        for preset, config in presets.items()
-        for name in ABLATIONS
-        if (preset, name) != ("splat", "no-saturation")
+        for preset, config, names in changes
+        for name in names
     }
 
 
@@ -242,11 +278,14 @@ METHODS: dict[str, TrainConfig] = {
     "splat": splat(),
     "grid": TrainConfig(),
     "paper": paper(),
+    "paper-small": small(paper()),
     "tiny": tiny(),
     "nsff": nsff(),
     "nsff-paper": nsff_paper(),
+    "nsff-paper-small": small(nsff_paper()),
     "nerf-wt": nerf_wt(),
     "nerf-wt-paper": nerf_wt_paper(),
+    "nerf-wt-paper-small": small(nerf_wt_paper()),
     "hdr-hexplane": hexplane(),
     "hdr-hexplane-paper": hexplane_paper(),
 }

@@ -76,6 +76,8 @@ class BranchesConfig:
     """
     opaque_end: Advanced[bool] = False
     """The last interval of a ray is 1e10, as published: any density there ends it."""
+    split: Advanced[bool] = True
+    """Static content beside the dynamic one; else everything is dynamic."""
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or the published one below 1."""
     density: Advanced[Literal["exp", "relu", "softplus"]] = "exp"
@@ -245,11 +247,12 @@ class TwoBranches(nn.Module):
         """Samples to query of the static and the dynamic branch: (N, S) bool."""
         coords, shape = samples.coords.reshape(-1, 3), samples.depths.shape
         if not self.config.cull:
-            every = torch.ones(shape, dtype=torch.bool, device=coords.device)
-            return every, every
-        static = self.static_cells.select(coords, 0.0, explore, generator).view(shape)
-        dynamic = self.dynamic_cells.select(coords, knot, explore, generator).view(shape)
-        return static, dynamic
+            static = torch.ones(shape, dtype=torch.bool, device=coords.device)
+            dynamic = static
+        else:
+            static = self.static_cells.select(coords, 0.0, explore, generator).view(shape)
+            dynamic = self.dynamic_cells.select(coords, knot, explore, generator).view(shape)
+        return static if self.config.split else torch.zeros_like(static), dynamic
 
     # Training
 

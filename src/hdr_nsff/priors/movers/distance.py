@@ -4,8 +4,9 @@ Two frames do not determine it: any distance fits some motion. But a hand-held c
 shakes and objects do not shake with it. Of all distances, the true one gives the object
 the smoothest path through the world (trajectory triangulation after Park et al., "3D
 reconstruction of a moving point from a series of 2D projections", ECCV 2010; we
-penalize third differences). Where the path does not determine it, a prior holds: an
-object is nearer than the static scene behind it, and about as far as what it stands on.
+penalize third differences). Where the path does not determine it, priors hold: an
+object is nearer than the static scene behind it, and about as far as what it stands on;
+its size hardly changes, so its distance changes as it shrinks in the picture.
 
 Every connected moving region is one patch of constant disparity per frame.
 """
@@ -94,7 +95,21 @@ def track_depth(
     known = np.array([motion is not None for motion in track.motions[:-1]], bool)
     prior = 1 / (tuning.disparity_ratio * np.maximum(surface, np.median(surface)))
     axes = clip.c2w[frames, :, 2]
-    return smoothest_path(eyes, axes, rays, clip.times[frames], known, prior, tuning)
+    size = apparent_size(track)
+    return smoothest_path(eyes, axes, rays, clip.times[frames], known, prior, size, tuning)
+
+
+def apparent_size(track: RegionTrack) -> np.ndarray:
+    """Size in the picture, relative to its mean over each run of known growths, and
+    the run of each frame: (2, n).
+    """
+    growths = track.growths[:-1]
+    steps = [0.0 if growth is None else growth for growth in growths]
+    run = np.cumsum([0, *(growth is None for growth in growths)])
+    log_size = np.concatenate([[0.0], np.cumsum(steps)])
+    for r in np.unique(run):
+        log_size[run == r] -= log_size[run == r].mean()
+    return np.stack([np.exp(log_size), run])
 
 
 def region_centers(
@@ -155,6 +170,7 @@ def smoothest_path(
     times: np.ndarray,
     known: np.ndarray,
     prior: np.ndarray,
+    size: np.ndarray,
     tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING,
 ) -> tuple[np.ndarray, np.ndarray]:
     """z-depth (n,) of the smoothest path, and its relative standard deviation (n,).
@@ -162,9 +178,10 @@ def smoothest_path(
     The path is along `rays` (n, 3), one unit of z-depth long, from `eyes` (n, 3); its
     steps are `known` (n - 1,) or not. z-depth is a low polynomial in time plus what the
     camera itself moves along its optical `axes` (n, 3). `prior` (n,) is the expected
-    z-depth, which counts as one observation in all. Where the rest of the path's third
-    differences is not much smaller than the camera's own shake, the path determines
-    nothing and the prior remains.
+    z-depth, which counts as one observation in all. `size` (2, n) is that of
+    `apparent_size`: z-depth times size is constant in each run, up to a tolerance.
+    Where the rest of the path's third differences is not much smaller than the camera's
+    own shake, the path determines nothing and the priors remain.
     """
     num = len(times)
     differences = third_differences(times, known)
@@ -190,12 +207,38 @@ def smoothest_path(
         rows.append(path_rows * weight[:, None])
         targets.append(path_target * weight)
 
-    system = np.concatenate(rows)
-    coefficients = np.linalg.lstsq(system, np.concatenate(targets), rcond=None)[0]
-    depth = basis @ coefficients + camera_depth
+    depth = prior
+    for _ in range(tuning.size_rounds):
+        size_rows, size_target = size_constraints(size, depth, basis, camera_depth, tuning)
+        system = np.concatenate([*rows, size_rows])
+        target = np.concatenate([*targets, size_target])
+        depth = basis @ np.linalg.lstsq(system, target, rcond=None)[0] + camera_depth
     covariance = np.linalg.pinv(system.T @ system)
     sigma = np.sqrt(np.einsum("nk,kl,nl->n", basis, covariance, basis))
     return depth, sigma / np.maximum(np.abs(depth), 1e-9)
+
+
+def size_constraints(
+    size: np.ndarray,
+    depth: np.ndarray,
+    basis: np.ndarray,
+    camera_depth: np.ndarray,
+    tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (n, k) and targets (n,) by which z-depth falls as size grows, in each run.
+
+    z-depth is `basis` (n, k) @ coefficients + `camera_depth` (n,); `depth` (n,) is an
+    estimate, from which its mean is taken.
+    """
+    scale, run = size
+    same_run = run[:, None] == run[None]
+    mean = same_run / same_run.sum(1, keepdims=True)  # (n, n): over the run of each frame
+    reference = np.maximum(mean @ depth, 1e-9)
+    expected = reference * ((1 / scale) / (mean @ (1 / scale)) - 1)  # z-depth less its mean
+    centering = np.eye(len(scale)) - mean
+    weight = 1 / (tuning.size_sigma * reference * np.sqrt(len(scale)))
+    rows = weight[:, None] * (centering @ basis)
+    return rows, weight * (expected - centering @ camera_depth)
 
 
 def huber_weights(

@@ -23,6 +23,8 @@ class RegionTrack:
     labels: list[int] = field(default_factory=list)  # of the region in each frame
     # (2,) px to the next frame of the track, None where unknown
     motions: list[np.ndarray | None] = field(default_factory=list)
+    # log of the growth in the picture from frame to frame, None where unknown
+    growths: list[float | None] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -216,6 +218,40 @@ def region_motion(
     return np.median(samples, axis=0)
 
 
+def region_growth(
+    step: FlowStep,
+    here: np.ndarray,
+    there: np.ndarray,
+    tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING,
+) -> float | None:
+    """Log of the scale between a region with masks `here` and `there`, both (H, W).
+
+    The mean of the scales of its flow and of its inverse backward flow, each by the
+    similarity with the least median of squares; None where too little is valid.
+    """
+    forward = flow_scale(step.flow, region_core(here, tuning) & step.valid, tuning)
+    backward = flow_scale(step.back, region_core(there, tuning) & step.back_valid, tuning)
+    if forward is None or backward is None:
+        return None
+    return float(np.log(forward) - np.log(backward)) / 2
+
+
+def flow_scale(
+    flow: np.ndarray, pixels: np.ndarray, tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING
+) -> float | None:
+    """Scale of the similarity that explains `flow` (H, W, 2) at `pixels` (H, W) best."""
+    y, x = np.nonzero(pixels)
+    stride = max(1, len(y) // tuning.max_scale_points)
+    y, x = y[::stride], x[::stride]
+    if len(y) < tuning.min_scale_points:
+        return None
+    start = np.stack([x, y], -1).astype(np.float32)
+    similarity, _ = cv2.estimateAffinePartial2D(start, start + flow[y, x], method=cv2.LMEDS)
+    if similarity is None:
+        return None
+    return float(np.hypot(*similarity[:, 0])) or None
+
+
 def link_regions(
     labels: np.ndarray,
     times: np.ndarray,
@@ -240,13 +276,17 @@ def link_regions(
                 tracks.append(region_track)
             region_track.frames.append(frame)
             region_track.labels.append(label)
-            motion = None
+            motion = growth = None
             if frame in step_from:
                 step = step_from[frame]
                 target, motion = next_region(labels, step, label, tuning)
-                if target and (step.end, target) not in current:
-                    current[step.end, target] = region_track
+                if target:
+                    here, there = labels[frame] == label, labels[step.end] == target
+                    growth = region_growth(step, here, there, tuning)
+                    if (step.end, target) not in current:
+                        current[step.end, target] = region_track
             region_track.motions.append(motion)
+            region_track.growths.append(growth)
     return tracks
 
 

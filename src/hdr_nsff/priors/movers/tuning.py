@@ -239,6 +239,17 @@ class MoverDistanceTuning:
     max_disparity_ratio: float = 8.0
     """Upper bound of an object's disparity, relative to the surface behind it."""
 
+    min_scale_points: int = 30
+    """Pixels of flow that determine a region's growth in the picture."""
+    max_scale_points: int = 400
+    """Pixels of flow that are used for it."""
+    size_sigma: float = 0.02
+    """Relative standard deviation of a mover's size over the clip, which counts as one
+    observation in all.
+    """
+    size_rounds: int = 3
+    """Solutions of a path: the mean z-depth of one scales the sizes of the next."""
+
     max_drift_degree: int = 3
     """Degree of the polynomial that ties integrated flow to the region's centroid."""
     frames_per_drift_degree: int = 4

@@ -128,7 +128,9 @@ class SynthScene:
     build: Callable[[int], list[Part]]
     """Every part, from a seed."""
     bodies: tuple[Body, ...]
-    """The movers; body k of a picture is the k-th of these, counted from 1."""
+    """The movers; body k of a picture is the k-th of these, counted from 1. One whose
+    name is MOVER-PART is a limb of that mover.
+    """
     camera_pose: Callable[[float], np.ndarray]
     """Camera to world (3, 4) of the one moving camera, at a time in frames."""
     rig: tuple[tuple[float, float, float], ...]
