@@ -239,7 +239,7 @@ def region_growth(
 def flow_scale(
     flow: np.ndarray, pixels: np.ndarray, tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING
 ) -> float | None:
-    """Scale of the similarity that explains `flow` (H, W, 2) at `pixels` (H, W) best."""
+    """Scale of the similarity that fits `flow` (H, W, 2) at `pixels` (H, W) best."""
     y, x = np.nonzero(pixels)
     stride = max(1, len(y) // tuning.max_scale_points)
     y, x = y[::stride], x[::stride]
