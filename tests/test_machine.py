@@ -36,6 +36,11 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_the_commit_of_a_checkout_is_known_and_changes_are_marked(checkout: Path) -> None:
     commit = commit_of(checkout)
     assert commit is not None and len(commit) == 40
+    numbers = checkout.parents[1] / "benchmarks" / "results" / "a.json"
+    numbers.parent.mkdir(parents=True)
+    numbers.write_text("{}")
+    subprocess.run(["git", "-C", str(checkout), "add", str(numbers)], check=True)
+    assert commit_of(checkout) == commit  # numbers are no program
     (checkout / "a.py").write_text("a = 2\n")
     assert commit_of(checkout) == f"{commit}-dirty"
 

@@ -112,7 +112,17 @@ def empty(path: Path) -> None:
     path.write_bytes(b"")
 
 
-DAMAGE = {"cut short or damaged": cut, "another version": other_version, "cut short": empty}
+def without_checksum(path: Path) -> None:
+    metadata = {"format": "hdr-nsff checkpoint 1", "step": "2", "seconds": "0"}
+    save_file(read_checkpoint(path).tensors, path, metadata=metadata)
+
+
+DAMAGE = {
+    "cut short or damaged": cut,
+    "another version": other_version,
+    "cut short": empty,
+    "damaged (KeyError)": without_checksum,
+}
 
 
 @pytest.mark.parametrize("what", DAMAGE)

@@ -14,6 +14,7 @@ from hdr_nsff import __version__
 from hdr_nsff.core.notes import Machine
 
 GIT_TIMEOUT_S = 10
+PROGRAM = (".", ":!benchmarks/results", ":!docs")  # pathspecs; numbers and prose are none
 
 
 def this_machine() -> Machine:
@@ -50,14 +51,14 @@ def memory_bytes() -> int | None:
 
 def commit_of(package: Path) -> str | None:
     """The commit of the checkout that `package` is in as src/PACKAGE, with "-dirty"
-    where tracked files have changed; None where it is installed elsewhere.
+    where tracked files of the program have changed; None where it is installed elsewhere.
     """
     root = package.parents[1]
     if package.parent.name != "src" or not (root / ".git").exists():
         return None
     try:
         commit = git(root, "rev-parse", "HEAD")
-        changes = git(root, "status", "--porcelain", "--untracked-files=no")
+        changes = git(root, "status", "--porcelain", "--untracked-files=no", "--", *PROGRAM)
     except (OSError, subprocess.SubprocessError):  # no git, or a checkout of another user
         return None
     return f"{commit}-dirty" if changes else commit

@@ -85,8 +85,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             names = file.keys()
             tensors = {name: file.get_tensor(name) for name in names}
         step, seconds = int(metadata["step"]), float(metadata["seconds"])
-        written = metadata.get("checksum")  # older files have none
-        if written is not None and written != checksum(step, seconds, tensors):
+        if metadata["checksum"] != checksum(step, seconds, tensors):
             raise ValueError("other bytes than were written")
         if not all(torch.isfinite(tensor).all() for tensor in tensors.values()):
             raise ValueError("NaN or Inf")

@@ -55,7 +55,9 @@ def weights(config: WeightsConfig) -> None:
         place = found_place(known)
         command = "" if place else get_command(known)
         table.add_row(known.name, known.purpose, size_and_license(known), place or "no", command)
-    console.print(table)
+    with console.capture() as text:  # rich would hide that the reader has gone
+        console.print(table)
+    print(text.get(), end="")
     print(
         "Or put the file, or the model's config.json and model.safetensors, into "
         f"{cache_folder()}/NAME; `hdr-nsff weights NAME` prints more about one."
