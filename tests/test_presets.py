@@ -57,7 +57,7 @@ def test_the_small_published_presets_change_sizes_alone() -> None:
         published, tiny = asdict(PRESETS[name]), asdict(PRESETS[f"{name}-small"])
         resized = {k for k in published if published[k] != tiny[k]}
         sizes = {"field", "budget", "schedule", "rays", "moving_rays"}
-        assert resized - sizes == {"tonemap_lr", "checkpoint_seconds"}
+        assert resized - sizes == {"tonemap_lr", "bf16", "checkpoint_seconds"}
         fields = published["field"], tiny["field"]
         changed = {k for k in fields[0] if fields[0][k] != fields[1][k]}
         assert changed == {"encoding", "samples", "render_samples"}
