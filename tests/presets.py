@@ -41,7 +41,9 @@ NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
     "nsff": GRID,
     "nsff-paper": MLP,
     "nerf-wt": GRID,
+    "nsff-paper-small": MLP,
     "nerf-wt-paper": MLP,
+    "nerf-wt-paper-small": MLP,
     "hdr-hexplane": HEXPLANE,
     "hdr-hexplane-paper": HEXPLANE,
     "grid-sigmoid": GRID,  # the ablation whose field differs

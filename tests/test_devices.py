@@ -60,7 +60,8 @@ def test_the_pretend_device_computes_gradients(device: torch.device) -> None:
 def test_a_preset_trains_renders_and_evaluates(
     preset: str, toy_folder: Path, tmp_path: Path, device: torch.device
 ) -> None:
-    train(small(preset, toy_folder, tmp_path / "run", STEPS), previews=False)
+    config = small(preset, toy_folder, tmp_path / "run", STEPS)
+    train(replace(config, bf16=False), previews=False)  # it has no autocast
     run = Run.open(tmp_path / "run")
     moved = [*run.field.parameters(), *run.tonemapper.parameters()]
     assert run.step == STEPS and all(isinstance(p, PretendTensor) for p in moved)

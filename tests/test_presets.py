@@ -63,8 +63,10 @@ def test_the_small_published_presets_change_sizes_alone() -> None:
         assert changed == {"encoding", "samples", "render_samples"}
 
 
-def test_without_a_split_everything_is_dynamic(toy: Scene, toy_folder: Path) -> None:
-    config = small("paper-small-no-split", toy_folder)
+def test_without_a_split_everything_is_dynamic(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    config = small("paper-small-no-split", toy_folder, tmp_path / "run")
     t = trainer(config, toy)
     batch = t.draw(0)
     render, _ = t.field(batch)
