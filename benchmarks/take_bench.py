@@ -17,7 +17,10 @@ from typing import Any
 from record import RESULTS, Record
 
 SETTINGS = ("methods", "budget", "steps", "oracle", "jobs", "max_size", "protocol")
-RUN = ("scene", "method", "oracle", "status", "measured_on", "seed", "device", "threads", "values")
+RUN = (
+    "scene", "method", "oracle", "status", "measured_on", "seed", "device", "threads", "values",
+    "curve",
+)  # fmt: skip
 
 
 def main() -> None:
@@ -39,7 +42,7 @@ def main() -> None:
 
 
 def one_run(run: dict[str, Any]) -> dict[str, Any]:
-    """A run without its curve and its folder, with the commit that trained it."""
+    """A run without its folder, with the commit that trained it."""
     machine = run["machine"] or {}
     return {key: run[key] for key in RUN} | {"commit": machine.get("commit")}
 
