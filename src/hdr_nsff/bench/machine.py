@@ -51,7 +51,7 @@ def memory_bytes() -> int | None:
 
 def commit_of(package: Path) -> str | None:
     """The commit of the checkout that `package` is in as src/PACKAGE, with "-dirty"
-    where tracked files of the program have changed; None where it is installed elsewhere.
+    where files of the program have changed; None where it is installed elsewhere.
     """
     root = package.parents[1]
     if package.parent.name != "src" or not (root / ".git").exists():

@@ -21,6 +21,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exif_ev,
     read_exposure_csv,
 )
+from hdr_nsff.footage.gpmf import read_gopro_ev
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
@@ -31,6 +32,8 @@ MAX_ROUNDING_8_BIT = 1e-6  # off whole codes of 8 bits up to which 8 bits hold a
 MAX_NOTES = 3  # that are printed; the rest is in scene.json
 # confidence of a cycle by brightness from which it refutes a list (hand-chosen)
 MIN_CONFIDENCE = 0.8
+GOPRO = "GoPro's metadata"  # as a source of exposures
+MIN_DRIFT_EV = 0.02  # of such exposures; below it, they are one
 
 
 # Frames
@@ -189,7 +192,8 @@ def frame_exposures(work: Work) -> FrameExposures:
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         notes = cycle_notes(work, cycles)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
-    if len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE and len(cameras) == 1:
+    many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
+    if source == GOPRO or (many and len(cameras) == 1):
         return drifting_exposures(source, given)
     brackets, known = exposure.brackets_by_ev(given)
     doubts = []
@@ -240,10 +244,19 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
         return path.name, [
             csv_exposure(path, rows, f, n) for f, n in zip(frames, numbers, strict=True)
         ]
-    known = [] if work.footage.video else exif_exposures(work)
-    if len(known) == len(frames) and max(known) - min(known) >= exposure.MIN_STEP:
-        return "EXIF", known
+    if work.footage.video:
+        source, known, least_change = GOPRO, gopro_exposures(work, numbers), MIN_DRIFT_EV
+    else:
+        source, known, least_change = "EXIF", exif_exposures(work), exposure.MIN_STEP
+    if len(known) == len(frames) and max(known) - min(known) >= least_change:
+        return source, known
     return "brightness", None
+
+
+def gopro_exposures(work: Work, numbers: list[int]) -> list[float]:
+    """The EVs of the frames `numbers` of a video, where a GoPro wrote them into it."""
+    written = read_gopro_ev(work.footage.path, work.footage.count or 0)
+    return [] if written is None else written[numbers].tolist()
 
 
 def csv_exposure(path: Path, rows: dict[str, float], frame: FrameEntry, number: int) -> float:

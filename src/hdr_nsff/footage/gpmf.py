@@ -1,0 +1,76 @@
+"""Exposures that a GoPro wrote into its video: the track in General Purpose Metadata
+Format (GPMF, https://github.com/gopro/gpmf-parser).
+
+The track's packets are nested entries of a key of four letters, a type, the size of a
+value, their number, and the values, padded to four bytes. `SHUT` holds exposure times
+in seconds, `ISOE` the sensor's sensitivity, both once a frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+HEADER_BYTES = 8
+NESTED = 0  # the type of an entry that holds entries
+TYPES = {b"f": ">f4", b"S": ">u2", b"L": ">u4", b"s": ">i2", b"l": ">i4"}
+# of frames, by which their number may differ from that of the written exposures
+MAX_MISSING_SHARE = 0.02
+
+
+def read_gopro_ev(path: Path, num_frames: int) -> np.ndarray | None:
+    """log2 of (exposure time x ISO / 100) of every frame of a video (num_frames,).
+
+    None where the video has no such track, or one that does not fit its frames.
+    """
+    seconds: list[float] = []
+    iso: list[float] = []
+    for packet in metadata_packets(path):
+        for key, values in entries(packet):
+            if key == b"SHUT":
+                seconds += values.tolist()
+            elif key == b"ISOE":
+                iso += values.tolist()
+    if not seconds or min(seconds) <= 0:
+        return None
+    if len(iso) != len(seconds) or min(iso) <= 0:
+        iso = [100.0] * len(seconds)
+    if abs(len(seconds) - num_frames) > max(1, MAX_MISSING_SHARE * num_frames):
+        return None
+    ev = np.log2(seconds) + np.log2(np.array(iso) / 100)
+    return np.pad(ev, (0, max(0, num_frames - len(ev))), mode="edge")[:num_frames]
+
+
+def metadata_packets(path: Path) -> Iterator[bytes]:
+    """The packets of a video's track of GPMF; none where it has none."""
+    import av
+    from av.error import FFmpegError
+
+    try:
+        with av.open(str(path)) as container:
+            tracks = [s for s in container.streams if "MET" in s.metadata.get("handler_name", "")]
+            if tracks:
+                yield from (bytes(packet) for packet in container.demux(tracks[0]))
+    except (FFmpegError, OSError):
+        return  # the frames were read: whatever is wrong with this track, they count
+
+
+def entries(data: bytes) -> Iterator[tuple[bytes, np.ndarray]]:
+    """Keys and values of all entries of numbers in a packet, however nested.
+
+    An entry that is cut short, as in a damaged file, ends its level.
+    """
+    start = 0
+    while start + HEADER_BYTES <= len(data):
+        key, kind = data[start : start + 4], data[start + 4 : start + 5]
+        size = data[start + 5] * int.from_bytes(data[start + 6 : start + HEADER_BYTES], "big")
+        content = data[start + HEADER_BYTES : start + HEADER_BYTES + size]
+        if len(content) < size:
+            return
+        if kind[0] == NESTED:
+            yield from entries(content)
+        elif kind in TYPES and size % np.dtype(TYPES[kind]).itemsize == 0:
+            yield key, np.frombuffer(content, TYPES[kind]).astype(np.float64)
+        start += HEADER_BYTES + -(-size // 4) * 4

@@ -1,0 +1,63 @@
+"""Exposures in a GoPro's metadata track."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hdr_nsff.footage import gpmf
+
+
+def entry(key: bytes, kind: bytes, size: int, content: bytes) -> bytes:
+    """One entry of the format; `size` bytes a value."""
+    count = len(content) // size
+    head = key + kind + bytes([size]) + count.to_bytes(2, "big")
+    return head + content + bytes(-len(content) % 4)
+
+
+def packet(seconds: list[float], iso: list[int]) -> bytes:
+    """A packet as a camera writes it: a device with streams, one of a text."""
+    shutter = entry(b"SHUT", b"f", 4, struct.pack(f">{len(seconds)}f", *seconds))
+    sensor = entry(b"ISOE", b"S", 2, struct.pack(f">{len(iso)}H", *iso))
+    streams = [entry(b"STNM", b"c", 1, b"Exposure time") + shutter, sensor]
+    return entry(b"DEVC", b"\0", 1, b"".join(entry(b"STRM", b"\0", 1, s) for s in streams))
+
+
+@pytest.fixture
+def track(monkeypatch: pytest.MonkeyPatch) -> list[bytes]:
+    """The packets of a video."""
+    packets = [packet([1 / 100, 1 / 200, 1 / 400], [100, 100, 200]), packet([1 / 50], [100])]
+    monkeypatch.setattr(gpmf, "metadata_packets", lambda path: iter(packets))
+    return packets
+
+
+def test_exposures_are_time_times_sensitivity(track: list[bytes]) -> None:
+    ev = gpmf.read_gopro_ev(Path("clip.mp4"), 4)
+    assert ev is not None
+    np.testing.assert_allclose(ev - ev[0], [0, -1, -1, 1], atol=1e-6)
+
+
+def test_a_last_frame_without_exposure_takes_the_one_before(track: list[bytes]) -> None:
+    ev = gpmf.read_gopro_ev(Path("clip.mp4"), 5)
+    assert ev is not None and ev.shape == (5,) and ev[4] == ev[3]
+
+
+def test_exposures_of_other_frames_are_not_taken(track: list[bytes]) -> None:
+    assert gpmf.read_gopro_ev(Path("clip.mp4"), 8) is None
+    track[:] = [packet([], [])]
+    assert gpmf.read_gopro_ev(Path("clip.mp4"), 4) is None
+
+
+@given(st.binary(max_size=200), st.integers(0, 80))
+def test_damaged_tracks_end_and_do_not_raise(noise: bytes, cut: int) -> None:
+    whole = packet([0.01] * 3, [100] * 3)
+    for data in (noise, whole[:cut] + noise, whole[cut:]):
+        assert all(len(key) == 4 for key, _ in gpmf.entries(data))
+
+
+def test_a_video_without_the_track_has_none(tmp_path: Path) -> None:
+    (tmp_path / "clip.mp4").write_bytes(b"no video")
+    assert gpmf.read_gopro_ev(tmp_path / "clip.mp4", 3) is None
