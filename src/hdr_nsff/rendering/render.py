@@ -118,7 +118,10 @@ def check_settings(config: RenderConfig) -> None:
         raise InputError(f"--ev {output.ev:g}: {meaning}")
     if output.hdr_video:
         check_encoder(output.hdr_codec)
-    if output.exr == "none" and not (output.png or output.video or output.hdr_video):
+    hdr = output.hdr_video or output.hdr_still
+    if "avif" in output.hdr_still:
+        check_encoder("av1")
+    if output.exr == "none" and not (output.png or output.video or hdr):
         options = "--exr none --no-png --no-video"
         raise InputError(f"{options}: nothing left to write; leave one of them out")
 

@@ -39,7 +39,8 @@ from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
-from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, write_hdr_shot
+from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, neutral_radiance, write_hdr_shot
+from hdr_nsff.rendering.hdr_stills import HdrStill, still_path, still_paths, write_hdr_still
 from hdr_nsff.rendering.interpolate import Mode, render_at
 from hdr_nsff.training.run_folder import Run
 
@@ -64,6 +65,10 @@ class Output:
     """
     hdr_codec: Codec = "hevc"
     """Of HDR videos: hevc plays on more screens, av1 is royalty-free."""
+    hdr_still: tuple[HdrStill, ...] = ()
+    """HDR picture of every view: ultrahdr (JPEG with a gain map, for phones and
+    browsers), avif (PQ, 10 bits), png16 (PQ, 16 bits).
+    """
     ev: float | None = None
     """Develop at this exposure, relative to the reference; default: tone-map for a
     display.
@@ -236,16 +241,15 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     if not 0 <= output.camera_id < cameras:
         problem = f"the run has learned cameras 0 to {cameras - 1}"
         raise InputError(f"camera {output.camera_id}: {problem}")
-    for path in hdr_files(out, shot.name, output):
-        camera = shot.views[0].camera
-        check_side(path, camera.width // 2 * 2, camera.height // 2 * 2)
+    check_sides(out, shot, output)
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
     sheet = out / f"{shot.name}_sheet.png"
     products = [video, sheet, *hdr_paths(out, shot.name)]
     note = open_sequence(run, shot, folder, output, products)
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
-    wanted = [*wanted_files(pictures, video, output), *hdr_files(out, shot.name, output)]
+    stills = still_paths(pictures, output.hdr_still)
+    wanted = [*wanted_files(pictures, video, output), *hdr_files(out, shot.name, output), *stills]
     if note.complete and all(path.exists() for path in wanted):
         say(f"{shot.name}: all {len(shot.views)} views are there already ({folder})")
         return result
@@ -255,6 +259,7 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     if output.video:
         write_video(video, (read_image(p) for p in pictures), shot.fps)
     write_hdr_videos(run, shot, pictures, out, output, note.display_exposure)
+    write_hdr_stills(run, shot, pictures, output, note.display_exposure)
     write_sheet(sheet, pictures)
     for picture in pictures:
         if not output.png:
@@ -265,6 +270,16 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     done = note.model_copy(update={"complete": True, "seconds": seconds})
     notes.write(folder / "sequence.json", done)
     return result
+
+
+def check_sides(out: Path, shot: Shot, output: Output) -> None:
+    """InputError where the encoders of HDR files do not take pictures of this size."""
+    files = hdr_files(out, shot.name, output)
+    if "avif" in output.hdr_still:
+        files.append(still_path(out / shot.name / "00000.png", "avif"))
+    camera = shot.views[0].camera
+    for path in files:
+        check_side(path, camera.width // 2 * 2, camera.height // 2 * 2)
 
 
 def wanted_files(pictures: Sequence[Path], video: Path, output: Output) -> list[Path]:
@@ -285,7 +300,7 @@ def name_results(
     """What a user gets of a shot: `result` of `render_shot` and the HDR videos."""
     videos = hdr_files(out, shot.name, output)
     named = {f"{label}, {t}": path for t, path in zip(output.hdr_video, videos, strict=True)}
-    with_pictures = output.video or output.png or output.exr != "none"
+    with_pictures = output.video or output.png or output.exr != "none" or output.hdr_still
     if not with_pictures:
         return named
     return {label: result, **named}
@@ -317,6 +332,21 @@ def write_hdr_videos(
         write_hdr_shot(run, files, path, transfer, codec, shot.fps, exposure, *balanced)
 
 
+def write_hdr_stills(
+    run: Run, shot: Shot, pictures: Sequence[Path], output: Output, display_exposure: float
+) -> None:
+    """The HDR stills that are missing, from the EXR files beside the `pictures`."""
+    balanced = output.white_balance, output.camera_id
+    for picture, view in zip(pictures, shot.views, strict=True):
+        ev = ev_of(view, output)
+        exposure = display_exposure if ev is None else 2.0**ev
+        missing = [kind for kind in output.hdr_still if not still_path(picture, kind).exists()]
+        if missing:
+            radiance = next(neutral_radiance(run, [picture.with_suffix(".exr")], *balanced))
+            for kind in missing:
+                write_hdr_still(picture, kind, radiance, exposure)
+
+
 def write_sheet(path: Path, pictures: Sequence[Path]) -> None:
     """A contact sheet of up to `SHEET_VIEWS` pictures, spread evenly over the shot."""
     count = min(SHEET_VIEWS, len(pictures))
@@ -334,8 +364,7 @@ def open_sequence(
     Pictures and `products` of other settings or of another checkpoint are removed.
     InputError for files that no `render` has written.
     """
-    pictures = replace(output, hdr_video=(), hdr_codec="hevc")  # HDR videos change none
-    key = fingerprint(run, shot.views, shot.fps, pictures)
+    key = fingerprint(run, shot.views, shot.fps, picture_settings(output))
     path = folder / "sequence.json"
     found = notes.read(path, notes.Sequence)
     if found is not None and found.key == key:
@@ -360,9 +389,16 @@ def open_sequence(
     return note
 
 
+def picture_settings(output: Output) -> dict[str, Any]:
+    """The settings that the pictures and EXR files of a shot depend on."""
+    later = {"hdr_video", "hdr_codec", "hdr_still"}  # made from them
+    return {name: value for name, value in vars(output).items() if name not in later}
+
+
 def numbered_pictures(folder: Path) -> list[Path]:
-    """PNG and EXR files in `folder` whose names begin with a digit."""
-    return [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}]
+    """Pictures and EXR files in `folder` whose names begin with a digit."""
+    endings = {".png", ".exr", ".jpg", ".avif"}
+    return [p for p in folder.glob("[0-9]*") if p.suffix in endings]
 
 
 def ev_of(view: PathView, output: Output) -> float | None:
@@ -377,7 +413,7 @@ def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure
     """
     exr = picture.with_suffix(".exr")
     with_vectors = output.exr != "none"
-    with_exr = with_vectors or bool(output.hdr_video)  # HDR videos are made from EXR
+    with_exr = with_vectors or bool(output.hdr_video or output.hdr_still)  # made from EXR
     if picture.exists() and (exr.exists() or not with_exr):
         return
     still = render_still(run, view, output.between, motion=with_vectors)

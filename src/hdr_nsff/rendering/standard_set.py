@@ -80,7 +80,7 @@ def render_all(
             results["EXR sequence"] = out / "training"
             results |= write_pictures(run, out, shot, output)
         else:
-            video = render_shot(run, shot, out, replace(output, exr="none"))
+            video = render_shot(run, shot, out, replace(output, exr="none", hdr_still=()))
         results |= name_results(out, shot, LABELS[shot.name], output, video)
     return results
 
