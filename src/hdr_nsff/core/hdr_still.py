@@ -61,7 +61,8 @@ def write_avif(path: Path | str, planes: Planes) -> None:
 def write_pq_png(path: Path | str, signal: np.ndarray, light: LightLevels) -> None:
     """Write a PQ signal (H, W, 3) in [0, 1] as 16-bit PNG, atomically.
 
-    Primaries are those of BT.2020. The chunks cICP and cLLI (PNG, third edition) hold the tags and the light levels.
+    Primaries are those of BT.2020. The chunks cICP and cLLI (PNG, third edition) hold
+    the tags and the light levels.
     """
     codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)
     ok, buffer = cv2.imencode(".png", np.ascontiguousarray(codes[..., ::-1]))

@@ -25,23 +25,21 @@ import torch
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import MOTION_DIRECTIONS, write_exr
 from hdr_nsff.core.hdr_video import Codec, check_side
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
-from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.core.video import write_video
-from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.outputs import record_pixels
-from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
 from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, neutral_radiance, write_hdr_shot
 from hdr_nsff.rendering.hdr_stills import HdrStill, still_path, still_paths, write_hdr_still
-from hdr_nsff.rendering.interpolate import Mode, render_at
+from hdr_nsff.rendering.interpolate import Mode
+from hdr_nsff.rendering.mattes import ObjectMattes
+from hdr_nsff.rendering.stills import Vectors, device_of, render_still, write_still
 from hdr_nsff.training.run_folder import Run
 
 PROBE_SCALE = 0.25  # size of the pictures that set the display exposure (hand-chosen: it is fast)
@@ -54,7 +52,11 @@ class Output:
     """Which files are written for every view, and how pictures are developed."""
 
     exr: Literal["half", "float", "none"] = "half"
-    """EXR: radiance, depth Z, motion, motion vectors."""
+    """EXR: radiance, alpha, depth Z, motion, motion vectors, mattes of the movers."""
+    exr_vectors: Vectors = "nuke"
+    """Names and signs of motion on the screen: forward.u, ... for Nuke, Vector.X, ...
+    for Blender.
+    """
     png: bool = True
     """8-bit PNG."""
     video: bool = True
@@ -95,53 +97,6 @@ class Shot:
     name: str
     views: list[PathView]
     fps: float
-
-
-@dataclass(frozen=True)
-class Still:
-    """One rendered view, numpy float32."""
-
-    radiance: np.ndarray  # (H, W, 3) linear HDR
-    depth: np.ndarray  # (H, W) z-depth, scene units
-    motion: np.ndarray  # (H, W) in [0, 1]: share of dynamic content
-    # {+-1: (H, W, 2)} pixels: motion of the content until the next / previous frame, in
-    # a camera at rest
-    flow: dict[int, np.ndarray]
-
-
-def device_of(run: Run) -> torch.device:
-    """The device of the run's field and tone mapper."""
-    return run.tonemapper.knots.device
-
-
-def render_still(run: Run, view: PathView, between: Mode = "auto", motion: bool = True) -> Still:
-    """Render one view; without `motion` vectors it takes less time."""
-    limit_torch_threads(run.config.torch_threads)
-    camera = to_device(view.camera, device_of(run))
-    times = run.scene.times.tolist()
-    with torch.no_grad():
-        seen = render_at(run.field, camera, view.time, times, between, motion)
-        flow = motion_vectors(seen, camera)
-
-    def image(values: torch.Tensor) -> np.ndarray:
-        return values.reshape(camera.height, camera.width, *values.shape[1:]).float().cpu().numpy()
-
-    flow_images = {offset: image(vectors) for offset, vectors in flow.items()}
-    return Still(image(seen.radiance), image(seen.depth), image(seen.motion), flow_images)
-
-
-def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
-    """The scene flow of a picture as pixels (S, 2) in the same camera.
-
-    It is the motion of the content, not of the camera.
-    """
-    pixels = camera.pixel_grid()
-    rays = camera.rays(pixels)
-    points = rays.origins + seen.depth[:, None] * rays.directions
-    return {
-        offset: camera.project(points + flow)[0] - pixels
-        for offset, flow in seen.scene_flow.items()
-    }
 
 
 def develop(
@@ -193,21 +148,6 @@ def display_exposure(run: Run, views: Sequence[PathView]) -> float:
     return color.auto_exposure(np.concatenate(radiance))
 
 
-def write_still(
-    path: Path, still: Still, view: PathView, half: bool, header: dict[str, Any]
-) -> None:
-    """One EXR: RGB radiance, `Z`, `motion`, and motion vectors where known.
-
-    The vectors are `forward.u`, `.v`, `backward.u`, `.v` in pixels.
-    """
-    channels = {"RGB": still.radiance, "Z": still.depth, "motion": still.motion}
-    for offset, flow in still.flow.items():
-        channels[f"{MOTION_DIRECTIONS[offset]}.u"] = flow[..., 0]
-        channels[f"{MOTION_DIRECTIONS[offset]}.v"] = flow[..., 1]
-    pose = json.dumps([[round(float(x), 6) for x in row] for row in view.camera.c2w])
-    write_exr(path, channels, {**header, "time": float(view.time), "cameraToWorld": pose}, half)
-
-
 # One shot
 
 
@@ -254,8 +194,9 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
         say(f"{shot.name}: all {len(shot.views)} views are there already ({folder})")
         return result
     start = time.monotonic()
-    for picture, view in zip(pictures, track(shot.views, f"rendering {shot.name}"), strict=True):
-        write_view(run, view, picture, output, note.display_exposure)
+    mattes = ObjectMattes.of_run(run) if output.exr != "none" else None
+    for i in track(range(len(pictures)), f"rendering {shot.name}"):
+        write_view(run, shot, i, pictures[i], output, note.display_exposure, mattes)
     if output.video:
         write_video(video, (read_image(p) for p in pictures), shot.fps)
     write_hdr_videos(run, shot, pictures, out, output, note.display_exposure)
@@ -406,17 +347,27 @@ def ev_of(view: PathView, output: Output) -> float | None:
     return output.ev if view.ev is None else view.ev
 
 
-def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure: float) -> None:
+def write_view(
+    run: Run,
+    shot: Shot,
+    index: int,
+    picture: Path,
+    output: Output,
+    exposure: float,
+    mattes: ObjectMattes | None,
+) -> None:
     """Write `picture` and the EXR beside it where one of them is missing.
 
     `exposure` is that of the display.
     """
+    view = shot.views[index]
     exr = picture.with_suffix(".exr")
     with_vectors = output.exr != "none"
     with_exr = with_vectors or bool(output.hdr_video or output.hdr_still)  # made from EXR
     if picture.exists() and (exr.exists() or not with_exr):
         return
-    still = render_still(run, view, output.between, motion=with_vectors)
+    steps = neighbor_views(shot.views, index) if with_vectors else {}
+    still = render_still(run, view, output.between, with_vectors, steps)
     ev = ev_of(view, output)
     if with_exr:
         header = radiance_header(run, output.white_balance, output.camera_id)
@@ -426,5 +377,12 @@ def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure
             header["developedEV"] = float(ev)
         stored = balance(run, still.radiance, output.white_balance, output.camera_id)
         stored_still = replace(still, radiance=stored)
-        write_still(exr, stored_still, view, output.exr != "float", header)
+        objects = mattes.coverage(view) if mattes is not None else {}
+        half = output.exr != "float"
+        write_still(exr, stored_still, view, half, header, output.exr_vectors, objects)
     write_png(picture, develop_view(run, view, still.radiance, ev, output.camera_id, exposure))
+
+
+def neighbor_views(views: Sequence[PathView], index: int) -> dict[int, PathView]:
+    """The next (1) and the previous (-1) view of a shot, where there is one."""
+    return {side: views[index + side] for side in (1, -1) if 0 <= index + side < len(views)}

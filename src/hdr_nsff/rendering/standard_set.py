@@ -28,8 +28,8 @@ from hdr_nsff.rendering.shots import (
     fingerprint,
     name_results,
     render_shot,
-    render_still,
 )
+from hdr_nsff.rendering.stills import render_still
 from hdr_nsff.training.run_folder import Run
 
 LABELS = {
