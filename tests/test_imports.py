@@ -47,6 +47,8 @@ HEAVY = {
     "transformers",
     "huggingface_hub",
     "kornia",
+    "pxr",
+    "PyOpenColorIO",
 }
 
 
