@@ -27,6 +27,7 @@ from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import Codec, check_side
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
+from hdr_nsff.core.ocio import Look
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.core.video import write_video
@@ -75,6 +76,17 @@ class Output:
     """Develop at this exposure, relative to the reference; default: tone-map for a
     display.
     """
+    ocio: str | None = None
+    """Develop PNG and video by OpenColorIO instead: studio-config-latest,
+    cg-config-latest, or a file NAME.ocio. White is as for HDR: --ev, else the
+    display's exposure.
+    """
+    view: str | None = None
+    """With --ocio: a view, like 'ACES 2.0 - SDR 100 nits (Rec.709)'; default: the
+    display's first.
+    """
+    display: str | None = None
+    """With --ocio: a display, like 'sRGB - Display'; default: the first."""
     camera_id: int = 0
     """Whose learned response and white balance develop the picture (with --ev), and
     whose neutral --white-balance takes.
@@ -195,8 +207,9 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
         return result
     start = time.monotonic()
     mattes = ObjectMattes.of_run(run) if output.exr != "none" else None
+    look = open_look(output)
     for i in track(range(len(pictures)), f"rendering {shot.name}"):
-        write_view(run, shot, i, pictures[i], output, note.display_exposure, mattes)
+        write_view(run, shot, i, pictures[i], output, note.display_exposure, mattes, look)
     if output.video:
         write_video(video, (read_image(p) for p in pictures), shot.fps)
     write_hdr_videos(run, shot, pictures, out, output, note.display_exposure)
@@ -355,6 +368,7 @@ def write_view(
     output: Output,
     exposure: float,
     mattes: ObjectMattes | None,
+    look: Look | None,
 ) -> None:
     """Write `picture` and the EXR beside it where one of them is missing.
 
@@ -380,7 +394,19 @@ def write_view(
         objects = mattes.coverage(view) if mattes is not None else {}
         half = output.exr != "float"
         write_still(exr, stored_still, view, half, header, output.exr_vectors, objects)
-    write_png(picture, develop_view(run, view, still.radiance, ev, output.camera_id, exposure))
+    if look is None:
+        rgb = develop_view(run, view, still.radiance, ev, output.camera_id, exposure)
+    else:
+        white = exposure if ev is None else 2.0**ev
+        rgb = look.develop(white * balance(run, still.radiance, "neutral", output.camera_id))
+    write_png(picture, rgb)
+
+
+def open_look(output: Output) -> Look | None:
+    """The look that develops pictures, where one is asked for."""
+    if output.ocio is None:
+        return None
+    return Look(output.ocio, output.view, output.display)
 
 
 def neighbor_views(views: Sequence[PathView], index: int) -> dict[int, PathView]:
