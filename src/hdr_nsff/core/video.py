@@ -106,6 +106,9 @@ class VideoInfo:
     frames: int  # 0: unknown
     fps: float
     seconds: float  # of the picture; 0: unknown
+    transfer: int = 2  # code of H.273: 16 PQ, 18 HLG, 2 unknown
+    primaries: int = 2  # code of H.273: 1 Rec. 709, 9 BT.2020, 2 unknown
+    bits: int = 8
 
 
 def video_info(path: Path | str) -> VideoInfo:
@@ -126,7 +129,15 @@ def video_info(path: Path | str) -> VideoInfo:
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")
             seconds = duration_of(container, stream)
-            return VideoInfo(stream.frames, float(stream.average_rate or DEFAULT_FPS), seconds)
+            pixels = codec.format
+            return VideoInfo(
+                stream.frames,
+                float(stream.average_rate or DEFAULT_FPS),
+                seconds,
+                codec.color_trc,
+                codec.color_primaries,
+                pixels.components[0].bits if pixels is not None else 8,
+            )
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
 
@@ -150,3 +161,22 @@ def unreadable(path: Path, error: Exception) -> InputError:
     reason = getattr(error, "strerror", None) or type(error).__name__
     problem = f"not a readable video, or cut short ({reason})"
     return InputError(f"{path}: {problem}; check that it plays, or copy it again")
+
+
+def frame_times(path: Path | str) -> np.ndarray:
+    """Seconds at which the frames of a video are shown, in order; nothing is decoded.
+
+    Frames that an edit list hides count too. InputError where the file is no video.
+    """
+    import av
+
+    path = Path(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: no video stream in this file")
+            packets = container.demux(video=0)
+            found = [float(p.pts * p.time_base) for p in packets if p.pts is not None]
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
+        raise unreadable(path, error) from error
+    return np.sort(np.array(found))
