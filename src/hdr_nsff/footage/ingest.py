@@ -8,6 +8,7 @@ one kind of recording. HLG and PQ video is brought there too, by its tags.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import re
@@ -285,10 +286,20 @@ def encode_light(signal: np.ndarray, transfer: Transfer, rec2020: bool) -> np.nd
     1 is the brightest scene light of HLG, and 1000 nits of PQ. Colors outside Rec. 709
     are clipped.
     """
-    light = pq_decode(signal) / PEAK_NITS if transfer == "pq" else hlg_inverse_oetf(signal)
+    codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)  # as decoded
+    light = light_table(transfer)[codes]
     if rec2020:
-        light = light @ np.linalg.solve(rgb_to_xyz(REC709), rgb_to_xyz(REC2020)).T
-    return (np.clip(light, 0, 1) ** (1 / GAMMA)).astype(np.float32)
+        matrix = np.linalg.solve(rgb_to_xyz(REC709), rgb_to_xyz(REC2020))
+        light = light @ matrix.T.astype(np.float32)
+    return np.clip(light, 0, 1) ** np.float32(1 / GAMMA)
+
+
+@functools.cache
+def light_table(transfer: Transfer) -> np.ndarray:
+    """Light (65536,) float32 of the signals of 16 bits, 1 is the peak."""
+    signal = np.linspace(0, 1, 65536)
+    light = pq_decode(signal) / PEAK_NITS if transfer == "pq" else hlg_inverse_oetf(signal)
+    return light.astype(np.float32)
 
 
 def read_frame(path: Path, over: float | None = None) -> np.ndarray:
