@@ -13,7 +13,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
-from hdr_nsff.rendering.hdr_shots import measure_light
+from hdr_nsff.radiometry.hdr_footage import measure_light
 from hdr_nsff.rendering.shots import Output, Shot, render_shot
 
 

@@ -104,8 +104,9 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
             yield Finding("warning", "exposure", text, "list the exposures in exposures.csv")
         else:
             text = "the exposure does not alternate, so light beyond its white is not recorded"
-            advice = "alternate two or three exposures (docs: shooting), or try `reexpose`"
-            yield Finding("problem", "exposure", text, advice)
+            advice = "alternate two or three exposures"
+            level: Level = "warning" if exposure.drift_ev > tuning.max_drift_ev else "problem"
+            yield Finding(level, "exposure", text, advice)
     if exposure.drift_ev > tuning.max_drift_ev and exposure.given_range_ev < MIN_STEP:
         text = f"the exposure drifts by about {exposure.drift_ev:.1f} EV: auto exposure"
         advice = "`prepare` follows it, but lock exposure and white balance if you can"

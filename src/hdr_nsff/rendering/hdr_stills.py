@@ -27,7 +27,7 @@ from hdr_nsff.maths.hdr_signal import (
     rgb_to_xyz,
     ycbcr_planes,
 )
-from hdr_nsff.rendering.hdr_shots import measure_light
+from hdr_nsff.radiometry.hdr_footage import measure_light
 
 HdrStill = Literal["ultrahdr", "avif", "png16"]
 
