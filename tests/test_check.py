@@ -54,7 +54,7 @@ def test_an_alternating_clip_with_parallax_is_fit_for_everything(
 
 
 def test_a_tripod_with_one_exposure_has_neither_hdr_nor_viewpoints(tmp_path: Path) -> None:
-    facts, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * FRAMES))
+    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * FRAMES))
     assert facts.camera.motion == "tripod" and facts.exposure.cycle == 1
     works = outlook(facts)
     assert works["HDR"].startswith("no") and works["new viewpoints"].startswith("no")
@@ -64,7 +64,7 @@ def test_a_tripod_with_one_exposure_has_neither_hdr_nor_viewpoints(tmp_path: Pat
 
 def test_auto_exposure_is_told_from_a_locked_one(tmp_path: Path) -> None:
     drifting = [0.1 * t - 0.6 for t in range(FRAMES)]
-    facts, _ = measure_clip(clip_of(tmp_path, still_scene, drifting))
+    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, drifting))
     assert facts.exposure.cycle == 1
     assert facts.exposure.drift_ev == pytest.approx(1.1, abs=0.15)
     assert any("auto exposure" in finding.text for finding in judge(facts))
@@ -76,7 +76,7 @@ def test_bands_of_mains_flicker_are_found(tmp_path: Path) -> None:
     def flickering(t: int) -> np.ndarray:
         return still_scene(t) * (1 + 0.1 * np.sin(2 * np.pi * (4 * rows + 0.3 * t)))
 
-    facts, _ = measure_clip(clip_of(tmp_path, flickering, [0.0] * FRAMES))
+    facts, _, _ = measure_clip(clip_of(tmp_path, flickering, [0.0] * FRAMES))
     assert facts.exposure.banding_ev == pytest.approx(0.24, abs=0.1)  # of a difference of two
     assert any(finding.subject == "flicker" for finding in judge(facts))
 
@@ -85,7 +85,7 @@ def test_a_cut_is_found(tmp_path: Path) -> None:
     def cut(t: int) -> np.ndarray:
         return still_scene(t) if t < 5 else still_scene(t)[:, ::-1]
 
-    facts, _ = measure_clip(clip_of(tmp_path, cut, [0.0] * FRAMES))
+    facts, _, _ = measure_clip(clip_of(tmp_path, cut, [0.0] * FRAMES))
     assert facts.camera.cuts == (5,)
 
 
@@ -97,10 +97,21 @@ def test_a_blurred_long_exposure_is_found(tmp_path: Path) -> None:
         return np.mean([np.roll(picture, k, 1) for k in range(-6, 7)], 0)
 
     evs = [0.0, -2.0] * (FRAMES // 2)
-    facts, _ = measure_clip(clip_of(tmp_path / "a", blurred, evs))
+    facts, _, _ = measure_clip(clip_of(tmp_path / "a", blurred, evs))
     assert facts.camera.long_sharpness is not None and facts.camera.long_sharpness < 0.8
-    facts, _ = measure_clip(clip_of(tmp_path / "b", still_scene, evs))
+    facts, _, _ = measure_clip(clip_of(tmp_path / "b", still_scene, evs))
     assert facts.camera.long_sharpness is not None and facts.camera.long_sharpness > 0.9
+
+
+def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
+    evs = [0.0, -1.0, -2.0, -3.0, -4.0, -5.0, -6.0, -7.0]  # no cycle: a bracket of stills
+    clip = clip_of(tmp_path, still_scene, evs)
+    rows = [f"{t},{ev}" for t, ev in enumerate(evs)]
+    (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows]))
+    facts, _, brackets = measure_clip(clip)
+    assert facts.exposure.given == "exposures.csv" and brackets == list(range(8))
+    assert facts.exposure.ev == (7, 6, 5, 4, 3, 2, 1, 0)
+    assert facts.exposure.white_share[7] == 0 and outlook(facts)["HDR"] == "yes"
 
 
 def good_facts() -> ClipFacts:
@@ -108,7 +119,7 @@ def good_facts() -> ClipFacts:
     return ClipFacts(
         FileFacts("a.mp4", 60, 1, 640, 360, 24.0, 8, "recorded", (41.7, 41.7)),
         60,
-        ExposureFacts(2, (0.0, 2.0), 0.97, None, 0, 2.0, 0.1, (0.0, 0.2), (0.1, 0.0), 0.0),
+        ExposureFacts(2, (0.0, 2.0), 0.97, None, 2.0, 0.1, (0.0, 0.2), (0.1, 0.0), 0.0),
         CameraFacts("parallax", 0.2, 3.0, 0.98, ()),
     )
 

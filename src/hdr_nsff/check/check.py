@@ -18,7 +18,6 @@ from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.check.picture import MARKS, draw
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
-from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 
 PNG_START = b"\x89PNG"
 WIDTH = 100  # characters of a line
@@ -43,10 +42,10 @@ def check(config: CheckConfig) -> Path:
     """The verb: the picture that was written."""
     picture = config.picture or Path(f"{config.clip.resolve().stem}_check.png")
     check_place(picture)
-    facts, video = measure_clip(config.clip)
+    facts, video, brackets = measure_clip(config.clip)
     findings, works = judge(facts), outlook(facts)
     with writing_to(picture):
-        draw(picture, facts, video, detect_cycle(video).brackets, works, findings)
+        draw(picture, facts, video, brackets, works, findings)
     if config.json:
         document = {
             "clip": str(config.clip),

@@ -26,13 +26,12 @@ class FileFacts:
 
 @dataclass(frozen=True)
 class ExposureFacts:
-    """Exposures, from brightness under a gamma of 2.2."""
+    """Exposures as given, or from brightness under a gamma of 2.2."""
 
     cycle: int  # frames; 1: no alternation
     ev: tuple[float, ...]  # per bracket, relative to the darkest
     explained: float  # share of the changes of brightness that the cycle explains
     given: str | None  # exposures.csv or EXIF, where frames have them
-    given_range_ev: float  # between the darkest and the brightest of those
     change_ev: float  # mean change of brightness from frame to frame
     drift_ev: float  # range of what matched points change beyond the cycle
     white_share: tuple[float, ...]  # per bracket: pixels with a saturated channel

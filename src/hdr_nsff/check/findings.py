@@ -59,7 +59,7 @@ def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Fin
 def outlook(facts: ClipFacts) -> dict[str, str]:
     """What will work, by purpose: yes, partly or no, and why."""
     exposure, camera = facts.exposure, facts.camera
-    varies = exposure.cycle > 1 or exposure.given_range_ev >= MIN_STEP
+    varies = max(exposure.ev) >= MIN_STEP
     hdr = "no: one exposure shows no light beyond its white"
     if varies:
         hdr = "yes"
@@ -78,41 +78,38 @@ def outlook(facts: ClipFacts) -> dict[str, str]:
 def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     """The cycle, or what is there instead."""
     exposure = facts.exposure
+    ordered = sorted(exposure.ev)
     if exposure.given is not None:
-        text = f"exposures are given by {exposure.given}, {exposure.given_range_ev:.1f} EV in all"
+        text = (
+            f"{len(ordered)} exposures are given by {exposure.given}, {ordered[-1]:.1f} EV in all"
+        )
         yield Finding("good", "exposure", text)
-    if exposure.cycle > 1:
-        levels = ", ".join(f"{value:.1f}" for value in sorted(exposure.ev))
+    elif exposure.cycle > 1:
+        levels = ", ".join(f"{value:.1f}" for value in ordered)
         text = (
             f"the exposure alternates in a cycle of {exposure.cycle} frames at about {levels} EV "
             f"(by brightness, gamma 2.2), which explains {exposure.explained:.0%} of its changes"
         )
         yield Finding("good", "exposure", text)
-        ordered = sorted(exposure.ev)
-        widest = max((b - a for a, b in itertools.pairwise(ordered)), default=0.0)
-        if widest > tuning.max_step_ev:
-            text = f"two exposures are {widest:.1f} EV apart and share few mid-tones"
-            yield Finding(
-                "warning", "exposure", text, "use steps of 1 to 3 EV, or a third exposure"
-            )
-    elif exposure.given_range_ev < MIN_STEP:
-        if exposure.change_ev > MIN_STEP:
-            text = (
-                f"brightness changes by {exposure.change_ev:.1f} EV from frame to frame, but in "
-                f"no cycle of up to {MAX_CYCLE} frames"
-            )
-            yield Finding("warning", "exposure", text, "list the exposures in exposures.csv")
-        else:
-            text = "the exposure does not alternate, so light beyond its white is not recorded"
-            advice = "alternate two or three exposures"
-            level: Level = "warning" if exposure.drift_ev > tuning.max_drift_ev else "problem"
-            yield Finding(level, "exposure", text, advice)
-    if exposure.drift_ev > tuning.max_drift_ev and exposure.given_range_ev < MIN_STEP:
+    elif exposure.change_ev > MIN_STEP:
+        text = (
+            f"brightness changes by {exposure.change_ev:.1f} EV from frame to frame, but in "
+            f"no cycle of up to {MAX_CYCLE} frames"
+        )
+        yield Finding("warning", "exposure", text, "list the exposures in exposures.csv")
+    else:
+        text = "the exposure does not alternate, so light beyond its white is not recorded"
+        level: Level = "warning" if exposure.drift_ev > tuning.max_drift_ev else "problem"
+        yield Finding(level, "exposure", text, "alternate two or three exposures")
+    widest = max((b - a for a, b in itertools.pairwise(ordered)), default=0.0)
+    if widest > tuning.max_step_ev:
+        text = f"two exposures are {widest:.1f} EV apart and share few mid-tones"
+        yield Finding("warning", "exposure", text, "use steps of 1 to 3 EV, or a third exposure")
+    if exposure.drift_ev > tuning.max_drift_ev and exposure.given is None:
         text = f"the exposure drifts by about {exposure.drift_ev:.1f} EV: auto exposure"
         advice = "`prepare` follows it, but lock exposure and white balance if you can"
         yield Finding("warning", "exposure", text, advice)
-    comparable = exposure.cycle > 1 or exposure.given_range_ev < MIN_STEP
-    if comparable and exposure.banding_ev > tuning.min_banding_ev:
+    if exposure.banding_ev > tuning.min_banding_ev:
         text = f"bands of about {exposure.banding_ev:.2f} EV run through the picture: mains flicker"
         advice = "use exposure times of 1/50 or 1/100 s (1/60 or 1/120 s where mains have 60 Hz)"
         yield Finding("warning", "flicker", text, advice)

@@ -61,8 +61,10 @@ class CheckTuning:
     min_band_power: float = 0.3
 
 
-def measure_clip(clip: Path, tuning: CheckTuning = CheckTuning()) -> tuple[ClipFacts, np.ndarray]:
-    """The facts of a clip, and the small frames (T, H, W, 3) that they are from.
+def measure_clip(
+    clip: Path, tuning: CheckTuning = CheckTuning()
+) -> tuple[ClipFacts, np.ndarray, list[int]]:
+    """The facts of a clip, its small frames (T, H, W, 3), and their brackets (T,).
 
     Of several cameras, the first is looked at. InputError for footage that cannot be
     read, and where all is black or white.
@@ -82,7 +84,8 @@ def measure_clip(clip: Path, tuning: CheckTuning = CheckTuning()) -> tuple[ClipF
     if nothing is not None:
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
     file = describe_file(footage)
-    cycle = exposure.detect_cycle(video)
+    source, given = given_exposures(footage, len(video))
+    cycle = given_cycle(given) if source is not None else exposure.detect_cycle(video)
     equalized, clipped = exposure.equalize(video, cycle.brackets)
     keypoints = detect_keypoints(equalized, clipped)
     following = match_pairs(keypoints, [(t, t + 1) for t in range(len(video) - 1)])
@@ -90,10 +93,10 @@ def measure_clip(clip: Path, tuning: CheckTuning = CheckTuning()) -> tuple[ClipF
     facts = ClipFacts(
         file=file,
         looked_at=len(video),
-        exposure=measure_exposure(footage, video, cycle, keypoints, tuning),
+        exposure=measure_exposure(source, video, cycle, keypoints, tuning),
         camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
     )
-    return facts, video
+    return facts, video, cycle.brackets
 
 
 def describe_file(footage: ingest.Footage) -> FileFacts:
@@ -123,7 +126,7 @@ def describe_file(footage: ingest.Footage) -> FileFacts:
 
 
 def measure_exposure(
-    footage: ingest.Footage,
+    source: str | None,
     video: np.ndarray,
     cycle: exposure.Cycle,
     keypoints: list[Keypoints],
@@ -135,7 +138,6 @@ def measure_exposure(
     black = (video < tuning.low).all(-1).mean((1, 2))
     steps = exposure.brightness_steps(video)
     count = len(cycle.ev)
-    source, given = given_exposures(footage, len(video))
 
     def per_bracket(shares: np.ndarray) -> tuple[float, ...]:
         return tuple(round(float(shares[brackets == b].mean()), 4) for b in range(count))
@@ -145,7 +147,6 @@ def measure_exposure(
         ev=tuple(round(value, 2) for value in cycle.ev),
         explained=round(cycle.confidence, 3),
         given=source,
-        given_range_ev=round(max(given, default=0.0) - min(given, default=0.0), 2),
         change_ev=round(float(np.abs(steps).mean()), 3),
         drift_ev=round(measure_drift(video, cycle, keypoints, tuning), 2),
         white_share=per_bracket(white),
@@ -158,12 +159,23 @@ def given_exposures(footage: ingest.Footage, count: int) -> tuple[str | None, li
     """Where exposures are written down, and those of the first `count` frames."""
     table = read_exposure_csv(footage)
     if table is not None:
-        return table[0].name, list(table[1].values())[:count]
+        given = list(table[1].values())[:count]
+        return (table[0].name, given) if len(given) == count else (None, [])
     if footage.video:
         return None, []
     known = [read_exif_ev(path) for path in footage.cameras[0][:count]]
     given = [ev for ev in known if ev is not None]
-    return ("EXIF", given) if len(given) == count else (None, [])
+    if len(given) < count or max(given) - min(given) < exposure.MIN_STEP:
+        return None, []
+    return "EXIF", given
+
+
+def given_cycle(given: list[float]) -> exposure.Cycle:
+    """The cycle of the EVs of frames as they are written down."""
+    brackets, ev = exposure.brackets_by_ev(given)
+    relative = [value - min(ev) for value in ev]
+    order = np.argsort(ev, kind="stable").tolist()
+    return exposure.Cycle(exposure.period(brackets), brackets, order, relative, 1.0)
 
 
 def measure_drift(
