@@ -66,9 +66,10 @@ def draw(
 
 def chosen_frames(brackets: Sequence[int]) -> list[int]:
     """Frames to show: the first of each exposure, or three of the clip."""
-    firsts = [list(brackets).index(b) for b in sorted(set(brackets))][:MAX_PICTURES]
+    firsts = [list(brackets).index(b) for b in sorted(set(brackets))]
     if len(firsts) > 1:
-        return firsts
+        count = min(len(firsts), MAX_PICTURES)
+        return [firsts[round(k)] for k in np.linspace(0, len(firsts) - 1, count)]
     return sorted({0, len(brackets) // 2, len(brackets) - 1})
 
 

@@ -6,6 +6,7 @@ Frames are rgb (H, W, 3) in [0, 1]. Reading checks and refuses in one sentence
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -80,7 +81,7 @@ def tag_rec709(target: Any) -> None:
 def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
     """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
 
-    Rotated as the file says. InputError where nothing can be decoded.
+    Rotated and mirrored as the file says. InputError where nothing can be decoded.
     """
     import av
 
@@ -92,11 +93,28 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
             for frame in container.decode(video=0):
                 deep = frame.format.components[0].bits > 8
                 array = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
-                turned = np.rot90(array, round(frame.rotation / 90))
+                turned = turn(array, frame.rotation, is_mirrored(frame))
                 top = np.float32(65535 if deep else 255)
                 yield turned.astype(np.float32) / top, float(frame.time or 0.0)
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
+
+
+def is_mirrored(frame: Any) -> bool:
+    """Whether the display matrix of a frame mirrors it: its determinant is negative."""
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = struct.unpack("<5i", bytes(data)[:20])
+            return a * d - b * c < 0
+    return False
+
+
+def turn(picture: np.ndarray, degrees: float, mirrored: bool) -> np.ndarray:
+    """A picture (H, W, 3) as players show it: mirrored top to bottom, then turned
+    counterclockwise, as FFmpeg takes display matrices apart.
+    """
+    upright = picture[::-1] if mirrored else picture
+    return np.rot90(upright, round(degrees / 90))
 
 
 @dataclass(frozen=True)
