@@ -8,16 +8,29 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from fakes import fake_run
+from test_export_gaussians import make_run
+from test_hdr_shots import large_shot
+from test_hdr_video import decoded, luma
+from toy_scene import ToyScene
 from viewer_scenes import render, scene_file, trained, trained_local
 
+from hdr_nsff.core.exr import read_exr
+from hdr_nsff.geometry.paths import read_path
+from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.maths.metrics import mu_law_psnr
+from hdr_nsff.rendering.shots import Output, render_shot
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import scene_of
 from hdr_nsff.viewer.page_file import PageSettings, make_page
 from hdr_nsff.viewer.scene_file import to_bytes
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "examples"))
+import camera_path
+import hdr_video
 import read_scene
+import render_view
 
 SIZE = (96, 64)
 
@@ -47,3 +60,35 @@ def test_the_reader_draws_time_local_gaussians(toy: Scene, tmp_path: Path) -> No
     expected = render(field, toy, 1, 1.7, SIZE)
     found = torch.from_numpy(draw(path, toy, 1.7))
     assert mu_law_psnr(found, expected, float(expected.max())) > 50
+
+
+def test_a_view_of_a_run_is_rendered(
+    toy: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(toy, tmp_path)
+    monkeypatch.setattr(Run, "open", lambda *_: run)
+    radiance = render_view.render_view(tmp_path, 1.5, tmp_path / "view.exr")
+    seen = read_exr(tmp_path / "view.exr")
+    assert np.allclose(seen["RGB"], radiance, rtol=1e-2, atol=1e-3)
+    assert seen["Z"].shape == (34, 60) and (tmp_path / "view.png").is_file()
+
+
+def test_a_path_made_from_the_scene_is_one_that_render_takes(toy: Scene, tmp_path: Path) -> None:
+    scene = ToyScene().write(tmp_path / "scene")
+    count = camera_path.dolly(scene, tmp_path / "dolly.json")
+    views = read_path(tmp_path / "dolly.json", toy.train[0].camera)
+    assert len(views) == count == 11
+    assert [view.time for view in views] == pytest.approx(np.arange(11) / 2)
+    assert torch.equal(views[0].camera.c2w, toy.train[3].camera.c2w)
+    assert not torch.equal(views[2].camera.c2w, views[0].camera.c2w)
+
+
+def test_exr_files_become_an_hdr_video(tmp_path: Path) -> None:
+    render_shot(fake_run(tmp_path), large_shot(), tmp_path, Output(exr="float"))
+    video = tmp_path / "hdr.mp4"
+    assert hdr_video.hdr_video(tmp_path / "some", video, 24, -1.0) == 2
+    stream, frames = decoded(video)
+    assert stream.codec_context.color_trc == 16 and len(frames) == 2
+    light = display_light(read_exr(tmp_path / "some/00001.exr")["RGB"], 0.5, "pq")
+    expected = ycbcr_planes(encode(light, "pq"))[0].astype(int)
+    assert np.abs(luma(frames[1]) - expected).mean() < 2

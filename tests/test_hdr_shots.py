@@ -13,7 +13,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
-from hdr_nsff.rendering.hdr_shots import measure_light
+from hdr_nsff.radiometry.hdr_footage import measure_light
 from hdr_nsff.rendering.shots import Output, Shot, render_shot
 
 
@@ -61,6 +61,6 @@ def test_light_levels_are_measured_from_the_largest_channel() -> None:
 def test_pictures_too_small_for_an_encoder_are_refused_before_rendering(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
     before = run.field.calls
-    with pytest.raises(InputError, match="48 x 32 pixels; HDR video takes at least 64"):
+    with pytest.raises(InputError, match="48 x 32 pixels; an HDR encoder takes at least 64"):
         render_shot(run, large_shot(1.0), tmp_path / "out", Output(hdr_video=("pq",)))
     assert run.field.calls == before and not (tmp_path / "out").exists()

@@ -83,7 +83,7 @@ def test_what_cannot_be_written_is_refused(tmp_path: Path, monkeypatch: Any) -> 
     with pytest.raises(InputError, match="no frames to write"):
         write_hdr_video(tmp_path / "a.mp4", [], 24, "pq")
     small = ycbcr_planes(np.zeros((8, 8, 3)))
-    with pytest.raises(InputError, match="8 x 8 pixels; HDR video takes at least 64"):
+    with pytest.raises(InputError, match="8 x 8 pixels; an HDR encoder takes at least 64"):
         write_hdr_video(tmp_path / "a.mp4", [small], 24, "pq")
     monkeypatch.setitem(ENCODERS, "hevc", "libnone")
     with pytest.raises(InputError, match="this PyAV has no encoder libnone"):

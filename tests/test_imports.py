@@ -11,6 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"
 VERBS = {
+    "check.check",
     "prepare.prepare",
     "synth.synth",
     "synth.reexpose",
@@ -47,6 +48,8 @@ HEAVY = {
     "transformers",
     "huggingface_hub",
     "kornia",
+    "pxr",
+    "PyOpenColorIO",
 }
 
 

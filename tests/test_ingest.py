@@ -3,6 +3,7 @@ written down.
 """
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -11,7 +12,8 @@ from mutations import check_reader
 from PIL import Image
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.exr import REC709, write_exr
+from hdr_nsff.core.hdr_video import write_hdr_video
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.ingest import (
@@ -23,6 +25,7 @@ from hdr_nsff.footage.ingest import (
     read_frames,
     shrink,
 )
+from hdr_nsff.maths.hdr_signal import REC2020, hlg_oetf, pq_encode, rgb_to_xyz, ycbcr_planes
 
 
 def picture(value: float, height: int = 24, width: int = 32) -> np.ndarray:
@@ -235,3 +238,25 @@ def test_unevenly_spaced_frames_have_no_spacing() -> None:
     assert hold_out_spacing([0, 8]) is None
     assert hold_out_spacing([4, 8]) is None
     assert hold_out_spacing([1, 2, 4]) is None
+
+
+@pytest.mark.parametrize("transfer", ["hlg", "pq"])
+def test_hdr_video_is_brought_to_linear_light_by_its_tags(tmp_path: Path, transfer: Any) -> None:
+    light = np.zeros((64, 96, 3))
+    light[...] = [0.3, 0.1, 0.05]  # Rec. 709, of the peak
+    light[:, 48:] *= 0.25
+    to_2020 = np.linalg.solve(rgb_to_xyz(REC2020), rgb_to_xyz(REC709))
+    wide = light @ to_2020.T
+    signal = pq_encode(1000 * wide) if transfer == "pq" else hlg_oetf(wide)
+    write_hdr_video(tmp_path / "a.mp4", [ycbcr_planes(signal)] * 3, 24, transfer)
+    footage = open_footage(tmp_path / "a.mp4")
+    assert footage.transfer == transfer
+    frame = next(read_frames(footage, 0, None, 1, 4096))
+    for column, factor in ((20, 1.0), (76, 0.25)):
+        found = frame.rgb[32, column] ** 2.2
+        assert found == pytest.approx(factor * np.array([0.3, 0.1, 0.05]), rel=0.04, abs=2e-3)
+
+
+def test_video_without_hdr_tags_is_taken_as_recorded(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", [np.full((16, 16, 3), 0.5)] * 3)
+    assert open_footage(tmp_path / "a.mp4").transfer is None

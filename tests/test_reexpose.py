@@ -3,16 +3,19 @@ other.
 """
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_hdr_video import decoded, luma
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.pose_files import import_poses
+from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.scene.truth import Truth
@@ -199,3 +202,18 @@ def test_auto_exposure_drifts_and_is_kept_as_truth(tmp_path):
 def test_without_auto_exposure_no_drift_is_kept(tmp_path):
     out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out"))
     assert Truth.open(out / "truth").clip_drift is None
+
+
+def test_hdr_references_hold_the_linearized_clip(tmp_path):
+    clip = tmp_path / "in"
+    for t in range(8):
+        write_png(clip / f"{t:03d}.png", np.full((64, 64, 3), 0.1 * (t + 1)))
+    config = ReexposeConfig(clip, tmp_path / "out", hdr_video=("pq", "hlg"))
+    out = reexpose(config)
+    reexpose(replace(config, hdr_video=("pq",)))  # the same problem
+    for transfer in ("pq", "hlg"):
+        _, frames = decoded(out / f"reference_{transfer}.mp4")
+        assert len(frames) == 8
+        light = display_light(np.full((2, 2, 3), 0.4**2.2), 1.0, transfer)
+        expected = ycbcr_planes(encode(light, transfer))[0][0, 0]
+        assert abs(float(np.median(luma(frames[3]))) - expected) < 4

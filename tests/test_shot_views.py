@@ -13,7 +13,7 @@ from fakes import SPEED, DiscBeforeWall, W, camera, fake_run
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.rendering.shot_views import plan_shot
-from hdr_nsff.rendering.shots import render_still
+from hdr_nsff.rendering.stills import render_still
 
 
 def path_file(folder: Path, x: float, time: float) -> str:

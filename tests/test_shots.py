@@ -36,9 +36,46 @@ def test_exr_holds_radiance_depth_motion_and_motion_vectors(tmp_path: Path) -> N
     disc = seen["motion"] > 0.5
     assert disc.sum() == truth.motion.sum()
     # speed 0.1, 0.025 scene units a frame at depth 2, focal 40: 2 and 0.5 pixels
-    assert np.allclose(seen["forward.u"][disc], 2.0, atol=1e-3)
-    assert np.allclose(seen["backward.v"][disc], -0.5, atol=1e-3)
-    assert np.allclose(seen["forward.u"][~disc], 0, atol=1e-3)
+    assert np.allclose(seen["content.forward.u"][disc], 2.0, atol=1e-3)
+    assert np.allclose(seen["content.backward.v"][disc], -0.5, atol=1e-3)
+    assert np.allclose(seen["content.forward.u"][~disc], 0, atol=1e-3)
+    assert np.allclose(seen["opacity"].ravel(), truth.opacity)
+    assert (seen["RGBA"][..., 3] == 1).all()
+    # a view alone: the same motion on the screen, y up
+    assert np.allclose(seen["forward.u"], seen["content.forward.u"])
+    assert np.allclose(seen["backward.v"], -seen["content.backward.v"])
+
+
+def motion_of_a_pair(tmp_path: Path, output: Output) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Channels of the first of two views half a frame apart, and its disc (H, W) bool.
+
+    The camera goes 0.2 to the right: the wall at depth 4 moves 2 pixels to the left,
+    the disc at 2 moves 4, and half a frame of its own motion back: 1 and 0.25 pixels.
+    """
+    views = [PathView(camera(0.0), 2.0), PathView(camera(0.2), 2.5)]
+    render_shot(fake_run(tmp_path), Shot("two", views, 12), tmp_path, output)
+    seen = read_exr(tmp_path / "two/00000.exr")
+    return seen, seen["motion"] > 0.5
+
+
+def test_motion_on_the_screen_has_the_cameras_part_and_y_up(tmp_path: Path) -> None:
+    seen, disc = motion_of_a_pair(tmp_path, Output(exr="float", between="direct"))
+    assert np.allclose(seen["forward.u"][disc], -3.0, atol=1e-3)
+    assert np.allclose(seen["forward.v"][disc], -0.25, atol=1e-3)
+    assert np.allclose(seen["forward.u"][~disc], -2.0, atol=1e-3)
+    assert np.allclose(seen["forward.v"][~disc], 0, atol=1e-3)
+    # the first view of a shot: motion continues in a straight line
+    assert np.allclose(seen["backward.u"], -seen["forward.u"])
+
+
+def test_vectors_for_blender_are_to_the_previous_and_from_the_next_picture(
+    tmp_path: Path,
+) -> None:
+    output = Output(exr="float", between="direct", exr_vectors="blender")
+    seen, disc = motion_of_a_pair(tmp_path, output)
+    for name, expected in zip("XYZW", (3.0, 0.25, 3.0, 0.25), strict=True):
+        assert np.allclose(seen[f"Vector.{name}"][disc], expected, atol=1e-3)
+    assert "forward.u" not in seen
 
 
 def test_exr_header_names_exposure_and_time(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from synth_scene import Flat, plane
+from test_hdr_video import decoded, luma
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
@@ -14,6 +15,7 @@ from hdr_nsff.core.video import read_video
 from hdr_nsff.footage.exposure_lists import read_exposure_csv
 from hdr_nsff.footage.ingest import open_footage
 from hdr_nsff.geometry.pinhole import pixel_centers, project
+from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 from hdr_nsff.synth import synth as verb
@@ -159,3 +161,22 @@ def test_a_killed_rig_continues_and_does_not_mix_with_one_camera(flat: SynthConf
     np.testing.assert_array_equal(read_npy(flow), before)
     with pytest.raises(InputError, match="other settings"):
         synth(flat)
+
+
+def test_hdr_references_hold_the_radiance_of_the_clip(flat: SynthConfig) -> None:
+    config = replace(flat, size="64x64", hdr_video=("pq",))
+    synth(config)
+    _, frames = decoded(flat.out / "reference_pq.mp4")
+    assert len(frames) == flat.frames
+    light = display_light(np.full((2, 2, 3), 0.18), 1.0, "pq")  # an even wall is mid gray
+    expected = ycbcr_planes(encode(light, "pq"))[0][0, 0]
+    assert abs(float(np.median(luma(frames[1]))) - expected) <= 4
+
+
+def test_hdr_references_of_too_small_frames_are_refused_before_rendering(
+    flat: SynthConfig,
+) -> None:
+    before = Flat.rendered
+    with pytest.raises(InputError, match="an HDR encoder takes at least 64"):
+        synth(replace(flat, hdr_video=("pq",)))
+    assert Flat.rendered == before

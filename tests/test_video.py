@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.video import read_video, video_info, write_video
+from hdr_nsff.core.video import (
+    is_mirrored,
+    read_video,
+    turn,
+    video_info,
+    write_video,
+)
 
 FRAMES = [np.full((17, 33, 3), level) for level in (0.1, 0.5, 0.9)]
 
@@ -41,3 +49,17 @@ def test_videos_that_are_cut_short_or_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "b.mp4").write_text("<html>")
     with pytest.raises(InputError, match="not a readable video"):
         list(read_video(tmp_path / "b.mp4"))
+
+
+def test_mirrored_display_matrices_are_taken_apart_as_ffmpeg_does() -> None:
+    """The matrix (0 1, 1 0) swaps x and y; FFmpeg calls that a turn by -90 degrees."""
+
+    class DisplayMatrix(bytes):
+        type = SimpleNamespace(name="DISPLAYMATRIX")
+
+    picture = np.arange(2 * 3 * 3).reshape(2, 3, 3)
+    for matrix, mirrored in (((0, 1, 0, 1, 0), True), ((0, 1, 0, -1, 0), False)):
+        data = DisplayMatrix(struct.pack("<5i", *(65536 * x for x in matrix)))
+        assert is_mirrored(SimpleNamespace(side_data=[data])) == mirrored
+    assert np.array_equal(turn(picture, -90, True), picture.transpose(1, 0, 2))
+    assert np.array_equal(turn(picture, -90, False), picture.transpose(1, 0, 2)[:, ::-1])

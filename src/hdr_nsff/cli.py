@@ -43,6 +43,11 @@ VERBS = {
         "hdr_nsff.pipeline:RunConfig",
         "Footage to HDR in one go: prepare, train, render, evaluate, report.",
     ),
+    "check": Verb(
+        "hdr_nsff.check.check:check",
+        "hdr_nsff.check.check:CheckConfig",
+        "Look at a clip in a minute: what will work, what to shoot otherwise.",
+    ),
     "prepare": Verb(
         "hdr_nsff.prepare.prepare:prepare",
         "hdr_nsff.prepare.prepare:PrepareConfig",

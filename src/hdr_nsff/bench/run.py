@@ -28,7 +28,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.prepare.prepare import prepare
-from hdr_nsff.rendering.shots import device_of
+from hdr_nsff.rendering.stills import device_of
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train

@@ -32,14 +32,16 @@ def write_exr(
 ) -> None:
     """Write channels {name: (H, W)} or {"RGB": (H, W, 3)}, never clamped.
 
-    NaN and Inf are an error. With `half`, channels take 16 bits, but depth `Z` and
-    radiance beyond 65504 keep 32. Keys of `header` (str, float, tuples) become
-    attributes; without `chromaticities`, the file claims none. Compression is ZIP.
+    NaN and Inf are an error. With `half`, channels take 16 bits, but depth `Z`, ids of
+    Cryptomatte and radiance beyond 65504 keep 32. Keys of `header` (str, float, tuples)
+    become attributes; without `chromaticities`, the file claims none. Compression is
+    ZIP.
     """
     arrays = {}
     for name, array in channels.items():
         assert np.isfinite(array).all(), f"{path}: channel {name} holds NaN or Inf"
-        arrays[name] = to_pixels(array, half and name != "Z")
+        exact = name == "Z" or name.startswith("Crypto")
+        arrays[name] = to_pixels(array, half and not exact)
     full = {
         "compression": OpenEXR.ZIP_COMPRESSION,
         "type": OpenEXR.scanlineimage,

@@ -104,7 +104,7 @@ def check_side(path: Path | str, width: int, height: int) -> None:
     """InputError for pictures that the encoders do not take."""
     if min(width, height) < MIN_SIDE_PX:
         size = f"pictures of {width} x {height} pixels"
-        limit = f"HDR video takes at least {MIN_SIDE_PX} pixels a side; use a larger --scale"
+        limit = f"an HDR encoder takes at least {MIN_SIDE_PX} pixels a side; use larger ones"
         raise InputError(f"{path}: {size}; {limit}")
 
 

@@ -6,6 +6,7 @@ Frames are rgb (H, W, 3) in [0, 1]. Reading checks and refuses in one sentence
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -80,7 +81,7 @@ def tag_rec709(target: Any) -> None:
 def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
     """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
 
-    Rotated as the file says. InputError where nothing can be decoded.
+    Rotated and mirrored as the file says. InputError where nothing can be decoded.
     """
     import av
 
@@ -92,11 +93,28 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
             for frame in container.decode(video=0):
                 deep = frame.format.components[0].bits > 8
                 array = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
-                turned = np.rot90(array, round(frame.rotation / 90))
+                turned = turn(array, frame.rotation, is_mirrored(frame))
                 top = np.float32(65535 if deep else 255)
                 yield turned.astype(np.float32) / top, float(frame.time or 0.0)
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
+
+
+def is_mirrored(frame: Any) -> bool:
+    """Whether the display matrix of a frame mirrors it: its determinant is negative."""
+    for data in frame.side_data:
+        if data.type.name == "DISPLAYMATRIX":
+            a, b, _, c, d = struct.unpack("<5i", bytes(data)[:20])
+            return a * d - b * c < 0
+    return False
+
+
+def turn(picture: np.ndarray, degrees: float, mirrored: bool) -> np.ndarray:
+    """A picture (H, W, 3) as players show it: mirrored top to bottom, then turned
+    counterclockwise, as FFmpeg takes display matrices apart.
+    """
+    upright = picture[::-1] if mirrored else picture
+    return np.rot90(upright, round(degrees / 90))
 
 
 @dataclass(frozen=True)
@@ -106,6 +124,9 @@ class VideoInfo:
     frames: int  # 0: unknown
     fps: float
     seconds: float  # of the picture; 0: unknown
+    transfer: int = 2  # code of H.273: 16 PQ, 18 HLG, 2 unknown
+    primaries: int = 2  # code of H.273: 1 Rec. 709, 9 BT.2020, 2 unknown
+    bits: int = 8
 
 
 def video_info(path: Path | str) -> VideoInfo:
@@ -126,7 +147,15 @@ def video_info(path: Path | str) -> VideoInfo:
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")
             seconds = duration_of(container, stream)
-            return VideoInfo(stream.frames, float(stream.average_rate or DEFAULT_FPS), seconds)
+            pixels = codec.format
+            return VideoInfo(
+                stream.frames,
+                float(stream.average_rate or DEFAULT_FPS),
+                seconds,
+                codec.color_trc,
+                codec.color_primaries,
+                pixels.components[0].bits if pixels is not None else 8,
+            )
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
 
@@ -150,3 +179,22 @@ def unreadable(path: Path, error: Exception) -> InputError:
     reason = getattr(error, "strerror", None) or type(error).__name__
     problem = f"not a readable video, or cut short ({reason})"
     return InputError(f"{path}: {problem}; check that it plays, or copy it again")
+
+
+def frame_times(path: Path | str) -> np.ndarray:
+    """Seconds at which the frames of a video are shown, in order; nothing is decoded.
+
+    Frames that an edit list hides count too. InputError where the file is no video.
+    """
+    import av
+
+    path = Path(path)
+    try:
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise InputError(f"{path}: no video stream in this file")
+            packets = container.demux(video=0)
+            found = [float(p.pts * p.time_base) for p in packets if p.pts is not None]
+    except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
+        raise unreadable(path, error) from error
+    return np.sort(np.array(found))

@@ -3,11 +3,12 @@ synchronized camera), read frame by frame.
 
 Frames come out as recorded rgb in [0, 1]. EXR and DNG are linear: they are scaled by
 one constant for the whole footage and encoded as x^(1/2.2), so that what follows sees
-one kind of recording.
+one kind of recording. HLG and PQ video is brought there too, by its tags.
 """
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 import re
@@ -19,10 +20,18 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError, shorten
-from hdr_nsff.core.exr import read_exr
+from hdr_nsff.core.exr import REC709, read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.core.picture_size import check_size
 from hdr_nsff.core.video import read_video, video_info
+from hdr_nsff.maths.hdr_signal import (
+    PEAK_NITS,
+    REC2020,
+    Transfer,
+    hlg_inverse_oetf,
+    pq_decode,
+    rgb_to_xyz,
+)
 
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
@@ -32,6 +41,8 @@ ACCEPTED = (
     "or a folder of such folders (one per camera)"
 )
 LOSSY = {".jpg", ".jpeg"}  # formats of frames
+TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}  # by their codes in H.273
+REC2020_CODE = 9  # of H.273: BT.2020 primaries
 GAMMA = 2.2  # linear footage is encoded as x^(1 / GAMMA)
 WHITE_PERCENTILE = 99.9  # of linear radiance, becomes 1 (hand-chosen)
 FOLDER_FPS = 24.0  # frames per second assumed for a folder of frames
@@ -56,6 +67,7 @@ class Footage:
     linear: bool  # EXR or DNG
     # gray that shows through transparent pixels; None: transparency is ignored
     over: float | None = None
+    transfer: Transfer | None = None  # of HDR video, by its tags
 
     @property
     def files(self) -> dict[str, Path]:
@@ -121,7 +133,8 @@ def open_video(clip: Path) -> Footage:
     if not clip.stat().st_size:
         raise InputError(f"{clip}: the file is empty; copy it again")
     info = video_info(clip)
-    return Footage(clip, [[clip]], True, info.frames, info.fps, False)
+    transfer = TRANSFERS.get(info.transfer)
+    return Footage(clip, [[clip]], True, info.frames, info.fps, False, transfer=transfer)
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
@@ -256,12 +269,37 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
             return
         last = seconds
         if number in chosen:
+            transfer = TRANSFERS.get(info.transfer)
+            if transfer is not None:
+                image = encode_light(image, transfer, info.primaries == REC2020_CODE)
             yield number, f"{path.name}#{number}", image
     if last + MAX_MISSING_FRAMES / info.fps < info.seconds:
         raise InputError(
             f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); "
             "copy it again"
         )
+
+
+def encode_light(signal: np.ndarray, transfer: Transfer, rec2020: bool) -> np.ndarray:
+    """HDR signals (H, W, 3) in [0, 1] as linear Rec. 709 light, encoded as x^(1/2.2).
+
+    1 is the brightest scene light of HLG, and 1000 nits of PQ. Colors outside Rec. 709
+    are clipped.
+    """
+    codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)  # as decoded
+    light = light_table(transfer)[codes]
+    if rec2020:
+        matrix = np.linalg.solve(rgb_to_xyz(REC709), rgb_to_xyz(REC2020))
+        light = light @ matrix.T.astype(np.float32)
+    return np.clip(light, 0, 1) ** np.float32(1 / GAMMA)
+
+
+@functools.cache
+def light_table(transfer: Transfer) -> np.ndarray:
+    """Light (65536,) float32 of the signals of 16 bits, 1 is the peak."""
+    signal = np.linspace(0, 1, 65536)
+    light = pq_decode(signal) / PEAK_NITS if transfer == "pq" else hlg_inverse_oetf(signal)
+    return light.astype(np.float32)
 
 
 def read_frame(path: Path, over: float | None = None) -> np.ndarray:

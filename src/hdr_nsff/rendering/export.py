@@ -1,5 +1,5 @@
-"""The verb `export`: a page that plays in a browser, Gaussians as PLY files, or a scene
-in a public data layout.
+"""The verb `export`: a page for browsers, Gaussians as PLY or USD, the camera
+as text, or a scene in a public data layout.
 
 The last two are for other programs. The writers of layouts are in `footage/layouts/`.
 """
@@ -20,10 +20,15 @@ from hdr_nsff.footage.layouts import held_out, llff, nerfstudio
 from hdr_nsff.footage.layouts.writer import Source
 from hdr_nsff.rendering.export_gaussians import ColorTransform, export_one, export_sequence
 from hdr_nsff.rendering.export_page import BARE, PAGE, export_page
+from hdr_nsff.rendering.export_scene import CHAN, export_chan, export_usd
+from hdr_nsff.rendering.usd import ENDINGS as USD_ENDINGS
 from hdr_nsff.training.run_folder import Run, read_config
 
 Layout = Literal["hdr-gopro", "nerfstudio"]
 MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
+# What files of these endings are
+KINDS = {PAGE: "a page", BARE: "a page", CHAN: "a camera path"}
+KINDS |= dict.fromkeys(USD_ENDINGS, "USD")
 
 
 @dataclass(frozen=True)
@@ -32,6 +37,10 @@ class ExportConfig:
 
     One HTML file that plays in every browser, without a network:
     hdr-nsff export out/run scene.html
+
+    Moving Gaussians and the camera as USD: hdr-nsff export out/run scene.usdc
+
+    The camera alone, for Nuke: hdr-nsff export out/run camera.chan
 
     Gaussians at a time: hdr-nsff export out/run frame.ply --ply --time 12.5
 
@@ -51,8 +60,9 @@ class ExportConfig:
     """Run folder; for --layout a scene folder, or a run folder, whose scene is meant.
     """
     out: tyro.conf.Positional[Path]
-    """The output: NAME.html for a page, NAME.hdr4d for its scene alone, a file NAME.ply
-    with --ply, a folder with --ply-sequence and --layout.
+    """The output: NAME.html for a page, NAME.hdr4d for its scene alone, NAME.usdc,
+    .usda or .usd for USD, NAME.chan for the camera, a file NAME.ply with --ply, a
+    folder with --ply-sequence and --layout.
     """
     layout: Layout | None = None
     """The scene's frames, poses, masks, depth and flow as HDR-GoPro / NSFF (LLFF), one
@@ -82,8 +92,13 @@ def export(config: ExportConfig) -> Path:
         return export_scene(config.run, config.out, config.layout, config.truth)
     run = Run.open(config.run, config.device)
     with writing_to(config.out), lock_output(config.out):
-        if is_page(config.out):
+        ending = config.out.suffix.lower()
+        if ending in (PAGE, BARE):
             return export_page(run, config.out)
+        if ending in USD_ENDINGS:
+            return export_usd(run, config.out)
+        if ending == CHAN:
+            return export_chan(run, config.out)
         if config.ply_sequence:
             return export_sequence(run, config.out, config.colors)
         time = config.time
@@ -93,19 +108,20 @@ def export(config: ExportConfig) -> Path:
         return export_one(run, config.out, time, config.colors)
 
 
-def is_page(out: Path) -> bool:
-    """Whether an output is a page or a scene file, by its ending."""
-    return out.suffix.lower() in (PAGE, BARE)
+def is_whole(out: Path) -> bool:
+    """Whether an output is of all times and needs no option, by its ending."""
+    return out.suffix.lower() in (PAGE, BARE, CHAN, *USD_ENDINGS)
 
 
 def check_settings(config: ExportConfig) -> None:
     """InputError for settings that make no sense, whatever the run is."""
     others = config.ply + config.ply_sequence + (config.layout is not None)
-    if is_page(config.out):
-        check_page(config, others)
+    if is_whole(config.out):
+        check_whole(config, others)
     elif others != 1:
         choices = "one of --ply (a file), --ply-sequence and --layout NAME (a folder)"
-        raise InputError(f"export: choose what to write, NAME.html or {choices}")
+        endings = "NAME.html, NAME.usdc, NAME.chan"
+        raise InputError(f"export: choose what to write, {endings} or {choices}")
     check_output(config)
     check_colors(config.colors)
     if config.layout is not None:
@@ -120,14 +136,15 @@ def check_settings(config: ExportConfig) -> None:
         raise InputError(f"--time: --ply-sequence writes every training time; {advice}")
 
 
-def check_page(config: ExportConfig, others: int) -> None:
-    """InputError for options that a page has no use for; `others` counts outputs."""
+def check_whole(config: ExportConfig, others: int) -> None:
+    """InputError for options that have no use here; `others` counts outputs."""
     out = config.out
+    kind = "a page" if out.suffix.lower() in (PAGE, BARE) else "a file with this ending"
     if others:
-        problem = "a file with this ending is a page"
+        problem = f"a file with this ending is {KINDS[out.suffix.lower()]}"
         raise InputError(f"{out}: {problem}; name another output, or leave the option out")
     if config.time is not None or config.colors != ColorTransform():
-        problem = "a page holds all times and linear radiance"
+        problem = f"{kind} holds all times and linear radiance"
         raise InputError(f"{out}: {problem}; leave --time, --ev, --linear and --camera-id out")
     if out.is_dir():
         raise InputError(f"{out}: is a folder; name a file")

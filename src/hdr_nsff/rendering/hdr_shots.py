@@ -12,14 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.exr import read_exr
-from hdr_nsff.core.hdr_video import Codec, LightLevels, Planes, write_hdr_video
-from hdr_nsff.maths.hdr_signal import (
-    PEAK_NITS,
-    Transfer,
-    display_light,
-    encode,
-    ycbcr_planes,
-)
+from hdr_nsff.core.hdr_video import Codec
+from hdr_nsff.maths.hdr_signal import Transfer
+from hdr_nsff.radiometry.hdr_footage import write_radiance_video
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, unbalance
 from hdr_nsff.training.run_folder import Run
 
@@ -71,26 +66,7 @@ def write_hdr_shot(
     `exposure` is the factor that brings diffuse white to radiance 1.
     """
 
-    def light() -> Iterator[np.ndarray]:
-        for radiance in neutral_radiance(run, files, choice, camera_id):
-            yield display_light(radiance, exposure, transfer)
+    def frames() -> Iterator[np.ndarray]:
+        return neutral_radiance(run, files, choice, camera_id)
 
-    def planes() -> Iterator[Planes]:
-        for nits in light():
-            yield ycbcr_planes(encode(nits, transfer))
-
-    levels = None  # HLG has none: its signal is relative to the display's peak
-    if transfer == "pq":
-        levels = measure_light(light())
-    write_hdr_video(path, planes(), fps, transfer, codec, levels, PEAK_NITS)
-
-
-def measure_light(frames: Iterator[np.ndarray]) -> LightLevels:
-    """MaxCLL and MaxFALL of frames of display light (H, W, 3) in nits."""
-    max_cll = 0.0
-    max_fall = 0.0
-    for nits in frames:
-        largest = nits.max(-1)
-        max_cll = max(max_cll, float(largest.max()))
-        max_fall = max(max_fall, float(largest.mean()))
-    return LightLevels(max_cll, max_fall)
+    write_radiance_video(path, frames, transfer, codec, fps, exposure)

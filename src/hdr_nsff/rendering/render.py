@@ -15,7 +15,7 @@ from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.shot_views import MAX_VIEWS, plan_shot, short_count
-from hdr_nsff.rendering.shots import Output, Shot, name_results, render_shot
+from hdr_nsff.rendering.shots import Output, Shot, name_results, open_look, render_shot
 from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.training.run_folder import Run
 
@@ -118,7 +118,13 @@ def check_settings(config: RenderConfig) -> None:
         raise InputError(f"--ev {output.ev:g}: {meaning}")
     if output.hdr_video:
         check_encoder(output.hdr_codec)
-    if output.exr == "none" and not (output.png or output.video or output.hdr_video):
+    hdr = output.hdr_video or output.hdr_still
+    if "avif" in output.hdr_still:
+        check_encoder("av1")
+    open_look(output)
+    if output.ocio is None and (output.view or output.display):
+        raise InputError("--view, --display: need a configuration; add --ocio studio-config-latest")
+    if output.exr == "none" and not (output.png or output.video or hdr):
         options = "--exr none --no-png --no-video"
         raise InputError(f"{options}: nothing left to write; leave one of them out")
 

@@ -20,7 +20,8 @@ from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.rendering.export_page import find_videos, run_scene
 from hdr_nsff.rendering.shot_views import check_views
-from hdr_nsff.rendering.shots import Still, develop_view, render_still
+from hdr_nsff.rendering.shots import develop_view
+from hdr_nsff.rendering.stills import Still, render_still
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import jpeg
 from hdr_nsff.viewer.page_file import PageSettings, make_page

@@ -106,9 +106,9 @@ def find_ranges(sources: Sequence[Path]) -> SequenceRanges:
     for source in sources:
         seen = read_exr(source)
         depths.append(seen["Z"][::DEPTH_STRIDE, ::DEPTH_STRIDE].ravel())
-        moves = moves and "forward.u" in seen
+        moves = moves and "content.forward.u" in seen
         if moves:
-            length = np.hypot(seen["forward.u"], seen["forward.v"])
+            length = np.hypot(seen["content.forward.u"], seen["content.forward.v"])
             lengths.append(length[::MOTION_STRIDE, ::MOTION_STRIDE].ravel())
     near, far = np.percentile(np.concatenate(depths), DEPTH_PERCENTILES).tolist()
     fastest = 0.0
@@ -136,7 +136,7 @@ def write_pictures_of_view(
     disparity = 1 / seen["Z"].clip(MIN_DEPTH)
     write_png(out / "depth" / name, colorize(disparity, 1 / ranges.far, 1 / ranges.near))
     if ranges.moves:
-        flow = np.stack([seen["forward.u"], seen["forward.v"]], -1)
+        flow = np.stack([seen["content.forward.u"], seen["content.forward.v"]], -1)
         write_png(out / "scene_flow" / name, colorize_flow(flow, ranges.fastest))
 
 

@@ -25,22 +25,22 @@ import torch
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.exr import MOTION_DIRECTIONS, write_exr
 from hdr_nsff.core.hdr_video import Codec, check_side
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
-from hdr_nsff.core.process import limit_torch_threads
+from hdr_nsff.core.ocio import Look
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.core.video import write_video
-from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.outputs import record_pixels
-from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
-from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, write_hdr_shot
-from hdr_nsff.rendering.interpolate import Mode, render_at
+from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, neutral_radiance, write_hdr_shot
+from hdr_nsff.rendering.hdr_stills import HdrStill, still_path, still_paths, write_hdr_still
+from hdr_nsff.rendering.interpolate import Mode
+from hdr_nsff.rendering.mattes import ObjectMattes
+from hdr_nsff.rendering.stills import Vectors, device_of, render_still, write_still
 from hdr_nsff.training.run_folder import Run
 
 PROBE_SCALE = 0.25  # size of the pictures that set the display exposure (hand-chosen: it is fast)
@@ -53,7 +53,11 @@ class Output:
     """Which files are written for every view, and how pictures are developed."""
 
     exr: Literal["half", "float", "none"] = "half"
-    """EXR: radiance, depth Z, motion, motion vectors."""
+    """EXR: radiance, alpha, depth Z, motion, motion vectors, mattes of the movers."""
+    exr_vectors: Vectors = "nuke"
+    """Names and signs of motion on the screen: forward.u, ... for Nuke, Vector.X, ...
+    for Blender.
+    """
     png: bool = True
     """8-bit PNG."""
     video: bool = True
@@ -64,10 +68,25 @@ class Output:
     """
     hdr_codec: Codec = "hevc"
     """Of HDR videos: hevc plays on more screens, av1 is royalty-free."""
+    hdr_still: tuple[HdrStill, ...] = ()
+    """HDR picture of every view: ultrahdr (JPEG with a gain map, for phones and
+    browsers), avif (PQ, 10 bits), png16 (PQ, 16 bits).
+    """
     ev: float | None = None
     """Develop at this exposure, relative to the reference; default: tone-map for a
     display.
     """
+    ocio: str | None = None
+    """Develop PNG and video by OpenColorIO instead: studio-config-latest,
+    cg-config-latest, or a file NAME.ocio. White is as for HDR: --ev, else the
+    display's exposure.
+    """
+    view: str | None = None
+    """With --ocio: a view, like 'ACES 2.0 - SDR 100 nits (Rec.709)'; default: the
+    display's first.
+    """
+    display: str | None = None
+    """With --ocio: a display, like 'sRGB - Display'; default: the first."""
     camera_id: int = 0
     """Whose learned response and white balance develop the picture (with --ev), and
     whose neutral --white-balance takes.
@@ -90,53 +109,6 @@ class Shot:
     name: str
     views: list[PathView]
     fps: float
-
-
-@dataclass(frozen=True)
-class Still:
-    """One rendered view, numpy float32."""
-
-    radiance: np.ndarray  # (H, W, 3) linear HDR
-    depth: np.ndarray  # (H, W) z-depth, scene units
-    motion: np.ndarray  # (H, W) in [0, 1]: share of dynamic content
-    # {+-1: (H, W, 2)} pixels: motion of the content until the next / previous frame, in
-    # a camera at rest
-    flow: dict[int, np.ndarray]
-
-
-def device_of(run: Run) -> torch.device:
-    """The device of the run's field and tone mapper."""
-    return run.tonemapper.knots.device
-
-
-def render_still(run: Run, view: PathView, between: Mode = "auto", motion: bool = True) -> Still:
-    """Render one view; without `motion` vectors it takes less time."""
-    limit_torch_threads(run.config.torch_threads)
-    camera = to_device(view.camera, device_of(run))
-    times = run.scene.times.tolist()
-    with torch.no_grad():
-        seen = render_at(run.field, camera, view.time, times, between, motion)
-        flow = motion_vectors(seen, camera)
-
-    def image(values: torch.Tensor) -> np.ndarray:
-        return values.reshape(camera.height, camera.width, *values.shape[1:]).float().cpu().numpy()
-
-    flow_images = {offset: image(vectors) for offset, vectors in flow.items()}
-    return Still(image(seen.radiance), image(seen.depth), image(seen.motion), flow_images)
-
-
-def motion_vectors(seen: Render, camera: Camera) -> dict[int, torch.Tensor]:
-    """The scene flow of a picture as pixels (S, 2) in the same camera.
-
-    It is the motion of the content, not of the camera.
-    """
-    pixels = camera.pixel_grid()
-    rays = camera.rays(pixels)
-    points = rays.origins + seen.depth[:, None] * rays.directions
-    return {
-        offset: camera.project(points + flow)[0] - pixels
-        for offset, flow in seen.scene_flow.items()
-    }
 
 
 def develop(
@@ -188,21 +160,6 @@ def display_exposure(run: Run, views: Sequence[PathView]) -> float:
     return color.auto_exposure(np.concatenate(radiance))
 
 
-def write_still(
-    path: Path, still: Still, view: PathView, half: bool, header: dict[str, Any]
-) -> None:
-    """One EXR: RGB radiance, `Z`, `motion`, and motion vectors where known.
-
-    The vectors are `forward.u`, `.v`, `backward.u`, `.v` in pixels.
-    """
-    channels = {"RGB": still.radiance, "Z": still.depth, "motion": still.motion}
-    for offset, flow in still.flow.items():
-        channels[f"{MOTION_DIRECTIONS[offset]}.u"] = flow[..., 0]
-        channels[f"{MOTION_DIRECTIONS[offset]}.v"] = flow[..., 1]
-    pose = json.dumps([[round(float(x), 6) for x in row] for row in view.camera.c2w])
-    write_exr(path, channels, {**header, "time": float(view.time), "cameraToWorld": pose}, half)
-
-
 # One shot
 
 
@@ -236,25 +193,27 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     if not 0 <= output.camera_id < cameras:
         problem = f"the run has learned cameras 0 to {cameras - 1}"
         raise InputError(f"camera {output.camera_id}: {problem}")
-    for path in hdr_files(out, shot.name, output):
-        camera = shot.views[0].camera
-        check_side(path, camera.width // 2 * 2, camera.height // 2 * 2)
+    check_sides(out, shot, output)
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
     sheet = out / f"{shot.name}_sheet.png"
     products = [video, sheet, *hdr_paths(out, shot.name)]
     note = open_sequence(run, shot, folder, output, products)
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
-    wanted = [*wanted_files(pictures, video, output), *hdr_files(out, shot.name, output)]
+    stills = still_paths(pictures, output.hdr_still)
+    wanted = [*wanted_files(pictures, video, output), *hdr_files(out, shot.name, output), *stills]
     if note.complete and all(path.exists() for path in wanted):
         say(f"{shot.name}: all {len(shot.views)} views are there already ({folder})")
         return result
     start = time.monotonic()
-    for picture, view in zip(pictures, track(shot.views, f"rendering {shot.name}"), strict=True):
-        write_view(run, view, picture, output, note.display_exposure)
+    mattes = ObjectMattes.of_run(run) if output.exr != "none" else None
+    look = open_look(output)
+    for i in track(range(len(pictures)), f"rendering {shot.name}"):
+        write_view(run, shot, i, pictures[i], output, note.display_exposure, mattes, look)
     if output.video:
         write_video(video, (read_image(p) for p in pictures), shot.fps)
     write_hdr_videos(run, shot, pictures, out, output, note.display_exposure)
+    write_hdr_stills(run, shot, pictures, output, note.display_exposure)
     write_sheet(sheet, pictures)
     for picture in pictures:
         if not output.png:
@@ -265,6 +224,16 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     done = note.model_copy(update={"complete": True, "seconds": seconds})
     notes.write(folder / "sequence.json", done)
     return result
+
+
+def check_sides(out: Path, shot: Shot, output: Output) -> None:
+    """InputError where the encoders of HDR files do not take pictures of this size."""
+    files = hdr_files(out, shot.name, output)
+    if "avif" in output.hdr_still:
+        files.append(still_path(out / shot.name / "00000.png", "avif"))
+    camera = shot.views[0].camera
+    for path in files:
+        check_side(path, camera.width // 2 * 2, camera.height // 2 * 2)
 
 
 def wanted_files(pictures: Sequence[Path], video: Path, output: Output) -> list[Path]:
@@ -285,7 +254,7 @@ def name_results(
     """What a user gets of a shot: `result` of `render_shot` and the HDR videos."""
     videos = hdr_files(out, shot.name, output)
     named = {f"{label}, {t}": path for t, path in zip(output.hdr_video, videos, strict=True)}
-    with_pictures = output.video or output.png or output.exr != "none"
+    with_pictures = output.video or output.png or output.exr != "none" or output.hdr_still
     if not with_pictures:
         return named
     return {label: result, **named}
@@ -317,6 +286,21 @@ def write_hdr_videos(
         write_hdr_shot(run, files, path, transfer, codec, shot.fps, exposure, *balanced)
 
 
+def write_hdr_stills(
+    run: Run, shot: Shot, pictures: Sequence[Path], output: Output, display_exposure: float
+) -> None:
+    """The HDR stills that are missing, from the EXR files beside the `pictures`."""
+    balanced = output.white_balance, output.camera_id
+    for picture, view in zip(pictures, shot.views, strict=True):
+        ev = ev_of(view, output)
+        exposure = display_exposure if ev is None else 2.0**ev
+        missing = [kind for kind in output.hdr_still if not still_path(picture, kind).exists()]
+        if missing:
+            radiance = next(neutral_radiance(run, [picture.with_suffix(".exr")], *balanced))
+            for kind in missing:
+                write_hdr_still(picture, kind, radiance, exposure)
+
+
 def write_sheet(path: Path, pictures: Sequence[Path]) -> None:
     """A contact sheet of up to `SHEET_VIEWS` pictures, spread evenly over the shot."""
     count = min(SHEET_VIEWS, len(pictures))
@@ -334,8 +318,7 @@ def open_sequence(
     Pictures and `products` of other settings or of another checkpoint are removed.
     InputError for files that no `render` has written.
     """
-    pictures = replace(output, hdr_video=(), hdr_codec="hevc")  # HDR videos change none
-    key = fingerprint(run, shot.views, shot.fps, pictures)
+    key = fingerprint(run, shot.views, shot.fps, picture_settings(output))
     path = folder / "sequence.json"
     found = notes.read(path, notes.Sequence)
     if found is not None and found.key == key:
@@ -360,9 +343,16 @@ def open_sequence(
     return note
 
 
+def picture_settings(output: Output) -> dict[str, Any]:
+    """The settings that the pictures and EXR files of a shot depend on."""
+    later = {"hdr_video", "hdr_codec", "hdr_still"}  # made from them
+    return {name: value for name, value in vars(output).items() if name not in later}
+
+
 def numbered_pictures(folder: Path) -> list[Path]:
-    """PNG and EXR files in `folder` whose names begin with a digit."""
-    return [p for p in folder.glob("[0-9]*") if p.suffix in {".png", ".exr"}]
+    """Pictures and EXR files in `folder` whose names begin with a digit."""
+    endings = {".png", ".exr", ".jpg", ".avif"}
+    return [p for p in folder.glob("[0-9]*") if p.suffix in endings]
 
 
 def ev_of(view: PathView, output: Output) -> float | None:
@@ -370,17 +360,28 @@ def ev_of(view: PathView, output: Output) -> float | None:
     return output.ev if view.ev is None else view.ev
 
 
-def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure: float) -> None:
+def write_view(
+    run: Run,
+    shot: Shot,
+    index: int,
+    picture: Path,
+    output: Output,
+    exposure: float,
+    mattes: ObjectMattes | None,
+    look: Look | None,
+) -> None:
     """Write `picture` and the EXR beside it where one of them is missing.
 
     `exposure` is that of the display.
     """
+    view = shot.views[index]
     exr = picture.with_suffix(".exr")
     with_vectors = output.exr != "none"
-    with_exr = with_vectors or bool(output.hdr_video)  # HDR videos are made from EXR
+    with_exr = with_vectors or bool(output.hdr_video or output.hdr_still)  # made from EXR
     if picture.exists() and (exr.exists() or not with_exr):
         return
-    still = render_still(run, view, output.between, motion=with_vectors)
+    steps = neighbor_views(shot.views, index) if with_vectors else {}
+    still = render_still(run, view, output.between, with_vectors, steps)
     ev = ev_of(view, output)
     if with_exr:
         header = radiance_header(run, output.white_balance, output.camera_id)
@@ -390,5 +391,24 @@ def write_view(run: Run, view: PathView, picture: Path, output: Output, exposure
             header["developedEV"] = float(ev)
         stored = balance(run, still.radiance, output.white_balance, output.camera_id)
         stored_still = replace(still, radiance=stored)
-        write_still(exr, stored_still, view, output.exr != "float", header)
-    write_png(picture, develop_view(run, view, still.radiance, ev, output.camera_id, exposure))
+        objects = mattes.coverage(view) if mattes is not None else {}
+        half = output.exr != "float"
+        write_still(exr, stored_still, view, half, header, output.exr_vectors, objects)
+    if look is None:
+        rgb = develop_view(run, view, still.radiance, ev, output.camera_id, exposure)
+    else:
+        white = exposure if ev is None else 2.0**ev
+        rgb = look.develop(white * balance(run, still.radiance, "neutral", output.camera_id))
+    write_png(picture, rgb)
+
+
+def open_look(output: Output) -> Look | None:
+    """The look that develops pictures, where one is asked for."""
+    if output.ocio is None:
+        return None
+    return Look(output.ocio, output.view, output.display)
+
+
+def neighbor_views(views: Sequence[PathView], index: int) -> dict[int, PathView]:
+    """The next (1) and the previous (-1) view of a shot, where there is one."""
+    return {side: views[index + side] for side in (1, -1) if 0 <= index + side < len(views)}

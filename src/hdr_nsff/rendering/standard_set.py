@@ -28,8 +28,8 @@ from hdr_nsff.rendering.shots import (
     fingerprint,
     name_results,
     render_shot,
-    render_still,
 )
+from hdr_nsff.rendering.stills import render_still
 from hdr_nsff.training.run_folder import Run
 
 LABELS = {
@@ -80,7 +80,7 @@ def render_all(
             results["EXR sequence"] = out / "training"
             results |= write_pictures(run, out, shot, output)
         else:
-            video = render_shot(run, shot, out, replace(output, exr="none"))
+            video = render_shot(run, shot, out, replace(output, exr="none", hdr_still=()))
         results |= name_results(out, shot, LABELS[shot.name], output, video)
     return results
 

@@ -25,6 +25,7 @@ from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.hdr_video import check_side
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -33,7 +34,9 @@ from hdr_nsff.footage import ingest
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.hdr_footage import write_radiance_video
 from hdr_nsff.radiometry.recording import Curve, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.settings import MAX_NOISE, sensor_noise
@@ -62,6 +65,10 @@ class ReexposeConfig:
     response: str = "film"
     """The camera that records: film (an S-curve, every channel its own), log, gamma or
     srgb.
+    """
+    hdr_video: tuple[Transfer, ...] = ()
+    """Also write the linearized clip as 10-bit HDR video, reference_hlg.mp4 and
+    reference_pq.mp4: hlg, pq or both. Its white is diffuse white.
     """
     hold_out: int = ingest.HOLD_OUT
     """Spacing of the frames that are held out as truth."""
@@ -127,6 +134,8 @@ def reexpose(config: ReexposeConfig) -> Path:
                 "re-expose one camera's folder at a time"
             )
         numbers, extents, size = look_through(config, footage)
+        if config.hdr_video:
+            check_side(config.clip, size[1], size[0])
         plan = plan_frames(len(numbers), len(evs), config.hold_out, config.poses is not None)
         poses = None
         if config.poses is not None:
@@ -146,6 +155,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         claim(config, footage)  # once nothing can be wrong with the settings any more
         write_frames(config, footage, plan, evs, drift, response)
         write_truth(config.out, plan, evs, drift, response, poses, masks)
+        write_references(config, footage)
         given = f"--hold-out {config.hold_out}"
         if poses is not None:
             path = config.out / "poses_bounds.npy"
@@ -200,7 +210,7 @@ def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
     """Write `reexpose.json`; InputError where the output holds something else."""
     settings: dict[str, Any] = {"clip": str(config.clip)}
     for name, value in asdict(config).items():
-        if name not in ("clip", "out"):
+        if name not in ("clip", "out", "hdr_video"):
             settings[name] = str(value) if isinstance(value, Path) else value
     settings["inputs"] = {name: ingest.hash_file(file) for name, file in footage.files.items()}
     path = config.out / "reexpose.json"
@@ -298,6 +308,19 @@ def write_frames(
             exr = config.out / f"truth/radiance/{k:05d}.exr"
             if not exr.is_file():
                 write_exr(exr, {"RGB": radiance.astype(np.float32)})
+
+
+def write_references(config: ReexposeConfig, footage: ingest.Footage) -> None:
+    """Write the linearized clip as HDR videos, where they are asked for."""
+
+    def radiance() -> Iterator[np.ndarray]:
+        return (frame.rgb.astype(np.float64) ** GAMMA for frame in chosen(config, footage))
+
+    for transfer in config.hdr_video:
+        path = config.out / f"reference_{transfer}.mp4"
+        fps = footage.fps / config.stride
+        write_radiance_video(path, radiance, transfer, "hevc", fps, 1.0)
+        say(f"{path}: the linearized clip")
 
 
 def write_truth(

@@ -10,6 +10,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry.recording import Noise, response_curve
 from hdr_nsff.synth.scenes.base import Views
 
@@ -60,6 +61,10 @@ class SynthConfig:
     """Of textures, paths and noise."""
     variant: str = "auto"
     """Mitsuba's variant: auto, llvm_ad_rgb, scalar_rgb, cuda_ad_rgb."""
+    hdr_video: tuple[Transfer, ...] = ()
+    """Also write the clip's radiance as 10-bit HDR video, reference_hlg.mp4 and
+    reference_pq.mp4: hlg, pq or both.
+    """
     oracle: bool = False
     """Also write a scene folder with exact poses and masks, and with depth and flow
     that have a little noise.

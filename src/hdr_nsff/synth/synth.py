@@ -34,11 +34,14 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS, REC709, read_exr, write_exr
+from hdr_nsff.core.hdr_video import check_side
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json, write_text, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.core.video import write_video
+from hdr_nsff.core.video import DEFAULT_FPS, write_video
+from hdr_nsff.maths import color
+from hdr_nsff.radiometry.hdr_footage import write_radiance_video
 from hdr_nsff.radiometry.recording import record, response_curve, vignette
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.motion import UV, exact_flow, view_geometry
@@ -59,6 +62,7 @@ from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 
 __all__ = ["SynthConfig", "synth"]
 
+VIDEO_FPS = DEFAULT_FPS  # of all videos
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
 TRACED_HEADER = {"chromaticities": REC709}  # Mitsuba's rgb variants are linear Rec. 709
 
@@ -75,6 +79,8 @@ def synth(config: SynthConfig) -> None:
     size = parse_size(config.size)
     evs = parse_ev(ev)
     check(config, min(spp, truth_spp))
+    if config.hdr_video:
+        check_side(config.out, *size)
     clip = clip_views(scene, config.frames, spp, config.seed, config.views)
     held_out = held_out_views(scene, config.frames, truth_spp, config.seed, config.views)
     K = intrinsics(*size)
@@ -87,6 +93,7 @@ def synth(config: SynthConfig) -> None:
         if config.views == "rig":
             list_exposures(evs, config)
         write_truth(clip, held_out, K, relative, reference, config)
+        write_references(clip, config)
         if config.oracle:
             noise = OracleNoise(
                 config.depth_noise, config.depth_grain, config.flow_noise, config.seed
@@ -226,6 +233,21 @@ def record_clip(
     return np.stack(video)
 
 
+def write_references(clip: list[TracedView], config: SynthConfig) -> None:
+    """Write the radiance of the clip as HDR videos, where they are asked for."""
+    if not config.hdr_video:
+        return
+    frames = [exact_path(config.out, view) for view in clip]
+    probes = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
+    white = color.auto_exposure(np.concatenate([read_exr(p)["RGB"] for p in probes]))
+    for transfer in config.hdr_video:
+        path = config.out / f"reference_{transfer}.mp4"
+        write_radiance_video(
+            path, lambda: (read_exr(p)["RGB"] for p in frames), transfer, "hevc", VIDEO_FPS, white
+        )
+        say(f"{path}: the clip's radiance")
+
+
 def list_exposures(evs: list[float], config: SynthConfig) -> None:
     """Write the exposure of every frame beside the footage of a rig: from camera to
     camera brightness changes for other reasons too.
@@ -276,7 +298,9 @@ def write_truth(
         response_y=curve.y.tolist(),
         white_balance=list(parse_white_balance(config.white_balance)),
         vignetting=config.vignetting,
-        settings={k: v for k, v in asdict(config).items() if k not in ("out", "variant")},
+        settings={
+            k: v for k, v in asdict(config).items() if k not in ("out", "variant", "hdr_video")
+        },
         K=K.tolist(),
         clip_c2w=[view.c2w.tolist() for view in clip],
         views=entries,

@@ -66,6 +66,9 @@ def frames_step(work: Work) -> StepResult:
     note = f"{len(entries)} frames of {m.width}x{m.height} pixels"
     if work.footage.linear:
         note += "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
+    if work.footage.transfer is not None:
+        kind = work.footage.transfer.upper()
+        note += f"; {kind} by its tags, brought to linear light and encoded as x^(1/2.2)"
     return StepResult(provenance="given", note=note)
 
 

@@ -1,0 +1,83 @@
+"""The verb `check`: what a clip is, what will work, and what to shoot otherwise.
+
+It looks at the first frames of a clip at a small size, takes less than a minute, and
+writes one picture. Nothing is stored for `prepare`.
+"""
+
+from __future__ import annotations
+
+import json
+import textwrap
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import tyro
+
+from hdr_nsff.check.findings import Finding, judge, outlook
+from hdr_nsff.check.measure import measure_clip
+from hdr_nsff.check.picture import MARKS, draw
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import writing_to
+
+PNG_START = b"\x89PNG"
+WIDTH = 100  # characters of a line
+
+
+@dataclass(frozen=True)
+class CheckConfig:
+    """Look at a clip before working with it: a minute instead of an hour.
+
+    hdr-nsff check CLIP
+    """
+
+    clip: tyro.conf.Positional[Path]
+    """Footage: a video, a folder of frames, or a folder of such folders."""
+    picture: Path | None = None
+    """The picture to write; default: CLIP_check.png in the current folder."""
+    json: bool = False
+    """Print facts and findings as JSON instead of sentences."""
+
+
+def check(config: CheckConfig) -> Path:
+    """The verb: the picture that was written."""
+    picture = config.picture or Path(f"{config.clip.resolve().stem}_check.png")
+    check_place(picture)
+    facts, video, brackets = measure_clip(config.clip)
+    findings, works = judge(facts), outlook(facts)
+    with writing_to(picture):
+        draw(picture, facts, video, brackets, works, findings)
+    if config.json:
+        document = {
+            "clip": str(config.clip),
+            "picture": str(picture),
+            "works": works,
+            "findings": [asdict(finding) for finding in findings],
+            "facts": asdict(facts),
+        }
+        print(json.dumps(document, indent=1, ensure_ascii=False))
+    else:
+        print_findings(works, findings)
+        print(f"picture: {picture}")
+    return picture
+
+
+def check_place(picture: Path) -> None:
+    """InputError where the picture is none, or would replace something else."""
+    if picture.suffix.lower() != ".png":
+        raise InputError(f"--picture {picture}: give a name that ends in .png")
+    if picture.is_dir():
+        raise InputError(f"--picture {picture}: is a folder; name a file")
+    if picture.is_file() and picture.read_bytes()[:4] != PNG_START:
+        raise InputError(f"--picture {picture}: exists and is no picture; name another file")
+
+
+def print_findings(works: dict[str, str], findings: list[Finding]) -> None:
+    """What a user reads."""
+    for name, answer in works.items():
+        print(f"{name}: {answer}")
+    print()
+    for finding in findings:
+        text = finding.text + (f"; {finding.advice}" if finding.advice else "")
+        head = f"{MARKS[finding.level]} {finding.subject:<12}"
+        indent = " " * len(head)
+        print(textwrap.fill(text, WIDTH, initial_indent=head, subsequent_indent=indent))

@@ -1,0 +1,61 @@
+"""What `check` measures of a clip: numbers, without judging them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+CameraMotion = Literal["parallax", "rotation", "tripod", "unknown"]
+
+
+@dataclass(frozen=True)
+class FileFacts:
+    """The file or the folder of frames."""
+
+    name: str
+    frames: int  # of one camera; 0: unknown
+    cameras: int
+    width: int  # as players show it, pixels
+    height: int
+    fps: float
+    bits: int
+    kind: str  # recorded, linear, hlg, pq
+    # milliseconds: the shortest and longest time between frames, of videos
+    interval_ms: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class ExposureFacts:
+    """Exposures as given, or from brightness under a gamma of 2.2."""
+
+    cycle: int  # frames; 1: no alternation
+    ev: tuple[float, ...]  # per bracket, relative to the darkest
+    explained: float  # share of the changes of brightness that the cycle explains
+    given: str | None  # exposures.csv or EXIF, where frames have them
+    change_ev: float  # mean change of brightness from frame to frame
+    drift_ev: float  # range of what matched points change beyond the cycle
+    white_share: tuple[float, ...]  # per bracket: pixels with a saturated channel
+    black_share: tuple[float, ...]  # per bracket: pixels with all channels black
+    banding_ev: float  # amplitude of bright and dark bands, 0 where there are none
+
+
+@dataclass(frozen=True)
+class CameraFacts:
+    """What the camera does, and how sharp its pictures are."""
+
+    motion: CameraMotion
+    rotation_share: float | None  # of static matches that rotations alone explain
+    pixels_per_frame: float  # median motion of matched points, pixels of the clip
+    # edges of the brightest bracket relative to those of the darkest: below 1 blurred
+    long_sharpness: float | None
+    cuts: tuple[int, ...]  # frames that show something else than the one before
+
+
+@dataclass(frozen=True)
+class ClipFacts:
+    """All of them, of the frames that were looked at."""
+
+    file: FileFacts
+    looked_at: int  # frames, from the start on
+    exposure: ExposureFacts
+    camera: CameraFacts

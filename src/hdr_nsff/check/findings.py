@@ -1,0 +1,192 @@
+"""What the facts of a clip mean: what will work, and what to shoot otherwise."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+from hdr_nsff.check.facts import ClipFacts
+from hdr_nsff.radiometry.exposure_cycle import MAX_CYCLE, MIN_STEP
+
+Level = Literal["good", "note", "warning", "problem"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One sentence about a clip, and advice where there is some."""
+
+    level: Level
+    subject: str
+    text: str
+    advice: str = ""
+
+
+@dataclass(frozen=True)
+class FindingTuning:
+    """From when on a measured number is worth a sentence; hand-chosen."""
+
+    max_step_ev: float = 3.3  # between neighboring exposures: they must share mid-tones
+    max_drift_ev: float = 0.3  # auto exposure; locked clips measure up to 0.13
+    max_white: float = 0.01  # share of pixels that even the darkest exposure saturates
+    max_black: float = 0.02  # share that even the brightest leaves black
+    min_sharpness: float = 0.8  # of the longest exposure relative to the shortest
+    max_motion: float = 0.03  # of the picture's width, from frame to frame
+    min_banding_ev: float = 0.05
+    max_interval_ratio: float = 1.5  # longest to shortest time between frames
+    few_frames: int = 12
+    many_frames: int = 150
+    sure_parallax: float = 0.5  # rotations explain less than this share: parallax is clear
+
+
+def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Finding]:
+    """Findings in the order in which a user decides."""
+    return [
+        *judge_exposure(facts, tuning),
+        *judge_clipping(facts, tuning),
+        *judge_camera(facts, tuning),
+        *judge_file(facts, tuning),
+        Finding(
+            "note",
+            "not checked",
+            "lens distortion, rolling shutter and electronic stabilization are not measured",
+            "turn stabilization off, and avoid very wide lenses",
+        ),
+    ]
+
+
+def outlook(facts: ClipFacts) -> dict[str, str]:
+    """What will work, by purpose: yes, partly or no, and why."""
+    exposure, camera = facts.exposure, facts.camera
+    varies = max(exposure.ev) >= MIN_STEP
+    hdr = "no: one exposure shows no light beyond its white"
+    if varies:
+        hdr = "yes"
+    elif exposure.drift_ev > FindingTuning().max_drift_ev:
+        hdr = f"partly: the exposure drifts by about {exposure.drift_ev:.1f} EV"
+    views = {
+        "parallax": "yes, near the filmed path",
+        "rotation": "no: the camera only turns, so there is no depth",
+        "tripod": "no: the camera stands still, so there is no depth",
+        "unknown": "unknown: too few points match between distant frames",
+    }[camera.motion]
+    times = "yes" if not camera.cuts else "only within a shot: the clip has cuts"
+    return {"HDR": hdr, "new viewpoints": views, "times between frames": times}
+
+
+def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """The cycle, or what is there instead."""
+    exposure = facts.exposure
+    ordered = sorted(exposure.ev)
+    if exposure.given is not None:
+        text = (
+            f"{len(ordered)} exposures are given by {exposure.given}, {ordered[-1]:.1f} EV in all"
+        )
+        yield Finding("good", "exposure", text)
+    elif exposure.cycle > 1:
+        levels = ", ".join(f"{value:.1f}" for value in ordered)
+        text = (
+            f"the exposure alternates in a cycle of {exposure.cycle} frames at about {levels} EV "
+            f"(by brightness, gamma 2.2), which explains {exposure.explained:.0%} of its changes"
+        )
+        yield Finding("good", "exposure", text)
+    elif exposure.change_ev > MIN_STEP:
+        text = (
+            f"brightness changes by {exposure.change_ev:.1f} EV from frame to frame, but in "
+            f"no cycle of up to {MAX_CYCLE} frames"
+        )
+        yield Finding("warning", "exposure", text, "list the exposures in exposures.csv")
+    else:
+        text = "the exposure does not alternate, so light beyond its white is not recorded"
+        level: Level = "warning" if exposure.drift_ev > tuning.max_drift_ev else "problem"
+        yield Finding(level, "exposure", text, "alternate two or three exposures")
+    widest = max((b - a for a, b in itertools.pairwise(ordered)), default=0.0)
+    if widest > tuning.max_step_ev:
+        text = f"two exposures are {widest:.1f} EV apart and share few mid-tones"
+        yield Finding("warning", "exposure", text, "use steps of 1 to 3 EV, or a third exposure")
+    if exposure.drift_ev > tuning.max_drift_ev and exposure.given is None:
+        text = f"the exposure drifts by about {exposure.drift_ev:.1f} EV: auto exposure"
+        advice = "`prepare` follows it, but lock exposure and white balance if you can"
+        yield Finding("warning", "exposure", text, advice)
+    if exposure.banding_ev > tuning.min_banding_ev:
+        text = f"bands of about {exposure.banding_ev:.2f} EV run through the picture: mains flicker"
+        advice = "use exposure times of 1/50 or 1/100 s (1/60 or 1/120 s where mains have 60 Hz)"
+        yield Finding("warning", "flicker", text, advice)
+
+
+def judge_clipping(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """What no exposure recorded."""
+    exposure = facts.exposure
+    darkest = exposure.ev.index(min(exposure.ev))
+    brightest = exposure.ev.index(max(exposure.ev))
+    white, black = exposure.white_share[darkest], exposure.black_share[brightest]
+    one = "the" if len(exposure.ev) == 1 else "even the darkest"
+    if white > tuning.max_white:
+        text = f"{one} exposure saturates {white:.1%} of the picture"
+        yield Finding("warning", "highlights", text, "add a darker exposure")
+    else:
+        yield Finding("good", "highlights", f"{one} exposure saturates {white:.1%} of the picture")
+    if black > tuning.max_black:
+        one = "the" if len(exposure.ev) == 1 else "even the brightest"
+        text = f"{one} exposure leaves {black:.1%} of the picture black"
+        yield Finding("warning", "shadows", text, "add a brighter exposure")
+
+
+def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """Parallax, blur, speed, cuts."""
+    camera = facts.camera
+    share = camera.rotation_share
+    if share is None:
+        text = "too few points match between distant frames to see how the camera moves"
+        advice = "film something with texture, with smaller steps of exposure, or give --poses"
+        yield Finding("warning", "camera", text, advice)
+    elif camera.motion == "parallax":
+        text = f"the camera moves through space: turns alone explain {share:.0%} of the matches"
+        level: Level = "good" if share < tuning.sure_parallax else "note"
+        advice = "" if level == "good" else "little parallax: move farther to the side"
+        yield Finding(level, "camera", text, advice)
+    else:
+        did = "stands still" if camera.motion == "tripod" else "turns, or hardly moves"
+        text = f"the camera {did}: turns alone explain {share:.0%} of the matches"
+        advice = "for new viewpoints, move sideways or in an arc; HDR and slow motion work as it is"
+        yield Finding("note", "camera", text, advice)
+    if camera.long_sharpness is not None and camera.long_sharpness < tuning.min_sharpness:
+        text = f"the longest exposure has {camera.long_sharpness:.0%} of the shortest one's edges"
+        yield Finding("warning", "blur", text, "shorten it and raise the gain, or move slower")
+    share_of_width = camera.pixels_per_frame / facts.file.width
+    if share_of_width > tuning.max_motion:
+        text = f"the picture moves by {share_of_width:.0%} of its width from frame to frame"
+        yield Finding("warning", "camera", text, "move slower, or record more frames a second")
+    if camera.cuts:
+        listed = ", ".join(str(cut) for cut in camera.cuts[:6])
+        text = f"the clip is cut at frame {listed}"
+        yield Finding("problem", "cuts", text, "use one shot: `prepare --start A --end B`")
+
+
+def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """Length, timing and tags."""
+    file = facts.file
+    kinds = {
+        "hlg": f"HLG of {file.bits} bits, brought to linear light by its tags",
+        "pq": f"PQ of {file.bits} bits, brought to linear light by its tags",
+        "linear": "linear frames",
+        "recorded": f"{file.bits} bits",
+    }
+    count = f"{file.frames} frames" if file.frames else "frames"
+    if file.cameras > 1:
+        count = f"{file.cameras} cameras of {count}"
+    size = f"{file.width} x {file.height}, {file.fps:.4g} a second"
+    yield Finding("note", "file", f"{count} of {size}; {kinds[file.kind]}")
+    if 0 < file.frames < tuning.few_frames:
+        text = f"{file.frames} frames are few"
+        yield Finding("warning", "length", text, "record two seconds or more")
+    if file.frames > tuning.many_frames:
+        text = f"{file.frames} frames take long, and most of that time repeats itself"
+        yield Finding("note", "length", text, "choose a part with --start and --end")
+    if file.interval_ms is not None:
+        shortest, longest = file.interval_ms
+        if longest > tuning.max_interval_ratio * shortest:
+            text = f"variable frame rate: {shortest:.0f} to {longest:.0f} ms between frames"
+            advice = "frames are taken as evenly spaced; record at a constant rate"
+            yield Finding("warning", "timing", text, advice)

@@ -1,0 +1,385 @@
+"""Measures a clip in seconds, on small frames, with the estimators that `prepare` uses:
+the cycle by brightness, SIFT matches on equalized frames, rotations that explain them.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.progress import track
+from hdr_nsff.core.video import frame_times, video_info
+from hdr_nsff.footage import ingest
+from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
+from hdr_nsff.priors.poses.estimate import PosesTuning
+from hdr_nsff.priors.poses.matching import (
+    Keypoints,
+    PairMatches,
+    detect_keypoints,
+    match_pairs,
+    view_pairs,
+)
+from hdr_nsff.priors.poses.reconstruct import spread_frames
+from hdr_nsff.priors.poses.rotation import fit_panorama, rotation_share
+from hdr_nsff.radiometry import exposure_cycle as exposure
+
+MIN_FRAMES = 3
+
+
+@dataclass(frozen=True)
+class CheckTuning:
+    """Hand-chosen on the real clips that docs/shooting.md was tried on."""
+
+    max_frames: int = 96  # looked at, from the start on
+    max_size: int = 480  # pixels of the longest side
+    low: float = 0.012  # recorded values beyond these are black and white, as for cycles
+    high: float = 0.97
+    point_blur_px: float = 1.5  # values at keypoints are means over this radius
+    min_points: int = 12  # of a pair, for a change of exposure
+    drift_frames: int = 16  # compared with each other
+    reweightings: int = 8
+    least_error_ev: float = 0.02  # smaller errors of a pair count alike
+    max_disagreement: float = 0.15  # of pairs, relative to the drift: else it is motion
+    # pixels between frames compared for bands: more motion looks like bands
+    max_band_shift: float = 1.0
+    edge_blur_px: float = 1.2  # keeps noise out of edges
+    edge_share: float = 0.1  # of pixels: the strongest edges are compared
+    # a cut: equalized thumbnails correlate less than this, and fewer points match than
+    # this share of the median
+    cut_correlation: float = 0.4
+    cut_matches: float = 0.1
+    thumbnail: tuple[int, int] = (48, 27)
+    min_band_cycles: int = 2  # of bands in a picture's height
+    max_band_cycles: int = 24
+    # share of the power of row changes in one frequency, above which they are bands
+    min_band_power: float = 0.3
+
+
+def measure_clip(
+    clip: Path, tuning: CheckTuning = CheckTuning()
+) -> tuple[ClipFacts, np.ndarray, list[int]]:
+    """The facts of a clip, its small frames (T, H, W, 3), and their brackets (T,).
+
+    Of several cameras, the first is looked at. InputError for footage that cannot be
+    read, and where all is black or white.
+    """
+    footage = ingest.open_footage(clip)
+    frames = ingest.read_frames(footage, 0, tuning.max_frames, 1, tuning.max_size)
+    total = min(footage.count or tuning.max_frames, tuning.max_frames)
+    pictures = []
+    for frame in track(frames, "frames", total):
+        if frame.camera_id:
+            break
+        pictures.append(frame.rgb)
+    if len(pictures) < MIN_FRAMES:
+        raise InputError(f"{clip}: {len(pictures)} frames; a clip has at least {MIN_FRAMES}")
+    video = np.stack(pictures)
+    nothing = exposure.all_clipped([exposure.extent(picture) for picture in video])
+    if nothing is not None:
+        raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
+    file = describe_file(footage)
+    source, given = given_exposures(footage, len(video))
+    cycle = given_cycle(given) if source is not None else exposure.detect_cycle(video)
+    equalized, clipped = exposure.equalize(video, cycle.brackets)
+    keypoints = detect_keypoints(equalized, clipped)
+    following = match_pairs(keypoints, [(t, t + 1) for t in range(len(video) - 1)])
+    scale = max(file.width, file.height) / max(video.shape[1:3])
+    facts = ClipFacts(
+        file=file,
+        looked_at=len(video),
+        exposure=measure_exposure(source, video, cycle, keypoints, tuning),
+        camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
+    )
+    return facts, video, cycle.brackets
+
+
+def describe_file(footage: ingest.Footage) -> FileFacts:
+    """The file's header, or the first frame of a folder."""
+    first = footage.cameras[0][0]
+    kind = "linear" if footage.linear else (footage.transfer or "recorded")
+    frame = next(ingest.read_frames(footage, 0, 1, 1, ingest.MAX_FRAMES))
+    height, width = frame.rgb.shape[:2]
+    bits, interval = 8, None
+    if footage.video:
+        bits = video_info(first).bits
+        gaps = np.diff(frame_times(first)) * 1000
+        if len(gaps):
+            interval = (round(float(gaps.min()), 2), round(float(gaps.max()), 2))
+    elif not footage.linear:
+        depth = cv2.imread(str(first), cv2.IMREAD_UNCHANGED)
+        bits = 16 if depth is not None and depth.dtype == np.uint16 else 8
+    else:
+        bits = 16
+    cameras = len(footage.cameras)
+    return FileFacts(
+        footage.path.name, footage.count, cameras, width, height, footage.fps, bits, kind, interval
+    )
+
+
+# Exposure
+
+
+def measure_exposure(
+    source: str | None,
+    video: np.ndarray,
+    cycle: exposure.Cycle,
+    keypoints: list[Keypoints],
+    tuning: CheckTuning,
+) -> ExposureFacts:
+    """Exposures of the recorded `video` (T, H, W, 3), and what they clip."""
+    brackets = np.array(cycle.brackets)
+    white = (video > tuning.high).any(-1).mean((1, 2))  # (T,)
+    black = (video < tuning.low).all(-1).mean((1, 2))
+    steps = exposure.brightness_steps(video)
+    count = len(cycle.ev)
+
+    def per_bracket(shares: np.ndarray) -> tuple[float, ...]:
+        return tuple(round(float(shares[brackets == b].mean()), 4) for b in range(count))
+
+    return ExposureFacts(
+        cycle=cycle.length,
+        ev=tuple(round(value, 2) for value in cycle.ev),
+        explained=round(cycle.confidence, 3),
+        given=source,
+        change_ev=round(float(np.abs(steps).mean()), 3),
+        drift_ev=round(measure_drift(video, cycle, keypoints, tuning), 2),
+        white_share=per_bracket(white),
+        black_share=per_bracket(black),
+        banding_ev=round(measure_banding(video, keypoints, cycle.length, tuning), 3),
+    )
+
+
+def given_exposures(footage: ingest.Footage, count: int) -> tuple[str | None, list[float]]:
+    """Where exposures are written down, and those of the first `count` frames."""
+    table = read_exposure_csv(footage)
+    if table is not None:
+        given = list(table[1].values())[:count]
+        return (table[0].name, given) if len(given) == count else (None, [])
+    if footage.video:
+        return None, []
+    known = [read_exif_ev(path) for path in footage.cameras[0][:count]]
+    given = [ev for ev in known if ev is not None]
+    if len(given) < count or max(given) - min(given) < exposure.MIN_STEP:
+        return None, []
+    return "EXIF", given
+
+
+def given_cycle(given: list[float]) -> exposure.Cycle:
+    """The cycle of the EVs of frames as they are written down."""
+    brackets, ev = exposure.brackets_by_ev(given)
+    relative = [value - min(ev) for value in ev]
+    order = np.argsort(ev, kind="stable").tolist()
+    return exposure.Cycle(exposure.period(brackets), brackets, order, relative, 1.0)
+
+
+def measure_drift(
+    video: np.ndarray, cycle: exposure.Cycle, keypoints: list[Keypoints], tuning: CheckTuning
+) -> float:
+    """The range in EV of what matched points change between frames of one bracket.
+
+    Points of the scene are compared, so a pan into the dark is no drift. Every pair of
+    some frames says how far their exposures are apart; least squares, reweighted to
+    least absolute errors, agree on one exposure per frame.
+    """
+    reference = exposure.reference_bracket(video, cycle.brackets)
+    own = np.flatnonzero(np.array(cycle.brackets) == reference)
+    chosen = own[spread_frames(len(own), tuning.drift_frames)]
+    pairs = list(itertools.combinations(range(len(chosen)), 2))
+    matches = match_pairs([keypoints[t] for t in chosen], pairs)
+    gray = [
+        cv2.GaussianBlur(video[t].mean(-1), (0, 0), tuning.point_blur_px) for t in chosen.tolist()
+    ]
+    changes, known = [], []
+    for pair in matches:
+        before, after = sample(gray[pair.i], pair.p), sample(gray[pair.j], pair.q)
+        use = (np.minimum(before, after) > 4 * tuning.low) & (
+            np.maximum(before, after) < tuning.high
+        )
+        if use.sum() >= tuning.min_points:
+            changes.append(float(np.median(np.log2(after[use] / before[use]))))
+            known.append((pair.i, pair.j))
+    linked = len({t for pair in known for t in pair})
+    if linked < 2:
+        return 0.0
+    design = np.zeros((len(known), len(chosen)))
+    for row, (i, j) in enumerate(known):
+        design[row, [i, j]] = -1, 1
+    change = exposure.GAMMA * np.array(changes)
+    weights = np.ones(len(known))
+    level: np.ndarray = np.zeros(len(chosen))
+    for _ in range(tuning.reweightings):
+        level = np.linalg.lstsq(design * weights[:, None], change * weights, rcond=None)[0]
+        error = np.abs(design @ level - change)
+        weights = 1 / np.sqrt(np.maximum(error, tuning.least_error_ev))
+    seen = level[sorted({t for pair in known for t in pair})]
+    drift = float(seen.max() - seen.min())
+    disagreement = float(np.median(np.abs(design @ level - change)))
+    return drift if disagreement < tuning.max_disagreement * drift else 0.0
+
+
+def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Values (M,) of an image (H, W) at points (M, 2), pixel centers at +0.5."""
+    height, width = image.shape
+    column = np.clip(points[:, 0].astype(int), 0, width - 1)
+    row = np.clip(points[:, 1].astype(int), 0, height - 1)
+    return image[row, column]
+
+
+def measure_banding(
+    video: np.ndarray, keypoints: list[Keypoints], cycle: int, tuning: CheckTuning
+) -> float:
+    """The amplitude in EV of bands across the picture that change from frame to frame.
+
+    Lamps on mains flicker, and a rolling shutter draws that as bands. Frames of equal
+    exposure are compared row by row.
+    """
+    amplitudes = []
+    pairs = [(t, t + cycle) for t in range(len(video) - cycle)]
+    for pair in match_pairs(keypoints, pairs):
+        shift = np.linalg.norm(pair.q - pair.p, axis=1)
+        if len(shift) < tuning.min_points or np.median(shift) > tuning.max_band_shift:
+            continue
+        before, after = (np.maximum(video[k].mean(-1), 1e-4) for k in (pair.i, pair.j))
+        low, high = np.minimum(before, after), np.maximum(before, after)
+        use = (low > 4 * tuning.low) & (high < tuning.high)
+        ratio = np.where(use, exposure.GAMMA * np.log2(after / before), np.nan)
+        rows = use.mean(1) > 0.2
+        if rows.mean() < 0.7:
+            continue
+        profile = np.zeros(len(ratio))
+        profile[rows] = np.nanmedian(ratio[rows], axis=1)
+        position = np.arange(len(profile))
+        profile = np.interp(position, position[rows], profile[rows])
+        profile -= np.polyval(np.polyfit(position, profile, 3), position)
+        power = np.abs(np.fft.rfft(profile * np.hanning(len(profile)))) ** 2
+        peak = int(power[: tuning.max_band_cycles + 1].argmax())
+        near = power[max(peak - 1, 0) : peak + 2].sum() / max(power.sum(), 1e-12)
+        periodic = peak >= tuning.min_band_cycles and near > tuning.min_band_power
+        amplitudes.append(np.sqrt(2) * float(profile.std()) if periodic else 0.0)
+    return float(np.median(amplitudes)) if amplitudes else 0.0
+
+
+# Camera
+
+
+def measure_camera(
+    equalized: np.ndarray,
+    clipped: np.ndarray,
+    cycle: exposure.Cycle,
+    keypoints: list[Keypoints],
+    following: list[PairMatches],
+    scale: float,
+    tuning: CheckTuning,
+) -> CameraFacts:
+    """What the camera does, from frames at one brightness (T, H, W, 3).
+
+    `scale` is the pixels of the clip per pixel of these.
+    """
+    cuts = find_cuts(equalized, following, tuning)
+    motion, share = find_motion(equalized, keypoints)
+    shifts = [np.linalg.norm(pair.q - pair.p, axis=1) for pair in following if len(pair.p)]
+    per_frame = float(np.median(np.concatenate(shifts))) if shifts else 0.0
+    return CameraFacts(
+        motion=motion,
+        rotation_share=None if share is None else round(share, 3),
+        pixels_per_frame=round(scale * per_frame, 2),
+        long_sharpness=compare_sharpness(equalized, clipped, cycle, tuning),
+        cuts=tuple(cuts),
+    )
+
+
+def find_motion(
+    equalized: np.ndarray, keypoints: list[Keypoints]
+) -> tuple[CameraMotion, float | None]:
+    """What the camera does, and the share of static matches that rotations explain.
+
+    As `prepare` decides it, on frames spread over the clip.
+    """
+    tuning = PosesTuning()
+    matching, rotation = tuning.reconstruction.matching, tuning.reconstruction.rotation
+    chosen = spread_frames(len(equalized), tuning.reconstruction.max_sampled_frames)
+    pairs = view_pairs([list(range(len(chosen)))], matching)
+    matches = match_pairs([keypoints[t] for t in chosen], pairs, matching)
+    height, width = equalized.shape[1:3]
+    panorama = fit_panorama(matches, len(chosen), width, height, rotation)
+    if panorama is None:
+        return "unknown", None
+    share = rotation_share(matches, panorama, width, height, rotation)
+    if share is None:
+        return "unknown", None
+    if share < tuning.min_rotation_share or panorama.slides:
+        return "parallax", share
+    still = panorama.max_displacement < rotation.max_tripod_motion_px
+    return ("tripod" if still else "rotation"), share
+
+
+def find_cuts(
+    equalized: np.ndarray, following: list[PairMatches], tuning: CheckTuning
+) -> list[int]:
+    """Frames that neither look like the one before nor share points with it."""
+    small = [cv2.resize(f, tuning.thumbnail, interpolation=cv2.INTER_AREA) for f in equalized]
+    usual = float(np.median([len(pair.p) for pair in following]))
+    cuts = []
+    for pair in following:
+        a, b = (small[t] - small[t].mean((0, 1)) for t in (pair.i, pair.j))
+        correlation = float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9))
+        few = len(pair.p) < tuning.cut_matches * usual
+        if few and correlation < tuning.cut_correlation:
+            cuts.append(pair.j)
+    return cuts
+
+
+def compare_sharpness(
+    equalized: np.ndarray, clipped: np.ndarray, cycle: exposure.Cycle, tuning: CheckTuning
+) -> float | None:
+    """Edges of the brightest bracket relative to those of the darkest beside it, in the
+    direction that lost most.
+
+    None without alternation, or where the two share too little of the picture.
+    """
+    if cycle.length == 1:
+        return None
+    darkest, brightest = cycle.order[0], cycle.order[-1]
+    brackets = cycle.brackets
+    edges = [edge_strengths(picture, tuning) for picture in equalized]
+    ratios = []
+    for t, bracket in enumerate(brackets):
+        if bracket != brightest:
+            continue
+        for s in range(max(t - cycle.length + 1, 0), min(t + cycle.length, len(brackets))):
+            if brackets[s] != darkest:
+                continue
+            use = ~(grow(clipped[t]) | grow(clipped[s]))
+            if use.mean() >= tuning.edge_share:
+                ratios.append(
+                    [edge_ratio(edges[t][k][use], edges[s][k][use], tuning) for k in (0, 1)]
+                )
+    return round(float(np.median(ratios, axis=0).min()), 3) if ratios else None
+
+
+def edge_ratio(long: np.ndarray, short: np.ndarray, tuning: CheckTuning) -> float:
+    """Strength of edges (P,) relative to those of another picture."""
+    mean = long + short
+    strong = mean > np.quantile(mean, 1 - tuning.edge_share)
+    return float(long[strong].sum() / max(short[strong].sum(), 1e-9))
+
+
+def grow(mask: np.ndarray) -> np.ndarray:
+    """A mask (H, W) grown by the reach of edges."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+
+
+def edge_strengths(picture: np.ndarray, tuning: CheckTuning) -> tuple[np.ndarray, np.ndarray]:
+    """Strength (H, W) of upright and of level edges of a smoothed picture.
+
+    Motion along a row blurs the upright ones alone.
+    """
+    gray = cv2.GaussianBlur(picture.mean(-1), (0, 0), tuning.edge_blur_px)
+    upright = np.abs(cv2.Sobel(gray, cv2.CV_32F, 1, 0))
+    return upright, np.abs(cv2.Sobel(gray, cv2.CV_32F, 0, 1))

@@ -1,0 +1,62 @@
+"""Camera paths as Nuke reads them: matrices made from the text are the cameras."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from fakes import fake_run
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.rendering.chan import write_chan
+from hdr_nsff.rendering.export_scene import export_chan
+from hdr_nsff.scene.scene import Scene
+
+
+def turn(axis: int, degrees: float) -> np.ndarray:
+    """A rotation (3, 3) about an axis."""
+    a, b = [(1, 2), (2, 0), (0, 1)][axis]
+    matrix = np.eye(3)
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    matrix[a, a], matrix[b, b], matrix[a, b], matrix[b, a] = c, c, -s, s
+    return matrix
+
+
+def see(line: str, camera: Camera, point: np.ndarray) -> list[float]:
+    """The pixel of a point (+y up) in the camera of a line."""
+    _, *place, rx, ry, rz, fov = (float(x) for x in line.split())
+    rotation = turn(1, ry) @ turn(0, rx) @ turn(2, rz)
+    local = rotation.T @ (point - place)
+    focal = camera.height / 2 / np.tan(np.radians(fov) / 2)
+    x = camera.width / 2 + focal * local[0] / -local[2]
+    return [x, camera.height / 2 - focal * local[1] / -local[2]]
+
+
+def test_nuke_sees_points_where_the_scene_does(toy: Scene, tmp_path: Path) -> None:
+    cameras = []
+    for i, frame in enumerate(toy.train):
+        turned = frame.camera.c2w.clone()
+        tilt = turn(0, 12.0 * i) @ turn(1, -7.0 * i) @ turn(2, 5.0)
+        turned[:, :3] = turned.new_tensor(tilt.tolist())
+        cameras.append(frame.camera.moved(turned))
+    write_chan(tmp_path / "a.chan", cameras)
+    lines = (tmp_path / "a.chan").read_text().splitlines()
+    assert [line.split()[0] for line in lines] == [str(i) for i in range(len(cameras))]
+    for line, camera in zip(lines, cameras, strict=True):
+        local = camera.c2w.new_tensor([0.3, -0.2, 3.0])
+        point = camera.c2w[:, :3] @ local + camera.c2w[:, 3]
+        expected = camera.project(point)[0].tolist()
+        assert see(line, camera, np.array([1, -1, -1]) * point.numpy()) == pytest.approx(
+            expected, abs=1e-2
+        )
+
+
+def test_only_camera_files_are_replaced(tmp_path: Path) -> None:
+    run, path = fake_run(tmp_path), tmp_path / "camera.chan"
+    export_chan(run, path)
+    export_chan(run, path)
+    path.write_text("my notes")
+    with pytest.raises(InputError, match="was not made by export"):
+        export_chan(run, path)

@@ -1,0 +1,159 @@
+"""`check` on clips whose truth is known, and its sentences on facts made by hand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_scene import EV, ToyScene
+
+from hdr_nsff.check.check import CheckConfig, check
+from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts
+from hdr_nsff.check.findings import judge, outlook
+from hdr_nsff.check.measure import measure_clip
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import read_image, write_png
+
+WIDTH, HEIGHT, FRAMES = 240, 136, 12
+
+
+def clip_of(folder: Path, radiance: Callable[[int], np.ndarray], evs: list[float]) -> Path:
+    """PNG frames of radiance (H, W, 3) at exposures, recorded by a gamma of 2.2."""
+    for t, ev in enumerate(evs):
+        picture = np.clip(radiance(t) * 2.0**ev, 0, 1) ** (1 / 2.2)
+        write_png(folder / f"{t:03d}.png", picture)
+    return folder
+
+
+def still_scene(t: int) -> np.ndarray:
+    """Radiance that the toy scene has at time 0, without its moving card."""
+    del t
+    scene = ToyScene(WIDTH, HEIGHT)
+    return scene.see(0.0)[0] * 0.6
+
+
+def test_an_alternating_clip_with_parallax_is_fit_for_everything(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scene = ToyScene(WIDTH, HEIGHT)
+    evs = [EV[t % 3] - 1 for t in range(FRAMES)]
+    clip = clip_of(tmp_path / "clip", lambda t: scene.see(float(t))[0], evs)
+    check(CheckConfig(clip, tmp_path / "seen.png", json=True))
+    document = json.loads(capsys.readouterr().out)
+    assert document["works"]["HDR"] == "yes"
+    assert document["works"]["new viewpoints"].startswith("yes")
+    facts = document["facts"]
+    assert facts["exposure"]["cycle"] == 3 and facts["camera"]["motion"] == "parallax"
+    assert sorted(facts["exposure"]["ev"]) == pytest.approx([0, 2, 4], abs=0.3)
+    assert facts["exposure"]["drift_ev"] < 0.3 and facts["camera"]["cuts"] == []
+    assert read_image(tmp_path / "seen.png").shape[1] == 1200
+
+
+def test_a_tripod_with_one_exposure_has_neither_hdr_nor_viewpoints(tmp_path: Path) -> None:
+    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * FRAMES))
+    assert facts.camera.motion == "tripod" and facts.exposure.cycle == 1
+    works = outlook(facts)
+    assert works["HDR"].startswith("no") and works["new viewpoints"].startswith("no")
+    problems = [finding.subject for finding in judge(facts) if finding.level == "problem"]
+    assert problems == ["exposure"]
+
+
+def test_auto_exposure_is_told_from_a_locked_one(tmp_path: Path) -> None:
+    drifting = [0.1 * t - 0.6 for t in range(FRAMES)]
+    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, drifting))
+    assert facts.exposure.cycle == 1
+    assert facts.exposure.drift_ev == pytest.approx(1.1, abs=0.15)
+    assert any("auto exposure" in finding.text for finding in judge(facts))
+
+
+def test_bands_of_mains_flicker_are_found(tmp_path: Path) -> None:
+    rows = np.arange(HEIGHT)[:, None, None] / HEIGHT
+
+    def flickering(t: int) -> np.ndarray:
+        return still_scene(t) * (1 + 0.1 * np.sin(2 * np.pi * (4 * rows + 0.3 * t)))
+
+    facts, _, _ = measure_clip(clip_of(tmp_path, flickering, [0.0] * FRAMES))
+    assert facts.exposure.banding_ev == pytest.approx(0.24, abs=0.1)  # of a difference of two
+    assert any(finding.subject == "flicker" for finding in judge(facts))
+
+
+def test_a_cut_is_found(tmp_path: Path) -> None:
+    def cut(t: int) -> np.ndarray:
+        return still_scene(t) if t < 5 else still_scene(t)[:, ::-1]
+
+    facts, _, _ = measure_clip(clip_of(tmp_path, cut, [0.0] * FRAMES))
+    assert facts.camera.cuts == (5,)
+
+
+def test_a_blurred_long_exposure_is_found(tmp_path: Path) -> None:
+    def blurred(t: int) -> np.ndarray:
+        picture = still_scene(t)
+        if t % 2:
+            return picture
+        return np.mean([np.roll(picture, k, 1) for k in range(-6, 7)], 0)
+
+    evs = [0.0, -2.0] * (FRAMES // 2)
+    facts, _, _ = measure_clip(clip_of(tmp_path / "a", blurred, evs))
+    assert facts.camera.long_sharpness is not None and facts.camera.long_sharpness < 0.8
+    facts, _, _ = measure_clip(clip_of(tmp_path / "b", still_scene, evs))
+    assert facts.camera.long_sharpness is not None and facts.camera.long_sharpness > 0.9
+
+
+def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
+    evs = [0.0, -1.0, -2.0, -3.0, -4.0, -5.0, -6.0, -7.0]  # no cycle: a bracket of stills
+    clip = clip_of(tmp_path, still_scene, evs)
+    rows = [f"{t},{ev}" for t, ev in enumerate(evs)]
+    (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows]))
+    facts, _, brackets = measure_clip(clip)
+    assert facts.exposure.given == "exposures.csv" and brackets == list(range(8))
+    assert facts.exposure.ev == (7, 6, 5, 4, 3, 2, 1, 0)
+    assert facts.exposure.white_share[7] == 0 and outlook(facts)["HDR"] == "yes"
+
+
+def good_facts() -> ClipFacts:
+    """A clip as it should be."""
+    return ClipFacts(
+        FileFacts("a.mp4", 60, 1, 640, 360, 24.0, 8, "recorded", (41.7, 41.7)),
+        60,
+        ExposureFacts(2, (0.0, 2.0), 0.97, None, 2.0, 0.1, (0.0, 0.2), (0.1, 0.0), 0.0),
+        CameraFacts("parallax", 0.2, 3.0, 0.98, ()),
+    )
+
+
+def test_a_good_clip_has_nothing_to_warn_of() -> None:
+    assert {finding.level for finding in judge(good_facts())} <= {"good", "note"}
+
+
+def test_every_warning_comes_with_advice() -> None:
+    good = good_facts()
+    exposure = replace(
+        good.exposure, ev=(0.0, 4.0), drift_ev=1.0, banding_ev=0.1, white_share=(0.1, 0.5)
+    )
+    bad = ClipFacts(
+        replace(good.file, frames=5, interval_ms=(20.0, 60.0)),
+        5,
+        replace(exposure, black_share=(0.5, 0.1)),
+        CameraFacts("tripod", 0.9, 40.0, 0.5, (3,)),
+    )
+    found = judge(bad)
+    warned = [finding for finding in found if finding.level in ("warning", "problem")]
+    assert all(finding.advice for finding in warned)
+    subjects = {finding.subject for finding in warned}
+    assert subjects >= {"exposure", "flicker", "highlights", "shadows", "blur", "cuts", "timing"}
+
+
+def test_bad_input_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such file"):
+        check(CheckConfig(tmp_path / "missing.mp4", tmp_path / "a.png"))
+    with pytest.raises(InputError, match=r"ends in \.png"):
+        check(CheckConfig(tmp_path, tmp_path / "a.jpg"))
+    (tmp_path / "notes.png").write_text("mine")
+    with pytest.raises(InputError, match="exists and is no picture"):
+        check(CheckConfig(tmp_path, tmp_path / "notes.png"))
+    black = clip_of(tmp_path / "black", lambda t: np.zeros((HEIGHT, WIDTH, 3)), [0.0] * 4)
+    with pytest.raises(InputError, match="all frames are black"):
+        check(CheckConfig(black, tmp_path / "b.png"))
