@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels import compositing, projection
+from hdr_nsff.fields.kernels import compositing, footprint, projection
 from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
 from hdr_nsff.fields.splat.rasterize import (
     Maps,
@@ -99,9 +99,9 @@ def clear_pixels(gaussians: list[Tensor], view: Camera) -> Tensor:
     d = view.pixel_grid()[:, None] - centers
     exponent = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0]
     alpha = gaussians[3] * torch.exp(-exponent)
-    near_min = (alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01
+    near_min = (alpha / float(footprint.ALPHA_MIN)).log().abs() < 0.01
     near_max = (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
-    doubtful = (near_min | near_max) & (z > projection.NEAREST)
+    doubtful = (near_min | near_max) & (z > footprint.NEAREST)
     return ~doubtful.any(1).unflatten(0, (view.height, view.width))
 
 
@@ -159,7 +159,7 @@ def test_gaussians_behind_the_camera_are_hidden_and_have_no_gradient() -> None:
 @pytest.mark.parametrize("size", [0.01, 1.0])
 def test_kernels_equal_plain_torch_across_the_near_plane(size: float) -> None:
     view = camera()
-    gaussians = at_depths(view, (0.0, 3 * projection.NEAREST), 1.0, size)
+    gaussians = at_depths(view, (0.0, 3 * footprint.NEAREST), 1.0, size)
     assert float(compare(gaussians, view, gradients=5e-3)[..., -1].max()) > 0.5
 
 
@@ -283,9 +283,9 @@ def test_the_depth_order_is_a_stable_sort_of_all_that_is_drawn() -> None:
     depths = g.permutation(depths).astype(np.float32)
     order = depth_order(depths)
     assert sorted(order.tolist()) == list(range(len(depths)))
-    drawn = order[depths[order] > projection.NEAREST]
+    drawn = order[depths[order] > footprint.NEAREST]
     expected = np.argsort(depths, kind="stable")
-    assert drawn.tolist() == expected[depths[expected] > projection.NEAREST].tolist()
+    assert drawn.tolist() == expected[depths[expected] > footprint.NEAREST].tolist()
 
 
 def test_opacity_never_exceeds_1_however_many_gaussians_there_are() -> None:

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.tensors import to_device
-from hdr_nsff.fields.kernels import compositing, projection
+from hdr_nsff.fields.kernels import compositing, footprint, projection
 from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
 from hdr_nsff.geometry.cameras import Camera
 
-ALPHA_MIN, ALPHA_MAX = float(projection.ALPHA_MIN), float(compositing.ALPHA_MAX)
-MIN_LENGTH = projection.MIN_LENGTH  # added to a quaternion's length, which may be 0
+ALPHA_MIN, ALPHA_MAX = float(footprint.ALPHA_MIN), float(compositing.ALPHA_MAX)
+MIN_LENGTH = footprint.MIN_LENGTH  # added to a quaternion's length, which may be 0
 
 
 class Maps(NamedTuple):
@@ -60,7 +60,7 @@ def rasterize(
             w2c, K = world_to_camera_and_focal(camera), camera.K.detach()
             size = camera.width, camera.height
             seen = rasterize_cuda.composite(
-                *gaussians, w2c, K, size, projection.NEAREST, projection.BLUR
+                *gaussians, w2c, K, size, footprint.NEAREST, footprint.BLUR
             )
             return Maps(*seen)
         case "cuda":
@@ -137,11 +137,11 @@ def project(
     """
     w2c, K = world_to_camera(camera), camera.K
     t = means @ w2c[:, :3].T + w2c[:, 3]  # camera points
-    z = t[:, 2].clamp_min(projection.NEAREST)
+    z = t[:, 2].clamp_min(footprint.NEAREST)
     size = torch.tensor([camera.width, camera.height]).to(means)
     focal, center = K[[0, 1], [0, 1]], K[:2, 2]
     # far outside of the frame the projection is linearized at its edge
-    edge = projection.MARGIN * 0.5 * size / focal
+    edge = footprint.MARGIN * 0.5 * size / focal
     low, high = -center / focal - edge, (size - center) / focal + edge
     ratio = t[:, :2] / z[:, None]
     xy = z[:, None] * torch.minimum(torch.maximum(ratio, low), high)
@@ -151,7 +151,7 @@ def project(
     jacobian = torch.stack([row_x, row_y], 1)  # (G, 2, 3)
     half_axes = rotation_matrices(quaternions) * scales[:, None]
     spread = jacobian @ w2c[:, :3] @ half_axes
-    covariance = spread @ spread.mT + projection.BLUR * torch.eye(2).to(means)
+    covariance = spread @ spread.mT + footprint.BLUR * torch.eye(2).to(means)
     return ratio * focal + center, covariance, t[:, 2]
 
 
@@ -175,7 +175,7 @@ def dense(
     opacities = opacities[finite]
     centers, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
-    order = order[z.detach()[order] > projection.NEAREST]
+    order = order[z.detach()[order] > footprint.NEAREST]
     d = camera.pixel_grid().to(means)[:, None] - centers[order]  # (S, G, 2)
     inverse = torch.linalg.inv(covariance[order])
     exponent = 0.5 * (d[:, :, None] @ inverse @ d[..., None])[..., 0, 0]
@@ -263,7 +263,7 @@ class RasterizeNumba(torch.autograd.Function):
         starts, members, places, owned = ctx.tiles
         means, _, _, _ = ctx.gaussians
         values = ctx.drawn[3]
-        pairs = np.empty((len(members), projection.MOMENTS + values.shape[1]), np.float32)
+        pairs = np.empty((len(members), footprint.MOMENTS + values.shape[1]), np.float32)
         grad_maps, grad_alpha = (g.contiguous().numpy() for g in grads)
         seen = (maps.numpy(), alpha.numpy(), grad_maps, grad_alpha)
         compositing.backward(starts, members, places, *ctx.drawn, *seen, pairs)
