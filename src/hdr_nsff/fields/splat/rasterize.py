@@ -1,9 +1,9 @@
 """3D Gaussians to feature maps, differentiable in everything, the camera's pose and
 focal lengths included (EWA splatting: Zwicker et al. 2001, Kerbl et al. 2023).
 
-One call with twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`,
-plain torch, slow and obviously right. Shapes: G Gaussians with D features, pictures of
-(H, W).
+One call with twins behind it: numba kernels on the CPU, CUDA kernels or gsplat on
+CUDA, and `dense`, plain torch, slow and obviously right. Shapes: G Gaussians with D
+features, pictures of (H, W).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.kernels import compositing, footprint, projection
-from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
+from hdr_nsff.fields.splat.cuda_backends import composite_on
 from hdr_nsff.geometry.cameras import Camera
 
 ALPHA_MIN, ALPHA_MAX = float(footprint.ALPHA_MIN), float(compositing.ALPHA_MAX)
@@ -56,17 +56,14 @@ def rasterize(
             # `split` joins the two gradients, where slices' would be added up
             seen, depth = maps.split([len(maps) - 1, 1])
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
-        case "cuda" if rasterize_cuda.available():
-            w2c, K = world_to_camera_and_focal(camera), camera.K.detach()
-            size = camera.width, camera.height
-            seen = rasterize_cuda.composite(
-                *gaussians, w2c, K, size, footprint.NEAREST, footprint.BLUR
-            )
-            return Maps(*seen)
         case "cuda":
-            # not `dense`, which would hold every Gaussian at every pixel
-            on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
-            return Maps(*(m.to(means.device) for m in on_cpu))
+            composite = composite_on(means.device)
+            if composite is None:
+                # not `dense`, which would hold every Gaussian at every pixel
+                on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
+                return Maps(*(m.to(means.device) for m in on_cpu))
+            w2c, size = world_to_camera_and_focal(camera), (camera.width, camera.height)
+            return Maps(*composite(*gaussians, w2c, camera.K.detach(), size))
         case _:
             return dense(*gaussians, camera)
 
@@ -83,7 +80,7 @@ def world_to_camera_and_focal(camera: Camera) -> Tensor:
     For kernels to which K is numbers: a longer focal length is a camera whose x and y
     are stretched.
     """
-    w2c, focal = world_to_camera(camera), camera.K[[0, 1], [0, 1]]
+    w2c, focal = world_to_camera(camera), camera.K.diagonal()[:2]
     if not focal.requires_grad:
         return w2c
     stretch = torch.cat([focal / focal.detach(), focal.new_ones(1)])  # ones, with a gradient

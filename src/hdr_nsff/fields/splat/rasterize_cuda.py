@@ -9,6 +9,7 @@ picture: for the number of pairs, before it takes memory for them.
 from __future__ import annotations
 
 from functools import cache
+from importlib import metadata
 from typing import Any
 
 import torch
@@ -17,8 +18,56 @@ from torch import Tensor
 from hdr_nsff.fields.kernels.cuda.launch import launch
 from hdr_nsff.fields.kernels.cuda.layout import CHANNELS, PIXELS, THREADS, TILE
 from hdr_nsff.fields.kernels.footprint import MOMENTS
+from hdr_nsff.fields.splat.try_out import fault_of
 
 ELLIPSE = 6  # numbers of a projected Gaussian: pixel center, conic, opacity
+
+
+@cache
+def fault(device: str = "cuda") -> str | None:
+    """Why the kernels cannot draw on `device`, and how to fix it; None where they draw
+    one Gaussian and its gradients.
+    """
+    try:
+        version = metadata.version("numba-cuda")
+    except metadata.PackageNotFoundError:  # numba's own CUDA target needs a toolkit
+        return f"CUDA kernels need numba-cuda, which is not installed: {install_command()}"
+    reason = fault_of(composite, device)
+    if reason is None:
+        return None
+    return (
+        f"numba-cuda {version} cannot draw with torch {torch.__version__} "
+        f"({reason}): {install_command()}, or update NVIDIA's driver"
+    )
+
+
+def install_command() -> str:
+    """The command that installs the compiler for the CUDA version that torch brings."""
+    is_cuda_12 = (torch.version.cuda or "").startswith("12.")
+    return f"pip install 'hdr-nsff[{'gpu12' if is_cuda_12 else 'gpu'}]'"
+
+
+def composite(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    w2c: Tensor,
+    K: Tensor,
+    size: tuple[int, int],
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians.
+
+    They are as `rasterize.rasterize` takes them, seen by `w2c` (3, 4) and `K` (3, 3) in
+    a picture of `size` (width, height). All on one CUDA device, float32; gradients
+    reach everything but `K`.
+    """
+    gaussians = means, quaternions, scales, opacities, features
+    maps, alpha = RasterizeCuda.apply(*gaussians, w2c, K, size)
+    # `split` joins the two gradients, where slices' would be added up
+    seen, depth = maps.split([len(maps) - 1, 1])
+    return seen.permute(1, 2, 0), depth[0], alpha
 
 
 class RasterizeCuda(torch.autograd.Function):

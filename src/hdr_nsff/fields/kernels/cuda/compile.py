@@ -110,7 +110,7 @@ def load_kernel(name: str, capability: tuple[int, int]) -> bytes:
         temporary.write_bytes(image)
         temporary.replace(path)
     except OSError:  # no home to write to: they are compiled at every start
-        temporary.unlink(missing_ok=True) if temporary.exists() else None
+        pass
     return image
 
 
@@ -130,8 +130,9 @@ def fingerprint() -> str:
     sources = [here, here.with_name("kernels.py"), Path(layout.__file__)]
     sources += [Path(str(m.__file__)) for m in (compositing, footprint)]
     digest = hashlib.sha256()
-    for text in (*(path.read_bytes() for path in sources), *versions(PACKAGES)):
-        digest.update(text if isinstance(text, bytes) else text.encode())
+    for path in sources:
+        digest.update(path.read_bytes())
+    digest.update(" ".join(versions(PACKAGES)).encode())
     return digest.hexdigest()[:16]
 
 

@@ -54,7 +54,7 @@ def device_functions(module: ModuleType, fastmath: bool) -> dict[str, Callable[.
     With `fastmath`, the compiler assumes that no number is NaN. The simulator calls the
     CPU's compiled functions.
     """
-    compiled = {k: v for k, v in vars(module).items() if isinstance(v, Dispatcher)}
+    compiled: dict[str, Any] = {k: v for k, v in vars(module).items() if isinstance(v, Dispatcher)}
     if config.ENABLE_CUDASIM:
         return compiled
     names = dict(vars(module))
@@ -98,9 +98,7 @@ def project(
     )
     k = (camera[12], camera[13], camera[14], camera[15])
     t, _, _, _, _, covariance = footprint_of(m, q, s, view, k, width, height)
-    shows, center, conic, bounds = ellipse_of(
-        t, covariance, float(opacities[g]), k, width, height
-    )
+    shows, center, conic, bounds = ellipse_of(t, covariance, float(opacities[g]), k, width, height)
     depths[g] = t[2]
     ellipses[g, 0], ellipses[g, 1] = center[0], center[1]
     ellipses[g, 2], ellipses[g, 3], ellipses[g, 4] = conic[0], conic[1], conic[2]
@@ -244,9 +242,7 @@ def backward(starts, owners, ellipses, values, maps, alpha, grad_maps, grad_alph
             v = u = ZERO
             if left >= MIN_TRANSMITTANCE:
                 dx, dy = px - shapes[j, 0], py - shapes[j, 1]
-                full = full_alpha(
-                    shapes[j, 5], shapes[j, 2], shapes[j, 3], shapes[j, 4], dx, dy
-                )
+                full = full_alpha(shapes[j, 5], shapes[j, 2], shapes[j, 3], shapes[j, 4], dx, dy)
                 alpha_j = cut_alpha(full)
                 if alpha_j > ZERO:
                     value = d_alpha

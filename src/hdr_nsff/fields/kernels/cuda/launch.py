@@ -108,10 +108,11 @@ class Driver:
         parameters: bytes,
     ) -> None:
         """Put a kernel with packed `parameters` on a stream."""
+        buffer = ctypes.create_string_buffer(parameters, len(parameters))
         size = ctypes.c_size_t(len(parameters))
         extra = (ctypes.c_void_p * 5)(
             BUFFER_POINTER,
-            ctypes.cast(parameters, ctypes.c_void_p),
+            ctypes.addressof(buffer),
             BUFFER_SIZE,
             ctypes.addressof(size),
             BUFFER_END,
@@ -123,7 +124,7 @@ class Driver:
 
 
 def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
-    """Run a kernel on tensors of the CPU by numba-cuda's simulator, thread by thread."""
+    """Run a kernel on tensors of the CPU by numba-cuda's simulator, in Python."""
     from numba import cuda
     from numba.core import config
 
