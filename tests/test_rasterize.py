@@ -85,7 +85,7 @@ def drawn(
     twin: Callable[..., Maps], gaussians: list[Tensor], view: Camera, weight: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
     """Maps (H, W, D + 2), and the gradients of all NAMES of their sum with `weight`."""
-    kind = torch.float32 if twin is rasterize else torch.float64
+    kind = torch.float64 if twin is dense else torch.float32
     leaves = [t.to(kind, copy=True).requires_grad_() for t in gaussians]
     pose, focal = view.c2w.clone().requires_grad_(), view.K[[0, 1], [0, 1]].clone().requires_grad_()
     seen = everything(twin(*leaves, lens(view, focal).moved(pose)))
@@ -107,8 +107,13 @@ def clear_pixels(gaussians: list[Tensor], view: Camera) -> Tensor:
     return ~doubtful.any(1).unflatten(0, (view.height, view.width))
 
 
-def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> Tensor:
-    """The maps (H, W, D + 2), after both twins were found to give the same ones.
+def compare(
+    gaussians: list[Tensor],
+    view: Camera,
+    gradients: float = 1e-3,
+    twin: Callable[..., Maps] = rasterize,
+) -> Tensor:
+    """The maps (H, W, D + 2), after `twin` and `dense` were found to give the same.
 
     Gradients are the same up to the share `gradients` of the largest ones.
     """
@@ -117,7 +122,7 @@ def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> T
     shape = (view.height, view.width, gaussians[4].shape[1] + 2)
     generator = torch.Generator().manual_seed(99)
     weight = torch.randn(shape, generator=generator, dtype=torch.float64) * clear[..., None]
-    ours, theirs = (drawn(twin, gaussians, view, weight) for twin in (rasterize, dense))
+    ours, theirs = (drawn(twin, gaussians, view, weight) for twin in (twin, dense))
     top = theirs[0].abs().amax((0, 1)).clamp_min(1.0)
     assert float(((ours[0] - theirs[0]).abs() / top)[clear].max()) < 2e-4
     for name, a, b in zip(NAMES, ours[1], theirs[1], strict=True):

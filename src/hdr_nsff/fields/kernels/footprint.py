@@ -305,9 +305,9 @@ def pose_gradient(point, d_projection, m, j):
 
 @jit(fastmath=FAST, error_model="numpy")
 def world_gradients(m, q, s, v, k, width, height, sums, d_depth):
-    """Gradients of a Gaussian's mean (3,), quaternion (4,), scales (3,) and of the view.
+    """Gradients of mean (3,), quaternion (4,) and scales (3,) of a Gaussian, and of v.
 
-    The view is the matrix v of `footprint`, three rows of 4. Arguments as in `footprint`, the MOMENTS `sums`, and dL / d z-depth.
+    Arguments as in `footprint`, the MOMENTS `sums`, and dL / d z-depth.
     """
     t, held, projection, (unit, r, n), spread, covariance = footprint(m, q, s, v, k, width, height)
     center, d_covariance = picture_gradient(covariance, sums)
