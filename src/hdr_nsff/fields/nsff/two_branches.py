@@ -130,7 +130,8 @@ class TwoBranches(nn.Module):
         super().__init__()
         self.config, self.space = config, space
         self.near, self.far = near, far
-        self.register_buffer("times", times.double())
+        self.host_times = times.double()  # reading the buffer would wait for a GPU
+        self.register_buffer("times", self.host_times)
         num_knots = len(times)
         if branches is None:
             blending = config.compositing == "blend"
@@ -176,7 +177,7 @@ class TwoBranches(nn.Module):
 
     def knot(self, time: float) -> float:
         """Position of a time (in frames) on the list of training times."""
-        return knot_of(self.times, time)
+        return knot_of(self.host_times, time)
 
     def sample(
         self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None
@@ -304,7 +305,7 @@ class TwoBranches(nn.Module):
         everywhere.
         """
         centers = self.space.decode(self.dynamic_cells.cell_centers())
-        for k, time in enumerate(self.times.tolist()):
+        for k, time in enumerate(self.host_times.tolist()):
             masked = [f for f in frames if f.time == time and f.moving is not None]
             if not masked:
                 continue

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.tensors import to_device
+from hdr_nsff.core.tensors import table_on, to_device
 from hdr_nsff.fields.kernels import compositing, footprint, projection
 from hdr_nsff.fields.splat.cuda_backends import composite_on
 from hdr_nsff.geometry.cameras import Camera
@@ -122,7 +122,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Rotation matrices (G, 3, 3) of quaternions (G, 4) w x y z of any length."""
     unit = quaternions / (quaternions.norm(dim=-1, keepdim=True) + MIN_LENGTH)
     outer = (unit[..., None] * unit[..., None, :]).flatten(-2)  # (G, 16)
-    return (outer @ ROTATION_MATRIX.to(unit)).unflatten(-1, (3, 3))
+    return (outer @ table_on(ROTATION_MATRIX, unit.device, unit.dtype)).unflatten(-1, (3, 3))
 
 
 def project(
