@@ -36,6 +36,7 @@ from hdr_nsff.training.run_writer import LOG_EVERY, RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
 from hdr_nsff.training.start import start_field
 
+CHECK_SAME_EVERY = 1000  # steps after which several processes compare their parameters
 REARRANGE_UNTIL = 0.8  # share of the run after which the field rearranges nothing (hand-chosen)
 
 
@@ -181,7 +182,10 @@ class Trainer:
             self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
         rearranging = clock.progress < REARRANGE_UNTIL
-        self.field.after_step(clock.step + 1, self.frame_errors if rearranging else None)
+        if self.field.after_step(clock.step + 1, self.frame_errors if rearranging else None):
+            self.ranks.follow_first([*self.field.parameters(), *self.field.buffers()])
+        if (clock.step + 1) % CHECK_SAME_EVERY == 0:
+            self.ranks.check_same(self.optimizers.parameters())
         if "mse" in totals:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals

@@ -287,11 +287,12 @@ class TwoBranches(nn.Module):
         return self.branches.param_groups()
 
     @torch.no_grad()
-    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Refresh the culling grids now and then, once they have seen enough."""
         if self.config.cull and step >= self.config.cull_after and step % REFRESH_EVERY == 0:
             self.static_cells.refresh(STATIC_MIN_WEIGHT, WEIGHT_DECAY)
             self.dynamic_cells.refresh(DYNAMIC_MIN_WEIGHT, WEIGHT_DECAY)
+        return False
 
     def shared_maxima(self) -> list[Tensor]:
         """The culling grids' memories: several processes share their maximum."""

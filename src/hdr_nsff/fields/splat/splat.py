@@ -385,14 +385,15 @@ class Splat(nn.Module):
 
     # Relocation
 
-    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Relocate Gaussians every `relocate_every` steps."""
         every = self.config.relocate_every
         if frame_errors is None or not every or step % every:
-            return
+            return False
         self.relocate(frame_errors(RELOCATE_FRAMES), torch.Generator().manual_seed(step))
         self.find_neighbors()
         self.local.find_neighbors(self.unit)
+        return True
 
     @torch.no_grad()
     def relocate(self, frame_errors: list[FrameError], generator: torch.Generator) -> int:
