@@ -245,7 +245,7 @@ def run_demo(device: torch.device) -> dict[str, Any]:
         folder = Path(name)
         start = time.monotonic()
         code = "import sys; from hdr_nsff.cli import main; sys.exit(main())"
-        words = ["prepare", str(ROOT / "demo/clip.mp4"), "--out", str(folder / "scene")]
+        words = ["prepare", str(ROOT / "demo/clip.mp4"), str(folder / "scene")]
         subprocess.run([sys.executable, "-c", code, *words], check=True, stdout=sys.stderr)
         prepare_seconds = time.monotonic() - start
         budget = Budget(steps=None, minutes=DEMO_MINUTES)

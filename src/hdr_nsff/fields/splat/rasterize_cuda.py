@@ -43,8 +43,9 @@ def fault(device: str = "cuda") -> str | None:
 
 def install_command() -> str:
     """The command that installs the compiler for the CUDA version that torch brings."""
-    is_cuda_12 = (torch.version.cuda or "").startswith("12.")
-    return f"pip install 'hdr-nsff[{'gpu12' if is_cuda_12 else 'gpu'}]'"
+    if (torch.version.cuda or "").startswith("12."):
+        return "pip install 'hdr-nsff[gpu12]'"
+    return "pip install 'hdr-nsff[gpu]'"
 
 
 def composite(
