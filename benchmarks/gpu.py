@@ -99,7 +99,7 @@ def all_measurements(
 
 
 def earlier_results(path: Path, device: torch.device) -> list[dict[str, Any]]:
-    """What an earlier start has measured on this device, at this commit, without error."""
+    """What an earlier start has measured here, at this commit, without an error."""
     try:
         document = json.loads(path.read_text())
     except (OSError, ValueError):
@@ -266,9 +266,7 @@ def run_demo(device: torch.device) -> dict[str, Any]:
         for point in curve
     ]
     reached = [
-        p["seconds"]
-        for p in points
-        if p["psnr"] >= GOAL_DB[0] and p["psnr_moving"] >= GOAL_DB[1]
+        p["seconds"] for p in points if p["psnr"] >= GOAL_DB[0] and p["psnr_moving"] >= GOAL_DB[1]
     ]
     return {
         "prepare_seconds": round(prepare_seconds, 1),
@@ -280,9 +278,7 @@ def run_demo(device: torch.device) -> dict[str, Any]:
 
 def compare_processes(args: argparse.Namespace) -> dict[str, Any]:
     """Steps per second of `splat` with 4 batches a step, on one GPU and on two."""
-    return {
-        f"steps_per_second_{count}": measure_processes(count, args.steps) for count in (1, 2)
-    }
+    return {f"steps_per_second_{count}": measure_processes(count, args.steps) for count in (1, 2)}
 
 
 def measure_processes(count: int, steps: int) -> float:
