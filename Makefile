@@ -15,6 +15,9 @@ PYTHON ?= $(shell for p in python3.11 python3.12 python3; do $$p -c '$(SUITABLE)
 CONSTRAINTS := $(if $(shell command -v nvidia-smi),,-c constraints-cpu.txt)
 INSTALL = $(VENV)/bin/python -m pip install --disable-pip-version-check $(CONSTRAINTS)
 
+# The compiler of the CUDA kernels, for the CUDA version that torch brings.
+GPU_EXTRA = import torch; print("gpu12" if (torch.version.cuda or "").startswith("12.") else "gpu")
+
 # One thread per test process: they share the cores already.
 ONE_THREAD = OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
 
@@ -46,4 +49,5 @@ $(VENV)/.ready-docs: EXTRAS = docs
 $(VENV)/.ready-%: pyproject.toml constraints-cpu.txt | $(VENV)/bin/pip
 	@echo "installing into $(VENV); the first time this downloads about a gigabyte"
 	$(INSTALL) -e '.[$(EXTRAS)]'
+	$(if $(and $(shell command -v nvidia-smi),$(filter demo,$*)),$(INSTALL) -e ".[$$($(VENV)/bin/python -c '$(GPU_EXTRA)')]")
 	@touch $@

@@ -105,7 +105,7 @@ class DiscBeforeWall:
     def param_groups(self) -> list[ParamGroup]:
         return []
 
-    def after_step(self, step: int, frame_errors: object = None) -> None:
+    def after_step(self, step: int, frame_errors: object = None) -> bool:
         del step
 
     def shared_maxima(self) -> list[Tensor]:

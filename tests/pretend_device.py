@@ -6,12 +6,17 @@ device. Operations refuse to mix the two, as CUDA does.
         x + torch.ones(3)  # RuntimeError
 
 Allowed, as on CUDA: CPU scalars of no dimension, CPU tensors as indices, and copies.
+
+`counted()` counts what costs time on a GPU: kernels that are launched, one for every
+operation that is no view, and operations for which the host waits.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -31,6 +36,52 @@ INDEXED = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default}
 INDEXED |= {aten._index_put_impl_.default, aten._unsafe_index.Tensor}
 # what torch calls where no mode sees it, to copy the numbers of Python lists
 UNSEEN = [aten.empty_strided.default, aten.empty.memory_format, aten._copy_from.default]
+
+
+# operations whose result has a size, or is a number, that only the device knows
+WAITS = {aten._local_scalar_dense.default, aten.nonzero.default, aten.masked_select.default}
+WAITS |= {aten._unique2.default, aten.repeat_interleave.Tensor, aten.equal.default}
+# operations that only take memory
+FREE = {aten.empty.memory_format, aten.empty_strided.default, aten.empty_like.default}
+FREE |= {aten.new_empty.default, aten.new_empty_strided.default, aten.detach.default}
+FREE |= {aten.set_.source_Tensor, aten.alias.default, aten.lift_fresh.default}
+
+
+@dataclass
+class Counts:
+    """What was counted, by the names of operations."""
+
+    launches: Counter[str] = field(default_factory=Counter)
+    waits: Counter[str] = field(default_factory=Counter)
+
+
+COUNTING: list[Counts] = []
+
+
+@contextmanager
+def counted() -> Iterator[Counts]:
+    """Counts for as long as the context lasts."""
+    counts = Counts()
+    COUNTING.append(counts)
+    try:
+        yield counts
+    finally:
+        COUNTING.remove(counts)
+
+
+def count(func: Any, args: tuple[Any, ...], there: bool, on_device: bool) -> None:
+    """Count an operation on the device, or a copy to it or from it."""
+    crosses = func in COPIES and there != on_device
+    if func in (aten.copy_.default, aten._copy_from.default):
+        crosses = len({isinstance(x, PretendTensor) for x in args[:2]}) == 2
+    is_mask = func in INDEXED and any(
+        x is not None and x.dtype in (torch.bool, torch.uint8) for x in args[1]
+    )
+    for counts in COUNTING:
+        if crosses or is_mask or func in WAITS:
+            counts.waits[str(func)] += 1
+        if (there or on_device) and not func.is_view and func not in FREE:
+            counts.launches[str(func)] += 1
 
 
 class PretendTensor(Tensor):
@@ -61,6 +112,8 @@ class PretendTensor(Tensor):
 
     def tolist(self) -> Any:
         """Numbers on the host; torch has none for subclasses."""
+        for counts in COUNTING:
+            counts.waits["tolist"] += 1
         return self.inner.tolist()
 
     @classmethod
@@ -94,6 +147,8 @@ def execute(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     on_device = there if wanted is None else torch.device(wanted).type == NAME
     if func is aten.copy_.default:
         on_device = isinstance(args[0], PretendTensor)
+    if COUNTING and (there or on_device):
+        count(func, args, there, on_device)
     if func is aten._copy_from.default:
         args[1].inner.copy_(unwrap(args[0]))
         return args[1]

@@ -5,16 +5,18 @@ one that refuses to mix devices (`pretend_device.py`). It computes what the CPU 
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from presets import random_field, small
-from pretend_device import PretendTensor, pretend_device
+from pretend_device import PretendTensor, counted, pretend_device
 from torch import nn
 
 from hdr_nsff.core import distributed
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.fields.splat.rasterize import Maps
 from hdr_nsff.rendering.shot_views import plan_shot
 from hdr_nsff.rendering.shots import Output, Shot, render_shot
 from hdr_nsff.scene.batch import Recorder
@@ -89,12 +91,52 @@ def test_a_step_has_the_losses_of_the_cpu(
     def first_step(out: Path, where: torch.device) -> dict[str, float]:
         of_folder = replace(config, out=out)
         open_folder(of_folder)
-        return Trainer(of_folder, toy, where, distributed.Ranks()).step()
+        trainer = Trainer(of_folder, toy, where, distributed.Ranks())
+        trainer.read_every = 1
+        return trainer.step()
 
     expected = first_step(tmp_path / "cpu", torch.device("cpu"))
     with pretend_device() as device:
         found = first_step(tmp_path / "pretend", device)
     assert found == pytest.approx(expected, rel=2e-3, abs=1e-5)
+
+
+# operations that a step launches at most, forward and backward and Adam, and for which
+# the host waits. Of `splat` without its rasterizer, which waits once for the number of
+# (Gaussian, tile) pairs; the size of arrays that `grid` and `paper` select is known on
+# the device alone.
+STEP_COSTS = {"splat": (820, 0), "grid": (7700, 25), "paper": (2200, 33)}
+
+
+def flat_picture(*arguments: Any) -> Maps:
+    """Maps that depend on all Gaussians, by as few operations as possible."""
+    means, quaternions, scales, opacities, features, view = arguments
+    size = view.height, view.width
+    shapes = sum(t.mean() for t in (means, quaternions, scales)) * 1e-6
+    alpha = (opacities.mean() + shapes).clamp(0.1, 0.9).expand(*size)
+    return Maps(features.mean(0).sigmoid().expand(*size, features.shape[1]), alpha, alpha)
+
+
+@pytest.mark.parametrize("preset", list(STEP_COSTS))
+def test_a_step_launches_and_waits_no_more_than_it_did(
+    preset: str,
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("hdr_nsff.fields.splat.splat.rasterize", flat_picture)
+    config = small(preset, toy_folder, tmp_path / "run")
+    open_folder(config)
+    trainer = Trainer(config, toy, device, distributed.Ranks())
+    for step in (*range(1, 13), 1):  # every constant of step 1 is on the device by then
+        trainer.clock = replace(trainer.clock, step=step)
+        with counted() as counts:
+            trainer.step()
+    max_launches, max_waits = STEP_COSTS[preset]
+    assert counts.launches.total() <= max_launches, counts.launches.most_common()
+    assert counts.waits.total() <= max_waits, counts.waits
 
 
 @pytest.mark.parametrize("preset", EACH_FIELD)

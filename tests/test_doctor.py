@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from hdr_nsff import cli, doctor
-from hdr_nsff.fields.splat import rasterize_gsplat
+from hdr_nsff.fields.splat import cuda_backends
 
 Capture = pytest.CaptureFixture[str]
 PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text())["project"]
@@ -117,15 +117,16 @@ def test_a_missing_video_encoder_is_a_problem(monkeypatch: pytest.MonkeyPatch) -
     assert "PyAV has no libx264" in report.problems[0]
 
 
-def test_a_cuda_device_is_named_with_what_gsplat_can_do(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cuda_device_is_named_with_what_can_draw_there(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
     monkeypatch.setattr(torch.cuda, "get_device_name", lambda i: "Fake H100")
-    monkeypatch.setattr(rasterize_gsplat, "fault", lambda: "gsplat cannot draw")
+    found = cuda_backends.Backend(None, "nothing draws", "nothing draws")
+    monkeypatch.setattr(cuda_backends, "find_backend", lambda: found)
     report = doctor.Report()
     doctor.cuda(report)
     assert any("Fake H100" in line for line in report.lines)
-    assert any("gsplat cannot draw" in line for line in report.lines)
+    assert any("nothing draws" in line for line in report.lines)
     assert not report.problems  # the CPU still works
 
 

@@ -14,7 +14,7 @@ from fakes import fake_run
 from presets import random_field, small
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.fields.kernels.projection import ALPHA_MIN
+from hdr_nsff.fields.kernels.footprint import ALPHA_MIN
 from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths import color

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numba
 import numpy as np
@@ -16,8 +17,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels import compositing, projection
-from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
+from hdr_nsff.fields.kernels import compositing, footprint
+from hdr_nsff.fields.splat import rasterize as module
+from hdr_nsff.fields.splat import rasterize_cuda, rasterize_gsplat
 from hdr_nsff.fields.splat.rasterize import (
     Maps,
     dense,
@@ -83,7 +85,7 @@ def drawn(
     twin: Callable[..., Maps], gaussians: list[Tensor], view: Camera, weight: Tensor
 ) -> tuple[Tensor, list[Tensor]]:
     """Maps (H, W, D + 2), and the gradients of all NAMES of their sum with `weight`."""
-    kind = torch.float32 if twin is rasterize else torch.float64
+    kind = torch.float64 if twin is dense else torch.float32
     leaves = [t.to(kind, copy=True).requires_grad_() for t in gaussians]
     pose, focal = view.c2w.clone().requires_grad_(), view.K[[0, 1], [0, 1]].clone().requires_grad_()
     seen = everything(twin(*leaves, lens(view, focal).moved(pose)))
@@ -99,14 +101,19 @@ def clear_pixels(gaussians: list[Tensor], view: Camera) -> Tensor:
     d = view.pixel_grid()[:, None] - centers
     exponent = 0.5 * (d[:, :, None] @ torch.linalg.inv(covariance) @ d[..., None])[..., 0, 0]
     alpha = gaussians[3] * torch.exp(-exponent)
-    near_min = (alpha / float(projection.ALPHA_MIN)).log().abs() < 0.01
+    near_min = (alpha / float(footprint.ALPHA_MIN)).log().abs() < 0.01
     near_max = (alpha / float(compositing.ALPHA_MAX)).log().abs() < 3e-4
-    doubtful = (near_min | near_max) & (z > projection.NEAREST)
+    doubtful = (near_min | near_max) & (z > footprint.NEAREST)
     return ~doubtful.any(1).unflatten(0, (view.height, view.width))
 
 
-def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> Tensor:
-    """The maps (H, W, D + 2), after both twins were found to give the same ones.
+def compare(
+    gaussians: list[Tensor],
+    view: Camera,
+    gradients: float = 1e-3,
+    twin: Callable[..., Maps] = rasterize,
+) -> Tensor:
+    """The maps (H, W, D + 2), after `twin` and `dense` were found to give the same.
 
     Gradients are the same up to the share `gradients` of the largest ones.
     """
@@ -115,7 +122,7 @@ def compare(gaussians: list[Tensor], view: Camera, gradients: float = 1e-3) -> T
     shape = (view.height, view.width, gaussians[4].shape[1] + 2)
     generator = torch.Generator().manual_seed(99)
     weight = torch.randn(shape, generator=generator, dtype=torch.float64) * clear[..., None]
-    ours, theirs = (drawn(twin, gaussians, view, weight) for twin in (rasterize, dense))
+    ours, theirs = (drawn(twin, gaussians, view, weight) for twin in (twin, dense))
     top = theirs[0].abs().amax((0, 1)).clamp_min(1.0)
     assert float(((ours[0] - theirs[0]).abs() / top)[clear].max()) < 2e-4
     for name, a, b in zip(NAMES, ours[1], theirs[1], strict=True):
@@ -159,7 +166,7 @@ def test_gaussians_behind_the_camera_are_hidden_and_have_no_gradient() -> None:
 @pytest.mark.parametrize("size", [0.01, 1.0])
 def test_kernels_equal_plain_torch_across_the_near_plane(size: float) -> None:
     view = camera()
-    gaussians = at_depths(view, (0.0, 3 * projection.NEAREST), 1.0, size)
+    gaussians = at_depths(view, (0.0, 3 * footprint.NEAREST), 1.0, size)
     assert float(compare(gaussians, view, gradients=5e-3)[..., -1].max()) > 0.5
 
 
@@ -283,9 +290,9 @@ def test_the_depth_order_is_a_stable_sort_of_all_that_is_drawn() -> None:
     depths = g.permutation(depths).astype(np.float32)
     order = depth_order(depths)
     assert sorted(order.tolist()) == list(range(len(depths)))
-    drawn = order[depths[order] > projection.NEAREST]
+    drawn = order[depths[order] > footprint.NEAREST]
     expected = np.argsort(depths, kind="stable")
-    assert drawn.tolist() == expected[depths[expected] > projection.NEAREST].tolist()
+    assert drawn.tolist() == expected[depths[expected] > footprint.NEAREST].tolist()
 
 
 def test_opacity_never_exceeds_1_however_many_gaussians_there_are() -> None:
@@ -345,27 +352,16 @@ def test_the_result_is_the_same_to_the_bit_for_any_number_of_threads() -> None:
     assert len(hashes) == 4 and len(set(hashes)) == 1
 
 
-def test_a_missing_gsplat_is_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    messages: list[str] = []
-    monkeypatch.setitem(sys.modules, "gsplat", None)
-    monkeypatch.setattr(rasterize_cuda, "say", messages.append)
-    rasterize_cuda.fault.cache_clear()
-    rasterize_cuda.available.cache_clear()
-    assert not rasterize_cuda.available() and not rasterize_cuda.available()
-    assert len(messages) == 1 and "hdr-nsff[gpu]" in messages[0]
-    rasterize_cuda.fault.cache_clear()
-    rasterize_cuda.available.cache_clear()
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 @pytest.mark.parametrize("channels", [1, 4, 17, 40])
-@pytest.mark.parametrize("installed", [True, False])
+@pytest.mark.parametrize("backend", [rasterize_cuda, rasterize_gsplat, None])
 def test_cuda_equals_plain_torch(
-    channels: int, installed: bool, monkeypatch: pytest.MonkeyPatch
+    channels: int, backend: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if installed:
+    if backend is rasterize_gsplat:
         pytest.importorskip("gsplat")
-    monkeypatch.setattr(rasterize_cuda, "available", lambda: installed)
+    composite = backend.composite if backend else None
+    monkeypatch.setattr(module, "composite_on", lambda device: composite)
     view = camera()
     gaussians = scene(0, view, channels=channels)
     clear = clear_pixels(gaussians, view)[..., None]

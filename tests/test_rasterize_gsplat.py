@@ -2,7 +2,6 @@
 
 import sys
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,13 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff import cli
-from hdr_nsff.core.errors import InputError
-from hdr_nsff.fields import build
-from hdr_nsff.fields.build import device_for
-from hdr_nsff.fields.nsff.nsff import NSFFConfig
 from hdr_nsff.fields.splat import rasterize_gsplat
-from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.rasterize import dense
 from hdr_nsff.geometry.cameras import Camera
 
@@ -92,49 +85,5 @@ def test_a_gsplat_that_draws_a_wrong_picture_is_not_used(gsplat: Callable[[Draw]
 def test_a_missing_gsplat_is_a_sentence_with_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gsplat", None)
     rasterize_gsplat.fault.cache_clear()
-    assert "pip install 'hdr-nsff[gpu]'" in str(rasterize_gsplat.fault("cpu"))
+    assert "pip install 'hdr-nsff[gsplat]'" in str(rasterize_gsplat.fault("cpu"))
     rasterize_gsplat.fault.cache_clear()
-
-
-@pytest.fixture
-def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """A CUDA device on which gsplat cannot draw, and the messages to the user."""
-    said: list[str] = []
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
-    monkeypatch.setattr(rasterize_gsplat, "fault", lambda device="cuda": "gsplat cannot draw")
-    monkeypatch.setattr(build, "say", said.append)
-    return said
-
-
-def test_gaussians_fall_back_to_the_cpu_loudly(broken_cuda: list[str]) -> None:
-    assert device_for(SplatConfig(), "auto") == torch.device("cpu")
-    assert len(broken_cuda) == 1 and "using the CPU" in broken_cuda[0]
-
-
-def test_gaussians_on_cuda_are_refused_where_cuda_was_requested(broken_cuda: list[str]) -> None:
-    with pytest.raises(InputError, match="--device cuda: gsplat cannot draw, or use --device cpu"):
-        device_for(SplatConfig(), "cuda")
-
-
-def test_other_fields_need_no_rasterizer(broken_cuda: list[str]) -> None:
-    assert device_for(NSFFConfig(), "auto") == torch.device("cuda") and not broken_cuda
-
-
-@pytest.mark.parametrize("verb", ["run", "train"])
-def test_gsplat_is_tried_before_anything_is_prepared_or_trained(
-    verb: str,
-    broken_cuda: list[str],
-    toy_folder: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    out = str(tmp_path / "out")
-    arguments = {
-        "run": ["run", str(toy_folder / "images"), out],
-        "train": ["train", "splat", "--scene", str(toy_folder), "--out", out],
-    }
-    with pytest.raises(SystemExit) as stop:
-        cli.main([*arguments[verb], "--device", "cuda"])
-    assert stop.value.code == 2 and "gsplat cannot draw" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()

@@ -60,7 +60,9 @@ EXTRAS = {
     "synth": {"mitsuba>=3.6": "mitsuba"},
     "usd": {"usd-core>=26.3": "pxr"},
     "ocio": {"opencolorio>=2.5": "PyOpenColorIO"},
-    "gpu": {"gsplat>=1.4": "gsplat"},
+    "gpu": {"numba-cuda[cu13]>=0.30.4,<0.31": "numba_cuda"},
+    "gpu12": {"numba-cuda[cu12]>=0.30.4,<0.31": "numba_cuda"},
+    "gsplat": {"gsplat>=1.4": "gsplat"},
     "raft": {"torchvision>=0.21": "torchvision"},
     "neural": {"transformers>=5.2,<6": "transformers", "kornia>=0.9,<0.10": "kornia"},
 }
@@ -256,7 +258,7 @@ def import_fault(module: str) -> str | None:
 
 def package_of(requirement: str) -> str:
     """The package's name in a requirement such as "rich>=13.7,<15"."""
-    return re.split(r"[<>=!~ ]", requirement, maxsplit=1)[0]
+    return re.split(r"[\[<>=!~ ]", requirement, maxsplit=1)[0]
 
 
 def version_of(name: str) -> str:
@@ -314,8 +316,8 @@ def cuda(report: Report) -> None:
         return
     names = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]
     report.add("CUDA", f"{', '.join(names)}; torch is built for CUDA {torch.version.cuda}")
-    rasterizer = importlib.import_module("hdr_nsff.fields.splat.rasterize_gsplat")
-    report.add("CUDA rasterizer", rasterizer.fault() or "gsplat draws")
+    backends = importlib.import_module("hdr_nsff.fields.splat.cuda_backends")
+    report.add("CUDA rasterizer", backends.find_backend().description)
 
 
 def driver() -> str:

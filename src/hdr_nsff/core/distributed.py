@@ -46,6 +46,27 @@ class Ranks:
         for buffer in buffers:
             dist.all_reduce(buffer, dist.ReduceOp.MAX)
 
+    def follow_first(self, tensors: Iterable[Tensor]) -> None:
+        """Every tensor becomes that of the first process."""
+        if self.world == 1:
+            return
+        for tensor in tensors:
+            dist.broadcast(tensor.detach(), 0)
+
+    def check_same(self, tensors: Iterable[Tensor]) -> None:
+        """RuntimeError where processes hold different tensors, by their sums."""
+        if self.world == 1:
+            return
+        lowest = torch.stack([tensor.detach().double().sum() for tensor in tensors])
+        highest = lowest.clone()
+        dist.all_reduce(lowest, dist.ReduceOp.MIN)
+        dist.all_reduce(highest, dist.ReduceOp.MAX)
+        if not torch.equal(lowest, highest):
+            raise RuntimeError(
+                f"the {self.world} processes have learned different parameters: "
+                "train in one process, and report this"
+            )
+
     def agree(self, seconds: float) -> float:
         """The first process's number, for all."""
         if self.world == 1:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Callable
+from functools import cache, lru_cache
 from typing import Any, TypeVar
 
 import torch
@@ -42,6 +43,23 @@ def tree_map(function: Callable[[Tensor], Tensor], value: T) -> T:
 def to_device(value: T, device: torch.device | str) -> T:
     """`value` with every tensor on `device`."""
     return tree_map(lambda t: t.to(device), value)
+
+
+@lru_cache(maxsize=4096)
+def constant(numbers: tuple[float, ...], device: torch.device, dtype: torch.dtype) -> Tensor:
+    """A vector of these numbers on a device, copied there once: not to be changed.
+
+    A copy from the host makes it wait for the device.
+    """
+    with torch.inference_mode(False):
+        return torch.tensor(numbers, dtype=dtype, device=device)
+
+
+@cache
+def table_on(table: Tensor, device: torch.device, dtype: torch.dtype) -> Tensor:
+    """A constant `table` on a device, copied there once: not to be changed."""
+    with torch.inference_mode(False):
+        return table.to(device, dtype)
 
 
 def pick_device(name: str) -> torch.device:

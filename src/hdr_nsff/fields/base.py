@@ -101,11 +101,13 @@ class RadianceField(Protocol):
         """Parameters with their learning rates."""
         ...
 
-    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Housekeeping between optimizer steps (culling grids, relocation).
 
         `frame_errors(n)` measures how wrong the pictures of n training frames are; None
-        late in a run, when nothing is to be rearranged any more.
+        late in a run, when nothing is to be rearranged any more. Returns whether
+        parameters were rearranged by what was measured, which may differ between
+        processes: the first one's are then everyone's.
         """
         ...
 

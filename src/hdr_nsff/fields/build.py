@@ -17,7 +17,7 @@ from hdr_nsff.fields.nsff.initialize_grid import initialize_grid
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.point_cloud import ToRadiance
 from hdr_nsff.fields.space import build_space
-from hdr_nsff.fields.splat import rasterize_gsplat
+from hdr_nsff.fields.splat import cuda_backends
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import count_local_pixels
@@ -32,13 +32,13 @@ AnyField = NSFF | NerfWT | HexPlane | Splat
 
 def device_for(config: FieldConfig, name: str) -> torch.device:
     """The device of a `--device` flag for this field. Gaussians use CUDA only where
-    gsplat has drawn one there: `auto` takes the CPU instead and says so, `cuda` is an
-    InputError.
+    a rasterizer has drawn one there: `auto` takes the CPU instead and says so, `cuda`
+    is an InputError.
     """
     device = pick_device(name)
     if device.type != "cuda" or not isinstance(config, SplatConfig):
         return device
-    reason = rasterize_gsplat.fault(str(device))
+    reason = cuda_backends.fault(str(device))
     if reason is None:
         return device
     if name == "auto":

@@ -7,6 +7,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from hdr_nsff.core.tensors import constant
+
 
 def knot_of(times: Tensor, time: float) -> float:
     """Position of a time (in frames) on the sorted training times (T,).
@@ -71,4 +73,5 @@ def weighted_rows(values: Tensor, weights: list[float]) -> Tensor:
 
     One product and not a sum of rows, whose gradients would each fill all of `values`.
     """
-    return (values.new_tensor(weights) @ values.flatten(1)).view(values.shape[1:])
+    factors = constant(tuple(weights), values.device, values.dtype)
+    return (factors @ values.flatten(1)).view(values.shape[1:])

@@ -60,7 +60,9 @@ class Camera:
 
     def pixel_grid(self) -> Tensor:
         """Every pixel center, row by row: (height * width, 2)."""
-        y, x = torch.meshgrid(torch.arange(self.height), torch.arange(self.width), indexing="ij")
+        rows = torch.arange(self.height, device=self.K.device)
+        columns = torch.arange(self.width, device=self.K.device)
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
         return (torch.stack([x, y], -1).reshape(-1, 2) + 0.5).to(self.K)
 
     def resized(self, width: int, height: int) -> Camera:

@@ -6,7 +6,7 @@ Pixels are drawn uniformly, and more from the moving mask.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -42,6 +42,7 @@ class PixelBatch:
     pixels: Tensor  # (N, 2) xy, centers at +0.5
     rgb: Tensor  # (N, 3) recorded, in [0, 1]
     uniform: Tensor  # (N,) bool: drawn uniformly (not added by motion-weighted drawing)
+    whole: bool = False  # every pixel of the frame, row by row
     # for the field's own randomness (jitter, noise): the same seed gives the same pass
     seed: int = 0
     recorder: Recorder | None = None  # the recording, while training
@@ -52,6 +53,10 @@ class PixelBatch:
     disparity_confidence: Tensor | None = None  # (N,) in [0, 1]
     flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (N, 2)} pixels
     flow_valid: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (N,)} bool
+
+    def all_uniform(self) -> bool:
+        """Whether no pixel was added; of whole frames without asking the device."""
+        return self.whole or bool(self.uniform.all())
 
 
 def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = None) -> PixelBatch:
@@ -73,7 +78,8 @@ def whole_frame(scene: Scene, frame: int) -> PixelBatch:
     def select(image: Tensor) -> Tensor:
         return image.flatten(0, 1)
 
-    return batch_of(scene, frame, scene.train[frame].camera.pixel_grid(), select)
+    batch = batch_of(scene, frame, scene.train[frame].camera.pixel_grid(), select)
+    return replace(batch, whole=True)
 
 
 def batch_of(

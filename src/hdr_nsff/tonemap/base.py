@@ -121,6 +121,14 @@ class ToneMapper(nn.Module, ABC):
             self.reference_frame = recordings.brackets.index(recordings.reference)
         self.register_buffer("knots", knot_positions(config.knots), persistent=False)
         self.register_buffer("anchored", torch.zeros((), dtype=torch.bool))
+        self.known_anchored: bool | None = None  # the buffer on the host, once it was read
+        self.register_load_state_dict_post_hook(forget_anchored)
+
+    def is_anchored(self) -> bool:
+        """Whether `anchor` was called, without waiting for a GPU at every step."""
+        if self.known_anchored is None:
+            self.known_anchored = bool(self.anchored)
+        return self.known_anchored
 
     # What a kind has to say
 
@@ -283,3 +291,8 @@ def informative(rgb: Tensor, low: float = 3 / 255, high: float = 250 / 255) -> T
     from black and from saturation.
     """
     return ((rgb >= low) & (rgb <= high)).all(-1)
+
+
+def forget_anchored(tonemapper: ToneMapper, keys: object) -> None:
+    """Another state was loaded: read again whether it is anchored."""
+    tonemapper.known_anchored = None

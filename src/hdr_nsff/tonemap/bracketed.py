@@ -202,7 +202,7 @@ class SharedToneMapper(BracketedToneMapper):
 
         These are curves, exposures (natural log) and white balances.
         """
-        if not self.anchored:
+        if not self.is_anchored():
             return self.knots.new_zeros(())
         distance = (self.response.values(slice(None)) - self.anchor_curve).square().mean()
         distance = distance + ((self.bracket_gain.ev() - self.anchor_ev) * LN2).square().mean()
@@ -220,6 +220,7 @@ class SharedToneMapper(BracketedToneMapper):
         self.anchor_ev.copy_(self.bracket_gain.ev())
         self.anchor_white_balance.copy_(self.bracket_gain.white_balance)
         self.anchored.fill_(True)
+        self.known_anchored = True
 
 
 class NetworkToneMapper(BracketedToneMapper):

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.settings import Weight
+from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.maths import losses
 from hdr_nsff.scene.batch import PixelBatch
@@ -57,7 +58,7 @@ class Objective:
         rgb = render.rgb
         if rgb is None:
             rgb = record(render.radiance, batch, tonemap)
-        uniform = None if batch.uniform.all() else batch.uniform[:, None].to(rgb)
+        uniform = None if batch.all_uniform() else batch.uniform[:, None].to(rgb)
         terms = {"photometric": losses.photometric(rgb, batch.rgb, uniform, self.squared)}
         terms |= self.dynamic(render, rgb, batch, tonemap, phase)
         terms |= self.warped(render, batch, tonemap, phase)
@@ -100,7 +101,7 @@ class Objective:
             weight = self.trust(batch)
             if phase >= 1:
                 weight = weight * render.motion.detach()[:, None]
-        elif batch.uniform.all():
+        elif batch.all_uniform():
             return {}
         else:
             weight = self.trust(batch) * (~batch.uniform)[:, None]
@@ -167,7 +168,8 @@ class Objective:
         assert not unknown, f"terms without a weight: {sorted(unknown)}"
         counting = {name: value for name, value in terms.items() if self.weights[name]}
         values = torch.stack(list(counting.values()))
-        return (values * torch.tensor([self.weights[name] for name in counting]).to(values)).sum()
+        weights = tuple(self.weights[name] for name in counting)
+        return (values * constant(weights, values.device, values.dtype)).sum()
 
 
 def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:

@@ -36,6 +36,7 @@ from hdr_nsff.training.run_writer import LOG_EVERY, RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
 from hdr_nsff.training.start import start_field
 
+CHECK_SAME_EVERY = 1000  # steps after which several processes compare their parameters
 REARRANGE_UNTIL = 0.8  # share of the run after which the field rearranges nothing (hand-chosen)
 
 
@@ -70,6 +71,9 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.config = config
         self.ranks = ranks
+        # steps after which terms are read: the host would wait for a GPU at every one
+        self.read_every = 1 if device.type == "cpu" else LOG_EVERY
+        self.latest: torch.Tensor | None = None  # values of the last step's terms
         self.clock = Clock(config.budget, config.schedule, len(scene.train))
         self.field = build_field(config.field, scene)
         self.tonemapper = tone_mapper_for(config.tonemap, scene)
@@ -146,7 +150,7 @@ class Trainer:
         clock, config = self.clock, self.config
         self.field.train()
         limit_torch_threads(config.torch_threads)
-        if clock.progress >= config.anchor_at and not bool(self.tonemapper.anchored):
+        if clock.progress >= config.anchor_at and not self.tonemapper.is_anchored():
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)
         totals: dict[str, float] = {}
@@ -160,10 +164,14 @@ class Trainer:
             terms |= self.objective.reduce(field_terms) | self.tonemapper.regularizers()
             if self.poses:
                 terms |= self.poses.regularizers(batch.frame)
-            values = dict(zip(terms, torch.stack(list(terms.values())).tolist(), strict=True))
+            log_due = (clock.step + 1) % LOG_EVERY == 0
+            self.latest = torch.stack([value.detach() for value in terms.values()])
+            values: dict[str, float] = {}
+            if log_due or clock.step % self.read_every == 0:
+                values = dict(zip(terms, self.latest.tolist(), strict=True))
             check_finite(values, clock.step, batch, render.radiance)
             (self.objective.total(terms) / config.batches).backward()
-            if (clock.step + 1) % LOG_EVERY == 0:
+            if log_due:
                 values["mse"] = squared_error(render, batch, self.tonemapper)
             for name, value in values.items():
                 totals[name] = totals.get(name, 0.0) + value / len(slots)
@@ -174,7 +182,10 @@ class Trainer:
             self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
         rearranging = clock.progress < REARRANGE_UNTIL
-        self.field.after_step(clock.step + 1, self.frame_errors if rearranging else None)
+        if self.field.after_step(clock.step + 1, self.frame_errors if rearranging else None):
+            self.ranks.follow_first([*self.field.parameters(), *self.field.buffers()])
+        if (clock.step + 1) % CHECK_SAME_EVERY == 0:
+            self.ranks.check_same(self.optimizers.parameters())
         if "mse" in totals:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
@@ -201,6 +212,8 @@ class Trainer:
 
     def save(self, preview: bool = False) -> None:
         """Save a checkpoint, and a `preview` of the frame in the middle."""
+        if self.latest is not None and not bool(self.latest.isfinite().all()):
+            raise FloatingPointError(f"step {self.clock.step}: some terms are not finite")
         self.writer.save_checkpoint(self.clock)
         if preview:
             middle = len(self.scene.train) // 2

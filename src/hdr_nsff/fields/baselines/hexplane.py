@@ -251,7 +251,7 @@ class HexPlane(nn.Module):
             ParamGroup(networks, self.config.network_lr, betas),
         ]
 
-    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Grow the planes three times, and refresh the culling grid.
 
         The culling grid waits until it has seen enough.
@@ -265,6 +265,7 @@ class HexPlane(nn.Module):
             self.appearance_planes.grow(cells)
         if step >= c.cull_after and step % REFRESH_EVERY == 0:
             self.cells.refresh(CULL_MIN_WEIGHT, WEIGHT_DECAY)
+        return False
 
     def shared_maxima(self) -> list[Tensor]:
         """The culling grid's memory, of which several processes need the maximum."""

@@ -26,7 +26,8 @@ import numba
 import numpy as np
 
 from hdr_nsff.core.jit import jit
-from hdr_nsff.fields.kernels.projection import ALPHA_MIN, MOMENTS, TILE_X, TILE_Y, ZERO
+from hdr_nsff.fields.kernels.footprint import ALPHA_MIN, MOMENTS
+from hdr_nsff.fields.kernels.projection import TILE_X, TILE_Y, ZERO
 
 PIXELS = TILE_X * TILE_Y  # of a tile
 BLOCK = 8  # channels that one pass over a Gaussian's pixels takes
@@ -74,6 +75,21 @@ def exp_minus(s):
     y = y * y
     y = y * y
     return y * y
+
+
+@jit(inline="always", fastmath=FAST)
+def full_alpha(o, a, b, c, dx, dy):
+    """Opacity `o` times exp(-s) at an offset from the center of a conic (a, b, c)."""
+    e0, e1 = a * dx, b * dx + c * dy
+    s = min(e0 * e0 + e1 * e1, MAX_EXPONENT)
+    return o * exp_minus(s)
+
+
+@jit(inline="always", fastmath=FAST)
+def cut_alpha(full):
+    """The alpha that is drawn: 0 below ALPHA_MIN, and at most ALPHA_MAX."""
+    q = min(full, ALPHA_MAX)
+    return q if q >= ALPHA_MIN else ZERO
 
 
 @jit(nogil=True)
@@ -240,10 +256,7 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
             f = load_block(features, g, 0)
             for p in range(first, last):
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
-                e0, e1 = a * dx, b * dx + c * dy
-                s = min(e0 * e0 + e1 * e1, MAX_EXPONENT)
-                q = min(o * exp_minus(s), ALPHA_MAX)
-                q = q if q >= ALPHA_MIN else ZERO
+                q = cut_alpha(full_alpha(o, a, b, c, dx, dy))
                 v = q * z[LEFT + p]
                 z[WEIGHT + p] = v
                 z[LEFT + p] -= v
@@ -346,11 +359,8 @@ def backward(
             for p in range(first, last):
                 value = z[GRAD_ALPHA + p] + z[VALUE + p] + dot_block(z, SUMS + p, f)
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
-                e0, e1 = a * dx, b * dx + c * dy
-                s = min(e0 * e0 + e1 * e1, MAX_EXPONENT)
-                full = o * exp_minus(s)
-                q = min(full, ALPHA_MAX)
-                q = q if q >= ALPHA_MIN else ZERO
+                full = full_alpha(o, a, b, c, dx, dy)
+                q = cut_alpha(full)
                 left = z[LEFT + p]
                 v = q * left
                 behind = z[BEHIND + p] - v * value

@@ -1,16 +1,8 @@
 """Numba kernels of the Gaussian rasterizer on the CPU: world Gaussians to projected
 ones and the tiles that they touch, and all of it backwards by hand.
 
-EWA splatting (Zwicker et al. 2001; Kerbl et al. 2023): a Gaussian of rotation R and
-scales S, seen by a camera of rotation W, has the 2D covariance V V^T + blur with V = J
-W R S, where J linearizes the projection at its mean. A projected Gaussian is a pixel
-center, a conic, a z-depth, an opacity and D features. The conic (a, b, c) is the
-inverse 2D covariance in factors: alpha = opacity * exp(-s) with s = (a dx)^2 + (b dx +
-c dy)^2. Multiplied out, float32 would lose needles whose center is far away.
-
-Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channels. Everything about one
-Gaussian is computed in float64 and in plain tuples. The plain-torch twin is
-`rasterize.project`; `compositing.py` draws what comes out.
+The mathematics of one Gaussian stands in `footprint.py`, and `compositing.py` draws
+what comes out. Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channels.
 """
 
 from __future__ import annotations
@@ -21,56 +13,16 @@ import numba
 import numpy as np
 
 from hdr_nsff.core.jit import jit
+from hdr_nsff.fields.kernels.footprint import (
+    FAST,
+    MOMENTS,
+    ellipse,
+    footprint,
+    world_gradients,
+)
 
 TILE_X, TILE_Y = 8, 32  # pixels
-# gradients of a pair before its features: sums over its pixels of u = dL / ds, u dx, u
-# dy, u dx^2, u dx dy and u dy^2
-MOMENTS = 6
 ZERO = np.float32(0)
-ALPHA_MIN = np.float32(1 / 255)  # alpha below this counts as 0
-NEAREST = 0.01  # z-depth, scene units: nothing nearer is drawn (gsplat's default)
-# pixels^2 added to 2D variances, so that no Gaussian falls between pixels (Kerbl et al.
-# 2023)
-BLUR = 0.3
-# of half the picture: how far outside of it the projection is still linearized at the
-# mean, and not at the edge (as in gsplat)
-MARGIN = 0.3
-MIN_LENGTH = 1e-12  # added to a quaternion's length, which may be 0
-# sums may be reordered, division be multiplication; NaN and Inf stay what they are
-FAST = {"contract", "reassoc", "nsz", "arcp"}
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def rotation(q):
-    """The unit quaternion (w, x, y, z) of `q`, its rotation matrix, and q's length.
-
-    The matrix is given row by row.
-    """
-    n = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]) + MIN_LENGTH
-    w, x, y, z = q[0] / n, q[1] / n, q[2] / n, q[3] / n
-    r = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return (w, x, y, z), r, n
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def clamp_ratio(x, z, low, high):
-    """x, moved so that x / z lies within [low, high], and whether it was moved."""
-    ratio = x / z
-    if ratio < low:
-        return z * low, True
-    if ratio > high:
-        return z * high, True
-    return x, False
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def dot(a, b):
-    """Dot product of two triples."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @jit(fastmath=FAST, error_model="numpy")
@@ -84,55 +36,13 @@ def gaussian(means, quaternions, scales, g):
 
 
 @jit(fastmath=FAST, error_model="numpy")
-def jacobian(k, held):
-    """Entries 00, 02, 11 and 12 of J (2, 3), the linearized projection.
-
-    It has intrinsics k and is linearized at the point of `held`; the other entries are
-    0.
-    """
-    x, y, z, _, _ = held
-    return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def footprint(m, q, s, v, k, width, height):
-    """A Gaussian of mean m, quaternion q and scales s in a camera's picture.
-
-    The camera has world-to-camera matrix v (3, 4) and intrinsics k = (fx, fy, cx, cy).
-    Returns the camera point t (3,); `held`, the point where the projection is
-    linearized and whether its x and y are clamped; T = J W (2, 3); the triple of
-    `rotation`; V = T R S (2, 3); and the 2D covariance V V^T + blur (xx, xy, yy).
-    """
-    t = (
-        v[0, 0] * m[0] + v[0, 1] * m[1] + v[0, 2] * m[2] + v[0, 3],
-        v[1, 0] * m[0] + v[1, 1] * m[1] + v[1, 2] * m[2] + v[1, 3],
-        v[2, 0] * m[0] + v[2, 1] * m[1] + v[2, 2] * m[2] + v[2, 3],
+def view_rows(w2c):
+    """The three rows of a world-to-camera matrix (3, 4) as tuples."""
+    return (
+        (w2c[0, 0], w2c[0, 1], w2c[0, 2], w2c[0, 3]),
+        (w2c[1, 0], w2c[1, 1], w2c[1, 2], w2c[1, 3]),
+        (w2c[2, 0], w2c[2, 1], w2c[2, 2], w2c[2, 3]),
     )
-    z = t[2] if t[2] > NEAREST else NEAREST
-    fx, fy, cx, cy = k[0], k[1], k[2], k[3]
-    edge_x, edge_y = MARGIN * 0.5 * width / fx, MARGIN * 0.5 * height / fy
-    x, held_x = clamp_ratio(t[0], z, -cx / fx - edge_x, (width - cx) / fx + edge_x)
-    y, held_y = clamp_ratio(t[1], z, -cy / fy - edge_y, (height - cy) / fy + edge_y)
-    held = (x, y, z, held_x, held_y)
-    j00, j02, j11, j12 = jacobian(k, held)
-    t0 = (
-        j00 * v[0, 0] + j02 * v[2, 0],
-        j00 * v[0, 1] + j02 * v[2, 1],
-        j00 * v[0, 2] + j02 * v[2, 2],
-    )
-    t1 = (
-        j11 * v[1, 0] + j12 * v[2, 0],
-        j11 * v[1, 1] + j12 * v[2, 1],
-        j11 * v[1, 2] + j12 * v[2, 2],
-    )
-    unit, r, n = rotation(q)
-    column0 = (r[0][0], r[1][0], r[2][0])
-    column1 = (r[0][1], r[1][1], r[2][1])
-    column2 = (r[0][2], r[1][2], r[2][2])
-    v0 = (dot(t0, column0) * s[0], dot(t0, column1) * s[1], dot(t0, column2) * s[2])
-    v1 = (dot(t1, column0) * s[0], dot(t1, column1) * s[1], dot(t1, column2) * s[2])
-    covariance = (dot(v0, v0) + BLUR, dot(v0, v1), dot(v1, v1) + BLUR)
-    return t, held, (t0, t1), (unit, r, n), (v0, v1), covariance
 
 
 @jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -162,29 +72,17 @@ def project(
     tiles_x, tiles_y = (width + TILE_X - 1) // TILE_X, (height + TILE_Y - 1) // TILE_Y
     for g in numba.prange(means.shape[0]):
         m, q, s = gaussian(means, quaternions, scales, g)
-        t, _, _, _, _, (xx, xy, yy) = footprint(m, q, s, w2c, k, width, height)
+        t, _, _, _, _, covariance = footprint(m, q, s, view_rows(w2c), k, width, height)
+        shows, center, conic, (left, top, right, bottom) = ellipse(
+            t, covariance, float(opacities[g]), k, width, height
+        )
         depths[g] = t[2]
+        centers[g, 0], centers[g, 1] = center
+        conics[g, 0], conics[g, 1], conics[g, 2] = conic
         boxes[g, 0] = boxes[g, 1] = boxes[g, 2] = boxes[g, 3] = 0
         rows[g, 0] = rows[g, 1] = 0
-        centers[g, 0] = centers[g, 1] = ZERO
-        conics[g, 0] = conics[g, 1] = conics[g, 2] = ZERO
-        o = float(opacities[g])
-        if not (t[2] > NEAREST and o >= ALPHA_MIN):
-            continue  # behind, too faint, or not a number
-        x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
-        # standard deviations at which alpha falls below 1/255
-        reach = math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
-        rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
-        if not (x + rx > 0 and y + ry > 0 and x - rx < width and y - ry < height):
-            continue  # outside, or not a number
-        det = xx * yy - xy * xy
-        if not det > 0:
-            continue  # too long and thin for float64
-        centers[g, 0], centers[g, 1] = x, y
-        across = math.sqrt(0.5 * xx / det)
-        conics[g, 0], conics[g, 1], conics[g, 2] = math.sqrt(0.5 / xx), -xy / xx * across, across
-        left, right = max(x - rx, 0.0), min(x + rx, float(width))
-        top, bottom = max(y - ry, 0.0), min(y + ry, float(height))
+        if not shows:
+            continue
         rows[g, 0], rows[g, 1] = int(top), math.ceil(bottom)
         boxes[g, 0], boxes[g, 1] = int(left) // TILE_X, int(top) // TILE_Y
         boxes[g, 2] = min(int(right) // TILE_X + 1, tiles_x)
@@ -224,19 +122,19 @@ def project_backward(
         sums = sum_moments(pairs, first, last)
         grad_opacities[g] = -sums[0] / opacities[g]  # dL / do = dL / dalpha * alpha / o
         m, q, s = gaussian(means, quaternions, scales, g)
-        t, held, projection, (unit, r, n), spread, covariance = footprint(
-            m, q, s, w2c, k, width, height
+        d_depth = float(grad_features[g, channels - 1])
+        d_mean, d_quaternion, d_scales, d_view = world_gradients(
+            m, q, s, view_rows(w2c), k, width, height, sums, d_depth
         )
-        center, d_covariance = picture_gradient(covariance, sums)
-        d_scales, d_rotation, d_projection = shape_gradient(d_covariance, projection, spread, r, s)
+        grad_means[g, 0], grad_means[g, 1], grad_means[g, 2] = d_mean
         grad_scales[g, 0], grad_scales[g, 1], grad_scales[g, 2] = d_scales
-        quaternion_gradient(unit, n, d_rotation, grad_quaternions[g])
-        dx, dy, dz = point_gradient(center, d_projection, t, held, w2c, k)
-        dz += float(grad_features[g, channels - 1])
-        for j in range(3):
-            grad_means[g, j] = w2c[0, j] * dx + w2c[1, j] * dy + w2c[2, j] * dz
+        for j in range(4):
+            grad_quaternions[g, j] = d_quaternion[j]
         if len(grad_pose):
-            pose_gradient((dx, dy, dz), d_projection, m, jacobian(k, held), grad_pose[g])
+            for j in range(4):
+                grad_pose[g, j] = d_view[0][j]
+                grad_pose[g, 4 + j] = d_view[1][j]
+                grad_pose[g, 8 + j] = d_view[2][j]
 
 
 @jit(fastmath=FAST, error_model="numpy")
@@ -251,150 +149,3 @@ def sum_moments(pairs, first, last):
         u4 += pairs[i, 4]
         u5 += pairs[i, 5]
     return u0, u1, u2, u3, u4, u5
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def picture_gradient(covariance, u):
-    """dL / d pixel center (2,) and dL / d covariance (xx, xy, yy), of the moments `u`.
-
-    With Q the inverse of the 2D covariance, s = d^T Q d / 2 of an offset d: dL / dQ is
-    half the second moments, and dL / d covariance = -Q (dL / dQ) Q.
-    """
-    xx, xy, yy = covariance
-    det = xx * yy - xy * xy
-    # Q = (a, b; b, c) in float64: needles thousands of pixels long need it
-    a, b, c = yy / det, -xy / det, xx / det
-    # rows of Q times the second moments
-    p0, p1 = a * u[3] + b * u[4], a * u[4] + b * u[5]
-    p2, p3 = b * u[3] + c * u[4], b * u[4] + c * u[5]
-    d_covariance = (-0.5 * (p0 * a + p1 * b), -0.5 * (p0 * b + p1 * c), -0.5 * (p2 * b + p3 * c))
-    d_center = (-(a * u[1] + b * u[2]), -(b * u[1] + c * u[2]))
-    return d_center, d_covariance
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def shape_gradient(g, projection, spread, r, s):
-    """From dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3).
-
-    `g` is G = dL / d covariance (xx, xy, yy). The covariance is V V^T + blur with V = T
-    M and M = R S, so that dV = 2 G V, dM = T^T dV and dT = dV M^T.
-    """
-    t0, t1 = projection
-    v0, v1 = spread
-    g00, g01, g11 = g
-    d0 = (
-        2 * (g00 * v0[0] + g01 * v1[0]),
-        2 * (g00 * v0[1] + g01 * v1[1]),
-        2 * (g00 * v0[2] + g01 * v1[2]),
-    )
-    d1 = (
-        2 * (g01 * v0[0] + g11 * v1[0]),
-        2 * (g01 * v0[1] + g11 * v1[1]),
-        2 * (g01 * v0[2] + g11 * v1[2]),
-    )
-    m0 = (
-        t0[0] * d0[0] + t1[0] * d1[0],
-        t0[0] * d0[1] + t1[0] * d1[1],
-        t0[0] * d0[2] + t1[0] * d1[2],
-    )
-    m1 = (
-        t0[1] * d0[0] + t1[1] * d1[0],
-        t0[1] * d0[1] + t1[1] * d1[1],
-        t0[1] * d0[2] + t1[1] * d1[2],
-    )
-    m2 = (
-        t0[2] * d0[0] + t1[2] * d1[0],
-        t0[2] * d0[1] + t1[2] * d1[1],
-        t0[2] * d0[2] + t1[2] * d1[2],
-    )
-    d_scales = (
-        m0[0] * r[0][0] + m1[0] * r[1][0] + m2[0] * r[2][0],
-        m0[1] * r[0][1] + m1[1] * r[1][1] + m2[1] * r[2][1],
-        m0[2] * r[0][2] + m1[2] * r[1][2] + m2[2] * r[2][2],
-    )
-    d_rotation = (
-        (m0[0] * s[0], m0[1] * s[1], m0[2] * s[2]),
-        (m1[0] * s[0], m1[1] * s[1], m1[2] * s[2]),
-        (m2[0] * s[0], m2[1] * s[1], m2[2] * s[2]),
-    )
-    e0 = (d0[0] * s[0], d0[1] * s[1], d0[2] * s[2])
-    e1 = (d1[0] * s[0], d1[1] * s[1], d1[2] * s[2])
-    d_projection = (
-        (dot(e0, r[0]), dot(e0, r[1]), dot(e0, r[2])),
-        (dot(e1, r[0]), dot(e1, r[1]), dot(e1, r[2])),
-    )
-    return d_scales, d_rotation, d_projection
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def point_gradient(center, d_projection, t, held, w2c, k):
-    """dL / d camera point t (3,), through the pixel center and through J in T = J W.
-
-    Given are dL / d pixel `center` (2,) and dL / dT (2, 3). J does not depend on x or y
-    where they are held at the edge: there x / z is constant.
-    """
-    gx, gy = center
-    dt0, dt1 = d_projection
-    x, y, z, held_x, held_y = held
-    fx, fy = k[0], k[1]
-    w0 = (w2c[0, 0], w2c[0, 1], w2c[0, 2])
-    w1 = (w2c[1, 0], w2c[1, 1], w2c[1, 2])
-    w2 = (w2c[2, 0], w2c[2, 1], w2c[2, 2])
-    # dL / dJ = dL / dT W^T
-    dj00, dj02 = dot(dt0, w0), dot(dt0, w2)
-    dj11, dj12 = dot(dt1, w1), dot(dt1, w2)
-    slope_x, slope_y = 1.0 if held_x else 2.0, 1.0 if held_y else 2.0
-    dz = -(fx * dj00 + fy * dj11) / (z * z) - (fx * t[0] * gx + fy * t[1] * gy) / (z * z)
-    dz += (fx * x * dj02 / (z * z * z)) * slope_x + (fy * y * dj12 / (z * z * z)) * slope_y
-    dx = fx / z * gx - (0.0 if held_x else fx * dj02 / (z * z))
-    dy = fy / z * gy - (0.0 if held_y else fy * dj12 / (z * z))
-    return dx, dy, dz
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def pose_gradient(point, d_projection, m, j, out):
-    """Fill `out` (12,), dL / d world-to-camera matrix row by row.
-
-    It flows through the camera point `W m + t`, and through W in T = J W.
-    """
-    dx, dy, dz = point
-    dt0, dt1 = d_projection
-    j00, j02, j11, j12 = j
-    for i in range(3):
-        out[i] = dx * m[i] + j00 * dt0[i]
-        out[4 + i] = dy * m[i] + j11 * dt1[i]
-        out[8 + i] = dz * m[i] + j02 * dt0[i] + j12 * dt1[i]
-    out[3], out[7], out[11] = dx, dy, dz
-
-
-@jit(fastmath=FAST, error_model="numpy")
-def quaternion_gradient(unit, n, dr, out):
-    """Fill `out` (4,), dL / d quaternion before it was normalized, from dL / dR (3, 3).
-
-    That is the unit quaternion's gradient without its part along it, over the length n.
-    """
-    w, x, y, z = unit
-    gw = 2 * (x * (dr[2][1] - dr[1][2]) + y * (dr[0][2] - dr[2][0]) + z * (dr[1][0] - dr[0][1]))
-    gx = 2 * (
-        -2 * x * (dr[1][1] + dr[2][2])
-        + y * (dr[0][1] + dr[1][0])
-        + z * (dr[0][2] + dr[2][0])
-        + w * (dr[2][1] - dr[1][2])
-    )
-    gy = 2 * (
-        x * (dr[0][1] + dr[1][0])
-        - 2 * y * (dr[0][0] + dr[2][2])
-        + z * (dr[1][2] + dr[2][1])
-        + w * (dr[0][2] - dr[2][0])
-    )
-    gz = 2 * (
-        x * (dr[0][2] + dr[2][0])
-        + y * (dr[1][2] + dr[2][1])
-        - 2 * z * (dr[0][0] + dr[1][1])
-        + w * (dr[1][0] - dr[0][1])
-    )
-    along = gw * w + gx * x + gy * y + gz * z
-    out[0] = (gw - along * w) / n
-    out[1] = (gx - along * x) / n
-    out[2] = (gy - along * y) / n
-    out[3] = (gz - along * z) / n

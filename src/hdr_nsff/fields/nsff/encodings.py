@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.kernels import grid as kernels
 
 Shape = tuple[int, int, int, int]  # x, y, z grid points and time slices
@@ -106,7 +107,7 @@ class AdditiveGrid(nn.Module):
         """The plain-torch twin of the kernels, for every device and dtype."""
         out = coords.new_zeros(len(coords), kernels.CHANNELS)
         for level, resolution in enumerate(self.res):
-            top = torch.as_tensor(resolution, device=coords.device) - 1
+            top = constant(tuple(resolution.tolist()), coords.device, torch.int64) - 1
             position = coords.clamp(0, 1) * top
             low = torch.minimum(position.floor().long(), top - 1)
             fraction = position - low
@@ -114,8 +115,8 @@ class AdditiveGrid(nn.Module):
                 if slice_weight == 0:
                     continue
                 for corner in range(8):
-                    upper = [corner & 1, (corner >> 1) & 1, corner >> 2]
-                    d = torch.tensor(upper, device=coords.device)
+                    upper = (corner & 1, (corner >> 1) & 1, corner >> 2)
+                    d = constant(upper, coords.device, torch.int64)
                     along = torch.where(d > 0, fraction, 1 - fraction)
                     weight = float(slice_weight) * along.prod(-1)
                     values = self.table[self.table_rows(low + d, int(s), level)].to(coords)

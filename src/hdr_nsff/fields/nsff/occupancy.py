@@ -12,6 +12,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.core.tensors import constant
+
 
 class Occupancy(nn.Module):
     """Grids of (x, y, z) `resolution` over the unit cube, one per slice.
@@ -35,7 +37,7 @@ class Occupancy(nn.Module):
     def cell_index(self, coords: Tensor, knot: float = 0.0) -> Tensor:
         """Flat cell index (M,) of `coords` (M, 3) in [0, 1] at the nearest slice."""
         x, y, z = self.resolution
-        size = torch.tensor([x, y, z], device=coords.device)
+        size = constant((x, y, z), coords.device, torch.int64)
         i = torch.minimum((coords.detach().clamp(0, 1) * size).long(), size - 1)
         return ((round(knot) * z + i[:, 2]) * y + i[:, 1]) * x + i[:, 0]
 

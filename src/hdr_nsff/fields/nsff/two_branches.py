@@ -132,7 +132,8 @@ class TwoBranches(nn.Module):
         super().__init__()
         self.config, self.space = config, space
         self.near, self.far = near, far
-        self.register_buffer("times", times.double())
+        self.host_times = times.double()  # reading the buffer would wait for a GPU
+        self.register_buffer("times", self.host_times)
         num_knots = len(times)
         if branches is None:
             blending = config.compositing == "blend"
@@ -178,7 +179,7 @@ class TwoBranches(nn.Module):
 
     def knot(self, time: float) -> float:
         """Position of a time (in frames) on the list of training times."""
-        return knot_of(self.times, time)
+        return knot_of(self.host_times, time)
 
     def sample(
         self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None
@@ -289,11 +290,12 @@ class TwoBranches(nn.Module):
         return self.branches.param_groups()
 
     @torch.no_grad()
-    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Refresh the culling grids now and then, once they have seen enough."""
         if self.config.cull and step >= self.config.cull_after and step % REFRESH_EVERY == 0:
             self.static_cells.refresh(STATIC_MIN_WEIGHT, WEIGHT_DECAY)
             self.dynamic_cells.refresh(DYNAMIC_MIN_WEIGHT, WEIGHT_DECAY)
+        return False
 
     def shared_maxima(self) -> list[Tensor]:
         """The culling grids' memories: several processes share their maximum."""
@@ -307,7 +309,7 @@ class TwoBranches(nn.Module):
         everywhere.
         """
         centers = self.space.decode(self.dynamic_cells.cell_centers())
-        for k, time in enumerate(self.times.tolist()):
+        for k, time in enumerate(self.host_times.tolist()):
             masked = [f for f in frames if f.time == time and f.moving is not None]
             if not masked:
                 continue

@@ -74,6 +74,8 @@ class LocalGaussians(nn.Module):
     @torch.no_grad()
     def alive(self, time: float) -> Tensor:
         """Indices (A,) of the Gaussians that are alive at a time."""
+        if not len(self):  # the host need not wait for a GPU
+            return torch.arange(0, device=self.means.device)
         return (self.window(self.means, self.log_scales, time) > MIN_WINDOW).nonzero()[:, 0]
 
     @staticmethod

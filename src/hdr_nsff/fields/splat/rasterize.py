@@ -1,9 +1,9 @@
 """3D Gaussians to feature maps, differentiable in everything, the camera's pose and
 focal lengths included (EWA splatting: Zwicker et al. 2001, Kerbl et al. 2023).
 
-One call with twins behind it: numba kernels on the CPU, gsplat on CUDA, and `dense`,
-plain torch, slow and obviously right. Shapes: G Gaussians with D features, pictures of
-(H, W).
+One call with twins behind it: numba kernels on the CPU, CUDA kernels or gsplat on
+CUDA, and `dense`, plain torch, slow and obviously right. Shapes: G Gaussians with D
+features, pictures of (H, W).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.tensors import to_device
-from hdr_nsff.fields.kernels import compositing, projection
-from hdr_nsff.fields.splat import rasterize_gsplat as rasterize_cuda
+from hdr_nsff.core.tensors import table_on, to_device
+from hdr_nsff.fields.kernels import compositing, footprint, projection
+from hdr_nsff.fields.splat.cuda_backends import composite_on
 from hdr_nsff.geometry.cameras import Camera
 
-ALPHA_MIN, ALPHA_MAX = float(projection.ALPHA_MIN), float(compositing.ALPHA_MAX)
-MIN_LENGTH = projection.MIN_LENGTH  # added to a quaternion's length, which may be 0
+ALPHA_MIN, ALPHA_MAX = float(footprint.ALPHA_MIN), float(compositing.ALPHA_MAX)
+MIN_LENGTH = footprint.MIN_LENGTH  # added to a quaternion's length, which may be 0
 
 
 class Maps(NamedTuple):
@@ -56,17 +56,14 @@ def rasterize(
             # `split` joins the two gradients, where slices' would be added up
             seen, depth = maps.split([len(maps) - 1, 1])
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
-        case "cuda" if rasterize_cuda.available():
-            w2c, K = world_to_camera_and_focal(camera), camera.K.detach()
-            size = camera.width, camera.height
-            seen = rasterize_cuda.composite(
-                *gaussians, w2c, K, size, projection.NEAREST, projection.BLUR
-            )
-            return Maps(*seen)
         case "cuda":
-            # not `dense`, which would hold every Gaussian at every pixel
-            on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
-            return Maps(*(m.to(means.device) for m in on_cpu))
+            composite = composite_on(means.device)
+            if composite is None:
+                # not `dense`, which would hold every Gaussian at every pixel
+                on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
+                return Maps(*(m.to(means.device) for m in on_cpu))
+            w2c, size = world_to_camera_and_focal(camera), (camera.width, camera.height)
+            return Maps(*composite(*gaussians, w2c, camera.K.detach(), size))
         case _:
             return dense(*gaussians, camera)
 
@@ -83,7 +80,7 @@ def world_to_camera_and_focal(camera: Camera) -> Tensor:
     For kernels to which K is numbers: a longer focal length is a camera whose x and y
     are stretched.
     """
-    w2c, focal = world_to_camera(camera), camera.K[[0, 1], [0, 1]]
+    w2c, focal = world_to_camera(camera), camera.K.diagonal()[:2]
     if not focal.requires_grad:
         return w2c
     stretch = torch.cat([focal / focal.detach(), focal.new_ones(1)])  # ones, with a gradient
@@ -125,7 +122,7 @@ def rotation_matrices(quaternions: Tensor) -> Tensor:
     """Rotation matrices (G, 3, 3) of quaternions (G, 4) w x y z of any length."""
     unit = quaternions / (quaternions.norm(dim=-1, keepdim=True) + MIN_LENGTH)
     outer = (unit[..., None] * unit[..., None, :]).flatten(-2)  # (G, 16)
-    return (outer @ ROTATION_MATRIX.to(unit)).unflatten(-1, (3, 3))
+    return (outer @ table_on(ROTATION_MATRIX, unit.device, unit.dtype)).unflatten(-1, (3, 3))
 
 
 def project(
@@ -137,11 +134,11 @@ def project(
     """
     w2c, K = world_to_camera(camera), camera.K
     t = means @ w2c[:, :3].T + w2c[:, 3]  # camera points
-    z = t[:, 2].clamp_min(projection.NEAREST)
+    z = t[:, 2].clamp_min(footprint.NEAREST)
     size = torch.tensor([camera.width, camera.height]).to(means)
     focal, center = K[[0, 1], [0, 1]], K[:2, 2]
     # far outside of the frame the projection is linearized at its edge
-    edge = projection.MARGIN * 0.5 * size / focal
+    edge = footprint.MARGIN * 0.5 * size / focal
     low, high = -center / focal - edge, (size - center) / focal + edge
     ratio = t[:, :2] / z[:, None]
     xy = z[:, None] * torch.minimum(torch.maximum(ratio, low), high)
@@ -151,7 +148,7 @@ def project(
     jacobian = torch.stack([row_x, row_y], 1)  # (G, 2, 3)
     half_axes = rotation_matrices(quaternions) * scales[:, None]
     spread = jacobian @ w2c[:, :3] @ half_axes
-    covariance = spread @ spread.mT + projection.BLUR * torch.eye(2).to(means)
+    covariance = spread @ spread.mT + footprint.BLUR * torch.eye(2).to(means)
     return ratio * focal + center, covariance, t[:, 2]
 
 
@@ -175,7 +172,7 @@ def dense(
     opacities = opacities[finite]
     centers, covariance, z = project(means, quaternions, scales, camera)
     order = torch.argsort(z.detach(), stable=True)
-    order = order[z.detach()[order] > projection.NEAREST]
+    order = order[z.detach()[order] > footprint.NEAREST]
     d = camera.pixel_grid().to(means)[:, None] - centers[order]  # (S, G, 2)
     inverse = torch.linalg.inv(covariance[order])
     exponent = 0.5 * (d[:, :, None] @ inverse @ d[..., None])[..., 0, 0]
@@ -263,7 +260,7 @@ class RasterizeNumba(torch.autograd.Function):
         starts, members, places, owned = ctx.tiles
         means, _, _, _ = ctx.gaussians
         values = ctx.drawn[3]
-        pairs = np.empty((len(members), projection.MOMENTS + values.shape[1]), np.float32)
+        pairs = np.empty((len(members), footprint.MOMENTS + values.shape[1]), np.float32)
         grad_maps, grad_alpha = (g.contiguous().numpy() for g in grads)
         seen = (maps.numpy(), alpha.numpy(), grad_maps, grad_alpha)
         compositing.backward(starts, members, places, *ctx.drawn, *seen, pairs)

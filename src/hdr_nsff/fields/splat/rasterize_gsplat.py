@@ -1,4 +1,6 @@
-"""The rasterizer's twin on CUDA: gsplat (Ye et al. 2024), extra `gpu`.
+"""The rasterizer's other twin on CUDA: gsplat (Ye et al. 2024), extra `gsplat`.
+
+It draws where our own kernels cannot.
 
 It draws by the same rules as the kernels for the CPU: 0.3 pixels^2 of blur, alpha
 between 1/255 and 0.999, nothing nearer than 0.01, and outside of the frame a projection
@@ -8,20 +10,18 @@ that is linearized at its edge.
 from __future__ import annotations
 
 from functools import cache
+from importlib.util import find_spec
 
 import torch
 from torch import Tensor
 
-from hdr_nsff.core.progress import say
+from hdr_nsff.fields.kernels.footprint import BLUR, NEAREST
+from hdr_nsff.fields.splat.try_out import fault_of
 
 
-@cache
-def available() -> bool:
-    """Whether gsplat can draw here; says once why not, where it cannot."""
-    reason = fault()
-    if reason is not None:
-        say(f"Gaussians are rasterized on the CPU, which is slower: {reason}")
-    return reason is None
+def installed() -> bool:
+    """Whether there is a gsplat to try out."""
+    return find_spec("gsplat") is not None
 
 
 @cache
@@ -35,41 +35,15 @@ def fault(device: str = "cuda") -> str | None:
     try:
         import gsplat
     except ImportError as error:
-        return f"gsplat cannot be imported ({error}): pip install 'hdr-nsff[gpu]'"
-    try:
-        alpha = draw_one_gaussian(device)
-    except Exception as error:  # of any type: compilers, drivers and Python all take part
-        first_line = str(error).strip().partition("\n")[0]
-        reason = f"{type(error).__name__}: {first_line:.120}"
-    else:
-        if abs(alpha - ONE_ALPHA) < 0.01:
-            return None
-        reason = f"it draws an alpha of {alpha:.3g} instead of {ONE_ALPHA}"
+        return f"gsplat cannot be imported ({error}): pip install 'hdr-nsff[gsplat]'"
+    reason = fault_of(composite, device)
+    if reason is None:
+        return None
     version = getattr(gsplat, "__version__", "of unknown version")
     return (
         f"gsplat {version} cannot draw with torch {torch.__version__} ({reason}): install a build "
         "of gsplat for this torch and CUDA, or the CUDA toolkit that compiles it"
     )
-
-
-ONE_ALPHA = 0.75  # opacity of the Gaussian that is drawn to try gsplat out
-
-
-def draw_one_gaussian(device: str) -> float:
-    """Alpha at the center of one wide Gaussian in a picture of 15x15 pixels, which is
-    its opacity. Its gradients are computed too.
-    """
-    means = torch.tensor([[0.0, 0.0, 2.0]], device=device, requires_grad=True)
-    quaternions = torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device)
-    scales = torch.full((1, 3), 1.0, device=device)
-    opacities = torch.tensor([ONE_ALPHA], device=device)
-    features = torch.ones(1, 3, device=device)
-    w2c = torch.eye(4, device=device)[:3]
-    K = torch.tensor([[15.0, 0.0, 7.5], [0.0, 15.0, 7.5], [0.0, 0.0, 1.0]], device=device)
-    gaussians = means, quaternions, scales, opacities, features
-    _, _, alpha = composite(*gaussians, w2c, K, size=(15, 15), nearest=0.01, blur=0.3)
-    alpha.sum().backward()
-    return float(alpha[7, 7].detach())
 
 
 def composite(
@@ -81,8 +55,6 @@ def composite(
     w2c: Tensor,
     K: Tensor,
     size: tuple[int, int],
-    nearest: float,
-    blur: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Features (H, W, D), z-depth (H, W) and alpha (H, W) of Gaussians.
 
@@ -104,8 +76,8 @@ def composite(
         K[None],
         width,
         height,
-        near_plane=nearest,
-        eps2d=blur,
+        near_plane=NEAREST,
+        eps2d=BLUR,
         packed=False,
         render_mode="RGB+D",
     )

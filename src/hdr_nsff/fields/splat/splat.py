@@ -64,7 +64,8 @@ class Splat(nn.Module):
         super().__init__()
         self.config, self.unit = config, near
         self.near, self.far = near, far
-        self.register_buffer("times", times.double())
+        self.host_times = times.double()  # reading the buffer would wait for a GPU
+        self.register_buffer("times", self.host_times)
         static, moving, local = config.counts(num_pixels, local_pixels, len(times))
         self.bounded = config.radiance == "sigmoid"
         views, bounded = config.view_dependence, self.bounded
@@ -84,7 +85,7 @@ class Splat(nn.Module):
 
     def knot(self, time: float) -> float:
         """Position of a time (in frames) on the list of training times."""
-        return knot_of(self.times, time)
+        return knot_of(self.host_times, time)
 
     def share(self, knot: float) -> float:
         """A knot as a share in [0, 1] of the clip."""
@@ -92,7 +93,7 @@ class Splat(nn.Module):
 
     def time(self, knot: float) -> float:
         """The time (in frames) at a knot within the clip."""
-        return time_at(self.times, knot)
+        return time_at(self.host_times, knot)
 
     def has_knot(self, knot: float) -> bool:
         """Whether a knot lies within the clip."""
@@ -258,7 +259,9 @@ class Splat(nn.Module):
         if not flow_turn:
             terms["rigidity"] = self.rigidity()
             terms["evenness"] = self.local.unevenness(alive, self.unit)
-        return select_pixels(render, batch.camera, batch.pixels), terms
+        if not batch.whole:
+            render = select_pixels(render, batch.camera, batch.pixels)
+        return render, terms
 
     @staticmethod
     def choose_neighbor(batch: PixelBatch) -> list[int]:
@@ -382,14 +385,15 @@ class Splat(nn.Module):
 
     # Relocation
 
-    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> None:
+    def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Relocate Gaussians every `relocate_every` steps."""
         every = self.config.relocate_every
         if frame_errors is None or not every or step % every:
-            return
+            return False
         self.relocate(frame_errors(RELOCATE_FRAMES), torch.Generator().manual_seed(step))
         self.find_neighbors()
         self.local.find_neighbors(self.unit)
+        return True
 
     @torch.no_grad()
     def relocate(self, frame_errors: list[FrameError], generator: torch.Generator) -> int:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.core.tensors import table_on
 from hdr_nsff.fields.knots import catmull_rom
 from hdr_nsff.fields.splat.rasterize import rotation_matrices, sum_products
 
@@ -101,11 +102,12 @@ class Trajectories(nn.Module):
             return turns.sum() * 0
         shifts = self.translations.view(self.num_knots, -1, 4)[first:last] / unit
         poses = torch.cat([turns, shifts], -1)
-        third_differences = poses.unfold(0, 4, 1) @ THIRD_DIFFERENCE.to(poses)
+        third_difference = table_on(THIRD_DIFFERENCE, poses.device, poses.dtype)
+        third_differences = poses.unfold(0, 4, 1) @ third_difference
         return POSE_NUMBERS * third_differences.square().mean()
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:
     """Hamilton product a b of (..., 4) w x y z: first b turns, then a."""
     outer = (a[..., None] * b[..., None, :]).flatten(-2)  # (..., 16)
-    return outer @ HAMILTON_PRODUCT.to(a)
+    return outer @ table_on(HAMILTON_PRODUCT, a.device, a.dtype)

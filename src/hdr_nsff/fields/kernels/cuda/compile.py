@@ -1,0 +1,147 @@
+"""The CUDA kernels to machine code, by numba-cuda and the compiler's libraries that it
+brings as wheels: no CUDA toolkit, no C compiler, no driver.
+
+numba-cuda makes PTX, and nvJitLink makes of it what one kind of GPU runs. PTX alone
+would need a driver as new as the compiler. It is what is left where nvJitLink does not
+know the GPU. Machine code is kept in the user's cache folder, under a name that changes
+with the sources and the compiler.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Iterable
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from hdr_nsff.fields.kernels import compositing, footprint
+from hdr_nsff.fields.kernels.cuda import layout
+
+# argument types of the kernels, in order: type and number of dimensions, 0 for a number
+SIGNATURES = {
+    "project": "f2 f2 f2 f1 d1 i0 i0 f2 f1 s2 i1",
+    "list_pairs": "s2 i1 s1 i0 i1 s1",
+    "forward": "i1 s1 f2 f2 f3 f2",
+    "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2",
+    "project_backward": "f2 f2 f2 f1 d1 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
+}
+# these may take every number for a finite one: `project` has thrown out the others
+FAST = ("forward", "backward")
+PACKAGES = ("numba", "numba-cuda", "cuda-bindings", "nvidia-nvvm", "nvidia-cuda-nvcc-cu12")
+
+
+def compile_kernel(name: str, capability: tuple[int, int]) -> bytes:
+    """What a GPU of this compute capability runs of a kernel, or PTX where the linker
+    does not know the GPU. The entry has the kernel's name.
+    """
+    ptx = compile_ptx(name, capability)
+    try:
+        return link(ptx, capability)
+    except Exception:  # of its own type, whose module is not there without nvJitLink
+        return ptx.encode() + b"\0"
+
+
+def compile_ptx(name: str, capability: tuple[int, int]) -> str:
+    """The PTX of a kernel for GPUs of a compute capability such as (8, 9)."""
+    from numba import cuda, types
+    from numba.cuda import dispatcher
+
+    from hdr_nsff.fields.kernels.cuda import kernels
+
+    kinds = {"f": types.float32, "d": types.float64, "s": types.int32, "i": types.int64}
+
+    def type_of(code: str) -> Any:
+        kind, dimensions = kinds[code[0]], int(code[1])
+        return types.Array(kind, dimensions, "C") if dimensions else kind
+
+    signature = types.void(*(type_of(code) for code in SIGNATURES[name].split()))
+    # numba-cuda asks the driver which GPU its device functions are for: answer for it
+    device, asked = SimpleNamespace(compute_capability=capability), dispatcher.get_current_device
+    dispatcher.get_current_device = lambda: device
+    try:
+        ptx, _ = cuda.compile(
+            getattr(kernels, name),
+            signature,
+            device=False,
+            fastmath=name in FAST,
+            cc=capability,
+            abi="numba",
+        )
+    finally:
+        dispatcher.get_current_device = asked
+    found = re.search(r"\.entry\s+(\w+)", ptx)
+    assert found, f"no kernel in the PTX of {name}"
+    return ptx.replace(found[1], name)
+
+
+def link(ptx: str, capability: tuple[int, int]) -> bytes:
+    """Machine code of PTX for one kind of GPU."""
+    from cuda.bindings import nvjitlink
+
+    architecture = "sm_{}{}".format(*capability)
+    linker = nvjitlink.create(2, [f"-arch={architecture}", "-O3"])
+    try:
+        source = ptx.encode()
+        nvjitlink.add_data(linker, nvjitlink.InputType.PTX, source, len(source), "kernels")
+        nvjitlink.complete(linker)
+        image = bytearray(nvjitlink.get_linked_cubin_size(linker))
+        nvjitlink.get_linked_cubin(linker, image)
+    finally:
+        nvjitlink.destroy(linker)
+    return bytes(image)
+
+
+def load_kernel(name: str, capability: tuple[int, int]) -> bytes:
+    """`compile_kernel`, once for each user, kind of GPU, and state of the sources."""
+    folder = cache_folder()
+    path = folder / "{}-sm_{}{}-{}".format(name, *capability, fingerprint())
+    try:
+        return path.read_bytes()
+    except OSError:
+        image = compile_kernel(name, capability)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(image)
+        temporary.replace(path)
+    except OSError:  # no home to write to: they are compiled at every start
+        pass
+    return image
+
+
+def cache_folder() -> Path:
+    """Where compiled kernels are kept: beside numba's, or in the user's cache."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given:
+        return Path(given) / "hdr-nsff-cuda"
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    return Path(home) / "hdr-nsff" / "cuda"
+
+
+@cache
+def fingerprint() -> str:
+    """Changes with the sources of the kernels and the versions of the compiler."""
+    here = Path(__file__)
+    sources = [here, here.with_name("kernels.py"), Path(layout.__file__)]
+    sources += [Path(str(m.__file__)) for m in (compositing, footprint)]
+    digest = hashlib.sha256()
+    for path in sources:
+        digest.update(path.read_bytes())
+    digest.update(" ".join(versions(PACKAGES)).encode())
+    return digest.hexdigest()[:16]
+
+
+def versions(packages: Iterable[str]) -> list[str]:
+    """The installed versions, "" of packages that are not installed."""
+    found = []
+    for package in packages:
+        try:
+            found.append(metadata.version(package))
+        except metadata.PackageNotFoundError:
+            found.append("")
+    return found

@@ -1,0 +1,137 @@
+"""Launches the CUDA kernels on torch's tensors, where they lie and on torch's current
+stream, by the driver's own interface.
+
+A launch packs its arguments into one buffer of eight-byte numbers, as numba-cuda's
+kernels take them: an array is (0, 0, number of items, bytes of an item, address, shape,
+strides). That takes a few microseconds, where numba-cuda's launcher takes about ten for
+every array. Tensors on the CPU are for tests: with NUMBA_ENABLE_CUDASIM=1 a simulator
+of CUDA runs the kernels on them, in Python.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from functools import cache
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.fields.kernels.cuda.compile import load_kernel
+
+# the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
+BUFFER_END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
+
+
+def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
+    """Run a kernel in `grid` blocks of `threads`, all tensors on one device.
+
+    Tensors are contiguous, and of the types in `compile.SIGNATURES`.
+    """
+    if 0 in grid:
+        return
+    device = next(a.device for a in arguments if isinstance(a, Tensor))
+    if device.type == "cpu":
+        simulate(name, grid, threads, *arguments)
+        return
+    with torch.cuda.device(device):
+        stream = torch.cuda.current_stream().cuda_stream
+        function = loaded_kernel(name, torch.cuda.current_device())
+        driver().launch(function, grid, threads, stream, pack(*arguments))
+
+
+def pack(*arguments: Tensor | int) -> bytes:
+    """Arguments as a kernel's parameters lie in memory."""
+    numbers: list[int] = []
+    for a in arguments:
+        if isinstance(a, Tensor):
+            assert a.is_contiguous(), f"strides {a.stride()} of shape {tuple(a.shape)}"
+            size = a.element_size()
+            numbers += (0, 0, a.numel(), size, a.data_ptr(), *a.shape)
+            numbers += (stride * size for stride in a.stride())
+        else:
+            numbers.append(a)
+    return struct.pack(f"{len(numbers)}q", *numbers)
+
+
+@cache
+def loaded_kernel(name: str, device: int) -> ctypes.c_void_p:
+    """A kernel in the memory of a CUDA device, which is the current one."""
+    image = load_kernel(name, torch.cuda.get_device_capability(device))
+    return driver().load(image, name, device)
+
+
+@cache
+def driver() -> Driver:
+    """NVIDIA's driver."""
+    return Driver(ctypes.CDLL("libcuda.so.1"))
+
+
+class Driver:
+    """The few functions of NVIDIA's driver that launches take; `library` is libcuda."""
+
+    def __init__(self, library: Any) -> None:
+        self.library = library
+
+    def call(self, function: str, *arguments: Any) -> None:
+        """Call a function of the driver; RuntimeError where it fails."""
+        code = getattr(self.library, function)(*arguments)
+        if code:
+            text = ctypes.c_char_p()
+            self.library.cuGetErrorString(code, ctypes.byref(text))
+            reason = (text.value or b"unknown error").decode()
+            raise RuntimeError(f"{function} failed: {reason} ({code})")
+
+    def load(self, image: bytes, name: str, device: int) -> ctypes.c_void_p:
+        """The function `name` of an image of machine code or PTX, on a device."""
+        self.make_current(device)
+        module, function = ctypes.c_void_p(), ctypes.c_void_p()
+        self.call("cuModuleLoadData", ctypes.byref(module), image)
+        self.call("cuModuleGetFunction", ctypes.byref(function), module, name.encode())
+        return function
+
+    def make_current(self, device: int) -> None:
+        """Make the context of a device, the one that torch uses, this thread's."""
+        context, handle = ctypes.c_void_p(), ctypes.c_int()
+        self.call("cuInit", 0)
+        self.call("cuDeviceGet", ctypes.byref(handle), device)
+        self.call("cuDevicePrimaryCtxRetain", ctypes.byref(context), handle)
+        self.call("cuCtxSetCurrent", context)
+
+    def launch(
+        self,
+        function: ctypes.c_void_p,
+        grid: tuple[int, int],
+        threads: int,
+        stream: int,
+        parameters: bytes,
+    ) -> None:
+        """Put a kernel with packed `parameters` on a stream."""
+        buffer = ctypes.create_string_buffer(parameters, len(parameters))
+        size = ctypes.c_size_t(len(parameters))
+        extra = (ctypes.c_void_p * 5)(
+            BUFFER_POINTER,
+            ctypes.addressof(buffer),
+            BUFFER_SIZE,
+            ctypes.addressof(size),
+            BUFFER_END,
+        )
+        blocks = *grid, 1, threads, 1, 1
+        shared_bytes = 0  # besides those that the kernels declare
+        queue = ctypes.c_void_p(stream)
+        self.call("cuLaunchKernel", function, *blocks, shared_bytes, queue, None, extra)
+
+
+def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
+    """Run a kernel on tensors of the CPU by numba-cuda's simulator, in Python."""
+    from numba import cuda
+    from numba.core import config
+
+    if not config.ENABLE_CUDASIM:
+        raise RuntimeError("CUDA kernels take tensors of the CPU with NUMBA_ENABLE_CUDASIM=1")
+    from hdr_nsff.fields.kernels.cuda import kernels
+
+    kernel = cuda.jit(getattr(kernels, name))
+    values = (a.detach().numpy() if isinstance(a, Tensor) else a for a in arguments)
+    kernel[grid, threads](*values)

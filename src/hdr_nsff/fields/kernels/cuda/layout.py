@@ -1,0 +1,11 @@
+"""How the CUDA rasterizer cuts up its work: numbers that both the kernels and those who
+launch them need.
+"""
+
+from __future__ import annotations
+
+TILE = 16  # pixels on a side
+PIXELS = TILE * TILE  # of a tile, and threads of its block
+BATCH = 16  # Gaussians that the backward pass takes at a time: one per row of threads
+CHANNELS = 8  # features that one block composites
+THREADS = 128  # of a block, in kernels with one thread per Gaussian

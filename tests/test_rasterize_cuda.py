@@ -1,0 +1,121 @@
+"""CUDA kernels without a GPU: every test of `simulated_cuda.py` in one process with
+numba-cuda's simulator, and every kernel compiled for four kinds of GPU.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from hdr_nsff.fields.kernels.cuda import compile as compiling
+from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES, compile_ptx, link, load_kernel
+from hdr_nsff.fields.splat import rasterize_cuda
+
+SIMULATED = Path(__file__).with_name("simulated_cuda.py")
+CAPABILITIES = [(7, 5), (8, 0), (9, 0), (12, 0)]  # Turing, Ampere, Hopper, Blackwell
+
+
+@pytest.fixture(scope="module")
+def simulated() -> str:
+    """What pytest prints of the simulated tests, a line each."""
+    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
+    command = [sys.executable, "-m", "pytest", "-rA", "--tb=short", "-p", "no:xdist", SIMULATED]
+    result = subprocess.run(command, env=environment, capture_output=True, text=True)
+    return result.stdout + result.stderr
+
+
+@pytest.mark.parametrize("name", re.findall(r"^def (test_\w+)", SIMULATED.read_text(), re.M))
+def test_simulated(name: str, simulated: str) -> None:
+    passed = re.findall(rf"^PASSED \S+::{name}\b", simulated, re.M)
+    assert passed and not re.findall(rf"^(FAILED|ERROR) \S+::{name}\b", simulated, re.M), simulated
+
+
+needs_compiler = pytest.mark.skipif(
+    not any(d.name == "numba-cuda" for d in metadata.distributions()),
+    reason="THE CUDA KERNELS ARE NOT COMPILED: numba-cuda is missing (extra gpu)",
+)
+
+
+@needs_compiler
+@pytest.mark.parametrize("capability", CAPABILITIES)
+@pytest.mark.parametrize("name", list(SIGNATURES))
+def test_a_kernel_becomes_machine_code(name: str, capability: tuple[int, int]) -> None:
+    ptx = compile_ptx(name, capability)
+    assert "\n.target sm_{}{}".format(*capability) in ptx
+    assert f".visible .entry {name}(" in ptx
+    assert not re.search(r"(ld|st)\.local", ptx)  # everything is in registers
+    assert link(ptx, capability)[:4] == b"\x7fELF"
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", list(SIGNATURES))
+def test_a_kernel_takes_eight_byte_numbers_as_many_as_are_packed(name: str) -> None:
+    ptx = compile_ptx(name, (8, 0))
+    parameters = ptx.partition(f".entry {name}(")[2].partition(")")[0]
+    dimensions = [int(code[1]) for code in SIGNATURES[name].split()]
+    expected = sum(5 + 2 * d if d else 1 for d in dimensions)
+    assert re.findall(r"\.param \.(\w+)", parameters) == ["u64"] * expected
+
+
+@needs_compiler
+def test_a_gpu_that_the_linker_does_not_know_gets_ptx(monkeypatch: pytest.MonkeyPatch) -> None:
+    def unknown(ptx: str, capability: tuple[int, int]) -> bytes:
+        raise RuntimeError("unknown architecture")
+
+    monkeypatch.setattr(compiling, "link", unknown)
+    image = compiling.compile_kernel("list_pairs", (9, 0))
+    assert b".entry list_pairs" in image and image.endswith(b"\0")
+
+
+def test_a_kernel_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled: list[str] = []
+
+    def compile_kernel(name: str, capability: tuple[int, int]) -> bytes:
+        compiled.append(name)
+        return b"machine code"
+
+    monkeypatch.setattr(compiling, "compile_kernel", compile_kernel)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    for capability in ((8, 0), (8, 0), (9, 0)):
+        assert load_kernel("forward", capability) == b"machine code"
+    assert compiled == ["forward", "forward"]
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "hdr-nsff-cuda" / "file"))
+    next((tmp_path / "hdr-nsff-cuda").iterdir()).rename(tmp_path / "hdr-nsff-cuda" / "file")
+    assert load_kernel("forward", (8, 0)) == b"machine code"  # where nothing can be written
+
+
+@pytest.mark.parametrize(("cuda", "extra"), [("12.8", "gpu12"), ("13.0", "gpu"), (None, "gpu")])
+def test_the_extra_fits_the_cuda_version_of_torch(
+    cuda: str | None, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torch.version.cuda", cuda)
+    assert rasterize_cuda.install_command() == f"pip install 'hdr-nsff[{extra}]'"
+
+
+def test_a_missing_compiler_is_a_sentence_with_the_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", missing)
+    rasterize_cuda.fault.cache_clear()
+    assert "numba-cuda, which is not installed: pip install" in str(rasterize_cuda.fault("cpu"))
+    rasterize_cuda.fault.cache_clear()
+
+
+def test_a_kernel_that_cannot_be_launched_is_a_sentence_with_the_fix(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def broken(*arguments: object) -> None:
+        raise RuntimeError("cuModuleLoadData failed: unsupported toolchain\nand more")
+
+    monkeypatch.setattr(metadata, "version", lambda name: "0.30.4")
+    monkeypatch.setattr(rasterize_cuda, "launch", broken)
+    rasterize_cuda.fault.cache_clear()
+    reason = str(rasterize_cuda.fault("cpu"))
+    rasterize_cuda.fault.cache_clear()
+    assert "numba-cuda 0.30.4 cannot draw" in reason and "unsupported toolchain)" in reason
+    assert "pip install 'hdr-nsff[gpu]', or update NVIDIA's driver" in reason
