@@ -9,7 +9,9 @@ lies between two motions. The depth may be wrong; later steps correct it. Pixels
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from scipy import ndimage
@@ -18,15 +20,23 @@ from hdr_nsff.geometry.round_trip import flow_at
 from hdr_nsff.priors.movers.tuning import TRACK_TUNING, TrackTuning
 
 
+class PixelValues(Protocol):
+    """An array over the pixels of a frame, or what reads one where it is indexed."""
+
+    def __getitem__(self, index: Any, /) -> np.ndarray:
+        """The values of pixels: rows and columns, or a mask."""
+        ...
+
+
 @dataclass(frozen=True)
 class MovingView:
     """What one training time shows of its moving pixels."""
 
     moving: np.ndarray  # (H, W) bool
-    points: np.ndarray  # (H, W, 3) every pixel at its depth, scene units
-    trust: np.ndarray  # (H, W) in the depth, in [0, 1]
-    flow: dict[int, np.ndarray]  # {+-1: (H, W, 2)} px to the neighboring times
-    valid: dict[int, np.ndarray]  # {+-1: (H, W) bool}
+    points: PixelValues  # (H, W, 3) every pixel at its depth, scene units
+    trust: PixelValues  # (H, W) in the depth, in [0, 1]
+    flow: Mapping[int, np.ndarray]  # {+-1: (H, W, 2)} px to the neighboring times
+    valid: Mapping[int, np.ndarray]  # {+-1: (H, W) bool}
 
 
 @dataclass(frozen=True)
