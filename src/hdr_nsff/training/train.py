@@ -101,7 +101,8 @@ class Trainer:
             self.start(scene)
         else:
             self.clock = resumed
-        self.scene = to_device(scene, device)
+        # frames on the CPU stay where they are: read when they are drawn
+        self.scene = scene if device.type == "cpu" else to_device(scene, device)
         for module in modules.values():
             module.to(device)
         self.optimizers.follow_parameters()
