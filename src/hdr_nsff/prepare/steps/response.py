@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 
 from hdr_nsff.core.io import read_npy
@@ -67,6 +69,12 @@ def drift_of_frames(work: Work, drift: np.ndarray | None) -> dict[int, float]:
         times = [work.train[k].time for k in same]
         found[f.index] = round(float(np.interp(f.time, times, drift[same])), 5)
     return found
+
+
+def response_view(work: Work, frame: FrameEntry) -> ResponseView:
+    """A training frame as the response is estimated from it, in memory."""
+    stored = StoredView(work, frame)
+    return ResponseView(**{f.name: getattr(stored, f.name) for f in fields(ResponseView)})
 
 
 class StoredView(ResponseView):
