@@ -106,10 +106,17 @@ def smooth_flow(
 
     It is NaN where a pixel itself is not known.
     """
+    result = np.full(flow.shape, np.nan, np.float32)
+    rows, columns = np.nonzero(known.any(1))[0], np.nonzero(known.any(0))[0]
+    if not len(rows):
+        return result
+    around = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     radius = tuning.smoothing_radius_px
+    margin = (radius, radius)
+    flow = np.where(known[around][..., None], flow[around], 0).astype(np.float32)
+    flow = np.pad(flow, (margin, margin, (0, 0)))
+    weight = np.pad(known[around].astype(np.float32), (margin, margin))
     offsets = range(-radius, radius + 1)
-    flow = np.where(known[..., None], flow, 0).astype(np.float32)
-    weight = known.astype(np.float32)
     total_weight = np.zeros_like(weight)
     total_flow = np.zeros_like(flow)
     for offset in itertools.product(offsets, offsets):
@@ -119,7 +126,9 @@ def smooth_flow(
         total_weight += other_weight
         total_flow += other * other_weight[..., None]
     mean = total_flow / np.maximum(total_weight, 1)[..., None]
-    return np.where((total_weight > 0)[..., None], mean, np.nan)
+    mean = np.where((total_weight > 0)[..., None], mean, np.nan)
+    result[around] = mean[radius:-radius or None, radius:-radius or None]
+    return result
 
 
 def chain_flow(
