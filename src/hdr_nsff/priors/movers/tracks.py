@@ -127,7 +127,8 @@ def smooth_flow(
         total_flow += other * other_weight[..., None]
     mean = total_flow / np.maximum(total_weight, 1)[..., None]
     mean = np.where((total_weight > 0)[..., None], mean, np.nan)
-    result[around] = mean[radius:-radius or None, radius:-radius or None]
+    height, width = known[around].shape
+    result[around] = mean[radius : radius + height, radius : radius + width]
     return result
 
 
