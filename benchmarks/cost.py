@@ -103,13 +103,12 @@ def prepare_costs(folder: Path) -> list[dict[str, Any]]:
     megapixels = manifest.width * manifest.height * len(manifest.frames) / 1e6
     rows = []
     for name, step in manifest.steps.items():
-        cpu = float(step.details.get("cpu_seconds", np.nan))
         rows.append(
             {
                 "step": name,
                 "seconds": step.seconds,
-                "cpu_seconds": cpu,
-                "peak_memory_gb": round(step.details.get("peak_memory_mb", 0) / 1024, 2),
+                "cpu_seconds": step.cpu_seconds,
+                "peak_memory_gb": round(step.peak_memory_mb / 1024, 2),
             }
         )
     rows.append(

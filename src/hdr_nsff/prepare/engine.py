@@ -63,12 +63,9 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
         provenance=result.provenance,
         note=result.note,
         seconds=round(time.monotonic() - start, 2),
-        details={
-            **record.details,
-            **result.details,
-            "cpu_seconds": round(cpu_seconds() - cpu_before, 2),
-            "peak_memory_mb": round(peak_memory() / 2**20),
-        },
+        cpu_seconds=round(cpu_seconds() - cpu_before, 2),
+        peak_memory_mb=round(peak_memory() / 2**20),
+        details={**record.details, **result.details},
     )
     work.save()
     work.forget(step.forgets)

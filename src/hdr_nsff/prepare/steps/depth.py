@@ -13,7 +13,6 @@ from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, lower_confidence_at_edges
 from hdr_nsff.scene.movers import fill_mover_depth, read_movers
 
-OWN_DETAILS = ("attempt", "cpu_seconds", "peak_memory_mb")  # that every step has
 MAX_SAMPLES = 8_000_000  # pixels from which near and far are found
 
 
@@ -25,7 +24,7 @@ def find_depth(work: Work) -> StepResult:
     """
     m = work.manifest
     record = m.steps["static_depth"]
-    details = {k: v for k, v in record.details.items() if k not in OWN_DETAILS}  # the source
+    details = {k: v for k, v in record.details.items() if k != "attempt"}  # the source
     still = work.still()
     if still is None:
         # movers before the background where there is no parallax
