@@ -8,6 +8,11 @@ a prepared clip: its frames are resized, dropped, or repeated backwards in memor
 Every measurement runs in a new process. It holds the median milliseconds of a step with
 all its losses and of a picture (radiance, depth, motion share, tone-mapped), and the
 peak memory of the process.
+
+    python benchmarks/cost.py SCENE ... --prepare --out benchmarks/results/prepare.json
+
+With --prepare nothing is run: it tabulates what `prepare` recorded in each SCENE of the
+cost of its steps, per megapixel and frame.
 """
 
 from __future__ import annotations
@@ -25,13 +30,14 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from record import Record, make_parser, restart_prepared
+from record import Record, make_parser, name_of, restart_prepared
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from hdr_nsff.core import distributed
 from hdr_nsff.core.process import limit_torch_threads
 from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.budget import Budget
@@ -54,13 +60,23 @@ AXES: dict[str, tuple[str, list[int]]] = {
 
 def main() -> None:
     parser = make_parser(__doc__, "cost")
-    parser.add_argument("scene", type=Path, help="a prepared scene")
+    parser.add_argument("scene", type=Path, nargs="+", help="a prepared scene")
+    parser.add_argument(
+        "--prepare", action="store_true", help="tabulate the recorded cost of preparing it"
+    )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the curves to this PNG")
     parser.add_argument("--steps", type=int, default=60, help="steps and pictures that are timed")
     parser.add_argument(
         "--only", nargs="+", choices=AXES, default=list(AXES), help="the axes to measure"
     )
     args = parser.parse_args()
+    if args.prepare:
+        record = Record("cost-prepare", args)
+        for scene in args.scene:
+            for row in prepare_costs(scene):
+                record.add({"scene": name_of(scene)} | row)
+        record.save()
+        return
     restart_prepared()
     record = Record("cost", args, seed=TrainConfig.seed)
     for axis in args.only:
@@ -71,11 +87,46 @@ def main() -> None:
             settings = DEFAULTS | {setting: value}
             # A new process for every measurement: its peak memory counts from zero.
             with multiprocessing.get_context("spawn").Pool(1) as pool:
-                row = pool.apply(measure, (args.scene, settings, args.steps))
+                row = pool.apply(measure, (args.scene[0], settings, args.steps))
             record.add({"axis": axis} | row)
     record.save()
     if args.plot:
         plot(record.results, args.plot)
+
+
+def prepare_costs(folder: Path) -> list[dict[str, Any]]:
+    """The recorded cost of every step of `prepare`, and of all: seconds of wall clock
+    and of processor time, the latter per megapixel and frame, and the peak memory of
+    the process up to the step's end.
+    """
+    manifest = Manifest.load(folder)
+    megapixels = manifest.width * manifest.height * len(manifest.frames) / 1e6
+    rows = []
+    for name, step in manifest.steps.items():
+        rows.append(
+            {
+                "step": name,
+                "seconds": step.seconds,
+                "cpu_seconds": step.cpu_seconds,
+                "peak_memory_gb": round(step.peak_memory_mb / 1024, 2),
+            }
+        )
+    rows.append(
+        {
+            "step": "all",
+            "seconds": sum(row["seconds"] for row in rows),
+            "cpu_seconds": sum(row["cpu_seconds"] for row in rows),
+            "peak_memory_gb": max(row["peak_memory_gb"] for row in rows),
+        }
+    )
+    size = {
+        "pixels": manifest.width * manifest.height,
+        "frames": len(manifest.frames),
+    }
+    return [
+        size | row | {"cpu_seconds_per_megapixel": round(row["cpu_seconds"] / megapixels, 3)}
+        for row in rows
+    ]
 
 
 def measure(folder: Path, settings: dict[str, int], steps: int) -> dict[str, Any]:

@@ -324,7 +324,7 @@ def epipolar_distance(clip: Clip, poses: Poses) -> float:
     segments are. A segment shrinks to a point for cameras that only turn.
     """
     flow, valid, pairs = clip.work.raw_flows
-    static = valid & ~clip.work.masks[pairs[:, 0]]
+    static = np.asarray(valid) & ~clip.work.masks[pairs[:, 0]]
     pixels = pinhole.pixel_centers(*flow.shape[1:3])
     max_disparity = 1 / (SEGMENT_NEAR * (poses.near or 1.0))
     distances = []
@@ -358,11 +358,11 @@ def depth_errors(clip: Clip, tuning: DepthTuning) -> Errors:
     default = work.still()
     if clip.exact is None:
         assert default is not None
-        depth = disparity_mismatch(clip, disparity)
-        wrong = still != default
+        depth = disparity_mismatch(clip, np.asarray(disparity))
+        wrong = np.asarray(still) != default
     else:
-        depth = depth_error(clip, disparity, ~clip.moving)
-        wrong = still == clip.moving
+        depth = depth_error(clip, np.asarray(disparity), ~clip.moving)
+        wrong = np.asarray(still) == clip.moving
     return {"depth": depth, "still": 100 * float(wrong[moving].mean())}
 
 
@@ -415,7 +415,7 @@ def mover_errors(clip: Clip, tuning: MoversTuning) -> Errors:
     moving = work.masks & ~still
     disparity, confidence = work.static_depth()
     first = np.stack([result.maps["mover_disparity"][k] for k in range(len(disparity))])
-    disparity = np.where(moving, first, disparity)
+    disparity = np.where(moving, first, np.asarray(disparity))
     for k, t in time_of.items():
         c2w = work.camera(work.train[k])[1]
         disparity[k], _ = fill_mover_depth(movers, t, moving[k], c2w, disparity[k], confidence[k])

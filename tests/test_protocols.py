@@ -28,6 +28,8 @@ from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.train import train
 
+COSTS_AND_KEY = ("seconds", "cpu_seconds", "peak_memory_mb", "key")  # differ from run to run
+
 
 def kept(count: int, cycle: int) -> list[int]:
     return sorted(set(range(count)) - set(frames_between(count, cycle)))
@@ -164,7 +166,7 @@ def trained(root: Path, maps: dict[str, Path]) -> dict[str, np.ndarray | dict[st
     )
     manifest = Manifest.load(scene).model_dump(exclude={"source"})
     steps = {
-        name: {k: v for k, v in step.items() if k not in ("seconds", "key")}
+        name: {k: v for k, v in step.items() if k not in COSTS_AND_KEY}
         for name, step in manifest["steps"].items()
     }
     found: dict[str, np.ndarray | dict[str, object]] = {"manifest": {**manifest, "steps": steps}}

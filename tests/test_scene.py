@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from toy_scene import CARD, EV, WALL, ToyScene
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.scene import scene as scene_module
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.movers import write_movers
 from hdr_nsff.scene.scene import Scene, neighbors, outline
@@ -103,3 +105,16 @@ def test_held_out_frames_lend_no_map_to_training(toy_folder: Path, tmp_path: Pat
         -1
     }  # no flow from 1 to 3 was made
     assert scene.times.tolist() == [0, 1, 3, 4, 5]
+
+
+def test_frames_are_forgotten_and_read_again(
+    toy_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scene_module, "MIN_KEPT_FRAMES", 1)
+    monkeypatch.setattr(scene_module, "FRAME_MEMORY", 0)
+    scene = Scene.open(toy_folder)
+    first = scene.train[0].image
+    assert scene.train[1].image is not None
+    assert scene.train[0].image is not first and torch.equal(scene.train[0].image, first)
+    moved = replace(scene.train[0], time=9.0)
+    assert moved.time == 9.0 and torch.equal(moved.image, first)

@@ -30,7 +30,7 @@ def test_a_worker_that_crashes_reports_why(tmp_path):
 def test_a_worker_does_not_outlive_its_parent(tmp_path):
     code = (
         "import subprocess, sys, time\n"
-        "worker = 'import time; from hdr_nsff.priors.poses.sfm import die_with_parent; '\n"
+        "worker = 'import time; from hdr_nsff.priors.poses.sfm_worker import die_with_parent; '\n"
         "worker += 'die_with_parent(); time.sleep(60)'\n"
         "print(subprocess.Popen([sys.executable, '-c', worker]).pid, flush=True)\n"
         "time.sleep(60)\n"

@@ -64,9 +64,8 @@ def test_a_waving_cloth_bends_no_camera(tmp_path):
         [names],
         wanted,
         focal=1.2 * FOCAL,
-        mapping="incremental",
+        task="incremental",
         threads=1,
-        matches_given=True,
     )
 
     model = read_model(sfm.run(job)[0])

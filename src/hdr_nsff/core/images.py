@@ -63,6 +63,21 @@ def read_image(path: Path | str, over: float | None = None) -> np.ndarray:
     return rgb * alpha + np.float32(over or 0.0) * (1 - alpha)
 
 
+def read_codes(path: Path | str) -> np.ndarray:
+    """The codes of a PNG, JPEG or TIFF as they are stored, rgb (H, W, 3), uint8 or
+    uint16; transparency is ignored.
+    """
+    image = decode(Path(path), transparency=False)
+    if image.ndim == 2:
+        image = np.repeat(image[..., None], 3, -1)
+    return np.ascontiguousarray(image[..., 2::-1])
+
+
+def codes_to_rgb(codes: np.ndarray) -> np.ndarray:
+    """Codes (H, W, 3) uint8 or uint16 as float32 rgb in [0, 1]."""
+    return codes.astype(np.float32) / np.iinfo(codes.dtype).max
+
+
 def decode(path: Path, transparency: bool) -> np.ndarray:
     """The pixels of an image file, uint8 or uint16, (H, W) or (H, W, 3 or 4).
 

@@ -88,6 +88,12 @@ def peak_memory() -> int:
     return peak if sys.platform == "darwin" else peak * 1024  # macOS counts bytes, Linux KiB
 
 
+def cpu_seconds() -> float:
+    """Processor time in seconds, of this process and of its children that ended."""
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
 def cpu_name() -> str:
     """The name of the CPU, as its maker writes it where the system knows it."""
     info = Path("/proc/cpuinfo")  # Linux

@@ -17,6 +17,7 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from hdr_nsff.core.process import cpu_seconds, peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Picture
@@ -53,7 +54,7 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
         return
     records[name] = record.model_copy(update={"done": False})
     work.save()
-    start = time.monotonic()
+    start, cpu_before = time.monotonic(), cpu_seconds()
     result = step.run(work)
     store(work.folder, work.manifest, result)
     records[name] = StepRecord(
@@ -62,6 +63,8 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
         provenance=result.provenance,
         note=result.note,
         seconds=round(time.monotonic() - start, 2),
+        cpu_seconds=round(cpu_seconds() - cpu_before, 2),
+        peak_memory_mb=round(peak_memory() / 2**20),
         details={**record.details, **result.details},
     )
     work.save()

@@ -187,7 +187,7 @@ STEPS: dict[StepName, Step] = {
         settings=("start", "end", "stride", "max_size"),
         outputs=("images",),
         complete=all_have("image"),
-        forgets=("video", "equalized"),
+        forgets=("codes", "equalized"),
     ),
     "exposure": Step(
         on_footage.exposure_step,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ class StepResult:
     # field of a frame's entry -> {frame index: value}; frames left out get None
     frames: dict[str, dict[int, Any]] = field(default_factory=dict)
     # the same of maps (H, W), which become files (`MAPS`)
-    maps: dict[str, dict[int, np.ndarray]] = field(default_factory=dict)
+    maps: dict[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
     # name of a file of the folder -> what writes it
     files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
 

@@ -10,8 +10,9 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
-from hdr_nsff.core.images import read_image, read_mask
+from hdr_nsff.core.images import codes_to_rgb, read_codes, read_mask
 from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.stack import ArrayStack, RecentArrays, Stack
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Capture, Picture
 from hdr_nsff.priors.flow.semantic import SemanticConfig
@@ -25,7 +26,9 @@ MaskName = Literal["motion", "sam2"]
 DepthName = Literal["geometric", "depth-anything"]
 Part = Literal["poses", "flow", "masks", "depth"]
 # flow (P, H, W, 2) float32 px, valid (P, H, W) bool, frame indices (P, 2) from and to
-Flows = tuple[np.ndarray, np.ndarray, np.ndarray]
+Flows = tuple[ArrayStack, ArrayStack, np.ndarray]
+FLOW_MEMORY = 256 << 20  # the same of flow
+FRAME_MEMORY = 384 << 20  # bytes of decoded frames that are kept; others are read again
 StepName = Literal[
     "frames",
     "exposure",
@@ -211,12 +214,21 @@ class Work:
         return names
 
     @cached_property
-    def video(self) -> np.ndarray:
+    def codes(self) -> Stack:
+        """All frames as stored, (T, H, W, 3) uint8 or uint16, read when asked for."""
+        files = [self.folder / f.image for f in self.manifest.frames]
+        recent = RecentArrays(FRAME_MEMORY)
+        shape = (len(files), self.manifest.height, self.manifest.width, 3)
+        return Stack(lambda t: recent.get(t, lambda: read_codes(files[t])), shape)
+
+    @property
+    def video(self) -> Stack:
         """All frames as recorded, (T, H, W, 3) float32 in [0, 1]."""
-        return np.stack([read_image(self.folder / f.image) for f in self.manifest.frames])
+        codes = self.codes
+        return Stack(lambda t: codes_to_rgb(codes[t]), codes.shape)
 
     @cached_property
-    def equalized(self) -> tuple[np.ndarray, np.ndarray]:
+    def equalized(self) -> tuple[Stack, Stack]:
         """All frames at one brightness (T, H, W, 3), and clipped pixels (T, H, W).
 
         The histograms are those of training frames.
@@ -225,7 +237,8 @@ class Work:
         num_brackets = 1 + max(f.bracket for f in frames)
         groups = [f.camera_id * num_brackets + f.bracket for f in frames]
         is_training = np.array([f.split == "train" for f in frames])
-        return exposure.equalize(self.video, groups, is_training)
+        equalizer = exposure.fit_equalizer(self.codes, groups, is_training)
+        return exposure.equalized_stacks(self.codes, equalizer)
 
     @cached_property
     def raw_flows(self) -> Flows:
@@ -238,16 +251,21 @@ class Work:
         return self.read_flows({f.index: f.flow for f in self.manifest.frames})
 
     def read_flows(self, files: dict[int, dict[int, FlowFiles]]) -> Flows:
-        """Flow from the files of every frame to others."""
-        flow = []
-        valid = []
-        pairs = []
-        for i, targets in files.items():
-            for j, names in targets.items():
-                flow.append(read_npy(self.folder / names.flow).astype(np.float32))
-                valid.append(read_mask(self.folder / names.valid))
-                pairs.append((i, j))
-        return np.stack(flow), np.stack(valid), np.array(pairs)
+        """Flow from the files of every frame to others, read when asked for."""
+        pairs = [(i, j) for i, targets in files.items() for j in targets]
+        names = [files[i][j] for i, j in pairs]
+        shape = (len(pairs), self.manifest.height, self.manifest.width)
+        recent = RecentArrays(FLOW_MEMORY)
+
+        def flow(k: int) -> np.ndarray:
+            file = self.folder / names[k].flow
+            return recent.get((k, "flow"), lambda: read_npy(file).astype(np.float32))
+
+        def valid(k: int) -> np.ndarray:
+            file = self.folder / names[k].valid
+            return recent.get((k, "valid"), lambda: read_mask(file))
+
+        return Stack(flow, (*shape, 2)), Stack(valid, shape), np.array(pairs)
 
     def forget(self, names: tuple[str, ...]) -> None:
         """Drop cached properties: a step changed them, or they are not needed again."""
@@ -285,11 +303,16 @@ class Work:
         kept = np.isin(pairs, index).all(1)
         return flow[kept], valid[kept], np.searchsorted(index, pairs[kept])
 
-    def static_depth(self) -> tuple[np.ndarray, np.ndarray]:
+    def static_depth(self) -> tuple[Stack, Stack]:
         """Disparity and confidence (T, H, W) of the training frames, without movers."""
-        disparity = [read_npy(self.folder / str(f.static_disparity)) for f in self.train]
-        confidence = [read_npy(self.folder / str(f.static_confidence)) for f in self.train]
-        return np.stack(disparity).astype(np.float32), np.stack(confidence).astype(np.float32)
+        disparity = self.maps([str(f.static_disparity) for f in self.train])
+        confidence = self.maps([str(f.static_confidence) for f in self.train])
+        return disparity, confidence
+
+    def maps(self, names: list[str]) -> Stack:
+        """Maps (N, H, W) float32 of the scene folder, read when asked for."""
+        shape = (len(names), self.manifest.height, self.manifest.width)
+        return Stack(lambda k: read_npy(self.folder / names[k]).astype(np.float32), shape)
 
     def still(self) -> np.ndarray | None:
         """Pixels (T, H, W) of the moving masks that stand still, as parallax explains.

@@ -10,6 +10,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
+
 LUMA = np.array([0.299, 0.587, 0.114], np.float32)  # Rec. 601
 RANGE_QUANTILES = (0.001, 0.999)  # hand-chosen: single hot pixels do not count
 # a common range narrower than this (of 1) would only stretch noise (hand-chosen)
@@ -28,7 +30,7 @@ def recorded_range(frame: np.ndarray, clipped: np.ndarray) -> tuple[np.ndarray, 
 
 
 def common_gray(
-    video: np.ndarray, ranges: Mapping | Sequence, i: int, j: int
+    video: ArrayStack, ranges: Mapping | Sequence, i: int, j: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frames `i` and `j` of `video` (T, H, W, 3) as gray uint8 (H, W), cut to the range
     both recorded and stretched to it. `ranges`: per frame, as of `recorded_range`.
@@ -41,7 +43,7 @@ def common_gray(
 
 
 def common_rgb(
-    video: np.ndarray, ranges: Mapping | Sequence, i: int, j: int
+    video: ArrayStack, ranges: Mapping | Sequence, i: int, j: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """As `common_gray`, in color: frames `i` and `j` (H, W, 3) in [0, 1], every channel
     cut and stretched by itself.

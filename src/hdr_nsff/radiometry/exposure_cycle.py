@@ -12,6 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack, Stack
+
 MAX_CYCLE = 6  # frames: the longest cycle looked for, two more than cameras offer
 # EV between the darkest and brightest bracket below which brightness merely flickers;
 # positions of a cycle that are closer than this share a bracket (hand-chosen on
@@ -83,7 +85,7 @@ def all_clipped(
 
 
 def brightness_steps(
-    video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
+    video: ArrayStack, tuning: ExposureCycleTuning = ExposureCycleTuning()
 ) -> np.ndarray:
     """EV from each frame of `video` (T, H, W, 3) recorded to the next, (T-1,).
 
@@ -93,7 +95,8 @@ def brightness_steps(
     """
     num_frames, height, width = video.shape[:3]
     stride = max(1, int(np.sqrt(height * width / tuning.sampled_pixels)))
-    luminance = video[:, ::stride, ::stride].mean(-1).reshape(num_frames, -1)
+    sampled = [frame[::stride, ::stride].mean(-1).ravel() for frame in video]
+    luminance = np.stack(sampled).reshape(num_frames, -1)
     quantiles = np.quantile(luminance, QUANTILES, axis=1).T  # (T, quantiles)
     ev = GAMMA * np.log2(np.maximum(quantiles, 1 / 512))
     informative = (quantiles > tuning.low) & (quantiles < tuning.high)
@@ -122,7 +125,7 @@ def fit_cycle(
     return max(misfit, tuning.noise_ev), levels - levels.min()
 
 
-def detect_cycle(video: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()) -> Cycle:
+def detect_cycle(video: ArrayStack, tuning: ExposureCycleTuning = ExposureCycleTuning()) -> Cycle:
     """The exposure cycle of `video` (T, H, W, 3) recorded in [0, 1], or a cycle of
     length 1 where there is none.
 
@@ -229,7 +232,7 @@ def common_brackets(cycles: list[Cycle]) -> list[list[int]]:
 
 
 def contradictions(
-    video: np.ndarray, ev: list[float], tuning: ExposureCycleTuning = ExposureCycleTuning()
+    video: ArrayStack, ev: list[float], tuning: ExposureCycleTuning = ExposureCycleTuning()
 ) -> list[str]:
     """What in `video` (T, H, W, 3), recorded, contradicts the given `ev` per frame:
     sentences, none where they agree.
@@ -267,15 +270,15 @@ def contradictions(
 
 
 def reference_bracket(
-    video: np.ndarray,
+    video: ArrayStack,
     brackets: list[int],
     tuning: ExposureCycleTuning = ExposureCycleTuning(),
 ) -> int:
     """The best-exposed bracket of `video` (T, H, W, 3): the one with the largest share
     of recorded values between `well_exposed_low` and `high`.
     """
-    well_exposed = (video > tuning.well_exposed_low) & (video < tuning.high)
-    share = well_exposed.mean((1, 2, 3))  # (T,)
+    low, high = tuning.well_exposed_low, tuning.high
+    share = np.array([((frame > low) & (frame < high)).mean() for frame in video])  # (T,)
     bracket = np.array(brackets)
     shares = np.zeros(bracket.max() + 1)
     for b in np.unique(bracket):
@@ -295,47 +298,128 @@ def equalize(
     H, W) bool: at least two channels are only "darker than" or "brighter than".
 
     `groups` gives the exposure (and camera) of each frame of `video` (T, H, W, 3);
-    `pool` (T,) bool the frames that the histograms are taken from (all). Each group
-    shows about the same content, so the value of rank r in one histogram corresponds to
-    that of rank r in another: a monotone map per channel between any two exposures,
-    without a response curve or exposure times (histogram specification, Grossberg and
-    Nayar 2003). A pixel becomes the mean of its images in all groups, which keeps
-    contrast wherever any exposure has some.
+    `pool` (T,) bool the frames that the histograms are taken from (all).
+    """
+    equalizer = fit_equalizer(video, groups, pool, tuning)
+    equalized = np.stack([equalizer.equalize(frame, t) for t, frame in enumerate(video)])
+    clipped = np.stack([equalizer.clipped(frame, t) for t, frame in enumerate(video)])
+    return equalized, clipped
+
+
+@dataclass(frozen=True)
+class Equalizer:
+    """A monotone map of recorded values per frame's group and channel.
+
+    Each group shows about the same content, so the value of rank r in one histogram
+    corresponds to that of rank r in another: a monotone map per channel between any two
+    exposures, without a response curve or exposure times (histogram specification,
+    Grossberg and Nayar 2003). A pixel becomes the mean of its images in all groups,
+    which keeps contrast wherever any exposure has some.
+    """
+
+    groups: list[int]  # of every frame
+    # per group and channel: recorded values, increasing, and their images
+    maps: dict[tuple[int, int], tuple[np.ndarray, np.ndarray]]
+    black: dict[tuple[int, int], float]  # recorded values below it are clipped
+    white: float  # recorded values above it are clipped
+
+    def equalize(self, frame: np.ndarray, t: int) -> np.ndarray:
+        """Frame `t` (H, W, 3), recorded in [0, 1] or as codes, at the common
+        brightness.
+        """
+        result = np.empty(frame.shape, np.float32)
+        for channel in range(3):
+            recorded = frame[..., channel]
+            value, image = self.maps[self.groups[t], channel]
+            if frame.dtype.kind == "u":  # as many values as codes
+                codes = np.arange(np.iinfo(frame.dtype).max + 1)
+                table = np.interp(unit(codes.astype(frame.dtype)), value, image)
+                result[..., channel] = table.astype(np.float32)[recorded]
+            else:
+                result[..., channel] = np.interp(recorded, value, image)
+        return result
+
+    def clipped(self, frame: np.ndarray, t: int) -> np.ndarray:
+        """Pixels (H, W) of frame `t`, recorded in [0, 1] or as codes, with at least two
+        channels that are only "darker than" or "brighter than".
+        """
+        count = np.zeros(frame.shape[:2], np.uint8)
+        recorded = unit(frame)
+        for channel in range(3):
+            black = self.black[self.groups[t], channel]
+            count += (recorded[..., channel] < black) | (recorded[..., channel] > self.white)
+        return count >= 2
+
+
+def unit(frame: np.ndarray) -> np.ndarray:
+    """Recorded values as float32 in [0, 1], from codes where these are integers."""
+    if frame.dtype.kind == "u":
+        return frame.astype(np.float32) / np.iinfo(frame.dtype).max
+    return frame
+
+
+def fit_equalizer(
+    video: ArrayStack,
+    groups: list[int],
+    pool: np.ndarray | None = None,
+    tuning: ExposureCycleTuning = ExposureCycleTuning(),
+) -> Equalizer:
+    """The maps that bring frames (T, H, W, 3), recorded in [0, 1] or as codes, to one
+    brightness. The other arguments are those of `equalize`.
     """
     group = np.array(groups)
     pool = np.ones(len(group), bool) if pool is None else pool
-    equalized = np.empty(video.shape, np.float32)
-    outside = np.empty(video.shape, bool)
+    counts = {(int(g), c): np.zeros(BINS, np.int64) for g in set(groups) for c in range(3)}
+    without_pool = {int(g) for g in set(groups) if not pool[group == g].any()}
+    for t, g in enumerate(groups):
+        if pool[t] or g in without_pool:
+            frame = unit(video[t])
+            for channel in range(3):
+                counts[g, channel] += value_counts(frame[..., channel])
     ranks = np.linspace(0, 1, 4 * BINS)
+    maps, black = {}, {}
     for channel in range(3):
-        recorded = video[..., channel]
-        histograms = {}
-        for g in np.unique(group):
-            frames = (group == g) & pool
-            if not frames.any():
-                frames = group == g
-            histograms[g] = value_ranks(recorded[frames], tuning)
+        histograms = {g: ranks_of(counts[g, channel], tuning) for g in sorted(set(groups))}
         values_at_ranks = [np.interp(ranks, rank, value) for value, rank in histograms.values()]
         common = np.mean(values_at_ranks, axis=0)  # (ranks,)
-        for t, g in enumerate(group):
-            value, rank = histograms[g]
-            image_of_value = np.interp(rank, ranks, common)
-            equalized[t, ..., channel] = np.interp(recorded[t], value, image_of_value)
-            black = tuning.low + np.interp(tuning.pedestal_quantile, rank, value)
-            outside[t, ..., channel] = (recorded[t] < black) | (recorded[t] > tuning.high)
-    return equalized, outside.sum(-1) >= 2
+        for g, (value, rank) in histograms.items():
+            maps[g, channel] = (value, np.interp(rank, ranks, common))
+            black[g, channel] = tuning.low + np.interp(tuning.pedestal_quantile, rank, value)
+    return Equalizer(list(groups), maps, black, tuning.high)
+
+
+def equalized_stacks(codes: Stack, equalizer: Equalizer) -> tuple[Stack, Stack]:
+    """Equalized frames (T, H, W, 3) and their clipped pixels (T, H, W), of recorded
+    `codes` (T, H, W, 3), made when asked for.
+    """
+    frames = Stack(lambda t: equalizer.equalize(codes[t], t), codes.shape)
+    clipped = Stack(lambda t: equalizer.clipped(codes[t], t), codes.shape[:3])
+    return frames, clipped
 
 
 def value_ranks(
     values: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The values in [0, 1] that occur, and the share of `values` below each.
+    """The values in [0, 1] that occur, and the share of `values` below each."""
+    return ranks_of(value_counts(values), tuning)
 
-    Values come in `BINS` steps, increasing; ties count half. All saturated values are
-    one tie, or codes 250 to 255 of a burnt sky would take half of the contrast.
-    """
+
+def value_counts(values: np.ndarray) -> np.ndarray:
+    """How many of `values` in [0, 1] fall into each of `BINS` steps."""
     codes = np.rint(values.ravel() * (BINS - 1)).astype(np.int64)
-    count = np.bincount(codes, minlength=BINS)
+    return np.bincount(codes, minlength=BINS)
+
+
+def ranks_of(
+    count: np.ndarray, tuning: ExposureCycleTuning = ExposureCycleTuning()
+) -> tuple[np.ndarray, np.ndarray]:
+    """The values in [0, 1] that occur, and the share of all below each.
+
+    Values come in `BINS` steps (BINS,), increasing; ties count half. All saturated
+    values are one tie, or codes 250 to 255 of a burnt sky would take half of the
+    contrast.
+    """
+    count = count.copy()
     white = round(tuning.high * (BINS - 1))
     count[white] = count[white:].sum()
     count[white + 1 :] = 0

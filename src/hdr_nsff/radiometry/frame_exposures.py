@@ -15,10 +15,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.maths.color import srgb_decode
 from hdr_nsff.radiometry.debevec import MAD_TO_SIGMA, DebevecTuning, Samples, debevec
 from hdr_nsff.radiometry.static_samples import (
+    KEPT_PATCHES,
     ResponseView,
     StaticSamplesTuning,
     empty_samples,
@@ -65,7 +67,7 @@ def read_points(
 ) -> Readings:
     """Static points of all `views`, in order of time, read in their neighbors."""
     points = points or StaticSamplesTuning()
-    patches = [view_patches(v, points) for v in views]
+    patches = LazyList(lambda k: view_patches(views[k], points), len(views), KEPT_PATCHES)
     per_view = max(1, tuning.num_samples // len(views))
     parts, frames = [], []
     for source, view in enumerate(views):

@@ -15,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack, LazyList, map_stack
 from hdr_nsff.radiometry.bracketing import FACTORS, StepScale, likely_scale, measured_scale
 from hdr_nsff.radiometry.brightness import brightness_ev
 from hdr_nsff.radiometry.debevec import (
@@ -229,7 +230,7 @@ def drift_scale(
     log_likelihood = None
     if lossless:
         levels = np.round((exposures - exposures.min()) / LEVEL_EV).astype(int)
-        images = [v.image for v in views]
+        images = LazyList(lambda k: views[k].image, len(views))
         log_likelihood = noise_log_likelihood(
             images,
             levels.tolist(),
@@ -288,7 +289,8 @@ def bracket_response(
 
 def evidence_of_noise(views: Sequence[ResponseView], tuning: ResponseTuning) -> ScaleEvidence:
     """What the noise of the recorded frames says of the common factor of all EVs."""
-    images, brackets = [v.image for v in views], [v.bracket for v in views]
+    images = LazyList(lambda k: views[k].image, len(views))
+    brackets = [v.bracket for v in views]
 
     def evidence(x: np.ndarray, y: np.ndarray, ev: np.ndarray) -> np.ndarray | None:
         return noise_log_likelihood(images, brackets, x, y, ev, FACTORS, tuning.noise)
@@ -393,7 +395,8 @@ def from_brightness(
     problem: str,
 ) -> Response:
     """Gamma 2.2 curves; unknown exposures from the brightness of the frames."""
-    guess = brightness_ev([v.image for v in views], [v.bracket for v in views], reference, len(ev))
+    images = LazyList(lambda k: views[k].image, len(views))
+    guess = brightness_ev(images, [v.bracket for v in views], reference, len(ev))
     known = [g if e is None else e for g, e in zip(guess, ev, strict=True)]
     level = np.linspace(0, 1, NUM_KNOTS)
     return Response(
@@ -411,12 +414,12 @@ def from_brightness(
 
 
 def at_one_exposure(
-    video: np.ndarray,
+    video: ArrayStack,
     brackets: np.ndarray,
     cameras: np.ndarray,
     response: Response,
     drift: np.ndarray | None = None,
-) -> np.ndarray:
+) -> ArrayStack:
     """`video` (T, H, W, 3) recorded in [0, 1] at one brightness, in [0, 1].
 
     Every pixel becomes the mean of what it would be in all brackets (T,) that its
@@ -424,14 +427,18 @@ def at_one_exposure(
     stops by which frames differ from their brackets.
     """
     drift = np.zeros(len(video)) if drift is None else drift
-    result = np.empty(video.shape, np.float32)
     value = np.linspace(0, 1, 1025)  # recorded values that are tabulated
-    for t, (own, camera) in enumerate(zip(brackets, cameras, strict=True)):
+
+    def one_frame(frame: np.ndarray, t: int) -> np.ndarray:
+        own, camera = brackets[t], cameras[t]
         used = np.unique(brackets[cameras == camera])
+        result = np.empty(frame.shape, np.float32)
         for c in range(3):
             y = response.y[camera, c]
             exposure = np.interp(value, y, response.x)
             gains = [2.0 ** (response.ev[b] - response.ev[own] - drift[t]) for b in used]
             images = [np.interp(exposure * gain, response.x, y) for gain in gains]
-            result[t, ..., c] = np.interp(video[t, ..., c], value, np.mean(images, axis=0))
-    return result
+            result[..., c] = np.interp(frame[..., c], value, np.mean(images, axis=0))
+        return result
+
+    return map_stack(one_frame, video)

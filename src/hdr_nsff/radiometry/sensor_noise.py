@@ -122,8 +122,9 @@ def measure_noise(
     num_levels = int(np.ceil(-tuning.darkest / tuning.bin_width)) - 1
     rows = []
     for bracket in sorted(set(brackets)):
-        own = [image for image, b in zip(images, brackets, strict=True) if b == bracket]
-        own = own[:: max(1, min(stride, len(own) // 3))]
+        of_bracket = [k for k, b in enumerate(brackets) if b == bracket]
+        step = max(1, min(stride, len(of_bracket) // 3))
+        own = [images[k] for k in of_bracket[::step]]
         for channel in range(3):
             pixels = [channel_noise(image[..., channel], x, y[channel]) for image in own]
             g, noise, slope, z, gain = np.concatenate(pixels, axis=1)

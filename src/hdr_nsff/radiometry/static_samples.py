@@ -15,8 +15,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.radiometry.debevec import HIGH, LOW, SATURATED, Samples
+
+# frames whose patches are in memory at a time: those around one in time, both ways
+KEPT_PATCHES = 56
 
 
 @dataclass(frozen=True)
@@ -71,7 +75,7 @@ def static_samples(
     A bracket is read in the frame nearest in time that sees the point: inside the
     frame, static, and with a disparity that agrees.
     """
-    patches = [view_patches(v, tuning) for v in views]
+    patches = LazyList(lambda k: view_patches(views[k], tuning), len(views), KEPT_PATCHES)
     points_per_view = max(1, num // max(len(views), 1))
     parts = [
         samples_of_view(source, views, patches, num_brackets, points_per_view, rng, tuning)

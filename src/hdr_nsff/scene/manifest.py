@@ -91,6 +91,8 @@ class StepRecord(Strict):
     provenance: Provenance = "estimated"
     note: str = ""  # one sentence for people
     seconds: float = 0.0
+    cpu_seconds: float = 0.0  # of processor time, worker processes included
+    peak_memory_mb: int = 0  # of the process, up to the end of the step
     details: dict[str, Any] = {}
 
 

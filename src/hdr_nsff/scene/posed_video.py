@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.radiometry.common_range import recorded_range
 
@@ -20,8 +21,8 @@ class PosedVideo:
     K: np.ndarray  # (T, 3, 3) pixels
     c2w: np.ndarray  # (T, 3, 4) OpenCV, scene units
     times: np.ndarray  # (T,) in frames
-    video: np.ndarray  # (T, H, W, 3) exposure-equalized rgb in [0, 1]
-    clipped: np.ndarray  # (T, H, W) bool: no information
+    video: ArrayStack  # (T, H, W, 3) exposure-equalized rgb in [0, 1]
+    clipped: ArrayStack  # (T, H, W) bool: no information
     moving: np.ndarray  # (T, H, W) bool
 
     @property

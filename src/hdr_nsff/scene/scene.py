@@ -7,10 +7,14 @@ scene lies outside, see `truth.py`; nothing here can read it.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass, field
+from functools import lru_cache, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,6 +31,10 @@ from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord, inside
 from hdr_nsff.scene.movers import Mover, read_movers
 from hdr_nsff.scene.response import read_response
 
+# frames in memory: as many as fit in this, each of about so many bytes for every pixel
+FRAME_MEMORY = 1500 << 20
+FRAME_BYTES = 42
+MIN_KEPT_FRAMES = 12
 OUTLINE_PX = 2  # by which the outline of an estimated mask may be wrong
 
 
@@ -49,6 +57,71 @@ class Frame:
     disparity_confidence: Tensor | None = None  # (H, W) in [0, 1]
     flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W, 2)} px
     flow_valid: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W) bool}
+
+
+class StoredFrame(Frame):
+    """A frame whose image and maps are read from the scene folder when they are asked
+    for, and forgotten when others need the memory. Replacing a field makes a frame that
+    holds all of them.
+    """
+
+    def __init__(self, load: Callable[[], Frame] | None = None, **fields: Any) -> None:
+        """`load` reads the whole frame; `fields` are those of `Frame` without its image
+        and maps, or all of them without `load`.
+        """
+        if load is None:
+            whole = Frame(**fields)
+            fields = {name: value for name, value in fields.items() if name not in STORED}
+            load = partial(copy, whole)
+        for name, value in fields.items():
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "load", load)
+
+
+STORED = (
+    "image",
+    "moving",
+    "outline",
+    "disparity",
+    "disparity_confidence",
+    "flow",
+    "flow_valid",
+)
+
+
+def stored_value(name: str) -> property:
+    """The property of a stored frame that reads the field `name`."""
+    return property(lambda self: getattr(self.load(), name))
+
+
+for stored_name in STORED:
+    setattr(StoredFrame, stored_name, stored_value(stored_name))
+
+
+class FrameStore:
+    """Reads frames of a scene folder; those used last stay in memory."""
+
+    def __init__(self, folder: Path, manifest: Manifest) -> None:
+        self.folder = folder
+        self.manifest = manifest
+        num_pixels = manifest.width * manifest.height
+        limit = max(MIN_KEPT_FRAMES, FRAME_MEMORY // (FRAME_BYTES * num_pixels))
+        self.read = lru_cache(limit)(self.read_frame)
+        self.arguments: dict[int, tuple[FrameEntry, dict[int, int], dict[int, int]]] = {}
+
+    def read_frame(self, index: int) -> Frame:
+        """The whole frame of that index in the manifest."""
+        return load_frame(self.folder, self.manifest, *self.arguments[index])
+
+    def frame(
+        self, entry: FrameEntry, neighbor_index: dict[int, int], positions: dict[int, int]
+    ) -> StoredFrame:
+        """A frame, read once to check it; arguments as of `load_frame`."""
+        self.arguments[entry.index] = (entry, neighbor_index, positions)
+        whole = self.read(entry.index)
+        names = [f.name for f in dataclasses.fields(Frame) if f.name not in STORED]
+        light = {name: getattr(whole, name) for name in names}
+        return StoredFrame(partial(self.read, entry.index), **light)
 
 
 @dataclass(frozen=True)
@@ -79,14 +152,15 @@ class Scene:
         m = Manifest.load(folder)
         near, far = check_complete(folder, m)
         entries = [e for e in m.frames if e.split == "train"]
-        train = []
+        store = FrameStore(folder, m)
+        train: list[Frame] = []
         for entry, positions in zip(entries, neighbors(entries), strict=True):
             indices = {o: entries[j].index for o, j in positions.items()}
-            train.append(load_frame(folder, m, entry, indices, positions))
+            train.append(store.frame(entry, indices, positions))
         return Scene(
             folder=folder,
             train=train,
-            test=[load_frame(folder, m, e, {}, {}) for e in m.frames if e.split == "test"],
+            test=[store.frame(e, {}, {}) for e in m.frames if e.split == "test"],
             near=near,
             far=far,
             points=load_points(folder, m.points) if m.points else torch.zeros(0, 3),

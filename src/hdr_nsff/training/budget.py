@@ -10,18 +10,26 @@ from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
 
+# minutes of training where none are given (hand-chosen): of a clip of so many pixels in
+# all frames, and at most
+SMALL_CLIP_MINUTES, SMALL_CLIP_PIXELS = 5.0, 1_700_000
+MAX_MINUTES = 30.0
+
 
 @dataclass(frozen=True)
 class Budget:
-    """Steps or minutes: steps count where both are given."""
+    """Steps or minutes: steps count where both are given; without either, the minutes
+    follow the clip.
+    """
 
     steps: Annotated[int, Ge(1), Le(10**12)] | None = None
     """Stop after this many steps. The same seed and steps give the same result, also
     through kills and restarts.
     """
-    minutes: Annotated[float, Gt(0), Le(1e6)] | None = 5.0
+    minutes: Annotated[float, Gt(0), Le(1e6)] | None = None
     """Without --steps: stop after this many minutes of training; learning rates and
-    schedules follow the clock.
+    schedules follow the clock. Default: 5 for a small clip, more for more pixels and
+    frames, at most 30.
     """
 
     def progress(self, step: int, seconds: float) -> float:
@@ -30,6 +38,15 @@ class Budget:
             return step / self.steps
         assert self.minutes is not None
         return min(seconds / (60 * self.minutes), 1.0)
+
+
+def minutes_for(num_pixels: int, num_frames: int) -> float:
+    """The minutes that a clip of `num_frames` of `num_pixels` each is trained for.
+
+    They grow with the root of all pixels, and hold where the user gives none.
+    """
+    share = num_pixels * num_frames / SMALL_CLIP_PIXELS
+    return round(min(max(SMALL_CLIP_MINUTES * share**0.5, SMALL_CLIP_MINUTES), MAX_MINUTES), 1)
 
 
 @dataclass(frozen=True)

@@ -124,8 +124,6 @@ def check_config(config: TrainConfig) -> TrainConfig:
 
     Its scene folder is absolute, so that the run can be opened from anywhere.
     """
-    if config.budget.steps is None and config.budget.minutes is None:
-        raise InputError("neither --steps nor --minutes: give one of them")
     config = with_changes(replace(config, set=()), config.set, HELP)
     two_branches = not isinstance(config.field, SplatConfig | HexPlaneConfig)
     extra_pixels = config.rays > 0 and config.moving_rays > 0

@@ -39,6 +39,8 @@ from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 # a cell is this many times longer along the view than across, as shares of the frustum
 DEPTH_CELLS = 12.0
 FILL = 0.95  # of the places are used at once; the rest go where the error is
+# of all frames that become points; of more, a lattice (a hundred for every Gaussian)
+MAX_START_PIXELS = 8_000_000
 OVERLAP = 0.6  # standard deviation relative to the distance to the neighbors
 OPACITY = 0.7
 KEY_FRAMES = 12  # times whose moving pixels become Gaussians
@@ -63,9 +65,13 @@ def initialize_gaussians(
                 "static Gaussians start at random places and moving ones not at all, "
                 "without a depth prior in scene units"
             )
+        num_pixels = sum(f.camera.width * f.camera.height for f in frames)
+        step = max(1, math.ceil(math.sqrt(num_pixels / MAX_START_PIXELS)))
         static = concatenate(
             [
-                unproject_frame(f, i, still(f), scene.near, scene.far, to_radiance)
+                unproject_frame(
+                    f, i, still(f) & lattice(f, i, step), scene.near, scene.far, to_radiance
+                )
                 for i, f in enumerate(frames)
             ]
         )
@@ -84,6 +90,13 @@ def still(f: Frame) -> Tensor:
         return torch.ones(f.image.shape[0] * f.image.shape[1], dtype=torch.bool)
     near = nn.functional.max_pool2d(f.moving[None, None].float(), 3, 1, 1)[0, 0] > 0
     return ~near.reshape(-1)
+
+
+def lattice(f: Frame, position: int, step: int) -> Tensor:
+    """(H * W,) bool: every `step`-th pixel in x and y, others in every frame."""
+    rows = torch.arange(f.camera.height) % step == position % step
+    columns = torch.arange(f.camera.width) % step == position // step % step
+    return (rows[:, None] & columns).reshape(-1)
 
 
 def thin(points: PointCloud, scene: Scene, limit: int) -> PointCloud:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, lower_confidence_at_edges
 from hdr_nsff.scene.movers import fill_mover_depth, read_movers
+
+MAX_SAMPLES = 8_000_000  # pixels from which near and far are found
 
 
 def find_depth(work: Work) -> StepResult:
@@ -30,14 +35,20 @@ def find_depth(work: Work) -> StepResult:
             },
         }
         return StepResult(record.note, record.provenance, details, frames=files)
-    disparity, confidence = depth_with_movers(work, work.training_masks() & ~still)
-    near, far = depth_range(disparity, confidence)
+    disparity, confidence = [], []
+    sampled = []
+    total = len(work.train) * work.manifest.height * work.manifest.width
+    step = max(1, int(np.sqrt(total / MAX_SAMPLES)))
+    for own_disparity, own_confidence in depth_with_movers(work, still):
+        sampled.append((own_disparity[::step, ::step], own_confidence[::step, ::step]))
+        disparity.append(halve(own_disparity))
+        confidence.append(halve(own_confidence))
+    sampled_disparity, sampled_confidence = (np.stack(m) for m in zip(*sampled, strict=True))
+    near, far = depth_range(sampled_disparity, sampled_confidence)
+    known = np.mean([(map > 0.5).mean() for _, map in sampled])
     indices = [f.index for f in work.train]
     return StepResult(
-        note=(
-            f"{(confidence > 0.5).mean():.0%} of the pixels well known, "
-            f"near {near:.2f}, far {far:.2f} scene units"
-        ),
+        note=f"{known:.0%} of the pixels well known, near {near:.2f}, far {far:.2f} scene units",
         details=details,
         manifest={"near": near, "far": far},
         maps={
@@ -47,22 +58,31 @@ def find_depth(work: Work) -> StepResult:
     )
 
 
-def depth_with_movers(work: Work, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Disparity and confidence (T, H, W) of the training frames; `moving` (T, H, W)."""
+def halve(values: np.ndarray) -> np.ndarray:
+    """A map as it is stored: in half precision, where that holds it."""
+    fits = np.abs(values).max() < np.finfo(np.float16).max
+    return values.astype(np.float16) if fits else values
+
+
+def depth_with_movers(work: Work, still: ArrayStack) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield disparity and confidence (H, W) of every training frame.
+
+    `still` (T, H, W): pixels of the moving masks that stand still.
+    """
     m = work.manifest
     assert m.movers is not None
     movers = read_movers(work.folder / m.movers)
     time_of = {int(index): t for t, index in enumerate(movers[0].frames)} if movers else {}
-    disparity, confidence = work.static_depth()
+    static_disparity, static_confidence = work.static_depth()
     for k, f in enumerate(work.train):
+        moving = work.masks[f.index] & ~still[k]
         found = read_npy(work.folder / str(f.mover_disparity)).astype(np.float32)
         trust = read_npy(work.folder / str(f.mover_confidence)).astype(np.float32)
-        disparity[k] = np.where(moving[k], found, disparity[k])
-        confidence[k] = np.where(moving[k], trust, confidence[k])
+        disparity = np.where(moving, found, static_disparity[k])
+        confidence = np.where(moving, trust, static_confidence[k])
         if f.index in time_of:
             c2w = work.camera(f)[1]
-            disparity[k], confidence[k] = fill_mover_depth(
-                movers, time_of[f.index], moving[k], c2w, disparity[k], confidence[k]
+            disparity, confidence = fill_mover_depth(
+                movers, time_of[f.index], moving, c2w, disparity, confidence
             )
-        confidence[k] = lower_confidence_at_edges(disparity[k], confidence[k])
-    return disparity, confidence
+        yield disparity, lower_confidence_at_edges(disparity, confidence)

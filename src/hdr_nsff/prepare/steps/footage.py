@@ -16,6 +16,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.footage.exposure_lists import (
     parse_exposures,
     read_exif_ev,
@@ -29,6 +30,7 @@ from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
 
 MIN_FRAMES = 3  # fewer show no motion
 MAX_ROUNDING_8_BIT = 1e-6  # off whole codes of 8 bits up to which 8 bits hold a picture
+MAX_LISTED_CUTS = 5  # in a message
 MAX_NOTES = 3  # that are printed; the rest is in scene.json
 # confidence of a cycle by brightness from which it refutes a list (hand-chosen)
 MIN_CONFIDENCE = 0.8
@@ -158,6 +160,8 @@ def exposure_step(work: Work) -> StepResult:
         frame.ev = m.bracket_ev[bracket]
         frame.drift = found.drift[frame.index] if found.drift else None
         frame.split = "test" if frame.index in held_out else "train"
+    work.forget(("equalized",))
+    check_cuts(work)
     cycle = "no alternation"
     if m.cycle > 1:
         cycle = f"cycle of {m.cycle}, {len(found.ev)} exposures"
@@ -340,6 +344,27 @@ def cycle_note(cycle: exposure.Cycle, change: float) -> str:
         "no alternation of exposures found; treated as an ordinary clip of one exposure, "
         "unless static points show that it drifts"
     )
+
+
+# Cuts
+
+
+def check_cuts(work: Work) -> None:
+    """InputError where the picture cuts to another scene."""
+    c = work.config
+    if work.capture is not None:
+        return
+    for own in work.camera_frames():
+        cuts = find_cuts(work.equalized[0][own])
+        if not cuts:
+            continue
+        numbers = [c.start + int(work.manifest.frames[own[k]].time) * c.stride for k in cuts]
+        places = ", ".join(f"{n - c.stride} and {n}" for n in numbers[:MAX_LISTED_CUTS])
+        first = numbers[0]
+        raise InputError(
+            f"{c.clip}: the picture cuts between frames {places}; prepare the parts one by "
+            f"one, the first with `--end {first}`, the next with `--start {first}`"
+        )
 
 
 # Frames to hold out

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
 
+from hdr_nsff.core.stack import ArrayStack, by_key, map_stack
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges
@@ -29,24 +31,27 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     if work.manifest.depth_kind == "relative":
         return result((), {}, "not estimated: depth is known up to scale and shift only")
     flow = work.training_flows(work.refined_flows)
+    disparity: ArrayStack
+    confidence: ArrayStack
     disparity, confidence = work.static_depth()
     still = work.still()
     clip = work.training_clip()
     masks = clip.moving
     indices = np.array([f.index for f in work.train])
-    maps = {}
+    maps: dict[str, Mapping[int, np.ndarray]] = {}
     if without_parallax(work):
-        nearer = disparity / np.float32(tuning.depth_share_without_parallax)
-        disparity = np.where(clip.moving, nearer, disparity)
-        maps["mover_disparity"] = dict(zip(indices.tolist(), disparity, strict=True))
-        maps["mover_confidence"] = dict(zip(indices.tolist(), confidence, strict=True))
+        share = np.float32(tuning.depth_share_without_parallax)
+        disparity = map_stack(lambda d, k: np.where(masks[k], d / share, d), disparity)
+        maps["mover_disparity"] = by_key(indices.tolist(), disparity)
+        maps["mover_confidence"] = by_key(indices.tolist(), confidence)
     elif still is not None:  # the depth is that of the static scene, without movers
         clip = replace(clip, moving=masks & ~still)
+        moving = clip.moving
         found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
-        disparity = np.where(clip.moving, found, disparity)
-        confidence = np.where(clip.moving, trust, confidence)
-        maps["mover_disparity"] = dict(zip(indices.tolist(), found, strict=True))
-        maps["mover_confidence"] = dict(zip(indices.tolist(), trust, strict=True))
+        disparity = found  # that of the static scene elsewhere
+        confidence = map_stack(lambda c, k: np.where(moving[k], trust[k], c), confidence)
+        maps["mover_disparity"] = by_key(indices.tolist(), found)
+        maps["mover_confidence"] = by_key(indices.tolist(), trust)
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
@@ -80,10 +85,10 @@ def within_outlines(moving: np.ndarray) -> np.ndarray:
 
 
 def with_shapes(
-    movers: tuple[Mover, ...], clip: PosedVideo, disparity: np.ndarray, confidence: np.ndarray
+    movers: tuple[Mover, ...], clip: PosedVideo, disparity: ArrayStack, confidence: ArrayStack
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparity and confidence (T, H, W) with moving pixels where the shapes are."""
-    disparity, confidence = disparity.copy(), confidence.copy()
+    disparity, confidence = np.array(disparity), np.array(confidence)
     for t, k in enumerate(movers[0].frames.tolist()):
         filled = fill_mover_depth(
             movers, t, clip.moving[k], clip.c2w[k], disparity[k], confidence[k]
@@ -93,7 +98,7 @@ def with_shapes(
 
 
 def result(
-    movers: tuple[Mover, ...], maps: dict[str, dict[int, np.ndarray]], note: str
+    movers: tuple[Mover, ...], maps: dict[str, Mapping[int, np.ndarray]], note: str
 ) -> StepResult:
     """Movers and the first depth of moving pixels, as the engine stores them."""
     sizes = [len(mover.pixels) for mover in movers]

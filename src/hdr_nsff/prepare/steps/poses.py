@@ -17,6 +17,7 @@ from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 MAX_ROUNDS = 2  # of structure from motion after the first
 MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the same
@@ -78,12 +79,13 @@ def poses_and_masks(work: Work) -> Poses:
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
     change any more.
     """
+    earlier = EarlierRounds()
     cache = work.folder / FIRST_ROUND
     if cache.is_file():
         poses, before = read_round(cache)
     else:
         before = rough_mask(*work.raw_flows, work.equalized[0])
-        poses = estimate(work, before)
+        poses = estimate(work, before, earlier)
         write_round(cache, poses, before)
     for _ in range(MAX_ROUNDS if poses.parallax == "full" else 0):
         moving = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
@@ -93,19 +95,21 @@ def poses_and_masks(work: Work) -> Poses:
         say(f"poses: masks from these poses agree to {agreement:.0%} with those before{outcome}")
         if not again:
             break
-        poses, before = estimate(work, moving), moving
+        poses, before = estimate(work, moving, earlier), moving
     return poses
 
 
-def estimate(work: Work, moving: np.ndarray) -> Poses:
+def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = None) -> Poses:
     """Poses by structure from motion on equalized frames, without pixels that are
-    `moving` (T, H, W) bool.
+    `moving` (T, H, W) bool; what `earlier` rounds found is used again.
     """
     video, clipped = work.equalized
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
     matcher, device = work.config.matcher, pick_device(work.config.device)
-    return estimate_poses(video, moving, folder, clipped, cameras, matcher=matcher, device=device)
+    return estimate_poses(
+        video, moving, folder, clipped, cameras, matcher=matcher, device=device, earlier=earlier
+    )
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")

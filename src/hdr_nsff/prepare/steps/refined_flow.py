@@ -13,6 +13,7 @@ import numpy as np
 
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.parallel import map_in_threads
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry.round_trip import RoundTripTuning, valid_flow
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.flow import Pair, flow_files, flow_is_given, stored, write_flow
@@ -71,7 +72,7 @@ def refine_flow(work: Work) -> StepResult:
     return StepResult(note=note, frames={"flow": flow})
 
 
-def equalized(work: Work) -> tuple[np.ndarray, str]:
+def equalized(work: Work) -> tuple[ArrayStack, str]:
     """All frames at one brightness (T, H, W, 3): through the response of their camera
     where static points determined it, else by the brackets' brightness; and which.
     """
@@ -91,7 +92,7 @@ class Refiner:
     """Refines the flow of one pair of frames at a time."""
 
     def __init__(
-        self, work: Work, video: np.ndarray, tuning: RefinedFlowTuning = REFINED_FLOW_TUNING
+        self, work: Work, video: ArrayStack, tuning: RefinedFlowTuning = REFINED_FLOW_TUNING
     ) -> None:
         """`video` (T, H, W, 3): all frames at one brightness, in [0, 1]."""
         self.work, self.video = work, video

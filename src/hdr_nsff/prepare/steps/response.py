@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
+
 import numpy as np
 
-from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
@@ -20,7 +21,7 @@ def find_response(work: Work) -> StepResult:
     the cameras.
     """
     m = work.manifest
-    views = [response_view(work, f) for f in work.train]
+    views = [StoredView(work, f) for f in work.train]
     cameras = [f.camera_id for f in work.train]
     response = estimate_response(
         views,
@@ -70,21 +71,57 @@ def drift_of_frames(work: Work, drift: np.ndarray | None) -> dict[int, float]:
     return found
 
 
-def response_view(work: Work, f: FrameEntry) -> ResponseView:
-    """A training frame as the response is estimated from it. Depth that is known up to
-    scale and shift does not lead from frame to frame: it counts as unknown.
+def response_view(work: Work, frame: FrameEntry) -> ResponseView:
+    """A training frame as the response is estimated from it, in memory."""
+    stored = StoredView(work, frame)
+    return ResponseView(**{f.name: getattr(stored, f.name) for f in fields(ResponseView)})
+
+
+class StoredView(ResponseView):
+    """A training frame as the response is estimated from it, its maps read from the
+    scene folder when asked for.
+
+    Depth that is known up to scale and shift does not lead from frame to frame: it
+    counts as unknown.
     """
-    K, c2w = work.camera(f)
-    disparity = read_npy(work.folder / str(f.static_disparity)).astype("f4")
-    if work.manifest.depth_kind == "relative":
-        disparity = 0 * disparity
-    return ResponseView(
-        image=work.video[f.index],
-        bracket=f.bracket,
-        time=f.time,
-        K=K,
-        c2w=c2w,
-        disparity=disparity,
-        confidence=read_npy(work.folder / str(f.static_confidence)).astype("f4"),
-        moving=read_mask(work.folder / str(f.mask)),
-    )
+
+    work: Work
+    frame: FrameEntry
+
+    def __init__(self, work: Work, frame: FrameEntry) -> None:
+        K, c2w = work.camera(frame)
+        own = {
+            "work": work,
+            "frame": frame,
+            "bracket": frame.bracket,
+            "time": frame.time,
+            "K": K,
+            "c2w": c2w,
+        }
+        for name, value in own.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def image(self) -> np.ndarray:
+        """(H, W, 3) recorded, in [0, 1]."""
+        return self.work.video[self.frame.index]
+
+    @property
+    def disparity(self) -> np.ndarray:
+        """(H, W) 1 / z-depth, scene units."""
+        disparity = self.map(self.frame.static_disparity)
+        return 0 * disparity if self.work.manifest.depth_kind == "relative" else disparity
+
+    @property
+    def confidence(self) -> np.ndarray:
+        """(H, W) in [0, 1]."""
+        return self.map(self.frame.static_confidence)
+
+    @property
+    def moving(self) -> np.ndarray:
+        """(H, W) bool."""
+        return self.work.masks[self.frame.index]
+
+    def map(self, name: str | None) -> np.ndarray:
+        """A map (H, W) of the scene folder."""
+        return read_npy(self.work.folder / str(name)).astype("f4")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.stack import ArrayStack, by_key
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.prepare.result import StepResult
@@ -28,12 +29,12 @@ DEPTH_FILES = {".npy", ".exr", ".png"}
 class Depth:
     """Depth of the training frames, in order."""
 
-    disparity: np.ndarray  # (T, H, W) 1 / scene units, or relative
-    confidence: np.ndarray  # (T, H, W) in [0, 1]
+    disparity: ArrayStack  # (T, H, W) 1 / scene units, or relative
+    confidence: ArrayStack  # (T, H, W) in [0, 1]
     note: str
     source: str  # "geometric", "given", ...
     given: bool = False
-    still: np.ndarray | None = None  # (T, H, W) pixels of the masks that stand still
+    still: ArrayStack | None = None  # (T, H, W) pixels of the masks that stand still
     details: dict[str, Any] = field(default_factory=dict)
     manifest: dict[str, Any] = field(default_factory=dict)
 
@@ -64,9 +65,7 @@ def find_static_depth(work: Work) -> StepResult:
         details={"source": depth.source, **depth.details},
         manifest={"depth_kind": "scene", **depth.manifest},
         frames=cleared,
-        maps={
-            name: dict(zip(indices, values, strict=True)) for name, values in result_maps.items()
-        },
+        maps={name: by_key(indices, values) for name, values in result_maps.items()},
     )
 
 
@@ -78,7 +77,8 @@ def geometric_depth(work: Work) -> Depth:
         points = np.array(read_npy(work.folder / m.points))
     flow = work.training_flows(work.raw_flows)
     disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
-    note = f"{(confidence > 0.5).mean():.0%} of the pixels well known"
+    known = np.mean([(map > 0.5).mean() for map in confidence])
+    note = f"{known:.0%} of the pixels well known"
     return Depth(disparity, confidence, note, "geometric", still=still)
 
 

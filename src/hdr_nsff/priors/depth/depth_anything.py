@@ -21,6 +21,7 @@ from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say, track
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.priors.depth.geometric import depth_range, lower_confidence_at_edges
 from hdr_nsff.priors.depth.parallax import triangulate
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD
@@ -51,7 +52,7 @@ class DepthAnythingTuning:
     min_disparity_percentile: float = 1.0
 
 
-def network_disparity(network: Any, video: np.ndarray) -> tuple[np.ndarray, Kind]:
+def network_disparity(network: Any, video: ArrayStack) -> tuple[np.ndarray, Kind]:
     """What the network predicts for `video` (T, H, W, 3), equalized rgb in [0, 1].
 
     Disparity (T, H, W) up to a scale and shift per frame ("relative"), or up to a scale
@@ -90,8 +91,8 @@ def anchored_depth(
     kind: Kind,
     clip: PosedVideo,
     points: np.ndarray,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
     tuning: DepthAnythingTuning = DepthAnythingTuning(),
 ) -> tuple[np.ndarray, np.ndarray, float, float]:

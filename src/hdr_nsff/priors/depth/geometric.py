@@ -2,7 +2,8 @@
 scene units, and a confidence.
 
 A plane sweep over the frames (`plane_sweep.py`) between the disparities that structure
-from motion found, fused over all frames (`fuse.py`). Moving objects are placed by their
+from motion found, fused over all frames (`fuse.py`); large frames are shrunk for that
+(`coarse.py`). Moving objects are placed by their
 path and shape afterwards (`priors/movers`).
 """
 
@@ -15,6 +16,14 @@ import numpy as np
 
 from hdr_nsff.core.parallel import map_in_threads
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.priors.depth.coarse import (
+    CoarseTuning,
+    at_pixels,
+    coarseness,
+    mask_at_pixels,
+    shrink,
+)
 from hdr_nsff.priors.depth.fuse import FuseTuning, joint_median, vote, warp_disparity
 from hdr_nsff.priors.depth.parallax import (
     ParallaxTuning,
@@ -59,17 +68,18 @@ class DepthTuning:
     far_factor: float = 1.2
     plane_sweep: PlaneSweepTuning = field(default_factory=PlaneSweepTuning)
     fuse: FuseTuning = field(default_factory=FuseTuning)
+    coarse: CoarseTuning = field(default_factory=CoarseTuning)
     parallax: ParallaxTuning = field(default_factory=ParallaxTuning)
 
 
 def static_geometric_depth(
     clip: PosedVideo,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
     points: np.ndarray,
     tuning: DepthTuning = DepthTuning(),
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[ArrayStack, ArrayStack, ArrayStack]:
     """Depth of the static scene from known poses, also behind moving objects.
 
     `flow` (P, H, W, 2) px and `valid` (P, H, W) of `pairs` (P, 2) of frames, both
@@ -96,7 +106,13 @@ def static_geometric_depth(
         flat = np.ones(shape, np.float32)
         return flat, np.zeros(shape, np.float32), np.zeros(shape, bool)
     low, high = disparity_range(clip, points, tuning.parallax)
-    return static_depth(clip, views, low, high, tuning)
+    factor = coarseness(clip.size, tuning.coarse)
+    if factor == 1:
+        return static_depth(clip, views, low, high, tuning)
+    small = shrink(clip, factor, tuning.coarse)
+    cell_disparity, trust, static = static_depth(small, views, low, high, tuning)
+    disparity, confidence = at_pixels(clip, small, cell_disparity, trust, tuning.coarse)
+    return disparity, confidence, mask_at_pixels(static, clip.size)
 
 
 def static_depth(

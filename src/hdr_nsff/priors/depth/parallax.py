@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.scene.posed_video import PosedVideo
 
@@ -23,6 +24,11 @@ class ParallaxTuning:
     # image widths: parallax of the middle of the scene between two frames that match
     # best
     best_parallax: float = 0.05
+    # frames: all within the first distance are candidates, every so manyth of those
+    # within the last
+    near_gap: int = 48
+    far_gap_step: int = 6
+    max_gap: int = 144
     time_decay: float = 0.02  # of a view's score per frame of distance in time ...
     min_time_weight: float = 0.3  # ... down to this
     # the candidates reach from and to these percentiles of the points' disparities,
@@ -84,7 +90,7 @@ def choose_views(
     for i in range(count):
         visible = points[clip.project(i, points)[2]]
         scores = np.zeros(count)
-        others = [j for j in range(count) if j != i and len(visible)]
+        others = candidates(i, count, tuning) if len(visible) else []
         for j in others:
             moved, share = parallax(clip, i, j, visible)
             ratio = max(moved / (tuning.best_parallax * width), 1e-9)
@@ -98,10 +104,24 @@ def choose_views(
     return chosen, largest
 
 
+def candidates(i: int, count: int, tuning: ParallaxTuning = ParallaxTuning()) -> list[int]:
+    """The frames that may determine the depth of frame `i` of `count`: all of a short
+    clip; of a long one the nearest, and every few of those farther away.
+    """
+    reach = range(-tuning.max_gap, tuning.max_gap + 1)
+    return [
+        i + gap
+        for gap in reach
+        if gap
+        and 0 <= i + gap < count
+        and (abs(gap) <= tuning.near_gap or gap % tuning.far_gap_step == 0)
+    ]
+
+
 def triangulate(
     clip: PosedVideo,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
     tuning: ParallaxTuning = ParallaxTuning(),
 ) -> np.ndarray:

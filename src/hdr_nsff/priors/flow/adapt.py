@@ -25,6 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from hdr_nsff.core.progress import say, track
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.priors.flow.correlation import (
     EXCLUDED,
     Search,
@@ -171,7 +172,7 @@ def build_refiner(channels: int, feature_norm: float, tuning: AdaptTuning) -> Re
     return ResidualNetwork(channels, feature_norm, tuning)
 
 
-def cell_colors(video: np.ndarray, features: Features, per_side: int) -> Tensor:
+def cell_colors(video: ArrayStack, features: Features, per_side: int) -> Tensor:
     """Colors (T, 3 * per_side^2, h, w) of the cells of `features`.
 
     They are read from `video` (T, H, W, 3) on a grid of `per_side` x `per_side` samples
@@ -255,7 +256,7 @@ class TrainingClip:
     def __init__(
         self,
         features: Features,
-        video: np.ndarray,
+        video: ArrayStack,
         tracks: list[Track],
         neighbors: list[tuple[int, int]],
         search: Search,

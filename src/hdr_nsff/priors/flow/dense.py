@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.parallel import map_in_threads
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry.round_trip import follow, max_round_trip, valid_flow
 from hdr_nsff.radiometry.common_range import common_gray, recorded_range
 
@@ -62,7 +63,7 @@ class FlowPrior(Protocol):
     """A source of optical flow between frames of a clip."""
 
     def __call__(
-        self, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+        self, video: ArrayStack, clipped: ArrayStack, pairs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flow (P, H, W, 2) float32 px and valid (P, H, W) bool of `pairs` (P, 2).
 
@@ -73,8 +74,8 @@ class FlowPrior(Protocol):
 
 
 def dense_flow(
-    video: np.ndarray,
-    clipped: np.ndarray,
+    video: ArrayStack,
+    clipped: ArrayStack,
     pairs: np.ndarray,
     tuning: DenseFlowTuning = DENSE_FLOW_TUNING,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -94,7 +95,7 @@ def dense_flow(
 
 
 def recorded_ranges(
-    video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+    video: ArrayStack, clipped: ArrayStack, pairs: np.ndarray
 ) -> dict[int, tuple[np.ndarray, np.ndarray]]:
     """The lowest and highest rgb (3,), (3,) that each frame of `pairs` recorded.
 
@@ -106,10 +107,10 @@ def recorded_ranges(
 
 def match_pairs(
     match: Callable[[int, int], tuple[np.ndarray, np.ndarray]],
-    clipped: np.ndarray,
+    clipped: ArrayStack,
     pairs: np.ndarray,
     report: str | None = None,
-    threads: int = 2,
+    threads: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flow (P, H, W, 2) float32 px and valid (P, H, W) bool of `pairs` (P, 2).
 

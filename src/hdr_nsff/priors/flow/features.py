@@ -22,6 +22,7 @@ from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.priors.pretrained import IMAGENET_MEAN, IMAGENET_STD, pretrained
 from hdr_nsff.priors.weights import find
@@ -74,7 +75,7 @@ class Features:
 
 
 # exposure-equalized rgb (T, H, W, 3) in [0, 1] -> Features
-FeatureSource = Callable[[np.ndarray], Features]
+FeatureSource = Callable[[ArrayStack], Features]
 FeatureName = Literal["xfeat", "dinov2-small", "dinov2-base", "dinov2-large"]
 
 
@@ -105,7 +106,7 @@ def feature_source(
 
 
 def run_per_frame(
-    video: np.ndarray,
+    video: ArrayStack,
     scale: float,
     multiple: int,
     network: Callable[[Tensor], Tensor],
@@ -211,7 +212,7 @@ def load_xfeat(path: Path) -> XFeat:
 
 
 def xfeat_features(
-    network: XFeat, video: np.ndarray, tuning: FeatureTuning = FEATURE_TUNING
+    network: XFeat, video: ArrayStack, tuning: FeatureTuning = FEATURE_TUNING
 ) -> Features:
     """`FeatureSource` by XFeat: 64 channels every 8 pixels, every 4 of small frames."""
     height, width = video.shape[1:3]
@@ -223,7 +224,7 @@ def xfeat_features(
 
 def dinov2_features(
     network: Any,
-    video: np.ndarray,
+    video: ArrayStack,
     layer: int | None = None,
     stride: int | None = None,
     tuning: FeatureTuning = FEATURE_TUNING,

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.priors.flow.dense import (
     DENSE_FLOW_TUNING,
     DenseFlowTuning,
@@ -68,8 +69,8 @@ NETWORK_FLOW_TUNING = NetworkFlowTuning()
 
 def network_flow(
     network: FlowNetwork,
-    video: np.ndarray,
-    clipped: np.ndarray,
+    video: ArrayStack,
+    clipped: ArrayStack,
     pairs: np.ndarray,
     tuning: NetworkFlowTuning = NETWORK_FLOW_TUNING,
     dense: DenseFlowTuning = DENSE_FLOW_TUNING,

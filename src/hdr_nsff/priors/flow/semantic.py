@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.round_trip import follow, round_trip
 from hdr_nsff.priors.flow.adapt import (
@@ -101,7 +102,7 @@ class SemanticTuning:
     features: FeatureTuning = field(default_factory=FeatureTuning)
     adapt: AdaptTuning = field(default_factory=AdaptTuning)
 
-    def search(self, features: Features, video: np.ndarray) -> Search:
+    def search(self, features: Features, video: ArrayStack) -> Search:
         """The search for `features` in frames of the size of `video` (T, H, W, 3)."""
         reach = self.reach * max(video.shape[1:3]) / features.stride
         return Search(reach, self.argmax_radius_cells, self.temperature)
@@ -170,7 +171,7 @@ class SemanticFlow:
         self.features: Features | None = None
 
     def __call__(
-        self, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+        self, video: ArrayStack, clipped: ArrayStack, pairs: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Flow (P, H, W, 2) px and valid (P, H, W) of `pairs` (P, 2).
 
@@ -180,7 +181,7 @@ class SemanticFlow:
             self.features = self.fit_features(video, clipped)
         return match_features(self.features, video, clipped, pairs, self.tuning, self.dense)
 
-    def fit_features(self, video: np.ndarray, clipped: np.ndarray) -> Features:
+    def fit_features(self, video: ArrayStack, clipped: ArrayStack) -> Features:
         """The clip's features, fitted to it."""
         features = self.source(video)
         if self.steps == 0 or not self.neighbors:
@@ -196,8 +197,8 @@ class SemanticFlow:
 
 def match_features(
     features: Features,
-    video: np.ndarray,
-    clipped: np.ndarray,
+    video: ArrayStack,
+    clipped: ArrayStack,
     pairs: np.ndarray,
     tuning: SemanticTuning = SEMANTIC_TUNING,
     dense: DenseFlowTuning = DENSE_FLOW_TUNING,
@@ -221,7 +222,7 @@ def match_features(
 
 def coarse_flow(
     features: Features,
-    video: np.ndarray,
+    video: ArrayStack,
     i: int,
     j: int,
     tuning: SemanticTuning = SEMANTIC_TUNING,
@@ -347,8 +348,8 @@ def joint_bilateral_mean(
 
 def equal_exposure_tracks(
     features: Features,
-    video: np.ndarray,
-    clipped: np.ndarray,
+    video: ArrayStack,
+    clipped: ArrayStack,
     equal: Pairs,
     tuning: SemanticTuning = SEMANTIC_TUNING,
     dense: DenseFlowTuning = DENSE_FLOW_TUNING,

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.flow_files import read_flow_files
 from hdr_nsff.priors.flow.dense import DenseFlowTuning, FlowPrior, dense_flow
@@ -156,7 +157,7 @@ def flow_weights(
 
 
 def flow_from_folder(
-    folder: Path, video: np.ndarray, clipped: np.ndarray, pairs: np.ndarray
+    folder: Path, video: ArrayStack, clipped: ArrayStack, pairs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """`FlowPrior` that reads maps made by another tool."""
-    return read_flow_files(folder, pairs, clipped.shape[1:3])
+    return read_flow_files(folder, pairs, (clipped.shape[1], clipped.shape[2]))

@@ -18,6 +18,7 @@ import numpy as np
 from scipy import ndimage
 
 from hdr_nsff.core.progress import say, track
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry.round_trip import follow
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING, GeometricMaskTuning
 from hdr_nsff.priors.masks.static_residuals import (
@@ -39,10 +40,10 @@ Residuals = Callable[[int, list[ChainedFlow]], np.ndarray]
 
 
 def rough_mask(
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    video: np.ndarray,
+    video: ArrayStack,
     tuning: GeometricMaskTuning = GEOMETRIC_MASK_TUNING,
 ) -> np.ndarray:
     """Moving pixels (T, H, W) bool from flow alone, without poses.
@@ -62,10 +63,10 @@ def rough_mask(
 
 
 def geometric_mask(
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    video: np.ndarray,
+    video: ArrayStack,
     K: np.ndarray,
     c2w: np.ndarray,
     tuning: GeometricMaskTuning = GEOMETRIC_MASK_TUNING,

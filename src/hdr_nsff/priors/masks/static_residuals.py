@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.round_trip import follow
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING, GeometricMaskTuning
@@ -60,10 +61,10 @@ class FlowClip:
 
 
 def working_clip(
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    video: np.ndarray,
+    video: ArrayStack,
     tuning: GeometricMaskTuning = GEOMETRIC_MASK_TUNING,
 ) -> FlowClip:
     """The clip on a grid of at most `working_pixels`, with each frame's shortest links.

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.regions import (
     RegionTrack,
@@ -31,10 +32,10 @@ ORDER = 3  # of the differences that are penalized: constant acceleration is fre
 
 def mover_depth(
     clip: PosedVideo,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    behind: np.ndarray,
+    behind: ArrayStack,
     tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Disparity and confidence (T, H, W) of moving pixels, `behind` and 0 elsewhere.
@@ -43,7 +44,7 @@ def mover_depth(
     scene units. `flow` (P, H, W, 2) px and `valid` (P, H, W) are of `pairs` (P, 2) of
     frames.
     """
-    disparity = behind.copy()
+    disparity = np.array(behind)
     confidence = np.where(clip.moving, np.float32(tuning.min_confidence), np.float32(0))
     labels = label_regions(clip.moving, tuning)
     steps = flow_steps(clip.times, flow, valid, pairs)

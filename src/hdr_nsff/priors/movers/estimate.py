@@ -8,10 +8,15 @@ bundle adjustment (`bundle.py`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
 import numpy as np
 from scipy import ndimage
 
-from hdr_nsff.geometry import pinhole
+from hdr_nsff.core.stack import ArrayStack, LazyMap
 from hdr_nsff.priors.movers.bundle_problem import Cameras
 from hdr_nsff.priors.movers.motion_segmentation import Segment, segment_tracks
 from hdr_nsff.priors.movers.regions import flow_steps
@@ -23,11 +28,11 @@ from hdr_nsff.scene.posed_video import PosedVideo
 
 def estimate_movers(
     clip: PosedVideo,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    disparity: np.ndarray,
-    confidence: np.ndarray,
+    disparity: ArrayStack,
+    confidence: ArrayStack,
     tuning: MoversTuning = MOVERS_TUNING,
 ) -> tuple[Mover, ...]:
     """The movers of a clip with known poses, largest first; none where nothing moves.
@@ -102,13 +107,39 @@ def mover_without_tracks(
     )
 
 
+@dataclass(frozen=True)
+class FrameMap:
+    """The map (H, W) of one frame of a stack, read where it is indexed."""
+
+    stack: ArrayStack
+    frame: int
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        return self.stack[self.frame][index]
+
+
+@dataclass(frozen=True)
+class FramePoints:
+    """The points (H, W, 3) of one frame's pixels, computed where they are asked for."""
+
+    clip: PosedVideo
+    frame: int
+    disparity: ArrayStack  # (T, H, W)
+
+    def __getitem__(self, index: Any) -> np.ndarray:
+        """The points (P, 3) of pixels: rows and columns (P,) each, or a mask (H, W)."""
+        y, x = np.nonzero(index) if isinstance(index, np.ndarray) else index
+        disparity = np.maximum(self.disparity[self.frame][y, x], 1e-9).astype(np.float64)
+        return self.clip.unproject(self.frame, np.stack([x, y], -1) + 0.5, disparity)
+
+
 def views_by_time(
     clip: PosedVideo,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    disparity: np.ndarray,
-    confidence: np.ndarray,
+    disparity: ArrayStack,
+    confidence: ArrayStack,
 ) -> tuple[list[int], list[MovingView]]:
     """One frame of every time, in order, and its view of the moving pixels.
 
@@ -118,19 +149,19 @@ def views_by_time(
     _, first = np.unique(clip.times, return_index=True)
     frames = [int(f) for f in first]
     steps = {(s.start, s.end): s for s in flow_steps(clip.times, flow, valid, pairs)}
-    height, width = clip.size
-    pixels = pinhole.pixel_centers(height, width).reshape(-1, 2)
     views = []
     for k, f in enumerate(frames):
-        frame_disparity = np.maximum(disparity[f].reshape(-1), 1e-9).astype(np.float64)
-        points = clip.unproject(f, pixels, frame_disparity).reshape(height, width, 3)
-        flows: dict[int, np.ndarray] = {}
-        valids: dict[int, np.ndarray] = {}
+        points = FramePoints(clip, f, disparity)
+        flows: dict[int, Callable[[], np.ndarray]] = {}
+        valids: dict[int, Callable[[], np.ndarray]] = {}
         forward = steps.get((f, frames[k + 1])) if k + 1 < len(frames) else None
         backward = steps.get((frames[k - 1], f)) if k > 0 else None
         if forward is not None:
-            flows[1], valids[1] = forward.flow, forward.valid
+            flows[1] = partial(flow.__getitem__, forward.forward)
+            valids[1] = partial(valid.__getitem__, forward.forward)
         if backward is not None:
-            flows[-1], valids[-1] = backward.back, backward.back_valid
-        views.append(MovingView(clip.moving[f], points, confidence[f], flows, valids))
+            flows[-1] = partial(flow.__getitem__, backward.backward)
+            valids[-1] = partial(valid.__getitem__, backward.backward)
+        trust = FrameMap(confidence, f)
+        views.append(MovingView(clip.moving[f], points, trust, LazyMap(flows), LazyMap(valids)))
     return frames, views

@@ -7,11 +7,12 @@ back from.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.priors.movers.tuning import MOVER_DISTANCE_TUNING, MoverDistanceTuning
 
 
@@ -33,14 +34,40 @@ class FlowStep:
 
     start: int
     end: int
-    flow: np.ndarray  # (H, W, 2) px
-    valid: np.ndarray  # (H, W) bool
-    back: np.ndarray  # (H, W, 2) px from `end` to `start`
-    back_valid: np.ndarray  # (H, W) bool
+    flows: ArrayStack  # (P, H, W, 2) px, of all pairs
+    valids: ArrayStack  # (P, H, W) bool
+    forward: int  # the pair from `start` to `end`
+    backward: int  # the pair from `end` to `start`
+
+    @property
+    def flow(self) -> np.ndarray:
+        """(H, W, 2) px from `start` to `end`."""
+        return self.flows[self.forward]
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(H, W) bool."""
+        return self.valids[self.forward]
+
+    @property
+    def back(self) -> np.ndarray:
+        """(H, W, 2) px from `end` to `start`."""
+        return self.flows[self.backward]
+
+    @property
+    def back_valid(self) -> np.ndarray:
+        """(H, W) bool."""
+        return self.valids[self.backward]
 
     def reversed(self) -> FlowStep:
         """The same step in the other direction."""
-        return FlowStep(self.end, self.start, self.back, self.back_valid, self.flow, self.valid)
+        return replace(
+            self,
+            start=self.end,
+            end=self.start,
+            forward=self.backward,
+            backward=self.forward,
+        )
 
 
 @dataclass(frozen=True)
@@ -72,7 +99,7 @@ def label_regions(
 
 
 def flow_steps(
-    times: np.ndarray, flow: np.ndarray, valid: np.ndarray, pairs: np.ndarray
+    times: np.ndarray, flow: ArrayStack, valid: ArrayStack, pairs: np.ndarray
 ) -> list[FlowStep]:
     """From each frame the step to the nearest later one, in order of time.
 
@@ -88,8 +115,7 @@ def flow_steps(
             next_frame[i] = j
     steps = []
     for i, j in sorted(next_frame.items(), key=lambda pair: times[pair[0]]):
-        k, back = index[i, j], index[j, i]
-        steps.append(FlowStep(i, j, flow[k], valid[k], flow[back], valid[back]))
+        steps.append(FlowStep(i, j, flow, valid, index[i, j], index[j, i]))
     return steps
 
 

@@ -15,6 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.regions import FlowStep, flow_steps
 from hdr_nsff.priors.movers.tuning import RIGIDITY_TUNING, RigidityTuning
@@ -27,10 +28,10 @@ STATIC_STRIDE = 4  # pixels, in x and in y, of the static samples
 def judge_rigidity(
     movers: Sequence[Mover],
     clip: PosedVideo,
-    flow: np.ndarray,
-    valid: np.ndarray,
+    flow: ArrayStack,
+    valid: ArrayStack,
     pairs: np.ndarray,
-    disparity: np.ndarray,
+    disparity: ArrayStack,
     tuning: RigidityTuning = RIGIDITY_TUNING,
 ) -> tuple[Mover, ...]:
     """The movers with the residuals of their flow, and whether each is rigid.

@@ -9,7 +9,9 @@ lies between two motions. The depth may be wrong; later steps correct it. Pixels
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 import numpy as np
 from scipy import ndimage
@@ -18,15 +20,23 @@ from hdr_nsff.geometry.round_trip import flow_at
 from hdr_nsff.priors.movers.tuning import TRACK_TUNING, TrackTuning
 
 
+class PixelValues(Protocol):
+    """An array over the pixels of a frame, or what reads one where it is indexed."""
+
+    def __getitem__(self, index: Any, /) -> np.ndarray:
+        """The values of pixels: rows and columns, or a mask."""
+        ...
+
+
 @dataclass(frozen=True)
 class MovingView:
     """What one training time shows of its moving pixels."""
 
     moving: np.ndarray  # (H, W) bool
-    points: np.ndarray  # (H, W, 3) every pixel at its depth, scene units
-    trust: np.ndarray  # (H, W) in the depth, in [0, 1]
-    flow: dict[int, np.ndarray]  # {+-1: (H, W, 2)} px to the neighboring times
-    valid: dict[int, np.ndarray]  # {+-1: (H, W) bool}
+    points: PixelValues  # (H, W, 3) every pixel at its depth, scene units
+    trust: PixelValues  # (H, W) in the depth, in [0, 1]
+    flow: Mapping[int, np.ndarray]  # {+-1: (H, W, 2)} px to the neighboring times
+    valid: Mapping[int, np.ndarray]  # {+-1: (H, W) bool}
 
 
 @dataclass(frozen=True)
@@ -96,10 +106,17 @@ def smooth_flow(
 
     It is NaN where a pixel itself is not known.
     """
+    result = np.full(flow.shape, np.nan, np.float32)
+    rows, columns = np.nonzero(known.any(1))[0], np.nonzero(known.any(0))[0]
+    if not len(rows):
+        return result
+    around = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     radius = tuning.smoothing_radius_px
+    margin = (radius, radius)
+    flow = np.where(known[around][..., None], flow[around], 0).astype(np.float32)
+    flow = np.pad(flow, (margin, margin, (0, 0)))
+    weight = np.pad(known[around].astype(np.float32), (margin, margin))
     offsets = range(-radius, radius + 1)
-    flow = np.where(known[..., None], flow, 0).astype(np.float32)
-    weight = known.astype(np.float32)
     total_weight = np.zeros_like(weight)
     total_flow = np.zeros_like(flow)
     for offset in itertools.product(offsets, offsets):
@@ -109,7 +126,10 @@ def smooth_flow(
         total_weight += other_weight
         total_flow += other * other_weight[..., None]
     mean = total_flow / np.maximum(total_weight, 1)[..., None]
-    return np.where((total_weight > 0)[..., None], mean, np.nan)
+    mean = np.where((total_weight > 0)[..., None], mean, np.nan)
+    height, width = known[around].shape
+    result[around] = mean[radius : radius + height, radius : radius + width]
+    return result
 
 
 def chain_flow(

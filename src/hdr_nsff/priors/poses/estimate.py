@@ -17,6 +17,7 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import Poses, interpolate
@@ -35,6 +36,7 @@ from hdr_nsff.priors.poses.reconstruct import (
     spread_frames,
 )
 from hdr_nsff.priors.poses.rotation import Panorama, fit_panorama, fit_video, rotation_share
+from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 MIN_FRAMES = 3
 
@@ -53,15 +55,16 @@ class PosesTuning:
 
 
 def estimate_poses(
-    video: np.ndarray,
+    video: ArrayStack,
     masks: np.ndarray | None,
     workdir: Path | str,
-    clipped: np.ndarray | None = None,
+    clipped: ArrayStack | None = None,
     camera_ids: list[int] | None = None,
     threads: int = 0,
     matcher: Matcher = "sift",
     tuning: PosesTuning = PosesTuning(),
     device: torch.device = CPU,
+    earlier: EarlierRounds | None = None,
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
@@ -69,7 +72,8 @@ def estimate_poses(
     `camera_ids` (T,) the physical camera of each frame (each has its own focal length),
     by default one. `matcher` finds and matches keypoints for structure from motion, a
     learned one on `device`; `threads` 0 uses all cores. Temporary files go into
-    `workdir`. InputError where poses cannot be estimated.
+    `workdir`. What `earlier` rounds on the same frames found is used again. InputError
+    where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -80,7 +84,8 @@ def estimate_poses(
     ignore = np.zeros(video.shape[:3], bool)
     for mask in (masks, clipped):
         if mask is not None:
-            ignore = ignore | mask
+            for t in range(count):
+                ignore[t] |= mask[t]
     groups = camera_groups(camera_ids or [0] * count)
     share = parallax_free_share(video, ignore, tuning) if len(groups) == 1 else None
     poses = None
@@ -90,9 +95,10 @@ def estimate_poses(
         views = sfm_views(video, ignore, groups, tuning.reconstruction)
         try:
             model, scale = best_model(
-                views, Path(workdir), threads, matcher, tuning.reconstruction, device
+                views, Path(workdir), threads, matcher, tuning.reconstruction, device, earlier
             )
-            poses = poses_from_model(model, views, scale, video.shape[1:3], tuning.reconstruction)
+            size = (video.shape[1], video.shape[2])
+            poses = poses_from_model(model, views, scale, size, tuning.reconstruction)
         except InputError as error:
             if share is not None and share >= tuning.min_rotation_share_fallback:
                 poses = rotation_poses(video, ignore, tuning)
@@ -106,7 +112,7 @@ def estimate_poses(
 
 
 def parallax_free_share(
-    video: np.ndarray, ignore: np.ndarray, tuning: PosesTuning = PosesTuning()
+    video: ArrayStack, ignore: np.ndarray, tuning: PosesTuning = PosesTuning()
 ) -> float | None:
     """The share of static matches that pure rotations explain, in [0, 1], from frames
     spread over the clip (T, H, W, 3); `ignore` (T, H, W) bool.
@@ -130,7 +136,7 @@ def parallax_free_share(
 
 
 def rotation_poses(
-    video: np.ndarray, ignore: np.ndarray, tuning: PosesTuning = PosesTuning()
+    video: ArrayStack, ignore: np.ndarray, tuning: PosesTuning = PosesTuning()
 ) -> Poses | None:
     """Poses of a camera on a tripod or turning in place, from all frames (T, H, W, 3);
     `ignore` (T, H, W) bool. None where rotations do not explain the footage after all.

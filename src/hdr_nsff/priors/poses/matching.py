@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.progress import track
+from hdr_nsff.core.stack import ArrayStack
 
 
 @dataclass(frozen=True)
@@ -90,7 +91,7 @@ def keypoint_mask(ignore: np.ndarray, scale: int, margin: int) -> np.ndarray:
 
 
 def detect_keypoints(
-    video: np.ndarray, ignore: np.ndarray, tuning: MatchingTuning = MatchingTuning()
+    video: ArrayStack, ignore: np.ndarray, tuning: MatchingTuning = MatchingTuning()
 ) -> list[Keypoints]:
     """The strongest keypoints of every frame of `video` (T, H, W, 3) in [0, 1], none in
     `ignore` (T, H, W) bool.

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import encode
 from hdr_nsff.core.progress import say
+from hdr_nsff.core.stack import ArrayStack, Stack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.geometry.pinhole import intrinsics
@@ -39,9 +41,15 @@ from hdr_nsff.priors.poses.matching import (
     keypoint_mask,
     sift_image,
     upsampling_factor,
-    view_pairs,
 )
 from hdr_nsff.priors.poses.rotation import RotationTuning, default_focal, fit_video
+from hdr_nsff.priors.poses.view_matches import (
+    EarlierRounds,
+    KeyframeTuning,
+    ViewMatches,
+    choose_keyframes,
+    pairs_to_match,
+)
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,7 @@ class ReconstructionTuning:
     max_sampled_frames: int = 24
     matching: MatchingTuning = field(default_factory=MatchingTuning)
     rotation: RotationTuning = field(default_factory=RotationTuning)
+    keyframes: KeyframeTuning = field(default_factory=KeyframeTuning)
     lightglue: LightGlueTuning = field(default_factory=LightGlueTuning)
     sfm: sfm.SfmTuning = field(default_factory=sfm.SfmTuning)
 
@@ -78,7 +87,7 @@ class SfmViews:
     that stands still.
     """
 
-    images: np.ndarray  # (V, H, W, 3) equalized rgb in [0, 1]
+    images: ArrayStack  # (V, H, W, 3) equalized rgb in [0, 1]
     ignore: np.ndarray  # (V, H, W) bool
     groups: list[list[int]]  # views of each physical camera
     of_frame: np.ndarray  # (T,) the view of each frame
@@ -90,7 +99,7 @@ def spread_frames(count: int, limit: int) -> np.ndarray:
 
 
 def sfm_views(
-    video: np.ndarray,
+    video: ArrayStack,
     ignore: np.ndarray,
     groups: list[list[int]],
     tuning: ReconstructionTuning = ReconstructionTuning(),
@@ -102,26 +111,33 @@ def sfm_views(
     """
     if len(groups) == 1:
         return SfmViews(video, ignore, groups, np.arange(len(video)))
-    images: list[np.ndarray] = []
+    medians: dict[int, np.ndarray] = {}
+    frame_of: list[int] = []
     hidden: list[np.ndarray] = []
     view_groups: list[list[int]] = []
     of_frame = np.zeros(len(video), int)
     for group in groups:
-        first = len(images)
+        first = len(frame_of)
         sampled = [group[k] for k in spread_frames(len(group), tuning.max_sampled_frames)]
         if stands_still(video[sampled], ignore[sampled], tuning):
-            images.append(median_image(video[sampled], ignore[sampled]))
+            medians[first] = median_image(np.asarray(video[sampled]), ignore[sampled])
+            frame_of.append(group[0])
             hidden.append(np.all(ignore[sampled], axis=0))
             of_frame[group] = first
         else:
-            images += [video[t] for t in group]
+            frame_of += group
             hidden += [ignore[t] for t in group]
             of_frame[group] = first + np.arange(len(group))
-        view_groups.append(list(range(first, len(images))))
-    return SfmViews(np.stack(images), np.stack(hidden), view_groups, of_frame)
+        view_groups.append(list(range(first, len(frame_of))))
+
+    def image(view: int) -> np.ndarray:
+        return medians[view] if view in medians else video[frame_of[view]]
+
+    images = Stack(image, (len(frame_of), *video.shape[1:]))
+    return SfmViews(images, np.stack(hidden), view_groups, of_frame)
 
 
-def stands_still(video: np.ndarray, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
+def stands_still(video: ArrayStack, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
     """Whether the frames (T, H, W, 3) of a camera are those of a tripod; `ignore` (T,
     H, W) bool.
     """
@@ -149,10 +165,14 @@ def best_model(
     matcher: Matcher,
     tuning: ReconstructionTuning = ReconstructionTuning(),
     device: torch.device = CPU,
+    earlier: EarlierRounds | None = None,
 ) -> tuple[ColmapModel, int]:
     """The best reconstruction of the views, and how many times larger than the views
     its images were. A learned `matcher` runs on `device`. InputError where no
     reconstruction is good enough.
+
+    Matches and poses of `earlier` rounds, on the same views with other pixels ignored,
+    are used again; this round's are added in place.
     """
     count = len(views.images)
     best: ColmapModel | None = None
@@ -161,26 +181,35 @@ def best_model(
     for leftover in workdir.glob(".sfm-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     workdir.mkdir(parents=True, exist_ok=True)
+    earlier = earlier or EarlierRounds()
     # learned keypoints work in color, and leveling the contrast gains nothing for them
     contrasts = {"leveled": True, "plain": False} if matcher == "sift" else {"plain": False}
     for contrast, level_contrast in contrasts.items():
         with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
-            job = write_job(
-                Path(folder), views, scale, level_contrast, threads, matcher, tuning, device
-            )
-            for mapping in ("incremental", "global"):
+            try:
+                job = write_job(
+                    Path(folder), views, scale, level_contrast, threads, matcher, earlier,
+                    tuning, device,
+                )  # fmt: skip
+            except sfm.SfmError as error:
+                failures.append(str(error))
+                continue
+            for attempt in attempts(job, earlier):
                 try:
-                    models = [read_model(p) for p in sfm.run(replace(job, mapping=mapping))]
+                    folders = sfm.run(attempt)
+                    models = [read_model(p) for p in folders]
                 except sfm.SfmError as error:
                     failures.append(str(error))
                     continue
                 candidates = models if best is None else [best, *models]
                 best = max(candidates, key=lambda m: model_rank(m, count, tuning), default=None)
                 if best is not None and model_rank(best, count, tuning)[:2] == (True, True):
+                    chosen = next(f for f, m in zip(folders, models, strict=True) if m is best)
+                    earlier.model = {p.name: p.read_bytes() for p in chosen.iterdir()}
                     return best, scale
                 num_registered = 0 if best is None else len(best.images)
                 say(
-                    f"poses: {mapping} mapping ({contrast} contrast): "
+                    f"poses: {attempt.task} mapping ({contrast} contrast): "
                     f"{num_registered} of {count} views registered at best so far"
                 )
     if best is None or not has_plausible_lens(best, tuning):
@@ -190,6 +219,26 @@ def best_model(
     return best, scale
 
 
+def attempts(job: sfm.Job, earlier: EarlierRounds) -> list[sfm.Job]:
+    """The ways to map the views of a job, in the order in which they are tried: from
+    the poses of earlier rounds, from keyframes, all at once, and globally.
+    """
+    tasks = []
+    if earlier.model:
+        start = Path(job.folder) / "start"
+        start.mkdir(exist_ok=True)
+        for name, content in earlier.model.items():
+            (start / name).write_bytes(content)
+        tasks.append(replace(job, task="adjust", start=str(start), keyframes=[]))
+    if job.keyframes:
+        tasks.append(replace(job, task="incremental"))
+    return [
+        *tasks,
+        replace(job, task="incremental", keyframes=[]),
+        replace(job, task="global", keyframes=[]),
+    ]
+
+
 def write_job(
     folder: Path,
     views: SfmViews,
@@ -197,34 +246,49 @@ def write_job(
     level_contrast: bool,
     threads: int,
     matcher: Matcher,
+    earlier: EarlierRounds,
     tuning: ReconstructionTuning = ReconstructionTuning(),
     device: torch.device = CPU,
 ) -> sfm.Job:
-    """Write the images and masks, and learned matches if those are wanted, into a
-    `folder`; the job that maps them.
+    """Write the images of the views and their matches outside the masks into a
+    `folder`; the job that maps them. Matches of `earlier` rounds are not found again.
     """
     names = [f"{v:05d}.png" for v in range(len(views.images))]
-    masks = [keypoint_mask(i, scale, tuning.matching.mask_margin_px) for i in views.ignore]
-    for name, image, mask in zip(names, views.images, masks, strict=True):
+    grays = []
+    for name, image in zip(names, views.images, strict=True):
         gray = sift_image(image, scale, level_contrast, tuning.matching)
         encode(folder / "images" / name, gray)
-        encode(folder / "masks" / f"{name}.png", mask)
-    pairs = view_pairs(views.groups, tuning.matching)
+        grays.append(zlib.crc32(gray.tobytes()))
+    keyframes = choose_keyframes(views.groups, tuning.keyframes)
+    pairs = pairs_to_match(views.groups, keyframes, tuning.matching, tuning.keyframes)
     named_pairs = [(names[a], names[b]) for a, b in pairs]
-    if matcher != "sift":
-        images = [upsample(image, scale) for image in views.images]
-        keypoints, matches = match_images(images, masks, pairs, matcher, tuning.lightglue, device)
-        sfm.write_matches(folder, names, keypoints, named_pairs, matches)
-    return sfm.Job(
+    job = sfm.Job(
         folder=str(folder),
         groups=[[names[v] for v in group] for group in views.groups],
         pairs=named_pairs,
         focal=default_focal(views.images.shape[2], tuning.rotation) * scale,
-        mapping="incremental",
+        task="match",
         threads=threads,
-        matches_given=matcher != "sift",
+        keyframes=[names[v] for v in keyframes],
         tuning=tuning.sfm,
     )
+    key = (f"{matcher} {level_contrast}", tuple(grays))
+    found = earlier.matches.get(key)
+    if found is None:
+        if matcher == "sift":
+            sfm.run_worker(job)
+            keypoints, matches = sfm.read_matches(folder, names, named_pairs)
+        else:
+            images = [upsample(image, scale) for image in views.images]
+            everywhere = [np.ones(image.shape[:2], np.uint8) for image in images]
+            keypoints, matches = match_images(
+                images, everywhere, pairs, matcher, tuning.lightglue, device
+            )
+        found = earlier.matches[key] = ViewMatches(keypoints, pairs, matches)
+    masks = [keypoint_mask(i, scale, tuning.matching.mask_margin_px) for i in views.ignore]
+    static = found.outside(masks)
+    sfm.write_matches(folder, names, static.keypoints, named_pairs, static.matches)
+    return job
 
 
 def has_plausible_lens(

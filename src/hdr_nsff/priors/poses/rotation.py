@@ -18,6 +18,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
+from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.poses.matching import (
     MatchingTuning,
@@ -179,7 +180,7 @@ def rotation_share(
 
 
 def fit_video(
-    video: np.ndarray,
+    video: ArrayStack,
     ignore: np.ndarray,
     matching: MatchingTuning,
     tuning: RotationTuning = RotationTuning(),

@@ -1,0 +1,57 @@
+"""Cuts: places where the picture changes to another scene from one frame to the next.
+
+Thumbnails of neighboring frames, at one brightness, are correlated. At a cut they are
+unlike, while those before it are alike, and those after it are too: a fast pan, a rig
+that takes frames in turn, and a single flash do not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import cv2
+import numpy as np
+
+from hdr_nsff.core.stack import ArrayStack
+
+
+@dataclass(frozen=True)
+class CutTuning:
+    """What counts as a cut (hand-chosen on recorded clips, joined and single)."""
+
+    thumbnail_px: int = 64  # width
+    max_correlation: float = 0.45  # of the two frames at a cut
+    min_correlation: float = 0.8  # of the frames before it, and of those after it
+    around: int = 2  # pairs of frames looked at before, and after
+    min_deviation: float = 0.02  # of gray: frames without contrast show no cut
+
+
+def find_cuts(video: ArrayStack, tuning: CutTuning = CutTuning()) -> list[int]:
+    """The first frames of new scenes, in `video` (T, H, W, 3) at one brightness."""
+    height, width = video.shape[1:3]
+    size = (tuning.thumbnail_px, max(2, round(tuning.thumbnail_px * height / width)))
+    thumbnails = [thumbnail(frame, size) for frame in video]
+    alike = np.array([correlation(a, b, tuning) for a, b in pairwise(thumbnails)])
+    cuts = []
+    for k, here in enumerate(alike):
+        before = alike[max(0, k - tuning.around) : k]
+        after = alike[k + 1 : k + 1 + tuning.around]
+        sides = np.concatenate([before, after])
+        if here < tuning.max_correlation and len(sides) and sides.min() > tuning.min_correlation:
+            cuts.append(k + 1)
+    return cuts
+
+
+def thumbnail(frame: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """A frame (H, W, 3) as a small gray picture of `size` (width, height)."""
+    gray = frame.mean(-1).astype(np.float32)
+    return np.asarray(cv2.resize(gray, size, interpolation=cv2.INTER_AREA))
+
+
+def correlation(a: np.ndarray, b: np.ndarray, tuning: CutTuning = CutTuning()) -> float:
+    """The correlation of two thumbnails, in [-1, 1]; 1 where one has no contrast."""
+    deviations = a.std() * b.std()
+    if min(a.std(), b.std()) < tuning.min_deviation:
+        return 1.0
+    return float(((a - a.mean()) * (b - b.mean())).mean() / deviations)
