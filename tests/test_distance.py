@@ -82,12 +82,10 @@ def test_growth_is_read_from_flow_whose_limbs_move_otherwise() -> None:
     back = (-0.04 / 1.04 * (pixels - center)).astype(np.float32)
     everywhere = np.ones((H, W), bool)
     region = (np.abs(X - W / 2) < 14) & (np.abs(Y - H / 2) < 14)
-    step = FlowStep(0, 1, flow, everywhere, back, everywhere)
-    growth = region_growth(step, region, region)
+    flows, valid = np.stack([flow, back]), np.stack([everywhere, everywhere])
+    growth = region_growth(FlowStep(0, 1, flows, valid, 0, 1), region, region)
     assert growth is not None and abs(growth - np.log(1.04)) < 0.004
-    assert (
-        region_growth(FlowStep(0, 1, flow, ~everywhere, back, everywhere), region, region) is None
-    )
+    assert region_growth(FlowStep(0, 1, flows, ~valid, 0, 1), region, region) is None
 
 
 def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None:
