@@ -75,6 +75,7 @@ def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
     tiny = ["--methods", "tiny", "--steps", 1]
     return {
         "run": ["run", footage, out],
+        "check": on_footage("check", footage, out),
         "prepare": ["prepare", footage, out],
         "train": training(scene, out, 1),
         "render": ["render", run, *small, "--out", out, *CPU],
@@ -86,6 +87,13 @@ def commands(run: Path, footage: Path, out: Path) -> dict[str, list[object]]:
         "finetune-flow": ["finetune-flow", out, *flow, *short, *often, *CPU],
         "bench": ["bench", out, "--scenes", scene, *tiny, *CPU],
     }
+
+
+def on_footage(verb: str, footage: Path, out: Path) -> list[object]:
+    """The command of a verb that reads footage."""
+    if verb == "check":
+        return ["check", footage, "--picture", out / "check.png"]
+    return [verb, footage, out]
 
 
 def reading(run: Path, out: Path) -> list[list[object]]:

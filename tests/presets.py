@@ -37,6 +37,7 @@ NETWORKS: dict[str, GridConfig | MlpConfig | SplatConfig | HexPlaneConfig] = {
     "splat": SplatConfig(static=400, moving=150, bases=2),
     "grid": GRID,
     "paper": MLP,
+    "paper-small": MLP,
     "tiny": GridConfig(finest=6.0, depth_cells=16, levels=2, max_rows=2**12),
     "nsff": GRID,
     "nsff-paper": MLP,

@@ -14,7 +14,18 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from bad_input import FOOTAGE_VERBS, FRAMES, Capture, call, clip, cut, recorded, refused, snapshot
+from bad_input import (
+    FOOTAGE_VERBS,
+    FRAMES,
+    Capture,
+    call,
+    clip,
+    cut,
+    on_footage,
+    recorded,
+    refused,
+    snapshot,
+)
 
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import encode, write_png
@@ -47,7 +58,7 @@ def test_missing_and_empty_footage(verb: str, tmp_path: Path, capsys: Capture) -
         ("empty", "no frames"),
         ("empty.mp4", "is empty"),
     ):
-        assert word in refused(capsys, verb, tmp_path / name, tmp_path / "out")
+        assert word in refused(capsys, *on_footage(verb, tmp_path / name, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
@@ -145,7 +156,7 @@ def test_footage_that_cannot_be_is_named(
     make, expected = FOOTAGE[what]
     footage = make(tmp_path / "ein clip ü")
     before = snapshot(tmp_path)
-    assert expected in refused(capsys, verb, footage, tmp_path / "out")
+    assert expected in refused(capsys, *on_footage(verb, footage, tmp_path / "out"))
     after = snapshot(tmp_path)
     assert all(after[p] == contents for p, contents in before.items())
     assert not list(tmp_path.rglob(".partial-*"))

@@ -29,7 +29,7 @@ from hdr_nsff.core.lock import absolute, acquire, release
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
     assert set(commands(Path("run"), Path("clip"), Path("out"))) == set(WORKING_VERBS)
-    assert {"run", "prepare", "reexpose"} == set(FOOTAGE_VERBS)
+    assert {"run", "check", "prepare", "reexpose"} == set(FOOTAGE_VERBS)
     assert {"render", "export", "evaluate", "report"} == set(RUN_VERBS)
 
 
@@ -101,11 +101,11 @@ def test_a_place_that_is_a_link_to_itself_is_named(
     assert "loop" in refused(capsys, *commands(run_folder, footage, out)[verb])
 
 
-# Two at once: `report` writes one file in one go and needs no lock
+# Two at once: `report` and `check` write one file in one go and need no lock
 
 
 @pytest.mark.usefixtures("flow_data")
-@pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v != "report"])
+@pytest.mark.parametrize("verb", [v for v in WORKING_VERBS if v not in ("report", "check")])
 def test_a_place_in_which_another_one_works_is_left_alone(
     verb: str, run_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:

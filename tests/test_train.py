@@ -26,12 +26,12 @@ from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.training import run_folder
-from hdr_nsff.training.budget import Budget, Clock, Schedule
+from hdr_nsff.training.budget import Budget, Clock, Schedule, minutes_for
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_log, snapshots
 from hdr_nsff.training.run_writer import RunWriter
-from hdr_nsff.training.train import Trainer, train
+from hdr_nsff.training.train import Trainer, train, with_budget
 
 STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
 
@@ -202,9 +202,12 @@ def test_a_finished_run_stays_finished(unbroken: Path, toy_folder: Path) -> None
     assert_same(before, final(unbroken))
 
 
-def test_neither_steps_nor_minutes_is_refused(toy_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--steps"):
-        train(replace(config(toy_folder, tmp_path / "run"), budget=Budget(minutes=None)))
+def test_without_steps_and_minutes_the_time_follows_the_clip(toy: Scene, toy_folder: Path) -> None:
+    open_budget = replace(config(toy_folder, Path("run")), budget=Budget())
+    assert with_budget(open_budget, toy).budget == Budget(minutes=5.0)
+    assert minutes_for(640 * 360, 65) > 10 and minutes_for(1920 * 1080, 300) == 30
+    given = replace(open_budget, budget=Budget(steps=7))
+    assert with_budget(given, toy) == given
 
 
 def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:

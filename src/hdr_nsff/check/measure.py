@@ -78,8 +78,10 @@ def measure_clip(
             break
         pictures.append(frame.rgb)
     if len(pictures) < MIN_FRAMES:
-        raise InputError(f"{clip}: {len(pictures)} frames; a clip has at least {MIN_FRAMES}")
+        count = f"{len(pictures)} frame{'s' * (len(pictures) != 1)}"
+        raise InputError(f"{clip}: {count} to look at; at least {MIN_FRAMES} are needed")
     video = np.stack(pictures)
+    ingest.check_frame_size(clip, video.shape[2], video.shape[1])
     nothing = exposure.all_clipped([exposure.extent(picture) for picture in video])
     if nothing is not None:
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
