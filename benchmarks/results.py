@@ -222,6 +222,30 @@ def bench_rise(document: Document) -> Lines:
     return table([*header, "steps", "minutes"], rows)
 
 
+def bench_scores_of_one(document: Document) -> Lines:
+    """One line per method on a single scene."""
+    rows = []
+    for run in document["results"]:
+        values = run["values"]
+        row = [f"`{run['method']}`", pair(values, "psnr", "psnr_moving")]
+        row += [number(values.get("ssim"), 3), pair(values, "mu5000", "mu5000_moving")]
+        rows.append([*row, number(values.get("depth_abs_rel"), 3)])
+    return table(["method", "PSNR", "SSIM", "HDR", "depth error"], rows)
+
+
+def prepare_cost(document: Document) -> Lines:
+    """One line per scene: processor seconds of the steps that cost most."""
+    steps = ("all", "flow", "poses", "static_depth", "refined_flow", "movers")
+    scenes = list(dict.fromkeys(row["scene"] for row in document["results"]))
+    rows = []
+    for scene in scenes:
+        found = {row["step"]: row for row in document["results"] if row["scene"] == scene}
+        size = f"{found['all']['frames']} of {found['all']['pixels']:,} pixels"
+        seconds = [number(found[step]["cpu_seconds"], 0) for step in steps]
+        rows.append([f"`{scene}`", size, *seconds, number(found["all"]["peak_memory_gb"], 2)])
+    return table(["clip", "frames", *steps, "peak GB"], rows)
+
+
 def sensitivity(document: Document) -> Lines:
     """One line per constant: its step's first error at half, as it is, and doubled."""
     rows = document["results"]
@@ -315,11 +339,18 @@ SECTIONS = (
     Section(
         "bench-paper-small-ablations",
         "Ablations of the paper at that size",
-        "The same scene in 2,500 steps, one part left out at a time, and both published "
-        "baselines.",
-        "hdr-nsff bench OUT --scenes interior --oracle --steps 2500 --methods "
+        "The same scene in 1,000 steps, a twelfth of the run above: one part left out at a time, "
+        "and both published baselines.",
+        "hdr-nsff bench OUT --scenes interior --oracle --steps 1000 --views 0 --methods "
         '"paper-small=paper-small --torch-threads 1,..."',
-        bench_rise,
+        bench_scores_of_one,
+    ),
+    Section(
+        "prepare",
+        "What preparing a clip costs",
+        "Processor seconds of the steps that cost most, and the peak memory of the process.",
+        "python benchmarks/cost.py SCENE ... --prepare --out benchmarks/results/prepare.json",
+        prepare_cost,
     ),
     Section(
         "bench-ablations",

@@ -84,7 +84,7 @@ class Trainer:
         self.ranks = ranks
         # steps after which terms are read: the host would wait for a GPU at every one
         self.read_every = 1 if device.type == "cpu" else LOG_EVERY
-        self.latest: torch.Tensor | None = None  # values of the last step's terms
+        self.latest: dict[str, torch.Tensor] = {}  # the last step's terms
         self.clock = Clock(config.budget, config.schedule, len(scene.train))
         self.field = build_field(config.field, scene)
         self.tonemapper = tone_mapper_for(config.tonemap, scene)
@@ -191,10 +191,10 @@ class Trainer:
             if self.poses:
                 terms |= self.poses.regularizers(batch.frame)
             log_due = (clock.step + 1) % LOG_EVERY == 0
-            self.latest = torch.stack([value.detach() for value in terms.values()])
+            self.latest = {name: value.detach() for name, value in terms.items()}
             values: dict[str, float] = {}
             if log_due or clock.step % self.read_every == 0:
-                values = dict(zip(terms, self.latest.tolist(), strict=True))
+                values = self.read_terms()
             check_finite(values, clock.step, batch, render.radiance)
             (self.objective.total(terms) / config.batches).backward()
             if log_due:
@@ -215,6 +215,13 @@ class Trainer:
         if "mse" in totals:
             totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
         return totals
+
+    def read_terms(self) -> dict[str, float]:
+        """The values of the last step's terms; the host waits once for all of them."""
+        if not self.latest:
+            return {}
+        values = torch.stack(list(self.latest.values())).tolist()
+        return dict(zip(self.latest, values, strict=True))
 
     def draw(self, slot: int) -> PixelBatch:
         """The batch of a slot of this step, with its recorder."""
@@ -238,8 +245,9 @@ class Trainer:
 
     def save(self, preview: bool = False) -> None:
         """Save a checkpoint, and a `preview` of the frame in the middle."""
-        if self.latest is not None and not bool(self.latest.isfinite().all()):
-            raise FloatingPointError(f"step {self.clock.step}: some terms are not finite")
+        wrong = [name for name, value in self.read_terms().items() if not math.isfinite(value)]
+        if wrong:
+            raise FloatingPointError(f"step {self.clock.step}: {', '.join(wrong)} not finite")
         self.writer.save_checkpoint(self.clock)
         if preview:
             middle = len(self.scene.train) // 2

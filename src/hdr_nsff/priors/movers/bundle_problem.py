@@ -311,15 +311,9 @@ class BundleProblem:
         by_pose, by_point, weight = self.jacobians(reprojection, state)
         weighted_pose = by_pose * weight[..., None]
         weighted_point = by_point * weight[..., None]
-        # matrix products over a long axis: einsum takes three times as long
-        pose_rows = by_pose.transpose(1, 0, 2, 3).reshape(num, 2 * count, 6)
-        weighted_rows = weighted_pose.transpose(1, 0, 2, 3).reshape(num, 2 * count, 6)
-        pose_blocks = weighted_rows.transpose(0, 2, 1) @ pose_rows
-        point_rows = by_point.reshape(count, 2 * num, 3)
-        points = weighted_point.reshape(count, 2 * num, 3).transpose(0, 2, 1) @ point_rows
-        x, y = 0, 1  # of the reprojection error
-        poses_points = weighted_pose[:, :, x, :, None] * by_point[:, :, x, None]
-        poses_points += weighted_pose[:, :, y, :, None] * by_point[:, :, y, None]
+        pose_blocks = np.einsum("ntij,ntik->tjk", weighted_pose, by_pose)
+        points = np.einsum("ntij,ntik->njk", weighted_point, by_point)
+        poses_points = np.einsum("ntij,ntik->ntjk", weighted_pose, by_point)
         pose_gradient = np.einsum("ntij,nti->tj", weighted_pose, reprojection.error)
         point_gradient = np.einsum("ntij,nti->nj", weighted_point, reprojection.error)
 
