@@ -339,8 +339,7 @@ SECTIONS = (
     Section(
         "bench-paper-small-ablations",
         "Ablations of the paper at that size",
-        "The same scene in 1,000 steps, a twelfth of the run above: one part left out at a time, "
-        "and both published baselines.",
+        "The same scene in 1,000 steps, a twelfth of the run above: one part left out at a time.",
         "hdr-nsff bench OUT --scenes interior --oracle --steps 1000 --views 0 --methods "
         '"paper-small=paper-small --torch-threads 1,..."',
         bench_scores_of_one,
