@@ -8,14 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from importlib import resources
-from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.exr import read_exr
 from hdr_nsff.synth import textures
 from hdr_nsff.synth.scenes.base import Part, Rigid, SynthScene
+from hdr_nsff.synth.scenes.cloth import sky
 from hdr_nsff.synth.scenes.geometry import look_at, rotation
 from hdr_nsff.synth.scenes.shapes import Builder, Mesh, cylinder, revolved, room, sphere
 
@@ -92,12 +90,6 @@ def camera_pose(t: float) -> np.ndarray:
     eye = [-0.75 + 0.8 * SPEED * t, -0.25 + 0.05 * np.sin(0.3 * t), 0.1 * np.sin(0.21 * t)]
     target = [-0.7 + 0.85 * SPEED * t, 0.25, 3.5]
     return look_at(np.array(eye) + shake, np.array(target) + 1.5 * shake[::-1])
-
-
-def sky() -> np.ndarray:
-    """Radiance (H, W, 3) from all around."""
-    with resources.as_file(resources.files("hdr_nsff.synth.scenes") / "sky.exr") as path:
-        return 0.6 * read_exr(Path(path))["RGB"]
 
 
 def build(seed: int) -> list[Part]:
