@@ -142,7 +142,7 @@ def pose_errors(scene: Scene, found: list[Frame]) -> dict[str, float]:
     twists = torch.cat([torch.from_numpy(turns), shifts], 1)  # (T, 6)
     metrics = torch.stack([visible_motion(frame, scene, unit) for frame in true])  # (T, 6, 6)
     roots = torch.linalg.cholesky(metrics).mT
-    basis = similarities(a[:, :, 3] / unit, turns_only=False).double()
+    basis = similarities(a[:, :, 3] / unit, rotations_only=False).double()
     basis = basis.view(-1, *twists.shape)  # (7, T, 6)
     columns = torch.einsum("tij,gtj->tig", roots, basis).flatten(0, 1)  # (6 T, 7)
     motion = torch.einsum("tij,tj->ti", roots, twists).flatten()

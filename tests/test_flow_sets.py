@@ -12,7 +12,12 @@ from mutations import check_reader
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
-from hdr_nsff.flow_training.flow_exposures import example, random_crop, random_curve, recorded_pair
+from hdr_nsff.flow_training.flow_exposures import (
+    random_crop,
+    random_curve,
+    record_middle_pair,
+    training_example,
+)
 from hdr_nsff.flow_training.flow_sets import Sample, flow_pairs, read_flo, read_pfm, read_sample
 
 H, W = 12, 16
@@ -168,16 +173,16 @@ def test_exposures_differ_by_the_requested_stops():
     """Around the median 2^-2.5 recorded at 0.18 in the middle, 4 EV apart: the halves
     of one ramp clip at different ends.
     """
-    dark, bright = recorded_pair(sample().radiance, 4, equal=False)
+    dark, bright = record_middle_pair(sample().radiance, 4, equal=False)
     assert (bright >= 0.999).all(-1).mean() > (dark >= 0.999).all(
         -1
     ).mean() + 0.3  # 4 EV of 11 saturate more: 36 %
-    same = recorded_pair(sample().radiance, 0, equal=False)
+    same = record_middle_pair(sample().radiance, 0, equal=False)
     assert np.abs(same[0] - same[1]).mean() < 0.02
 
 
 def test_equalizing_brings_pairs_closer_in_brightness():
-    raw, equal = (recorded_pair(sample().radiance, 4, e) for e in (False, True))
+    raw, equal = (record_middle_pair(sample().radiance, 4, e) for e in (False, True))
     assert np.abs(equal[0] - equal[1]).mean() < 0.3 * np.abs(raw[0] - raw[1]).mean()
 
 
@@ -199,7 +204,7 @@ def test_crops_scale_and_mirror_flow_with_the_pixels():
 
 
 def test_an_example_is_a_matter_of_its_seed():
-    draw = lambda seed: example(sample(), 4, (96, 128), np.random.default_rng(seed)).images  # noqa: E731
+    draw = lambda seed: training_example(sample(), 4, (96, 128), np.random.default_rng(seed)).images  # noqa: E731
     assert (draw(1) == draw(1)).all()
     assert not (draw(1) == draw(2)).all()
 

@@ -30,7 +30,12 @@ from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.config import TrainConfig
-from hdr_nsff.training.pose_corrections import PoseCorrections, moved, typical_depth, visible_motion
+from hdr_nsff.training.pose_corrections import (
+    PoseCorrections,
+    move_camera,
+    typical_depth,
+    visible_motion,
+)
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
@@ -85,7 +90,7 @@ def wrong(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = exact.write(tmp_path_factory.mktemp("wrong") / "scene")
     scene = Scene.open(folder)
     cameras = [
-        moved(f.camera, t, typical_depth(scene))
+        move_camera(f.camera, t, typical_depth(scene))
         for f, t in zip(scene.train, perturbed(scene), strict=True)
     ]
     return edited(folder, exact, c2w={i: c.c2w.tolist() for i, c in enumerate(cameras)})

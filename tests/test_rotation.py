@@ -7,9 +7,9 @@ from scipy.spatial.transform import Rotation
 from hdr_nsff.priors.poses.matching import PairMatches, detect_keypoints, match_pairs, view_pairs
 from hdr_nsff.priors.poses.rotation import (
     fit_panorama,
-    nearest_rotation,
     rotate_pixels,
     rotate_pixels_jacobian,
+    rotation_up_to_scale,
 )
 
 
@@ -51,6 +51,6 @@ def test_the_nearest_rotation_ignores_scale_sign_and_a_little_noise():
     turn = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
     noise = 1e-3 * np.random.default_rng(0).normal(size=(3, 3))
     for factor in (1.0, -4.0, 0.01):
-        found = nearest_rotation(factor * (turn + noise))
+        found = rotation_up_to_scale(factor * (turn + noise))
         assert np.allclose(found, turn, atol=3e-3)
         assert np.allclose(found @ found.T, np.eye(3)) and np.linalg.det(found) > 0

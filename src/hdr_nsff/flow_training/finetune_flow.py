@@ -35,7 +35,7 @@ from hdr_nsff.core.io import atomic, read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.flow_training.flow_exposures import Example, example, recorded_pair
+from hdr_nsff.flow_training.flow_exposures import Example, record_middle_pair, training_example
 from hdr_nsff.flow_training.flow_sets import FlowPair, flow_pairs, read_sample
 from hdr_nsff.priors.flow.networks import (
     FINETUNED,
@@ -298,7 +298,7 @@ def draw_example(
     """The example in a slot of the batch of a step."""
     rng = np.random.default_rng([config.seed, step, slot])
     sample = read_sample(pairs[rng.integers(len(pairs))])
-    return example(sample, config.stops, size, rng)
+    return training_example(sample, config.stops, size, rng)
 
 
 def stack_pairs(examples: list[Example], name: str) -> Tensor:
@@ -361,7 +361,7 @@ def measure_errors(network: FlowNetwork, pairs: list[FlowPair]) -> dict[str, dic
     for pair in track(pairs, "measure"):
         sample = read_sample(pair)
         for stops in MEASURED_EV:
-            pictures = recorded_pair(sample.radiance, stops, equal=True)
+            pictures = record_middle_pair(sample.radiance, stops, equal=True)
             flow = np.stack(predict_both_directions(network, *pictures))
             error = np.linalg.norm(flow - sample.flow, axis=-1)[sample.known]
             errors[f"{stops:g}"].append(error)

@@ -57,7 +57,7 @@ class PairCamera:
     noise: float  # relative to `Noise`
 
 
-def recorded_pair(radiance: np.ndarray, stops: float, equal: bool) -> np.ndarray:
+def record_middle_pair(radiance: np.ndarray, stops: float, equal: bool) -> np.ndarray:
     """A pair (2, H, W, 3) recorded `stops` EV apart by one fixed camera, to measure on.
 
     `radiance` (2, H, W, 3) is exposed around its own middle; `equal` brings both
@@ -68,7 +68,7 @@ def recorded_pair(radiance: np.ndarray, stops: float, equal: bool) -> np.ndarray
     return record_pair(radiance, camera, np.random.default_rng(0), equal)
 
 
-def example(
+def training_example(
     sample: Sample, stops: float, size: tuple[int, int], rng: np.random.Generator
 ) -> Example:
     """A random crop of a pair, recorded up to `stops` EV apart by a random camera.

@@ -110,16 +110,16 @@ def capture_part(work: Work, name: StepName) -> Any:
         case "exposure":
             known = asdict(capture.exposures) if capture.exposures else None
             return [capture.has_held_out, known, [(p.ev, p.bracket) for p in pictures]]
-        case "flow" if work.gives("flow"):
+        case "flow" if work.capture_with("flow"):
             named = [sorted(p.flow.items()) for p in pictures]
             return [[(to, ingest.hash_file(path)) for to, path in each] for each in named]
-        case "poses" if work.gives("poses") and (given := capture.poses) is not None:
+        case "poses" if work.capture_with("poses") and (given := capture.poses) is not None:
             points = None if capture.points is None else capture.points.tolist()
             cameras = [given.K.tolist(), given.c2w.tolist(), given.size.tolist()]
             return [*cameras, given.near, given.far, points]
-        case "masks" if work.gives("masks"):
+        case "masks" if work.capture_with("masks"):
             return [capture.is_static, capture.white_moves, files(lambda p: p.mask)]
-        case "static_depth" if work.gives("depth"):
+        case "static_depth" if work.capture_with("depth"):
             maps = [files(lambda p: p.depth), files(lambda p: p.confidence)]
             return [capture.depth_kind, capture.depth_units, *maps]
     return None

@@ -109,7 +109,7 @@ def report_data_set(work: Work) -> None:
     if capture is None:
         return
     parts: tuple[Part, ...] = ("poses", "flow", "masks", "depth")
-    given: list[str] = [part for part in parts if work.gives(part)]
+    given: list[str] = [part for part in parts if work.capture_with(part)]
     if capture.parts()["exposures"]:
         given.insert(0, "exposures")
     provided = ", ".join(given) or "pictures alone"

@@ -167,7 +167,7 @@ class Work:
         """Write the manifest."""
         self.manifest.save(self.folder)
 
-    def gives(self, part: Part) -> Capture | None:
+    def capture_with(self, part: Part) -> Capture | None:
         """The data set, if it gives that part and the settings let it.
 
         They may replace the part, or ask for an estimate.

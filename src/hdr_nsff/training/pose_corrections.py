@@ -111,7 +111,7 @@ class PoseCorrections(nn.Module):
         camera = replace(camera, K=camera.K + change * camera.K * FOCAL.to(camera.K))
         if correction is None:
             return camera
-        return moved(camera, self.twists()[correction], self.unit)
+        return move_camera(camera, self.twists()[correction], self.unit)
 
     def forward(self, batch: PixelBatch) -> PixelBatch:
         """The batch seen by its corrected camera, with corrected neighbors."""
@@ -163,7 +163,7 @@ class PoseCorrections(nn.Module):
         )
 
     @torch.no_grad()
-    def applied(self, scene: Scene) -> Scene:
+    def correct(self, scene: Scene) -> Scene:
         """The scene with corrected cameras, in its manifest as well.
 
         A held-out frame shares the factor of its K. Its pose is corrected only if the
@@ -198,7 +198,7 @@ def lens_key(f: Frame) -> tuple[float, ...]:
     return tuple(f.camera.K.flatten().tolist())
 
 
-def moved(camera: Camera, twist: Tensor, unit: float) -> Camera:
+def move_camera(camera: Camera, twist: Tensor, unit: float) -> Camera:
     """`camera` rotated about its center by `twist[:3]`, and shifted.
 
     The rotation is an axis-angle in radians and world axes; the shift is `twist[3:]` *
@@ -245,7 +245,7 @@ def visible_motion(f: Frame, scene: Scene, unit: float) -> Tensor:
     points = rays.origins + rays.directions / disparity[:, None]
 
     def project(twist: Tensor) -> Tensor:
-        return moved(f.camera, twist, unit).project(points)[0]
+        return move_camera(f.camera, twist, unit).project(points)[0]
 
     jacobian = torch.func.jacfwd(project)(torch.zeros(6))  # (P, 2, 6)
     in_widths = (jacobian / f.camera.width).double().flatten(0, 1)  # (P * 2, 6)
@@ -263,17 +263,17 @@ def roots(metric: Tensor) -> tuple[Tensor, Tensor]:
     return power(-0.5), power(0.5)
 
 
-def similarities(centers: Tensor, turns_only: bool) -> Tensor:
+def similarities(centers: Tensor, rotations_only: bool) -> Tensor:
     """An orthonormal basis (G, C * 6) of the twists that a similarity gives to cameras.
 
     The cameras are at `centers` (C, 3) in typical depths. A similarity is three
     rotations about their mean, three shifts and a scale, or the rotations alone if
-    `turns_only`.
+    `rotations_only`.
     """
     arms = (centers - centers.mean(0)).double()
     zeros = torch.zeros_like(arms)
     axes = [axis.expand_as(arms) for axis in torch.eye(3, dtype=torch.float64)]
-    if turns_only:
+    if rotations_only:
         twists = [torch.cat([axis, zeros], 1) for axis in axes]
     else:
         rotations = [torch.cat([axis, torch.linalg.cross(axis, arms)], 1) for axis in axes]

@@ -88,7 +88,7 @@ class Run:
         return Run(
             folder=folder,
             config=config,
-            scene=scene if poses is None else poses.applied(scene),
+            scene=scene if poses is None else poses.correct(scene),
             field=field.to(target).eval(),
             tonemapper=tonemapper.to(target).eval(),
             step=found.step,

@@ -110,7 +110,7 @@ def store_given_flow(work: Work, names: dict[Pair, FlowFiles]) -> set[Pair]:
     """Write the flow that a data set gives; the pairs it gives."""
     m = work.manifest
     found: set[Pair] = set()
-    if work.gives("flow") is None:
+    if work.capture_with("flow") is None:
         return found
     for (i, j), files in names.items():
         path = work.picture(m.frames[i]).flow.get(m.frames[j].source)
@@ -128,7 +128,7 @@ def flow_is_given(work: Work, i: int, j: int) -> bool:
     """
     if isinstance(work.config.flow, Path):
         return True
-    if work.gives("flow") is None:
+    if work.capture_with("flow") is None:
         return False
     a, b = work.manifest.frames[i], work.manifest.frames[j]
     return b.source in work.picture(a).flow or a.source in work.picture(b).flow

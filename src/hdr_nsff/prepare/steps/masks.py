@@ -23,7 +23,7 @@ def find_masks(work: Work) -> StepResult:
     held-out frames from all flow.
     """
     m, c = work.manifest, work.config
-    given = isinstance(c.masks, Path) or work.gives("masks") is not None
+    given = isinstance(c.masks, Path) or work.capture_with("masks") is not None
     if given:
         moving = given_masks(work)
     else:
@@ -54,7 +54,7 @@ def given_masks(work: Work) -> np.ndarray:
     """The moving masks (T, H, W) of a data set, or the user's, one file per frame in
     order; InputError where one is missing or of another size.
     """
-    m, folder, capture = work.manifest, work.config.masks, work.gives("masks")
+    m, folder, capture = work.manifest, work.config.masks, work.capture_with("masks")
     size = (m.height, m.width)
     masks = []
     if capture is not None:

@@ -31,12 +31,12 @@ def find_poses(work: Work) -> StepResult:
     """Cameras of all frames: a data set's, the user's, or by structure from motion."""
     m, c = work.manifest, work.config
     given = True
-    capture = work.gives("poses")
+    capture = work.capture_with("poses")
     if capture is not None and capture.poses is not None:
         poses = data_set_poses(work)
     elif c.poses is not None:
         poses = import_poses(c.poses, [f.source for f in m.frames], (m.height, m.width))
-    elif isinstance(c.masks, Path) or work.gives("masks") is not None:
+    elif isinstance(c.masks, Path) or work.capture_with("masks") is not None:
         poses, given = estimate(work, given_masks(work)), False
     else:
         poses, given = poses_and_masks(work), False

@@ -42,7 +42,7 @@ class Depth:
 def find_static_depth(work: Work) -> StepResult:
     """Disparity of the training frames and how far it can be believed."""
     m, c = work.manifest, work.config
-    if work.gives("depth") is not None:
+    if work.capture_with("depth") is not None:
         depth = data_set_depth(work)
     elif isinstance(c.depth, Path):
         depth = user_depth(work, c.depth)
@@ -84,7 +84,7 @@ def geometric_depth(work: Work) -> Depth:
 
 def data_set_depth(work: Work) -> Depth:
     """The depth of a data set."""
-    m, capture = work.manifest, work.gives("depth")
+    m, capture = work.manifest, work.capture_with("depth")
     assert capture is not None
     pictures = [work.picture(f) for f in work.train]
     disparity, confidence, how = maps.disparities(capture, pictures, (m.height, m.width))

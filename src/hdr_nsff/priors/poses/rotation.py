@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
+from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.priors.poses.matching import (
     MatchingTuning,
     PairMatches,
@@ -285,7 +286,7 @@ def chain_rotations(
     """
     K = np.array([[focal, 0, center[0]], [0, focal, center[1]], [0, 0, 1]])
     relative = {
-        (m.i, m.j): nearest_rotation(np.linalg.inv(K) @ h @ K)
+        (m.i, m.j): rotation_up_to_scale(np.linalg.inv(K) @ h @ K)
         for m, h in zip(pairs, homographies, strict=True)
     }  # R_j^T R_i
     i, j = np.array(list(relative)).T
@@ -304,12 +305,9 @@ def chain_rotations(
     return rotations, linked
 
 
-def nearest_rotation(matrix: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) nearest, in the Frobenius norm, to a matrix (3, 3) that is
-    known up to a factor: Kabsch's problem for the axes and the matrix's columns.
-    """
-    proper = matrix / np.cbrt(np.linalg.det(matrix))
-    return Rotation.align_vectors(proper.T, np.eye(3))[0].as_matrix()
+def rotation_up_to_scale(matrix: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) nearest to a `matrix` (3, 3) known up to a factor of any sign."""
+    return nearest_rotation(matrix / np.cbrt(np.linalg.det(matrix)))
 
 
 def rotate_pixels(
