@@ -13,6 +13,7 @@ from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import sam2_masks
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.masks.background import correct_by_background
 from hdr_nsff.priors.masks.geometric import geometric_mask
 
 
@@ -47,7 +48,13 @@ def estimated_masks(work: Work) -> np.ndarray:
     moving = geometric_mask(found[among], valid[among], pairs[among], video, K, c2w)
     if not train.all():
         moving[~train] = geometric_mask(found, valid, pairs, video, K, c2w)[~train]
-    return moving
+    if work.manifest.parallax == "full":
+        return moving
+    frames = work.manifest.frames
+    recorded_alike = np.unique(
+        [(f.camera_id, f.bracket) for f in frames], axis=0, return_inverse=True
+    )
+    return correct_by_background(moving, video, recorded_alike[1].ravel(), train, K, c2w)
 
 
 def given_masks(work: Work) -> np.ndarray:

@@ -306,7 +306,7 @@ def chain_rotations(
 
 
 def rotation_up_to_scale(matrix: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) nearest to a `matrix` (3, 3) known up to a factor of any sign."""
+    """The rotation (3, 3) nearest to a `matrix` (3, 3) up to a factor."""
     return nearest_rotation(matrix / np.cbrt(np.linalg.det(matrix)))
 
 
