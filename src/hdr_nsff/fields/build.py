@@ -21,6 +21,7 @@ from hdr_nsff.fields.splat import cuda_backends
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import count_local_pixels
+from hdr_nsff.fields.splat.shutter import shutter_for
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
 
@@ -54,7 +55,9 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
         local_pixels = count_local_pixels(scene)
         if config.moving is None and not any(mover.rigid for mover in scene.movers):
             config = replace(config, moving=0)  # there is nothing for them to draw
-        return Splat(config, scene.times, near, far, m.width * m.height, local_pixels)
+        shutter = shutter_for(config.readout, config.shutter, m.fps, scene.response.ev.tolist())
+        num_pixels = m.width * m.height
+        return Splat(config, scene.times, near, far, num_pixels, local_pixels, shutter)
     space = build_space([f.camera for f in scene.train], near, far)
     match config:
         case NSFFConfig():

@@ -77,6 +77,12 @@ class SplatConfig:
     """
     radiance: Literal["exp", "sigmoid"] = "exp"
     """Unbounded radiance, or one below 1."""
+    readout: Annotated[float, Ge(0), Le(1000)] = 0.0
+    """Milliseconds from the first row to the last of a rolling shutter."""
+    shutter: Annotated[float, Ge(0), Le(1)] = 0.0
+    """Share of a frame's time for which the shutter is open at the brightest exposure;
+    at others, made by the shutter alone, it is open for less. 0: no motion blur.
+    """
     relocate_every: Advanced[Number] = 200
     """Steps after which unseen Gaussians are moved to where the picture is wrong (0:
     never).

@@ -16,9 +16,12 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import START_LOG_SCALE, START_LOGIT, to_radiance
 
 MIN_WINDOW = 0.02  # below this share of its opacity, a Gaussian is not alive: 2.8 durations
+VELOCITY_SHARE = 0.1  # learning rate of velocities per frame relative to positions
 NUM_NEIGHBORS = 4  # whose velocities are compared
 # scene lengths (in units of the near depth) that count as far as one frame, for
 # neighbors in space and time
@@ -68,6 +71,24 @@ class LocalGaussians(nn.Module):
         for name in self.table_names():
             table = getattr(self, name)
             table[target] = table[source]
+
+    def param_groups(self, config: SplatConfig, unit: float) -> list[ParamGroup]:
+        """One group for every table; `unit` is the scene's typical length."""
+        rates = {
+            "means": config.position_lr * unit,
+            "velocities": VELOCITY_SHARE * config.position_lr * unit,
+            "quaternions": config.shape_lr,
+            "log_scales": config.shape_lr,
+            "colors": config.color_lr,
+        }
+        return [
+            ParamGroup(
+                [getattr(self, name)],
+                config.lr * rate,
+                row_marks=[getattr(self, f"{name}_touched")],
+            )
+            for name, rate in rates.items()
+        ]
 
     # At a time
 

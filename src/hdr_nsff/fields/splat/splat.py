@@ -25,6 +25,7 @@ from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radian
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import LocalScores, relocate
+from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
 from hdr_nsff.fields.splat.trajectories import Trajectories
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
@@ -37,7 +38,6 @@ MIN_ALPHA = 1e-3  # of a pixel: below, it has no depth of its own
 MIN_DEPTH_SHARE = 1e-3  # of `near`: the least z-depth that a pixel gets
 MAX_FLOW = 2.0  # picture widths: keeps the flow of Gaussians near the camera finite
 COLOR_OFFSET_SHARE = 0.01  # weight of color offsets relative to their changes in time
-VELOCITY_SHARE = 0.1  # learning rate of velocities per frame relative to positions
 ADAM_EPS = 1e-15  # as 3D Gaussian splatting has it (Kerbl et al. 2023)
 
 
@@ -46,7 +46,8 @@ class Splat(nn.Module):
 
     `times` (T,) are the training times; `near` and `far` are z-depths in scene units,
     and `near` is the scene's typical length; frames have `num_pixels`, and movers that
-    are not rigid `local_pixels` in all of them.
+    are not rigid `local_pixels` in all of them. Training frames see what the `shutter`
+    lets them see; None: each a moment.
     """
 
     times: Tensor
@@ -60,8 +61,10 @@ class Splat(nn.Module):
         far: float,
         num_pixels: int,
         local_pixels: int = 0,
+        shutter: Shutter | None = None,
     ) -> None:
         super().__init__()
+        self.shutter = shutter
         self.config, self.unit = config, near
         self.near, self.far = near, far
         self.host_times = times.double()  # reading the buffer would wait for a GPU
@@ -247,7 +250,7 @@ class Splat(nn.Module):
         alive = self.alive(knot)
         cloud = self.cloud(knot, alive)
         flows = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
-        render, drawn = self.composite(self.draw(batch.camera, cloud, flows))
+        render, drawn = self.composite(self.expose(batch, cloud, alive, flows))
         # features are premultiplied by opacity
         flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
         certain = torch.ones_like(render.opacity)
@@ -262,6 +265,27 @@ class Splat(nn.Module):
         if not batch.whole:
             render = select_pixels(render, batch.camera, batch.pixels)
         return render, terms
+
+    def expose(
+        self, batch: PixelBatch, cloud: GaussianCloud, alive: Tensor, extra: list[Tensor]
+    ) -> Maps:
+        """What the batch's frame sees of the `cloud`, with `extra` features (G, ...).
+
+        `alive` (A,) are the time-local ones in it.
+        """
+
+        def draw(means: Tensor) -> Maps:
+            return self.draw(batch.camera, replace(cloud, means=means), extra)
+
+        if self.shutter is None or not batch.neighbors:
+            return draw(cloud.means)
+        neighbors = []
+        for offset in sorted(batch.neighbors):
+            knot = self.knot(batch.time) + offset
+            points = self.positions(knot, alive).detach()
+            neighbors.append((batch.neighbors[offset], points, self.time(knot)))
+        motion = apparent_motion(batch.camera, neighbors, cloud.means, batch.time)
+        return Maps(*self.shutter.expose(draw, batch.camera, cloud.means, motion, batch.bracket))
 
     @staticmethod
     def choose_neighbor(batch: PixelBatch) -> list[int]:
@@ -362,26 +386,7 @@ class Splat(nn.Module):
             config.lr * config.pose_lr,
             row_marks=[t.rotations_touched, t.translations_touched],
         )
-        return [*groups, poses, *self.local_groups()]
-
-    def local_groups(self) -> list[ParamGroup]:
-        """One group for every table of the time-local Gaussians."""
-        config, local = self.config, self.local
-        rates = {
-            "means": config.position_lr * self.unit,
-            "velocities": VELOCITY_SHARE * config.position_lr * self.unit,
-            "quaternions": config.shape_lr,
-            "log_scales": config.shape_lr,
-            "colors": config.color_lr,
-        }
-        return [
-            ParamGroup(
-                [getattr(local, name)],
-                config.lr * rate,
-                row_marks=[getattr(local, f"{name}_touched")],
-            )
-            for name, rate in rates.items()
-        ]
+        return [*groups, poses, *self.local.param_groups(config, self.unit)]
 
     # Relocation
 

@@ -1,0 +1,82 @@
+"""Rolling shutters and motion blur against renders at the time of each row."""
+
+import math
+
+import pytest
+import torch
+from test_splat import BESIDE, CAMERA, STEP, batch_of, card_field
+from torch import Tensor
+
+from hdr_nsff.fields.splat.shutter import (
+    MAX_RENDERS,
+    Shutter,
+    apparent_motion,
+    open_times,
+    row_times,
+    shutter_for,
+)
+
+TIME = 4
+
+
+def trained_picture(shutter: Shutter | None) -> Tensor:
+    """What a training frame of the moving card sees, (H, W, 3)."""
+    field = card_field()
+    field.shutter = shutter
+    batch = batch_of(TIME, 1)
+    batch.neighbors.update({1: CAMERA, -1: CAMERA})
+    return field(batch)[0].radiance.detach().reshape(CAMERA.height, CAMERA.width, 3)
+
+
+def picture(time: float) -> Tensor:
+    return card_field().render(CAMERA, time).radiance.reshape(CAMERA.height, CAMERA.width, 3)
+
+
+def test_every_row_is_of_its_own_time() -> None:
+    readout = 0.9
+    rolled = trained_picture(Shutter(readout))
+    rows = [readout * ((y + 0.5) / CAMERA.height - 0.5) for y in range(CAMERA.height)]
+    exact = torch.stack([picture(TIME + t)[y] for y, t in enumerate(rows)])
+    assert (rolled - exact).abs().mean() < 0.25 * (picture(TIME) - exact).abs().mean()
+
+
+def test_blur_is_the_mean_over_the_time_of_the_open_shutter() -> None:
+    blurred = trained_picture(Shutter(open=(0.8,)))
+    moments = [TIME + 0.8 * ((k + 0.5) / 40 - 0.5) for k in range(40)]
+    exact = torch.stack([picture(t) for t in moments]).mean(0)
+    assert (blurred - exact).abs().mean() < 0.25 * (picture(TIME) - exact).abs().mean()
+
+
+def test_no_shutter_and_a_moment_are_the_same() -> None:
+    assert torch.equal(trained_picture(None), trained_picture(Shutter(0.0, (0.0,))))
+
+
+def test_the_cameras_motion_counts_as_that_of_points() -> None:
+    points = torch.tensor([[0.0, 0, 2], [0.3, 0.1, 4]])
+    motion = apparent_motion(CAMERA, [(BESIDE, points + STEP, 5.0)], points, 4.0)
+    there = BESIDE.project(points + STEP)[0]
+    torch.testing.assert_close(CAMERA.project(points + motion)[0], there)
+    both = [(CAMERA, points - STEP, 3.0), (CAMERA, points + STEP, 5.0)]
+    torch.testing.assert_close(apparent_motion(CAMERA, both, points, 4.0), STEP.expand(2, 3))
+
+
+def test_rows_are_read_from_the_first_to_the_last() -> None:
+    rows = torch.tensor([0.0, CAMERA.height / 2, CAMERA.height])
+    y = (rows - CAMERA.K[1, 2]) / CAMERA.K[1, 1]
+    points = torch.stack([torch.zeros(3), y, torch.ones(3)], -1)
+    assert row_times(CAMERA, points, 0.5).tolist() == pytest.approx([-0.25, 0.0, 0.25])
+
+
+def test_as_many_renders_as_pixels_of_blur() -> None:
+    points = torch.tensor([[0.0, 0, 1]])
+    for pixels, count in ((0.4, 1), (1.5, 2), (3.2, 4), (50.0, MAX_RENDERS)):
+        motion = torch.tensor([[pixels / 60, 0, 0]])
+        times = open_times(CAMERA, points, motion, 1.0)
+        assert len(times) == count and math.isclose(sum(times), 0, abs_tol=1e-9)
+    assert open_times(CAMERA, points, motion, 0.0) == [0.0]
+
+
+def test_exposures_shorten_the_shutter_and_nothing_is_nothing() -> None:
+    assert shutter_for(0.0, 0.0, 24.0, [0.0, -2.0]) is None
+    shutter = shutter_for(20.0, 0.5, 25.0, [-2.0, 0.0, -4.0])
+    assert shutter == Shutter(0.5, (0.125, 0.5, 0.03125))
