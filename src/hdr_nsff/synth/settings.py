@@ -49,6 +49,14 @@ class SynthConfig:
     """Gains of red, green and blue before the response."""
     vignetting: float = 0.0
     """Fall-off of light towards the corners: 1 is the cos^4 law of a simple lens."""
+    readout: float = 0.0
+    """Milliseconds from the first row to the last of a rolling shutter. The truth has
+    none.
+    """
+    shutter: float = 0.0
+    """Share of a frame's time for which the shutter is open at the brightest exposure,
+    which blurs what moves. The truth is sharp.
+    """
     noise: float = 1.0
     """Noise relative to that of a small sensor; 0 is a perfect one."""
     spp: int | None = None
@@ -86,6 +94,11 @@ def check(config: SynthConfig, min_paths: int) -> None:
     c = config
     if not 0 <= c.vignetting <= 1:
         raise InputError(f"--vignetting {c.vignetting}: choose from 0 (none) to 1 (the cos^4 law)")
+    if not (0 <= c.readout <= 1000 and 0 <= c.shutter <= 1):
+        raise InputError(
+            f"--readout {c.readout} --shutter {c.shutter}: choose 0 to 1000 milliseconds, "
+            "and 0 (a moment) to 1 (open all the time)"
+        )
     if not MIN_FRAMES <= c.frames <= MAX_FRAMES:
         raise InputError(
             f"--frames {c.frames}: choose from {MIN_FRAMES} to {MAX_FRAMES}; "

@@ -58,12 +58,14 @@ from hdr_nsff.synth.settings import (
     parse_white_balance,
     sensor_noise,
 )
+from hdr_nsff.synth.shutter import BANDS, exposures, trace_exposure
 from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 
 __all__ = ["SynthConfig", "synth"]
 
 VIDEO_FPS = DEFAULT_FPS  # of all videos
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
+SEEN = ("seen.red", "seen.green", "seen.blue")  # radiance through the shutter
 TRACED_HEADER = {"chromaticities": REC709}  # Mitsuba's rgb variants are linear Rec. 709
 
 
@@ -112,6 +114,8 @@ def claim(config: SynthConfig) -> None:
     something else.
     """
     key = {name: getattr(config, name) for name in ("size", "frames", "spp", "truth_spp", "seed")}
+    if config.readout or config.shutter:
+        key |= {"readout": config.readout, "shutter": config.shutter, "ev": config.ev}
     if config.views != "mono":
         key["views"] = config.views
     if config.name != "interior":
@@ -141,17 +145,23 @@ def render(
         return
     scene = SCENES[config.name]
     tracer = Tracer(scene, config.seed, config.variant)
-    seconds = estimate_seconds(tracer, missing, K, size)
+    renders = BANDS if config.readout else 1
+    seconds = estimate_seconds(tracer, missing, K, size, renders)
     say(
         f"{config.name}: {len(missing)} pictures of {size[0]}x{size[1]} to trace, "
         f"about {seconds / 60:.1f} minutes"
     )
+    shutters = exposures(config.readout, config.shutter, parse_ev(str(config.ev)), VIDEO_FPS)
     spent: dict[int, list[float]] = defaultdict(list)  # seconds per picture, by its spp
     for view in track(missing, "path tracing"):
         start = clock.monotonic()
         surface = tracer.surface(view.time, K, view.c2w, size)
         channels = geometry_channels(scene, surface, view, K, config.views)
         channels["RGB"] = tracer.radiance(view.time, K, view.c2w, size, view.spp, view.seed)
+        if shutters is not None and view.name.startswith("clip"):
+            shutter = shutters[view.anchor % len(shutters)]
+            seen = trace_exposure(tracer, scene, view, K, size, config.views, shutter)
+            channels |= {name: seen[..., k] for k, name in enumerate(SEEN)}
         write_exr(exact_path(config.out, view), channels, TRACED_HEADER, half=False)
         spent[view.spp].append(clock.monotonic() - start)
     costs = [
@@ -163,10 +173,11 @@ def render(
 
 
 def estimate_seconds(
-    tracer: Tracer, views: list[TracedView], K: np.ndarray, size: tuple[int, int]
+    tracer: Tracer, views: list[TracedView], K: np.ndarray, size: tuple[int, int], renders: int = 1
 ) -> float:
     """How many seconds the pictures will take, from the first of them with one path per
-    pixel and with as many as are traced at once.
+    pixel and with as many as are traced at once. Frames of the clip are traced
+    `renders` times more.
     """
     view = views[0]
     many = min(PASS_SPP, view.spp)
@@ -177,7 +188,8 @@ def estimate_seconds(
         taken.append(clock.monotonic() - start)
     _, one_path, many_paths = taken
     per_path = max(0.0, many_paths - one_path) / max(1, many - 1)
-    return sum(one_path + per_path * (v.spp - 1) for v in views)
+    times = [1 + (renders if renders > 1 and v.name.startswith("clip") else 0) for v in views]
+    return sum(n * (one_path + per_path * (v.spp - 1)) for n, v in zip(times, views, strict=True))
 
 
 def geometry_channels(
@@ -222,7 +234,10 @@ def record_clip(
     video = []
     for t, view in enumerate(clip):
         rng = np.random.default_rng([config.seed, t])
-        radiance = exact(config.out, view)["RGB"]
+        channels = exact(config.out, view)
+        radiance = channels["RGB"]
+        if SEEN[0] in channels:
+            radiance = np.stack([channels[name] for name in SEEN], -1)
         height, width = radiance.shape[:2]
         transmission = vignette(height, width, K, config.vignetting)
         ev = relative[t % len(relative)]
