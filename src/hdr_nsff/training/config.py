@@ -65,7 +65,7 @@ class TrainConfig:
     """Share of the run after which response and exposures are held where they are (1:
     never), unless static points determined them: then at once.
     """
-    from_priors: bool = True
+    from_priors: Advanced[bool] = True
     """Start the field from the depth prior and the recorded colors."""
     refine_poses: bool = False
     """Learn small corrections of the training cameras: poses and focal length."""
@@ -83,7 +83,7 @@ class TrainConfig:
     """Form the terms as the reference does: both neighbors add up, depth is compared up
     to scale and shift whatever the prior, and errors of flow have no upper limit.
     """
-    bf16: bool = False
+    bf16: Advanced[bool] = False
     """Network layers in bfloat16 (matters for `paper` only)."""
     seed: Annotated[int, Ge(0), Le(MAX_SEED)] = 0
     device: str = "auto"

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Le
+from tyro.conf import arg
 
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Weight
 
@@ -54,13 +55,12 @@ class SplatConfig:
     static: Annotated[int, Ge(1), Le(10**8)] | None = None
     """Static Gaussians; default: 0.55 for every pixel of a frame, at most 80,000."""
     moving: Annotated[int, Ge(0), Le(10**8)] | None = None
-    """Moving Gaussians, for rigid movers; default: 0.15 for every pixel of a frame, at
-    most 20,000; none where no mover is rigid.
+    """Moving Gaussians, for rigid movers; default: 0.15 for every pixel of a frame, or
+    none.
     """
     local: Annotated[int, Ge(0), Le(10**8)] | None = None
     """Time-local Gaussians, for movers that are not rigid; default: one for every two
-    of their pixels in all frames, at most 0.03 for every pixel of every frame, 4,000
-    for every frame, and 400,000.
+    of their pixels in all frames, at most 400,000.
     """
     bases: Count = 6
     """Shared rigid motions that the moving ones mix."""
@@ -72,17 +72,13 @@ class SplatConfig:
     """Times at which a moving Gaussian has an opacity of its own, to appear and vanish.
     """
     view_dependence: bool = False
-    """Let colors change with the direction of view (to first order, in log radiance),
-    for shiny objects seen from many sides.
-    """
-    radiance: Literal["exp", "sigmoid"] = "exp"
+    """Let colors change with the direction of view, for shiny objects."""
+    radiance: Advanced[Literal["exp", "sigmoid"]] = "exp"
     """Unbounded radiance, or one below 1."""
-    readout: Annotated[float, Ge(0), Le(1000)] = 0.0
-    """Milliseconds from the first row to the last of a rolling shutter."""
-    shutter: Annotated[float, Ge(0), Le(1)] = 0.0
-    """Share of a frame's time for which the shutter is open at the brightest exposure;
-    at others, made by the shutter alone, it is open for less. 0: no motion blur.
-    """
+    readout: Annotated[float, Ge(0), Le(1000), arg(aliases=("--readout",))] = 0.0
+    """Milliseconds from a rolling shutter's first row to its last."""
+    shutter: Annotated[float, Ge(0), Le(1), arg(aliases=("--shutter",))] = 0.0
+    """Motion blur: share of a frame's time that the brightest exposure takes."""
     relocate_every: Advanced[Number] = 200
     """Steps after which unseen Gaussians are moved to where the picture is wrong (0:
     never).
