@@ -12,6 +12,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.pose_files import fit_poses, import_poses
 from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.prepare.lens import DistortedFramesError, lens_to_find
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.work import Work
@@ -101,15 +102,27 @@ def poses_and_masks(work: Work) -> Poses:
 
 def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = None) -> Poses:
     """Poses by structure from motion on equalized frames, without pixels that are
-    `moving` (T, H, W) bool; what `earlier` rounds found is used again.
+    `moving` (T, H, W) bool; what `earlier` rounds found is used again. DistortedFramesError where
+    the frames turn out to be distorted.
     """
     video, clipped = work.equalized
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
     matcher, device = work.config.matcher, pick_device(work.config.device)
-    return estimate_poses(
-        video, moving, folder, clipped, cameras, matcher=matcher, device=device, earlier=earlier
+    poses = estimate_poses(
+        video,
+        moving,
+        folder,
+        clipped,
+        cameras,
+        matcher=matcher,
+        device=device,
+        earlier=earlier,
+        lens=lens_to_find(work),
     )
+    if poses.lenses:
+        raise DistortedFramesError(poses.lenses)
+    return poses
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")
