@@ -7,11 +7,15 @@ finds is known only later, so the steps before start over (`DistortedFramesError
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.pose_files import locate, read_given
+from hdr_nsff.footage.pose_formats import common_lens, distorted
 from hdr_nsff.geometry.lens import Lens, undistorted_picture
-from hdr_nsff.prepare.work import PrepareConfig, Work
+from hdr_nsff.prepare.work import Part, PrepareConfig, Work
 from hdr_nsff.priors.poses.lens import LensChoice
 from hdr_nsff.scene.manifest import LensEntry, Manifest
 
@@ -51,6 +55,34 @@ def known_lenses(found: Manifest, config: PrepareConfig) -> dict[int, LensEntry]
     if choice == "auto":
         return {c: entry for c, entry in found.lens.items() if not entry.given}
     return {c: e for c, e in found.lens.items() if e.given and tuple(e.distortion[:2]) == choice}
+
+
+def given_lenses(work: Work) -> dict[int, LensEntry]:
+    """The lenses that come with given poses: theirs, or that of the settings with their
+    focal length. Empty where poses are not given, or nothing is distorted.
+    """
+    choice = parse_lens(work.config.lens_distortion)
+    capture, path = work.gives("poses"), work.config.poses
+    if capture is not None and capture.poses is not None:
+        path, given = capture.root, capture.poses
+    elif path is not None:
+        path = locate(path)
+        given, _ = read_given(path)
+    else:
+        return {}
+    if choice == "none":
+        return {}
+    if choice != "auto":
+        given = replace(given, distortion=np.tile([*choice, 0.0, 0.0], (len(given.K), 1)))
+    lens = common_lens(path, given)
+    if lens is None:
+        return {}
+    other_parts: tuple[Part, ...] = ("flow", "masks", "depth")
+    with_maps = any(work.gives(part) for part in other_parts)
+    if with_maps or (work.capture is not None and work.capture.has_held_out):
+        raise distorted(path, lens.max_displacement_px())
+    entry = LensEntry.of(lens, given=True)
+    return {camera_id: entry for camera_id in range(len(work.footage.cameras))}
 
 
 def lens_to_find(work: Work) -> LensChoice:

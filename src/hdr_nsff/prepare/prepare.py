@@ -23,7 +23,13 @@ from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.prepare.engine import Step, all_have, run_step
-from hdr_nsff.prepare.lens import DistortedFramesError, describe, known_lenses, parse_lens
+from hdr_nsff.prepare.lens import (
+    DistortedFramesError,
+    describe,
+    given_lenses,
+    known_lenses,
+    parse_lens,
+)
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.depth import find_depth
 from hdr_nsff.prepare.steps.flow import find_flow
@@ -110,7 +116,9 @@ def begin(config: PrepareConfig) -> Work:
         found.lens = known_lenses(found, config) if found.inputs == inputs else {}
         found.source = str(config.clip)
         found.inputs = inputs
-        return Work(config, footage, found, capture)
+        work = Work(config, footage, found, capture)
+        found.lens |= given_lenses(work)
+        return work
     start = config.start
     first = next(ingest.read_frames(footage, start, start + 1, 1, config.max_size), None)
     if first is None:
@@ -118,6 +126,7 @@ def begin(config: PrepareConfig) -> Work:
     height, width = first.rgb.shape[:2]
     manifest = Manifest(source=str(config.clip), inputs=inputs, width=width, height=height)
     work = Work(config, footage, manifest, capture)
+    manifest.lens = given_lenses(work)
     work.save()
     return work
 
