@@ -24,7 +24,9 @@ def test_a_recorded_pixel_shows_what_lies_on_its_bent_ray():
     rays = camera_rays(pixel_centers(WIDE.height, WIDE.width), K)[..., :2]
     pixels = pixel_centers(H, W)
     bent = LENS.bend(SEEN.distort(rays))  # the picture of rays, as the lens records it
-    assert np.abs(bent - camera_rays(pixels, LENS.K)[..., :2]).max() < 1e-3  # a sixteenth of a pixel
+    assert (
+        np.abs(bent - camera_rays(pixels, LENS.K)[..., :2]).max() < 1e-3
+    )  # a sixteenth of a pixel
     assert (WIDE.width, WIDE.height) > (W, H) and SEEN.view.time == 1.5
 
 

@@ -121,7 +121,9 @@ def test_a_pixel_through_a_lens_has_the_radiance_of_its_bent_ray(monkeypatch) ->
     view = TracedView("clip_00000", 0.0, np.eye(4)[:3], spp=4, seed=0, anchor=0)
     seen = lens_radiance(view, lens, Path("unused"))[..., :2] - 1
     pixels = pinhole.pixel_centers(48, 64)
-    assert np.abs(lens.bend(seen) - pinhole.camera_rays(pixels, K)[..., :2]).max() < 1e-3  # a sixteenth of a pixel
+    assert (
+        np.abs(lens.bend(seen) - pinhole.camera_rays(pixels, K)[..., :2]).max() < 1e-3
+    )  # a sixteenth of a pixel
 
 
 def test_scenes_do_not_mix_in_a_folder_and_are_exposed_as_suits_them(flat: SynthConfig) -> None:

@@ -32,6 +32,7 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.manifest import bracket_problem
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.curve import knot_positions
 
 LN2 = math.log(2.0)
@@ -177,6 +178,11 @@ class ToneMapper(nn.Module, ABC):
         """Start where `prepare` estimated the response."""
 
     # What everything else uses
+
+    def start_vignetting(self, scene: Scene) -> None:
+        """Start the fall-off towards the corners, after `start`, at what static points of
+        a scene show; only the shared kind learns one.
+        """
 
     def forward(
         self,

@@ -11,12 +11,14 @@ from torch import Tensor, nn
 
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import curve
 from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper
 from hdr_nsff.tonemap.curve import GAMMA
 from hdr_nsff.tonemap.kernel import bin_table
 from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
 from hdr_nsff.tonemap.vignetting import Vignetting
+from hdr_nsff.tonemap.vignetting_start import start_vignetting
 
 
 class BracketGain(nn.Module):
@@ -158,6 +160,10 @@ class SharedToneMapper(BracketedToneMapper):
         if config.vignetting and recordings.corners:
             self.vignetting = Vignetting(recordings.corners)
             self.register_load_state_dict_pre_hook(without_vignetting)
+
+    def start_vignetting(self, scene: Scene) -> None:
+        if self.vignetting is not None:
+            start_vignetting(self.vignetting, self, scene)
 
     def shade(
         self, radiance: Tensor, camera: Camera, camera_id: int, pixels: Tensor | None = None
