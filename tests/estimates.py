@@ -93,9 +93,11 @@ def tone_mapper(
     ev: list[float | None],
     reference: int = 0,
     num_cameras: int | None = None,
+    corners: tuple[float, ...] = (),
     **config,
 ) -> ToneMapper:
     """A tone mapper of the kind and settings in `config`, for frames as given."""
     count = num_cameras or max(cameras, default=0) + 1
-    recordings = Recordings(tuple(brackets), tuple(cameras), tuple(ev), reference, count)
+    frames = tuple(brackets), tuple(cameras)
+    recordings = Recordings(*frames, tuple(ev), reference, count, corners=corners)
     return build_tone_mapper(ToneMapConfig(**config), recordings)

@@ -1,6 +1,7 @@
 """`synth`: footage, truth and oracle fit together; a killed run continues."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.video import read_video
 from hdr_nsff.footage.exposure_lists import read_exposure_csv
 from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.geometry import pinhole
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import pixel_centers, project
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.scene.scene import Scene
@@ -23,8 +26,8 @@ from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
-from hdr_nsff.synth.synth import synth
-from hdr_nsff.synth.views import clip_views, held_out_views
+from hdr_nsff.synth.synth import lens_canvas, lens_radiance, synth
+from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 
 
 def test_exposures_alternate_about_the_middle_bracket(flat: SynthConfig) -> None:
@@ -100,6 +103,27 @@ def test_the_cameras_settings_are_in_the_truth_and_in_the_recording(flat: SynthC
         recorded = read_image(flat.out / "clip" / f"{bracket:05d}.png")
         np.testing.assert_allclose(recorded, pictures[bracket], atol=0.51 / 255)
     assert pictures[1][8, 8, 1] > pictures[1][0, 0, 1] + 0.02  # darker in the corner
+
+
+def test_a_lens_is_in_the_recording_and_not_in_the_held_out_views(flat: SynthConfig) -> None:
+    synth(replace(flat, oracle=False))
+    synth(replace(flat, oracle=False, lens="-0.1"))
+    assert Flat.rendered == 12 + 16 + 12  # wider pictures of the clip alone
+    assert Truth.open(flat.out / "truth").lens == [-0.1, 0]
+
+
+def test_a_pixel_through_a_lens_has_the_radiance_of_its_bent_ray(monkeypatch) -> None:
+    K = pinhole.intrinsics(60.0, 64, 48)
+    lens = Lens(K, (-0.1, 0.0, 0.0, 0.0), 64, 48)
+    wide_K, (width, height) = lens_canvas(K, (64, 48))
+    rays = pinhole.camera_rays(pinhole.pixel_centers(height, width), wide_K)
+    monkeypatch.setattr("hdr_nsff.synth.synth.exact", lambda out, view: {"RGB": rays + 1})
+    view = TracedView("clip_00000", 0.0, np.eye(4)[:3], spp=4, seed=0, anchor=0)
+    seen = lens_radiance(view, lens, Path("unused"))[..., :2] - 1
+    pixels = pinhole.pixel_centers(48, 64)
+    assert (
+        np.abs(lens.bend(seen) - pinhole.camera_rays(pixels, K)[..., :2]).max() < 1e-3
+    )  # a sixteenth of a pixel
 
 
 def test_scenes_do_not_mix_in_a_folder_and_are_exposed_as_suits_them(flat: SynthConfig) -> None:

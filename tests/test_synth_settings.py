@@ -39,6 +39,7 @@ def test_a_bad_white_balance_is_refused_in_a_sentence(text: str) -> None:
             {"noise": float("nan")},
             {"response": "kodak"},
         ),
+        *({"lens": "-3"}, {"lens": "much"}, {"lens": "0.1,0,0"}, {"lens": "-0.1"}),
         *({"vignetting": 1.1}, {"vignetting": float("nan")}, {"white_balance": "1"}),
         *({"depth_noise": 1.0}, {"depth_grain": -0.1}, {"flow_noise": float("nan")}),
     ],

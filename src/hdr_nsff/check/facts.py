@@ -40,6 +40,15 @@ class ExposureFacts:
 
 
 @dataclass(frozen=True)
+class LensFacts:
+    """Radial distortion; all 0 where the clip shows none."""
+
+    k1: float  # as OpenCV has them
+    k2: float
+    corner_px: float  # by which a corner moves, pixels of the clip
+
+
+@dataclass(frozen=True)
 class CameraFacts:
     """What the camera does, and how sharp its pictures are."""
 
@@ -49,6 +58,7 @@ class CameraFacts:
     # edges of the brightest bracket relative to those of the darkest: below 1 blurred
     long_sharpness: float | None
     cuts: tuple[int, ...]  # frames that show something else than the one before
+    lens: LensFacts | None = None  # None: unknown
 
 
 @dataclass(frozen=True)

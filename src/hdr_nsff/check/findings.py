@@ -47,11 +47,12 @@ def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Fin
         *judge_clipping(facts, tuning),
         *judge_camera(facts, tuning),
         *judge_file(facts, tuning),
+        *judge_lens(facts),
         Finding(
             "note",
             "not checked",
-            "lens distortion, rolling shutter and electronic stabilization are not measured",
-            "turn stabilization off, and avoid very wide lenses",
+            "rolling shutter and electronic stabilization are not measured",
+            "turn stabilization off",
         ),
     ]
 
@@ -162,6 +163,19 @@ def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         listed = ", ".join(str(cut) for cut in camera.cuts[:6])
         text = f"the clip is cut at frame {listed}"
         yield Finding("problem", "cuts", text, "use one shot: `prepare --start A --end B`")
+
+
+def judge_lens(facts: ClipFacts) -> Iterator[Finding]:
+    """Distortion, where a camera with parallax shows it."""
+    lens = facts.camera.lens
+    if lens is None:
+        text = "lens distortion is not measured: that takes a camera that moves through space"
+        yield Finding("note", "lens", text, "avoid very wide lenses")
+    elif lens.corner_px == 0:
+        yield Finding("good", "lens", "straight lines stay straight")
+    else:
+        text = f"the lens moves corners by {lens.corner_px:.0f} px (k1 {lens.k1:.3f})"
+        yield Finding("note", "lens", text, "`prepare` undistorts the frames")
 
 
 def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
+from hdr_nsff.check.lens import measure_lens
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.video import frame_times, video_info
@@ -287,12 +288,16 @@ def measure_camera(
     motion, share = find_motion(equalized, keypoints)
     shifts = [np.linalg.norm(pair.q - pair.p, axis=1) for pair in following if len(pair.p)]
     per_frame = float(np.median(np.concatenate(shifts))) if shifts else 0.0
+    lens = None
+    if motion == "parallax" and not cuts:
+        lens = measure_lens(equalized, clipped, scale)
     return CameraFacts(
         motion=motion,
         rotation_share=None if share is None else round(share, 3),
         pixels_per_frame=round(scale * per_frame, 2),
         long_sharpness=compare_sharpness(equalized, clipped, cycle, tuning),
         cuts=tuple(cuts),
+        lens=lens,
     )
 
 

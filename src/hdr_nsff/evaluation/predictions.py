@@ -156,5 +156,6 @@ def record(
     camera = to_device(target.view.camera, device)
     flat = radiance.reshape(-1, 3).to(device)
     with torch.no_grad():
+        flat = run.tonemapper.shade(flat, camera, target.camera_id)
         pictures = record_pixels(run.field, camera, target.view.time, recorders, flat)
     return [picture.cpu().reshape(radiance.shape) for picture in pictures]

@@ -19,6 +19,7 @@ from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.progress import say
 from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.geometry.lens import undistorted_picture
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, inside
 from hdr_nsff.scene.scene import Frame
@@ -180,12 +181,17 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
 def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: float) -> Target:
     """One view of a truth folder; InputError where its files do not fit together."""
     exact, true = true_pictures(truth, view, folder)
+    anchor = anchor_of(run, view, folder)
+    lens = run.scene.manifest.lens.get(anchor.camera_id)
+    distorted = lens is not None and truth.lens is None  # as the scene's frames were
+    if lens is not None and distorted:
+        true = {b: undistorted_picture(rgb, lens.lens()) for b, rgb in true.items()}
+        exact = None if exact is None else undistorted_picture(exact, lens.lens())
     pictures = {bracket: torch.from_numpy(rgb) for bracket, rgb in true.items()}
     radiance = None
     if exact is not None:
         white_balance = np.array(truth.white_balance, np.float32)
         radiance = torch.from_numpy(exact * white_balance)
-    anchor = anchor_of(run, view, folder)
     pose = np.array(anchor.c2w)
     if view.c2w is not None:
         assert truth.clip_c2w is not None, "world_scale refuses this"
@@ -204,16 +210,20 @@ def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: f
             known[match[bracket]] = rgb
         elif ev is not None:
             novel[ev] = rgb
+    moving = moving_mask(run, view, folder, size)
+    if lens is not None and distorted and moving is not None and view.mask is not None:
+        moving = torch.from_numpy(undistorted_picture(moving.numpy(), lens.lens()))
+    geometry = None if distorted else geometry_file(truth, view, folder, size, pose)
     return Target(
         name=view.name,
         group=group_of(run, view),
-        view=PathView(camera_of(run, view, anchor, pose, size), view.time),
+        view=PathView(camera_of(run, truth, view, anchor, pose, size), view.time),
         bracket=match[view.bracket],
         camera_id=anchor.camera_id,
         rgb=known,
         radiance=radiance,
-        moving=moving_mask(run, view, folder, size),
-        geometry=geometry_file(truth, view, folder, size, pose),
+        moving=moving,
+        geometry=geometry,
         novel=novel,
     )
 
@@ -232,18 +242,28 @@ def anchor_of(run: Run, view: TruthView, folder: Path) -> FrameEntry:
 
 
 def camera_of(
-    run: Run, view: TruthView, anchor: FrameEntry, pose: np.ndarray, size: tuple[int, int]
+    run: Run,
+    truth: Truth,
+    view: TruthView,
+    anchor: FrameEntry,
+    pose: np.ndarray,
+    size: tuple[int, int],
 ) -> Camera:
     """The camera of a truth view at `pose` (3, 4) for pictures of `size` (H, W).
 
-    With a K of its own, else with that of its anchor.
+    With a K of its own, else with that of its anchor: of the anchor's lens where frames
+    were undistorted and the truth has no distortion.
     """
     manifest = run.scene.manifest
     height, width = size
     c2w = torch.from_numpy(pose).float()
     if view.K is not None:
         return Camera(torch.tensor(view.K), c2w, width, height)
-    camera = Camera(torch.tensor(anchor.K), c2w, manifest.width, manifest.height)
+    K = np.array(anchor.K)
+    lens = manifest.lens.get(anchor.camera_id)
+    if lens is not None and truth.lens is not None:
+        K = lens.lens().unzoomed(K)
+    camera = Camera(torch.from_numpy(K).float(), c2w, manifest.width, manifest.height)
     return camera.resized(width, height)
 
 

@@ -16,8 +16,16 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapModel, read_model
-from hdr_nsff.footage.pose_formats import GivenPoses, from_colmap, from_json, from_llff
+from hdr_nsff.footage.pose_formats import (
+    GivenPoses,
+    common_lens,
+    distorted,
+    from_colmap,
+    from_json,
+    from_llff,
+)
 from hdr_nsff.geometry.alignment import nearest_rotation
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.poses import (
     MIN_REGISTERED_SHARE,
     Poses,
@@ -37,26 +45,22 @@ Parallax = Literal["full", "rotation", "none"]
 NAMES = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "precomputed.json")
 
 
-def import_poses(path: Path | str, sources: list[str], size: tuple[int, int]) -> Poses:
+def import_poses(
+    path: Path | str, sources: list[str], size: tuple[int, int], lens: Lens | None = None
+) -> Poses:
     """Poses of the frames named `sources` (T) from `path`, for `size` (height, width).
 
     Frames are matched by file name, or in order where no name fits and the numbers do.
-    `path` is a file, or a folder that holds one of the known ones. InputError where it
-    cannot be read, does not fit, or has fewer poses than six frames in ten.
+    `path` is a file, or a folder that holds one of the known ones. Where frames were
+    undistorted, `lens` is what distorted them. InputError where it cannot be read, does
+    not fit, or has fewer poses than six frames in ten.
     """
     path = locate(Path(path))
-    model = None
-    if path.is_dir():
-        model = read_model(path)
-        given = from_colmap(path, model)
-    elif path.suffix == ".npy":
-        given = from_llff(path)
-    else:
-        given = from_json(path)
+    given, model = read_given(path)
     rows = match_frames(path, given.names, len(given.c2w), sources)
-    poses = fit_poses(path, given, rows, size)
+    poses = fit_poses(path, given, rows, size, lens)
     if model is not None:
-        poses = with_points(poses, model, rows)
+        poses = with_points(poses, model, rows, lens)
     if all(row is not None for row in rows):
         return poses
     folders = [str(Path(source).parent) for source in sources]
@@ -65,6 +69,16 @@ def import_poses(path: Path | str, sources: list[str], size: tuple[int, int]) ->
         for camera in sorted(set(folders))
     ]
     return interpolate(poses, cameras)
+
+
+def read_given(path: Path) -> tuple[GivenPoses, ColmapModel | None]:
+    """The poses at a place that `locate` returns, and the COLMAP model they are from."""
+    if path.is_dir():
+        model = read_model(path)
+        return from_colmap(path, model), model
+    if path.suffix == ".npy":
+        return from_llff(path), None
+    return from_json(path), None
 
 
 def locate(path: Path) -> Path:
@@ -144,9 +158,14 @@ def path_end(name: str, parts: int) -> tuple[str, ...]:
 
 
 def fit_poses(
-    path: Path, given: GivenPoses, rows: Sequence[int | None], size: tuple[int, int]
+    path: Path,
+    given: GivenPoses,
+    rows: Sequence[int | None],
+    size: tuple[int, int],
+    lens: Lens | None = None,
 ) -> Poses:
-    """The poses `rows` (T) of `given`, for frames of `size` (height, width).
+    """The poses `rows` (T) of `given`, for frames of `size` (height, width) that were
+    freed of the distortion of `lens`.
 
     A row of None is a frame without a pose. InputError, which names `path`, for poses
     that make no sense or are for frames of another shape.
@@ -154,6 +173,11 @@ def fit_poses(
     check_given(path, given)
     first = next(row for row in rows if row is not None)
     K = np.stack([scaled_intrinsics(path, given, first if r is None else r, size) for r in rows])
+    if lens is not None:
+        height, width = size
+        K[:] = lens.resized(width, height).pinhole()
+    elif (found := common_lens(path, given)) is not None:
+        raise distorted(path, found.max_displacement_px())
     c2w = np.tile(np.eye(4)[:3], (len(rows), 1, 1))
     for t, row in enumerate(rows):
         if row is not None:
@@ -215,12 +239,15 @@ def parallax_of(c2w: np.ndarray, near: float) -> Parallax:
     return "rotation" if turns > MIN_TURN else "none"
 
 
-def with_points(poses: Poses, model: ColmapModel, rows: Sequence[int | None]) -> Poses:
+def with_points(
+    poses: Poses, model: ColmapModel, rows: Sequence[int | None], lens: Lens | None = None
+) -> Poses:
     """`poses` with the static points of a COLMAP model, and near and far from those.
 
-    `rows` (T) are the images of the frames in the order of their names.
+    `rows` (T) are the images of the frames in the order of their names; `lens` what
+    distorted their keypoints.
     """
-    tracks = tracks_of(poses, model, rows)
+    tracks = tracks_of(poses, model, rows, lens)
     shrink = poses.K[0, 0, 0] / next(iter(model.cameras.values())).K[0, 0]
     errors = model.errors * shrink  # in pixels of the frames
     poses = trusted_points(replace(poses, points=model.points, point_errors=errors, tracks=tracks))
@@ -234,7 +261,9 @@ def with_points(poses: Poses, model: ColmapModel, rows: Sequence[int | None]) ->
     return replace(poses, near=near, far=far)
 
 
-def tracks_of(poses: Poses, model: ColmapModel, rows: Sequence[int | None]) -> np.ndarray:
+def tracks_of(
+    poses: Poses, model: ColmapModel, rows: Sequence[int | None], lens: Lens | None
+) -> np.ndarray:
     """Every view of a point (O, 4): frame, point, x, y in pixels of the frames."""
     images = sorted(model.images.values(), key=lambda i: i.name)
     points = {int(key): p for p, key in enumerate(model.point_ids)}
@@ -244,9 +273,10 @@ def tracks_of(poses: Poses, model: ColmapModel, rows: Sequence[int | None]) -> n
             continue
         image = images[row]
         camera = model.cameras[image.camera_id]
-        scale = poses.K[t, (0, 1), (0, 1)] / camera.K[(0, 1), (0, 1)]
-        for xy, key in zip(image.xy, image.point_ids, strict=True):
+        pixels = image.xy * (poses.K[t, (0, 1), (0, 1)] / camera.K[(0, 1), (0, 1)])
+        if lens is not None:
+            pixels = lens.resized(camera.width, camera.height).undistort(image.xy, poses.K[t])
+        for (x, y), key in zip(pixels, image.point_ids, strict=True):
             if key >= 0 and int(key) in points:
-                x, y = xy * scale
                 tracks.append((t, points[int(key)], x, y))
     return np.array(tracks, np.float64).reshape(-1, 4)

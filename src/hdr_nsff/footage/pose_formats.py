@@ -19,6 +19,7 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.scene.manifest import MAX_NUMBER
 
 # columns right, up, back -> right, down, forward
@@ -29,6 +30,7 @@ FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
 MAX_DISTORTION_PX = 2.0
 # models whose distortion is that of OpenCV: k1, k2, p1, p2, or the first of these
 OPENCV_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2")  # of `transforms.json`
 # what Python and numpy raise for JSON values of another shape or size than expected
 UNREADABLE = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
 
@@ -43,6 +45,8 @@ class GivenPoses:
     size: np.ndarray  # (N, 2) width, height that K is for; a height of 0 is unknown
     near: float | None = None  # z-depth, units of the poses
     far: float | None = None
+    # (N, 4) k1, k2, p1, p2 of OpenCV's model; None: no pose has any
+    distortion: np.ndarray | None = None
 
 
 # COLMAP
@@ -56,15 +60,12 @@ def from_colmap(path: Path, model: ColmapModel) -> GivenPoses:
         )
     images = sorted(model.images.values(), key=lambda i: i.name)
     cameras = [model.cameras[i.camera_id] for i in images]
-    for camera_id in sorted({i.camera_id for i in images}):
-        camera = model.cameras[camera_id]
-        distortion = colmap_distortion(path, camera)
-        check_distortion(path, camera.K, camera.width, camera.height, distortion)
     return GivenPoses(
         names=[i.name for i in images],
         K=np.stack([c.K for c in cameras]),
         c2w=np.stack([i.c2w for i in images]),
         size=np.array([(c.width, c.height) for c in cameras], np.float64),
+        distortion=np.stack([colmap_distortion(path, c) for c in cameras]),
     )
 
 
@@ -82,27 +83,36 @@ def colmap_distortion(path: Path, camera: ColmapCamera) -> np.ndarray:
     )
 
 
-def check_distortion(
-    path: Path, K: np.ndarray, width: float, height: float, distortion: np.ndarray
-) -> None:
-    """InputError where a pinhole would misplace a corner by over `MAX_DISTORTION_PX`.
-
-    `distortion` (4,) is k1, k2, p1, p2 of OpenCV's model, `K` (3, 3) is in pixels.
+def common_lens(path: Path, given: GivenPoses) -> Lens | None:
+    """The lens of all poses; None where a pinhole misplaces no corner by more than
+    `MAX_DISTORTION_PX`. InputError where they have several lenses, or no size.
     """
-    k1, k2, p1, p2 = distortion
-    corners = np.array([(0, 0), (width, 0), (0, height), (width, height)])
-    with np.errstate(all="ignore"):  # impossible numbers are refused later
-        x, y = ((corners - K[:2, 2]) / K[(0, 1), (0, 1)]).T
-        r2 = x * x + y * y
-        radial = k1 * r2 + k2 * r2 * r2
-        dx = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        dy = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        worst = np.hypot(dx * K[0, 0], dy * K[1, 1]).max()
-    if worst > MAX_DISTORTION_PX:
-        raise InputError(
-            f"{path}: lens distortion moves corners by {worst:.0f} px; undistort the frames "
-            "(colmap image_undistorter) and export again"
+    if given.distortion is None or not given.distortion.any():
+        return None
+    numbers = (given.K, given.distortion, given.size)
+    if not all(np.isfinite(each).all() for each in numbers):
+        return None  # refused later
+    lenses = [
+        Lens(K, (k1, k2, p1, p2), round(width), round(height))
+        for K, (k1, k2, p1, p2), (width, height) in zip(
+            given.K, given.distortion.tolist(), given.size, strict=True
         )
+    ]
+    worst = max(lens.max_displacement_px() for lens in lenses)
+    if not worst > MAX_DISTORTION_PX:
+        return None
+    several = any(not np.allclose(each, each[0]) for each in numbers)
+    if several or lenses[0].height <= 0 or not lenses[0].is_one_to_one():
+        raise distorted(path, worst)
+    return lenses[0]
+
+
+def distorted(path: Path, displacement: float) -> InputError:
+    """The error for frames that have to be undistorted first."""
+    return InputError(
+        f"{path}: lens distortion moves corners by {displacement:.0f} px; undistort the frames "
+        "(colmap image_undistorter) and export again"
+    )
 
 
 # LLFF
@@ -207,7 +217,9 @@ def parse_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
     frames = document["frames"]
     if not frames:
         raise InputError(f"{path}: no frames in it; export the poses again")
-    lenses = [parse_intrinsics(path, {**document, **frame}) for frame in frames]
+    values = [{**document, **frame} for frame in frames]
+    lenses = [parse_intrinsics(path, each) for each in values]
+    distortion = [[float(each.get(key, 0)) for key in DISTORTION_KEYS] for each in values]
     matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)[:, :3]
     with np.errstate(invalid="ignore"):  # NaN and Inf are refused afterwards
         c2w = np.concatenate([matrices[:, :, :3] @ FROM_OPENGL, matrices[:, :, 3:4]], 2)
@@ -219,6 +231,7 @@ def parse_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
         size=np.array([size for _, size in lenses], np.float64),
         near=near,
         far=far,
+        distortion=np.array(distortion),
     )
 
 
@@ -267,6 +280,4 @@ def parse_intrinsics(
     cx = float(values.get("cx", width / 2))
     cy = float(values.get("cy", height / 2))
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    distortion = np.array([float(values.get(key, 0)) for key in ("k1", "k2", "p1", "p2")])
-    check_distortion(path, K, width, height, distortion)
     return K, (width, height)

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry import pinhole
+from hdr_nsff.geometry.lens import Lens
 
 ADVICE = (
     "film with the camera moving sideways past textured, static surfaces, give masks of the "
@@ -41,6 +42,9 @@ class Poses:
     near: float | None = None  # z-depth, scene units
     far: float | None = None
     notes: tuple[str, ...] = ()  # sentences for the user
+    # {camera_id: lens} where the frames turned out to be distorted: these poses are then
+    # only the start
+    lenses: dict[int, Lens] = field(default_factory=dict)
 
 
 def format_ranges(numbers: list[int]) -> str:

@@ -90,8 +90,20 @@ def step_key(work: Work, name: StepName, step: Step) -> str:
     before = [(n, records[n].key, records[n].details.get("attempt")) for n in step.needs]
     inputs = work.manifest.inputs if name == "frames" else {}
     from_capture = [capture_part(work, name)] if work.capture is not None else []
-    parts = [settings, before, inputs, *from_capture, *weights_of(work.config, name)]
+    lens = lens_part(work, name)
+    parts = [settings, before, inputs, *from_capture, *lens, *weights_of(work.config, name)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def lens_part(work: Work, name: StepName) -> list[Any]:
+    """What of the lens a step depends on: frames on the lens that undistorts them,
+    poses on whether one is looked for. Empty for a pinhole camera.
+    """
+    if name == "frames":
+        return [entry.model_dump() for entry in work.manifest.lens.values()]
+    if name == "poses" and work.config.lens_distortion != "auto":
+        return [work.config.lens_distortion]
+    return []
 
 
 def capture_part(work: Work, name: StepName) -> Any:

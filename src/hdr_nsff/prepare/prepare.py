@@ -23,6 +23,13 @@ from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.prepare.engine import Step, all_have, run_step
+from hdr_nsff.prepare.lens import (
+    DistortedFramesError,
+    describe,
+    given_lenses,
+    known_lenses,
+    parse_lens,
+)
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.depth import find_depth
 from hdr_nsff.prepare.steps.flow import find_flow
@@ -36,7 +43,7 @@ from hdr_nsff.prepare.steps.sheet import draw_sheet
 from hdr_nsff.prepare.steps.static_depth import find_static_depth
 from hdr_nsff.prepare.work import Part, PrepareConfig, StepName, Work
 from hdr_nsff.priors.flow.sources import check_flow
-from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.manifest import LensEntry, Manifest
 
 __all__ = ["PrepareConfig", "prepare"]
 
@@ -49,8 +56,7 @@ def prepare(config: PrepareConfig) -> Path:
     with writing_to(config.out), lock_output(config.out):
         work = begin(config)
         report_data_set(work)
-        for name, step in STEPS.items():
-            run_step(work, name, step)
+        run_steps(work)
         capture = work.capture
         if capture is not None and capture.has_held_out:
             place = truth_place(config)
@@ -58,6 +64,24 @@ def prepare(config: PrepareConfig) -> Path:
     sheet = config.out / "contact_sheet.png"
     say(f"scene: {config.out}  ({len(work.manifest.frames)} frames, contact sheet {sheet})")
     return config.out
+
+
+def run_steps(work: Work) -> None:
+    """Run every step that is not done; once more from the frames where these turn out
+    to be distorted.
+    """
+    try:
+        for name, step in STEPS.items():
+            run_step(work, name, step)
+    except DistortedFramesError as found:
+        given = work.config.lens_distortion != "auto"
+        lenses = {c: LensEntry.of(lens, given) for c, lens in found.lenses.items()}
+        say(f"poses: the lens distorts ({describe(lenses)}); frames are undistorted, once")
+        work.manifest.lens = lenses
+        work.save()
+        work.forget(("codes", "equalized", "raw_flows"))
+        for name, step in STEPS.items():
+            run_step(work, name, step)
 
 
 def truth_place(config: PrepareConfig) -> Path:
@@ -89,9 +113,12 @@ def begin(config: PrepareConfig) -> Work:
                 "choose another folder"
             )
     if found is not None:
+        found.lens = known_lenses(found, config) if found.inputs == inputs else {}
         found.source = str(config.clip)
         found.inputs = inputs
-        return Work(config, footage, found, capture)
+        work = Work(config, footage, found, capture)
+        found.lens |= given_lenses(work)
+        return work
     start = config.start
     first = next(ingest.read_frames(footage, start, start + 1, 1, config.max_size), None)
     if first is None:
@@ -99,6 +126,7 @@ def begin(config: PrepareConfig) -> Work:
     height, width = first.rgb.shape[:2]
     manifest = Manifest(source=str(config.clip), inputs=inputs, width=width, height=height)
     work = Work(config, footage, manifest, capture)
+    manifest.lens = given_lenses(work)
     work.save()
     return work
 
@@ -159,6 +187,7 @@ def check_settings(config: PrepareConfig) -> None:
             "training; leave one out"
         )
     parse_exposures(config.exposures, config.ev)
+    parse_lens(config.lens_distortion)
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "

@@ -90,6 +90,11 @@ class PrepareConfig:
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of
     structure from motion.
     """
+    lens_distortion: str = "auto"
+    """Radial distortion of the lens. auto: estimated, and left at none where the clip
+    does not show any; none: a pinhole camera; K1 or K1,K2: as OpenCV has them, such as
+    -0.2,0.03. Frames are undistorted.
+    """
     matcher: Matcher = "sift"
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
     learned, matched by LightGlue (extra `neural`), seconds per pair of frames on a CPU,

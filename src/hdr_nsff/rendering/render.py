@@ -14,6 +14,7 @@ from hdr_nsff.core.hdr_video import check_encoder
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.rendering.interpolate import LayeredField
+from hdr_nsff.rendering.lens import original_lens
 from hdr_nsff.rendering.shot_views import MAX_VIEWS, plan_shot, short_count
 from hdr_nsff.rendering.shots import Output, Shot, name_results, open_look, render_shot
 from hdr_nsff.rendering.standard_set import render_all
@@ -64,6 +65,10 @@ def render(config: RenderConfig) -> dict[str, Path]:
     run = Run.open(config.run, config.device)
     if config.output.between == "splat" and not isinstance(run.field, LayeredField):
         raise InputError("--between splat: this field has no layers to splat; use --between direct")
+    if config.output.lens == "original":
+        original_lens(run.scene.manifest, config.output.camera_id)
+        if config.path == "all":
+            raise InputError("--lens original: name a path with it, such as `--path training`")
     out = config.out or Path(config.run) / "render"
     with writing_to(out), lock_output(out):
         if config.path == "all":

@@ -39,6 +39,7 @@ from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
 from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, neutral_radiance, write_hdr_shot
 from hdr_nsff.rendering.hdr_stills import HdrStill, still_path, still_paths, write_hdr_still
 from hdr_nsff.rendering.interpolate import Mode
+from hdr_nsff.rendering.lens import LensView, original_lens
 from hdr_nsff.rendering.mattes import ObjectMattes
 from hdr_nsff.rendering.stills import Vectors, device_of, render_still, write_still
 from hdr_nsff.training.run_folder import Run
@@ -95,6 +96,10 @@ class Output:
     """Radiance in EXR files. camera: in the run's unit of each channel; neutral: times
     the gains that make gray neutral. The header has these gains either way. PNG and
     video are neutral anyhow.
+    """
+    lens: Literal["pinhole", "original"] = "pinhole"
+    """original: with the distortion of the clip's lens (of --camera-id), where
+    `prepare` has removed one.
     """
     between: Mode = "auto"
     """Times between frames: splat along the scene flow, or ask the field directly; auto
@@ -346,6 +351,8 @@ def open_sequence(
 def picture_settings(output: Output) -> dict[str, Any]:
     """The settings that the pictures and EXR files of a shot depend on."""
     later = {"hdr_video", "hdr_codec", "hdr_still"}  # made from them
+    if output.lens == "pinhole":
+        later.add("lens")  # as before there was a choice
     return {name: value for name, value in vars(output).items() if name not in later}
 
 
@@ -381,7 +388,14 @@ def write_view(
     if picture.exists() and (exr.exists() or not with_exr):
         return
     steps = neighbor_views(shot.views, index) if with_vectors else {}
-    still = render_still(run, view, output.between, with_vectors, steps)
+    lens_view = view_through_lens(run, view, output)
+    if lens_view is None:
+        still = render_still(run, view, output.between, with_vectors, steps)
+    else:
+        lenses = {side: view_through_lens(run, v, output) for side, v in steps.items()}
+        steps = {side: each.view for side, each in lenses.items() if each is not None}
+        rendered = render_still(run, lens_view.view, output.between, with_vectors, steps)
+        still = lens_view.distort_still(rendered)
     ev = ev_of(view, output)
     if with_exr:
         header = radiance_header(run, output.white_balance, output.camera_id)
@@ -391,15 +405,35 @@ def write_view(
             header["developedEV"] = float(ev)
         stored = balance(run, still.radiance, output.white_balance, output.camera_id)
         stored_still = replace(still, radiance=stored)
-        objects = mattes.coverage(view) if mattes is not None else {}
+        objects = matte_pictures(mattes, view, lens_view)
         half = output.exr != "float"
         write_still(exr, stored_still, view, half, header, output.exr_vectors, objects)
-    if look is None:
+    if look is None and lens_view is not None:
+        rgb = develop(run, still.radiance, ev, output.camera_id, exposure)
+    elif look is None:
         rgb = develop_view(run, view, still.radiance, ev, output.camera_id, exposure)
     else:
         white = exposure if ev is None else 2.0**ev
         rgb = look.develop(white * balance(run, still.radiance, "neutral", output.camera_id))
     write_png(picture, rgb)
+
+
+def view_through_lens(run: Run, view: PathView, output: Output) -> LensView | None:
+    """The view through the clip's lens; None for a pinhole camera."""
+    if output.lens == "pinhole":
+        return None
+    return LensView.of(view, original_lens(run.scene.manifest, output.camera_id))
+
+
+def matte_pictures(
+    mattes: ObjectMattes | None, view: PathView, lens_view: LensView | None
+) -> dict[str, np.ndarray]:
+    """The mattes of a view by name, through the lens if there is one."""
+    if mattes is None:
+        return {}
+    if lens_view is None:
+        return mattes.coverage(view)
+    return lens_view.distort_mattes(mattes.coverage(lens_view.view))
 
 
 def open_look(output: Output) -> Look | None:

@@ -17,6 +17,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import read_json, write_json
 from hdr_nsff.core.names import resolve_name
 from hdr_nsff.core.notes import first_problem
+from hdr_nsff.geometry.lens import Lens
 
 Parallax = Literal["full", "rotation", "none"]
 Provenance = Literal["estimated", "given", "absent"]
@@ -41,6 +42,32 @@ class FlowFiles(Strict):
     # .npy (H, W, 2) half, px: where a pixel goes in the other frame, minus where it is
     flow: str
     valid: str  # PNG, 255 where the forward-backward check passed
+
+
+class LensEntry(Strict):
+    """The camera as it recorded, before `prepare` undistorted its frames."""
+
+    K: list[list[float]]  # 3x3 px of width x height
+    distortion: list[float] = Field(min_length=4, max_length=4)  # k1, k2, p1, p2 (OpenCV)
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    given: bool = False  # by the user or with the poses; else estimated
+
+    @staticmethod
+    def of(lens: Lens, given: bool) -> LensEntry:
+        """The entry of a lens."""
+        return LensEntry(
+            given=given,
+            K=lens.K.tolist(),
+            distortion=list(lens.distortion),
+            width=lens.width,
+            height=lens.height,
+        )
+
+    def lens(self) -> Lens:
+        """The lens of an entry."""
+        k1, k2, p1, p2 = self.distortion
+        return Lens(np.array(self.K), (k1, k2, p1, p2), self.width, self.height)
 
 
 class FrameEntry(Strict):
@@ -119,6 +146,7 @@ class Manifest(Strict):
     points: str | None = None  # .npy (P, 3) float, scene units
     response: str | None = None  # JSON, see `scene/response.py`
     movers: str | None = None  # .npz, see `scene/movers.py`
+    lens: dict[int, LensEntry] = {}  # camera_id -> its lens, where frames were undistorted
     frames: list[FrameEntry] = []
     steps: dict[str, StepRecord] = {}
 
@@ -211,6 +239,8 @@ def manifest_problem(m: Manifest) -> str | None:
         return "two frames have the same index"
     if len({(f.camera_id, f.time) for f in m.frames}) < len(m.frames):
         return "two frames of one camera have the same time"
+    if not all(is_matrix(entry.K, (3, 3), is_intrinsic) for entry in m.lens.values()):
+        return "a lens with a K that is not a 3x3 camera matrix"
     cameras = sorted({f.camera_id for f in m.frames})
     if cameras != list(range(len(cameras))):
         return "the camera_ids of the frames are not counted from 0 without gaps"

@@ -115,6 +115,9 @@ class Truth(Strict):
     white_balance: list[float] = Field(default=[1.0, 1.0, 1.0])
     # strength of the lens's fall-off, see `recording.vignette`
     vignetting: float = Field(default=0.0, ge=0.0, le=1.0)
+    # k1, k2 of the lens that recorded the clip (OpenCV); the views have no distortion.
+    # None: views are as the camera recorded them
+    lens: list[float] | None = None
     K: list[list[float]] | None = None  # 3x3 pixels
     settings: dict[str, str | int | float | bool] | None = None  # of what made it, for the record
     # true poses of the clip's frames, for pose errors and for the transfer of views

@@ -10,12 +10,16 @@ import numpy as np
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry.recording import Noise, response_curve
 from hdr_nsff.synth.scenes.base import Views
+from hdr_nsff.synth.scenes.geometry import intrinsics
 
 MIN_FRAMES, MAX_FRAMES = 12, 400  # fewer leave no view far from the frames of its time
 MIN_SIDE = 16  # pixels of a picture
+# pictures that a lens distorts are traced this much wider than the clip, and finer
+LENS_MARGIN, LENS_FINENESS = 1.25, 1.5
 MAX_SEED = 999  # seeds of pictures are made of it, see `views`
 MAX_NOISE = 1000.0  # times the noise of a small sensor
 
@@ -56,6 +60,10 @@ class SynthConfig:
     shutter: float = 0.0
     """Share of a frame's time for which the shutter is open at the brightest exposure,
     which blurs what moves. The truth is sharp.
+    """
+    lens: str = "0"
+    """Radial distortion of the recordings, k1 or k1,k2 as OpenCV has them, such as
+    -0.1; held-out views have none.
     """
     noise: float = 1.0
     """Noise relative to that of a small sensor; 0 is a perfect one."""
@@ -99,6 +107,11 @@ def check(config: SynthConfig, min_paths: int) -> None:
             f"--readout {c.readout} --shutter {c.shutter}: choose 0 to 1000 milliseconds, "
             "and 0 (a moment) to 1 (open all the time)"
         )
+    size = parse_size(c.size)
+    if parse_lens(c.lens, intrinsics(*size), size) is not None and c.oracle:
+        raise InputError("--lens, --oracle: exact flow is that of a pinhole; leave one out")
+    if parse_lens(c.lens, intrinsics(*size), size) is not None and (c.readout or c.shutter):
+        raise InputError("--lens and --readout or --shutter: record one of them")
     if not MIN_FRAMES <= c.frames <= MAX_FRAMES:
         raise InputError(
             f"--frames {c.frames}: choose from {MIN_FRAMES} to {MAX_FRAMES}; "
@@ -160,6 +173,28 @@ def parse_white_balance(text: str) -> tuple[float, float, float]:
     if not all(0.01 <= gain <= 100 for gain in gains):
         raise InputError(f"--white-balance {text!r:.40}: the gains must be from 0.01 to 100")
     return gains
+
+
+def parse_lens(text: str, K: np.ndarray, size: tuple[int, int]) -> Lens | None:
+    """The lens "K1[,K2]" of a camera `K` (3, 3) with pictures of `size` (width,
+    height); None where it distorts nothing.
+    """
+    try:
+        k1, k2, *more = [float(word) for word in f"{text},0".split(",")]
+    except ValueError as error:
+        raise InputError(
+            f"--lens {text!r:.40}: write k1, or k1 and k2 with a comma between them, such as -0.1"
+        ) from error
+    lens = Lens(K, (k1, k2, 0.0, 0.0), *size)
+    sides = np.array(size)
+    outline = lens.undistort(lens.border(), K)
+    in_view = (np.abs(outline - sides / 2) < LENS_MARGIN * sides / 2).all()
+    if len(more) > 1 or not (in_view and lens.is_one_to_one()):
+        raise InputError(
+            f"--lens {text!r:.40}: too strong for these pictures, or not k1,k2; "
+            "choose a k1 from -0.3 to 0.3"
+        )
+    return lens if any(lens.distortion) else None
 
 
 def sensor_noise(strength: float) -> Noise | None:

@@ -40,6 +40,8 @@ from hdr_nsff.core.io import write_json, write_text, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.video import DEFAULT_FPS, write_video
+from hdr_nsff.geometry import pinhole
+from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.maths import color
 from hdr_nsff.radiometry.hdr_footage import write_radiance_video
 from hdr_nsff.radiometry.recording import record, response_curve, vignette
@@ -51,9 +53,12 @@ from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.base import SynthScene, Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.settings import (
+    LENS_FINENESS,
+    LENS_MARGIN,
     SynthConfig,
     check,
     parse_ev,
+    parse_lens,
     parse_size,
     parse_white_balance,
     sensor_noise,
@@ -64,6 +69,7 @@ from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 __all__ = ["SynthConfig", "synth"]
 
 VIDEO_FPS = DEFAULT_FPS  # of all videos
+LENS_PREFIX = "lens"  # of their names
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
 SEEN = ("seen.red", "seen.green", "seen.blue")  # radiance through the shutter
 TRACED_HEADER = {"chromaticities": REC709}  # Mitsuba's rgb variants are linear Rec. 709
@@ -91,6 +97,10 @@ def synth(config: SynthConfig) -> None:
     with writing_to(config.out), lock_output(config.out):
         claim(config)
         render(clip + held_out, K, size, config)
+        lens = parse_lens(config.lens, K, size)
+        if lens is not None:
+            wide_K, wide_size = lens_canvas(K, size)
+            render([lens_view(view) for view in clip], wide_K, wide_size, config)
         video = record_clip(clip, relative, K, config)
         if config.views == "rig":
             list_exposures(evs, config)
@@ -231,13 +241,11 @@ def record_clip(
     curve = response_curve(config.response)
     gains = parse_white_balance(config.white_balance)
     noise = sensor_noise(config.noise)
+    lens = parse_lens(config.lens, K, parse_size(config.size))
     video = []
     for t, view in enumerate(clip):
         rng = np.random.default_rng([config.seed, t])
-        channels = exact(config.out, view)
-        radiance = channels["RGB"]
-        if SEEN[0] in channels:
-            radiance = np.stack([channels[name] for name in SEEN], -1)
+        radiance = lens_radiance(view, lens, config.out)
         height, width = radiance.shape[:2]
         transmission = vignette(height, width, K, config.vignetting)
         ev = relative[t % len(relative)]
@@ -246,6 +254,37 @@ def record_clip(
         video.append(frame)
     write_video(config.out / "clip.mp4", video, crf=VIDEO_CRF, footage=True)
     return np.stack(video)
+
+
+def lens_canvas(K: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, tuple[int, int]]:
+    """K (3, 3), and width and height, of the pictures that a lens distorts.
+
+    They do not depend on the lens, so that clips of several lenses share them.
+    """
+    wide = np.rint(np.array(size) * LENS_MARGIN * LENS_FINENESS).astype(int)
+    width, height = (int(side) for side in wide)
+    return pinhole.intrinsics(K[0, 0] * LENS_FINENESS, width, height), (width, height)
+
+
+def lens_view(view: TracedView) -> TracedView:
+    """The wide picture of a frame; its finer pixels need fewer paths each."""
+    spp = max(1, round(view.spp / LENS_FINENESS**2))
+    return replace(view, name=view.name.replace("clip", LENS_PREFIX), spp=spp)
+
+
+def lens_radiance(view: TracedView, lens: Lens | None, out: Path) -> np.ndarray:
+    """The radiance (H, W, 3) that falls on the sensor, through the lens if there is
+    one: the mean of four points of every pixel.
+    """
+    if lens is None:
+        channels = exact(out, view)
+        if SEEN[0] in channels:
+            return np.stack([channels[name] for name in SEEN], -1)
+        return channels["RGB"]
+    wide = exact(out, lens_view(view))["RGB"]
+    wide_K, _ = lens_canvas(lens.K, (lens.width, lens.height))
+    fine = distorted_picture(wide, wide_K, lens.resized(2 * lens.width, 2 * lens.height))
+    return fine.reshape(lens.height, 2, lens.width, 2, 3).mean((1, 3))
 
 
 def write_references(clip: list[TracedView], config: SynthConfig) -> None:
@@ -287,6 +326,7 @@ def write_truth(
     folder = config.out / "truth"
     curve = response_curve(config.response)
     scene = SCENES[config.name]
+    lens = parse_lens(config.lens, K, parse_size(config.size))
     entries = []
     for k, view in enumerate(held_out):
         channels = exact(config.out, view)
@@ -313,6 +353,7 @@ def write_truth(
         response_y=curve.y.tolist(),
         white_balance=list(parse_white_balance(config.white_balance)),
         vignetting=config.vignetting,
+        lens=None if lens is None else list(lens.distortion[:2]),
         settings={
             k: v for k, v in asdict(config).items() if k not in ("out", "variant", "hdr_video")
         },

@@ -28,9 +28,11 @@ from torch import Tensor, nn
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.settings import Advanced, Weight
 from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.manifest import bracket_problem
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.curve import knot_positions
 
 LN2 = math.log(2.0)
@@ -50,6 +52,8 @@ class ToneMapLosses:
     """shared: square of the frames' deviations from their bracket's gain."""
     response_anchor: Weight = 100.0
     """shared: distance from the curve and exposures held since `anchor_at`."""
+    vignetting: Weight = 1e-3
+    """shared: mean square of the coefficients of vignetting."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,10 @@ class ToneMapConfig:
     residual: Advanced[bool] = True
     """shared: let every training frame deviate a little from its bracket's gain
     (flicker, drifting white balance).
+    """
+    vignetting: Advanced[bool] = True
+    """shared: learn the fall-off of light towards the corners, where the camera moves
+    enough to determine it.
     """
     from_recordings: Advanced[bool] = True
     """per_image: start at the response that `prepare` estimated; else at gamma 2.2 and
@@ -95,6 +103,8 @@ class Recordings:
     # stops by which every training frame differs from its bracket (auto exposure);
     # empty: none does
     drift: tuple[float, ...] = ()
+    # of every camera, where vignetting can be learned (see `vignetting_corners`)
+    corners: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         assert len(self.brackets) == len(self.cameras), (self.brackets, self.cameras)
@@ -169,6 +179,11 @@ class ToneMapper(nn.Module, ABC):
 
     # What everything else uses
 
+    def start_vignetting(self, scene: Scene) -> None:
+        """Start the fall-off towards the corners, after `start`, at what static points of
+        a scene show; only the shared kind learns one.
+        """
+
     def forward(
         self,
         radiance: Tensor,
@@ -187,6 +202,14 @@ class ToneMapper(nn.Module, ABC):
         gain = self.log_gain(bracket, camera_id, frame).exp()
         images = self.images_of(bracket) if frame is None else frame
         return self.respond(radiance.float(), gain, camera_id, images, leaky)
+
+    def shade(
+        self, radiance: Tensor, camera: Camera, camera_id: int, pixels: Tensor | None = None
+    ) -> Tensor:
+        """What of `radiance` (N, 3) the lens of a camera passes to `pixels` (N, 2), by
+        default all of a picture: pass it on to `forward` or a recorder.
+        """
+        return radiance
 
     def develop(self, radiance: Tensor, ev: float, camera_id: int = 0) -> Tensor:
         """The picture (..., 3) in [0, 1] that camera `camera_id` would record of

@@ -4,15 +4,21 @@ default, whose curve is learned; `fixed`, gamma 2.2; `mlp`, HDR-NeRF's network.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import curve
 from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper
 from hdr_nsff.tonemap.curve import GAMMA
 from hdr_nsff.tonemap.kernel import bin_table
 from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
+from hdr_nsff.tonemap.vignetting import Vignetting
+from hdr_nsff.tonemap.vignetting_start import start_vignetting
 
 
 class BracketGain(nn.Module):
@@ -150,6 +156,23 @@ class SharedToneMapper(BracketedToneMapper):
         self.register_buffer("anchor_curve", torch.zeros(count, 3, len(self.knots)))
         self.register_buffer("anchor_ev", torch.zeros(len(recordings.ev)))
         self.register_buffer("anchor_white_balance", torch.zeros(count - 1, 3))
+        self.vignetting: Vignetting | None = None
+        if config.vignetting and recordings.corners:
+            self.vignetting = Vignetting(recordings.corners)
+            self.register_load_state_dict_pre_hook(without_vignetting)
+
+    def start_vignetting(self, scene: Scene) -> None:
+        if self.vignetting is not None:
+            start_vignetting(self.vignetting, self, scene)
+
+    def shade(
+        self, radiance: Tensor, camera: Camera, camera_id: int, pixels: Tensor | None = None
+    ) -> Tensor:
+        if self.vignetting is None:
+            return radiance
+        if pixels is None:
+            pixels = camera.pixel_grid()
+        return radiance * self.vignetting(camera, pixels, camera_id)
 
     def curve_values(self, camera_id: int, images: Tensor | int | None) -> Tensor:
         return self.response.values(camera_id)
@@ -191,11 +214,14 @@ class SharedToneMapper(BracketedToneMapper):
         residual = self.knots.new_zeros(())
         if small:
             residual = torch.stack([t.square().mean() for t in small]).sum()
-        return {
+        terms = {
             "response_smoothness": curve.smoothness(self.response.values(slice(None))),
             "gain_residual": residual,
             "response_anchor": self.anchor_distance(),
         }
+        if self.vignetting is not None:
+            terms["vignetting"] = self.vignetting.size()
+        return terms
 
     def anchor_distance(self) -> Tensor:
         """Mean square distance from the values that `anchor()` held.
@@ -221,6 +247,15 @@ class SharedToneMapper(BracketedToneMapper):
         self.anchor_white_balance.copy_(self.bracket_gain.white_balance)
         self.anchored.fill_(True)
         self.known_anchored = True
+
+
+def without_vignetting(
+    tonemapper: SharedToneMapper, state: dict[str, Tensor], prefix: str, *args: Any
+) -> None:
+    """Runs from before vignetting was learned have none."""
+    assert tonemapper.vignetting is not None
+    none = torch.zeros_like(tonemapper.vignetting.coefficients)
+    state.setdefault(f"{prefix}vignetting.coefficients", none)
 
 
 class NetworkToneMapper(BracketedToneMapper):

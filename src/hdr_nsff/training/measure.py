@@ -36,7 +36,8 @@ def squared_error(render: Render, batch: PixelBatch, tonemapper: ToneMapper) -> 
     rgb = render.rgb
     if rgb is None:
         which = batch.bracket, batch.camera_id, batch.frame
-        rgb = tonemapper(render.radiance, *which, leaky=False)
+        shaded = tonemapper.shade(render.radiance, batch.camera, batch.camera_id, batch.pixels)
+        rgb = tonemapper(shaded, *which, leaky=False)
     return float((rgb.clamp(0, 1) - batch.rgb)[batch.uniform].square().mean())
 
 
@@ -58,5 +59,6 @@ def rgb_error(tonemapper: ToneMapper, frame: Frame, position: int, radiance: Ten
 
     `radiance` (S, 3) is recorded as the frame's camera would have recorded it.
     """
-    rgb = tonemapper(radiance, frame.bracket, frame.camera_id, position, leaky=False)
+    shaded = tonemapper.shade(radiance, frame.camera, frame.camera_id)
+    rgb = tonemapper(shaded, frame.bracket, frame.camera_id, position, leaky=False)
     return (rgb - frame.image.flatten(0, 1)).abs().mean(-1)

@@ -174,7 +174,8 @@ class Objective:
 
 def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
     """What the batch's camera would have recorded of `radiance` (N, 3)."""
-    return tonemap(radiance, batch.bracket, batch.camera_id, batch.frame, leaky=True)
+    shaded = tonemap.shade(radiance, batch.camera, batch.camera_id, batch.pixels)
+    return tonemap(shaded, batch.bracket, batch.camera_id, batch.frame, leaky=True)
 
 
 def merge_weights(shared: LossWeights, *others: dict[str, float]) -> dict[str, float]:

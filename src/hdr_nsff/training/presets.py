@@ -73,7 +73,7 @@ def paper() -> TrainConfig:
         kind="per_image",
         knots="even",
         from_recordings=False,
-        loss=ToneMapLosses(gain_residual=0.0, response_anchor=0.0),
+        loss=ToneMapLosses(gain_residual=0.0, response_anchor=0.0, vignetting=0.0),
     )
     return TrainConfig(
         field=field,

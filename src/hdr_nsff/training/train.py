@@ -125,6 +125,7 @@ class Trainer:
     def start(self, scene: Scene) -> None:
         """Start tone mapper and field from what `prepare` estimated."""
         self.tonemapper.start(scene.response)
+        self.tonemapper.start_vignetting(scene)
         with_flow = bool(self.objective.weights["flow"])
         from_priors = self.config.from_priors
         self.writer.say(start_field(self.field, self.tonemapper, scene, from_priors, with_flow))

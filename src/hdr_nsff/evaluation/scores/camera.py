@@ -124,10 +124,13 @@ def trajectory_errors(run: Run, truth: Truth, targets: Sequence[Target]) -> dict
     paths = trajectories(run, truth)
     errors = {} if paths is None else alignment.pose_errors(*paths)
     manifest = run.scene.manifest
-    own_K = manifest.frames[0].K
-    if truth.K is not None and own_K is not None and targets:
+    first = manifest.frames[0]
+    if truth.K is not None and first.K is not None and targets:
+        own_K = np.array(first.K)
+        if first.camera_id in manifest.lens:
+            own_K = manifest.lens[first.camera_id].lens().unzoomed(own_K)
         # At the size of the truth's pictures, which is that of its K.
-        focal = own_K[0][0] * targets[0].view.camera.width / manifest.width
+        focal = float(own_K[0, 0]) * targets[0].view.camera.width / manifest.width
         true_focal = truth.K[0][0]
         errors |= {
             "focal": focal,

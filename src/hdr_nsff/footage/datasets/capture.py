@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -164,6 +164,12 @@ def select_poses(given: GivenPoses, rows: Sequence[int]) -> GivenPoses:
     names = None
     if given.names is not None:
         names = [given.names[row] for row in rows]
-    return GivenPoses(
-        names, given.K[rows], given.c2w[rows], given.size[rows], given.near, given.far
+    distortion = None if given.distortion is None else given.distortion[rows]
+    return replace(
+        given,
+        names=names,
+        K=given.K[rows],
+        c2w=given.c2w[rows],
+        size=given.size[rows],
+        distortion=distortion,
     )

@@ -10,6 +10,7 @@ under the key `hdr_nsff` where `export` wrote the file.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +162,7 @@ def exported(
         layout="nerfstudio, written by hdr-nsff",
         root=folder,
         pictures=[exported_picture(folder, frames[k]["file_path"], own[k]) for k in order],
-        poses=GivenPoses(poses.names, poses.K, poses.c2w, poses.size, extra.near, extra.far),
+        poses=replace(poses, near=extra.near, far=extra.far),
         has_held_out=has_held_out,
         depth_kind="disparity" if extra.depth_kind == "scene" else "relative",
         points=static_points(folder, extra.points),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exposure_csv,
 )
 from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
@@ -58,7 +60,9 @@ def frames_step(work: Work) -> StepResult:
             camera_id=frame.camera_id,
             bracket=0,
         )
-        write_frame(work.folder / entry.image, frame.rgb)
+        bits: Literal[8, 16] = 8 if fits_8_bits(frame.rgb) else 16
+        rgb = undistorted(work, frame.rgb, frame.camera_id)
+        write_frame(work.folder / entry.image, rgb, bits)
         entries.append(entry)
         extents.append(exposure.extent(frame.rgb))
     check_frames(c.clip, entries, extents)
@@ -71,6 +75,8 @@ def frames_step(work: Work) -> StepResult:
     if work.footage.transfer is not None:
         kind = work.footage.transfer.upper()
         note += f"; {kind} by its tags, brought to linear light and encoded as x^(1/2.2)"
+    if m.lens:
+        note += f", undistorted ({describe(m.lens)})"
     return StepResult(provenance="given", note=note)
 
 
@@ -89,15 +95,15 @@ def expected_frames(work: Work) -> int | None:
     return len(range(c.start, stop, c.stride)) * len(work.footage.cameras)
 
 
-def write_frame(path: Path, rgb: np.ndarray) -> None:
-    """Write a frame (H, W, 3) in 8 bits where these hold it, else in 16.
+def write_frame(path: Path, rgb: np.ndarray, bits: Literal[8, 16]) -> None:
+    """Write a frame (H, W, 3). A file that is there already stays."""
+    if not path.is_file():
+        write_png(path, rgb, bits=bits)
 
-    A file that is there already stays.
-    """
-    if path.is_file():
-        return
-    error = np.abs(rgb - np.rint(rgb * 255) / 255).max()
-    write_png(path, rgb, bits=8 if error < MAX_ROUNDING_8_BIT else 16)
+
+def fits_8_bits(rgb: np.ndarray) -> bool:
+    """Whether 8 bits hold a frame (H, W, 3) in [0, 1]."""
+    return bool(np.abs(rgb - np.rint(rgb * 255) / 255).max() < MAX_ROUNDING_8_BIT)
 
 
 def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[float, float]]) -> None:

@@ -11,7 +11,9 @@ from hdr_nsff.core.io import atomic, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage.pose_files import fit_poses, import_poses
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.prepare.lens import DistortedFramesError, lens_to_find
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.work import Work
@@ -35,7 +37,8 @@ def find_poses(work: Work) -> StepResult:
     if capture is not None and capture.poses is not None:
         poses = data_set_poses(work)
     elif c.poses is not None:
-        poses = import_poses(c.poses, [f.source for f in m.frames], (m.height, m.width))
+        size, sources = (m.height, m.width), [f.source for f in m.frames]
+        poses = import_poses(c.poses, sources, size, lens_of_clip(work))
     elif isinstance(c.masks, Path) or work.capture_with("masks") is not None:
         poses, given = estimate(work, given_masks(work)), False
     else:
@@ -69,8 +72,15 @@ def data_set_poses(work: Work) -> Poses:
     capture, m = work.capture, work.manifest
     assert capture is not None and capture.poses is not None
     rows: list[int | None] = [capture.row[f.source] for f in m.frames]
-    poses = fit_poses(capture.root, capture.poses, rows, (m.height, m.width))
+    size = (m.height, m.width)
+    poses = fit_poses(capture.root, capture.poses, rows, size, lens_of_clip(work))
     return poses if capture.points is None else replace(poses, points=capture.points)
+
+
+def lens_of_clip(work: Work) -> Lens | None:
+    """The lens of given poses, which is that of all cameras; None for a pinhole."""
+    entries = list(work.manifest.lens.values())
+    return entries[0].lens() if entries else None
 
 
 def poses_and_masks(work: Work) -> Poses:
@@ -101,15 +111,27 @@ def poses_and_masks(work: Work) -> Poses:
 
 def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = None) -> Poses:
     """Poses by structure from motion on equalized frames, without pixels that are
-    `moving` (T, H, W) bool; what `earlier` rounds found is used again.
+    `moving` (T, H, W) bool; what `earlier` rounds found is used again. DistortedFramesError where
+    the frames turn out to be distorted.
     """
     video, clipped = work.equalized
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
     matcher, device = work.config.matcher, pick_device(work.config.device)
-    return estimate_poses(
-        video, moving, folder, clipped, cameras, matcher=matcher, device=device, earlier=earlier
+    poses = estimate_poses(
+        video,
+        moving,
+        folder,
+        clipped,
+        cameras,
+        matcher=matcher,
+        device=device,
+        earlier=earlier,
+        lens=lens_to_find(work),
     )
+    if poses.lenses:
+        raise DistortedFramesError(poses.lenses)
+    return poses
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")

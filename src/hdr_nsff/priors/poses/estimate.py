@@ -19,8 +19,18 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.core.tensors import CPU
+from hdr_nsff.footage.colmap import ColmapModel
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import Poses, interpolate
+from hdr_nsff.priors.poses.lens import (
+    PINHOLE,
+    LensChoice,
+    Mapping,
+    bent_cameras,
+    lens_fit,
+    lens_of,
+)
 from hdr_nsff.priors.poses.lightglue import Matcher
 from hdr_nsff.priors.poses.matching import (
     camera_groups,
@@ -30,10 +40,12 @@ from hdr_nsff.priors.poses.matching import (
 )
 from hdr_nsff.priors.poses.reconstruct import (
     ReconstructionTuning,
+    SfmViews,
     best_model,
     poses_from_model,
     sfm_views,
     spread_frames,
+    views_of_images,
 )
 from hdr_nsff.priors.poses.rotation import Panorama, fit_panorama, fit_video, rotation_share
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
@@ -65,6 +77,7 @@ def estimate_poses(
     tuning: PosesTuning = PosesTuning(),
     device: torch.device = CPU,
     earlier: EarlierRounds | None = None,
+    lens: LensChoice = "none",
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
@@ -72,8 +85,9 @@ def estimate_poses(
     `camera_ids` (T,) the physical camera of each frame (each has its own focal length),
     by default one. `matcher` finds and matches keypoints for structure from motion, a
     learned one on `device`; `threads` 0 uses all cores. Temporary files go into
-    `workdir`. What `earlier` rounds on the same frames found is used again. InputError
-    where poses cannot be estimated.
+    `workdir`. What `earlier` rounds on the same frames found is used again. A `lens`
+    that was found or given is in `Poses.lenses`; undistort the frames, and estimate
+    again. InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -86,29 +100,99 @@ def estimate_poses(
         if mask is not None:
             for t in range(count):
                 ignore[t] |= mask[t]
-    groups = camera_groups(camera_ids or [0] * count)
+    cameras = camera_ids or [0] * count
+    groups = camera_groups(cameras)
     share = parallax_free_share(video, ignore, tuning) if len(groups) == 1 else None
     poses = None
     if share is not None and share >= tuning.min_rotation_share:
-        poses = rotation_poses(video, ignore, tuning)
+        poses = rotation_poses(video, ignore, tuning, lens)
     if poses is None:
         views = sfm_views(video, ignore, groups, tuning.reconstruction)
+        mapper = Mapper(
+            views, Path(workdir), threads, matcher, tuning.reconstruction, device,
+            earlier or EarlierRounds(),
+        )  # fmt: skip
         try:
-            model, scale = best_model(
-                views, Path(workdir), threads, matcher, tuning.reconstruction, device, earlier
-            )
-            size = (video.shape[1], video.shape[2])
-            poses = poses_from_model(model, views, scale, size, tuning.reconstruction)
+            poses = mapper.poses(lens)
         except InputError as error:
             if share is not None and share >= tuning.min_rotation_share_fallback:
-                poses = rotation_poses(video, ignore, tuning)
+                poses = rotation_poses(video, ignore, tuning, lens)
             if poses is None:
                 raise
             note = f"treated as a camera that turns in place, since {error}"
             poses = replace(poses, notes=(note, *poses.notes))
+    if poses.lenses:
+        return replace(poses, lenses={cameras[groups[k][0]]: v for k, v in poses.lenses.items()})
     for note in poses.notes:
         say(f"poses: {note}")
     return poses
+
+
+@dataclass(frozen=True)
+class Mapper:
+    """Structure from motion on the views of a clip, as a pinhole camera or with a lens."""
+
+    views: SfmViews
+    workdir: Path
+    threads: int
+    matcher: Matcher
+    tuning: ReconstructionTuning
+    device: torch.device
+    earlier: EarlierRounds
+
+    def model(self, mapping: Mapping, earlier: EarlierRounds) -> tuple[ColmapModel, int]:
+        """The best reconstruction, and how much larger than the views its images are."""
+        return best_model(
+            self.views, self.workdir, self.threads, self.matcher, self.tuning, self.device,
+            earlier, mapping,
+        )  # fmt: skip
+
+    def poses(self, lens: LensChoice) -> Poses:
+        """Poses of all frames, with the lens of each group of views where one is found
+        or given. InputError where there is no good reconstruction.
+        """
+        if not isinstance(lens, str):
+            return self.bent_poses(Mapping(distortion=lens))
+        if lens == "none":
+            return self.of_model(*self.model(PINHOLE, self.earlier))
+        try:
+            model, scale = self.model(Mapping(try_lens=True), self.earlier)
+        except InputError:  # perhaps it bends too much for a pinhole camera
+            poses = self.bent_poses(Mapping(distortion=(0.0, 0.0), refine=True, try_lens=True))
+            if not poses.lenses:
+                raise
+            return poses
+        fit = lens_fit(self.earlier)
+        bent = [] if fit is None else bent_cameras(fit, model, scale, self.tuning.lens)
+        if bent:
+            poses = self.bent_poses(Mapping(distortion=bent[0], refine=True, try_lens=True))
+            if poses.lenses:
+                return poses
+        return self.of_model(model, scale)
+
+    def bent_poses(self, mapping: Mapping) -> Poses:
+        """Poses of a reconstruction with a lens, and the lenses unless they bend too
+        little after all.
+        """
+        size = (self.views.images.shape[1], self.views.images.shape[2])
+        round_of_its_own = EarlierRounds(self.earlier.matches)
+        model, scale = self.model(mapping, round_of_its_own)
+        fit = lens_fit(round_of_its_own)
+        image_of = views_of_images(model)
+        lenses = {}
+        for k, group in enumerate(self.views.groups):
+            camera_ids = [image_of[v].camera_id for v in group if v in image_of]
+            lenses[k] = lens_of(model, camera_ids[0], fit, size, self.tuning.lens)
+        poses = self.of_model(model, scale)
+        largest = max(lens.max_displacement_px() for lens in lenses.values())
+        if mapping.refine and largest < self.tuning.lens.min_displacement_px:
+            return poses
+        return replace(poses, lenses=lenses)
+
+    def of_model(self, model: ColmapModel, scale: int) -> Poses:
+        """The poses of a reconstruction."""
+        height, width = self.views.images.shape[1:3]
+        return poses_from_model(model, self.views, scale, (height, width), self.tuning)
 
 
 def parallax_free_share(
@@ -136,10 +220,14 @@ def parallax_free_share(
 
 
 def rotation_poses(
-    video: ArrayStack, ignore: np.ndarray, tuning: PosesTuning = PosesTuning()
+    video: ArrayStack,
+    ignore: np.ndarray,
+    tuning: PosesTuning = PosesTuning(),
+    lens: LensChoice = "none",
 ) -> Poses | None:
     """Poses of a camera on a tripod or turning in place, from all frames (T, H, W, 3);
     `ignore` (T, H, W) bool. None where rotations do not explain the footage after all.
+    A given `lens` gets the focal length; none is estimated.
     """
     rotation = tuning.reconstruction.rotation
     panorama = fit_video(video, ignore, tuning.reconstruction.matching, rotation)
@@ -159,6 +247,11 @@ def rotation_poses(
         frame_errors=panorama.frame_errors,
         notes=rotation_notes(panorama, still, rotation.default_fov_degrees),
     )
+    if lens == "auto":
+        note = "lens distortion is not estimated without parallax; --lens-distortion gives it"
+        poses = replace(poses, notes=(*poses.notes, note))
+    elif not isinstance(lens, str):
+        poses = replace(poses, lenses={0: Lens(poses.K[0], (*lens, 0.0, 0.0), width, height)})
     return interpolate(poses, [list(range(count))])
 
 

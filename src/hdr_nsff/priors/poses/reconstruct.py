@@ -35,6 +35,7 @@ from hdr_nsff.geometry.poses import (
     trusted_points,
 )
 from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.lens import PINHOLE, LensTuning, Mapping
 from hdr_nsff.priors.poses.lightglue import LightGlueTuning, Matcher, match_images, upsample
 from hdr_nsff.priors.poses.matching import (
     MatchingTuning,
@@ -78,6 +79,7 @@ class ReconstructionTuning:
     rotation: RotationTuning = field(default_factory=RotationTuning)
     keyframes: KeyframeTuning = field(default_factory=KeyframeTuning)
     lightglue: LightGlueTuning = field(default_factory=LightGlueTuning)
+    lens: LensTuning = field(default_factory=LensTuning)
     sfm: sfm.SfmTuning = field(default_factory=sfm.SfmTuning)
 
 
@@ -166,10 +168,11 @@ def best_model(
     tuning: ReconstructionTuning = ReconstructionTuning(),
     device: torch.device = CPU,
     earlier: EarlierRounds | None = None,
+    mapping: Mapping = PINHOLE,
 ) -> tuple[ColmapModel, int]:
     """The best reconstruction of the views, and how many times larger than the views
     its images were. A learned `matcher` runs on `device`. InputError where no
-    reconstruction is good enough.
+    reconstruction is good enough. `mapping` is the lens to map with.
 
     Matches and poses of `earlier` rounds, on the same views with other pixels ignored,
     are used again; this round's are added in place.
@@ -191,6 +194,7 @@ def best_model(
                     Path(folder), views, scale, level_contrast, threads, matcher, earlier,
                     tuning, device,
                 )  # fmt: skip
+                job = with_lens(job, mapping)
             except sfm.SfmError as error:
                 failures.append(str(error))
                 continue
@@ -217,6 +221,16 @@ def best_model(
     if len(best.images) < tuning.min_registered * count:
         raise InputError(failure_message(best, views, failures, tuning))
     return best, scale
+
+
+def with_lens(job: sfm.Job, mapping: Mapping) -> sfm.Job:
+    """A job that maps its images with a lens."""
+    return replace(
+        job,
+        distortion=list(mapping.distortion or ()),
+        refine_distortion=mapping.refine,
+        try_lens=mapping.try_lens,
+    )
 
 
 def attempts(job: sfm.Job, earlier: EarlierRounds) -> list[sfm.Job]:

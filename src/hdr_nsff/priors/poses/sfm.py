@@ -74,6 +74,11 @@ class Job:
     threads: int = 0  # 0 = all cores
     keyframes: list[str] = field(default_factory=list)  # mapped first; empty: all at once
     start: str = ""  # folder of a model
+    # k1, k2 of the images, to start from; empty: a pinhole camera
+    distortion: list[float] = field(default_factory=list)
+    refine_distortion: bool = True
+    # also fit another lens to every model, and write it to its folder (`LensFit`)
+    try_lens: bool = False
 
     @property
     def out(self) -> Path:
@@ -81,6 +86,28 @@ class Job:
         return Path(self.folder) / (f"{self.task}-keyframes" if self.keyframes else self.task)
 
     tuning: SfmTuning = field(default_factory=SfmTuning)
+
+
+@dataclass(frozen=True)
+class LensFit:
+    """Another lens fit to the cameras of a model: k1 and k2 instead of a pinhole, or k1
+    alone instead of both.
+    """
+
+    # by camera: focal length in pixels of the images, k1, k2
+    cameras: dict[int, tuple[float, float, float]]
+    model_error_px: float  # mean reprojection error of the model, pixels of the images
+    error_px: float  # the same with this lens
+
+
+LENS_FILE = "lens.json"  # in the folder of a model
+
+
+def parse_lens_fit(content: bytes) -> LensFit:
+    """The lens fit that a worker wrote."""
+    raw = json.loads(content)
+    cameras = {int(key): tuple(values) for key, values in raw["cameras"].items()}
+    return LensFit(cameras, raw["model_error_px"], raw["error_px"])
 
 
 class SfmError(RuntimeError):

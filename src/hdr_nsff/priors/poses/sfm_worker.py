@@ -10,18 +10,28 @@ number of images and not with its square.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import threading
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from hdr_nsff.core.process import prepare_process
-from hdr_nsff.priors.poses.sfm import Job, SfmTuning, read_job, read_matches, write_matches
-from hdr_nsff.priors.poses.trimming import trim
+from hdr_nsff.priors.poses.sfm import (
+    LENS_FILE,
+    Job,
+    LensFit,
+    SfmTuning,
+    read_job,
+    read_matches,
+    write_matches,
+)
+from hdr_nsff.priors.poses.trimming import NUM_PINHOLE_PARAMS, trim
 
 EXTRACTION_BATCH = 6  # images per call, between two steps of progress
 MATCHING_STEPS = 24  # of progress
@@ -69,8 +79,20 @@ def import_images(job: Job, database: Path) -> dict[str, int]:
     with pycolmap.Database.open(database) as db:
         for camera in db.read_all_cameras():
             camera.focal_length = job.focal
+            if job.distortion:
+                set_lens(camera, job.distortion)
             db.update_camera(camera)
         return {image.name: image.image_id for image in db.read_all_images()}
+
+
+def set_lens(camera: Any, distortion: list[float]) -> None:
+    """Give a camera, in place, a lens with k1 and k2, or k1 alone."""
+    import pycolmap
+
+    focal, x, y = list(camera.params)[:3]
+    models = (pycolmap.CameraModelId.SIMPLE_RADIAL, pycolmap.CameraModelId.RADIAL)
+    camera.model = models[len(distortion) - 1]
+    camera.params = [focal, x, y, *distortion]
 
 
 def find_matches(job: Job, database: Path, threads: int) -> None:
@@ -211,11 +233,34 @@ def reconstruct(job: Job, database: Path, threads: int) -> None:
     models = {key: model for key, model in models.items() if len(model.points3D)}
     send("stage adjustment", (job.tuning.trimming.max_rounds + 1) * len(models))
     for key, model in models.items():
-        trim(model, lambda m: adjust(m, job.tuning, final=False), job.tuning.trimming)
-        adjust(model, job.tuning, final=True)
+        trim(model, lambda m: adjust(m, job, final=False), job.tuning.trimming)
+        adjust(model, job, final=True)
         (out / str(key)).mkdir(exist_ok=True)
         model.write_binary(out / str(key))
+        if job.try_lens:
+            fit = fit_lens(model, job.tuning)
+            (out / str(key) / LENS_FILE).write_text(json.dumps(asdict(fit)))
     send("end")
+
+
+def fit_lens(model: Any, tuning: SfmTuning) -> LensFit:
+    """Another lens for the cameras of an adjusted `model`, which stays as it is."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.function_tolerance = tuning.trimming_tolerance
+    options.ceres.solver_options.max_num_iterations = tuning.max_trimming_iterations
+    other = pycolmap.Reconstruction(model)
+    for camera in other.cameras.values():
+        radial = list(camera.params[NUM_PINHOLE_PARAMS:])
+        set_lens(camera, radial[:1] if radial else [0.0, 0.0])
+    pycolmap.bundle_adjustment(other, options)
+    lenses = {}
+    for key, camera in other.cameras.items():
+        focal, _, _, k1, k2 = [*(float(value) for value in camera.params), 0.0][:5]
+        lenses[int(key)] = (focal, k1, k2)
+    return LensFit(lenses, mean_error(model), mean_error(other))
 
 
 def incremental_options(job: Job, threads: int) -> Any:
@@ -233,6 +278,7 @@ def incremental_options(job: Job, threads: int) -> Any:
     options.ba_global_max_refinements = tuning.max_global_refinements
     options.ba_global_function_tolerance = tuning.mapping_tolerance
     options.ba_local_function_tolerance = tuning.mapping_tolerance
+    options.ba_refine_extra_params = job.refine_distortion
     return options
 
 
@@ -290,28 +336,30 @@ def from_known_poses(job: Job, database: Path, threads: int) -> Any:
     return model
 
 
-def adjust(model: Any, tuning: SfmTuning, final: bool) -> None:
+def adjust(model: Any, job: Job, final: bool) -> None:
     """Adjust cameras and points to each other, and focal lengths where that lowers the
     error: a camera that slides without turning does not determine them. Only the
     `final` adjustment runs to convergence.
     """
     import pycolmap
 
+    tuning = job.tuning
     held = pycolmap.BundleAdjustmentOptions()
     held.print_summary = held.refine_focal_length = False
     free = pycolmap.BundleAdjustmentOptions()
     free.print_summary = False
     for options in (held, free):
+        options.refine_extra_params = job.refine_distortion
         if not final:
             options.ceres.solver_options.function_tolerance = tuning.trimming_tolerance
             options.ceres.solver_options.max_num_iterations = tuning.max_trimming_iterations
     pycolmap.bundle_adjustment(model, held)
-    focal_lengths = {key: camera.focal_length for key, camera in model.cameras.items()}
+    before = {key: list(camera.params) for key, camera in model.cameras.items()}
     held_error = mean_error(model)
     pycolmap.bundle_adjustment(model, free)
     if mean_error(model) > tuning.max_free_focal_error_share * held_error:
-        for key, focal in focal_lengths.items():
-            model.cameras[key].focal_length = focal
+        for key, params in before.items():
+            model.cameras[key].params = params
         pycolmap.bundle_adjustment(model, held)
     send("tick")
 

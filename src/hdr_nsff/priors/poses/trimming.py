@@ -21,6 +21,8 @@ import numpy as np
 
 from hdr_nsff.geometry import pinhole
 
+NUM_PINHOLE_PARAMS = 3  # focal length and principal point
+
 
 @dataclass(frozen=True)
 class TrimmingTuning:
@@ -110,6 +112,9 @@ def triangulate(model: Any, track: Any) -> tuple[np.ndarray, float]:
     pixels = np.array(
         [i.points2D[e.point2D_idx].xy for i, e in zip(images, track.elements, strict=True)]
     )
+    cameras = [model.cameras[i.camera_id] for i in images]
+    if any(len(camera.params) > NUM_PINHOLE_PARAMS for camera in cameras):
+        pixels = np.array([undistorted(c, xy) for c, xy in zip(cameras, pixels, strict=True)])
     K = np.array([model.cameras[i.camera_id].calibration_matrix() for i in images])
     w2c = np.array([i.cam_from_world().matrix() for i in images])  # (V, 3, 4)
     rotations = np.swapaxes(w2c[:, :, :3], 1, 2)
@@ -125,3 +130,9 @@ def triangulate(model: Any, track: Any) -> tuple[np.ndarray, float]:
         return point, np.inf
     error = float(np.linalg.norm(projected - pixels, axis=1).mean())
     return point, unbiased_error(error, len(pixels))
+
+
+def undistorted(camera: Any, pixel: np.ndarray) -> np.ndarray:
+    """The pixel (2,) at which a camera would see a point if its lens did not distort."""
+    plane = camera.cam_from_img(pixel)
+    return camera.calibration_matrix()[:2] @ np.append(plane, 1.0)

@@ -1,0 +1,161 @@
+"""Lens distortion: where a real lens puts what a pinhole camera would see, and pictures
+brought from one to the other.
+
+The model is that of Brown 1971 as OpenCV and COLMAP (RADIAL, OPENCV) have it. A point
+(x, y) of the image plane at depth 1 is recorded at
+
+    x (1 + k1 r^2 + k2 r^4) + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y (1 + k1 r^2 + k2 r^4) + p1 (r^2 + 2 y^2) + 2 p2 x y
+
+Pixels have their centers at +0.5. Undistorted pictures have the size of the recorded
+ones, and the widest view that shows no pixel from outside of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from hdr_nsff.geometry import pinhole
+
+UNDISTORT_STEPS = 100  # of the fixed-point iteration, which ends earlier where it converges
+UNDISTORT_ERROR = 1e-9  # image plane at depth 1
+ZOOM_RANGE = (0.25, 4.0)  # of focal lengths that are tried for an undistorted picture
+ZOOM_STEPS = 40  # of bisection
+BORDER_POINTS = 65  # along each side of a picture
+
+
+@dataclass(frozen=True)
+class Lens:
+    """The camera of recorded pictures: a pinhole, and the distortion of its lens."""
+
+    K: np.ndarray  # (3, 3) pixels
+    distortion: tuple[float, float, float, float]  # k1, k2, p1, p2
+    width: int  # pixels that K is for
+    height: int
+
+    def resized(self, width: int, height: int) -> Lens:
+        """The same lens for pictures of another size."""
+        scale = np.array([width / self.width, height / self.height, 1])
+        return replace(self, K=self.K * scale[:, None], width=width, height=height)
+
+    def bend(self, plane: np.ndarray) -> np.ndarray:
+        """Where the lens brings points (..., 2) of the image plane at depth 1."""
+        x, y = plane[..., 0], plane[..., 1]
+        k1, k2, p1, p2 = self.distortion
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+        bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        return np.stack([bent_x, bent_y], -1)
+
+    def distort(self, pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
+        """Where the lens records (..., 2) what a pinhole camera `K` (3, 3) sees at
+        `pixels` (..., 2).
+        """
+        bent = self.bend(pinhole.camera_rays(pixels, K)[..., :2])
+        return pinhole.to_pixels(pinhole.homogeneous(bent), self.K)
+
+    def undistort(self, pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
+        """Where a pinhole camera `K` (3, 3) sees (..., 2) what the lens recorded at
+        `pixels` (..., 2).
+        """
+        recorded = pinhole.camera_rays(pixels, self.K)[..., :2]
+        plane = recorded
+        for _ in range(UNDISTORT_STEPS):
+            error = recorded - self.bend(plane)
+            plane = plane + error
+            if not (np.abs(error).max(initial=0) > UNDISTORT_ERROR):
+                break
+        return pinhole.to_pixels(pinhole.homogeneous(plane), K)
+
+    def border(self) -> np.ndarray:
+        """Points (N, 2) along the border of a picture, in pixels."""
+        along = np.linspace(0, 1, BORDER_POINTS)
+        zero, one = np.zeros_like(along), np.ones_like(along)
+        sides = [(along, zero), (along, one), (zero, along), (one, along)]
+        shares = np.concatenate([np.stack(side, -1) for side in sides])
+        return shares * np.array([self.width, self.height])
+
+    def pinhole(self) -> np.ndarray:
+        """K (3, 3) of undistorted pictures: the shortest focal length at which all of
+        their pixels were recorded.
+        """
+        border, size = self.border(), np.array([self.width, self.height])
+        short, long = ZOOM_RANGE
+        for _ in range(ZOOM_STEPS):
+            zoom = (short + long) / 2
+            recorded = self.distort(border, zoomed(self.K, zoom))
+            inside = ((recorded >= 0) & (recorded <= size)).all()
+            short, long = (short, zoom) if inside else (zoom, long)
+        return zoomed(self.K, long)
+
+    def unzoomed(self, K: np.ndarray) -> np.ndarray:
+        """The camera `K` (3, 3) of undistorted pictures, estimated from them, at the focal
+        length of the lens: what a pinhole camera in its place would have recorded.
+        """
+        return zoomed(K, self.K[0, 0] / self.pinhole()[0, 0])
+
+    def wide_pinhole(self) -> tuple[np.ndarray, int, int]:
+        """K (3, 3), width and height of the smallest pinhole picture, at the focal length
+        of the lens, that shows all that the lens records.
+        """
+        outline = self.undistort(self.border(), self.K)
+        low = np.floor(outline.min(0)).astype(int) - 1
+        width, height = np.ceil(outline.max(0)).astype(int) + 1 - low
+        K = self.K.copy()
+        K[:2, 2] -= low
+        return K, int(width), int(height)
+
+    def max_displacement_px(self) -> float:
+        """By how many pixels the lens moves a corner of the picture at most."""
+        width, height = self.width, self.height
+        corners = np.array([(0.0, 0), (width, 0), (0, height), (width, height)])
+        with np.errstate(all="ignore"):  # impossible numbers are refused elsewhere
+            return float(np.linalg.norm(self.distort(corners, self.K) - corners, axis=-1).max())
+
+    def is_one_to_one(self) -> bool:
+        """Whether distance from the axis grows with the angle to it, up to the corners."""
+        k1, k2, _, _ = self.distortion
+        r2 = (pinhole.camera_rays(self.border(), self.K)[..., :2] ** 2).sum(-1).max()
+        # the border is recorded; what a barrel lens brings there lies up to twice as far
+        squares = np.linspace(0, 2 * r2 if k1 < 0 else r2, BORDER_POINTS)
+        return bool((1 + 3 * k1 * squares + 5 * k2 * squares**2 > 0).all())
+
+
+def zoomed(K: np.ndarray, zoom: float) -> np.ndarray:
+    """K (3, 3) with its focal lengths times `zoom`."""
+    return K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]])
+
+
+def undistorted_picture(picture: np.ndarray, lens: Lens) -> np.ndarray:
+    """A recorded picture (H, W) or (H, W, C) as the pinhole camera `lens.pinhole()`
+    would have recorded it; boolean pictures are taken from the nearest pixel.
+    """
+    height, width = picture.shape[:2]
+    lens = lens.resized(width, height)
+    return sample(picture, lens.distort(pinhole.pixel_centers(height, width), lens.pinhole()))
+
+
+def distorted_picture(picture: np.ndarray, K: np.ndarray, lens: Lens) -> np.ndarray:
+    """The picture (H, W) or (H, W, C) that the lens records of what a pinhole camera
+    `K` (3, 3) sees as `picture`; it has the size of the lens.
+    """
+    return sample(picture, lens.undistort(pinhole.pixel_centers(lens.height, lens.width), K))
+
+
+def sample(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """A picture (H, W) or (H, W, C) read at `pixels` (h, w, 2), between its pixels by a
+    cubic, and beyond its border as there.
+    """
+    places = np.ascontiguousarray(pixels - 0.5, np.float32)
+    x, y = places[..., 0], places[..., 1]
+    edge = cv2.BORDER_REPLICATE
+    if picture.dtype == bool:
+        marks = picture.astype(np.uint8)
+        return np.asarray(cv2.remap(marks, x, y, cv2.INTER_NEAREST, borderMode=edge)) > 0
+    values = np.ascontiguousarray(picture, np.float32)
+    read = np.asarray(cv2.remap(values, x, y, cv2.INTER_CUBIC, borderMode=edge))
+    return read.clip(values.min(), values.max())

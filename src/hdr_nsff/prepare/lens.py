@@ -1,0 +1,110 @@
+"""The lens of a clip in `prepare`: what the settings ask for, what is known already, and
+the frames as a pinhole camera would have recorded them.
+
+Frames are undistorted once, as they are decoded. A lens that structure from motion
+finds is known only later, so the steps before start over (`DistortedFramesError`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.pose_files import locate, read_given
+from hdr_nsff.footage.pose_formats import common_lens, distorted
+from hdr_nsff.geometry.lens import Lens, undistorted_picture
+from hdr_nsff.prepare.work import Part, PrepareConfig, Work
+from hdr_nsff.priors.poses.lens import LensChoice
+from hdr_nsff.scene.manifest import LensEntry, Manifest
+
+MAX_K = 10.0  # no lens has more: beyond it, a number is a mistake
+
+
+class DistortedFramesError(Exception):
+    """The frames turned out to be distorted, by these lenses {camera_id: lens}."""
+
+    def __init__(self, lenses: dict[int, Lens]) -> None:
+        super().__init__("the frames are distorted")
+        self.lenses = lenses
+
+
+def parse_lens(text: str) -> LensChoice:
+    """What `--lens-distortion` asks for; InputError where it makes no sense."""
+    if text == "auto":
+        return "auto"
+    if text == "none":
+        return "none"
+    try:
+        k1, k2, *more = [float(word) for word in f"{text},0".split(",")]
+    except ValueError:
+        more = [0.0, 0.0]
+    if len(more) > 1 or not abs(k1) + abs(k2) < MAX_K:
+        raise InputError(
+            f"--lens-distortion {text!r:.40}: write auto, none, K1, or K1,K2, such as -0.2,0.03"
+        )
+    return (k1, k2)
+
+
+def known_lenses(found: Manifest, config: PrepareConfig) -> dict[int, LensEntry]:
+    """The lenses of a scene folder that the settings let stand."""
+    choice = parse_lens(config.lens_distortion)
+    if "frames" in config.redo or choice == "none":
+        return {}
+    if choice == "auto":
+        return {c: entry for c, entry in found.lens.items() if not entry.given}
+    return {c: e for c, e in found.lens.items() if e.given and tuple(e.distortion[:2]) == choice}
+
+
+def given_lenses(work: Work) -> dict[int, LensEntry]:
+    """The lenses that come with given poses: theirs, or that of the settings with their
+    focal length. Empty where poses are not given, or nothing is distorted.
+    """
+    choice = parse_lens(work.config.lens_distortion)
+    capture, path = work.gives("poses"), work.config.poses
+    if capture is not None and capture.poses is not None:
+        path, given = capture.root, capture.poses
+    elif path is not None:
+        path = locate(path)
+        given, _ = read_given(path)
+    else:
+        return {}
+    if choice == "none":
+        return {}
+    if choice != "auto":
+        given = replace(given, distortion=np.tile([*choice, 0.0, 0.0], (len(given.K), 1)))
+    lens = common_lens(path, given)
+    if lens is None:
+        return {}
+    other_parts: tuple[Part, ...] = ("flow", "masks", "depth")
+    with_maps = any(work.gives(part) for part in other_parts)
+    if with_maps or (work.capture is not None and work.capture.has_held_out):
+        raise distorted(path, lens.max_displacement_px())
+    entry = LensEntry.of(lens, given=True)
+    return {camera_id: entry for camera_id in range(len(work.footage.cameras))}
+
+
+def lens_to_find(work: Work) -> LensChoice:
+    """What structure from motion is to do about the lens: nothing, once it is known."""
+    return "none" if work.manifest.lens else parse_lens(work.config.lens_distortion)
+
+
+def undistorted(work: Work, rgb: np.ndarray, camera_id: int) -> np.ndarray:
+    """A frame (H, W, 3) of a camera without the distortion of its lens, where that is
+    known.
+    """
+    entry = work.manifest.lens.get(camera_id)
+    return rgb if entry is None else undistorted_picture(rgb, entry.lens())
+
+
+def describe(lenses: dict[int, LensEntry]) -> str:
+    """The distortion of lenses in words, such as "k1 -0.096, k2 0.007, 5 px at the
+    corners".
+    """
+    words = []
+    for entry in lenses.values():
+        k1, k2, *_ = entry.distortion
+        moved = entry.lens().max_displacement_px()
+        words.append(f"k1 {k1:.4f}, k2 {k2:.4f}, {moved:.0f} px at the corners")
+    return "; ".join(dict.fromkeys(words))

@@ -1,0 +1,78 @@
+"""Rendered views as the clip's lens would have recorded them: `render --lens original`.
+
+The view is rendered by a pinhole camera that sees all that the lens does, and the
+picture is then distorted, with depth, opacity, mattes and motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.lens import Lens, distorted_picture
+from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.geometry.pinhole import pixel_centers
+from hdr_nsff.rendering.stills import Still
+from hdr_nsff.scene.manifest import Manifest
+
+
+def original_lens(manifest: Manifest, camera_id: int) -> Lens:
+    """The lens of a camera of a scene; InputError where its frames had no distortion."""
+    entry = manifest.lens.get(camera_id)
+    if entry is None:
+        raise InputError(
+            "--lens original: the frames of this scene were recorded without distortion; "
+            "leave it out"
+        )
+    return entry.lens()
+
+
+@dataclass(frozen=True)
+class LensView:
+    """A view through a lens: what to render, and how to distort it."""
+
+    view: PathView  # of a pinhole camera that sees all that the lens does
+    lens: Lens  # of the picture's size
+
+    @staticmethod
+    def of(view: PathView, lens: Lens) -> LensView:
+        """The same for a `view` of an undistorted camera of the scene."""
+        camera = view.camera
+        width, height = camera.width, camera.height
+        K = lens.unzoomed(camera.K.double().cpu().numpy())
+        own = replace(lens.resized(width, height), K=K)
+        wide_K, wide_width, wide_height = own.wide_pinhole()
+        wide = replace(
+            camera, K=torch.from_numpy(wide_K).to(camera.K), width=wide_width, height=wide_height
+        )
+        return LensView(replace(view, camera=wide), own)
+
+    def distort(self, picture: np.ndarray) -> np.ndarray:
+        """A picture (h, w) or (h, w, C) of `view` as the lens records it, (H, W[, C])."""
+        return distorted_picture(picture, self.view.camera.K.double().cpu().numpy(), self.lens)
+
+    def distort_motion(self, vectors: np.ndarray) -> np.ndarray:
+        """Motion (h, w, 2) in pixels of `view` as that of the lens's pixels (H, W, 2)."""
+        K = self.view.camera.K.double().cpu().numpy()
+        pixels = pixel_centers(self.lens.height, self.lens.width)
+        landing = self.lens.undistort(pixels, K) + self.distort(vectors)
+        return (self.lens.distort(landing, K) - pixels).astype(np.float32)
+
+    def distort_still(self, still: Still) -> Still:
+        """All of a still of `view`."""
+        return Still(
+            radiance=self.distort(still.radiance),
+            opacity=self.distort(still.opacity),
+            depth=self.distort(still.depth),
+            motion=self.distort(still.motion),
+            flow={side: self.distort_motion(v) for side, v in still.flow.items()},
+            screen_motion={s: self.distort_motion(v) for s, v in still.screen_motion.items()},
+        )
+
+    def distort_mattes(self, mattes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Mattes {name: (h, w)} of `view`."""
+        return {name: self.distort(matte) for name, matte in mattes.items()}

@@ -1,0 +1,37 @@
+"""The lens that structure from motion finds, and where it finds none."""
+
+import numpy as np
+import posed_clips
+import pytest
+
+from hdr_nsff.geometry.lens import Lens, distorted_picture
+from hdr_nsff.priors.poses.estimate import estimate_poses
+
+LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)
+
+
+@pytest.fixture(scope="module")
+def clip():
+    return posed_clips.sliding(posed_clips.PLACES)
+
+
+def test_a_clip_of_a_pinhole_camera_has_the_same_poses_with_the_search_as_without(tmp_path, clip):
+    searched, plain = (
+        estimate_poses(clip, None, tmp_path, threads=1, lens=choice) for choice in ("auto", "none")
+    )
+    assert not searched.lenses and np.array_equal(searched.c2w, plain.c2w)
+    assert np.array_equal(searched.K, plain.K)
+
+
+def test_the_distortion_of_a_clip_is_found(tmp_path, clip):
+    bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
+    lens = estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses[0]
+    assert lens.max_displacement_px() == pytest.approx(LENS.max_displacement_px(), rel=0.25)
+    assert lens.distortion[0] > 0 and lens.distortion[1:] == (0, 0, 0)
+
+
+def test_given_distortion_is_held_and_gets_a_focal_length(tmp_path, clip):
+    bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
+    lens = estimate_poses(bent, None, tmp_path, threads=1, lens=(0.15, 0.0)).lenses[0]
+    assert lens.distortion == (0.15, 0, 0, 0)
+    assert lens.K[0, 0] == pytest.approx(posed_clips.FOCAL, rel=0.1)

@@ -1,0 +1,72 @@
+"""What `prepare` does about the lens: settings, given lenses, frames undistorted once."""
+
+import json
+
+import numpy as np
+import pytest
+from posed_clips import PLACES, H, K, W, sliding
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.geometry.lens import Lens, undistorted_picture
+from hdr_nsff.prepare.engine import run_step
+from hdr_nsff.prepare.lens import known_lenses, parse_lens
+from hdr_nsff.prepare.prepare import STEPS, begin
+from hdr_nsff.prepare.steps.poses import find_poses
+from hdr_nsff.prepare.work import PrepareConfig
+from hdr_nsff.scene.manifest import LensEntry, Manifest
+
+LENS = Lens(K, (0.15, 0.0, 0.0, 0.0), W, H)
+
+
+@pytest.fixture(scope="module")
+def footage(tmp_path_factory):
+    """Four frames, and a transforms.json that says they are distorted."""
+    folder = tmp_path_factory.mktemp("distorted")
+    frames = []
+    for t, picture in enumerate(sliding(PLACES[:4])):
+        write_png(folder / "clip" / f"{t}.png", picture)
+        pose = np.eye(4)
+        pose[:3, 3] = PLACES[t]
+        frames.append({"file_path": f"{t}.png", "transform_matrix": pose.tolist()})
+    size = {"w": W, "h": H, "fl_x": K[0, 0], "cx": W / 2, "cy": H / 2, "k1": 0.15}
+    (folder / "poses.json").write_text(json.dumps({"frames": frames, **size}))
+    return folder
+
+
+def test_the_option_is_read_or_refused_in_a_sentence():
+    assert parse_lens("auto") == "auto" and parse_lens("none") == "none"
+    assert parse_lens("-0.2") == (-0.2, 0) and parse_lens("-0.2,0.03") == (-0.2, 0.03)
+    for text in ("", "1,2,3", "nan", "much", "-99"):
+        with pytest.raises(InputError, match="K1"):
+            parse_lens(text)
+
+
+def test_frames_of_given_poses_are_undistorted_and_poses_are_of_a_pinhole(tmp_path, footage):
+    config = PrepareConfig(footage / "clip", tmp_path / "scene", poses=footage / "poses.json")
+    work = begin(config)
+    run_step(work, "frames", STEPS["frames"])
+    straight = undistorted_picture(read_image(footage / "clip" / "2.png"), LENS)
+    assert np.abs(read_image(tmp_path / "scene" / "images" / "00002.png") - straight).max() < 3e-3
+    entry = Manifest.load(tmp_path / "scene").lens[0]
+    assert entry.given and entry.distortion == [0.15, 0, 0, 0]
+    focal = find_poses(work).frames["K"][0][0][0]
+    assert focal == pytest.approx(LENS.pinhole()[0, 0])
+
+
+def test_the_lens_of_a_scene_stays_while_the_settings_ask_for_it(tmp_path):
+    found, given = LensEntry.of(LENS, given=False), LensEntry.of(LENS, given=True)
+    for entry, choice, stays in (
+        *((found, "auto", True), (given, "auto", False), (found, "none", False)),
+        *((given, "0.15", True), (given, "0.2", False), (found, "0.15", False)),
+    ):
+        manifest = Manifest(source="clip", width=W, height=H, lens={0: entry})
+        config = PrepareConfig(tmp_path, tmp_path, lens_distortion=choice)
+        assert bool(known_lenses(manifest, config)) == stays
+    assert not known_lenses(manifest, PrepareConfig(tmp_path, tmp_path, redo=("frames",)))
+
+
+def test_a_scene_keeps_its_lens_on_disk(tmp_path):
+    Manifest(source="clip", width=W, height=H, lens={0: LensEntry.of(LENS, False)}).save(tmp_path)
+    again = Manifest.load(tmp_path).lens[0].lens()
+    assert np.array_equal(again.K, LENS.K) and again.distortion == LENS.distortion
