@@ -62,7 +62,7 @@ def given_lenses(work: Work) -> dict[int, LensEntry]:
     focal length. Empty where poses are not given, or nothing is distorted.
     """
     choice = parse_lens(work.config.lens_distortion)
-    capture, path = work.gives("poses"), work.config.poses
+    capture, path = work.capture_with("poses"), work.config.poses
     if capture is not None and capture.poses is not None:
         path, given = capture.root, capture.poses
     elif path is not None:
@@ -78,7 +78,7 @@ def given_lenses(work: Work) -> dict[int, LensEntry]:
     if lens is None:
         return {}
     other_parts: tuple[Part, ...] = ("flow", "masks", "depth")
-    with_maps = any(work.gives(part) for part in other_parts)
+    with_maps = any(work.capture_with(part) for part in other_parts)
     if with_maps or (work.capture is not None and work.capture.has_held_out):
         raise distorted(path, lens.max_displacement_px())
     entry = LensEntry.of(lens, given=True)
