@@ -30,6 +30,7 @@ from hdr_nsff.fields.point_cloud import (
     unproject_frame,
 )
 from hdr_nsff.fields.space import FrustumSpace, build_space
+from hdr_nsff.fields.splat.free_space import remove_fog
 from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.initialize_local import local_mask, place_local
 from hdr_nsff.fields.splat.splat import Splat
@@ -78,6 +79,7 @@ def initialize_gaussians(
         count = place(field.static, thin(static, scene, int(FILL * len(field.static))))
         num_movers, moving = place_movers(field, scene, to_radiance)
         local = place_local(field.local, scene, to_radiance, field.unit)
+        count -= remove_fog(field, frames)
         return (
             f"{count} static Gaussians from the depth prior; "
             f"{moving} moving ones on {num_movers} rigid movers; {local} time-local ones"
