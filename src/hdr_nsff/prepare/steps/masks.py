@@ -39,7 +39,11 @@ def find_masks(work: Work) -> StepResult:
 
 
 def estimated_masks(work: Work) -> np.ndarray:
-    """Moving masks (T, H, W) from flow and poses."""
+    """Moving masks (T, H, W) from flow and poses; of a rig, from the visits of its
+    cameras.
+    """
+    if work.manifest.rig > 1:
+        return work.visits.moving
     found, valid, pairs = work.raw_flows
     video, (K, c2w) = work.equalized[0], work.cameras()
     train = np.array([f.split == "train" for f in work.manifest.frames])

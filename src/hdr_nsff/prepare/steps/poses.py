@@ -17,6 +17,7 @@ from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.reconstruct import rig_views
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 MAX_ROUNDS = 2  # of structure from motion after the first
@@ -77,8 +78,10 @@ def poses_and_masks(work: Work) -> Poses:
     """Structure from motion in up to three rounds.
 
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
-    change any more.
+    change any more. A rig needs one: its masks need no poses.
     """
+    if work.manifest.rig > 1:
+        return estimate(work, work.visits.moving)
     earlier = EarlierRounds()
     cache = work.folder / FIRST_ROUND
     if cache.is_file():
@@ -107,9 +110,15 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
     matcher, device = work.config.matcher, pick_device(work.config.device)
+    views = None
+    if work.manifest.rig > 1:
+        pictures = work.visits
+        ignore = pictures.unknown | pictures.clipped
+        views = rig_views(pictures.video, ignore, work.manifest.places)
     return estimate_poses(
-        video, moving, folder, clipped, cameras, matcher=matcher, device=device, earlier=earlier
-    )
+        video, moving, folder, clipped, cameras,
+        matcher=matcher, device=device, earlier=earlier, views=views,
+    )  # fmt: skip
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")

@@ -30,6 +30,7 @@ from hdr_nsff.priors.poses.matching import (
 )
 from hdr_nsff.priors.poses.reconstruct import (
     ReconstructionTuning,
+    SfmViews,
     best_model,
     poses_from_model,
     sfm_views,
@@ -65,6 +66,7 @@ def estimate_poses(
     tuning: PosesTuning = PosesTuning(),
     device: torch.device = CPU,
     earlier: EarlierRounds | None = None,
+    views: SfmViews | None = None,
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
@@ -72,8 +74,9 @@ def estimate_poses(
     `camera_ids` (T,) the physical camera of each frame (each has its own focal length),
     by default one. `matcher` finds and matches keypoints for structure from motion, a
     learned one on `device`; `threads` 0 uses all cores. Temporary files go into
-    `workdir`. What `earlier` rounds on the same frames found is used again. InputError
-    where poses cannot be estimated.
+    `workdir`. What `earlier` rounds on the same frames found is used again. `views`:
+    the images of a rig in turn, see `rig_views`, mapped instead of the frames.
+    InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -87,12 +90,15 @@ def estimate_poses(
             for t in range(count):
                 ignore[t] |= mask[t]
     groups = camera_groups(camera_ids or [0] * count)
-    share = parallax_free_share(video, ignore, tuning) if len(groups) == 1 else None
+    share = None
+    if len(groups) == 1 and views is None:
+        share = parallax_free_share(video, ignore, tuning)
     poses = None
     if share is not None and share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning)
     if poses is None:
-        views = sfm_views(video, ignore, groups, tuning.reconstruction)
+        if views is None:
+            views = sfm_views(video, ignore, groups, tuning.reconstruction)
         try:
             model, scale = best_model(
                 views, Path(workdir), threads, matcher, tuning.reconstruction, device, earlier

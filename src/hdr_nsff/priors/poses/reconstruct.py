@@ -11,6 +11,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -135,6 +136,14 @@ def sfm_views(
 
     images = Stack(image, (len(frame_of), *video.shape[1:]))
     return SfmViews(images, np.stack(hidden), view_groups, of_frame)
+
+
+def rig_views(pictures: np.ndarray, ignore: np.ndarray, places: Sequence[int]) -> SfmViews:
+    """One view per camera of a rig in turn, all with one focal length: its static
+    picture (N, H, W, 3) with `ignore` (N, H, W) bool; `places` (T,): the camera of each
+    frame.
+    """
+    return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places))
 
 
 def stands_still(video: ArrayStack, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
