@@ -19,6 +19,7 @@ from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses
 from hdr_nsff.priors.poses.reconstruct import rig_views
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
+from hdr_nsff.priors.poses.visit_matches import choose_visits
 
 MAX_ROUNDS = 2  # of structure from motion after the first
 MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the same
@@ -113,8 +114,11 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
     views = None
     if work.manifest.rig > 1:
         pictures = work.visits
-        ignore = pictures.unknown | pictures.clipped
-        views = rig_views(pictures.video, ignore, work.manifest.places)
+        places = work.manifest.places
+        hidden = pictures.unknown | pictures.clipped
+        ignore = moving | np.array(clipped)
+        visits = choose_visits(video, ignore, pictures.video, hidden, places)
+        views = rig_views(pictures.video, visits, places)
     return estimate_poses(
         video, moving, folder, clipped, cameras,
         matcher=matcher, device=device, earlier=earlier, views=views,

@@ -51,6 +51,7 @@ from hdr_nsff.priors.poses.view_matches import (
     choose_keyframes,
     pairs_to_match,
 )
+from hdr_nsff.priors.poses.visit_matches import VisitImages, VisitTuning, merge_visits
 
 
 @dataclass(frozen=True)
@@ -79,6 +80,7 @@ class ReconstructionTuning:
     rotation: RotationTuning = field(default_factory=RotationTuning)
     keyframes: KeyframeTuning = field(default_factory=KeyframeTuning)
     lightglue: LightGlueTuning = field(default_factory=LightGlueTuning)
+    visits: VisitTuning = field(default_factory=VisitTuning)
     sfm: sfm.SfmTuning = field(default_factory=sfm.SfmTuning)
 
 
@@ -92,6 +94,7 @@ class SfmViews:
     ignore: np.ndarray  # (V, H, W) bool
     groups: list[list[int]]  # views of each physical camera
     of_frame: np.ndarray  # (T,) the view of each frame
+    visits: VisitImages | None = None  # of a rig: what is matched instead of the images
 
 
 def spread_frames(count: int, limit: int) -> np.ndarray:
@@ -138,12 +141,13 @@ def sfm_views(
     return SfmViews(images, np.stack(hidden), view_groups, of_frame)
 
 
-def rig_views(pictures: np.ndarray, ignore: np.ndarray, places: Sequence[int]) -> SfmViews:
+def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) -> SfmViews:
     """One view per camera of a rig in turn, all with one focal length: its static
-    picture (N, H, W, 3) with `ignore` (N, H, W) bool; `places` (T,): the camera of each
+    picture (N, H, W, 3), matched by its `visits`; `places` (T,): the camera of each
     frame.
     """
-    return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places))
+    ignore = np.zeros(pictures.shape[:3], bool)
+    return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places), visits)
 
 
 def stands_still(video: ArrayStack, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
@@ -269,6 +273,8 @@ def write_job(
         encode(folder / "images" / name, gray)
         grays.append(zlib.crc32(gray.tobytes()))
     keyframes = choose_keyframes(views.groups, tuning.keyframes)
+    if views.visits is not None:
+        keyframes = []
     pairs = pairs_to_match(views.groups, keyframes, tuning.matching, tuning.keyframes)
     named_pairs = [(names[a], names[b]) for a, b in pairs]
     job = sfm.Job(
@@ -281,6 +287,11 @@ def write_job(
         keyframes=[names[v] for v in keyframes],
         tuning=tuning.sfm,
     )
+    if views.visits is not None:
+        merged = match_visits(folder, views.visits, level_contrast, job, matcher, tuning, device)
+        named_pairs = [(names[a], names[b]) for a, b in merged.pairs]
+        sfm.write_matches(folder, names, merged.keypoints, named_pairs, merged.matches)
+        return replace(job, pairs=named_pairs)
     key = (f"{matcher} {level_contrast}", tuple(grays))
     found = earlier.matches.get(key)
     if found is None:
@@ -298,6 +309,36 @@ def write_job(
     static = found.outside(masks)
     sfm.write_matches(folder, names, static.keypoints, named_pairs, static.matches)
     return job
+
+
+def match_visits(
+    folder: Path,
+    visits: VisitImages,
+    level_contrast: bool,
+    job: sfm.Job,
+    matcher: Matcher,
+    tuning: ReconstructionTuning,
+    device: torch.device,
+) -> ViewMatches:
+    """Keypoints and matches of the cameras of a rig, found in the images of their
+    visits, which are written into the `folder` of the `job`.
+    """
+    scale = upsampling_factor(visits.images.shape[2], tuning.matching)
+    pairs = visits.pairs()
+    masks = [keypoint_mask(i, scale, tuning.matching.mask_margin_px) for i in visits.ignore]
+    if matcher == "sift":
+        names = [f"visit{k:05d}.png" for k in range(len(visits.images))]
+        for name, image in zip(names, visits.images, strict=True):
+            gray = sift_image(image, scale, level_contrast, tuning.matching)
+            encode(folder / "images" / name, gray)
+        named_pairs = [(names[a], names[b]) for a, b in pairs]
+        sfm.run_worker(replace(job, groups=[names], pairs=named_pairs, keyframes=[]))
+        keypoints, matches = sfm.read_matches(folder, names, named_pairs)
+    else:
+        images = [upsample(image, scale) for image in visits.images]
+        keypoints, matches = match_images(images, masks, pairs, matcher, tuning.lightglue, device)
+    static = ViewMatches(keypoints, pairs, matches).outside(masks)
+    return merge_visits(static, visits.camera, tuning.visits)
 
 
 def has_plausible_lens(
