@@ -71,7 +71,7 @@ def local_detail(frame: np.ndarray, tuning: TurnsTuning = TurnsTuning()) -> np.n
     """The fine detail (h, w) of a frame (H, W, 3) in gray, at most `max_width` wide, at
     one local contrast, of length 1.
     """
-    gray = np.asarray(frame, np.float32) @ LUMA
+    gray: np.ndarray = np.asarray(frame, np.float32) @ LUMA
     if gray.shape[1] > tuning.max_width:
         height = round(gray.shape[0] * tuning.max_width / gray.shape[1])
         gray = cv2.resize(gray, (tuning.max_width, height), interpolation=cv2.INTER_AREA)

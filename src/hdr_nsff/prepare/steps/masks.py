@@ -39,18 +39,20 @@ def find_masks(work: Work) -> StepResult:
 
 
 def estimated_masks(work: Work) -> np.ndarray:
-    """Moving masks (T, H, W) from flow and poses; of a rig, from the visits of its
+    """Moving masks (T, H, W) from flow and poses; of a rig, also from the visits of its
     cameras.
     """
-    if work.manifest.rig > 1:
-        return work.visits.moving
+    evidence = work.visits.distance if work.manifest.rig > 1 else None
     found, valid, pairs = work.raw_flows
     video, (K, c2w) = work.equalized[0], work.cameras()
     train = np.array([f.split == "train" for f in work.manifest.frames])
     among = train[pairs].all(1)
-    moving = geometric_mask(found[among], valid[among], pairs[among], video, K, c2w)
+    moving = geometric_mask(
+        found[among], valid[among], pairs[among], video, K, c2w, evidence=evidence
+    )
     if not train.all():
-        moving[~train] = geometric_mask(found, valid, pairs, video, K, c2w)[~train]
+        by_all = geometric_mask(found, valid, pairs, video, K, c2w, evidence=evidence)
+        moving[~train] = by_all[~train]
     return moving
 
 

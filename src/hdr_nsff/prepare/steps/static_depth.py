@@ -21,6 +21,7 @@ from hdr_nsff.prepare.steps.masks import given_files
 from hdr_nsff.prepare.steps.neural import network_depth
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
+from hdr_nsff.priors.masks.visits import without_movers
 from hdr_nsff.scene.posed_video import PosedVideo
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
@@ -90,18 +91,20 @@ def rig_depth(work: Work, points: np.ndarray) -> tuple[ArrayStack, ArrayStack, A
     """Depth from the static pictures of a rig's cameras, the same for all frames of a
     camera: disparity, confidence, and that no pixel of the masks is static, (T, H, W).
     """
-    m, pictures = work.manifest, work.visits
-    first = [m.places.index(k) for k in range(m.rig)]
-    K, c2w = work.cameras()
-    times = np.arange(m.rig, dtype=np.float64)
-    clip = PosedVideo(
-        K[first], c2w[first], times, pictures.video, pictures.clipped, pictures.unknown
+    m = work.manifest
+    own = np.array([m.places[f.index] for f in work.train])
+    cameras, first, of_frame = np.unique(own, return_index=True, return_inverse=True)
+    frames = work.training_clip()
+    pictures = without_movers(
+        frames.video, frames.clipped, frames.moving, of_frame.tolist(), len(cameras)
     )
+    # each at a time of its own: what is unknown in one may move in another
+    times = np.arange(len(cameras), dtype=np.float64)
+    clip = PosedVideo(frames.K[first], frames.c2w[first], times, *pictures)
     no_flow = np.zeros((0, *clip.size, 2)), np.zeros((0, *clip.size), bool), np.zeros((0, 2), int)
     disparity, confidence, _ = static_geometric_depth(clip, *no_flow, points)
-    own = np.array([m.places[f.index] for f in work.train])
     still = np.zeros((len(own), *clip.size), bool)
-    return np.array(disparity)[own], np.array(confidence)[own], still
+    return np.array(disparity)[of_frame], np.array(confidence)[of_frame], still
 
 
 def data_set_depth(work: Work) -> Depth:

@@ -17,7 +17,7 @@ import numpy as np
 
 from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.priors.masks.geometric import extract_objects
-from hdr_nsff.priors.masks.geometric_tuning import GeometricMaskTuning
+from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING, GeometricMaskTuning
 from hdr_nsff.radiometry.common_range import recorded_range
 
 SIGMA_PER_MAD = 1.48  # standard deviation of a Gaussian per median absolute deviation
@@ -35,13 +35,17 @@ class VisitTuning:
     """Lower bound of the noise, in [0, 1] of equalized rgb."""
     relative_noise: float = 0.02
     """Noise as a share of the value: light changes by so much."""
-    same_distance: float = 3.0
+    max_distance: float = 8.0
+    """Distances are limited to this many standard deviations."""
+    same_distance: float = 2.0
     """Two visits closer than this many standard deviations show the same."""
     score_scale: float = 0.5
-    """Units of `objects` per standard deviation."""
+    """Units of `objects` per standard deviation, where nothing else is known."""
+    max_score: float = 4.5
+    """Standard deviations that distances are limited to beside other evidence."""
     smoothing_px: float = 1.0
     """Standard deviation of the blur of the squared distances."""
-    objects: GeometricMaskTuning = GeometricMaskTuning()
+    objects: GeometricMaskTuning = GEOMETRIC_MASK_TUNING
     """How scores become objects."""
 
 
@@ -56,6 +60,8 @@ class StaticPictures:
     clipped: np.ndarray  # (N, H, W) bool: no information
     unknown: np.ndarray  # (N, H, W) bool: no two visits agree
     moving: np.ndarray  # (T, H, W) bool, of the frames
+    # (T, H, W) between a frame and its camera's picture, standard deviations of noise
+    distance: np.ndarray
 
 
 def separate_movers(
@@ -80,6 +86,7 @@ def separate_movers(
     unrecorded = np.ones((count, height, width), bool)
     unknown = np.ones((count, height, width), bool)
     moving = np.zeros((len(video), height, width), bool)
+    difference = np.zeros((len(video), height, width), np.float32)
     for camera in range(count):
         times = np.flatnonzero(camera_of == camera)
         visits = read_visits(video, clipped, times, tuning)
@@ -99,8 +106,9 @@ def separate_movers(
         unknown[camera] = supporters.sum(0) < 2
         from_static = np.take_along_axis(distances, chosen[None, None], 0)[0]
         for t, distance in zip(times, from_static, strict=True):
-            moving[t] = moving_objects(distance, tuning)
-    return StaticPictures(pictures, unrecorded, unknown, moving)
+            difference[t] = np.minimum(distance, tuning.max_score)
+            moving[t] = extract_objects(tuning.score_scale * distance, tuning.objects)
+    return StaticPictures(pictures, unrecorded, unknown, moving, difference)
 
 
 @dataclass(frozen=True)
@@ -141,7 +149,9 @@ def visit_distances(visits: Visits, tuning: VisitTuning = VISIT_TUNING) -> np.nd
         for b in range(a + 1, count):
             first, second = visits.in_common(a, b)
             variance = noise[a] ** 2 + noise[b] ** 2
-            distance = np.sqrt(((first - second) ** 2 / variance).mean(-1))
+            squared = ((first - second) ** 2 / variance).mean(-1)
+            squared = np.minimum(squared, tuning.max_distance**2)
+            distance = np.sqrt(cv2.GaussianBlur(squared, (0, 0), tuning.smoothing_px))
             distances[a, b] = distances[b, a] = distance
     return distances
 
@@ -188,9 +198,27 @@ def weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return (values * weights[..., None]).sum(0) / np.maximum(total, 1e-9)
 
 
-def moving_objects(distance: np.ndarray, tuning: VisitTuning = VISIT_TUNING) -> np.ndarray:
-    """Moving objects (H, W) bool from the `distance` (H, W) to the static picture."""
-    limit = tuning.objects.max_score / tuning.score_scale
-    squared = np.minimum(distance, limit) ** 2
-    smooth = np.sqrt(cv2.GaussianBlur(squared, (0, 0), tuning.smoothing_px))
-    return extract_objects(tuning.score_scale * smooth, tuning.objects)
+def without_movers(
+    video: ArrayStack,
+    clipped: ArrayStack,
+    moving: np.ndarray,
+    places: Sequence[int],
+    count: int,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The mean (N, H, W, 3) of the static pixels of the frames of each of `count`
+    cameras, which pixels (N, H, W) are clipped in all of them, and where none is static
+    (N, H, W); arguments as of `separate_movers`, with `moving` (T, H, W) bool known.
+    """
+    pictures, unrecorded, unknown = [], [], []
+    for camera in range(count):
+        own = np.flatnonzero(np.asarray(places) == camera)
+        frames = np.stack([np.asarray(video[t], np.float32) for t in own])
+        static = ~moving[own]
+        hidden = ~static.any(0)
+        static |= hidden
+        recorded = static & ~np.stack([np.asarray(clipped[t], bool) for t in own])
+        lost = ~recorded.any(0)
+        pictures.append(weighted_mean(frames, np.where(lost, static, recorded)))
+        unrecorded.append(lost)
+        unknown.append(hidden)
+    return np.stack(pictures), np.stack(unrecorded), np.stack(unknown)
