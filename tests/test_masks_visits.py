@@ -50,7 +50,7 @@ def test_frames_that_are_held_out_do_not_shape_the_picture():
 
 
 def test_each_camera_has_a_picture_of_its_own():
-    video, truth = visits()
+    video, _ = visits()
     both = np.stack([video, video[:, :, ::-1]], 1).reshape(-1, H, W, 3)
     clipped = np.zeros(both.shape[:3], bool)
     found = separate_movers(both, clipped, [0, 1] * VISITS)

@@ -51,7 +51,7 @@ from hdr_nsff.priors.poses.view_matches import (
     choose_keyframes,
     pairs_to_match,
 )
-from hdr_nsff.priors.poses.visit_matches import VisitImages, VisitTuning, merge_visits
+from hdr_nsff.priors.poses.visit_matches import VisitImages, VisitTuning, match_visits
 
 
 @dataclass(frozen=True)
@@ -143,8 +143,7 @@ def sfm_views(
 
 def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) -> SfmViews:
     """One view per camera of a rig in turn, all with one focal length: its static
-    picture (N, H, W, 3), matched by its `visits`; `places` (T,): the camera of each
-    frame.
+    picture (N, H, W, 3), matched by `visits`; `places` (T,): the camera of each frame.
     """
     ignore = np.zeros(pictures.shape[:3], bool)
     return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places), visits)
@@ -273,8 +272,6 @@ def write_job(
         encode(folder / "images" / name, gray)
         grays.append(zlib.crc32(gray.tobytes()))
     keyframes = choose_keyframes(views.groups, tuning.keyframes)
-    if views.visits is not None:
-        keyframes = []
     pairs = pairs_to_match(views.groups, keyframes, tuning.matching, tuning.keyframes)
     named_pairs = [(names[a], names[b]) for a, b in pairs]
     job = sfm.Job(
@@ -288,7 +285,8 @@ def write_job(
         tuning=tuning.sfm,
     )
     if views.visits is not None:
-        merged = match_visits(folder, views.visits, level_contrast, job, matcher, tuning, device)
+        tunings = tuning.matching, tuning.lightglue, tuning.visits
+        merged = match_visits(job, views.visits, level_contrast, matcher, device, *tunings)
         named_pairs = [(names[a], names[b]) for a, b in merged.pairs]
         sfm.write_matches(folder, names, merged.keypoints, named_pairs, merged.matches)
         return replace(job, pairs=named_pairs)
@@ -309,36 +307,6 @@ def write_job(
     static = found.outside(masks)
     sfm.write_matches(folder, names, static.keypoints, named_pairs, static.matches)
     return job
-
-
-def match_visits(
-    folder: Path,
-    visits: VisitImages,
-    level_contrast: bool,
-    job: sfm.Job,
-    matcher: Matcher,
-    tuning: ReconstructionTuning,
-    device: torch.device,
-) -> ViewMatches:
-    """Keypoints and matches of the cameras of a rig, found in the images of their
-    visits, which are written into the `folder` of the `job`.
-    """
-    scale = upsampling_factor(visits.images.shape[2], tuning.matching)
-    pairs = visits.pairs()
-    masks = [keypoint_mask(i, scale, tuning.matching.mask_margin_px) for i in visits.ignore]
-    if matcher == "sift":
-        names = [f"visit{k:05d}.png" for k in range(len(visits.images))]
-        for name, image in zip(names, visits.images, strict=True):
-            gray = sift_image(image, scale, level_contrast, tuning.matching)
-            encode(folder / "images" / name, gray)
-        named_pairs = [(names[a], names[b]) for a, b in pairs]
-        sfm.run_worker(replace(job, groups=[names], pairs=named_pairs, keyframes=[]))
-        keypoints, matches = sfm.read_matches(folder, names, named_pairs)
-    else:
-        images = [upsample(image, scale) for image in visits.images]
-        keypoints, matches = match_images(images, masks, pairs, matcher, tuning.lightglue, device)
-    static = ViewMatches(keypoints, pairs, matches).outside(masks)
-    return merge_visits(static, visits.camera, tuning.visits)
 
 
 def has_plausible_lens(

@@ -9,11 +9,22 @@ all. The static pictures of the cameras count as one more frame each.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
+import torch
 
+from hdr_nsff.core.images import encode
 from hdr_nsff.core.stack import ArrayStack, Stack
+from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.lightglue import LightGlueTuning, Matcher, match_images, upsample
+from hdr_nsff.priors.poses.matching import (
+    MatchingTuning,
+    keypoint_mask,
+    sift_image,
+    upsampling_factor,
+)
 from hdr_nsff.priors.poses.view_matches import Pairs, ViewMatches
 
 
@@ -72,6 +83,38 @@ def choose_visits(
         ignore=np.concatenate([hidden, ignore[frames]]),
         camera=np.concatenate([np.arange(count), np.asarray(places)[frames]]),
     )
+
+
+def match_visits(
+    job: sfm.Job,
+    visits: VisitImages,
+    level_contrast: bool,
+    matcher: Matcher,
+    device: torch.device,
+    matching: MatchingTuning,
+    lightglue: LightGlueTuning,
+    tuning: VisitTuning,
+) -> ViewMatches:
+    """Keypoints and matches of the cameras of a rig, found in the images of their
+    visits, which are written into the folder of the `job`.
+    """
+    scale = upsampling_factor(visits.images.shape[2], matching)
+    pairs = visits.pairs()
+    masks = [keypoint_mask(ignore, scale, matching.mask_margin_px) for ignore in visits.ignore]
+    if matcher == "sift":
+        folder = Path(job.folder)
+        names = [f"visit{k:05d}.png" for k in range(len(visits.images))]
+        for name, image in zip(names, visits.images, strict=True):
+            gray = sift_image(image, scale, level_contrast, matching)
+            encode(folder / "images" / name, gray)
+        named_pairs = [(names[a], names[b]) for a, b in pairs]
+        sfm.run_worker(replace(job, groups=[names], pairs=named_pairs, keyframes=[]))
+        keypoints, matches = sfm.read_matches(folder, names, named_pairs)
+    else:
+        images = [upsample(image, scale) for image in visits.images]
+        keypoints, matches = match_images(images, masks, pairs, matcher, lightglue, device)
+    static = ViewMatches(keypoints, pairs, matches).outside(masks)
+    return merge_visits(static, visits.camera, tuning)
 
 
 def merge_visits(
