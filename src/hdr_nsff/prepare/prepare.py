@@ -188,6 +188,8 @@ def check_settings(config: PrepareConfig) -> None:
         )
     parse_exposures(config.exposures, config.ev)
     parse_lens(config.lens_distortion)
+    if config.rig is not None and config.rig < 1:
+        raise InputError(f"--rig {config.rig}: give the number of cameras, or 1 for one camera")
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "
@@ -221,8 +223,8 @@ STEPS: dict[StepName, Step] = {
     "exposure": Step(
         on_footage.exposure_step,
         needs=("frames",),
-        settings=("exposures", "ev", "hold_out", "protocol"),
-        forgets=("equalized",),
+        settings=("exposures", "ev", "hold_out", "protocol", "rig"),
+        forgets=("equalized", "visits"),
     ),
     "flow": Step(
         find_flow,

@@ -17,6 +17,7 @@ from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Capture, Picture
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.flow.sources import FlowName
+from hdr_nsff.priors.masks.visits import StaticPictures, separate_movers
 from hdr_nsff.priors.poses.lightglue import Matcher
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, Protocol
@@ -85,6 +86,10 @@ class PrepareConfig:
     novel-view-time: train on every second frame, to be evaluated at the times between.
     Either wants held-out views: a truth folder in `evaluate`, or a data set that brings
     them.
+    """
+    rig: int | None = None
+    """How many still cameras of one make took the frames in turn: frame i is that of
+    camera i modulo RIG. 1: the frames are those of one camera. Default: found.
     """
     poses: Path | None = None
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of
@@ -244,6 +249,15 @@ class Work:
         is_training = np.array([f.split == "train" for f in frames])
         equalizer = exposure.fit_equalizer(self.codes, groups, is_training)
         return exposure.equalized_stacks(self.codes, equalizer)
+
+    @cached_property
+    def visits(self) -> StaticPictures:
+        """Of a rig: the static picture of each camera, from its training frames, and
+        the moving pixels of all frames.
+        """
+        m = self.manifest
+        learned = np.array([f.split == "train" for f in m.frames])
+        return separate_movers(*self.equalized, m.places, learned)
 
     @cached_property
     def raw_flows(self) -> Flows:

@@ -134,6 +134,8 @@ class Manifest(Strict):
     protocol: Protocol | None = None  # how the clip was split for `evaluate`
     fps: float = Field(default=24.0, gt=0, le=1e6)
     cycle: int = Field(default=1, ge=1)  # length of the exposure cycle
+    # still cameras of one make that took the frames in turn, 1: no rig
+    rig: int = Field(default=1, ge=1)
     reference_bracket: int = Field(default=0, ge=0)  # its gain is 1: the radiometric gauge
     # per bracket: log2 exposure relative to the reference, None where unknown
     bracket_ev: list[float | None] = []
@@ -161,6 +163,11 @@ class Manifest(Strict):
     def num_cameras(self) -> int:
         """Physical cameras."""
         return max((f.camera_id for f in self.frames), default=0) + 1
+
+    @property
+    def places(self) -> list[int]:
+        """Per frame the camera of the rig that took it; 0 where there is no rig."""
+        return [f.index % self.rig for f in self.frames]
 
     @property
     def known_ev(self) -> list[float | None]:

@@ -24,6 +24,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exposure_csv,
 )
 from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.footage.turns import find_cameras_in_turn
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
@@ -167,10 +168,14 @@ def exposure_step(work: Work) -> StepResult:
         frame.drift = found.drift[frame.index] if found.drift else None
         frame.split = "test" if frame.index in held_out else "train"
     work.forget(("equalized",))
-    check_cuts(work)
+    m.rig = cameras_in_turn(work)
+    if m.rig == 1:
+        check_cuts(work)
     cycle = "no alternation"
     if m.cycle > 1:
         cycle = f"cycle of {m.cycle}, {len(found.ev)} exposures"
+    if m.rig > 1:
+        cycle = f"{m.rig} cameras in turn, {cycle}"
     return StepResult(
         provenance="estimated" if found.estimated else "given",
         note=f"{cycle} ({found.source}); {len(held_out)} frames held out",
@@ -352,7 +357,30 @@ def cycle_note(cycle: exposure.Cycle, change: float) -> str:
     )
 
 
-# Cuts
+# Rigs, and cuts
+
+
+def cameras_in_turn(work: Work) -> int:
+    """How many still cameras took the frames in turn, given or found; 1: no rig."""
+    given, count = work.config.rig, len(work.manifest.frames)
+    if work.manifest.num_cameras > 1:
+        if given is not None and given > 1:
+            raise InputError(
+                f"--rig {given}: {work.config.clip} has a folder per camera already; "
+                "leave the option out"
+            )
+        return 1
+    if given is None:
+        found = find_cameras_in_turn(work.equalized[0])
+        if found > 1:
+            say(f"exposure: {found} still cameras take the frames in turn (--rig 1 if not)")
+        return found
+    if 2 * given > count:
+        raise InputError(
+            f"--rig {given}: only {count} frames; each camera needs at least two to be "
+            "told from movers; correct the number"
+        )
+    return given
 
 
 def check_cuts(work: Work) -> None:

@@ -40,14 +40,20 @@ def find_masks(work: Work) -> StepResult:
 
 
 def estimated_masks(work: Work) -> np.ndarray:
-    """Moving masks (T, H, W) from flow and poses."""
+    """Moving masks (T, H, W) from flow and poses; of a rig, also from the visits of its
+    cameras.
+    """
+    evidence = work.visits.distance if work.manifest.rig > 1 else None
     found, valid, pairs = work.raw_flows
     video, (K, c2w) = work.equalized[0], work.cameras()
     train = np.array([f.split == "train" for f in work.manifest.frames])
     among = train[pairs].all(1)
-    moving = geometric_mask(found[among], valid[among], pairs[among], video, K, c2w)
+    moving = geometric_mask(
+        found[among], valid[among], pairs[among], video, K, c2w, evidence=evidence
+    )
     if not train.all():
-        moving[~train] = geometric_mask(found, valid, pairs, video, K, c2w)[~train]
+        by_all = geometric_mask(found, valid, pairs, video, K, c2w, evidence=evidence)
+        moving[~train] = by_all[~train]
     if work.manifest.parallax == "full":
         return moving
     frames = work.manifest.frames

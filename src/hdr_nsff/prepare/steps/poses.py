@@ -19,7 +19,9 @@ from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.reconstruct import rig_views
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
+from hdr_nsff.priors.poses.visit_matches import choose_visits
 
 MAX_ROUNDS = 2  # of structure from motion after the first
 MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the same
@@ -87,8 +89,10 @@ def poses_and_masks(work: Work) -> Poses:
     """Structure from motion in up to three rounds.
 
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
-    change any more.
+    change any more. A rig needs one: its masks need no poses.
     """
+    if work.manifest.rig > 1:
+        return estimate(work, work.visits.moving)
     earlier = EarlierRounds()
     cache = work.folder / FIRST_ROUND
     if cache.is_file():
@@ -118,6 +122,15 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
     matcher, device = work.config.matcher, pick_device(work.config.device)
+    views, lens = None, lens_to_find(work)
+    if work.manifest.rig > 1:
+        lens = "none"  # its static pictures are of frames as recorded
+        pictures = work.visits
+        places = work.manifest.places
+        hidden = pictures.unknown | pictures.clipped
+        ignore = moving | np.array(clipped)
+        visits = choose_visits(video, ignore, pictures.video, hidden, places)
+        views = rig_views(pictures.video, visits, places)
     poses = estimate_poses(
         video,
         moving,
@@ -127,7 +140,8 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
         matcher=matcher,
         device=device,
         earlier=earlier,
-        lens=lens_to_find(work),
+        lens=lens,
+        views=views,
     )
     if poses.lenses:
         raise DistortedFramesError(poses.lenses)

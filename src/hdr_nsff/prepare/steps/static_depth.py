@@ -21,6 +21,8 @@ from hdr_nsff.prepare.steps.masks import given_files
 from hdr_nsff.prepare.steps.neural import network_depth
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
+from hdr_nsff.priors.masks.visits import without_movers
+from hdr_nsff.scene.posed_video import PosedVideo
 
 DEPTH_FILES = {".npy", ".exr", ".png"}
 
@@ -75,11 +77,34 @@ def geometric_depth(work: Work) -> Depth:
     points = np.zeros((0, 3))
     if m.points:
         points = np.array(read_npy(work.folder / m.points))
-    flow = work.training_flows(work.raw_flows)
-    disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
+    if m.rig > 1:
+        disparity, confidence, still = rig_depth(work, points)
+    else:
+        flow = work.training_flows(work.raw_flows)
+        disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
     known = np.mean([(map > 0.5).mean() for map in confidence])
     note = f"{known:.0%} of the pixels well known"
     return Depth(disparity, confidence, note, "geometric", still=still)
+
+
+def rig_depth(work: Work, points: np.ndarray) -> tuple[ArrayStack, ArrayStack, ArrayStack]:
+    """Depth from the static pictures of a rig's cameras, the same for all frames of a
+    camera: disparity, confidence, and that no pixel of the masks is static, (T, H, W).
+    """
+    m = work.manifest
+    own = np.array([m.places[f.index] for f in work.train])
+    cameras, first, of_frame = np.unique(own, return_index=True, return_inverse=True)
+    frames = work.training_clip()
+    pictures = without_movers(
+        frames.video, frames.clipped, frames.moving, of_frame.tolist(), len(cameras)
+    )
+    # each at a time of its own: what is unknown in one may move in another
+    times = np.arange(len(cameras), dtype=np.float64)
+    clip = PosedVideo(frames.K[first], frames.c2w[first], times, *pictures)
+    no_flow = np.zeros((0, *clip.size, 2)), np.zeros((0, *clip.size), bool), np.zeros((0, 2), int)
+    disparity, confidence, _ = static_geometric_depth(clip, *no_flow, points)
+    still = np.zeros((len(own), *clip.size), bool)
+    return np.array(disparity)[of_frame], np.array(confidence)[of_frame], still
 
 
 def data_set_depth(work: Work) -> Depth:

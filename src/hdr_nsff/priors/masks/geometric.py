@@ -70,11 +70,13 @@ def geometric_mask(
     K: np.ndarray,
     c2w: np.ndarray,
     tuning: GeometricMaskTuning = GEOMETRIC_MASK_TUNING,
+    evidence: np.ndarray | None = None,
 ) -> np.ndarray:
     """Moving pixels (T, H, W) bool: no one depth explains their flow to all neighbors.
 
     The arguments are those of `rough_mask`, with `K` (3, 3) or (T, 3, 3) px and `c2w`
-    (T, 3, 4) OpenCV.
+    (T, 3, 4) OpenCV. Other `evidence` (T, H, W) of motion, in units of its noise, is
+    added to that of flow.
     """
     clip = working_clip(flow, valid, pairs, video, tuning)
     scale = np.array([1 / clip.coarseness, 1 / clip.coarseness, 1])[:, None]
@@ -83,13 +85,19 @@ def geometric_mask(
     def residuals(frame: int, chains: list[ChainedFlow]) -> np.ndarray:
         return static_residual(frame, chains, small_K, c2w, tuning)
 
-    return segment_motion(clip, residuals, "masks", tuning)
+    return segment_motion(clip, residuals, "masks", tuning, evidence)
 
 
 def segment_motion(
-    clip: FlowClip, residuals: Residuals, report: str, tuning: GeometricMaskTuning
+    clip: FlowClip,
+    residuals: Residuals,
+    report: str,
+    tuning: GeometricMaskTuning,
+    evidence: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Moving pixels (T, H, W) bool from the residuals against a static scene."""
+    """Moving pixels (T, H, W) bool from the residuals against a static scene, and from
+    other `evidence` (T, H, W).
+    """
     scores = np.zeros_like(clip.gray)
     for frame in track(range(len(scores)), report):
         chains = chain_flow(clip, frame, tuning)
@@ -97,6 +105,11 @@ def segment_motion(
             scores[frame] = motion_score(clip, frame, chains, residuals(frame, chains), tuning)
     for _ in range(tuning.votes):
         scores = temporal_median(clip, scores)
+    if evidence is not None:
+        small = clip.gray.shape[2], clip.gray.shape[1]
+        for frame, other in enumerate(evidence):
+            shrunk = cv2.resize(other, small, interpolation=cv2.INTER_AREA)
+            scores[frame] = tuning.flow_share * scores[frame] + tuning.other_share * shrunk
 
     height, width = clip.size
     moving = np.zeros((len(scores), height, width), bool)

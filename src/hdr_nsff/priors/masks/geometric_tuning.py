@@ -79,6 +79,13 @@ class GeometricMaskTuning:
     votes: int = 2
     """Rounds of the median over time."""
 
+    flow_share: float = 0.65
+    """Factor on the score of flow where there is other evidence, such as the visits of
+    a rig's cameras (both chosen on four rendered rigs, by the mean overlap with the
+    truth; 0.5 or 0.8 lowers it by 0.01).
+    """
+    other_share: float = 0.36
+    """Factor on that evidence."""
     likely: float = 1.25
     """Score, in units of noise, that connects the pixels of an object."""
     certain: float = 2.5

@@ -78,6 +78,7 @@ def estimate_poses(
     device: torch.device = CPU,
     earlier: EarlierRounds | None = None,
     lens: LensChoice = "none",
+    views: SfmViews | None = None,
 ) -> Poses:
     """Poses of every frame of `video` (T, H, W, 3), exposure-equalized rgb in [0, 1].
 
@@ -87,7 +88,8 @@ def estimate_poses(
     learned one on `device`; `threads` 0 uses all cores. Temporary files go into
     `workdir`. What `earlier` rounds on the same frames found is used again. A `lens`
     that was found or given is in `Poses.lenses`; undistort the frames, and estimate
-    again. InputError where poses cannot be estimated.
+    again. `views`: the images of a rig in turn, see `rig_views`, mapped instead of the
+    frames. InputError where poses cannot be estimated.
     """
     count = len(video)
     if count < MIN_FRAMES:
@@ -102,12 +104,15 @@ def estimate_poses(
                 ignore[t] |= mask[t]
     cameras = camera_ids or [0] * count
     groups = camera_groups(cameras)
-    share = parallax_free_share(video, ignore, tuning) if len(groups) == 1 else None
+    share = None
+    if len(groups) == 1 and views is None:
+        share = parallax_free_share(video, ignore, tuning)
     poses = None
     if share is not None and share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning, lens)
     if poses is None:
-        views = sfm_views(video, ignore, groups, tuning.reconstruction)
+        if views is None:
+            views = sfm_views(video, ignore, groups, tuning.reconstruction)
         mapper = Mapper(
             views, Path(workdir), threads, matcher, tuning.reconstruction, device,
             earlier or EarlierRounds(),

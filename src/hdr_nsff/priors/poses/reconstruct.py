@@ -11,6 +11,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -51,6 +52,7 @@ from hdr_nsff.priors.poses.view_matches import (
     choose_keyframes,
     pairs_to_match,
 )
+from hdr_nsff.priors.poses.visit_matches import VisitImages, VisitTuning, match_visits
 
 
 @dataclass(frozen=True)
@@ -80,6 +82,7 @@ class ReconstructionTuning:
     keyframes: KeyframeTuning = field(default_factory=KeyframeTuning)
     lightglue: LightGlueTuning = field(default_factory=LightGlueTuning)
     lens: LensTuning = field(default_factory=LensTuning)
+    visits: VisitTuning = field(default_factory=VisitTuning)
     sfm: sfm.SfmTuning = field(default_factory=sfm.SfmTuning)
 
 
@@ -93,6 +96,7 @@ class SfmViews:
     ignore: np.ndarray  # (V, H, W) bool
     groups: list[list[int]]  # views of each physical camera
     of_frame: np.ndarray  # (T,) the view of each frame
+    visits: VisitImages | None = None  # of a rig: what is matched instead of the images
 
 
 def spread_frames(count: int, limit: int) -> np.ndarray:
@@ -137,6 +141,14 @@ def sfm_views(
 
     images = Stack(image, (len(frame_of), *video.shape[1:]))
     return SfmViews(images, np.stack(hidden), view_groups, of_frame)
+
+
+def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) -> SfmViews:
+    """One view per camera of a rig in turn, all with one focal length: its static
+    picture (N, H, W, 3), matched by `visits`; `places` (T,): the camera of each frame.
+    """
+    ignore = np.zeros(pictures.shape[:3], bool)
+    return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places), visits)
 
 
 def stands_still(video: ArrayStack, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
@@ -286,6 +298,12 @@ def write_job(
         keyframes=[names[v] for v in keyframes],
         tuning=tuning.sfm,
     )
+    if views.visits is not None:
+        tunings = tuning.matching, tuning.lightglue, tuning.visits
+        merged = match_visits(job, views.visits, level_contrast, matcher, device, *tunings)
+        named_pairs = [(names[a], names[b]) for a, b in merged.pairs]
+        sfm.write_matches(folder, names, merged.keypoints, named_pairs, merged.matches)
+        return replace(job, pairs=named_pairs)
     key = (f"{matcher} {level_contrast}", tuple(grays))
     found = earlier.matches.get(key)
     if found is None:
