@@ -1,4 +1,6 @@
-"""Laws of lens distortion: there and back, no pixel from outside, pinhole is nothing."""
+"""Laws of lens distortion: there and back, no pixel from outside, pinhole is
+nothing.
+"""
 
 import numpy as np
 import pytest

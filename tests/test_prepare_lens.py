@@ -1,4 +1,6 @@
-"""What `prepare` does about the lens: settings, given lenses, frames undistorted once."""
+"""What `prepare` does about the lens: settings, given lenses, frames undistorted
+once.
+"""
 
 import json
 

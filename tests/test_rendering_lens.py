@@ -1,4 +1,6 @@
-"""Views through the clip's lens: pixels come from where the lens bends their rays to."""
+"""Views through the clip's lens: pixels come from where the lens bends their rays
+to.
+"""
 
 import numpy as np
 import pytest

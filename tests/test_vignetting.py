@@ -1,5 +1,5 @@
-"""Laws of learned vignetting: none at the start, on the axis and without a moving camera;
-its gradient; what it explains and what it leaves alone.
+"""Laws of learned vignetting: none at the start, on the axis and without a moving
+camera; its gradient; what it explains and what it leaves alone.
 """
 
 import pytest

@@ -72,7 +72,7 @@ def import_poses(
 
 
 def read_given(path: Path) -> tuple[GivenPoses, ColmapModel | None]:
-    """The poses at a place that `locate` returns, and the COLMAP model they are from."""
+    """The poses at a place that `locate` returns, and their COLMAP model."""
     if path.is_dir():
         model = read_model(path)
         return from_colmap(path, model), model

@@ -93,14 +93,15 @@ class Lens:
         return zoomed(self.K, long)
 
     def unzoomed(self, K: np.ndarray) -> np.ndarray:
-        """The camera `K` (3, 3) of undistorted pictures, estimated from them, at the focal
-        length of the lens: what a pinhole camera in its place would have recorded.
+        """The camera `K` (3, 3) of undistorted pictures, estimated from them, at the
+        focal length of the lens: what a pinhole camera in its place would have
+        recorded.
         """
         return zoomed(K, self.K[0, 0] / self.pinhole()[0, 0])
 
     def wide_pinhole(self) -> tuple[np.ndarray, int, int]:
-        """K (3, 3), width and height of the smallest pinhole picture, at the focal length
-        of the lens, that shows all that the lens records.
+        """K (3, 3), width and height of the smallest pinhole picture, at the focal
+        length of the lens, that shows all that the lens records.
         """
         outline = self.undistort(self.border(), self.K)
         low = np.floor(outline.min(0)).astype(int) - 1
@@ -117,10 +118,10 @@ class Lens:
             return float(np.linalg.norm(self.distort(corners, self.K) - corners, axis=-1).max())
 
     def is_one_to_one(self) -> bool:
-        """Whether distance from the axis grows with the angle to it, up to the corners."""
+        """Whether pixels further out see further out, up to the corners."""
         k1, k2, _, _ = self.distortion
         r2 = (pinhole.camera_rays(self.border(), self.K)[..., :2] ** 2).sum(-1).max()
-        # the border is recorded; what a barrel lens brings there lies up to twice as far
+        # what a barrel lens brings to the recorded border lies up to twice as far out
         squares = np.linspace(0, 2 * r2 if k1 < 0 else r2, BORDER_POINTS)
         return bool((1 + 3 * k1 * squares + 5 * k2 * squares**2 > 0).all())
 

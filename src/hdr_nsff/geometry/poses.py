@@ -42,8 +42,8 @@ class Poses:
     near: float | None = None  # z-depth, scene units
     far: float | None = None
     notes: tuple[str, ...] = ()  # sentences for the user
-    # {camera_id: lens} where the frames turned out to be distorted: these poses are then
-    # only the start
+    # {camera_id: lens} where the frames turned out to be distorted: these poses are
+    # then only the start
     lenses: dict[int, Lens] = field(default_factory=dict)
 
 

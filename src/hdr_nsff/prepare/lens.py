@@ -1,5 +1,5 @@
-"""The lens of a clip in `prepare`: what the settings ask for, what is known already, and
-the frames as a pinhole camera would have recorded them.
+"""The lens of a clip in `prepare`: what the settings ask for, what is known already,
+and the frames as a pinhole camera would have recorded them.
 
 Frames are undistorted once, as they are decoded. A lens that structure from motion
 finds is known only later, so the steps before start over (`DistortedFramesError`).

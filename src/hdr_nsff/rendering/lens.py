@@ -21,7 +21,7 @@ from hdr_nsff.scene.manifest import Manifest
 
 
 def original_lens(manifest: Manifest, camera_id: int) -> Lens:
-    """The lens of a camera of a scene; InputError where its frames had no distortion."""
+    """The lens of a camera of a scene; InputError where it distorted nothing."""
     entry = manifest.lens.get(camera_id)
     if entry is None:
         raise InputError(
@@ -52,11 +52,11 @@ class LensView:
         return LensView(replace(view, camera=wide), own)
 
     def distort(self, picture: np.ndarray) -> np.ndarray:
-        """A picture (h, w) or (h, w, C) of `view` as the lens records it, (H, W[, C])."""
+        """A picture (h, w[, C]) of `view` as the lens records it, (H, W[, C])."""
         return distorted_picture(picture, self.view.camera.K.double().cpu().numpy(), self.lens)
 
     def distort_motion(self, vectors: np.ndarray) -> np.ndarray:
-        """Motion (h, w, 2) in pixels of `view` as that of the lens's pixels (H, W, 2)."""
+        """Motion (h, w, 2) of `view`, in pixels, as that of the lens (H, W, 2)."""
         K = self.view.camera.K.double().cpu().numpy()
         pixels = pixel_centers(self.lens.height, self.lens.width)
         landing = self.lens.undistort(pixels, K) + self.distort(vectors)

@@ -180,8 +180,8 @@ class ToneMapper(nn.Module, ABC):
     # What everything else uses
 
     def start_vignetting(self, scene: Scene) -> None:
-        """Start the fall-off towards the corners, after `start`, at what static points of
-        a scene show; only the shared kind learns one.
+        """Start the fall-off towards the corners, after `start`, at what static points
+        of a scene show; only the shared kind learns one.
         """
 
     def forward(

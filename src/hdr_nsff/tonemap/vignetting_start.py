@@ -1,10 +1,10 @@
 """Where learned vignetting starts: at what static points show that a camera saw at
 several distances from the axis.
 
-A point of the scene has one radiance. What its recordings in two frames differ by is the
-fall-off between two radii, and an error of the frames' gains. Robust least squares of
-log radiance (Huber 1964) finds both: training alone would let the field take over most
-of the fall-off, since brightness of the scene is learned faster.
+A point of the scene has one radiance. What its recordings in two frames differ by is
+the fall-off between two radii, and an error of the frames' gains. Robust least squares
+of log radiance (Huber 1964) finds both: training alone would let the field take over
+most of the fall-off, since brightness of the scene is learned faster.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ DEGREES = (1, 2, 3)  # of r^2
 
 @torch.no_grad()
 def start_vignetting(lens: Vignetting, tonemapper: ToneMapper, scene: Scene) -> None:
-    """Start the coefficients of every camera, in place, where static points show them."""
+    """Start the coefficients of every camera where static points show them."""
     generator = np.random.default_rng(0)
     for camera_id in range(len(lens.coefficients)):
         frames = [(k, f) for k, f in enumerate(scene.train) if f.camera_id == camera_id]
@@ -63,8 +63,8 @@ def compare(
     corner: float,
     generator: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Differences of r^2, r^4, r^6 (N, 3), and of log radiance (N,), of static points in
-    two frames (position, frame).
+    """Differences of r^2, r^4, r^6 (N, 3), and of log radiance (N,), of static points
+    in two frames (position, frame).
     """
     (k, a), (j, b) = one, other
     nothing = np.zeros((0, 3)), np.zeros(0)
@@ -123,7 +123,7 @@ def robust_fit(rows: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def as_polynomial(log_shares: np.ndarray) -> np.ndarray:
-    """v1, v2, v3 of the share of light whose log is the polynomial `log_shares` (3,)."""
+    """v1, v2, v3 of the share of light with the log polynomial `log_shares` (3,)."""
     r2 = np.linspace(0, 1, 33)
     powers = np.stack([r2**n for n in DEGREES], 1)
     share = np.exp(np.clip(powers @ log_shares, -2.0, 0.5))

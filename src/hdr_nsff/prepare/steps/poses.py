@@ -115,8 +115,8 @@ def poses_and_masks(work: Work) -> Poses:
 
 def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = None) -> Poses:
     """Poses by structure from motion on equalized frames, without pixels that are
-    `moving` (T, H, W) bool; what `earlier` rounds found is used again. DistortedFramesError where
-    the frames turn out to be distorted.
+    `moving` (T, H, W) bool; what `earlier` rounds found is used again.
+    DistortedFramesError where the frames turn out to be distorted.
     """
     video, clipped = work.equalized
     cameras = [f.camera_id for f in work.manifest.frames]

@@ -135,7 +135,7 @@ def estimate_poses(
 
 @dataclass(frozen=True)
 class Mapper:
-    """Structure from motion on the views of a clip, as a pinhole camera or with a lens."""
+    """Structure from motion on the views of a clip, with a lens or without."""
 
     views: SfmViews
     workdir: Path
@@ -146,7 +146,7 @@ class Mapper:
     earlier: EarlierRounds
 
     def model(self, mapping: Mapping, earlier: EarlierRounds) -> tuple[ColmapModel, int]:
-        """The best reconstruction, and how much larger than the views its images are."""
+        """The best reconstruction, and the scale of its images over the views."""
         return best_model(
             self.views, self.workdir, self.threads, self.matcher, self.tuning, self.device,
             earlier, mapping,

@@ -29,8 +29,8 @@ class LensTuning:
     # by which a corner of a frame moves: below it, a pinhole serves as well
     min_displacement_px: float = 1.0
     # mean reprojection error with one more coefficient over that without it: 1.000 on a
-    # rendered pinhole clip, 0.961 with 5 pixels of distortion at the corners (hand-chosen
-    # between)
+    # rendered pinhole clip, 0.961 with 5 pixels of distortion at the corners
+    # (hand-chosen between)
     max_error_share: float = 0.99
 
 

@@ -133,6 +133,6 @@ def triangulate(model: Any, track: Any) -> tuple[np.ndarray, float]:
 
 
 def undistorted(camera: Any, pixel: np.ndarray) -> np.ndarray:
-    """The pixel (2,) at which a camera would see a point if its lens did not distort."""
+    """The pixel (2,) that a recorded one would be without the lens's distortion."""
     plane = camera.cam_from_img(pixel)
     return camera.calibration_matrix()[:2] @ np.append(plane, 1.0)
