@@ -60,6 +60,8 @@ def test_drift_on_top_of_alternation_is_found():
     truth = drift_within_brackets(drift, np.arange(NUM) % 2)
     assert np.median(np.abs(response.drift - truth)) < 0.05
     assert response.drift[1::2].mean() == pytest.approx(0, abs=1e-9)  # the gauge
+    listed = estimate_response(views, [0] * NUM, [-4.0, 0.0], 1, 1, may_drift=False)
+    assert listed.drift is None
 
 
 @pytest.mark.parametrize("cycle, ev", [((0, 1, 2), [None] * 3), ((1,), [None])])

@@ -99,6 +99,7 @@ def estimate_response(
     tuning: ResponseTuning = ResponseTuning(),
     lossless: bool = False,
     drift: np.ndarray | None = None,
+    may_drift: bool = True,
 ) -> Response:
     """Response and exposures from recorded frames with depth and poses.
 
@@ -107,13 +108,15 @@ def estimate_response(
     disparity (all 0) contribute brightness only. `lossless`: the frames were never
     compressed with loss, so that they show the noise of the sensor. Where single frames
     differ from their brackets, `drift` of the response is by how much; `drift` (V,) is
-    given where it is known.
+    given where it is known, and looked for only if exposures `may_drift`.
     """
     response = bracket_response(views, view_cameras, ev, reference, num_cameras, tuning, lossless)
     if num_cameras > 1:
         return response
     if drift is not None:
         return with_given_drift(response, views, ev, drift, tuning)
+    if not may_drift:
+        return response
     return with_drift(response, views, ev, reference, tuning, lossless)
 
 

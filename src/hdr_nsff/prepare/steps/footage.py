@@ -183,6 +183,7 @@ def exposure_step(work: Work) -> StepResult:
             "source": found.source,
             "doubts": list(found.notes),
             "drift_given": bool(found.drift),
+            "every_frame_given": found.given and found.source != "flags",
         },
     )
 

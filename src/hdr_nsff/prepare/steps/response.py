@@ -31,6 +31,7 @@ def find_response(work: Work) -> StepResult:
         m.num_cameras,
         lossless=work.footage.lossless,
         drift=given_drift(work),
+        may_drift=may_drift(work),
     )
     return StepResult(
         note=describe(response, m.known_ev),
@@ -44,6 +45,17 @@ def find_response(work: Work) -> StepResult:
         frames={"drift": drift_of_frames(work, response.drift)},
         files={"response.json": lambda path: write_response(path, response)},
     )
+
+
+def may_drift(work: Work) -> bool:
+    """Whether frames may differ from their brackets by exposures that nobody gave.
+
+    Not where the exposure of every frame is given. Between the cameras of a rig that
+    take turns, brightness differs for other reasons.
+    """
+    exposure = work.manifest.steps.get("exposure")
+    every_frame = exposure is not None and exposure.details.get("every_frame_given", False)
+    return not every_frame and work.manifest.rig == 1
 
 
 def given_drift(work: Work) -> np.ndarray | None:
