@@ -55,6 +55,9 @@ class Section:
     body: Callable[[Document], Lines]
 
 
+SHOWN_CONSTANTS = 12  # of those whose half and double were measured
+
+
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Lines:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
@@ -246,14 +249,26 @@ def prepare_cost(document: Document) -> Lines:
     return table(["clip", "frames", *steps, "peak GB"], rows)
 
 
+def largest_change(values: list[float | None]) -> float:
+    """Of an error at half, as it is and doubled: relative to the error as it is."""
+    half, default, double = values
+    if not default:
+        return 0.0
+    return max(abs(value / default - 1) for value in (half, double, default) if value is not None)
+
+
 def sensitivity(document: Document) -> Lines:
-    """One line per constant: its step's first error at half, as it is, and doubled."""
+    """The constants that change most: their step's first error at half, as it is, and
+    doubled.
+    """
     rows = document["results"]
     clips = list(dict.fromkeys(row["clip"] for row in rows))
     lines = []
+    changes = []
     for constant in sorted({row["constant"] for row in rows} - {""}):
         step = next(row["step"] for row in rows if row["constant"] == constant)
         cells = [f"`{constant}`", step]
+        change = 0.0
         for clip in clips:
             own = [row for row in rows if (row["clip"], row["step"]) == (clip, step)]
             default = next((row for row in own if row["constant"] == ""), None)
@@ -265,8 +280,12 @@ def sensitivity(document: Document) -> Lines:
             shown = [scaled.get(0.5), default, scaled.get(2.0)]
             values = [row["errors"].get(name) if row else None for row in shown]
             cells.append(" / ".join(number(value, 3) for value in values))
+            change = max(change, largest_change(values))
         lines.append(cells)
-    return table(["constant", "step", *(f"`{clip}`" for clip in clips)], lines)
+        changes.append(change)
+    limit = sorted(changes, reverse=True)[:SHOWN_CONSTANTS][-1]
+    shown_lines = [cells for cells, change in zip(lines, changes, strict=True) if change >= limit]
+    return table(["constant", "step", *(f"`{clip}`" for clip in clips)], shown_lines)
 
 
 SECTIONS = (
@@ -317,6 +336,7 @@ SECTIONS = (
     Section(
         "sensitivity",
         "Tuning constants of the priors, at half and double",
+        "The twelve that change most, of all in the JSON file. "
         "The first error of the constant's own step at half / as it is / double: EV, mask "
         "error, flow in pixels, ATE, depth; on 12 frames of 160x90. `hand_books` and "
         "`park_walkers` are real and have no true depth or masks: there the mask error is the "
