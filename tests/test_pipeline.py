@@ -16,12 +16,14 @@ from hdr_nsff import cli, pipeline
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.pipeline import RunConfig, held_out_every, prepare_settings, train_settings
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
 from hdr_nsff.training.budget import Budget
+from hdr_nsff.training.config import check_config
 from hdr_nsff.training.presets import PRESETS
 
 COUNT = 21
@@ -162,3 +164,13 @@ def test_shared_options_have_the_same_help(capsys: pytest.CaptureFixture[str]) -
         start = shown["prepare"].index(f"{option} ")
         end = shown["prepare"].index(" --", start)  # of the next option
         assert shown["prepare"][start:end][:100] in shown["run"], option
+
+
+def test_the_shutter_reaches_the_field_that_has_one(tmp_path: Path) -> None:
+    config = RunConfig(tmp_path / "clip.mp4", tmp_path / "out", readout=20.0, shutter=0.5)
+    field = check_config(train_settings(config)).field
+    assert isinstance(field, SplatConfig) and (field.readout, field.shutter) == (20.0, 0.5)
+    with pytest.raises(InputError, match="--preset splat"):
+        train_settings(replace(config, preset="grid"))
+    with pytest.raises(InputError, match="shutter"):
+        check_config(train_settings(replace(config, shutter=3.0)))

@@ -18,6 +18,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.evaluate import evaluate_run, views_of_clip
 from hdr_nsff.evaluation.report import check_place, write_report
 from hdr_nsff.fields.build import device_for
+from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.footage.ingest import hold_out_spacing
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
 from hdr_nsff.rendering import export_page
@@ -54,6 +55,11 @@ class RunConfig(PrepareConfig):
     """
     minutes: float | None = None
     """Training time instead of the preset's."""
+    readout: float = 0.0
+    """Milliseconds from a rolling shutter's first row to its last (`splat`)."""
+    shutter: float = 0.0
+    """Motion blur: share of a frame's time that the brightest exposure takes (`splat`).
+    """
     refine_poses: bool = False
     """Correct the training cameras (poses and focal length) a little, by the picture.
     """
@@ -100,7 +106,20 @@ def train_settings(config: RunConfig) -> TrainConfig:
     )
     if config.minutes is not None:
         settings = replace(settings, budget=Budget(minutes=config.minutes))
-    return settings
+    return with_shutter(settings, config)
+
+
+def with_shutter(settings: TrainConfig, config: RunConfig) -> TrainConfig:
+    """The settings with the clip's shutter; InputError for a field that has none."""
+    if not config.readout and not config.shutter:
+        return settings
+    if not isinstance(settings.field, SplatConfig):
+        raise InputError(
+            f"--readout, --shutter: --preset {config.preset} takes every frame for a moment; "
+            "choose --preset splat, or leave them out"
+        )
+    shutter = replace(settings.field, readout=config.readout, shutter=config.shutter)
+    return replace(settings, field=shutter)
 
 
 def prepare_settings(config: RunConfig) -> PrepareConfig:
