@@ -33,7 +33,12 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.training.budget import Budget
-from hdr_nsff.training.pose_corrections import moved, similarities, typical_depth, visible_motion
+from hdr_nsff.training.pose_corrections import (
+    move_camera,
+    similarities,
+    typical_depth,
+    visible_motion,
+)
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
@@ -126,7 +131,7 @@ def perturb_poses(folder: Path, out: Path, seed: int) -> Path:
         K = torch.tensor(entry.K).double()
         c2w = torch.tensor(entry.c2w).double()
         camera = Camera(K, c2w, manifest.width, manifest.height)
-        wrong = moved(camera, torch.from_numpy(twist), unit).c2w.tolist()
+        wrong = move_camera(camera, torch.from_numpy(twist), unit).c2w.tolist()
         entry.c2w = perturbed.setdefault(str(entry.c2w), wrong)
     manifest.save(out)
     return out

@@ -150,7 +150,8 @@ def test_frame_errors_are_the_recorded_differences(
     assert [x.time for x in found] == [f.time for f in toy.train]
     f = toy.train[2]
     radiance = t.field.render(f.camera, f.time).radiance
-    rgb = t.tonemapper(radiance, f.bracket, f.camera_id, 2, leaky=False)
+    shaded = t.tonemapper.shade(radiance, f.camera, f.camera_id)
+    rgb = t.tonemapper(shaded, f.bracket, f.camera_id, 2, leaky=False)
     expected = (rgb.detach().view_as(f.image) - f.image).abs().mean(-1)
     torch.testing.assert_close(found[2].error(radiance).view_as(expected), expected)
     assert len({x.time for x in t.frame_errors(3)}) == 3
