@@ -4,8 +4,9 @@ import numpy as np
 import posed_clips
 import pytest
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.lens import Lens, distorted_picture
-from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.estimate import Mapper, estimate_poses
 
 LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)
 
@@ -35,3 +36,14 @@ def test_given_distortion_is_held_and_gets_a_focal_length(tmp_path, clip):
     lens = estimate_poses(bent, None, tmp_path, threads=1, lens=(0.15, 0.0)).lenses[0]
     assert lens.distortion == (0.15, 0, 0, 0)
     assert lens.K[0, 0] == pytest.approx(posed_clips.FOCAL, rel=0.1)
+
+
+def test_where_no_mapping_with_the_lens_succeeds_its_fit_counts(tmp_path, clip, monkeypatch):
+    def fail(self, mapping):
+        raise InputError("too few views")
+
+    bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
+    monkeypatch.setattr(Mapper, "bent_poses", fail)
+    lens = estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses[0]
+    assert lens.max_displacement_px() == pytest.approx(LENS.max_displacement_px(), rel=0.3)
+    assert (lens.width, lens.height) == (posed_clips.W, posed_clips.H)

@@ -9,6 +9,7 @@ near is 1.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from hdr_nsff.priors.poses.lens import (
     LensChoice,
     Mapping,
     bent_cameras,
+    fitted_lens,
     lens_fit,
     lens_of,
 )
@@ -169,8 +171,13 @@ class Mapper:
             return poses
         fit = lens_fit(self.earlier)
         bent = [] if fit is None else bent_cameras(fit, model, scale, self.tuning.lens)
-        if bent:
-            poses = self.bent_poses(Mapping(distortion=bent[0], refine=True, try_lens=True))
+        if fit is not None and bent:
+            mapping = Mapping(distortion=bent[0], refine=True, try_lens=True)
+            try:
+                poses = self.bent_poses(mapping)
+            except InputError:  # the lens that fits the model of a pinhole has to do
+                lenses = self.lenses(model, lambda camera: fitted_lens(fit, model, camera))
+                poses = replace(self.of_model(model, scale), lenses=lenses)
             if poses.lenses:
                 return poses
         return self.of_model(model, scale)
@@ -179,20 +186,26 @@ class Mapper:
         """Poses of a reconstruction with a lens, and the lenses unless they bend too
         little after all.
         """
-        size = (self.views.images.shape[1], self.views.images.shape[2])
         round_of_its_own = EarlierRounds(self.earlier.matches)
         model, scale = self.model(mapping, round_of_its_own)
         fit = lens_fit(round_of_its_own)
-        image_of = views_of_images(model)
-        lenses = {}
-        for k, group in enumerate(self.views.groups):
-            camera_ids = [image_of[v].camera_id for v in group if v in image_of]
-            lenses[k] = lens_of(model, camera_ids[0], fit, size, self.tuning.lens)
+        tuning = self.tuning.lens
+        lenses = self.lenses(model, lambda camera: lens_of(model, camera, fit, tuning))
         poses = self.of_model(model, scale)
         largest = max(lens.max_displacement_px() for lens in lenses.values())
         if mapping.refine and largest < self.tuning.lens.min_displacement_px:
             return poses
         return replace(poses, lenses=lenses)
+
+    def lenses(self, model: ColmapModel, of_camera: Callable[[int], Lens]) -> dict[int, Lens]:
+        """The lens of each group of views, of the size of the frames."""
+        height, width = self.views.images.shape[1:3]
+        image_of = views_of_images(model)
+        lenses = {}
+        for k, group in enumerate(self.views.groups):
+            camera_ids = [image_of[v].camera_id for v in group if v in image_of]
+            lenses[k] = of_camera(camera_ids[0]).resized(width, height)
+        return lenses
 
     def of_model(self, model: ColmapModel, scale: int) -> Poses:
         """The poses of a reconstruction."""

@@ -77,19 +77,22 @@ def lens_of(
     model: ColmapModel,
     camera_id: int,
     fit: LensFit | None,
-    size: tuple[int, int],
     tuning: LensTuning = LensTuning(),
 ) -> Lens:
-    """The lens of a camera of a reconstruction, for frames of `size` (height, width).
+    """The lens of a camera of a reconstruction, for its images.
 
     Without its k2 where k1 alone, the `fit`, serves as well.
     """
-    camera = model.cameras[camera_id]
-    K = camera.K
-    k1, k2 = (float(k) for k in camera.distortion[:2])
     if fit is not None and tuning.max_error_share * fit.error_px < fit.model_error_px:
-        focal, k1, k2 = fit.cameras[camera_id]
-        K = intrinsics(focal, camera.width, camera.height)
-    height, width = size
-    lens = Lens(K, (k1, k2, 0.0, 0.0), camera.width, camera.height)
-    return lens.resized(width, height)
+        return fitted_lens(fit, model, camera_id)
+    camera = model.cameras[camera_id]
+    k1, k2 = (float(k) for k in camera.distortion[:2])
+    return Lens(camera.K, (k1, k2, 0.0, 0.0), camera.width, camera.height)
+
+
+def fitted_lens(fit: LensFit, model: ColmapModel, camera_id: int) -> Lens:
+    """The lens that was fit to a camera of a reconstruction, for its images."""
+    camera = model.cameras[camera_id]
+    focal, k1, k2 = fit.cameras[camera_id]
+    K = intrinsics(focal, camera.width, camera.height)
+    return Lens(K, (k1, k2, 0.0, 0.0), camera.width, camera.height)
