@@ -172,9 +172,8 @@ class Mapper:
         fit = lens_fit(self.earlier)
         bent = [] if fit is None else bent_cameras(fit, model, scale, self.tuning.lens)
         if fit is not None and bent:
-            mapping = Mapping(distortion=bent[0], refine=True, try_lens=True)
             try:
-                poses = self.bent_poses(mapping)
+                poses = self.bent_poses(bent[0])
             except InputError:  # the lens that fits the model of a pinhole has to do
                 lenses = self.lenses(model, lambda camera: fitted_lens(fit, model, camera))
                 poses = replace(self.of_model(model, scale), lenses=lenses)

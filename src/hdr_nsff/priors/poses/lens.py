@@ -39,6 +39,7 @@ class Mapping:
     """Which lens the views are mapped with."""
 
     distortion: tuple[float, float] | None = None  # k1, k2 to start from; None: a pinhole
+    focal: float | None = None  # to start from, pixels of the images; None: a common one
     refine: bool = False  # or held
     try_lens: bool = False  # fit one to the pinhole model afterwards
 
@@ -54,9 +55,9 @@ def lens_fit(earlier: EarlierRounds) -> LensFit | None:
 
 def bent_cameras(
     fit: LensFit, model: ColmapModel, scale: int, tuning: LensTuning = LensTuning()
-) -> list[tuple[float, float]]:
-    """k1 and k2 of the cameras that bend their pictures, the strongest first; empty
-    where the reconstruction shows none.
+) -> list[Mapping]:
+    """The lenses of cameras that bend their pictures, to map with, the strongest first;
+    empty where the reconstruction shows none.
 
     `scale`: how many times larger the images of the reconstruction are than the frames.
     """
@@ -69,8 +70,8 @@ def bent_cameras(
         lens = Lens(K, (k1, k2, 0.0, 0.0), camera.width, camera.height)
         displacement = lens.max_displacement_px() / scale
         if lens.is_one_to_one() and displacement >= tuning.min_displacement_px:
-            found.append((displacement, k1, k2))
-    return [(k1, k2) for _, k1, k2 in sorted(found, reverse=True)]
+            found.append((displacement, Mapping((k1, k2), focal, refine=True, try_lens=True)))
+    return [mapping for _, mapping in sorted(found, key=lambda item: -item[0])]
 
 
 def lens_of(

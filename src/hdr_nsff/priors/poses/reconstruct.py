@@ -239,6 +239,7 @@ def with_lens(job: sfm.Job, mapping: Mapping) -> sfm.Job:
     """A job that maps its images with a lens."""
     return replace(
         job,
+        focal=mapping.focal or job.focal,
         distortion=list(mapping.distortion or ()),
         refine_distortion=mapping.refine,
         try_lens=mapping.try_lens,
