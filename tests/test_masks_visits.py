@@ -1,4 +1,4 @@
-"""What the visits of a camera show: the static scene, and what moves before it."""
+"""What the visits of a camera show: the static scene, and movers before it."""
 
 import cv2
 import numpy as np

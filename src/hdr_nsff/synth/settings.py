@@ -59,7 +59,7 @@ class SynthConfig:
     """
     shutter: float = 0.0
     """Share of a frame's time for which the shutter is open at the brightest exposure,
-    which blurs what moves. The truth is sharp.
+    which blurs motion. The truth is sharp.
     """
     lens: str = "0"
     """Radial distortion of the recordings, k1 or k1,k2 as OpenCV has them, such as

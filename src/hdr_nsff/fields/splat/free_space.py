@@ -61,7 +61,7 @@ def find_fog(field: Splat, frames: Sequence[Frame]) -> Tensor:
 
 def static_surface(frame: Frame) -> Tensor | None:
     """The nearest surface around every pixel of a frame, (S, 2): 1 / z-depth, and
-    confidence in [0, 1], which is 0 near what moves. None without a depth prior.
+    confidence in [0, 1], which is 0 near movers. None without a depth prior.
     """
     if frame.disparity is None:
         return None

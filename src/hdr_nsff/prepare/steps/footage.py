@@ -378,8 +378,8 @@ def cameras_in_turn(work: Work) -> int:
         return found
     if 2 * given > count:
         raise InputError(
-            f"--rig {given}: only {count} frames; each camera needs at least two to be "
-            "told from movers; correct the number"
+            f"--rig {given}: only {count} frames; each camera needs at least two, "
+            "to separate movers from the static scene; correct the number"
         )
     return given
 

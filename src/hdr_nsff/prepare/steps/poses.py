@@ -18,8 +18,7 @@ from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
-from hdr_nsff.priors.poses.estimate import estimate_poses
-from hdr_nsff.priors.poses.reconstruct import rig_views
+from hdr_nsff.priors.poses.estimate import estimate_poses, rig_views
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import choose_visits
 

@@ -9,7 +9,7 @@ near is 1.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -51,6 +51,7 @@ from hdr_nsff.priors.poses.reconstruct import (
 )
 from hdr_nsff.priors.poses.rotation import Panorama, fit_panorama, fit_video, rotation_share
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
+from hdr_nsff.priors.poses.visit_matches import VisitImages
 
 MIN_FRAMES = 3
 
@@ -133,6 +134,14 @@ def estimate_poses(
     for note in poses.notes:
         say(f"poses: {note}")
     return poses
+
+
+def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) -> SfmViews:
+    """One view per camera of a rig in turn, all with one focal length: its static
+    picture (N, H, W, 3), matched by `visits`; `places` (T,): the camera of each frame.
+    """
+    ignore = np.zeros(pictures.shape[:3], bool)
+    return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places), visits)
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,13 @@ k2 only where k1 alone serves worse. Otherwise the clip is that of a pinhole cam
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hdr_nsff.footage.colmap import ColmapModel
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import intrinsics
-from hdr_nsff.priors.poses.sfm import LENS_FILE, LensFit, parse_lens_fit
+from hdr_nsff.priors.poses.sfm import LENS_FILE, Job, LensFit, parse_lens_fit
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 
 # auto: estimated where the clip shows it; none: a pinhole; (k1, k2): given
@@ -42,6 +42,16 @@ class Mapping:
     focal: float | None = None  # to start from, pixels of the images; None: a common one
     refine: bool = False  # or held
     try_lens: bool = False  # fit one to the pinhole model afterwards
+
+    def apply_to(self, job: Job) -> Job:
+        """The job with its images mapped with this lens."""
+        return replace(
+            job,
+            focal=self.focal or job.focal,
+            distortion=list(self.distortion or ()),
+            refine_distortion=self.refine,
+            try_lens=self.try_lens,
+        )
 
 
 PINHOLE = Mapping()

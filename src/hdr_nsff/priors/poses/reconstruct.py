@@ -11,7 +11,6 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -143,14 +142,6 @@ def sfm_views(
     return SfmViews(images, np.stack(hidden), view_groups, of_frame)
 
 
-def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) -> SfmViews:
-    """One view per camera of a rig in turn, all with one focal length: its static
-    picture (N, H, W, 3), matched by `visits`; `places` (T,): the camera of each frame.
-    """
-    ignore = np.zeros(pictures.shape[:3], bool)
-    return SfmViews(pictures, ignore, [list(range(len(pictures)))], np.asarray(places), visits)
-
-
 def stands_still(video: ArrayStack, ignore: np.ndarray, tuning: ReconstructionTuning) -> bool:
     """Whether the frames (T, H, W, 3) of a camera are those of a tripod; `ignore` (T,
     H, W) bool.
@@ -206,7 +197,7 @@ def best_model(
                     Path(folder), views, scale, level_contrast, threads, matcher, earlier,
                     tuning, device,
                 )  # fmt: skip
-                job = with_lens(job, mapping)
+                job = mapping.apply_to(job)
             except sfm.SfmError as error:
                 failures.append(str(error))
                 continue
@@ -233,17 +224,6 @@ def best_model(
     if len(best.images) < tuning.min_registered * count:
         raise InputError(failure_message(best, views, failures, tuning))
     return best, scale
-
-
-def with_lens(job: sfm.Job, mapping: Mapping) -> sfm.Job:
-    """A job that maps its images with a lens."""
-    return replace(
-        job,
-        focal=mapping.focal or job.focal,
-        distortion=list(mapping.distortion or ()),
-        refine_distortion=mapping.refine,
-        try_lens=mapping.try_lens,
-    )
 
 
 def attempts(job: sfm.Job, earlier: EarlierRounds) -> list[sfm.Job]:
