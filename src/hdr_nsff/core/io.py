@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.core.npy import map_npy
 
 # Who writes a temporary file: the machine, the process, and a token of that process,
 # since a restarted container gives the same numbers to other processes.
@@ -224,7 +225,7 @@ def read_npy(path: Path | str) -> np.ndarray:
     if not Path(path).is_file():  # a pipe would be waited for
         raise InputError(f"{path}: missing; run `hdr-nsff prepare` again to make it")
     try:
-        return np.lib.format.open_memmap(path, mode="r")
+        return map_npy(path)
     except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
             f"{path}: not a readable .npy array ({shorten(error)}); "

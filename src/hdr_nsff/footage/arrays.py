@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.core.npy import map_npy
 
 NUMBERS = "biuf"  # kinds of numpy's dtypes: truth values, integers, floats
 # bytes of one array in a .npz, unpacked: flow of 200 megapixels in double precision
@@ -28,7 +29,7 @@ def read_array(path: Path, dtype: type = np.float32) -> np.ndarray:
     check_file(path)
     try:
         # mapped, so that what the header claims is compared with the file's length
-        array = np.lib.format.open_memmap(path, mode="r")
+        array = map_npy(path)
     except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
             f"{path}: not a readable .npy array ({shorten(error)}); copy it again"

@@ -45,10 +45,11 @@ class Lens:
         """Where the lens brings points (..., 2) of the image plane at depth 1."""
         x, y = plane[..., 0], plane[..., 1]
         k1, k2, p1, p2 = self.distortion
-        r2 = x * x + y * y
-        radial = 1 + k1 * r2 + k2 * r2 * r2
-        bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+        with np.errstate(over="ignore", invalid="ignore"):  # a model that no lens has
+            r2 = x * x + y * y
+            radial = 1 + k1 * r2 + k2 * r2 * r2
+            bent_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+            bent_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
         return np.stack([bent_x, bent_y], -1)
 
     def distort(self, pixels: np.ndarray, K: np.ndarray) -> np.ndarray:
