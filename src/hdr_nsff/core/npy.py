@@ -1,7 +1,7 @@
 """Arrays of `.npy` files, memory-mapped by any number of threads at once.
 
-numpy parses the header with `ast.literal_eval`, which fails now and then in CPython before
-3.11.8 and 3.12.2 where two threads do so at once ("AST constructor recursion depth
+numpy parses the header with `ast.literal_eval`. In CPython before 3.11.8 and 3.12.2 that
+fails now and then where two threads do so at once ("AST constructor recursion depth
 mismatch", python/cpython#106905). Here a pattern reads it.
 
 Source: numpy.lib.format, versions 1 to 3 of the format.
@@ -27,8 +27,8 @@ MAX_HEADER = 10_000  # bytes; numpy's own limit
 def map_npy(path: Path | str) -> np.ndarray:
     """The array of a `.npy` file, memory-mapped, read-only.
 
-    ValueError or OSError where the file is no `.npy`, holds records or Python objects, or
-    is shorter than its header claims.
+    ValueError or OSError where the file is no `.npy`, holds records or Python objects,
+    or is shorter than its header claims.
     """
     with open(path, "rb") as file:
         magic = file.read(8)
@@ -41,5 +41,7 @@ def map_npy(path: Path | str) -> np.ndarray:
     if found is None:
         raise ValueError(f"its header is {header.strip()!r}")
     shape = tuple(int(size) for size in re.findall(r"\d+", found["shape"]))
-    order = "F" if found["fortran"] == "True" else "C"
-    return np.memmap(path, np.dtype(found["dtype"]), "r", offset, shape, order)
+    dtype = np.dtype(found["dtype"])
+    if found["fortran"] == "True":
+        return np.memmap(path, dtype, "r", offset, shape, "F")
+    return np.memmap(path, dtype, "r", offset, shape)
