@@ -1,8 +1,8 @@
 """Arrays of `.npy` files, memory-mapped by any number of threads at once.
 
-numpy parses the header with `ast.literal_eval`. In CPython before 3.11.8 and 3.12.2 that
-fails now and then where two threads do so at once ("AST constructor recursion depth
-mismatch", python/cpython#106905). Here a pattern reads it.
+numpy parses the header with `ast.literal_eval`, which fails now and then where two
+threads call it at once (CPython 3.11.7: "AST constructor recursion depth mismatch",
+python/cpython#106905). Here a pattern reads it.
 
 Source: numpy.lib.format, versions 1 to 3 of the format.
 """
