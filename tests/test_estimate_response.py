@@ -9,10 +9,10 @@ from estimates import tone_mapper
 from wall import EV, GAMMA22, S_CURVE, rmse, wall_view
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.radiometry.one_exposure import at_one_exposure
 from hdr_nsff.radiometry.response import (
     Response,
     alternating_medians,
-    at_one_exposure,
     estimate_response,
 )
 from hdr_nsff.radiometry.response_words import describe

@@ -80,6 +80,28 @@ def test_a_given_drift_is_kept_and_the_curve_fitted_to_it():
     assert response.source == "static points" and not response.problem
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_little_drift_leaves_the_curve_alone(known):
+    drift = smooth_drift(0.6)
+    views = drifting_views(S_CURVE, drift, (1,))
+    # as where tones are mapped locally: nothing becomes darker with less exposure
+    still = drifting_views(S_CURVE, np.zeros(NUM), (1,))
+    given = drift if known else None
+    response = estimate_response(still if known else views, [0] * NUM, [0.0], 0, 1, drift=given)
+    assert response.source == "one exposure"
+    np.testing.assert_allclose(response.y[0, 0], response.x ** (1 / 2.2), atol=1e-9)
+    if known:
+        np.testing.assert_array_equal(response.drift, drift)
+    else:
+        assert np.abs(response.drift - drift + drift.mean()).max() < 0.25
+
+
+def test_a_curve_that_no_camera_has_is_not_taken():
+    still = drifting_views(S_CURVE, np.zeros(NUM), (1,))
+    response = estimate_response(still, [0] * NUM, [0.0], 0, 1, drift=smooth_drift(3.0))
+    assert response.source == "one exposure"
+
+
 def test_pixels_that_disagree_with_a_given_drift_are_reported():
     views = drifting_views(SRGB, smooth_drift(3.0), (1,))
     wrong = smooth_drift(3.0).copy()

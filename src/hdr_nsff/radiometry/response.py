@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from hdr_nsff.core.stack import ArrayStack, LazyList, map_stack
+from hdr_nsff.core.stack import LazyList
 from hdr_nsff.radiometry.bracketing import FACTORS, StepScale, likely_scale, measured_scale
 from hdr_nsff.radiometry.brightness import brightness_ev
 from hdr_nsff.radiometry.debevec import (
@@ -52,6 +52,12 @@ class ResponseTuning:
 
     num_samples: int = 4000  # static points
     median_rounds: int = 20  # of the robust fit of white balance
+    # stops from the darkest frame to the brightest that determine a curve, where frames
+    # differ by drift alone (a GoPro's frames 0.2 stops apart gave a step from black to
+    # white)
+    min_range: float = 1.0
+    # stops from a recorded 0.1 to 0.8; cameras take 5 to 7 (gamma 2.2 is 6.6)
+    min_span: float = 2.0
     debevec: DebevecTuning = field(default_factory=DebevecTuning)
     noise: SensorNoiseTuning = field(default_factory=SensorNoiseTuning)
     frames: FrameExposuresTuning = field(default_factory=FrameExposuresTuning)
@@ -135,9 +141,11 @@ def with_given_drift(
     if not is_determined(readings, len(views), tuning.frames):
         return response
     exposures = np.array([float(ev[v.bracket] or 0.0) for v in views]) + drift
+    if np.ptp(exposures) < tuning.min_range:
+        return response
     samples = replace(readings.samples, offset=exposures[readings.frame])
     fit = debevec(samples, [0.0] * readings.frame.shape[1], 0, tuning.debevec)
-    if fit.misfit >= MAX_MISFIT:
+    if fit.misfit >= MAX_MISFIT or curve_span(fit.x, fit.y) < tuning.min_span:
         return response
     brackets = np.array([v.bracket for v in views])
     seen = frame_log_exposures(readings, fit.x, fit.y, brackets, tuning.frames)
@@ -179,10 +187,14 @@ def with_drift(
     drift = drift_within_brackets(exposures, brackets)
     if np.quantile(np.abs(drift), DRIFTING_SHARE) < tuning.frames.min_drift:
         return response
+    in_order = np.zeros(len(views))
+    in_order[ordered] = drift
+    if np.ptp(exposures) < tuning.min_range:
+        return replace(response, drift=in_order)
     x, y, exposures, misfit = fit_curve_and_exposures(
         readings, response.x, response.y[0], brackets, tuning.debevec, tuning.frames
     )
-    if misfit >= MAX_MISFIT:
+    if misfit >= MAX_MISFIT or curve_span(x, y) < tuning.min_span:
         return response
     drift = drift_within_brackets(exposures, brackets)
     level = exposures - drift  # (V,) of the frame's bracket
@@ -191,7 +203,6 @@ def with_drift(
         found[bracket] = level[brackets == bracket][0]
     found = found - found[reference]
     scale = drift_scale(in_time, x, y, exposures, found, ev, tuning, lossless)
-    in_order = np.zeros(len(views))
     in_order[ordered] = drift * scale.factor
     knots = np.linspace(0, 1, NUM_KNOTS) ** GAMMA
     curves = np.stack([np.interp(knots, x**scale.factor, channel) for channel in y])
@@ -271,6 +282,10 @@ def bracket_response(
     if fit.misfit >= MAX_MISFIT:
         problem = f"static points differ by {fit.misfit:.2f} stops"
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
+    span = curve_span(fit.x, fit.y)
+    if span < tuning.min_span:
+        problem = f"static points give a curve from black to white within {span:.1f} stops"
+        return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
     own = camera_fits(views, view_cameras, fit, reference, tuning) if num_cameras > 1 else {}
     y = np.stack([own[c].y if c in own else fit.y for c in range(num_cameras)])
     scale = fit.scale or StepScale(1.0, 1.0, 1.0, 1.0)
@@ -288,6 +303,14 @@ def bracket_response(
         scale_low=scale.low / scale.factor,
         scale_high=scale.high / scale.factor,
     )
+
+
+def curve_span(x: np.ndarray, y: np.ndarray) -> float:
+    """Stops of exposure from a recorded 0.1 to a recorded 0.8, of the shortest of the
+    curves `y` (3, K) over `x` (K,).
+    """
+    ends = [np.interp([0.1, 0.8], channel, x) for channel in y]
+    return min(float(np.log2(bright / max(dark, 1e-9))) for dark, bright in ends)
 
 
 def evidence_of_noise(views: Sequence[ResponseView], tuning: ResponseTuning) -> ScaleEvidence:
@@ -414,34 +437,3 @@ def from_brightness(
         own_curves=(),
         problem=problem,
     )
-
-
-def at_one_exposure(
-    video: ArrayStack,
-    brackets: np.ndarray,
-    cameras: np.ndarray,
-    response: Response,
-    drift: np.ndarray | None = None,
-) -> ArrayStack:
-    """`video` (T, H, W, 3) recorded in [0, 1] at one brightness, in [0, 1].
-
-    Every pixel becomes the mean of what it would be in all brackets (T,) that its
-    camera (T,) used, which keeps contrast wherever any of them has some. `drift` (T,):
-    stops by which frames differ from their brackets.
-    """
-    drift = np.zeros(len(video)) if drift is None else drift
-    value = np.linspace(0, 1, 1025)  # recorded values that are tabulated
-
-    def one_frame(frame: np.ndarray, t: int) -> np.ndarray:
-        own, camera = brackets[t], cameras[t]
-        used = np.unique(brackets[cameras == camera])
-        result = np.empty(frame.shape, np.float32)
-        for c in range(3):
-            y = response.y[camera, c]
-            exposure = np.interp(value, y, response.x)
-            gains = [2.0 ** (response.ev[b] - response.ev[own] - drift[t]) for b in used]
-            images = [np.interp(exposure * gain, response.x, y) for gain in gains]
-            result[..., c] = np.interp(frame[..., c], value, np.mean(images, axis=0))
-        return result
-
-    return map_stack(one_frame, video)

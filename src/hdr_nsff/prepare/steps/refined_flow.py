@@ -25,7 +25,7 @@ from hdr_nsff.priors.flow.masked_least_squares import (
     refine_mover_flow,
 )
 from hdr_nsff.radiometry.common_range import common_gray, common_rgb, recorded_range
-from hdr_nsff.radiometry.response import at_one_exposure
+from hdr_nsff.radiometry.one_exposure import at_one_exposure
 from hdr_nsff.scene.response import read_response
 
 
