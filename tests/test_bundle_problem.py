@@ -25,7 +25,7 @@ from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING
 
 def path_residuals(problem: BundleProblem, state: BundleState) -> np.ndarray:
     """The path's residuals (TIMES - 3, 3) of a state."""
-    return problem.prior_residuals(state, problem.reproject(state).local).path
+    return problem.prior_residuals(state, problem.reproject(state).depth).path
 
 
 def test_each_direction_of_a_path_has_its_own_smoothness() -> None:
@@ -82,43 +82,57 @@ def test_only_the_prior_of_distance_changes_with_scale() -> None:
         assert np.allclose(path_true, 0) and np.allclose(path_scaled, expected)
 
 
-def test_the_jacobians_are_the_derivatives_of_the_errors() -> None:
-    problem, h = flat_problem(), 1e-6
-    s = true_state(problem)
-    reprojection = problem.reproject(s)
-    by_pose, by_point, _ = problem.jacobians(reprojection, s)
-    for k in range(3):
-        step = h * np.eye(3)[k]
-        rotation = Rotation.from_rotvec(step).as_matrix()
-        for moved, jacobian in (
-            (replace(s, rotations=rotation @ s.rotations), by_pose[..., k]),
-            (replace(s, translations=s.translations + step), by_pose[..., 3 + k]),
-            (replace(s, points=s.points + step), by_point[..., k]),
-        ):
-            measured = (problem.reproject(moved).error - reprojection.error) / h
-            # of derivatives of up to 100 px
-            assert np.abs(measured - jacobian)[problem.visible].max() < 1e-2
+def numeric_jacobians(problem: BundleProblem, s: BundleState) -> tuple[np.ndarray, np.ndarray]:
+    """Measured derivatives of errors by pose (N, T, 2, 6) and point (N, T, 2, 3)."""
+    h, columns = 1e-6, []
+    for k in range(9):
+        ends = []
+        for step in (h, -h):
+            along = step * np.eye(3)[k % 3]
+            turn = Rotation.from_rotvec(along).as_matrix() @ s.rotations
+            moved = (
+                replace(s, rotations=turn),
+                replace(s, translations=s.translations + along),
+                replace(s, points=s.points + along),
+            )
+            ends.append(problem.reproject(moved[k // 3]).error)
+        columns.append((ends[0] - ends[1]) / (2 * h))
+    jacobian = np.stack(columns, -1)
+    return jacobian[..., :6], jacobian[..., 6:]
 
 
-def test_tracks_of_large_error_weigh_less() -> None:
+@pytest.mark.parametrize("offset", [0.1, 7.0], ids=["small", "large"])
+def test_the_terms_are_those_of_weighted_least_squares(offset: float) -> None:
     problem = flat_problem()
     s = true_state(problem)
-    reprojection = problem.reproject(s)
-    wrong = replace(reprojection, error=reprojection.error + np.array([7.0, 0.0]))
-    weight = problem.jacobians(wrong, s)[2][problem.visible]
-    assert weight == pytest.approx(0.4 / 7.0 / 0.4**2)  # Huber beyond 0.4 px: 1 / length
+    problem.pixels = problem.pixels - np.array([offset, 0.0])
+    by_pose, by_point = numeric_jacobians(problem, s)
+    error = problem.reproject(s).error
+    length = np.linalg.norm(error, axis=-1)
+    sigma = problem.noise  # beyond one of it, Huber's weight falls as 1 / length
+    weight = problem.visible * np.where(length < sigma, 1, sigma / np.maximum(length, 1e-9))
+    weight = weight / sigma**2
+    terms = problem.reprojection_terms(s)
+    pairs = [
+        (terms.pose_blocks, np.einsum("nt,ntij,ntik->tjk", weight, by_pose, by_pose)),
+        (terms.points, np.einsum("nt,ntij,ntik->njk", weight, by_point, by_point)),
+        (terms.poses_points, np.einsum("nt,ntij,ntik->ntjk", weight, by_pose, by_point)),
+        (terms.pose_gradient, np.einsum("nt,ntij,nti->tj", weight, by_pose, error)),
+        (terms.point_gradient, np.einsum("nt,ntij,nti->nj", weight, by_point, error)),
+    ]
+    for found, expected in pairs:
+        assert found == pytest.approx(expected, abs=1e-4 * np.abs(expected).max())
 
 
 def test_old_tracks_weigh_less() -> None:
     young = tracked(pixels_of(TRUE))
     old = replace(young, age=np.full(young.age.shape, 3))
     group = path_without_rotation(young, fit_motion(young, np.arange(COUNT)))
-    weights = []
+    blocks = []
     for problem in (BundleProblem(young, group, CAMERAS), BundleProblem(old, group, CAMERAS)):
-        s = true_state(problem)
-        weights.append(problem.jacobians(problem.reproject(s), s)[2][problem.visible])
+        blocks.append(problem.reprojection_terms(true_state(problem)).pose_blocks)
     # the errors of three more steps have four times the variance
-    assert weights[0] == pytest.approx(4 * weights[1])
+    assert blocks[0] == pytest.approx(4 * blocks[1])
 
 
 def test_points_are_fitted_to_known_poses() -> None:

@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry import pinhole
+from hdr_nsff.priors.movers import bundle_kernels as kernels
 from hdr_nsff.priors.movers.rigid_motion import RigidGroup, canonical_points
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING, BundleTuning
@@ -52,8 +53,7 @@ class Reprojection:
     """A state's points as the cameras see them."""
 
     error: np.ndarray  # (N, T, 2) px, 0 where not visible
-    rotated: np.ndarray  # (N, T, 3) rotated canonical points
-    local: np.ndarray  # (N, T, 3) camera coordinates
+    depth: np.ndarray  # (N, T) z-depth, 0 where not visible
 
 
 @dataclass(frozen=True)
@@ -74,6 +74,17 @@ class NormalEquations:
     points: np.ndarray  # (N, 3, 3)
     poses_points: np.ndarray  # (N, 6 T, 3)
     pose_gradient: np.ndarray  # (6 T,)
+    point_gradient: np.ndarray  # (N, 3)
+
+
+@dataclass(frozen=True)
+class ReprojectionTerms:
+    """The same of the reprojection errors alone, a block for every time."""
+
+    pose_blocks: np.ndarray  # (T, 6, 6)
+    points: np.ndarray  # (N, 3, 3)
+    poses_points: np.ndarray  # (N, T, 6, 3)
+    pose_gradient: np.ndarray  # (T, 6)
     point_gradient: np.ndarray  # (N, 3)
 
 
@@ -101,10 +112,10 @@ class BundleProblem:
         self.start = start[self.usable]  # (N, 3)
         self.pixels = np.nan_to_num(tracks.pixels[members])  # (N, T, 2)
         self.noise = tuning.flow_noise_px * np.sqrt(1.0 + tracks.age[members])  # (N, T) px
-        self.K = cameras.K
+        self.K = np.ascontiguousarray(cameras.K, np.float64)
         self.eyes = cameras.c2w[:, :, 3] - group.center  # (T, 3)
         self.c2w = np.concatenate([cameras.c2w[:, :, :3], self.eyes[..., None]], -1)
-        self.w2c = np.swapaxes(self.c2w[:, :, :3], 1, 2)  # (T, 3, 3), rotation only
+        self.w2c = np.swapaxes(self.c2w[:, :, :3], 1, 2).copy()  # (T, 3, 3), rotation only
         self.middle = np.zeros(3)
         self.size = 1.0
         if len(members):
@@ -188,12 +199,9 @@ class BundleProblem:
         sigma = self.shape_sigma(state)
         middle = np.median(points, 0)
         for _ in range(iterations):
-            reprojection = self.reproject(replace(state, points=points))
-            _, jacobian, weight = self.jacobians(reprojection, state)
-            weighted = jacobian * weight[..., None]
-            hessian = np.einsum("ntij,ntik->njk", weighted, jacobian) + np.eye(3) / sigma**2
-            gradient = np.einsum("ntij,nti->nj", weighted, reprojection.error)
-            gradient = gradient + (points - middle) / sigma**2
+            terms = self.reprojection_terms(replace(state, points=points))
+            hessian = terms.points + np.eye(3) / sigma**2
+            gradient = terms.point_gradient + (points - middle) / sigma**2
             points = points - np.linalg.solve(hessian, gradient[..., None])[..., 0]
         return replace(state, points=points)
 
@@ -206,26 +214,32 @@ class BundleProblem:
 
     def reproject(self, state: BundleState) -> Reprojection:
         """The points of a state in all cameras."""
-        rotated = np.einsum("tij,nj->nti", state.rotations, state.points)
-        local = pinhole.to_camera(rotated + state.translations, self.c2w)
-        error = pinhole.to_pixels(local, self.K, self.min_depth) - self.pixels
-        return Reprojection(np.where(self.visible[..., None], error, 0), rotated, local)
+        error, depth = np.empty(self.pixels.shape), np.empty(self.visible.shape)
+        kernels.reproject_points(*self.observed(state), self.min_depth, error, depth)
+        return Reprojection(error, depth)
+
+    def observed(self, state: BundleState) -> tuple[np.ndarray, ...]:
+        """Points, poses, cameras and observations of a state, for the kernels."""
+        shifts = state.translations - self.eyes
+        return (
+            *(np.ascontiguousarray(a) for a in (state.points, state.rotations, shifts)),
+            *(self.w2c, self.K, self.pixels, self.noise, self.visible),
+        )
 
     @property
     def min_depth(self) -> float:
         """The z-depth from which nearer points project, scene units."""
         return self.tuning.min_depth_share * self.prior_distance
 
-    def prior_residuals(self, state: BundleState, local: np.ndarray) -> PriorResiduals:
-        """The residuals of all priors; `local` (N, T, 3) are camera coordinates."""
-        count = np.maximum(self.visible.sum(0), 1)
-        mean_depth = np.where(self.visible, local[..., 2], 0).sum(0) / count
-        depth = (mean_depth - self.mean_depth) / self.depth_sigma
+    def prior_residuals(self, state: BundleState, depth: np.ndarray) -> PriorResiduals:
+        """The residuals of all priors; `depth` (N, T) is that of `Reprojection`."""
+        mean_depth = depth.sum(0) / np.maximum(self.visible.sum(0), 1)
+        change = (mean_depth - self.mean_depth) / self.depth_sigma
         path = self.third_differences @ state.translations / self.distance(state)
         relative = state.rotations[1:] @ np.swapaxes(state.rotations[:-1], 1, 2)
         steps = Rotation.from_matrix(relative).as_rotvec()
         return PriorResiduals(
-            depth=np.where(self.depth_known, depth, 0),
+            depth=np.where(self.depth_known, change, 0),
             path=path @ self.path_whitening,
             rotation=np.diff(steps, axis=0) / self.tuning.rotation_sigma_rad,
             shape=(state.points - self.middle) / self.shape_sigma(state),
@@ -274,48 +288,42 @@ class BundleProblem:
         reprojection = self.reproject(state)
         length = np.linalg.norm(reprojection.error, axis=-1) / self.noise
         huber = np.where(length < 1, 0.5 * length**2, length - 0.5)[self.visible].sum()
-        priors = self.prior_residuals(state, reprojection.local)
+        priors = self.prior_residuals(state, reprojection.depth)
         squares = [
             (residual**2).sum()
             for residual in (priors.depth, priors.path, priors.rotation, priors.shape)
         ]
         return float(huber + 0.5 * sum(squares))
 
-    def jacobians(
-        self, reprojection: Reprojection, state: BundleState
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Derivatives of reprojection errors, and their Huber weights (N, T, 1).
-
-        By pose (N, T, 2, 6), rotation vector before translation, and by point
-        (N, T, 2, 3).
-        """
-        length = np.linalg.norm(reprojection.error, axis=-1) / self.noise
-        weight = (self.visible / np.maximum(length, 1) / self.noise**2)[..., None]
-        x, y = reprojection.local[..., 0], reprojection.local[..., 1]
-        z = np.maximum(reprojection.local[..., 2], self.min_depth)
-        fx, fy = self.K[:, 0, 0], self.K[:, 1, 1]
-        zero = np.zeros_like(z)
-        entries = [fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2]
-        by_local = np.stack(entries, -1).reshape(*z.shape, 2, 3)
-        by_world = by_local @ self.w2c  # (N, T, 2, 3)
-        by_rotation = -by_world @ cross_matrices(reprojection.rotated)
-        by_pose = np.concatenate([by_rotation, by_world], -1)
-        by_point = by_world @ state.rotations
-        return by_pose, by_point, weight
+    def reprojection_terms(self, state: BundleState) -> ReprojectionTerms:
+        """The Gauss-Newton terms of the reprojection errors alone."""
+        count, num = self.visible.shape
+        terms = ReprojectionTerms(
+            pose_blocks=np.zeros((num, 6, 6)),
+            points=np.zeros((count, 3, 3)),
+            poses_points=np.zeros((count, num, 6, 3)),
+            pose_gradient=np.zeros((num, 6)),
+            point_gradient=np.zeros((count, 3)),
+        )
+        kernels.accumulate(
+            *self.observed(state),
+            self.min_depth,
+            terms.pose_blocks,
+            terms.points,
+            terms.poses_points,
+            terms.pose_gradient,
+            terms.point_gradient,
+        )
+        return terms
 
     def normal_equations(self, state: BundleState) -> NormalEquations:
         """The Gauss-Newton system of the reprojection errors and all priors."""
         count, num = self.visible.shape
-        reprojection = self.reproject(state)
-        priors = self.prior_residuals(state, reprojection.local)
-        by_pose, by_point, weight = self.jacobians(reprojection, state)
-        weighted_pose = by_pose * weight[..., None]
-        weighted_point = by_point * weight[..., None]
-        pose_blocks = np.einsum("ntij,ntik->tjk", weighted_pose, by_pose)
-        points = np.einsum("ntij,ntik->njk", weighted_point, by_point)
-        poses_points = np.einsum("ntij,ntik->ntjk", weighted_pose, by_point)
-        pose_gradient = np.einsum("ntij,nti->tj", weighted_pose, reprojection.error)
-        point_gradient = np.einsum("ntij,nti->nj", weighted_point, reprojection.error)
+        priors = self.prior_residuals(state, self.reproject(state).depth)
+        terms = self.reprojection_terms(state)
+        pose_blocks, pose_gradient = terms.pose_blocks, terms.pose_gradient
+        points, point_gradient = terms.points, terms.point_gradient
+        poses_points = terms.poses_points
 
         # mean z-depth
         by_depth = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1)
@@ -387,11 +395,3 @@ def solve_damped(equations: NormalEquations, damping: float) -> tuple[np.ndarray
     pose_step = np.linalg.solve(reduced, -equations.pose_gradient + carried)
     remaining = equations.point_gradient + np.einsum("nij,i->nj", poses_points, pose_step)
     return pose_step, -np.einsum("nij,nj->ni", inverse, remaining)
-
-
-def cross_matrices(v: np.ndarray) -> np.ndarray:
-    """Matrices (..., 3, 3) that map x to the cross product of `v` (..., 3) and x."""
-    x, y, z = np.moveaxis(v, -1, 0)
-    zero = np.zeros_like(x)
-    entries = [zero, -z, y, z, zero, -x, -y, x, zero]
-    return np.stack(entries, -1).reshape(*v.shape[:-1], 3, 3)
