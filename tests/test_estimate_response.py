@@ -12,8 +12,10 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.radiometry.one_exposure import at_one_exposure
 from hdr_nsff.radiometry.response import (
     Response,
+    ResponseTuning,
     alternating_medians,
     estimate_response,
+    problem_of,
 )
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.scene.response import read_response, write_response
@@ -149,3 +151,13 @@ def test_what_is_no_response_is_refused_in_a_sentence(text: str, tmp_path) -> No
     (tmp_path / "response.json").write_text(text)
     with pytest.raises(InputError, match="--redo response"):
         read_response(tmp_path / "response.json", num_cameras=1, num_brackets=3)
+
+
+@pytest.mark.parametrize("curve, believed", [("gamma", True), ("step", False)])
+def test_a_curve_that_no_camera_has_is_not_believed(curve, believed):
+    x = np.linspace(0, 1, 256) ** 2.2
+    y = x ** (1 / 2.2) if curve == "gamma" else np.interp(x, [0, 0.5, 0.6, 1], [0, 0.01, 0.9, 1])
+    problem = problem_of(x, np.tile(y, (3, 1)), 0.01, ResponseTuning())
+    assert (problem == "") == believed
+    if not believed:
+        assert "from black to white within 0.2 stops" in problem

@@ -145,8 +145,8 @@ def with_given_drift(
         return response
     samples = replace(readings.samples, offset=exposures[readings.frame])
     fit = debevec(samples, [0.0] * readings.frame.shape[1], 0, tuning.debevec)
-    if fit.misfit >= MAX_MISFIT or curve_span(fit.x, fit.y) < tuning.min_span:
-        return response
+    if problem := problem_of(fit.x, fit.y, fit.misfit, tuning):
+        return replace(response, problem=problem)
     brackets = np.array([v.bracket for v in views])
     seen = frame_log_exposures(readings, fit.x, fit.y, brackets, tuning.frames)
     off = np.abs(seen - seen.mean() - exposures + exposures.mean())
@@ -194,8 +194,8 @@ def with_drift(
     x, y, exposures, misfit = fit_curve_and_exposures(
         readings, response.x, response.y[0], brackets, tuning.debevec, tuning.frames
     )
-    if misfit >= MAX_MISFIT or curve_span(x, y) < tuning.min_span:
-        return response
+    if problem := problem_of(x, y, misfit, tuning):
+        return replace(response, problem=problem)
     drift = drift_within_brackets(exposures, brackets)
     level = exposures - drift  # (V,) of the frame's bracket
     found = np.zeros(len(ev))
@@ -279,12 +279,7 @@ def bracket_response(
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
     evidence = evidence_of_noise(views, tuning) if lossless else None
     fit = debevec(samples, ev, reference, tuning.debevec, evidence)
-    if fit.misfit >= MAX_MISFIT:
-        problem = f"static points differ by {fit.misfit:.2f} stops"
-        return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
-    span = curve_span(fit.x, fit.y)
-    if span < tuning.min_span:
-        problem = f"static points give a curve from black to white within {span:.1f} stops"
+    if problem := problem_of(fit.x, fit.y, fit.misfit, tuning):
         return from_brightness(views, ev, reference, num_cameras, "brightness", problem)
     own = camera_fits(views, view_cameras, fit, reference, tuning) if num_cameras > 1 else {}
     y = np.stack([own[c].y if c in own else fit.y for c in range(num_cameras)])
@@ -303,6 +298,16 @@ def bracket_response(
         scale_low=scale.low / scale.factor,
         scale_high=scale.high / scale.factor,
     )
+
+
+def problem_of(x: np.ndarray, y: np.ndarray, misfit: float, tuning: ResponseTuning) -> str:
+    """Why curves `y` (3, K) over `x` (K,) are not to be believed; "" if they are."""
+    if misfit >= MAX_MISFIT:
+        return f"static points differ by {misfit:.2f} stops"
+    span = curve_span(x, y)
+    if span < tuning.min_span:
+        return f"static points give a curve from black to white within {span:.1f} stops"
+    return ""
 
 
 def curve_span(x: np.ndarray, y: np.ndarray) -> float:

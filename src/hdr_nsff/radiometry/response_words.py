@@ -14,7 +14,7 @@ def describe(response: Response, given_ev: Sequence[float | None]) -> str:
     steps = ", ".join(f"{e:+.2f}" for e in response.ev)
     match response.source:
         case "one exposure":
-            return "gamma 2.2: a single exposure does not determine the response"
+            return f"gamma 2.2: {describe_one_exposure(response)}"
         case "brightness":
             how = "gamma 2.2"
             if response.problem:
@@ -34,11 +34,26 @@ def describe(response: Response, given_ev: Sequence[float | None]) -> str:
                 unknown = describe_scale(response)
     if all(e is not None for e in given_ev) and not response.guessed:
         unknown = "as given"
-    sentence = f"{how}; EV {steps} ({unknown})"
-    if response.drift is not None:
-        low, high = response.drift.min(), response.drift.max()
-        sentence += f"; single frames drift by {low:+.2f} to {high:+.2f} EV (auto exposure)"
-    return sentence
+    return f"{how}; EV {steps} ({unknown}){describe_drift(response)}"
+
+
+def describe_one_exposure(response: Response) -> str:
+    """Why a clip without brackets does not determine the response."""
+    if response.drift is None:
+        return "a single exposure does not determine the response"
+    why = response.problem
+    if not why:
+        span = np.ptp(response.drift)
+        why = f"exposures within {span:.2f} stops do not determine the response"
+    return why + describe_drift(response)
+
+
+def describe_drift(response: Response) -> str:
+    """By how much single frames differ from their brackets; nothing where none does."""
+    if response.drift is None:
+        return ""
+    low, high = response.drift.min(), response.drift.max()
+    return f"; single frames drift by {low:+.2f} to {high:+.2f} EV (auto exposure)"
 
 
 def describe_scale(response: Response) -> str:
