@@ -29,6 +29,7 @@ from hdr_nsff.fields.point_cloud import (
     unproject_frame,
 )
 from hdr_nsff.fields.space import FrustumSpace, build_space
+from hdr_nsff.fields.splat.detail import cell_sizes, detail_density, scale_by_size
 from hdr_nsff.fields.splat.free_space import remove_fog
 from hdr_nsff.fields.splat.gaussians import START_LOGIT, Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.initialize_local import local_mask, place_local
@@ -84,30 +85,34 @@ def place_static(field: Splat, scene: Scene, to_radiance: ToRadiance) -> int:
     cells, so that the places of fog are used for what is there. Movers are placed
     before: they may hide what is static.
     """
-    points = static_points(scene, to_radiance)
+    points, density = static_points(scene, to_radiance)
     limit = int(FILL * len(field.static))
-    cells = thin_cells(points, scene, limit)
+    cells = thin_cells(points, density, scene, limit)
     count = place(field.static, merge_by_cell(points, cells))
     fog = remove_fog(field, scene.train)
     if len(fog) < MIN_REFILL_SHARE * len(field.static):
         return count - len(fog)
     _, gaussian = torch.unique(cells, return_inverse=True)  # of every point
-    points = points.select(~torch.isin(gaussian, fog))
-    cells = thin_cells(points, scene, limit)
+    clear = ~torch.isin(gaussian, fog)
+    points, density = points.select(clear), density[clear]
+    cells = thin_cells(points, density, scene, limit)
     count = place(field.static, merge_by_cell(points, cells))
     return count - len(remove_fog(field, scene.train))
 
 
-def static_points(scene: Scene, to_radiance: ToRadiance) -> PointCloud:
-    """Pixels of all training frames outside the moving masks, as points."""
+def static_points(scene: Scene, to_radiance: ToRadiance) -> tuple[PointCloud, Tensor]:
+    """Pixels of all training frames outside the moving masks, as points; and the
+    relative density (P,) that the detail of their frames asks for.
+    """
     frames = scene.train
     num_pixels = sum(f.camera.width * f.camera.height for f in frames)
     step = max(1, math.ceil(math.sqrt(num_pixels / MAX_START_PIXELS)))
-    clouds = []
+    clouds, densities = [], []
     for i, f in enumerate(frames):
         chosen = still(f) & lattice(f, i, step)
         clouds.append(unproject_frame(f, i, chosen, scene.near, scene.far, to_radiance))
-    return concatenate(clouds)
+        densities.append(detail_density(f.image)[chosen])
+    return concatenate(clouds), torch.cat(densities)
 
 
 def still(f: Frame) -> Tensor:
@@ -125,17 +130,20 @@ def lattice(f: Frame, position: int, step: int) -> Tensor:
     return (rows[:, None] & columns).reshape(-1)
 
 
-def thin_cells(points: PointCloud, scene: Scene, limit: int) -> Tensor:
+def thin_cells(points: PointCloud, density: Tensor, scene: Scene, limit: int) -> Tensor:
     """The cell (P,) of every point: a pixel's frustum, or a cube in a box. They are the
-    finest of which at most `limit` are occupied.
+    finest of which at most `limit` are occupied, larger where the relative `density`
+    (P,) is low.
     """
     space = build_space([f.camera for f in scene.train], scene.near, scene.far)
     coords = space.encode(points.positions)
     if isinstance(space, FrustumSpace):
         extent = space.high - space.low
         coords = coords * torch.stack([extent[0], extent[1], extent[0] / DEPTH_CELLS]) / extent[0]
-    one_kind = torch.zeros(len(points), dtype=torch.long)
-    return assign_cells(coords, one_kind, limit)
+    size = cell_sizes(points, coords, density, scene.manifest.width)
+    if not len(points):
+        return size
+    return assign_cells(scale_by_size(coords, size), size, limit)
 
 
 def place(gaussians: Gaussians, points: PointCloud) -> int:
