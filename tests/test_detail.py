@@ -45,7 +45,7 @@ def test_a_flat_picture_asks_for_nothing_and_more_contrast_for_more() -> None:
 def test_a_checkerboard_of_the_half_density_detail_asks_for_half() -> None:
     y, x = torch.meshgrid(torch.arange(32), torch.arange(32), indexing="ij")
     board = ((x + y) % 2 * 2.0 - 1)[..., None].expand(-1, -1, 3)
-    # the two boxes leave 1 / 81 of it, as a box of 3 x 3 has 5 of one sign and 4 of the other
+    # each of the two boxes leaves 1 / 9 of it: 5 pixels of one sign and 4 of the other
     image = 0.5 + HALF_DENSITY_DETAIL / (1 - 1 / 81) * board
     middle = detail_density(image).view(32, 32)[8:-8, 8:-8]
     torch.testing.assert_close(middle, torch.full_like(middle, 0.5), atol=1e-4, rtol=0)

@@ -63,5 +63,5 @@ def cell_sizes(points: PointCloud, coords: Tensor, density: Tensor, width: int) 
 
 
 def scale_by_size(coords: Tensor, size: Tensor) -> Tensor:
-    """`coords` (P, 3), shrunk by each point's cell `size` (P,) towards the least ones."""
+    """`coords` (P, 3) minus their least, in units of each point's cell `size` (P,)."""
     return (coords - coords.amin(0)) * torch.exp2(-size / SIZES_PER_OCTAVE)[:, None]
