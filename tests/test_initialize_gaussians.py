@@ -80,6 +80,18 @@ def test_static_gaussians_lie_on_the_wall(field: Splat) -> None:
     )  # half-precision disparity
 
 
+def test_places_of_fog_are_used_for_surfaces(toy: Scene) -> None:
+    def pull_first(frame: Frame) -> Frame:
+        """The first frame's wall half as far away as it is."""
+        assert frame.disparity is not None
+        return replace(frame, disparity=frame.disparity * (2.0 if frame.time == 0 else 1.0))
+
+    field, _ = seeded(replace(toy, train=[pull_first(f) for f in toy.train]))
+    on = seen(field.static)
+    assert int(on.sum()) > 0.85 * 400
+    assert float((field.static.means.detach()[on, 2] - WALL).abs().median()) < 0.01
+
+
 def test_static_gaussians_have_the_walls_radiance(toy: Scene) -> None:
     field, _ = seeded(toy, replace(CONFIG, static=3000))
     at = field.static.means[seen(field.static)].detach()

@@ -13,7 +13,6 @@ from hdr_nsff.fields.point_cloud import (
     concatenate,
     exposure_trust,
     merge_by_cell,
-    thin_points,
     unproject_frame,
 )
 from hdr_nsff.geometry.cameras import Camera
@@ -116,6 +115,12 @@ def test_thinning_takes_trust_weighted_means() -> None:
     torch.testing.assert_close(kept.log_radiance, torch.tensor([[9.0] * 3, [1.75] * 3]))
     torch.testing.assert_close(kept.footprint, torch.tensor([9.0, 1.75]))
     assert kept.trust.tolist() == [0.5, 4.0]
+
+
+def thin_points(points: PointCloud, coords: Tensor, limit: int) -> PointCloud:
+    """At most `limit` points: one per cubic cell of `coords` (P, 3)."""
+    one_kind = torch.zeros(len(points), dtype=torch.long)
+    return merge_by_cell(points, assign_cells(coords, one_kind, limit))
 
 
 def test_concatenated_points_keep_their_order() -> None:

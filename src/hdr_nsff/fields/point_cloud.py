@@ -42,6 +42,15 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.trust)
 
+    def select(self, chosen: Tensor) -> PointCloud:
+        """The `chosen` (P,) bool points, in order."""
+        return PointCloud(
+            self.positions[chosen],
+            self.log_radiance[chosen],
+            self.trust[chosen],
+            self.footprint[chosen],
+        )
+
 
 def unproject_frame(
     frame: Frame, position: int, chosen: Tensor, near: float, far: float, to_radiance: ToRadiance
@@ -130,15 +139,6 @@ def merge_by_cell(points: PointCloud, cell: Tensor) -> PointCloud:
         total.to(points.trust),
         mean(points.footprint),
     )
-
-
-def thin_points(points: PointCloud, coords: Tensor, limit: int) -> PointCloud:
-    """At most `limit` points: one per cubic cell of `coords` (P, 3).
-
-    The cells are the finest that leave no more.
-    """
-    one_kind = torch.zeros(len(points), dtype=torch.long)
-    return merge_by_cell(points, assign_cells(coords, one_kind, limit))
 
 
 def assign_cells(coords: Tensor, kind: Tensor, limit: int) -> Tensor:

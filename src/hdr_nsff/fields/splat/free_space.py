@@ -28,22 +28,21 @@ MIN_VOTES_PX = 0.05  # pixels of full confidence with a surface behind, in all f
 MIN_VOTE_SHARE = 0.5  # of the votes for a surface behind it or at it
 
 
-def remove_fog(field: Splat, frames: Sequence[Frame]) -> int:
-    """Make the static Gaussians that are fog invisible; how many.
+def remove_fog(field: Splat, frames: Sequence[Frame]) -> Tensor:
+    """Make the static Gaussians that are fog invisible; their indices (N,).
 
-    Frames without a depth prior have no vote. The Gaussians' places are used again by
-    later relocations.
+    Frames without a depth prior have no vote.
     """
     step = max(len(frames) / NUM_FRAMES, 1.0)
     chosen = [frames[int(i * step)] for i in range(int(len(frames) / step))]
-    removed = 0
+    removed = []
     for _ in range(MAX_ROUNDS):
         fog = find_fog(field, chosen)
         field.static.opacity_logits.data[fog] = START_LOGIT
-        removed += len(fog)
+        removed.append(fog)
         if len(fog) < MIN_REMOVED_SHARE * len(field.static):
             break
-    return removed
+    return torch.cat(removed)
 
 
 @torch.no_grad()

@@ -26,12 +26,12 @@ from hdr_nsff.fields.point_cloud import (
     assign_cells,
     concatenate,
     merge_by_cell,
-    thin_points,
     unproject_frame,
 )
 from hdr_nsff.fields.space import FrustumSpace, build_space
+from hdr_nsff.fields.splat.detail import cell_sizes, detail_density, scale_by_size
 from hdr_nsff.fields.splat.free_space import remove_fog
-from hdr_nsff.fields.splat.gaussians import Gaussians, from_log_radiance
+from hdr_nsff.fields.splat.gaussians import START_LOGIT, Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.initialize_local import local_mask, place_local
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
@@ -40,6 +40,9 @@ from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 # a cell is this many times longer along the view than across, as shares of the frustum
 DEPTH_CELLS = 12.0
 FILL = 0.95  # of the places are used at once; the rest go where the error is
+# of the static Gaussians: with less fog its places wait for relocation (hand-chosen: a
+# second start takes as long as the first)
+MIN_REFILL_SHARE = 0.02
 # of all frames that become points; of more, a lattice (a hundred for every Gaussian)
 MAX_START_PIXELS = 8_000_000
 OVERLAP = 0.6  # standard deviation relative to the distance to the neighbors
@@ -66,24 +69,50 @@ def initialize_gaussians(
                 "static Gaussians start at random places and moving ones not at all, "
                 "without a depth prior in scene units"
             )
-        num_pixels = sum(f.camera.width * f.camera.height for f in frames)
-        step = max(1, math.ceil(math.sqrt(num_pixels / MAX_START_PIXELS)))
-        static = concatenate(
-            [
-                unproject_frame(
-                    f, i, still(f) & lattice(f, i, step), scene.near, scene.far, to_radiance
-                )
-                for i, f in enumerate(frames)
-            ]
-        )
-        count = place(field.static, thin(static, scene, int(FILL * len(field.static))))
         num_movers, moving = place_movers(field, scene, to_radiance)
         local = place_local(field.local, scene, to_radiance, field.unit)
-        count -= remove_fog(field, frames)
+        count = place_static(field, scene, to_radiance)
         return (
             f"{count} static Gaussians from the depth prior; "
             f"{moving} moving ones on {num_movers} rigid movers; {local} time-local ones"
         )
+
+
+def place_static(field: Splat, scene: Scene, to_radiance: ToRadiance) -> int:
+    """Place the static Gaussians where the depth prior sees surfaces; how many.
+
+    Points whose Gaussians are fog are left out. The others are then merged into finer
+    cells, so that the places of fog are used for what is there. Movers are placed
+    before: they may hide what is static.
+    """
+    points, density = static_points(scene, to_radiance)
+    limit = int(FILL * len(field.static))
+    cells = thin_cells(points, density, scene, limit)
+    count = place(field.static, merge_by_cell(points, cells))
+    fog = remove_fog(field, scene.train)
+    if len(fog) < MIN_REFILL_SHARE * len(field.static):
+        return count - len(fog)
+    _, gaussian = torch.unique(cells, return_inverse=True)  # of every point
+    clear = ~torch.isin(gaussian, fog)
+    points, density = points.select(clear), density[clear]
+    cells = thin_cells(points, density, scene, limit)
+    count = place(field.static, merge_by_cell(points, cells))
+    return count - len(remove_fog(field, scene.train))
+
+
+def static_points(scene: Scene, to_radiance: ToRadiance) -> tuple[PointCloud, Tensor]:
+    """Pixels of all training frames outside the moving masks, as points; and the
+    relative density (P,) that the detail of their frames asks for.
+    """
+    frames = scene.train
+    num_pixels = sum(f.camera.width * f.camera.height for f in frames)
+    step = max(1, math.ceil(math.sqrt(num_pixels / MAX_START_PIXELS)))
+    clouds, densities = [], []
+    for i, f in enumerate(frames):
+        chosen = still(f) & lattice(f, i, step)
+        clouds.append(unproject_frame(f, i, chosen, scene.near, scene.far, to_radiance))
+        densities.append(detail_density(f.image)[chosen])
+    return concatenate(clouds), torch.cat(densities)
 
 
 def still(f: Frame) -> Tensor:
@@ -101,21 +130,28 @@ def lattice(f: Frame, position: int, step: int) -> Tensor:
     return (rows[:, None] & columns).reshape(-1)
 
 
-def thin(points: PointCloud, scene: Scene, limit: int) -> PointCloud:
-    """At most `limit` points, one per cell: a pixel's frustum, or a cube in a box."""
+def thin_cells(points: PointCloud, density: Tensor, scene: Scene, limit: int) -> Tensor:
+    """The cell (P,) of every point: a pixel's frustum, or a cube in a box. They are the
+    finest of which at most `limit` are occupied, larger where the relative `density`
+    (P,) is low.
+    """
     space = build_space([f.camera for f in scene.train], scene.near, scene.far)
     coords = space.encode(points.positions)
     if isinstance(space, FrustumSpace):
         extent = space.high - space.low
         coords = coords * torch.stack([extent[0], extent[1], extent[0] / DEPTH_CELLS]) / extent[0]
-    return thin_points(points, coords, limit)
+    size = cell_sizes(points, coords, density, scene.manifest.width)
+    if not len(points):
+        return size
+    return assign_cells(scale_by_size(coords, size), size, limit)
 
 
 def place(gaussians: Gaussians, points: PointCloud) -> int:
     """Put the first Gaussians at the points, as wide as their neighbors are away; the
-    others stay invisible. How many.
+    others are invisible. How many.
     """
     n = min(len(points), len(gaussians))
+    gaussians.opacity_logits[n:] = START_LOGIT
     if n == 0:
         return 0
     apart = torch.from_numpy(neighbor_distance(points.positions[:n].numpy())).float()
