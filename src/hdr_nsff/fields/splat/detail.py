@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from hdr_nsff.fields.point_cloud import PointCloud
 
 # root mean square of an image, in [0, 1], without its low frequencies, at which the
-# density is half of the greatest (chosen on four real clips: 5 levels of 255)
+# density is half of the greatest (hand-chosen: 5 levels of 255)
 HALF_DENSITY_DETAIL = 0.02
 MIN_DENSITY = 1 / 64  # relative to the greatest, which nothing reaches
 BLUR_PX = 3  # width of the box that separates low frequencies, applied twice
