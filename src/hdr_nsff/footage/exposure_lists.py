@@ -85,7 +85,7 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     of what is not understood.
     """
     path = footage.path / "exposures.csv"
-    if footage.video:
+    if footage.video and not footage.same_camera:
         path = footage.path.with_suffix(".csv")
     if not path.is_file():
         return None

@@ -68,12 +68,17 @@ class Footage:
     # gray that shows through transparent pixels; None: transparency is ignored
     over: float | None = None
     transfer: Transfer | None = None  # of HDR video, by its tags
+    same_camera: bool = False  # the `cameras` are tracks of one (`tracks.py`)
+
+    @property
+    def root(self) -> Path:
+        """The folder that names of files are relative to."""
+        return self.path.parent if self.video and not self.same_camera else self.path
 
     @property
     def files(self) -> dict[str, Path]:
         """Every file by its name relative to the footage."""
-        root = self.path.parent if self.video else self.path
-        return {f.relative_to(root).as_posix(): f for files in self.cameras for f in files}
+        return {f.relative_to(self.root).as_posix(): f for files in self.cameras for f in files}
 
     @property
     def lossless(self) -> bool:
@@ -90,6 +95,7 @@ class FootageFrame:
     number: int  # position in its camera's footage, before any stride
     source: str  # file name relative to the footage; `#number` for a frame of a video
     rgb: np.ndarray  # (H, W, 3) float32 recorded, in [0, 1]
+    track: int = 0  # of one camera that records several at the same times
 
 
 # Which files
@@ -229,7 +235,8 @@ def read_frames(
     if footage.linear:
         scale = linear_scale([f for files in footage.cameras for f in files[start:end:stride]])
     first: tuple[str, int, int] | None = None  # name, height, width
-    for camera_id, files in enumerate(footage.cameras):
+    for line, files in enumerate(footage.cameras):
+        camera_id, track = (0, line) if footage.same_camera else (line, 0)
         for number, source, image in decode(footage, files, chosen):
             h, w = image.shape[:2]
             first = first or (source, h, w)
@@ -242,7 +249,7 @@ def read_frames(
             rgb = shrink(image, max_size)
             if footage.linear:
                 rgb = np.clip(rgb * scale, 0, 1) ** np.float32(1 / GAMMA)
-            yield FootageFrame(camera_id, number, source, rgb)
+            yield FootageFrame(camera_id, number, source, rgb, track)
 
 
 def decode(

@@ -82,7 +82,8 @@ def given_lenses(work: Work) -> dict[int, LensEntry]:
     if with_maps or (work.capture is not None and work.capture.has_held_out):
         raise distorted(path, lens.max_displacement_px())
     entry = LensEntry.of(lens, given=True)
-    return {camera_id: entry for camera_id in range(len(work.footage.cameras))}
+    cameras = 1 if work.footage.same_camera else len(work.footage.cameras)
+    return {camera_id: entry for camera_id in range(cameras)}
 
 
 def lens_to_find(work: Work) -> LensChoice:
