@@ -84,9 +84,7 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     and `ev` or a time (`TIMES`), with those of `GAINS`. InputError that names the line
     of what is not understood.
     """
-    path = footage.path / "exposures.csv"
-    if footage.video and not footage.same_camera:
-        path = footage.path.with_suffix(".csv")
+    path = csv_path(footage)
     if not path.is_file():
         return None
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
@@ -106,6 +104,13 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
             f"{path}, line {line}: no readable CSV ({error}); correct the line"
         ) from error
     return path, rows
+
+
+def csv_path(footage: Footage) -> Path:
+    """Where the CSV of a clip is."""
+    if footage.video and not footage.same_camera:
+        return footage.path.with_suffix(".csv")
+    return footage.path / "exposures.csv"
 
 
 def read_utf8(path: Path) -> str:

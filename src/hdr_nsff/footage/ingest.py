@@ -96,6 +96,7 @@ class FootageFrame:
     source: str  # file name relative to the footage; `#number` for a frame of a video
     rgb: np.ndarray  # (H, W, 3) float32 recorded, in [0, 1]
     track: int = 0  # of one camera that records several at the same times
+    seconds: float | None = None  # when it is shown, of videos
 
 
 # Which files
@@ -237,7 +238,7 @@ def read_frames(
     first: tuple[str, int, int] | None = None  # name, height, width
     for line, files in enumerate(footage.cameras):
         camera_id, track = (0, line) if footage.same_camera else (line, 0)
-        for number, source, image in decode(footage, files, chosen):
+        for number, source, image, seconds in decode(footage, files, chosen):
             h, w = image.shape[:2]
             first = first or (source, h, w)
             name, height, width = first
@@ -249,23 +250,23 @@ def read_frames(
             rgb = shrink(image, max_size)
             if footage.linear:
                 rgb = np.clip(rgb * scale, 0, 1) ** np.float32(1 / GAMMA)
-            yield FootageFrame(camera_id, number, source, rgb, track)
+            yield FootageFrame(camera_id, number, source, rgb, track, seconds)
 
 
 def decode(
     footage: Footage, files: list[Path], chosen: range
-) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames of one camera."""
+) -> Iterator[tuple[int, str, np.ndarray, float | None]]:
+    """(number, source, image (H, W, 3), seconds) of the chosen frames of one camera."""
     if footage.video:
         yield from decode_video(files[0], chosen)
         return
     for number, path in list(enumerate(files))[chosen.start : chosen.stop : chosen.step]:
         source = path.relative_to(footage.path).as_posix()
-        yield number, source, read_frame(path, footage.over)
+        yield number, source, read_frame(path, footage.over), None
 
 
-def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames of a video.
+def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """(number, source, image (H, W, 3), seconds) of the chosen frames of a video.
 
     InputError where it ends before the duration in its header.
     """
@@ -279,7 +280,7 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
             transfer = TRANSFERS.get(info.transfer)
             if transfer is not None:
                 image = encode_light(image, transfer, info.primaries == REC2020_CODE)
-            yield number, f"{path.name}#{number}", image
+            yield number, f"{path.name}#{number}", image, seconds
     if last + MAX_MISSING_FRAMES / info.fps < info.seconds:
         raise InputError(
             f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); "

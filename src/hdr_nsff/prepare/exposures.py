@@ -7,7 +7,7 @@ training learns the exposures.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -20,14 +20,17 @@ from hdr_nsff.footage.exposure_lists import (
     read_exposure_csv,
 )
 from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.prepare.times import by_timestamps, evenly_spaced
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.dropped_frames import GappedCycle, find_cycle
 from hdr_nsff.scene.manifest import FrameEntry
 
 # confidence of a cycle by brightness from which it refutes a list (hand-chosen)
 MIN_CONFIDENCE = 0.8
 GOPRO = "GoPro's metadata"  # as a source of exposures
 MIN_DRIFT_EV = 0.02  # of such exposures; below it, they are one
+MAX_LISTED = 5  # frames in a message
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,30 @@ class FrameExposures:
     reference: int | None = None  # bracket; None: the best exposed one
     notes: tuple[str, ...] = ()  # sentences for people
     drift: tuple[float, ...] = ()  # given, per frame: stops from its bracket; empty: none
+    # where frames are missing: per frame its time, and the length of the cycle in these
+    slots: tuple[float, ...] = ()
+    cycle: int | None = None
 
 
 def frame_exposures(work: Work) -> FrameExposures:
     """The exposures of all frames, as given, or by brightness."""
-    capture, frames = work.capture, work.manifest.frames
     source, given = given_exposures(work)
+    gapped = cycle_with_gaps(work, given)
+    found = exposures_by(work, source, given, gapped)
+    if gapped is None:
+        return found
+    slots = tuple(gapped.slots.astype(float).tolist())
+    notes = (*gap_notes(work, gapped), *found.notes)
+    return replace(found, slots=slots, cycle=gapped.period(), notes=notes)
+
+
+def exposures_by(
+    work: Work, source: str, given: list[float] | None, gapped: GappedCycle | None
+) -> FrameExposures:
+    """The exposures of all frames from the EVs that a `source` gives, else from
+    brightness; `gapped`: their cycle where frames are missing from it.
+    """
+    capture, frames = work.capture, work.manifest.frames
     if capture is not None and capture.exposures is not None and source == "data set":
         stored = capture.exposures
         brackets = [work.picture(frame).bracket or 0 for frame in frames]
@@ -59,18 +80,54 @@ def frame_exposures(work: Work) -> FrameExposures:
         return track_exposures(work, source, given)
     if given is None:
         cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
+        if gapped is not None:
+            cycles = [gapped.cycle]
         brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         notes = cycle_notes(work, cycles)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
     many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
     if source == GOPRO or (many and len(cameras) == 1):
-        return drifting_exposures(source, given)
+        return drifting_exposures(source, given, gapped)
     brackets, known = exposure.brackets_by_ev(given)
     doubts = []
     for own in cameras:
         doubts += exposure.contradictions(work.video[own], [given[i] for i in own])
     return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
+
+
+def cycle_with_gaps(work: Work, given: list[float] | None) -> GappedCycle | None:
+    """The cycle of a clip from which frames are missing, by the `given` EVs of its
+    frames or else their brightness; None where none are missing, or nothing alternates.
+
+    Looked for in the clip of one camera, every frame of it.
+    """
+    cameras = work.camera_frames()
+    if work.capture is not None or work.config.stride != 1 or len(cameras) > 1:
+        return None
+    times = evenly_spaced(work)
+    if by_timestamps(work):
+        times = [f.time for f in work.manifest.frames]
+    known = np.diff(times).astype(int)
+    steps = np.diff(given) if given is not None else exposure.brightness_steps(work.video)
+    gapped = find_cycle(steps, known)
+    if gapped.cycle.length == 1 or (not gapped.gaps and (known == 1).all()):
+        return None
+    return gapped
+
+
+def gap_notes(work: Work, gapped: GappedCycle) -> list[str]:
+    """A sentence on the frames that are missing, where the exposures show it."""
+    if not gapped.gaps:
+        return []
+    numbers = work.frame_numbers()
+    listed = ", ".join(str(numbers[t]) for t in gapped.gaps[:MAX_LISTED])
+    more = ", ..." if len(gapped.gaps) > MAX_LISTED else ""
+    sentence = f"frames are missing before frame {listed}{more}: the exposures skip a part "
+    sentence += f"of their cycle of {gapped.cycle.length}"
+    if by_timestamps(work):
+        return [f"{sentence}; times are those of the timestamps"]
+    return [f"{sentence}; times leave the gaps"]
 
 
 def track_exposures(work: Work, source: str, given: list[float] | None) -> FrameExposures:
@@ -107,11 +164,14 @@ def levels_and_drift(given: list[float], brackets: list[int]) -> tuple[list[floa
     return levels, drift
 
 
-def drifting_exposures(source: str, given: list[float]) -> FrameExposures:
+def drifting_exposures(
+    source: str, given: list[float], gapped: GappedCycle | None = None
+) -> FrameExposures:
     """Given EVs of frames that are too many for a cycle: brackets of one where they
     alternate, and the drift of every frame from its bracket.
     """
-    brackets = exposure.cycle_of_steps(np.diff(given)).brackets
+    cycle = exposure.cycle_of_steps(np.diff(given)) if gapped is None else gapped.cycle
+    brackets = cycle.brackets
     known, drift = levels_and_drift(given, brackets)
     note = f"given exposures drift by {drift.min():+.2f} to {drift.max():+.2f} EV"
     return FrameExposures(
@@ -131,6 +191,9 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
     if cycle is not None and tracks > 1:
         return "flags", track_cycle(work, cycle)
     if cycle is not None:
+        gapped = cycle_with_gaps(work, None)
+        if gapped is not None and exposure.period(cycle_brackets(cycle)) == gapped.cycle.length:
+            return "flags", [cycle[(c.start + n) % len(cycle)] for n in gapped.slots]
         check_cycle(work, cycle, numbers)
         return "flags", [cycle[n % len(cycle)] for n in numbers]
     if "auto" in (c.exposures, c.ev):
@@ -201,6 +264,11 @@ def exif_exposures(work: Work) -> list[float]:
     if known and lost:
         say(f"exposure: EXIF of {lost} frames holds no exposure time; brightness decides instead")
     return known
+
+
+def cycle_brackets(cycle: list[float]) -> list[int]:
+    """The brackets of two rounds of a list of exposures."""
+    return exposure.brackets_by_ev(2 * cycle)[0]
 
 
 def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:

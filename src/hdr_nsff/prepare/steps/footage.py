@@ -16,6 +16,7 @@ from hdr_nsff.footage.turns import find_cameras_in_turn
 from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.times import leave_gaps, times_of_slots
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
@@ -34,6 +35,7 @@ def frames_step(work: Work) -> StepResult:
     c, m = work.config, work.manifest
     entries: list[FrameEntry] = []
     extents = []
+    seconds: list[float | None] = []
     frames = ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size)
     for frame in track(frames, "frames", expected_frames(work)):
         m.height, m.width = frame.rgb.shape[:2]
@@ -51,11 +53,17 @@ def frames_step(work: Work) -> StepResult:
         rgb = undistorted(work, frame.rgb, frame.camera_id)
         write_frame(work.folder / entry.image, rgb, bits)
         entries.append(entry)
+        seconds.append(frame.seconds)
         extents.append(exposure.extent(frame.rgb))
     check_frames(c.clip, entries, extents)
+    missing = leave_gaps(work, entries, seconds)
     m.fps = work.footage.fps / c.stride
-    if [identity(f) for f in m.frames] != [identity(f) for f in entries]:
+    with_time = work.capture is not None  # of other footage, it may have gaps by the cycle
+    if [identity(f, with_time) for f in m.frames] != [identity(f, with_time) for f in entries]:
         m.frames = entries  # else the results of later steps for these frames stay
+    elif missing:
+        for kept, entry in zip(m.frames, entries, strict=True):
+            kept.time = entry.time
     note = f"{len(entries)} frames of {m.width}x{m.height} pixels"
     if work.footage.linear:
         note += "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
@@ -64,12 +72,15 @@ def frames_step(work: Work) -> StepResult:
         note += f"; {kind} by its tags, brought to linear light and encoded as x^(1/2.2)"
     if m.lens:
         note += f", undistorted ({describe(m.lens)})"
-    return StepResult(provenance="given", note=note)
+    if missing:
+        note += f"; {missing} are missing by the timestamps, and their times are left out"
+    return StepResult(provenance="given", note=note, details={"missing": missing})
 
 
-def identity(entry: FrameEntry) -> tuple[int, str, float, int, int]:
+def identity(entry: FrameEntry, with_time: bool) -> tuple[int, str, float, int, int]:
     """What makes a frame of the scene the same frame."""
-    return entry.index, entry.source, entry.time, entry.camera_id, entry.track
+    time = entry.time if with_time else 0.0
+    return entry.index, entry.source, time, entry.camera_id, entry.track
 
 
 def expected_frames(work: Work) -> int | None:
@@ -120,7 +131,7 @@ def exposure_step(work: Work) -> StepResult:
     found = frame_exposures(work)
     for note in found.notes[:MAX_NOTES]:
         say(f"exposure: {note}")
-    m.cycle = exposure.period([found.brackets[i] for i in work.camera_frames()[0]])
+    m.cycle = found.cycle or exposure.period([found.brackets[i] for i in work.camera_frames()[0]])
     if found.reference is None:
         m.reference_bracket = exposure.reference_bracket(work.video, found.brackets)
     else:
@@ -134,6 +145,8 @@ def exposure_step(work: Work) -> StepResult:
     held_out = frames_to_hold_out(work)
     if m.protocol is not None:
         check_protocol(m.protocol, found.brackets, held_out)
+    for frame, time in zip(m.frames, times_of_slots(work, found.slots), strict=True):
+        frame.time = time
     for frame, bracket in zip(m.frames, found.brackets, strict=True):
         frame.bracket = bracket
         frame.ev = m.bracket_ev[bracket]
