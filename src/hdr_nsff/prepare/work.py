@@ -103,7 +103,8 @@ class PrepareConfig:
     lens_distortion: str = "auto"
     """Radial distortion of the lens. auto: estimated, and left at none where the clip
     does not show any; none: a pinhole camera; K1 or K1,K2: as OpenCV has them, such as
-    -0.2,0.03. Frames are undistorted.
+    -0.2,0.03; or the file of a calibration: COLMAP's cameras.txt, nerfstudio's
+    transforms.json, YAML or JSON of OpenCV, ROS or Kalibr. Frames are undistorted.
     """
     matcher: Matcher = "sift"
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
