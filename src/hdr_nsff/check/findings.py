@@ -35,6 +35,7 @@ class FindingTuning:
     max_motion: float = 0.03  # of the picture's width, from frame to frame
     min_banding_ev: float = 0.05
     max_interval_ratio: float = 1.5  # longest to shortest time between frames
+    min_readout: float = 0.1  # share of the time between frames
     few_frames: int = 12
     many_frames: int = 150
     sure_parallax: float = 0.5  # rotations explain less than this share: parallax is clear
@@ -48,10 +49,11 @@ def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Fin
         *judge_camera(facts, tuning),
         *judge_file(facts, tuning),
         *judge_lens(facts),
+        *judge_shutter(facts, tuning),
         Finding(
             "note",
             "not checked",
-            "rolling shutter and electronic stabilization are not measured",
+            "electronic stabilization is not measured",
             "turn stabilization off",
         ),
     ]
@@ -178,6 +180,32 @@ def judge_lens(facts: ClipFacts) -> Iterator[Finding]:
         yield Finding("note", "lens", text, "`prepare` undistorts the frames")
 
 
+def judge_shutter(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """Rolling shutter, where the camera's shake shows it."""
+    if facts.camera.motion == "tripod":
+        return
+    if facts.camera.readout is None:
+        text = (
+            "rolling shutter is not measured: the camera shakes too little, or too little matches"
+        )
+        yield Finding("note", "shutter", text)
+        return
+    readout, error = facts.camera.readout
+    ms = 1000 / facts.file.fps
+    if readout < max(tuning.min_readout, 2 * error):
+        most = max(tuning.min_readout, readout + 2 * error)
+        text = f"no rolling shutter is seen (less than {most:.0%} of the time between frames)"
+        yield Finding("good", "shutter", text)
+        return
+    text = f"rolling shutter: rows are read over {readout:.0%} of the time between frames"
+    text += f" (standard error {error:.0%})"
+    advice = "move slower"
+    if facts.file.interval_ms is not None:
+        text += f", {readout * ms:.0f} ms"
+        advice += f", or train with `--readout {readout * ms:.0f}`"
+    yield Finding("note", "shutter", text, advice)
+
+
 def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     """Length, timing and tags."""
     file = facts.file
@@ -198,7 +226,16 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     if file.frames > tuning.many_frames:
         text = f"{file.frames} frames take long, and most of that time repeats itself"
         yield Finding("note", "length", text, "choose a part with --start and --end")
-    if file.interval_ms is not None:
+    if facts.exposure.missing_before:
+        listed = ", ".join(str(frame) for frame in facts.exposure.missing_before[:6])
+        text = f"frames are missing before frame {listed}: the exposure cycle skips a part"
+        advice = "`prepare` leaves gaps in time; use a faster card, or record at a lower rate"
+        yield Finding("warning", "timing", text, advice)
+    if file.missing:
+        text = f"{file.missing} frames are missing by the timestamps of the video"
+        advice = "`prepare` leaves gaps in time; use a faster card, or record at a constant rate"
+        yield Finding("warning", "timing", text, advice)
+    elif file.interval_ms is not None:
         shortest, longest = file.interval_ms
         if longest > tuning.max_interval_ratio * shortest:
             text = f"variable frame rate: {shortest:.0f} to {longest:.0f} ms between frames"

@@ -13,11 +13,13 @@ import numpy as np
 
 from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
 from hdr_nsff.check.lens import measure_lens
+from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
+from hdr_nsff.footage.timestamps import frame_gaps
 from hdr_nsff.priors.poses.estimate import PosesTuning
 from hdr_nsff.priors.poses.matching import (
     Keypoints,
@@ -29,6 +31,7 @@ from hdr_nsff.priors.poses.matching import (
 from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.priors.poses.rotation import fit_panorama, rotation_share
 from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.dropped_frames import find_cycle
 
 MIN_FRAMES = 3
 
@@ -88,7 +91,9 @@ def measure_clip(
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
     file = describe_file(footage)
     source, given = given_exposures(footage, len(video))
-    cycle = given_cycle(given) if source is not None else exposure.detect_cycle(video)
+    gapped = find_cycle(exposure.brightness_steps(video), np.ones(len(video) - 1, int))
+    cycle = given_cycle(given) if source is not None else gapped.cycle
+    gaps = gapped.gaps if source is None else ()
     equalized, clipped = exposure.equalize(video, cycle.brackets)
     keypoints = detect_keypoints(equalized, clipped)
     following = match_pairs(keypoints, [(t, t + 1) for t in range(len(video) - 1)])
@@ -96,7 +101,7 @@ def measure_clip(
     facts = ClipFacts(
         file=file,
         looked_at=len(video),
-        exposure=measure_exposure(source, video, cycle, keypoints, tuning),
+        exposure=measure_exposure(source, video, cycle, keypoints, gaps, tuning),
         camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
     )
     return facts, video, cycle.brackets
@@ -108,10 +113,13 @@ def describe_file(footage: ingest.Footage) -> FileFacts:
     kind = "linear" if footage.linear else (footage.transfer or "recorded")
     frame = next(ingest.read_frames(footage, 0, 1, 1, ingest.MAX_FRAMES))
     height, width = frame.rgb.shape[:2]
-    bits, interval = 8, None
+    bits, interval, missing = 8, None, 0
     if footage.video:
         bits = video_info(first).bits
-        gaps = np.diff(frame_times(first)) * 1000
+        times = frame_times(first)
+        gaps = np.diff(times) * 1000
+        steps = frame_gaps(times.tolist())
+        missing = 0 if steps is None else round(float((steps - 1).sum()))
         if len(gaps):
             interval = (round(float(gaps.min()), 2), round(float(gaps.max()), 2))
     elif not footage.linear:
@@ -120,9 +128,8 @@ def describe_file(footage: ingest.Footage) -> FileFacts:
     else:
         bits = 16
     cameras = len(footage.cameras)
-    return FileFacts(
-        footage.path.name, footage.count, cameras, width, height, footage.fps, bits, kind, interval
-    )
+    name, count, fps = footage.path.name, footage.count, footage.fps
+    return FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing)
 
 
 # Exposure
@@ -133,6 +140,7 @@ def measure_exposure(
     video: np.ndarray,
     cycle: exposure.Cycle,
     keypoints: list[Keypoints],
+    gaps: tuple[int, ...],
     tuning: CheckTuning,
 ) -> ExposureFacts:
     """Exposures of the recorded `video` (T, H, W, 3), and what they clip."""
@@ -155,6 +163,7 @@ def measure_exposure(
         white_share=per_bracket(white),
         black_share=per_bracket(black),
         banding_ev=round(measure_banding(video, keypoints, cycle.length, tuning), 3),
+        missing_before=gaps,
     )
 
 
@@ -291,6 +300,10 @@ def measure_camera(
     lens = None
     if motion == "parallax" and not cuts:
         lens = measure_lens(equalized, clipped, scale)
+    height, width = equalized.shape[1:3]
+    readout = None
+    if motion != "tripod" and not cuts:
+        readout = measure_readout(following, (height, width), portrait=height > width)
     return CameraFacts(
         motion=motion,
         rotation_share=None if share is None else round(share, 3),
@@ -298,6 +311,7 @@ def measure_camera(
         long_sharpness=compare_sharpness(equalized, clipped, cycle, tuning),
         cuts=tuple(cuts),
         lens=lens,
+        readout=None if readout is None else (round(readout[0], 3), round(readout[1], 3)),
     )
 
 
