@@ -60,8 +60,9 @@ def test_columns_of_a_portrait_are_rows_of_the_sensor() -> None:
 def test_a_steady_pan_does_not_determine_it() -> None:
     places = np.random.default_rng(0).uniform(0, W, (200, 2))
     rng = np.random.default_rng(1)
+    step = np.array([3.0, 0.0])
     pan = [
-        PairMatches(t, t + 1, places, places + (3, 0) + rng.normal(0, 0.2, places.shape))
+        PairMatches(t, t + 1, places, places + step + rng.normal(0, 0.2, places.shape))
         for t in range(40)
     ]
     assert measure_readout(pan, (H, W)) is None
