@@ -38,6 +38,7 @@ class ExposureFacts:
     white_share: tuple[float, ...]  # per bracket: pixels with a saturated channel
     black_share: tuple[float, ...]  # per bracket: pixels with all channels black
     banding_ev: float  # amplitude of bright and dark bands, 0 where there are none
+    color_drift_ev: float = 0.0  # the same of red or blue against green
     missing_before: tuple[int, ...] = ()  # frames before which the cycle skips some
 
 

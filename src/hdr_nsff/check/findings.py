@@ -29,6 +29,7 @@ class FindingTuning:
 
     max_step_ev: float = 3.3  # between neighboring exposures: they must share mid-tones
     max_drift_ev: float = 0.3  # auto exposure; locked clips measure up to 0.13
+    max_color_drift_ev: float = 0.2  # of red or blue against green
     max_white: float = 0.01  # share of pixels that even the darkest exposure saturates
     max_black: float = 0.02  # share that even the brightest leaves black
     min_sharpness: float = 0.8  # of the longest exposure relative to the shortest
@@ -112,6 +113,10 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         text = f"the exposure drifts by about {exposure.drift_ev:.1f} EV: auto exposure"
         advice = "`prepare` follows it, but lock exposure and white balance if you can"
         yield Finding("warning", "exposure", text, advice)
+    if exposure.color_drift_ev > tuning.max_color_drift_ev:
+        text = f"colors drift by about {exposure.color_drift_ev:.2f} EV: auto white balance"
+        advice = "training follows a slow drift; lock white balance if you can"
+        yield Finding("warning", "color", text, advice)
     if exposure.banding_ev > tuning.min_banding_ev:
         text = f"bands of about {exposure.banding_ev:.2f} EV run through the picture: mains flicker"
         advice = "use exposure times of 1/50 or 1/100 s (1/60 or 1/120 s where mains have 60 Hz)"

@@ -4,13 +4,13 @@ the cycle by brightness, SIFT matches on equalized frames, rotations that explai
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from hdr_nsff.check.drift import measure_drift
 from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
 from hdr_nsff.check.lens import measure_lens
 from hdr_nsff.check.shutter import measure_readout
@@ -44,12 +44,7 @@ class CheckTuning:
     max_size: int = 480  # pixels of the longest side
     low: float = 0.012  # recorded values beyond these are black and white, as for cycles
     high: float = 0.97
-    point_blur_px: float = 1.5  # values at keypoints are means over this radius
-    min_points: int = 12  # of a pair, for a change of exposure
-    drift_frames: int = 16  # compared with each other
-    reweightings: int = 8
-    least_error_ev: float = 0.02  # smaller errors of a pair count alike
-    max_disagreement: float = 0.15  # of pairs, relative to the drift: else it is motion
+    min_points: int = 12  # of a pair, to look for bands
     # pixels between frames compared for bands: more motion looks like bands
     max_band_shift: float = 1.0
     edge_blur_px: float = 1.2  # keeps noise out of edges
@@ -150,6 +145,8 @@ def measure_exposure(
     steps = exposure.brightness_steps(video)
     count = len(cycle.ev)
 
+    drift = measure_drift(video, cycle, keypoints)
+
     def per_bracket(shares: np.ndarray) -> tuple[float, ...]:
         return tuple(round(float(shares[brackets == b].mean()), 4) for b in range(count))
 
@@ -159,7 +156,8 @@ def measure_exposure(
         explained=round(cycle.confidence, 3),
         given=source,
         change_ev=round(float(np.abs(steps).mean()), 3),
-        drift_ev=round(measure_drift(video, cycle, keypoints, tuning), 2),
+        drift_ev=round(drift.exposure_ev, 2),
+        color_drift_ev=round(drift.color_ev, 2),
         white_share=per_bracket(white),
         black_share=per_bracket(black),
         banding_ev=round(measure_banding(video, keypoints, cycle.length, tuning), 3),
@@ -188,59 +186,6 @@ def given_cycle(given: list[float]) -> exposure.Cycle:
     relative = [value - min(ev) for value in ev]
     order = np.argsort(ev, kind="stable").tolist()
     return exposure.Cycle(exposure.period(brackets), brackets, order, relative, 1.0)
-
-
-def measure_drift(
-    video: np.ndarray, cycle: exposure.Cycle, keypoints: list[Keypoints], tuning: CheckTuning
-) -> float:
-    """The range in EV of what matched points change between frames of one bracket.
-
-    Points of the scene are compared, so a pan into the dark is no drift. Every pair of
-    some frames says how far their exposures are apart; least squares, reweighted to
-    least absolute errors, agree on one exposure per frame.
-    """
-    reference = exposure.reference_bracket(video, cycle.brackets)
-    own = np.flatnonzero(np.array(cycle.brackets) == reference)
-    chosen = own[spread_frames(len(own), tuning.drift_frames)]
-    pairs = list(itertools.combinations(range(len(chosen)), 2))
-    matches = match_pairs([keypoints[t] for t in chosen], pairs)
-    gray = [
-        cv2.GaussianBlur(video[t].mean(-1), (0, 0), tuning.point_blur_px) for t in chosen.tolist()
-    ]
-    changes, known = [], []
-    for pair in matches:
-        before, after = sample(gray[pair.i], pair.p), sample(gray[pair.j], pair.q)
-        use = (np.minimum(before, after) > 4 * tuning.low) & (
-            np.maximum(before, after) < tuning.high
-        )
-        if use.sum() >= tuning.min_points:
-            changes.append(float(np.median(np.log2(after[use] / before[use]))))
-            known.append((pair.i, pair.j))
-    linked = len({t for pair in known for t in pair})
-    if linked < 2:
-        return 0.0
-    design = np.zeros((len(known), len(chosen)))
-    for row, (i, j) in enumerate(known):
-        design[row, [i, j]] = -1, 1
-    change = exposure.GAMMA * np.array(changes)
-    weights = np.ones(len(known))
-    level: np.ndarray = np.zeros(len(chosen))
-    for _ in range(tuning.reweightings):
-        level = np.linalg.lstsq(design * weights[:, None], change * weights, rcond=None)[0]
-        error = np.abs(design @ level - change)
-        weights = 1 / np.sqrt(np.maximum(error, tuning.least_error_ev))
-    seen = level[sorted({t for pair in known for t in pair})]
-    drift = float(seen.max() - seen.min())
-    disagreement = float(np.median(np.abs(design @ level - change)))
-    return drift if disagreement < tuning.max_disagreement * drift else 0.0
-
-
-def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Values (M,) of an image (H, W) at points (M, 2), pixel centers at +0.5."""
-    height, width = image.shape
-    column = np.clip(points[:, 0].astype(int), 0, width - 1)
-    row = np.clip(points[:, 1].astype(int), 0, height - 1)
-    return image[row, column]
 
 
 def measure_banding(
