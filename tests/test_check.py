@@ -124,6 +124,13 @@ def good_facts() -> ClipFacts:
     )
 
 
+def test_a_frame_that_is_missing_from_the_cycle_is_found(tmp_path: Path) -> None:
+    evs = [EV[t % 3] - 1 for t in range(16) if t != 7]
+    facts, _, brackets = measure_clip(clip_of(tmp_path, still_scene, evs))
+    assert facts.exposure.missing_before == (7,)
+    assert brackets == [t % 3 for t in range(16) if t != 7]
+
+
 def test_a_good_clip_has_nothing_to_warn_of() -> None:
     assert {finding.level for finding in judge(good_facts())} <= {"good", "note"}
 
@@ -144,6 +151,27 @@ def test_every_warning_comes_with_advice() -> None:
     assert all(finding.advice for finding in warned)
     subjects = {finding.subject for finding in warned}
     assert subjects >= {"exposure", "flicker", "highlights", "shadows", "blur", "cuts", "timing"}
+
+
+def test_the_readout_is_given_in_milliseconds_where_it_is_seen() -> None:
+    good = good_facts()
+
+    def sentence(readout: tuple[float, float] | None) -> str:
+        camera = replace(good.camera, readout=readout)
+        found = judge(replace(good, camera=camera))
+        return next(f.text + f.advice for f in found if f.subject == "shutter")
+
+    assert "50% of the time between frames" in sentence((0.5, 0.02))
+    assert ", 21 ms" in sentence((0.5, 0.02)) and "--readout 21" in sentence((0.5, 0.02))
+    assert sentence((0.05, 0.04)).startswith("no rolling shutter is seen (less than 13%")
+    assert "is not measured" in sentence(None)
+
+
+def test_frames_that_timestamps_miss_are_counted() -> None:
+    good = good_facts()
+    found = judge(replace(good, file=replace(good.file, missing=2, interval_ms=(41.0, 84.0))))
+    timing = [f.text for f in found if f.subject == "timing"]
+    assert timing == ["2 frames are missing by the timestamps of the video"]
 
 
 def test_bad_input_is_one_sentence(tmp_path: Path) -> None:

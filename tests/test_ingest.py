@@ -16,6 +16,7 @@ from hdr_nsff.core.exr import REC709, write_exr
 from hdr_nsff.core.hdr_video import write_hdr_video
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.video import write_video
+from hdr_nsff.footage.exposure_lists import read_exif_ev
 from hdr_nsff.footage.ingest import (
     hash_file,
     hold_out_every,
@@ -169,9 +170,11 @@ def test_pipes_and_devices_are_not_read_without_end():
         hash_file(Path("/dev/zero"))
 
 
-def write_dng(path: Path, level: float) -> None:
+def write_dng(
+    path: Path, level: float, seconds: tuple[int, int] | None = None, green: float = 1.0
+) -> None:
     """A small raw photograph of a gray card, its upper half at half `level` of the
-    sensor's range.
+    sensor's range; with its exposure time, and a white balance as shot.
     """
     tifffile = pytest.importorskip("tifffile")
     raw = np.full((64, 96), int(level * 65535), np.uint16)
@@ -198,10 +201,12 @@ def write_dng(path: Path, level: float) -> None:
         (33421, "H", 2, (2, 2)),  # a Bayer pattern ...
         (33422, "B", 4, (0, 1, 1, 2)),  # ... of red green / green blue
         (50721, "2i", 9, ratios(matrix)),
-        (50728, "2I", 3, ratios((1, 1, 1))),  # neutral as shot
+        (50728, "2I", 3, ratios((1, green, 1))),  # neutral as shot
         (50778, "H", 1, 21),  # under daylight
         (50717, "H", 1, 65535),  # white level
     ]
+    if seconds is not None:
+        tags += [(33434, "2I", 1, seconds), (34855, "H", 1, 400), (33437, "2I", 1, (28, 10))]
     tifffile.imwrite(path, raw, photometric=32803, extratags=[(*t, True) for t in tags])
 
 
@@ -213,6 +218,20 @@ def test_raw_photographs_are_linear_and_share_a_white_balance(tmp_path):
     assert np.allclose(bright / dark, 4, rtol=0.01)
     half = all_frames(tmp_path)[1].rgb[16, 48] ** 2.2
     assert np.allclose(bright / half, 2, rtol=0.01)
+
+
+def test_the_tags_of_a_raw_photograph_are_its_exposure(tmp_path):
+    write_dng(tmp_path / "a.dng", 0.1, (1, 250))
+    expected = np.log2(1 / 250 * 400 / 100 / 2.8**2)
+    assert read_exif_ev(tmp_path / "a.dng") == pytest.approx(expected)
+
+
+def test_the_white_balance_as_shot_does_not_color_raw_frames(tmp_path):
+    pytest.importorskip("rawpy")
+    for i, green in enumerate((1.0, 0.5)):
+        write_dng(tmp_path / f"{i}.dng", 0.2, green=green)
+    first, second = (f.rgb for f in all_frames(tmp_path))
+    assert np.array_equal(first, second)
 
 
 def test_a_broken_raw_photograph_is_named(tmp_path):

@@ -11,8 +11,8 @@ from posed_clips import PLACES, H, K, W, sliding
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.geometry.lens import Lens, undistorted_picture
-from hdr_nsff.prepare.engine import run_step
-from hdr_nsff.prepare.lens import known_lenses, parse_lens
+from hdr_nsff.prepare.engine import run_step, step_key
+from hdr_nsff.prepare.lens import known_lenses, lens_to_find, parse_lens
 from hdr_nsff.prepare.prepare import STEPS, begin
 from hdr_nsff.prepare.steps.poses import find_poses
 from hdr_nsff.prepare.work import PrepareConfig
@@ -72,3 +72,24 @@ def test_a_scene_keeps_its_lens_on_disk(tmp_path):
     Manifest(source="clip", width=W, height=H, lens={0: LensEntry.of(LENS, False)}).save(tmp_path)
     again = Manifest.load(tmp_path).lens[0].lens()
     assert np.array_equal(again.K, LENS.K) and again.distortion == LENS.distortion
+
+
+def test_a_calibration_undistorts_the_frames(tmp_path, footage):
+    text = f"1 SIMPLE_RADIAL {2 * W} {2 * H} {2 * K[0, 0]} {W} {H} 0.15\n"
+    (tmp_path / "cameras.txt").write_text(text)
+    file = str(tmp_path / "cameras.txt")
+    config = PrepareConfig(footage / "clip", tmp_path / "scene", lens_distortion=file)
+    work = begin(config)
+    run_step(work, "frames", STEPS["frames"])
+    straight = undistorted_picture(read_image(footage / "clip" / "2.png"), LENS)
+    assert np.abs(read_image(tmp_path / "scene" / "images" / "00002.png") - straight).max() < 3e-3
+    assert work.manifest.lens[0].given and lens_to_find(work) == "none"
+    done = work.manifest.steps["frames"].key
+    assert step_key(begin(config), "frames", STEPS["frames"]) == done  # read again, the same
+
+
+def test_a_calibration_of_another_shape_is_refused(tmp_path, footage):
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_RADIAL 100 900 500 50 450 0.15\n")
+    file = str(tmp_path / "cameras.txt")
+    with pytest.raises(InputError, match="another shape"):
+        begin(PrepareConfig(footage / "clip", tmp_path / "scene", lens_distortion=file))

@@ -22,6 +22,7 @@ class FileFacts:
     kind: str  # recorded, linear, hlg, pq
     # milliseconds: the shortest and longest time between frames, of videos
     interval_ms: tuple[float, float] | None
+    missing: int = 0  # frames by the timestamps of a video
 
 
 @dataclass(frozen=True)
@@ -37,6 +38,8 @@ class ExposureFacts:
     white_share: tuple[float, ...]  # per bracket: pixels with a saturated channel
     black_share: tuple[float, ...]  # per bracket: pixels with all channels black
     banding_ev: float  # amplitude of bright and dark bands, 0 where there are none
+    color_drift_ev: float = 0.0  # the same of red or blue against green
+    missing_before: tuple[int, ...] = ()  # frames before which the cycle skips some
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,9 @@ class CameraFacts:
     long_sharpness: float | None
     cuts: tuple[int, ...]  # frames that show something else than the one before
     lens: LensFacts | None = None  # None: unknown
+    # of a rolling shutter, as a share of the time between frames, and its standard
+    # error; None: unknown
+    readout: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

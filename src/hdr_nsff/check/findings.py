@@ -29,12 +29,14 @@ class FindingTuning:
 
     max_step_ev: float = 3.3  # between neighboring exposures: they must share mid-tones
     max_drift_ev: float = 0.3  # auto exposure; locked clips measure up to 0.13
+    max_color_drift_ev: float = 0.2  # of red or blue against green
     max_white: float = 0.01  # share of pixels that even the darkest exposure saturates
     max_black: float = 0.02  # share that even the brightest leaves black
     min_sharpness: float = 0.8  # of the longest exposure relative to the shortest
     max_motion: float = 0.03  # of the picture's width, from frame to frame
     min_banding_ev: float = 0.05
     max_interval_ratio: float = 1.5  # longest to shortest time between frames
+    min_readout: float = 0.1  # share of the time between frames
     few_frames: int = 12
     many_frames: int = 150
     sure_parallax: float = 0.5  # rotations explain less than this share: parallax is clear
@@ -48,10 +50,11 @@ def judge(facts: ClipFacts, tuning: FindingTuning = FindingTuning()) -> list[Fin
         *judge_camera(facts, tuning),
         *judge_file(facts, tuning),
         *judge_lens(facts),
+        *judge_shutter(facts, tuning),
         Finding(
             "note",
             "not checked",
-            "rolling shutter and electronic stabilization are not measured",
+            "electronic stabilization is not measured",
             "turn stabilization off",
         ),
     ]
@@ -110,6 +113,10 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         text = f"the exposure drifts by about {exposure.drift_ev:.1f} EV: auto exposure"
         advice = "`prepare` follows it, but lock exposure and white balance if you can"
         yield Finding("warning", "exposure", text, advice)
+    if exposure.color_drift_ev > tuning.max_color_drift_ev:
+        text = f"colors drift by about {exposure.color_drift_ev:.2f} EV: auto white balance"
+        advice = "lock white balance; training follows only a part of its drift"
+        yield Finding("warning", "color", text, advice)
     if exposure.banding_ev > tuning.min_banding_ev:
         text = f"bands of about {exposure.banding_ev:.2f} EV run through the picture: mains flicker"
         advice = "use exposure times of 1/50 or 1/100 s (1/60 or 1/120 s where mains have 60 Hz)"
@@ -178,6 +185,32 @@ def judge_lens(facts: ClipFacts) -> Iterator[Finding]:
         yield Finding("note", "lens", text, "`prepare` undistorts the frames")
 
 
+def judge_shutter(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
+    """Rolling shutter, where the camera's shake shows it."""
+    if facts.camera.motion == "tripod":
+        return
+    if facts.camera.readout is None:
+        text = (
+            "rolling shutter is not measured: the camera shakes too little, or too little matches"
+        )
+        yield Finding("note", "shutter", text)
+        return
+    readout, error = facts.camera.readout
+    ms = 1000 / facts.file.fps
+    if readout < max(tuning.min_readout, 2 * error):
+        most = max(tuning.min_readout, readout + 2 * error)
+        text = f"no rolling shutter is seen (less than {most:.0%} of the time between frames)"
+        yield Finding("good", "shutter", text)
+        return
+    text = f"rolling shutter: rows are read over {readout:.0%} of the time between frames"
+    text += f" (standard error {error:.0%})"
+    advice = "move slower"
+    if facts.file.interval_ms is not None:
+        text += f", {readout * ms:.0f} ms"
+        advice += f", or train with `--readout {readout * ms:.0f}`"
+    yield Finding("note", "shutter", text, advice)
+
+
 def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     """Length, timing and tags."""
     file = facts.file
@@ -198,7 +231,16 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     if file.frames > tuning.many_frames:
         text = f"{file.frames} frames take long, and most of that time repeats itself"
         yield Finding("note", "length", text, "choose a part with --start and --end")
-    if file.interval_ms is not None:
+    if facts.exposure.missing_before:
+        listed = ", ".join(str(frame) for frame in facts.exposure.missing_before[:6])
+        text = f"frames are missing before frame {listed}: the exposure cycle skips a part"
+        advice = "`prepare` leaves gaps in time; use a faster card, or record at a lower rate"
+        yield Finding("warning", "timing", text, advice)
+    if file.missing:
+        text = f"{file.missing} frames are missing by the timestamps of the video"
+        advice = "`prepare` leaves gaps in time; use a faster card, or record at a constant rate"
+        yield Finding("warning", "timing", text, advice)
+    elif file.interval_ms is not None:
         shortest, longest = file.interval_ms
         if longest > tuning.max_interval_ratio * shortest:
             text = f"variable frame rate: {shortest:.0f} to {longest:.0f} ms between frames"

@@ -4,20 +4,22 @@ the cycle by brightness, SIFT matches on equalized frames, rotations that explai
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from hdr_nsff.check.drift import measure_drift
 from hdr_nsff.check.facts import CameraFacts, CameraMotion, ClipFacts, ExposureFacts, FileFacts
 from hdr_nsff.check.lens import measure_lens
+from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
+from hdr_nsff.footage.timestamps import frame_gaps
 from hdr_nsff.priors.poses.estimate import PosesTuning
 from hdr_nsff.priors.poses.matching import (
     Keypoints,
@@ -29,6 +31,7 @@ from hdr_nsff.priors.poses.matching import (
 from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.priors.poses.rotation import fit_panorama, rotation_share
 from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.dropped_frames import find_cycle
 
 MIN_FRAMES = 3
 
@@ -41,12 +44,7 @@ class CheckTuning:
     max_size: int = 480  # pixels of the longest side
     low: float = 0.012  # recorded values beyond these are black and white, as for cycles
     high: float = 0.97
-    point_blur_px: float = 1.5  # values at keypoints are means over this radius
-    min_points: int = 12  # of a pair, for a change of exposure
-    drift_frames: int = 16  # compared with each other
-    reweightings: int = 8
-    least_error_ev: float = 0.02  # smaller errors of a pair count alike
-    max_disagreement: float = 0.15  # of pairs, relative to the drift: else it is motion
+    min_points: int = 12  # of a pair, to look for bands
     # pixels between frames compared for bands: more motion looks like bands
     max_band_shift: float = 1.0
     edge_blur_px: float = 1.2  # keeps noise out of edges
@@ -88,7 +86,9 @@ def measure_clip(
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
     file = describe_file(footage)
     source, given = given_exposures(footage, len(video))
-    cycle = given_cycle(given) if source is not None else exposure.detect_cycle(video)
+    gapped = find_cycle(exposure.brightness_steps(video), np.ones(len(video) - 1, int))
+    cycle = given_cycle(given) if source is not None else gapped.cycle
+    gaps = gapped.gaps if source is None else ()
     equalized, clipped = exposure.equalize(video, cycle.brackets)
     keypoints = detect_keypoints(equalized, clipped)
     following = match_pairs(keypoints, [(t, t + 1) for t in range(len(video) - 1)])
@@ -96,7 +96,7 @@ def measure_clip(
     facts = ClipFacts(
         file=file,
         looked_at=len(video),
-        exposure=measure_exposure(source, video, cycle, keypoints, tuning),
+        exposure=measure_exposure(source, video, cycle, keypoints, gaps, tuning),
         camera=measure_camera(equalized, clipped, cycle, keypoints, following, scale, tuning),
     )
     return facts, video, cycle.brackets
@@ -108,10 +108,13 @@ def describe_file(footage: ingest.Footage) -> FileFacts:
     kind = "linear" if footage.linear else (footage.transfer or "recorded")
     frame = next(ingest.read_frames(footage, 0, 1, 1, ingest.MAX_FRAMES))
     height, width = frame.rgb.shape[:2]
-    bits, interval = 8, None
+    bits, interval, missing = 8, None, 0
     if footage.video:
         bits = video_info(first).bits
-        gaps = np.diff(frame_times(first)) * 1000
+        times = frame_times(first)
+        gaps = np.diff(times) * 1000
+        steps = frame_gaps(times.tolist())
+        missing = 0 if steps is None else round(float((steps - 1).sum()))
         if len(gaps):
             interval = (round(float(gaps.min()), 2), round(float(gaps.max()), 2))
     elif not footage.linear:
@@ -120,9 +123,8 @@ def describe_file(footage: ingest.Footage) -> FileFacts:
     else:
         bits = 16
     cameras = len(footage.cameras)
-    return FileFacts(
-        footage.path.name, footage.count, cameras, width, height, footage.fps, bits, kind, interval
-    )
+    name, count, fps = footage.path.name, footage.count, footage.fps
+    return FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing)
 
 
 # Exposure
@@ -133,6 +135,7 @@ def measure_exposure(
     video: np.ndarray,
     cycle: exposure.Cycle,
     keypoints: list[Keypoints],
+    gaps: tuple[int, ...],
     tuning: CheckTuning,
 ) -> ExposureFacts:
     """Exposures of the recorded `video` (T, H, W, 3), and what they clip."""
@@ -141,6 +144,8 @@ def measure_exposure(
     black = (video < tuning.low).all(-1).mean((1, 2))
     steps = exposure.brightness_steps(video)
     count = len(cycle.ev)
+
+    drift = measure_drift(video, cycle, keypoints)
 
     def per_bracket(shares: np.ndarray) -> tuple[float, ...]:
         return tuple(round(float(shares[brackets == b].mean()), 4) for b in range(count))
@@ -151,10 +156,12 @@ def measure_exposure(
         explained=round(cycle.confidence, 3),
         given=source,
         change_ev=round(float(np.abs(steps).mean()), 3),
-        drift_ev=round(measure_drift(video, cycle, keypoints, tuning), 2),
+        drift_ev=round(drift.exposure_ev, 2),
+        color_drift_ev=round(drift.color_ev, 2),
         white_share=per_bracket(white),
         black_share=per_bracket(black),
         banding_ev=round(measure_banding(video, keypoints, cycle.length, tuning), 3),
+        missing_before=gaps,
     )
 
 
@@ -179,59 +186,6 @@ def given_cycle(given: list[float]) -> exposure.Cycle:
     relative = [value - min(ev) for value in ev]
     order = np.argsort(ev, kind="stable").tolist()
     return exposure.Cycle(exposure.period(brackets), brackets, order, relative, 1.0)
-
-
-def measure_drift(
-    video: np.ndarray, cycle: exposure.Cycle, keypoints: list[Keypoints], tuning: CheckTuning
-) -> float:
-    """The range in EV of what matched points change between frames of one bracket.
-
-    Points of the scene are compared, so a pan into the dark is no drift. Every pair of
-    some frames says how far their exposures are apart; least squares, reweighted to
-    least absolute errors, agree on one exposure per frame.
-    """
-    reference = exposure.reference_bracket(video, cycle.brackets)
-    own = np.flatnonzero(np.array(cycle.brackets) == reference)
-    chosen = own[spread_frames(len(own), tuning.drift_frames)]
-    pairs = list(itertools.combinations(range(len(chosen)), 2))
-    matches = match_pairs([keypoints[t] for t in chosen], pairs)
-    gray = [
-        cv2.GaussianBlur(video[t].mean(-1), (0, 0), tuning.point_blur_px) for t in chosen.tolist()
-    ]
-    changes, known = [], []
-    for pair in matches:
-        before, after = sample(gray[pair.i], pair.p), sample(gray[pair.j], pair.q)
-        use = (np.minimum(before, after) > 4 * tuning.low) & (
-            np.maximum(before, after) < tuning.high
-        )
-        if use.sum() >= tuning.min_points:
-            changes.append(float(np.median(np.log2(after[use] / before[use]))))
-            known.append((pair.i, pair.j))
-    linked = len({t for pair in known for t in pair})
-    if linked < 2:
-        return 0.0
-    design = np.zeros((len(known), len(chosen)))
-    for row, (i, j) in enumerate(known):
-        design[row, [i, j]] = -1, 1
-    change = exposure.GAMMA * np.array(changes)
-    weights = np.ones(len(known))
-    level: np.ndarray = np.zeros(len(chosen))
-    for _ in range(tuning.reweightings):
-        level = np.linalg.lstsq(design * weights[:, None], change * weights, rcond=None)[0]
-        error = np.abs(design @ level - change)
-        weights = 1 / np.sqrt(np.maximum(error, tuning.least_error_ev))
-    seen = level[sorted({t for pair in known for t in pair})]
-    drift = float(seen.max() - seen.min())
-    disagreement = float(np.median(np.abs(design @ level - change)))
-    return drift if disagreement < tuning.max_disagreement * drift else 0.0
-
-
-def sample(image: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Values (M,) of an image (H, W) at points (M, 2), pixel centers at +0.5."""
-    height, width = image.shape
-    column = np.clip(points[:, 0].astype(int), 0, width - 1)
-    row = np.clip(points[:, 1].astype(int), 0, height - 1)
-    return image[row, column]
 
 
 def measure_banding(
@@ -291,6 +245,10 @@ def measure_camera(
     lens = None
     if motion == "parallax" and not cuts:
         lens = measure_lens(equalized, clipped, scale)
+    height, width = equalized.shape[1:3]
+    readout = None
+    if motion != "tripod" and not cuts:
+        readout = measure_readout(following, (height, width), portrait=height > width)
     return CameraFacts(
         motion=motion,
         rotation_share=None if share is None else round(share, 3),
@@ -298,6 +256,7 @@ def measure_camera(
         long_sharpness=compare_sharpness(equalized, clipped, cycle, tuning),
         cuts=tuple(cuts),
         lens=lens,
+        readout=None if readout is None else (round(readout[0], 3), round(readout[1], 3)),
     )
 
 

@@ -84,9 +84,7 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     and `ev` or a time (`TIMES`), with those of `GAINS`. InputError that names the line
     of what is not understood.
     """
-    path = footage.path / "exposures.csv"
-    if footage.video:
-        path = footage.path.with_suffix(".csv")
+    path = csv_path(footage)
     if not path.is_file():
         return None
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
@@ -106,6 +104,13 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
             f"{path}, line {line}: no readable CSV ({error}); correct the line"
         ) from error
     return path, rows
+
+
+def csv_path(footage: Footage) -> Path:
+    """Where the CSV of a clip is."""
+    if footage.video and not footage.same_camera:
+        return footage.path.with_suffix(".csv")
+    return footage.path / "exposures.csv"
 
 
 def read_utf8(path: Path) -> str:
@@ -173,7 +178,8 @@ def check_cells(row: Mapping[str | Any, Any], columns: Sequence[str], where: str
 
 
 def read_exif_ev(path: Path) -> float | None:
-    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF.
+    """log2 of (exposure time x ISO / 100 / f-number^2) from a file's EXIF, or from the
+    same tags of a DNG's pictures.
 
     None where it has no exposure time, or is damaged.
     """
@@ -186,16 +192,19 @@ def read_exif_ev(path: Path) -> float | None:
             tags = exifread.process_file(file, details=False)
     except Exception:  # many unrelated types, for damaged EXIF
         return None
-    seconds = exif_number(tags, "EXIF ExposureTime") or 0.0
-    iso = exif_number(tags, "EXIF ISOSpeedRatings") or 100.0
-    aperture = exif_number(tags, "EXIF FNumber") or 1.0
+    seconds = exif_number(tags, "ExposureTime") or 0.0
+    iso = exif_number(tags, "ISOSpeedRatings") or 100.0
+    aperture = exif_number(tags, "FNumber") or 1.0
     exposure = seconds * iso / 100 / aperture**2
     return math.log2(exposure) if 0 < exposure < math.inf else None
 
 
 def exif_number(tags: Mapping[str, Any], name: str) -> float | None:
-    """The first value of an EXIF tag; None where it is missing or no number."""
+    """The first value of a tag of the EXIF, else of the picture; None where it is
+    missing or no number.
+    """
+    tag = tags.get(f"EXIF {name}", tags.get(f"Image {name}"))
     try:
-        return float(tags[name].values[0])
-    except (KeyError, ArithmeticError, ValueError, TypeError, IndexError):
+        return float(tag.values[0])
+    except (AttributeError, ArithmeticError, ValueError, TypeError, IndexError):
         return None

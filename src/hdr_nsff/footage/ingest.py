@@ -68,12 +68,17 @@ class Footage:
     # gray that shows through transparent pixels; None: transparency is ignored
     over: float | None = None
     transfer: Transfer | None = None  # of HDR video, by its tags
+    same_camera: bool = False  # the `cameras` are tracks of one (`tracks.py`)
+
+    @property
+    def root(self) -> Path:
+        """The folder that names of files are relative to."""
+        return self.path.parent if self.video and not self.same_camera else self.path
 
     @property
     def files(self) -> dict[str, Path]:
         """Every file by its name relative to the footage."""
-        root = self.path.parent if self.video else self.path
-        return {f.relative_to(root).as_posix(): f for files in self.cameras for f in files}
+        return {f.relative_to(self.root).as_posix(): f for files in self.cameras for f in files}
 
     @property
     def lossless(self) -> bool:
@@ -90,6 +95,8 @@ class FootageFrame:
     number: int  # position in its camera's footage, before any stride
     source: str  # file name relative to the footage; `#number` for a frame of a video
     rgb: np.ndarray  # (H, W, 3) float32 recorded, in [0, 1]
+    track: int = 0  # of one camera that records several at the same times
+    seconds: float | None = None  # when it is shown, of videos
 
 
 # Which files
@@ -229,8 +236,9 @@ def read_frames(
     if footage.linear:
         scale = linear_scale([f for files in footage.cameras for f in files[start:end:stride]])
     first: tuple[str, int, int] | None = None  # name, height, width
-    for camera_id, files in enumerate(footage.cameras):
-        for number, source, image in decode(footage, files, chosen):
+    for line, files in enumerate(footage.cameras):
+        camera_id, track = (0, line) if footage.same_camera else (line, 0)
+        for number, source, image, seconds in decode(footage, files, chosen):
             h, w = image.shape[:2]
             first = first or (source, h, w)
             name, height, width = first
@@ -242,23 +250,23 @@ def read_frames(
             rgb = shrink(image, max_size)
             if footage.linear:
                 rgb = np.clip(rgb * scale, 0, 1) ** np.float32(1 / GAMMA)
-            yield FootageFrame(camera_id, number, source, rgb)
+            yield FootageFrame(camera_id, number, source, rgb, track, seconds)
 
 
 def decode(
     footage: Footage, files: list[Path], chosen: range
-) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames of one camera."""
+) -> Iterator[tuple[int, str, np.ndarray, float | None]]:
+    """(number, source, image (H, W, 3), seconds) of the chosen frames of one camera."""
     if footage.video:
         yield from decode_video(files[0], chosen)
         return
     for number, path in list(enumerate(files))[chosen.start : chosen.stop : chosen.step]:
         source = path.relative_to(footage.path).as_posix()
-        yield number, source, read_frame(path, footage.over)
+        yield number, source, read_frame(path, footage.over), None
 
 
-def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray]]:
-    """(number, source, image (H, W, 3)) of the chosen frames of a video.
+def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """(number, source, image (H, W, 3), seconds) of the chosen frames of a video.
 
     InputError where it ends before the duration in its header.
     """
@@ -272,7 +280,7 @@ def decode_video(path: Path, chosen: range) -> Iterator[tuple[int, str, np.ndarr
             transfer = TRANSFERS.get(info.transfer)
             if transfer is not None:
                 image = encode_light(image, transfer, info.primaries == REC2020_CODE)
-            yield number, f"{path.name}#{number}", image
+            yield number, f"{path.name}#{number}", image, seconds
     if last + MAX_MISSING_FRAMES / info.fps < info.seconds:
         raise InputError(
             f"{path}: the video is cut short ({last:.1f} of {info.seconds:.1f} s can be read); "

@@ -8,11 +8,13 @@ finds is known only later, so the steps before start over (`DistortedFramesError
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.pose_files import locate, read_given
+from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.footage.lens_files import read_lens
+from hdr_nsff.footage.pose_files import MAX_ASPECT_ERROR, locate, read_given
 from hdr_nsff.footage.pose_formats import common_lens, distorted
 from hdr_nsff.geometry.lens import Lens, undistorted_picture
 from hdr_nsff.prepare.work import Part, PrepareConfig, Work
@@ -30,8 +32,10 @@ class DistortedFramesError(Exception):
         self.lenses = lenses
 
 
-def parse_lens(text: str) -> LensChoice:
-    """What `--lens-distortion` asks for; InputError where it makes no sense."""
+def parse_lens(text: str) -> LensChoice | Path:
+    """What `--lens-distortion` asks for, or the file of a calibration; InputError where
+    it makes no sense.
+    """
     if text == "auto":
         return "auto"
     if text == "none":
@@ -39,10 +43,13 @@ def parse_lens(text: str) -> LensChoice:
     try:
         k1, k2, *more = [float(word) for word in f"{text},0".split(",")]
     except ValueError:
+        if text and Path(text).exists():
+            return Path(text)
         more = [0.0, 0.0]
     if len(more) > 1 or not abs(k1) + abs(k2) < MAX_K:
         raise InputError(
-            f"--lens-distortion {text!r:.40}: write auto, none, K1, or K1,K2, such as -0.2,0.03"
+            f"--lens-distortion {shorten(text)!r}: no such file; write auto, none, K1, or K1,K2, "
+            "such as -0.2,0.03, or the file of a calibration"
         )
     return (k1, k2)
 
@@ -52,16 +59,21 @@ def known_lenses(found: Manifest, config: PrepareConfig) -> dict[int, LensEntry]
     choice = parse_lens(config.lens_distortion)
     if "frames" in config.redo or choice == "none":
         return {}
+    if isinstance(choice, Path):
+        return {}  # read again
     if choice == "auto":
         return {c: entry for c, entry in found.lens.items() if not entry.given}
     return {c: e for c, e in found.lens.items() if e.given and tuple(e.distortion[:2]) == choice}
 
 
 def given_lenses(work: Work) -> dict[int, LensEntry]:
-    """The lenses that come with given poses: theirs, or that of the settings with their
-    focal length. Empty where poses are not given, or nothing is distorted.
+    """The lenses of a calibration, else those that come with given poses: theirs, or
+    that of the settings with their focal length. Empty where neither is given, or
+    nothing is distorted.
     """
     choice = parse_lens(work.config.lens_distortion)
+    if isinstance(choice, Path):
+        return entries_of(work, choice, calibrated_lens(work, choice))
     capture, path = work.capture_with("poses"), work.config.poses
     if capture is not None and capture.poses is not None:
         path, given = capture.root, capture.poses
@@ -77,17 +89,40 @@ def given_lenses(work: Work) -> dict[int, LensEntry]:
     lens = common_lens(path, given)
     if lens is None:
         return {}
+    return entries_of(work, path, lens)
+
+
+def calibrated_lens(work: Work, path: Path) -> Lens:
+    """The lens of a calibration; InputError where its pictures have another shape."""
+    lens = read_lens(path)
+    width, height = work.manifest.width, work.manifest.height
+    if abs(width / height / (lens.width / lens.height) - 1) > MAX_ASPECT_ERROR:
+        raise InputError(
+            f"{path}: the calibration is for {lens.width}x{lens.height} pictures, the frames are "
+            f"{width}x{height}: another shape; give one for these frames"
+        )
+    return lens
+
+
+def entries_of(work: Work, path: Path, lens: Lens) -> dict[int, LensEntry]:
+    """A lens, given by the file `path`, for every camera; InputError where maps that
+    are given would have to be undistorted too.
+    """
     other_parts: tuple[Part, ...] = ("flow", "masks", "depth")
     with_maps = any(work.capture_with(part) for part in other_parts)
     if with_maps or (work.capture is not None and work.capture.has_held_out):
         raise distorted(path, lens.max_displacement_px())
     entry = LensEntry.of(lens, given=True)
-    return {camera_id: entry for camera_id in range(len(work.footage.cameras))}
+    cameras = 1 if work.footage.same_camera else len(work.footage.cameras)
+    return {camera_id: entry for camera_id in range(cameras)}
 
 
 def lens_to_find(work: Work) -> LensChoice:
     """What structure from motion is to do about the lens: nothing, once it is known."""
-    return "none" if work.manifest.lens else parse_lens(work.config.lens_distortion)
+    choice = parse_lens(work.config.lens_distortion)
+    if work.manifest.lens or isinstance(choice, Path):
+        return "none"
+    return choice
 
 
 def undistorted(work: Work, rgb: np.ndarray, camera_id: int) -> np.ndarray:

@@ -20,8 +20,10 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import recognize
+from hdr_nsff.footage.datasets.capture import Capture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.footage.exposure_lists import parse_exposures
+from hdr_nsff.footage.tracks import open_tracks
 from hdr_nsff.prepare.engine import Step, all_have, run_step
 from hdr_nsff.prepare.lens import (
     DistortedFramesError,
@@ -100,8 +102,8 @@ def begin(config: PrepareConfig) -> Work:
     InputError where they do not belong together.
     """
     check_settings(config)
-    capture = recognize(config.clip)
-    footage = capture.footage() if capture else ingest.open_footage(config.clip)
+    capture = None if config.same_camera else recognize(config.clip)
+    footage = open_clip(config, capture)
     inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
     if found is not None and found.inputs != inputs:
@@ -129,6 +131,13 @@ def begin(config: PrepareConfig) -> Work:
     manifest.lens = given_lenses(work)
     work.save()
     return work
+
+
+def open_clip(config: PrepareConfig, capture: Capture | None) -> ingest.Footage:
+    """The footage of a data set, of tracks of one camera, or at `config.clip`."""
+    if config.same_camera:
+        return open_tracks(config.clip, config.same_camera)
+    return capture.footage() if capture else ingest.open_footage(config.clip)
 
 
 def report_data_set(work: Work) -> None:
@@ -215,7 +224,7 @@ def check_settings(config: PrepareConfig) -> None:
 STEPS: dict[StepName, Step] = {
     "frames": Step(
         on_footage.frames_step,
-        settings=("start", "end", "stride", "max_size"),
+        settings=("start", "end", "stride", "max_size", "same_camera"),
         outputs=("images",),
         complete=all_have("image"),
         forgets=("codes", "equalized"),

@@ -87,6 +87,11 @@ class PrepareConfig:
     Either wants held-out views: a truth folder in `evaluate`, or a data set that brings
     them.
     """
+    same_camera: tuple[str, str] | None = None
+    """Two tracks of one camera that record at the same times with two exposures (HDRx,
+    dual gain): video files or folders of frames in the folder CLIP. Movers are tracked
+    in the first, so name the better exposed one first.
+    """
     rig: int | None = None
     """How many still cameras of one make took the frames in turn: frame i is that of
     camera i modulo RIG. 1: the frames are those of one camera. Default: found.
@@ -98,7 +103,8 @@ class PrepareConfig:
     lens_distortion: str = "auto"
     """Radial distortion of the lens. auto: estimated, and left at none where the clip
     does not show any; none: a pinhole camera; K1 or K1,K2: as OpenCV has them, such as
-    -0.2,0.03. Frames are undistorted.
+    -0.2,0.03; or the file of a calibration: COLMAP's cameras.txt, nerfstudio's
+    transforms.json, YAML or JSON of OpenCV, ROS or Kalibr. Frames are undistorted.
     """
     matcher: Matcher = "sift"
     """What finds and matches keypoints for poses. sift: needs no weights; aliked, disk:
@@ -211,6 +217,18 @@ class Work:
         first_files = [files[self.config.start] for files in self.sources()]
         first = min(self.capture.by_source[name].time for name in first_files)
         return round((time - first) / self.config.stride, 6)
+
+    def frame_numbers(self) -> list[int]:
+        """The position of every frame in the footage of its camera."""
+        start, stride = self.config.start, self.config.stride
+        frames = self.manifest.frames
+        if self.capture is not None:
+            return [start + int(f.time) * stride for f in frames]
+        numbers = [0] * len(frames)
+        for line in self.camera_frames():
+            for place, index in enumerate(line):
+                numbers[index] = start + place * stride
+        return numbers
 
     def sources(self) -> list[list[str]]:
         """The names of the footage's files, camera by camera.
@@ -353,8 +371,8 @@ class Work:
         return np.stack([K for K, _ in cameras]), np.stack([c2w for _, c2w in cameras])
 
     def camera_frames(self) -> list[list[int]]:
-        """Per camera the indices of its frames in time."""
-        indices: dict[int, list[int]] = {}
+        """Per camera, and track of it, the indices of its frames in time."""
+        indices: dict[tuple[int, int], list[int]] = {}
         for f in self.manifest.frames:
-            indices.setdefault(f.camera_id, []).append(f.index)
-        return [indices[camera_id] for camera_id in sorted(indices)]
+            indices.setdefault((f.camera_id, f.track), []).append(f.index)
+        return [indices[line] for line in sorted(indices)]

@@ -374,8 +374,7 @@ def estimate_white_balance(
         return white_balance
     # One "bracket" per camera and exposure, so that the sampler keeps cameras apart.
     slots = [
-        replace(v, bracket=c * num_brackets + v.bracket)
-        for v, c in zip(views, view_cameras, strict=True)
+        v.in_bracket(c * num_brackets + v.bracket) for v, c in zip(views, view_cameras, strict=True)
     ]
     count = num_cameras * num_brackets
     samples = static_samples(slots, count, tuning.num_samples, np.random.default_rng(SEED))

@@ -10,7 +10,7 @@ mean over clipped pixels is no recording.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -51,6 +51,10 @@ class ResponseView:
     disparity: np.ndarray  # (H, W) 1 / z-depth, scene units
     confidence: np.ndarray | None = None  # (H, W) in [0, 1]
     moving: np.ndarray | None = None  # (H, W) bool
+
+    def in_bracket(self, bracket: int) -> ResponseView:
+        """The same frame, counted as one of another bracket."""
+        return replace(self, bracket=bracket)
 
 
 @dataclass(frozen=True)

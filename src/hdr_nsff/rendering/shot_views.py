@@ -38,6 +38,7 @@ def plan_shot(
     InputError where the footage cannot show them.
     """
     frames = sorted(run.scene.train, key=lambda f: f.time)
+    frames = list({(f.camera_id, f.time): f for f in reversed(frames)}.values())[::-1]
     cameras = [f.camera for f in frames]
     times = run.scene.times.tolist()
     start = find_frame(run, frame)

@@ -78,6 +78,8 @@ class FrameEntry(Strict):
     source: str  # which file (and frame of it) this came from
     time: float  # in frames of the footage
     camera_id: int = Field(default=0, ge=0)  # physical camera: owns a response curve
+    # of the tracks that one camera records at the same times (HDRx, dual gain)
+    track: int = Field(default=0, ge=0)
     bracket: int = Field(ge=0)  # which exposure of the cycle
     ev: float | None = None  # log2 exposure relative to the reference bracket, if known
     # stops by which it differs from its bracket's (auto exposure), None: not at all
@@ -165,6 +167,11 @@ class Manifest(Strict):
         return max((f.camera_id for f in self.frames), default=0) + 1
 
     @property
+    def num_tracks(self) -> int:
+        """Tracks that one camera records at the same times, 1 for other cameras."""
+        return max((f.track for f in self.frames), default=0) + 1
+
+    @property
     def places(self) -> list[int]:
         """Per frame the camera of the rig that took it; 0 where there is no rig."""
         return [f.index % self.rig for f in self.frames]
@@ -244,7 +251,7 @@ def manifest_problem(m: Manifest) -> str | None:
     indices = {f.index for f in m.frames}
     if len(indices) < len(m.frames):
         return "two frames have the same index"
-    if len({(f.camera_id, f.time) for f in m.frames}) < len(m.frames):
+    if len({(f.camera_id, f.track, f.time) for f in m.frames}) < len(m.frames):
         return "two frames of one camera have the same time"
     if not all(is_matrix(entry.K, (3, 3), is_intrinsic) for entry in m.lens.values()):
         return "a lens with a K that is not a 3x3 camera matrix"

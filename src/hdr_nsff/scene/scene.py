@@ -229,15 +229,16 @@ def load_points(folder: Path, name: str) -> Tensor:
 
 def neighbors(entries: list[FrameEntry]) -> list[dict[int, int]]:
     """For each frame the positions of the frames at the previous (-1) and next (+1)
-    training time of the same physical camera.
+    training time of the same physical camera, and track of it.
 
     A camera that has no frame at that time has no neighbor there: fields know scene
     flow from one training time to the next.
     """
     result: list[dict[int, int]] = [{} for _ in entries]
     rank = {time: k for k, time in enumerate(sorted({e.time for e in entries}))}
-    for camera_id in {e.camera_id for e in entries}:
-        own = [i for i, e in enumerate(entries) if e.camera_id == camera_id]
+    lines = [(e.camera_id, e.track) for e in entries]
+    for line in set(lines):
+        own = [i for i, other in enumerate(lines) if other == line]
         for a, b in itertools.pairwise(sorted(own, key=lambda i: entries[i].time)):
             if rank[entries[b].time] - rank[entries[a].time] == 1:
                 result[a][1] = b

@@ -144,7 +144,7 @@ def frame_extra(frame: FrameEntry, names: dict[int, str]) -> ExtraFrame:
     """What nerfstudio has no place for of a frame; `names` of the pictures by index."""
     return ExtraFrame(
         time=frame.time,
-        camera_id=frame.camera_id,
+        camera_id=frame.camera_id + frame.track,  # tracks become cameras
         bracket=frame.bracket,
         flow={names[to]: files.flow for to, files in frame.flow.items()},
         disparity=frame.disparity,

@@ -80,11 +80,12 @@ def write_flow(work: Work, names: FlowFiles, flow: np.ndarray, valid: np.ndarray
 
 def flow_pairs(frames: list[FrameEntry]) -> list[Pair]:
     """The pairs (from, to) that flow is wanted for, both directions side by side:
-    neighbors in the clip, and neighbors among the training frames, of each camera.
+    neighbors in the clip, and neighbors among the training frames, of each camera
+    and track.
     """
     pairs: dict[Pair, None] = {}
-    for camera in sorted({f.camera_id for f in frames}):
-        own = [f for f in frames if f.camera_id == camera]
+    for camera in sorted({(f.camera_id, f.track) for f in frames}):
+        own = [f for f in frames if (f.camera_id, f.track) == camera]
         train = [f for f in own if f.split == "train"]
         for line in (own, train):
             pairs |= dict.fromkeys(pairwise(f.index for f in line))
@@ -92,14 +93,14 @@ def flow_pairs(frames: list[FrameEntry]) -> list[Pair]:
 
 
 def learning_pairs(frames: list[FrameEntry]) -> tuple[list[Pair], list[Pair]]:
-    """Of the training frames of each camera: neighbors, and consecutive ones of equal
-    exposure.
+    """Of the training frames of each camera and track: neighbors, and consecutive ones
+    of equal exposure.
     """
-    of_camera: dict[int, list[int]] = {}
+    of_camera: dict[tuple[int, int], list[int]] = {}
     of_exposure: dict[tuple[int, int], list[int]] = {}
     for f in frames:
         if f.split == "train":
-            of_camera.setdefault(f.camera_id, []).append(f.index)
+            of_camera.setdefault((f.camera_id, f.track), []).append(f.index)
             of_exposure.setdefault((f.camera_id, f.bracket), []).append(f.index)
     neighbors = [pair for line in of_camera.values() for pair in pairwise(line)]
     equal = [pair for line in of_exposure.values() for pair in pairwise(line)]

@@ -1,13 +1,7 @@
-"""The steps of `prepare` that need the footage alone: frames, and the exposure of each.
-
-Exposures come from the command line, a data set, a CSV or EXIF, in this order; where
-none of these has them, frames of one exposure are found by their brightness, and
-training learns the exposures.
-"""
+"""The steps of `prepare` that need the footage alone: frames, and their exposures."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -18,15 +12,11 @@ from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.exposure_lists import (
-    parse_exposures,
-    read_exif_ev,
-    read_exposure_csv,
-)
-from hdr_nsff.footage.gpmf import read_gopro_ev
 from hdr_nsff.footage.turns import find_cameras_in_turn
+from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
+from hdr_nsff.prepare.times import leave_gaps, times_of_slots
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.scene.manifest import FrameEntry, Protocol, bracket_problem
@@ -35,10 +25,6 @@ MIN_FRAMES = 3  # fewer show no motion
 MAX_ROUNDING_8_BIT = 1e-6  # off whole codes of 8 bits up to which 8 bits hold a picture
 MAX_LISTED_CUTS = 5  # in a message
 MAX_NOTES = 3  # that are printed; the rest is in scene.json
-# confidence of a cycle by brightness from which it refutes a list (hand-chosen)
-MIN_CONFIDENCE = 0.8
-GOPRO = "GoPro's metadata"  # as a source of exposures
-MIN_DRIFT_EV = 0.02  # of such exposures; below it, they are one
 
 
 # Frames
@@ -49,6 +35,7 @@ def frames_step(work: Work) -> StepResult:
     c, m = work.config, work.manifest
     entries: list[FrameEntry] = []
     extents = []
+    seconds: list[float | None] = []
     frames = ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size)
     for frame in track(frames, "frames", expected_frames(work)):
         m.height, m.width = frame.rgb.shape[:2]
@@ -59,17 +46,24 @@ def frames_step(work: Work) -> StepResult:
             source=frame.source,
             time=work.time_of(frame.source, frame.number),
             camera_id=frame.camera_id,
+            track=frame.track,
             bracket=0,
         )
         bits: Literal[8, 16] = 8 if fits_8_bits(frame.rgb) else 16
         rgb = undistorted(work, frame.rgb, frame.camera_id)
         write_frame(work.folder / entry.image, rgb, bits)
         entries.append(entry)
+        seconds.append(frame.seconds)
         extents.append(exposure.extent(frame.rgb))
     check_frames(c.clip, entries, extents)
+    missing = leave_gaps(work, entries, seconds)
     m.fps = work.footage.fps / c.stride
-    if [identity(f) for f in m.frames] != [identity(f) for f in entries]:
+    with_time = work.capture is not None  # of other footage, it may have gaps by the cycle
+    if [identity(f, with_time) for f in m.frames] != [identity(f, with_time) for f in entries]:
         m.frames = entries  # else the results of later steps for these frames stay
+    elif missing:
+        for kept, entry in zip(m.frames, entries, strict=True):
+            kept.time = entry.time
     note = f"{len(entries)} frames of {m.width}x{m.height} pixels"
     if work.footage.linear:
         note += "; linear frames, scaled by one constant and encoded as x^(1/2.2)"
@@ -78,12 +72,15 @@ def frames_step(work: Work) -> StepResult:
         note += f"; {kind} by its tags, brought to linear light and encoded as x^(1/2.2)"
     if m.lens:
         note += f", undistorted ({describe(m.lens)})"
-    return StepResult(provenance="given", note=note)
+    if missing:
+        note += f"; {missing} are missing by the timestamps, and their times are left out"
+    return StepResult(provenance="given", note=note, details={"missing": missing})
 
 
-def identity(entry: FrameEntry) -> tuple[int, str, float, int]:
+def identity(entry: FrameEntry, with_time: bool) -> tuple[int, str, float, int, int]:
     """What makes a frame of the scene the same frame."""
-    return entry.index, entry.source, entry.time, entry.camera_id
+    time = entry.time if with_time else 0.0
+    return entry.index, entry.source, time, entry.camera_id, entry.track
 
 
 def expected_frames(work: Work) -> int | None:
@@ -128,27 +125,13 @@ def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[floa
 # Exposures
 
 
-@dataclass(frozen=True)
-class FrameExposures:
-    """The exposures of all frames."""
-
-    source: str  # where they come from, for people
-    brackets: list[int]  # per frame
-    ev: list[float | None]  # per bracket, to any reference; None: to be learned
-    given: bool
-    estimated: bool  # the brackets were found by brightness
-    reference: int | None = None  # bracket; None: the best exposed one
-    notes: tuple[str, ...] = ()  # sentences for people
-    drift: tuple[float, ...] = ()  # given, per frame: stops from its bracket; empty: none
-
-
 def exposure_step(work: Work) -> StepResult:
     """Give each frame its exposure, and choose the frames to hold out of training."""
     m = work.manifest
     found = frame_exposures(work)
     for note in found.notes[:MAX_NOTES]:
         say(f"exposure: {note}")
-    m.cycle = exposure.period([found.brackets[i] for i in work.camera_frames()[0]])
+    m.cycle = found.cycle or exposure.period([found.brackets[i] for i in work.camera_frames()[0]])
     if found.reference is None:
         m.reference_bracket = exposure.reference_bracket(work.video, found.brackets)
     else:
@@ -162,6 +145,8 @@ def exposure_step(work: Work) -> StepResult:
     held_out = frames_to_hold_out(work)
     if m.protocol is not None:
         check_protocol(m.protocol, found.brackets, held_out)
+    for frame, time in zip(m.frames, times_of_slots(work, found.slots), strict=True):
+        frame.time = time
     for frame, bracket in zip(m.frames, found.brackets, strict=True):
         frame.bracket = bracket
         frame.ev = m.bracket_ev[bracket]
@@ -174,6 +159,8 @@ def exposure_step(work: Work) -> StepResult:
     cycle = "no alternation"
     if m.cycle > 1:
         cycle = f"cycle of {m.cycle}, {len(found.ev)} exposures"
+    if m.num_tracks > 1:
+        cycle = f"{m.num_tracks} tracks of one camera, {len(found.ev)} exposures"
     if m.rig > 1:
         cycle = f"{m.rig} cameras in turn, {cycle}"
     return StepResult(
@@ -194,170 +181,6 @@ def relative_to(ev: list[float | None], reference: int) -> list[float | None]:
     return [None if v is None or gauge is None else v - gauge for v in ev]
 
 
-def frame_exposures(work: Work) -> FrameExposures:
-    """The exposures of all frames, as given, or by brightness."""
-    capture, frames = work.capture, work.manifest.frames
-    source, given = given_exposures(work)
-    if capture is not None and capture.exposures is not None and source == "data set":
-        stored = capture.exposures
-        brackets = [work.picture(frame).bracket or 0 for frame in frames]
-        return FrameExposures(
-            source, brackets, list(stored.ev), stored.given, False, stored.reference
-        )
-    cameras = work.camera_frames()
-    if given is None:
-        cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
-        brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
-        unknown: list[float | None] = [None] * (max(brackets) + 1)
-        notes = cycle_notes(work, cycles)
-        return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
-    many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
-    if source == GOPRO or (many and len(cameras) == 1):
-        return drifting_exposures(source, given)
-    brackets, known = exposure.brackets_by_ev(given)
-    doubts = []
-    for own in cameras:
-        doubts += exposure.contradictions(work.video[own], [given[i] for i in own])
-    return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
-
-
-def drifting_exposures(source: str, given: list[float]) -> FrameExposures:
-    """Given EVs of frames that are too many for a cycle: brackets of one where they
-    alternate, and the drift of every frame from its bracket.
-    """
-    brackets = exposure.cycle_of_steps(np.diff(given)).brackets
-    known: list[float | None] = []
-    drift = np.array(given)
-    for bracket in range(max(brackets) + 1):
-        own = np.array(brackets) == bracket
-        known.append(float(drift[own].mean()))
-        drift[own] -= drift[own].mean()
-    note = f"given exposures drift by {drift.min():+.2f} to {drift.max():+.2f} EV"
-    return FrameExposures(
-        source, brackets, known, True, False, notes=(note,), drift=tuple(drift.tolist())
-    )
-
-
-def given_exposures(work: Work) -> tuple[str, list[float] | None]:
-    """Where the EVs of the frames come from, and the EV of each frame.
-
-    The EVs are None where brightness has to show them, or a data set stores brackets.
-    """
-    c, frames = work.config, work.manifest.frames
-    capture = work.capture
-    numbers = [c.start + int(f.time) * c.stride for f in frames]
-    cycle = parse_exposures(c.exposures, c.ev)
-    if cycle is not None:
-        check_cycle(work, cycle, numbers)
-        return "flags", [cycle[n % len(cycle)] for n in numbers]
-    if "auto" in (c.exposures, c.ev):
-        return "brightness", None
-    if capture is not None and capture.parts()["exposures"]:
-        if capture.exposures is not None:
-            return "data set", None
-        stored = [work.picture(f).ev for f in frames]
-        return "data set", [ev for ev in stored if ev is not None]
-    table = read_exposure_csv(work.footage)
-    if table is not None:
-        path, rows = table
-        return path.name, [
-            csv_exposure(path, rows, f, n) for f, n in zip(frames, numbers, strict=True)
-        ]
-    if work.footage.video:
-        source, known, least_change = GOPRO, gopro_exposures(work, numbers), MIN_DRIFT_EV
-    else:
-        source, known, least_change = "EXIF", exif_exposures(work), exposure.MIN_STEP
-    if len(known) == len(frames) and max(known) - min(known) >= least_change:
-        return source, known
-    return "brightness", None
-
-
-def gopro_exposures(work: Work, numbers: list[int]) -> list[float]:
-    """The EVs of the frames `numbers` of a video, where a GoPro wrote them into it."""
-    written = read_gopro_ev(work.footage.path, work.footage.count or 0)
-    return [] if written is None else written[numbers].tolist()
-
-
-def csv_exposure(path: Path, rows: dict[str, float], frame: FrameEntry, number: int) -> float:
-    """The EV of a frame in the `rows` of a CSV, by its name or `number`."""
-    for key in (frame.source, Path(frame.source).name, f"#{number}"):
-        if key in rows:
-            return rows[key]
-    raise InputError(f"{path}: no row for frame {frame.source}; add it, or give `--exposures auto`")
-
-
-def exif_exposures(work: Work) -> list[float]:
-    """The EVs of the frames whose EXIF has one; prints where only some have."""
-    files = work.footage.files
-    found = [read_exif_ev(files[f.source]) for f in work.manifest.frames]
-    known = [ev for ev in found if ev is not None]
-    lost = len(found) - len(known)
-    if known and lost:
-        say(f"exposure: EXIF of {lost} frames holds no exposure time; brightness decides instead")
-    return known
-
-
-def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:
-    """InputError where a list of exposures cannot be the cycle of these frames.
-
-    `numbers` are the positions of the frames in the footage of their camera.
-    """
-    frames = work.camera_frames()[0]
-    if len(cycle) > len(frames):
-        raise InputError(
-            f"{len(cycle)} exposures listed for {len(frames)} frames; list one cycle only, "
-            "or give `--exposures auto`"
-        )
-    brackets, _ = exposure.brackets_by_ev([cycle[numbers[i] % len(cycle)] for i in frames])
-    listed = exposure.period(brackets)
-    found = exposure.detect_cycle(work.video[frames])
-    if listed % found.length and found.confidence > MIN_CONFIDENCE:
-        raise InputError(
-            f"{len(cycle)} exposures listed, which repeat every {listed} frames, but the "
-            f"brightness repeats every {found.length}; list the exposures of one cycle in the "
-            "order of the frames, or give `--exposures auto`"
-        )
-
-
-def cycle_notes(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
-    """What the brightness of each camera's frames shows, in sentences."""
-    notes = []
-    lengths = [cycle.length for cycle in cycles]
-    if len(set(lengths)) > 1:
-        notes.append(
-            f"the cameras disagree on the length of the cycle ({lengths}); "
-            "list the exposures in a CSV"
-        )
-    for frames, cycle in zip(work.camera_frames(), cycles, strict=True):
-        camera = ""
-        if len(cycles) > 1:
-            camera = f"camera {work.manifest.frames[frames[0]].camera_id}: "
-        steps = exposure.brightness_steps(work.video[frames])
-        notes.append(camera + cycle_note(cycle, float(np.abs(steps).mean())))
-    return notes
-
-
-def cycle_note(cycle: exposure.Cycle, change: float) -> str:
-    """A sentence on a cycle; `change` is the mean EV from frame to frame."""
-    if cycle.length > 1:
-        first = [cycle.brackets.index(b) for b in cycle.order]
-        levels = ", ".join(f"{cycle.ev[b]:.1f}" for b in cycle.order)
-        return (
-            f"brightness repeats every {cycle.length} frames, from dark to bright frame {first} "
-            f"of the cycle, about {levels} EV (gamma 2.2); this explains "
-            f"{cycle.confidence:.0%} of its changes"
-        )
-    if change > exposure.MIN_STEP:
-        return (
-            f"brightness changes by {change:.1f} EV from frame to frame, but in no cycle of up "
-            f"to {exposure.MAX_CYCLE} frames; list the exposures in a CSV if they were set"
-        )
-    return (
-        "no alternation of exposures found; treated as an ordinary clip of one exposure, "
-        "unless static points show that it drifts"
-    )
-
-
 # Rigs, and cuts
 
 
@@ -369,6 +192,13 @@ def cameras_in_turn(work: Work) -> int:
             raise InputError(
                 f"--rig {given}: {work.config.clip} has a folder per camera already; "
                 "leave the option out"
+            )
+        return 1
+    if work.manifest.num_tracks > 1:
+        if given is not None and given > 1:
+            raise InputError(
+                f"--rig {given}: the frames of --same-camera are those of one camera; "
+                "leave one of both out"
             )
         return 1
     if given is None:
@@ -393,7 +223,8 @@ def check_cuts(work: Work) -> None:
         cuts = find_cuts(work.equalized[0][own])
         if not cuts:
             continue
-        numbers = [c.start + int(work.manifest.frames[own[k]].time) * c.stride for k in cuts]
+        all_numbers = work.frame_numbers()
+        numbers = [all_numbers[own[k]] for k in cuts]
         places = ", ".join(f"{n - c.stride} and {n}" for n in numbers[:MAX_LISTED_CUTS])
         first = numbers[0]
         raise InputError(

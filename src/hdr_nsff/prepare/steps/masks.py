@@ -12,6 +12,7 @@ from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import sam2_masks
+from hdr_nsff.prepare.tracks import share_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.background import correct_by_background
 from hdr_nsff.priors.masks.geometric import geometric_mask
@@ -55,12 +56,13 @@ def estimated_masks(work: Work) -> np.ndarray:
         by_all = geometric_mask(found, valid, pairs, video, K, c2w, evidence=evidence)
         moving[~train] = by_all[~train]
     if work.manifest.parallax == "full":
-        return moving
+        return share_masks(work, moving)
     frames = work.manifest.frames
     recorded_alike = np.unique(
         [(f.camera_id, f.bracket) for f in frames], axis=0, return_inverse=True
     )
-    return correct_by_background(moving, video, recorded_alike[1].ravel(), train, K, c2w)
+    groups = recorded_alike[1].ravel()
+    return share_masks(work, correct_by_background(moving, video, groups, train, K, c2w))
 
 
 def given_masks(work: Work) -> np.ndarray:

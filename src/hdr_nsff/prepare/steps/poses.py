@@ -16,6 +16,7 @@ from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.lens import DistortedFramesError, lens_to_find
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_masks
+from hdr_nsff.prepare.tracks import best_track, share_masks, share_poses, track_frames
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import estimate_poses, rig_views
@@ -38,8 +39,9 @@ def find_poses(work: Work) -> StepResult:
     if capture is not None and capture.poses is not None:
         poses = data_set_poses(work)
     elif c.poses is not None:
-        size, sources = (m.height, m.width), [f.source for f in m.frames]
+        size, sources = (m.height, m.width), [f.source for f in m.frames if not f.track]
         poses = import_poses(c.poses, sources, size, lens_of_clip(work))
+        poses = share_poses(work, poses, track=0)
     elif isinstance(c.masks, Path) or work.capture_with("masks") is not None:
         poses, given = estimate(work, given_masks(work)), False
     else:
@@ -97,11 +99,12 @@ def poses_and_masks(work: Work) -> Poses:
     if cache.is_file():
         poses, before = read_round(cache)
     else:
-        before = rough_mask(*work.raw_flows, work.equalized[0])
+        before = share_masks(work, rough_mask(*work.raw_flows, work.equalized[0]))
         poses = estimate(work, before, earlier)
         write_round(cache, poses, before)
     for _ in range(MAX_ROUNDS if poses.parallax == "full" else 0):
-        moving = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
+        found = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
+        moving = share_masks(work, found)
         agreement = (before & moving).sum() / max((before | moving).sum(), 1)
         again = agreement < MIN_MASK_IOU
         outcome = ": once more" if again else ""
@@ -117,6 +120,8 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
     `moving` (T, H, W) bool; what `earlier` rounds found is used again.
     DistortedFramesError where the frames turn out to be distorted.
     """
+    if work.manifest.num_tracks > 1:
+        return estimate_of_track(work, moving, earlier)
     video, clipped = work.equalized
     cameras = [f.camera_id for f in work.manifest.frames]
     folder = work.folder / "poses"
@@ -145,6 +150,28 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
     if poses.lenses:
         raise DistortedFramesError(poses.lenses)
     return poses
+
+
+def estimate_of_track(work: Work, moving: np.ndarray, earlier: EarlierRounds | None) -> Poses:
+    """Poses of tracks that one camera records at the same times: those of the track
+    that clips least. Arguments as of `estimate`.
+    """
+    video, clipped = work.equalized
+    track = best_track(work)
+    own = track_frames(work.manifest, track)
+    poses = estimate_poses(
+        video[own],
+        moving[own],
+        work.folder / "poses",
+        clipped[own],
+        matcher=work.config.matcher,
+        device=pick_device(work.config.device),
+        earlier=earlier,
+        lens=lens_to_find(work),
+    )
+    if poses.lenses:
+        raise DistortedFramesError(poses.lenses)
+    return share_poses(work, poses, track)
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import fields
 
 import numpy as np
@@ -133,6 +134,12 @@ class StoredView(ResponseView):
     def moving(self) -> np.ndarray:
         """(H, W) bool."""
         return self.work.masks[self.frame.index]
+
+    def in_bracket(self, bracket: int) -> StoredView:
+        """The same frame, counted as one of another bracket."""
+        view = copy(self)
+        object.__setattr__(view, "bracket", bracket)
+        return view
 
     def map(self, name: str | None) -> np.ndarray:
         """A map (H, W) of the scene folder."""

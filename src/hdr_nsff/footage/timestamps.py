@@ -1,0 +1,71 @@
+"""Times of frames by their timestamps: a gap in time is a gap in time.
+
+Timestamps jitter, and phones vary their frame rate a little. Frames count as evenly
+spaced, and only where a gap is longer by most of a frame are frames missing.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.footage.exposure_lists import csv_path, parse_number, read_utf8
+from hdr_nsff.footage.ingest import Footage
+
+COLUMN = "timestamp_ns"
+# frames by which a gap is longer than the usual one before a frame counts as missing
+# (hand-chosen: pulldown of 24 to 60 frames a second has gaps half a frame longer)
+MIN_EXTRA = 0.75
+# of gaps with missing frames above which the frame rate varies as a whole
+MAX_SHARE = 0.2
+
+
+def read_timestamps(footage: Footage) -> dict[str, float]:
+    """Seconds of every frame in the column `timestamp_ns` of the CSV beside the frames,
+    by file name or `#number`; empty without.
+    """
+    path = csv_path(footage)
+    if not path.is_file():
+        return {}
+    reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
+    columns = reader.fieldnames or []
+    name = next((c for c in ("file", "frame") if c in columns), None)
+    if name is None or COLUMN not in columns:
+        return {}
+    seconds = {}
+    try:
+        for row in reader:
+            where = f"{path}, line {reader.line_num}"
+            key = (row[name] or "").strip()
+            if name == "frame":
+                key = f"#{key}"
+            seconds[key] = 1e-9 * parse_number(row[COLUMN] or "", where)
+    except csv.Error as error:
+        line = reader.line_num + 1
+        raise InputError(
+            f"{path}, line {line}: no readable CSV ({error}); correct the line"
+        ) from error
+    return seconds
+
+
+def frame_gaps(seconds: Sequence[float | None], stride: int = 1) -> np.ndarray | None:
+    """By how many used frames each of the used ones follows the one before (T-1,): 1,
+    or more where frames are missing; None where timestamps do not show it.
+
+    `stride`: every how manyth frame of the footage is used.
+    """
+    if len(seconds) < 3 or any(s is None for s in seconds):
+        return None
+    gaps = np.diff(np.array(seconds, np.float64))
+    usual = float(np.median(gaps))
+    if not usual > 0 or gaps.min() <= 0:
+        return None
+    frames = gaps / usual * stride
+    longer = frames - stride > MIN_EXTRA
+    if longer.mean() > MAX_SHARE:
+        return None
+    return np.where(longer, np.round(frames), stride) / stride

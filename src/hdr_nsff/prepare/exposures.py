@@ -1,0 +1,332 @@
+"""The exposure of every frame of a clip in `prepare`: given, or by brightness.
+
+Exposures come from the command line, a data set, a CSV or EXIF, in this order; where
+none of these has them, frames of one exposure are found by their brightness, and
+training learns the exposures.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.progress import say
+from hdr_nsff.footage.exposure_lists import (
+    parse_exposures,
+    read_exif_ev,
+    read_exposure_csv,
+)
+from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.prepare.times import by_timestamps, evenly_spaced
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.dropped_frames import GappedCycle, find_cycle
+from hdr_nsff.scene.manifest import FrameEntry
+
+# confidence of a cycle by brightness from which it refutes a list (hand-chosen)
+MIN_CONFIDENCE = 0.8
+GOPRO = "GoPro's metadata"  # as a source of exposures
+MIN_DRIFT_EV = 0.02  # of such exposures; below it, they are one
+MAX_LISTED = 5  # frames in a message
+
+
+@dataclass(frozen=True)
+class FrameExposures:
+    """The exposures of all frames."""
+
+    source: str  # where they come from, for people
+    brackets: list[int]  # per frame
+    ev: list[float | None]  # per bracket, to any reference; None: to be learned
+    given: bool
+    estimated: bool  # the brackets were found by brightness
+    reference: int | None = None  # bracket; None: the best exposed one
+    notes: tuple[str, ...] = ()  # sentences for people
+    drift: tuple[float, ...] = ()  # given, per frame: stops from its bracket; empty: none
+    # where frames are missing: per frame its time, and the length of the cycle in these
+    slots: tuple[float, ...] = ()
+    cycle: int | None = None
+
+
+def frame_exposures(work: Work) -> FrameExposures:
+    """The exposures of all frames, as given, or by brightness."""
+    source, given = given_exposures(work)
+    gapped = cycle_with_gaps(work, given)
+    found = exposures_by(work, source, given, gapped)
+    if gapped is None:
+        return found
+    slots = tuple(gapped.slots.astype(float).tolist())
+    notes = (*gap_notes(work, gapped), *found.notes)
+    return replace(found, slots=slots, cycle=gapped.period(), notes=notes)
+
+
+def exposures_by(
+    work: Work, source: str, given: list[float] | None, gapped: GappedCycle | None
+) -> FrameExposures:
+    """The exposures of all frames from the EVs that a `source` gives, else from
+    brightness; `gapped`: their cycle where frames are missing from it.
+    """
+    capture, frames = work.capture, work.manifest.frames
+    if capture is not None and capture.exposures is not None and source == "data set":
+        stored = capture.exposures
+        brackets = [work.picture(frame).bracket or 0 for frame in frames]
+        return FrameExposures(
+            source, brackets, list(stored.ev), stored.given, False, stored.reference
+        )
+    cameras = work.camera_frames()
+    if work.manifest.num_tracks > 1:
+        return track_exposures(work, source, given)
+    if given is None:
+        cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
+        if gapped is not None:
+            cycles = [gapped.cycle]
+        brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
+        unknown: list[float | None] = [None] * (max(brackets) + 1)
+        notes = cycle_notes(work, cycles)
+        return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
+    many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
+    if source == GOPRO or (many and len(cameras) == 1):
+        return drifting_exposures(source, given, gapped)
+    brackets, known = exposure.brackets_by_ev(given)
+    doubts = []
+    for own in cameras:
+        doubts += exposure.contradictions(work.video[own], [given[i] for i in own])
+    return FrameExposures(source, brackets, [*known], True, False, notes=tuple(doubts))
+
+
+def cycle_with_gaps(work: Work, given: list[float] | None) -> GappedCycle | None:
+    """The cycle of a clip from which frames are missing, by the `given` EVs of its
+    frames or else their brightness; None where none are missing, or nothing alternates.
+
+    Looked for in the clip of one camera, every frame of it.
+    """
+    cameras = work.camera_frames()
+    if work.capture is not None or work.config.stride != 1 or len(cameras) > 1:
+        return None
+    times = evenly_spaced(work)
+    if by_timestamps(work):
+        times = [f.time for f in work.manifest.frames]
+    known = np.diff(times).astype(int)
+    steps = np.diff(given) if given is not None else exposure.brightness_steps(work.video)
+    gapped = find_cycle(steps, known)
+    if gapped.cycle.length == 1 or (not gapped.gaps and (known == 1).all()):
+        return None
+    return gapped
+
+
+def gap_notes(work: Work, gapped: GappedCycle) -> list[str]:
+    """A sentence on the frames that are missing, where the exposures show it."""
+    if not gapped.gaps:
+        return []
+    numbers = work.frame_numbers()
+    listed = ", ".join(str(numbers[t]) for t in gapped.gaps[:MAX_LISTED])
+    more = ", ..." if len(gapped.gaps) > MAX_LISTED else ""
+    sentence = f"frames are missing before frame {listed}{more}: the exposures skip a part "
+    sentence += f"of their cycle of {gapped.cycle.length}"
+    if by_timestamps(work):
+        return [f"{sentence}; times are those of the timestamps"]
+    return [f"{sentence}; times leave the gaps"]
+
+
+def track_exposures(work: Work, source: str, given: list[float] | None) -> FrameExposures:
+    """Exposures of tracks that one camera records at the same times: each has brackets
+    of its own, one unless it alternates; `given` EVs may drift from it.
+    """
+    brackets = [0] * len(work.manifest.frames)
+    count = 0
+    for own in work.camera_frames():
+        steps = exposure.brightness_steps(work.video[own])
+        if given is not None:
+            steps = np.diff([given[i] for i in own])
+        cycle = exposure.cycle_of_steps(steps)
+        for index, bracket in zip(own, cycle.brackets, strict=True):
+            brackets[index] = count + bracket
+        count += len(cycle.order)
+    if given is None:
+        return FrameExposures(source, brackets, [None] * count, False, True)
+    known, drift = levels_and_drift(given, brackets)
+    drifts = np.ptp(drift) > MIN_DRIFT_EV
+    return FrameExposures(
+        source, brackets, [*known], True, False, drift=tuple(drift.tolist()) if drifts else ()
+    )
+
+
+def levels_and_drift(given: list[float], brackets: list[int]) -> tuple[list[float], np.ndarray]:
+    """The mean EV of every bracket, and by how much each frame differs from it."""
+    levels = []
+    drift = np.array(given)
+    for bracket in range(max(brackets) + 1):
+        own = np.array(brackets) == bracket
+        levels.append(float(drift[own].mean()))
+        drift[own] -= drift[own].mean()
+    return levels, drift
+
+
+def drifting_exposures(
+    source: str, given: list[float], gapped: GappedCycle | None = None
+) -> FrameExposures:
+    """Given EVs of frames that are too many for a cycle: brackets of one where they
+    alternate, and the drift of every frame from its bracket.
+    """
+    cycle = exposure.cycle_of_steps(np.diff(given)) if gapped is None else gapped.cycle
+    brackets = cycle.brackets
+    known, drift = levels_and_drift(given, brackets)
+    note = f"given exposures drift by {drift.min():+.2f} to {drift.max():+.2f} EV"
+    return FrameExposures(
+        source, brackets, [*known], True, False, notes=(note,), drift=tuple(drift.tolist())
+    )
+
+
+def given_exposures(work: Work) -> tuple[str, list[float] | None]:
+    """Where the EVs of the frames come from, and the EV of each frame.
+
+    The EVs are None where brightness has to show them, or a data set stores brackets.
+    """
+    c, frames = work.config, work.manifest.frames
+    capture, tracks = work.capture, work.manifest.num_tracks
+    numbers = work.frame_numbers()
+    cycle = parse_exposures(c.exposures, c.ev)
+    if cycle is not None and tracks > 1:
+        return "flags", track_cycle(work, cycle)
+    if cycle is not None:
+        gapped = cycle_with_gaps(work, None)
+        if gapped is not None and exposure.period(cycle_brackets(cycle)) == gapped.cycle.length:
+            return "flags", [cycle[(c.start + n) % len(cycle)] for n in gapped.slots]
+        check_cycle(work, cycle, numbers)
+        return "flags", [cycle[n % len(cycle)] for n in numbers]
+    if "auto" in (c.exposures, c.ev):
+        return "brightness", None
+    if capture is not None and capture.parts()["exposures"]:
+        if capture.exposures is not None:
+            return "data set", None
+        stored = [work.picture(f).ev for f in frames]
+        return "data set", [ev for ev in stored if ev is not None]
+    table = read_exposure_csv(work.footage)
+    if table is not None:
+        path, rows = table
+        return path.name, [
+            csv_exposure(path, rows, f, n, tracks > 1) for f, n in zip(frames, numbers, strict=True)
+        ]
+    if work.footage.video:
+        source, known, least_change = GOPRO, gopro_exposures(work), MIN_DRIFT_EV
+    else:
+        source, known, least_change = "EXIF", exif_exposures(work), exposure.MIN_STEP
+    if len(known) == len(frames) and max(known) - min(known) >= least_change:
+        return source, known
+    return "brightness", None
+
+
+def gopro_exposures(work: Work) -> list[float]:
+    """The EVs of the frames of videos, where a GoPro wrote them into these."""
+    known: list[float] = []
+    numbers = work.frame_numbers()
+    for own, files in zip(work.camera_frames(), work.footage.cameras, strict=True):
+        written = read_gopro_ev(files[0], work.footage.count or 0)
+        if written is not None:
+            known += [float(written[numbers[i]]) for i in own]
+    return known
+
+
+def track_cycle(work: Work, evs: list[float]) -> list[float]:
+    """The EV of every frame of tracks of one camera, from one per track."""
+    tracks = work.manifest.num_tracks
+    if len(evs) != tracks:
+        raise InputError(
+            f"{len(evs)} exposures listed for {tracks} tracks of one camera; list one per track, "
+            "in the order of --same-camera"
+        )
+    return [evs[f.track] for f in work.manifest.frames]
+
+
+def csv_exposure(
+    path: Path, rows: dict[str, float], frame: FrameEntry, number: int, whole_name: bool = False
+) -> float:
+    """The EV of a frame in the `rows` of a CSV, by its name or `number`; by its
+    `whole_name`, with the folder, only, where several tracks have the others.
+    """
+    keys = [frame.source]
+    if not whole_name:
+        keys += [Path(frame.source).name, f"#{number}"]
+    for key in keys:
+        if key in rows:
+            return rows[key]
+    raise InputError(f"{path}: no row for frame {frame.source}; add it, or give `--exposures auto`")
+
+
+def exif_exposures(work: Work) -> list[float]:
+    """The EVs of the frames whose EXIF has one; prints where only some have."""
+    files = work.footage.files
+    found = [read_exif_ev(files[f.source]) for f in work.manifest.frames]
+    known = [ev for ev in found if ev is not None]
+    lost = len(found) - len(known)
+    if known and lost:
+        say(f"exposure: EXIF of {lost} frames holds no exposure time; brightness decides instead")
+    return known
+
+
+def cycle_brackets(cycle: list[float]) -> list[int]:
+    """The brackets of two rounds of a list of exposures."""
+    return exposure.brackets_by_ev(2 * cycle)[0]
+
+
+def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:
+    """InputError where a list of exposures cannot be the cycle of these frames.
+
+    `numbers` are the positions of the frames in the footage of their camera.
+    """
+    frames = work.camera_frames()[0]
+    if len(cycle) > len(frames):
+        raise InputError(
+            f"{len(cycle)} exposures listed for {len(frames)} frames; list one cycle only, "
+            "or give `--exposures auto`"
+        )
+    brackets, _ = exposure.brackets_by_ev([cycle[numbers[i] % len(cycle)] for i in frames])
+    listed = exposure.period(brackets)
+    found = exposure.detect_cycle(work.video[frames])
+    if listed % found.length and found.confidence > MIN_CONFIDENCE:
+        raise InputError(
+            f"{len(cycle)} exposures listed, which repeat every {listed} frames, but the "
+            f"brightness repeats every {found.length}; list the exposures of one cycle in the "
+            "order of the frames, or give `--exposures auto`"
+        )
+
+
+def cycle_notes(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
+    """What the brightness of each camera's frames shows, in sentences."""
+    notes = []
+    lengths = [cycle.length for cycle in cycles]
+    if len(set(lengths)) > 1:
+        notes.append(
+            f"the cameras disagree on the length of the cycle ({lengths}); "
+            "list the exposures in a CSV"
+        )
+    for frames, cycle in zip(work.camera_frames(), cycles, strict=True):
+        camera = ""
+        if len(cycles) > 1:
+            camera = f"camera {work.manifest.frames[frames[0]].camera_id}: "
+        steps = exposure.brightness_steps(work.video[frames])
+        notes.append(camera + cycle_note(cycle, float(np.abs(steps).mean())))
+    return notes
+
+
+def cycle_note(cycle: exposure.Cycle, change: float) -> str:
+    """A sentence on a cycle; `change` is the mean EV from frame to frame."""
+    if cycle.length > 1:
+        first = [cycle.brackets.index(b) for b in cycle.order]
+        levels = ", ".join(f"{cycle.ev[b]:.1f}" for b in cycle.order)
+        return (
+            f"brightness repeats every {cycle.length} frames, from dark to bright frame {first} "
+            f"of the cycle, about {levels} EV (gamma 2.2); this explains "
+            f"{cycle.confidence:.0%} of its changes"
+        )
+    if change > exposure.MIN_STEP:
+        return (
+            f"brightness changes by {change:.1f} EV from frame to frame, but in no cycle of up "
+            f"to {exposure.MAX_CYCLE} frames; list the exposures in a CSV if they were set"
+        )
+    return (
+        "no alternation of exposures found; treated as an ordinary clip of one exposure, "
+        "unless static points show that it drifts"
+    )

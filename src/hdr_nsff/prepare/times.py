@@ -1,0 +1,70 @@
+"""Times of the frames of a clip from which some are missing: a gap in time is a gap."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hdr_nsff.footage.timestamps import frame_gaps, read_timestamps
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.scene.manifest import FrameEntry
+
+
+def leave_gaps(work: Work, entries: list[FrameEntry], seconds: list[float | None]) -> int:
+    """Count the frames that are missing by timestamps in the times of `entries`, in
+    place; how many there are. `seconds`: of the entries, by a video's own clock.
+
+    The CSV beside the frames decides before the video. Tracks and cameras that disagree
+    are taken as evenly spaced, and so are the pictures of data sets.
+    """
+    if work.capture is not None:
+        return 0
+    written = read_timestamps(work.footage)
+    stride = work.config.stride
+    lines: dict[tuple[int, int], list[int]] = {}
+    for k, entry in enumerate(entries):
+        lines.setdefault((entry.camera_id, entry.track), []).append(k)
+    found = []
+    for line in lines.values():
+        known = [seconds[k] for k in line]
+        if written:
+            known = [seconds_of(work, entries[k], written) for k in line]
+        found.append(frame_gaps(known, stride))
+    first = found[0]
+    if first is None or not all(g is not None and np.array_equal(g, first) for g in found):
+        return 0
+    times = np.concatenate([[0.0], np.cumsum(first)])
+    for line in lines.values():
+        for k, time in zip(line, times.tolist(), strict=True):
+            entries[k].time = round(time, 6)
+    return round(float((first - 1).sum() * stride))
+
+
+def seconds_of(work: Work, entry: FrameEntry, written: dict[str, float]) -> float | None:
+    """The seconds of a frame in a CSV, by its name or number; None without."""
+    number = work.config.start + int(entry.time) * work.config.stride
+    name = entry.source.rsplit("/", 1)[-1]
+    for key in (entry.source, name, f"#{number}"):
+        if key in written:
+            return written[key]
+    return None
+
+
+def by_timestamps(work: Work) -> bool:
+    """Whether the times of the frames have gaps that timestamps show."""
+    step = work.manifest.steps.get("frames")
+    return step is not None and bool(step.details.get("missing", 0))
+
+
+def evenly_spaced(work: Work) -> list[float]:
+    """The times of all frames if none were missing."""
+    frames, numbers = work.manifest.frames, work.frame_numbers()
+    return [work.time_of(f.source, number) for f, number in zip(frames, numbers, strict=True)]
+
+
+def times_of_slots(work: Work, slots: tuple[float, ...]) -> list[float]:
+    """The time of every frame: by timestamps where these have gaps, else by its place
+    `slots` (T,) in the exposure cycle where frames are missing from it.
+    """
+    if work.capture is not None or by_timestamps(work):
+        return [f.time for f in work.manifest.frames]
+    return list(slots) or evenly_spaced(work)

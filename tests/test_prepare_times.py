@@ -1,0 +1,97 @@
+"""Clips from which frames are missing: brackets and times after the gap."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from test_exposure_cycle import clip
+from test_prepare_footage import work_on
+
+from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.prepare.prepare import PrepareConfig
+from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
+from hdr_nsff.prepare.work import Work
+from hdr_nsff.scene.manifest import Manifest, StepRecord
+
+EVS = [-2, 0, 2]
+KEPT = np.delete(np.arange(27), [10])
+WITH_GAP = KEPT.astype(float).tolist()
+
+
+def times(work: Work) -> list[float]:
+    return [f.time for f in work.manifest.frames]
+
+
+def brackets(work: Work) -> list[int]:
+    return [f.bracket for f in work.manifest.frames]
+
+
+def test_a_frame_that_is_missing_leaves_a_gap_and_the_cycle_goes_on(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    work = work_on(tmp_path, clip(EVS, frames=27)[KEPT])
+    exposure_step(work)
+    assert brackets(work) == (KEPT % 3).tolist() and times(work) == WITH_GAP
+    assert work.manifest.cycle == 3
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "frames are missing before frame 10: the exposures skip a part" in printed
+    exposure_step(work)  # once more, it is the same
+    assert times(work) == WITH_GAP
+
+
+def test_without_a_gap_frames_are_evenly_spaced(tmp_path: Path) -> None:
+    work = work_on(tmp_path, clip(EVS, frames=27))
+    exposure_step(work)
+    assert times(work) == list(range(27)) and brackets(work) == [0, 1, 2] * 9
+
+
+def test_a_listed_cycle_goes_on_after_a_gap(tmp_path: Path) -> None:
+    work = work_on(tmp_path, clip(EVS, frames=27)[KEPT], ev="-2,0,2")
+    exposure_step(work)
+    assert brackets(work) == (KEPT % 3).tolist() and times(work) == WITH_GAP
+    steps = [f.ev for f in work.manifest.frames[9:12]]
+    assert np.diff(np.array(steps, float)).tolist() == [4, -4]  # frames 9, 11, 12
+
+
+def test_exposures_of_a_csv_show_a_gap_too(tmp_path: Path) -> None:
+    rows = "".join(f"{i:03d}.png,{EVS[t % 3]}\n" for i, t in enumerate(KEPT))
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text(f"file,ev\n{rows}")
+    work = work_on(tmp_path, clip(EVS, frames=27)[KEPT])
+    exposure_step(work)
+    assert times(work) == WITH_GAP and work.manifest.exposure_given
+
+
+def test_timestamps_of_a_csv_decide_where_the_cycle_shows_less(tmp_path: Path) -> None:
+    kept = np.delete(np.arange(27), [10, 11, 12])  # a whole cycle, which no exposure shows
+    rows = "".join(f"{i:03d}.png,{EVS[t % 3]},{t * 4e7:.0f}\n" for i, t in enumerate(kept))
+    (tmp_path / "clip").mkdir()
+    (tmp_path / "clip/exposures.csv").write_text(f"file,ev,timestamp_ns\n{rows}")
+    work = work_on(tmp_path, clip(EVS, frames=27)[kept])
+    result = frames_step(work)
+    assert "3 are missing by the timestamps" in result.note
+    work.manifest.steps["frames"] = StepRecord(done=True, details=result.details)
+    exposure_step(work)
+    assert times(work) == kept.astype(float).tolist()
+    assert brackets(work) == (kept % 3).tolist()
+
+
+def test_a_gap_in_the_clock_of_a_video_is_a_gap(tmp_path: Path) -> None:
+    path = tmp_path / "clip.mp4"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width = stream.height = 64
+        stream.time_base = stream.codec_context.time_base = Fraction(1, 25)
+        for t in KEPT.tolist():
+            codes = np.full((64, 64, 3), 40 + 60 * (t % 3), np.uint8)
+            frame = av.VideoFrame.from_ndarray(codes, format="rgb24")
+            frame.pts, frame.time_base = t, Fraction(1, 25)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode())
+    manifest = Manifest(source="clip", width=1, height=1)
+    config = PrepareConfig(path, tmp_path / "scene")
+    work = Work(config, open_footage(path), manifest)
+    assert frames_step(work).details == {"missing": 1}
+    assert times(work) == WITH_GAP
