@@ -12,9 +12,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +30,7 @@ SIGNATURES = {
     "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2",
     "project_backward": "f2 f2 f2 f1 d1 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
 }
+MODULES = ("gaussian_kernels", "tile_kernels")  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
 FAST = ("forward", "backward")
 PACKAGES = ("numba", "numba-cuda", "cuda-bindings", "nvidia-nvvm", "nvidia-cuda-nvcc-cu12")
@@ -46,12 +47,17 @@ def compile_kernel(name: str, capability: tuple[int, int]) -> bytes:
         return ptx.encode() + b"\0"
 
 
+def kernel_function(name: str) -> Callable[..., None]:
+    """The Python function of a kernel."""
+    modules = [import_module(f"hdr_nsff.fields.kernels.cuda.{m}") for m in MODULES]
+    found: Callable[..., None] = next(getattr(m, name) for m in modules if hasattr(m, name))
+    return found
+
+
 def compile_ptx(name: str, capability: tuple[int, int]) -> str:
     """The PTX of a kernel for GPUs of a compute capability such as (8, 9)."""
     from numba import cuda, types
     from numba.cuda import dispatcher
-
-    from hdr_nsff.fields.kernels.cuda import kernels
 
     kinds = {"f": types.float32, "d": types.float64, "s": types.int32, "i": types.int64}
 
@@ -65,7 +71,7 @@ def compile_ptx(name: str, capability: tuple[int, int]) -> str:
     dispatcher.get_current_device = lambda: device
     try:
         ptx, _ = cuda.compile(
-            getattr(kernels, name),
+            kernel_function(name),
             signature,
             device=False,
             fastmath=name in FAST,
@@ -127,7 +133,8 @@ def cache_folder() -> Path:
 def fingerprint() -> str:
     """Changes with the sources of the kernels and the versions of the compiler."""
     here = Path(__file__)
-    sources = [here, here.with_name("kernels.py"), Path(layout.__file__)]
+    sources = [here, here.with_name("device.py"), Path(layout.__file__)]
+    sources += [here.with_name(f"{module}.py") for module in MODULES]
     sources += [Path(str(m.__file__)) for m in (compositing, footprint)]
     digest = hashlib.sha256()
     for path in sources:

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels.cuda.compile import load_kernel
+from hdr_nsff.fields.kernels.cuda.compile import kernel_function, load_kernel
 
 # the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
 BUFFER_END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
@@ -130,8 +130,6 @@ def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor 
 
     if not config.ENABLE_CUDASIM:
         raise RuntimeError("CUDA kernels take tensors of the CPU with NUMBA_ENABLE_CUDASIM=1")
-    from hdr_nsff.fields.kernels.cuda import kernels
-
-    kernel = cuda.jit(getattr(kernels, name))
+    kernel = cuda.jit(kernel_function(name))
     values = (a.detach().numpy() if isinstance(a, Tensor) else a for a in arguments)
     kernel[grid, threads](*values)

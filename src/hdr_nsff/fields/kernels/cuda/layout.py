@@ -9,3 +9,4 @@ PIXELS = TILE * TILE  # of a tile, and threads of its block
 BATCH = 16  # Gaussians that the backward pass takes at a time: one per row of threads
 CHANNELS = 8  # features that one block composites
 THREADS = 128  # of a block, in kernels with one thread per Gaussian
+ELLIPSE = 6  # numbers of a projected Gaussian: pixel center, conic, opacity
