@@ -49,6 +49,14 @@ def fault(device: str = "cuda") -> str | None:
 
 
 @cache
+def kernels_on(device: torch.device) -> bool:
+    """Whether our own kernels run on a device."""
+    if device.type != "cuda":
+        return False
+    return find_backend(str(device)).composite is rasterize_cuda.composite
+
+
+@cache
 def composite_on(device: torch.device) -> Composite | None:
     """The rasterizer of a device; says once why there is none."""
     backend = find_backend(str(device))

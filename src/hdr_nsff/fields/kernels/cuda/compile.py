@@ -22,6 +22,10 @@ from typing import Any
 from hdr_nsff.fields.kernels import compositing, footprint
 from hdr_nsff.fields.kernels.cuda import layout
 
+# groups of arguments of the kernels that make the Gaussians of a moment: what was
+# learned of each kind, time and cameras, and what is made
+STATIC, MOVING, LOCAL = "f2 f2 f2 f1 f2 f3", "f2 f2 f2 f1 f2 f3 f3 f2", "f2 f2 f2 f2 f2"
+SIGHT, CLOUD = "d1 f2 f2 f2 f2", "f2 f2 f2 f1 f2 f1"
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 d1 i0 i0 f2 f1 s2 i1",
@@ -29,8 +33,18 @@ SIGNATURES = {
     "forward": "i1 s1 f2 f2 f3 f2",
     "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2",
     "project_backward": "f2 f2 f2 f1 d1 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
+    "cloud": f"{STATIC} {MOVING} f2 f2 f2 {LOCAL} i1 s2 s2 {SIGHT} {CLOUD}",
+    "static_backward": f"f2 f2 f1 f2 f3 {SIGHT} {CLOUD} {STATIC}",
+    "moving_backward": f"{MOVING} f2 f2 f2 s2 i0 {SIGHT} {CLOUD} {MOVING} f2",
+    "trajectory_backward": "f2 f2 f2 d1 i0 f2 f1 f2 f2 b1 b1",
+    "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",
 }
-MODULES = ("gaussian_kernels", "tile_kernels")  # that hold the kernels
+MODULES = (
+    "gaussian_kernels",
+    "tile_kernels",
+    "cloud_kernels",
+    "cloud_gradients",
+)  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
 FAST = ("forward", "backward")
 PACKAGES = ("numba", "numba-cuda", "cuda-bindings", "nvidia-nvvm", "nvidia-cuda-nvcc-cu12")
@@ -60,6 +74,7 @@ def compile_ptx(name: str, capability: tuple[int, int]) -> str:
     from numba.cuda import dispatcher
 
     kinds = {"f": types.float32, "d": types.float64, "s": types.int32, "i": types.int64}
+    kinds["b"] = types.uint8
 
     def type_of(code: str) -> Any:
         kind, dimensions = kinds[code[0]], int(code[1])

@@ -10,3 +10,7 @@ BATCH = 16  # Gaussians that the backward pass takes at a time: one per row of t
 CHANNELS = 8  # features that one block composites
 THREADS = 128  # of a block, in kernels with one thread per Gaussian
 ELLIPSE = 6  # numbers of a projected Gaussian: pixel center, conic, opacity
+POSE = 16  # numbers of a basis at a time: a 3x4 matrix and a quaternion
+TERMS = 8  # of the field's own, that the kernel `cloud` adds up
+NUMBERS = 27  # that it takes of the time
+MAX_LOG_RADIANCE = 16.0  # of a Gaussian, as in `splat/gaussians.py`
