@@ -1,5 +1,5 @@
-"""A training step of `splat` by CUDA kernels, without a GPU: every test of
-`simulated_cloud.py` and `simulated_step.py` in processes with numba-cuda's simulator.
+"""A training step of `splat` by CUDA kernels, without a GPU: every test of three
+files, in processes with numba-cuda's simulator.
 """
 
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from simulator import assert_passed, names_in
 
-FILES = ("simulated_cloud.py", "simulated_step.py")
+FILES = ("simulated_cloud.py", "simulated_picture.py", "simulated_step.py")
 PATHS = [Path(__file__).with_name(name) for name in FILES]
 
 

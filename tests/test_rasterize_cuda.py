@@ -46,7 +46,9 @@ def test_a_kernel_takes_eight_byte_numbers_as_many_as_are_packed(name: str) -> N
     parameters = ptx.partition(f".entry {name}(")[2].partition(")")[0]
     dimensions = [int(code[1]) for code in SIGNATURES[name].split()]
     expected = sum(5 + 2 * d if d else 1 for d in dimensions)
-    assert re.findall(r"\.param \.(\w+)", parameters) == ["u64"] * expected
+    kinds = re.findall(r"\.param \.(\w+)", parameters)
+    assert len(kinds) == expected and set(kinds) <= {"u64", "f64"}
+    assert kinds.count("f64") == SIGNATURES[name].split().count("d0")
 
 
 @needs_compiler

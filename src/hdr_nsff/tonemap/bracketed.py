@@ -172,7 +172,7 @@ class SharedToneMapper(BracketedToneMapper):
             return radiance
         if pixels is None:
             pixels = camera.pixel_grid()
-        return radiance * self.vignetting(camera, pixels, camera_id)
+        return self.vignetting.shade(radiance, camera, pixels, camera_id)
 
     def curve_values(self, camera_id: int, images: Tensor | int | None) -> Tensor:
         return self.response.values(camera_id)

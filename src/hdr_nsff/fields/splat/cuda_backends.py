@@ -51,9 +51,7 @@ def fault(device: str = "cuda") -> str | None:
 @cache
 def kernels_on(device: torch.device) -> bool:
     """Whether our own kernels run on a device."""
-    if device.type != "cuda":
-        return False
-    return find_backend(str(device)).composite is rasterize_cuda.composite
+    return device.type == "cuda" and rasterize_cuda.fault(str(device)) is None
 
 
 @cache

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.tensors import constant
-from hdr_nsff.fields.kernels.cuda.launch import launch
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
 from hdr_nsff.fields.kernels.cuda.layout import NUMBERS, POSE, TERMS, THREADS
 from hdr_nsff.fields.knots import catmull_rom_weights, linear_position
 from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY, Model
@@ -101,11 +101,6 @@ def fused_cloud(model: Model, moment: Moment, alive: Tensor) -> Cloud:
     named = dict(zip(TERM_NAMES, terms.unbind(), strict=False))
     means, quaternions, scales, opacities, features = made
     return Cloud(means, quaternions, scales, opacities, features, named)
-
-
-def blocks_for(count: int) -> tuple[int, int]:
-    """The grid of a kernel with a thread for each of `count`."""
-    return -(-count // THREADS), 1
 
 
 class MakeCloud(torch.autograd.Function):

@@ -26,6 +26,7 @@ from hdr_nsff.fields.kernels.cuda import layout
 # learned of each kind, time and cameras, and what is made
 STATIC, MOVING, LOCAL = "f2 f2 f2 f1 f2 f3", "f2 f2 f2 f1 f2 f3 f3 f2", "f2 f2 f2 f2 f2"
 SIGHT, CLOUD = "d1 f2 f2 f2 f2", "f2 f2 f2 f1 f2 f1"
+PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and known before
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 d1 i0 i0 f2 f1 s2 i1",
@@ -37,6 +38,13 @@ SIGNATURES = {
     "static_backward": f"f2 f2 f1 f2 f3 {SIGHT} {CLOUD} {STATIC}",
     "moving_backward": f"{MOVING} f2 f2 f2 s2 i0 {SIGHT} {CLOUD} {MOVING} f2",
     "trajectory_backward": "f2 f2 f2 d1 i0 f2 f1 f2 f2 b1 b1",
+    "adam_rows": "f2 f2 f2 f2 b1 d0 d0 d0 d0 d0 d0",
+    "respond": "f2 f1 f2 f1 i0 d0 f2",
+    "respond_backward": "f2 f1 f2 f1 i0 d0 f2 f2 f1 f2",
+    "shade": "f2 f2 f2 f1 f2 i0 d0 f2",
+    "shade_backward": "f2 f2 f2 f1 f2 i0 d0 f2 f2 f2",
+    "losses": f"{PIXELS} d0 d0 d0 d0 f1",
+    "losses_backward": f"{PIXELS} d0 d0 d0 d0 f1 f1 f2 f1 f1 f2",
     "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",
 }
 MODULES = (
@@ -44,6 +52,8 @@ MODULES = (
     "tile_kernels",
     "cloud_kernels",
     "cloud_gradients",
+    "adam_kernels",
+    "picture_kernels",
 )  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
 FAST = ("forward", "backward")

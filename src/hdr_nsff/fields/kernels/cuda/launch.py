@@ -19,12 +19,13 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.fields.kernels.cuda.compile import kernel_function, load_kernel
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
 
 # the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
 BUFFER_END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
 
 
-def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
+def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | float) -> None:
     """Run a kernel in `grid` blocks of `threads`, all tensors on one device.
 
     Tensors are contiguous, and of the types in `compile.SIGNATURES`.
@@ -41,18 +42,26 @@ def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | 
         driver().launch(function, grid, threads, stream, pack(*arguments))
 
 
-def pack(*arguments: Tensor | int) -> bytes:
+def blocks_for(count: int) -> tuple[int, int]:
+    """The grid of a kernel with a thread for each of `count`, THREADS in a block."""
+    return -(-count // THREADS), 1
+
+
+def pack(*arguments: Tensor | float) -> bytes:
     """Arguments as a kernel's parameters lie in memory."""
-    numbers: list[int] = []
+    numbers: list[float] = []
+    kinds = ""
     for a in arguments:
         if isinstance(a, Tensor):
             assert a.is_contiguous(), f"strides {a.stride()} of shape {tuple(a.shape)}"
             size = a.element_size()
             numbers += (0, 0, a.numel(), size, a.data_ptr(), *a.shape)
             numbers += (stride * size for stride in a.stride())
+            kinds += "q" * (5 + 2 * a.ndim)
         else:
             numbers.append(a)
-    return struct.pack(f"{len(numbers)}q", *numbers)
+            kinds += "d" if isinstance(a, float) else "q"
+    return struct.pack(kinds, *numbers)
 
 
 @cache
@@ -123,7 +132,7 @@ class Driver:
         self.call("cuLaunchKernel", function, *blocks, shared_bytes, queue, None, extra)
 
 
-def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
+def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | float) -> None:
     """Run a kernel on tensors of the CPU by numba-cuda's simulator, in Python."""
     from numba import cuda
     from numba.core import config

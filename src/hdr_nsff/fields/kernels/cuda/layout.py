@@ -14,3 +14,6 @@ POSE = 16  # numbers of a basis at a time: a 3x4 matrix and a quaternion
 TERMS = 8  # of the field's own, that the kernel `cloud` adds up
 NUMBERS = 27  # that it takes of the time
 MAX_LOG_RADIANCE = 16.0  # of a Gaussian, as in `splat/gaussians.py`
+MAX_KNOTS = 256  # of a response curve
+PICTURE_SUMS = 6  # that the kernel `losses` adds up
+MAX_BLOCKS = 512  # of kernels whose threads take several pixels each
