@@ -27,6 +27,8 @@ from hdr_nsff.fields.kernels.cuda import layout
 STATIC, MOVING, LOCAL = "f2 f2 f2 f1 f2 f3", "f2 f2 f2 f1 f2 f3 f3 f2", "f2 f2 f2 f2 f2"
 SIGHT, CLOUD = "d1 f2 f2 f2 f2", "f2 f2 f2 f1 f2 f1"
 PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and known before
+# what a tone mapper has learned and holds, and which of it is wanted
+TONE = "f3 f1 i1 f1 f1 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 d1 i0 i0 f2 f1 s2 i1",
@@ -45,6 +47,8 @@ SIGNATURES = {
     "shade_backward": "f2 f2 f2 f1 f2 i0 d0 f2 f2 f2",
     "losses": f"{PIXELS} d0 d0 d0 d0 f1",
     "losses_backward": f"{PIXELS} d0 d0 d0 d0 f1 f1 f2 f1 f1 f2",
+    "tone": f"{TONE} f3 f1 f1",
+    "tone_backward": f"{TONE} f3 f1 f3 f1 f1 f3 f1 f2 f2 f2",
     "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",
 }
 MODULES = (
@@ -54,6 +58,7 @@ MODULES = (
     "cloud_gradients",
     "adam_kernels",
     "picture_kernels",
+    "tone_kernels",
 )  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
 FAST = ("forward", "backward")
