@@ -13,6 +13,8 @@ from torch import Tensor
 
 from hdr_nsff.fields.splat import splat
 from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.fused_picture import fused_composite
+from hdr_nsff.fields.splat.rasterize import Maps
 from hdr_nsff.fields.splat.splat import Splat
 
 NAMES = ("means", "quaternions", "scales", "opacities", "features")
@@ -113,6 +115,39 @@ def test_short_clips(num_times: int) -> None:
         p.data.add_(0.1)
     compare(field, float(num_times - 1), -1, rigidity=False)
     compare(field, 0.0, None, rigidity=True)
+
+
+def drawn_maps(channels: int) -> list[Tensor]:
+    """Planes, depth and alpha of a picture, alpha near its limit here and there."""
+    generator = torch.Generator().manual_seed(0)
+    alpha = torch.rand(9, 15, generator=generator)
+    alpha[0], alpha[1], alpha[2] = 0.0, 1e-3, 0.9e-3
+    depth = 3 * torch.rand(9, 15, generator=generator) * alpha
+    return [torch.rand(channels, 9, 15, generator=generator), depth, alpha]
+
+
+@pytest.mark.parametrize("radiance", ["exp", "sigmoid"])
+@pytest.mark.parametrize("channels", [4, 6])
+def test_maps_over_the_background(radiance: str, channels: int) -> None:
+    field = random_field(radiance=radiance)
+    found = []
+    for fused in (True, False):
+        leaves = [m.clone().requires_grad_() for m in drawn_maps(channels)]
+        maps = Maps(leaves[0].permute(1, 2, 0), leaves[1], leaves[2])
+        if fused:
+            numbers = field.bounded, field.far, splat.MIN_DEPTH_SHARE, splat.MIN_ALPHA
+            render, flow = fused_composite(maps, field.background, *numbers)
+        else:
+            render, drawn = field.composite(maps)
+            flow = drawn / render.opacity.clamp_min(splat.MIN_ALPHA)[:, None]
+        values = [render.radiance, render.depth, render.motion, flow]
+        values = [v for v in values if v.numel()]
+        generator = torch.Generator().manual_seed(1)
+        loss = sum((torch.randn(v.shape, generator=generator) * v).sum() for v in values)
+        gradients = torch.autograd.grad(loss, [*leaves, field.background])
+        found.append([*(v.detach() for v in values), *gradients])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
 
 
 def test_more_gaussians_than_a_block() -> None:

@@ -60,6 +60,13 @@ class PixelBatch:
         return self.whole or bool(self.uniform.all())
 
 
+def neighbor_in_turn(batch: PixelBatch) -> list[int]:
+    """The offset of the one neighbor with known flow whose turn it is, if any."""
+    offsets = [o for o in batch.neighbors if o in batch.flow]
+    turn = batch.seed // 2 % max(len(offsets), 1)
+    return offsets[turn : turn + 1]
+
+
 def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = None) -> PixelBatch:
     """The batch of integer `pixels` (N, 2; column, row) of training frame `frame`."""
     column, row = pixels[:, 0], pixels[:, 1]

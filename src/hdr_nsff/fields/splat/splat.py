@@ -16,13 +16,14 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from hdr_nsff.core.tensors import tree_map
+from hdr_nsff.core.tensors import constant, tree_map
 from hdr_nsff.fields.base import FrameError, ParamGroup, Render, Warp
 from hdr_nsff.fields.knots import interpolate_linear, knot_of, time_at
 from hdr_nsff.fields.outputs import GaussianCloud, select_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
+from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
@@ -31,7 +32,7 @@ from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
 from hdr_nsff.fields.splat.terms import MIN_OPACITY, Model, mixture_difference, regularizers
 from hdr_nsff.fields.splat.trajectories import Trajectories
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.batch import PixelBatch
+from hdr_nsff.scene.batch import PixelBatch, neighbor_in_turn
 
 NUM_NEIGHBORS = 4  # of a moving Gaussian, for rigidity
 MAX_VIEW_LOG_FACTOR = 2.0  # by which log radiance may change with the direction of view
@@ -246,14 +247,19 @@ class Splat(nn.Module):
         """
         knot = self.knot(batch.time)
         flow_turn = batch.seed % 2 == 0
-        offsets = self.choose_neighbor(batch) if flow_turn else []
+        offsets = neighbor_in_turn(batch) if flow_turn else []
         alive = self.alive(knot)
-        draw = self.draw_fused if self.can_fuse(batch) else self.draw_terms
-        maps, terms = draw(batch, knot, alive, offsets, not flow_turn)
-        render, drawn = self.composite(maps)
-        # features are premultiplied by opacity
-        flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
-        certain = torch.ones_like(render.opacity)
+        if self.can_fuse(batch):
+            maps, terms = self.draw_fused(batch, knot, alive, offsets, not flow_turn)
+            least = MIN_DEPTH_SHARE * self.unit
+            numbers = self.bounded, self.far, least, MIN_ALPHA
+            render, flow = fused_composite(maps, self.background, *numbers)
+        else:
+            maps, terms = self.draw_terms(batch, knot, alive, offsets, not flow_turn)
+            render, drawn = self.composite(maps)
+            # features are premultiplied by opacity
+            flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
+        certain = constant((1.0,), flow.device, flow.dtype).expand(len(render.opacity))
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)
         if not batch.whole:
@@ -323,13 +329,6 @@ class Splat(nn.Module):
             neighbors.append((batch.neighbors[offset], points, self.time(knot)))
         motion = apparent_motion(batch.camera, neighbors, cloud.means, batch.time)
         return Maps(*self.shutter.expose(draw, batch.camera, cloud.means, motion, batch.bracket))
-
-    @staticmethod
-    def choose_neighbor(batch: PixelBatch) -> list[int]:
-        """The offset of the one neighbor with known flow whose turn it is, if any."""
-        offsets = [o for o in batch.neighbors if o in batch.flow]
-        turn = batch.seed // 2 % max(len(offsets), 1)
-        return offsets[turn : turn + 1]
 
     def flow_to_neighbor(
         self, batch: PixelBatch, means: Tensor, alive: Tensor, knot: float, offset: int

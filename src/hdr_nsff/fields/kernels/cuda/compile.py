@@ -27,6 +27,7 @@ from hdr_nsff.fields.kernels.cuda import layout
 STATIC, MOVING, LOCAL = "f2 f2 f2 f1 f2 f3", "f2 f2 f2 f1 f2 f3 f3 f2", "f2 f2 f2 f2 f2"
 SIGHT, CLOUD = "d1 f2 f2 f2 f2", "f2 f2 f2 f1 f2 f1"
 PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and known before
+MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f1 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
@@ -47,6 +48,8 @@ SIGNATURES = {
     "shade_backward": "f2 f2 f2 f1 f2 i0 d0 f2 f2 f2",
     "losses": f"{PIXELS} d0 d0 d0 d0 f1",
     "losses_backward": f"{PIXELS} d0 d0 d0 d0 f1 f1 f2 f1 f1 f2",
+    "compose": f"{MAPS} f2 f1 f1 f2",
+    "compose_backward": f"{MAPS} f2 f1 f1 f2 f2 f1 f1 f1",
     "tone": f"{TONE} f3 f1 f1",
     "tone_backward": f"{TONE} f3 f1 f3 f1 f1 f3 f1 f2 f2 f2",
     "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",

@@ -13,6 +13,7 @@ import math
 
 from numba import cuda, float32
 
+from hdr_nsff.fields.kernels.cuda.cloud_kernels import radiance_of
 from hdr_nsff.fields.kernels.cuda.device import exact_device
 from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS, PICTURE_SUMS, THREADS
 
@@ -248,3 +249,60 @@ def losses_backward(
             weight = d_terms[FLOW] * fade / max(sums[VALID], float32(1))
         for axis in range(2):
             g_flow[i, axis] = weight * sign(flow[i, axis] - flow_target[i, axis])
+
+
+def compose(
+    planes, depths, alphas, background, bounded, far, least, least_alpha,
+    radiance, depth, motion, flow,
+):  # fmt: skip
+    """Fill the picture (N, 3), z-depth, motion and flow (N, 2 or 0 of them) over the
+    background, of premultiplied `planes` (D, N), `depths` and `alphas` (N,).
+    """
+    i = cuda.grid(1)
+    if i >= alphas.shape[0]:
+        return
+    alpha = float(alphas[i])
+    for c in range(3):
+        behind, _ = radiance_of(background[c], bounded)
+        radiance[i, c] = planes[c, i] + (1 - alpha) * behind
+    z = far
+    if alphas[i] > float32(least_alpha):
+        z = depths[i] / alpha
+    depth[i] = max(z, least)
+    motion[i] = planes[3, i]
+    if flow.shape[0] > 0:
+        for axis in range(2):
+            flow[i, axis] = planes[4 + axis, i] / max(alpha, least_alpha)
+
+
+def compose_backward(
+    planes, depths, alphas, background, bounded, far, least, least_alpha,
+    d_radiance, d_depth, d_motion, d_flow, g_planes, g_depths, g_alphas, g_background,
+):  # fmt: skip
+    """Fill the gradients of the maps, and add to those of the background (3,)."""
+    sums = cuda.shared.array(3, float32)
+    thread = cuda.threadIdx.x
+    if thread < 3:
+        sums[thread] = 0.0
+    cuda.syncthreads()
+    for i in range(cuda.grid(1), alphas.shape[0], cuda.gridDim.x * THREADS):
+        alpha = float(alphas[i])
+        g_alpha = g_depth = 0.0
+        for c in range(3):
+            behind, slope = radiance_of(background[c], bounded)
+            g_planes[c, i] = d_radiance[i, c]
+            g_alpha -= d_radiance[i, c] * behind
+            cuda.atomic.add(sums, c, float32(d_radiance[i, c] * (1 - alpha) * slope))
+        if alphas[i] > float32(least_alpha) and depths[i] / alpha >= least:
+            g_depth = d_depth[i] / alpha
+            g_alpha -= g_depth * depths[i] / alpha
+        g_planes[3, i] = d_motion[i]
+        for axis in range(planes.shape[0] - 4):
+            d = d_flow[i, axis] / max(alpha, least_alpha)
+            g_planes[4 + axis, i] = d
+            if alphas[i] >= float32(least_alpha):
+                g_alpha -= d * planes[4 + axis, i] / alpha
+        g_depths[i], g_alphas[i] = g_depth, g_alpha
+    cuda.syncthreads()
+    if thread < 3:
+        cuda.atomic.add(g_background, thread, sums[thread])
