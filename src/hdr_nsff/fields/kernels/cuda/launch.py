@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels.cuda.compile import kernel_function, load_kernel
+from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES, kernel_function, load_kernel
 from hdr_nsff.fields.kernels.cuda.layout import THREADS
 
 # the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
@@ -69,6 +69,13 @@ def loaded_kernel(name: str, device: int) -> ctypes.c_void_p:
     """A kernel in the memory of a CUDA device, which is the current one."""
     image = load_kernel(name, torch.cuda.get_device_capability(device))
     return driver().load(image, name, device)
+
+
+def load_all(device: torch.device) -> None:
+    """Compile every kernel for a CUDA device, and load it there."""
+    with torch.cuda.device(device):
+        for name in SIGNATURES:
+            loaded_kernel(name, torch.cuda.current_device())
 
 
 @cache
