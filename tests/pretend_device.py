@@ -220,5 +220,11 @@ LIBRARY = register()
 @contextmanager
 def pretend_device() -> Iterator[torch.device]:
     """The device, for as long as the context lasts."""
-    with PretendMode():
-        yield torch.device(NAME, 0)
+    swaps = torch.__future__.get_swap_module_params_on_conversion()
+    # modules keep their parameters when they are moved, as they do on CUDA
+    torch.__future__.set_swap_module_params_on_conversion(True)
+    try:
+        with PretendMode():
+            yield torch.device(NAME, 0)
+    finally:
+        torch.__future__.set_swap_module_params_on_conversion(swaps)

@@ -13,7 +13,7 @@ import torch
 from test_rasterize import NAMES, ahead, at_depths, camera, compare, drawn, facing, scene
 from torch import Tensor
 
-from hdr_nsff.fields.kernels import footprint
+from hdr_nsff.fields.kernels import footprint, grid
 from hdr_nsff.fields.kernels.cuda import launch as launching
 from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES
 from hdr_nsff.fields.kernels.cuda.launch import Driver, launch, pack
@@ -217,3 +217,18 @@ def test_tensors_of_the_cpu_are_refused_without_the_simulator(
     monkeypatch.setattr(config, "ENABLE_CUDASIM", 0)
     with pytest.raises(RuntimeError, match="NUMBA_ENABLE_CUDASIM=1"):
         launching.simulate("project", (1, 1), 1)
+
+
+def test_adam_moves_the_rows_that_it_moves_on_the_cpu() -> None:
+    generator = torch.Generator().manual_seed(0)
+    tables = [torch.rand(9, 4, generator=generator) for _ in range(4)]
+    marks = torch.tensor([1, 0, 1, 0, 1, 1, 0, 0, 1], dtype=torch.uint8)
+    tables[1][marks == 0] = 0.0
+    tables[1][0] = 0.0  # a mark without a gradient moves on
+    numbers = 0.1, 0.9, 0.99, 1e-12, 0.19, 0.0199
+    expected = [t.clone() for t in (*tables, marks)]
+    grid.adam_rows(*(t.numpy() for t in expected), *numbers)
+    found = [t.clone() for t in (*tables, marks)]
+    launch("adam_rows", (1, 1), 16, *found, *numbers)
+    for i in (0, 2, 3, 4):
+        torch.testing.assert_close(found[i], expected[i])

@@ -70,6 +70,25 @@ def test_a_device_without_a_rasterizer_is_reported_once(
     assert len(messages) == 1 and "on the CPU, which is slower: no compiler" in messages[0]
 
 
+def test_kernels_of_a_step_that_cannot_be_loaded_are_reported_once(
+    messages: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(device: torch.device) -> None:
+        raise RuntimeError("no room\nand more")
+
+    faults(monkeypatch, None, None)
+    monkeypatch.setattr(cuda_backends, "load_all", broken)
+    cuda_backends.kernels_on.cache_clear()
+    for _ in range(2):
+        assert not cuda_backends.kernels_on(torch.device("cuda"))
+    cuda_backends.kernels_on.cache_clear()
+    assert messages == ["training steps are plain torch, which is slower: RuntimeError: no room"]
+
+
+def test_the_cpu_has_no_kernels_of_a_gpu() -> None:
+    assert not cuda_backends.kernels_on(torch.device("cpu"))
+
+
 @pytest.fixture
 def broken_cuda(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """A CUDA device on which nothing draws Gaussians, and the messages to the user."""

@@ -2,14 +2,12 @@
 numba-cuda's simulator, and every kernel compiled for four kinds of GPU.
 """
 
-import os
 import re
-import subprocess
-import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+from simulator import assert_passed, names_in
 
 from hdr_nsff.fields.kernels.cuda import compile as compiling
 from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES, compile_ptx, link, load_kernel
@@ -19,19 +17,9 @@ SIMULATED = Path(__file__).with_name("simulated_cuda.py")
 CAPABILITIES = [(7, 5), (8, 0), (9, 0), (12, 0)]  # Turing, Ampere, Hopper, Blackwell
 
 
-@pytest.fixture(scope="module")
-def simulated() -> str:
-    """What pytest prints of the simulated tests, a line each."""
-    environment = {**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}
-    command = [sys.executable, "-m", "pytest", "-rA", "--tb=short", "-p", "no:xdist", SIMULATED]
-    result = subprocess.run(command, env=environment, capture_output=True, text=True)
-    return result.stdout + result.stderr
-
-
-@pytest.mark.parametrize("name", re.findall(r"^def (test_\w+)", SIMULATED.read_text(), re.M))
-def test_simulated(name: str, simulated: str) -> None:
-    passed = re.findall(rf"^PASSED \S+::{name}\b", simulated, re.M)
-    assert passed and not re.findall(rf"^(FAILED|ERROR) \S+::{name}\b", simulated, re.M), simulated
+@pytest.mark.parametrize("name", names_in(SIMULATED))
+def test_simulated(name: str) -> None:
+    assert_passed(SIMULATED, name)
 
 
 needs_compiler = pytest.mark.skipif(
@@ -58,7 +46,9 @@ def test_a_kernel_takes_eight_byte_numbers_as_many_as_are_packed(name: str) -> N
     parameters = ptx.partition(f".entry {name}(")[2].partition(")")[0]
     dimensions = [int(code[1]) for code in SIGNATURES[name].split()]
     expected = sum(5 + 2 * d if d else 1 for d in dimensions)
-    assert re.findall(r"\.param \.(\w+)", parameters) == ["u64"] * expected
+    kinds = re.findall(r"\.param \.(\w+)", parameters)
+    assert len(kinds) == expected and set(kinds) <= {"u64", "f64"}
+    assert kinds.count("f64") == SIGNATURES[name].split().count("d0")
 
 
 @needs_compiler

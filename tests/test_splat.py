@@ -20,6 +20,7 @@ from hdr_nsff.fields.outputs import select_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import MAX_LOG_RADIANCE, Gaussians
 from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
 from hdr_nsff.fields.splat.trajectories import WINDOW
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, whole_frame
@@ -224,17 +225,21 @@ def test_a_step_moves_only_the_poses_near_the_drawn_frame(
 def test_invisible_gaussians_are_left_alone_by_the_regularizers() -> None:
     field = scattered()
     field.static.opacity_logits.data[:10] = -10.0
-    own = field.regularizers(field.cloud(3.0), 3.0)
+    own = regularizers(field.model(), field.cloud(3.0), 3.0)
     (own["opacity"] + own["scale"]).backward()
     for g in (field.static.opacity_logits.grad, field.static.log_scales.grad):
         assert g is not None and float(g[:10].abs().max()) == 0 and float(g[10:].abs().min()) > 0
     field.static.log_scales.data[:10] += 5.0
-    torch.testing.assert_close(field.regularizers(field.cloud(3.0), 3.0)["scale"], own["scale"])
+    torch.testing.assert_close(
+        regularizers(field.model(), field.cloud(3.0), 3.0)["scale"], own["scale"]
+    )
 
 
 def test_the_regularizers_of_a_plain_field_by_hand() -> None:
     field = card_field()
-    own = {k: float(v.detach()) for k, v in field.regularizers(field.cloud(3.0), 3.0).items()}
+    own = {
+        k: float(v.detach()) for k, v in regularizers(field.model(), field.cloud(3.0), 3.0).items()
+    }
     assert own["opacity"] == pytest.approx(1 / (1 + math.exp(-6)))
     scale = (825 * (0.2 + 1e-3) + 121 * (0.08 + 1e-3)) / 3 / 946  # near is 1
     assert own["scale"] == pytest.approx(scale, rel=1e-5)
@@ -245,7 +250,7 @@ def test_the_regularizers_of_a_plain_field_by_hand() -> None:
 def test_the_color_change_by_hand() -> None:
     field = card_field()
     field.moving.log_radiance_offsets.data[3] = 2.0  # up and down: 2 of 6 differences; 1 of 7 times
-    change = field.regularizers(field.cloud(3.0), 3.0)["color_change"].detach()
+    change = regularizers(field.model(), field.cloud(3.0), 3.0)["color_change"].detach()
     assert float(change) == pytest.approx(4 * 2 / 6 + 0.01 * 4 / 7)
 
 
@@ -404,13 +409,15 @@ def test_neighbors_with_equal_mixtures_are_rigid_and_others_cost() -> None:
     field = card_field()  # equal mixtures; a grid of 11 x 11 Gaussians
     field.find_neighbors()
     assert set(field.neighbors[60].tolist()) == {49, 59, 61, 71}  # the middle one's four
-    assert float(field.rigidity().detach()) == 0
+    assert float(mixture_difference(field.mixture_logits, field.neighbors).detach()) == 0
     # 0.8808 and 0.1192 instead of halves
     field.mixture_logits.data[:, 60] = torch.tensor([1.0, -1.0])
     pairs = int((field.neighbors == 60).sum()) + 4  # those whose neighbor it is, and its own
     expected = pairs * 2 * 0.3808**2 / (121 * 4 * 2)
-    assert float(field.rigidity().detach()) == pytest.approx(expected, rel=1e-3)
-    field.rigidity().backward()
+    assert float(
+        mixture_difference(field.mixture_logits, field.neighbors).detach()
+    ) == pytest.approx(expected, rel=1e-3)
+    mixture_difference(field.mixture_logits, field.neighbors).backward()
     assert field.mixture_logits.grad is not None and float(field.mixture_logits.grad[0, 60]) > 0
 
 

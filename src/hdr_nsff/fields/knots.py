@@ -36,9 +36,16 @@ def interpolate_linear(values: Tensor, position: float) -> Tensor:
     """`values` (K, ...) at `position` in [0, K - 1], linear in between: (...)."""
     if len(values) == 1:
         return values[0]
-    low = min(int(position), len(values) - 2)
-    fraction = position - low
+    low, fraction = linear_position(len(values), position)
     return weighted_rows(values[low : low + 2], [1 - fraction, fraction])
+
+
+def linear_position(count: int, position: float) -> tuple[int, float]:
+    """The row below a position in [0, count - 1], and the share of the next one."""
+    if count == 1:
+        return 0, 0.0
+    low = min(int(position), count - 2)
+    return low, position - low
 
 
 def catmull_rom(values: Tensor, position: float) -> Tensor:
@@ -47,9 +54,17 @@ def catmull_rom(values: Tensor, position: float) -> Tensor:
     The cubic has continuous velocity (Catmull and Rom 1974). Both ends are extended in
     a straight line, so that linear motion is reproduced everywhere.
     """
-    last = len(values) - 1
-    if last == 0:
+    if len(values) == 1:
         return values[0]
+    first_row, weights = catmull_rom_weights(len(values), position)
+    return weighted_rows(values[first_row : first_row + len(weights)], weights)
+
+
+def catmull_rom_weights(count: int, position: float) -> tuple[int, list[float]]:
+    """The first of `count` rows that `catmull_rom` adds up, and their weights."""
+    last = count - 1
+    if last == 0:
+        return 0, [1.0]
     low = min(max(int(position), 0), last - 1)
     u = position - low
     # weights of the rows low - 1, low, low + 1, low + 2
@@ -65,7 +80,7 @@ def catmull_rom(values: Tensor, position: float) -> Tensor:
         after = 0.0
     first_row, end_row = max(low - 1, 0), min(low + 3, last + 1)
     weights = [before, start, end, after][first_row - low + 1 : end_row - low + 1]
-    return weighted_rows(values[first_row:end_row], weights)
+    return first_row, weights
 
 
 def weighted_rows(values: Tensor, weights: list[float]) -> Tensor:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import torch
 from torch import Tensor
@@ -59,6 +60,13 @@ class PixelBatch:
         return self.whole or bool(self.uniform.all())
 
 
+def neighbor_in_turn(batch: PixelBatch) -> list[int]:
+    """The offset of the one neighbor with known flow whose turn it is, if any."""
+    offsets = [o for o in batch.neighbors if o in batch.flow]
+    turn = batch.seed // 2 % max(len(offsets), 1)
+    return offsets[turn : turn + 1]
+
+
 def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = None) -> PixelBatch:
     """The batch of integer `pixels` (N, 2; column, row) of training frame `frame`."""
     column, row = pixels[:, 0], pixels[:, 1]
@@ -67,6 +75,19 @@ def gather(scene: Scene, frame: int, pixels: Tensor, uniform: Tensor | None = No
         return image[row, column]
 
     return batch_of(scene, frame, pixels + 0.5, select, uniform)
+
+
+@lru_cache(maxsize=8)
+def all_pixels(width: int, height: int, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Pixel centers (N, 2) row by row, and that all are drawn uniformly (N,).
+
+    These are constants, not to be changed.
+    """
+    with torch.inference_mode(False):
+        pose = torch.eye(4, device=device)[:3]
+        camera = Camera(torch.eye(3, device=device), pose, width, height)
+        uniform = torch.ones(width * height, dtype=torch.bool, device=device)
+        return camera.pixel_grid(), uniform
 
 
 def whole_frame(scene: Scene, frame: int) -> PixelBatch:
@@ -78,7 +99,9 @@ def whole_frame(scene: Scene, frame: int) -> PixelBatch:
     def select(image: Tensor) -> Tensor:
         return image.flatten(0, 1)
 
-    batch = batch_of(scene, frame, scene.train[frame].camera.pixel_grid(), select)
+    camera = scene.train[frame].camera
+    pixels, all_uniform = all_pixels(camera.width, camera.height, camera.K.device)
+    batch = batch_of(scene, frame, pixels, select, all_uniform)
     return replace(batch, whole=True)
 
 

@@ -9,12 +9,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import curve
 from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper
 from hdr_nsff.tonemap.curve import GAMMA
+from hdr_nsff.tonemap.fused_tone import Held, Learned, fused_recording, fused_regularizers
 from hdr_nsff.tonemap.kernel import bin_table
 from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
 from hdr_nsff.tonemap.vignetting import Vignetting
@@ -172,10 +174,43 @@ class SharedToneMapper(BracketedToneMapper):
             return radiance
         if pixels is None:
             pixels = camera.pixel_grid()
-        return radiance * self.vignetting(camera, pixels, camera_id)
+        return self.vignetting.shade(radiance, camera, pixels, camera_id)
 
     def curve_values(self, camera_id: int, images: Tensor | int | None) -> Tensor:
         return self.response.values(camera_id)
+
+    def forward(
+        self,
+        radiance: Tensor,
+        bracket: int,
+        camera_id: int = 0,
+        frame: int | None = None,
+        leaky: bool = True,
+    ) -> Tensor:
+        if not kernels_on(self.knots.device):
+            return super().forward(radiance, bracket, camera_id, frame, leaky)
+        assert radiance.shape[-1] == 3, radiance.shape
+        state = self.learned(), self.held()
+        gain, values = fused_recording(*state, bracket, camera_id, frame)
+        leak = self.config.leak if leaky else None
+        rgb = radiance.float()
+        return curve.record(rgb, gain, values, self.knots, self.bins, self.power, leak)
+
+    def learned(self) -> Learned:
+        """What is learned, for CUDA kernels."""
+        gain, none = self.bracket_gain, self.knots.new_empty(0, 3)
+        residual = none if gain.residual is None else gain.residual
+        vignetting = none if self.vignetting is None else self.vignetting.coefficients
+        return Learned(
+            self.response.logits, gain.learned_ev, gain.white_balance, residual, vignetting
+        )
+
+    def held(self) -> Held:
+        """What is given and held, for CUDA kernels."""
+        gain = self.bracket_gain
+        given = gain.known, gain.unknown, gain.drift
+        anchors = self.anchor_curve, self.anchor_ev, self.anchor_white_balance
+        return Held(*given, *anchors, self.is_anchored(), self.config.min_step)
 
     def set_curve(self, x: Tensor, y: Tensor, camera_id: int | None = None) -> None:
         """Start the response from a curve y (3, M) over x (M,) in [0, 1].
@@ -209,6 +244,8 @@ class SharedToneMapper(BracketedToneMapper):
         balances: for a camera that recorded one bracket only, exposure and white
         balance cannot be separated. `response_anchor` is 0 until `anchor()`.
         """
+        if kernels_on(self.knots.device):
+            return fused_regularizers(self.learned(), self.held())
         gain = self.bracket_gain
         small = [t for t in (gain.residual, gain.white_balance) if t is not None and t.numel()]
         residual = self.knots.new_zeros(())

@@ -9,7 +9,9 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.tonemap.kernel import Respond
+from hdr_nsff.tonemap.kernel_cuda import RespondCuda
 
 NUM_KNOTS = 256
 GAMMA = 2.2
@@ -60,11 +62,13 @@ def record(
 ) -> Tensor:
     """g(gain * radiance) (N, 3) for radiance (N, 3), gain (3,) and a curve (3, K).
 
-    `leak` is that of eq. 11, None clamps. On the CPU one fused kernel does it.
+    `leak` is that of eq. 11, None clamps. One fused kernel does it where there is one.
     """
     inputs = (radiance, gain, values)
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in inputs):
         return Respond.apply(radiance, gain, values, knots, bins, leak)
+    if radiance.dtype == torch.float32 and kernels_on(radiance.device):
+        return RespondCuda.apply(radiance, gain, values, knots, leak)
     x = radiance * gain
     y = piecewise_linear(x, values, knots, power)
     return y if leak is None else leaky_ends(x, y, leak)

@@ -14,8 +14,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.tonemap.kernel_cuda import ShadeCuda
 
 # standard deviation of r^2 over the frames that see a point, averaged over points:
 # below it a clip determines no vignetting (hand-chosen: real pans have 0.04 to 0.09,
@@ -40,6 +42,14 @@ class Vignetting(nn.Module):
         r2 = squared_tangent(camera, pixels)[:, None] / self.corners[camera_id]
         v1, v2, v3 = self.coefficients[camera_id]
         return (1 + r2 * (v1 + r2 * (v2 + r2 * v3))).clamp_min(MIN_TRANSMISSION)
+
+    def shade(self, radiance: Tensor, camera: Camera, pixels: Tensor, camera_id: int) -> Tensor:
+        """What of `radiance` (N, 3) a camera's lens passes to `pixels` (N, 2)."""
+        if camera.K.requires_grad or not kernels_on(radiance.device):
+            return radiance * self(camera, pixels, camera_id)
+        lens = camera.K, self.corners, camera_id, MIN_TRANSMISSION
+        shaded: Tensor = ShadeCuda.apply(radiance, self.coefficients, pixels, *lens)
+        return shaded
 
     def size(self) -> Tensor:
         """Mean square of the coefficients: how far from none."""

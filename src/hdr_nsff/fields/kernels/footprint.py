@@ -10,7 +10,7 @@ c dy)^2. Multiplied out, float32 would lose needles whose center is far away.
 
 Everything is computed in float64 and in plain tuples, without arrays: numba compiles
 these functions for the CPU (`projection.py`), and numba-cuda the same ones for NVIDIA
-GPUs (`cuda/kernels.py`). The plain-torch twin is `rasterize.project`.
+GPUs (`cuda/gaussian_kernels.py`). The plain-torch twin is `rasterize.project`.
 """
 
 from __future__ import annotations

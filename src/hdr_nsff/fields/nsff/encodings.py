@@ -17,6 +17,9 @@ from torch import Tensor, nn
 
 from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.kernels import grid as kernels
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
 
 Shape = tuple[int, int, int, int]  # x, y, z grid points and time slices
 ON_SLICE = 1e-5  # of a slice's distance: a time this near to a slice reads it alone
@@ -234,6 +237,12 @@ class TouchedAdam(torch.optim.Optimizer):
             tensors = (p, p.grad, m, v, self.marks[p])
             arrays = [tensor.detach().numpy() for tensor in tensors]
             kernels.adam_rows(*arrays, lr, beta1, beta2, eps, correction1, correction2)
+            return
+        if kernels_on(p.device):
+            tensors = (p.detach(), p.grad.contiguous(), m, v, self.marks[p])
+            numbers = float(lr), beta1, beta2, eps, correction1, correction2
+            launch("adam_rows", blocks_for(len(p)), THREADS, *tensors, *numbers)
+            p.grad = None  # the next one is taken as it is, not added to zeros
             return
         rows = (p.grad != 0).any(-1, keepdim=True)
         m.copy_(torch.where(rows, beta1 * m + (1 - beta1) * p.grad, m))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.progress import say
+from hdr_nsff.fields.kernels.cuda.launch import load_all
 from hdr_nsff.fields.splat import rasterize_cuda, rasterize_gsplat
 
 # Gaussians, w2c (3, 4), K (3, 3) and size (width, height) to features, z-depth, alpha
@@ -46,6 +47,20 @@ def find_backend(device: str = "cuda") -> Backend:
 def fault(device: str = "cuda") -> str | None:
     """Why no rasterizer draws on `device`, and how to fix it; None where one does."""
     return find_backend(device).fault
+
+
+@cache
+def kernels_on(device: torch.device) -> bool:
+    """Whether all of our own kernels run on a device; says once where only some do."""
+    if device.type != "cuda" or rasterize_cuda.fault(str(device)) is not None:
+        return False
+    try:
+        load_all(device)
+    except Exception as error:  # of any type: compilers and drivers take part
+        reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]:.120}"
+        say(f"training steps are plain torch, which is slower: {reason}")
+        return False
+    return True
 
 
 @cache

@@ -46,6 +46,11 @@ def scale_radiance(radiance: Tensor, log_factor: Tensor, bounded: bool) -> Tenso
     return radiance * factor / (1 - radiance + radiance * factor)
 
 
+def mean_square(values: Tensor) -> Tensor:
+    """Mean of the squares; 0 of no values."""
+    return values.square().sum() / max(values.numel(), 1)
+
+
 class Gaussians(nn.Module):
     """`count` Gaussians at rest, whose color may change in time and with the view.
 

@@ -2,7 +2,7 @@
 by numba-cuda (extras `gpu` and `gpu12`), without a CUDA toolkit.
 
 torch sorts the (Gaussian, tile) pairs and holds all memory; the kernels in
-`kernels/cuda/kernels.py` do the rest, on torch's current stream. The host waits once a
+`kernels/cuda/` do the rest, on torch's current stream. The host waits once a
 picture: for the number of pairs, before it takes memory for them.
 """
 
@@ -16,11 +16,9 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.fields.kernels.cuda.launch import launch
-from hdr_nsff.fields.kernels.cuda.layout import CHANNELS, PIXELS, THREADS, TILE
+from hdr_nsff.fields.kernels.cuda.layout import CHANNELS, ELLIPSE, PIXELS, THREADS, TILE
 from hdr_nsff.fields.kernels.footprint import MOMENTS
 from hdr_nsff.fields.splat.try_out import fault_of
-
-ELLIPSE = 6  # numbers of a projected Gaussian: pixel center, conic, opacity
 
 
 @cache

@@ -16,28 +16,29 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from hdr_nsff.core.tensors import tree_map
+from hdr_nsff.core.tensors import constant, tree_map
 from hdr_nsff.fields.base import FrameError, ParamGroup, Render, Warp
 from hdr_nsff.fields.knots import interpolate_linear, knot_of, time_at
 from hdr_nsff.fields.outputs import GaussianCloud, select_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
+from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
+from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import LocalScores, relocate
 from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
+from hdr_nsff.fields.splat.terms import MIN_OPACITY, Model, mixture_difference, regularizers
 from hdr_nsff.fields.splat.trajectories import Trajectories
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.batch import PixelBatch
+from hdr_nsff.scene.batch import PixelBatch, neighbor_in_turn
 
 NUM_NEIGHBORS = 4  # of a moving Gaussian, for rigidity
 MAX_VIEW_LOG_FACTOR = 2.0  # by which log radiance may change with the direction of view
 RELOCATE_FRAMES = 24  # training frames whose errors decide what is relocated
-MIN_OPACITY = 0.003  # below, a Gaussian draws nothing: less than ALPHA_MIN = 1/255
 MIN_ALPHA = 1e-3  # of a pixel: below, it has no depth of its own
 MIN_DEPTH_SHARE = 1e-3  # of `near`: the least z-depth that a pixel gets
-MAX_FLOW = 2.0  # picture widths: keeps the flow of Gaussians near the camera finite
-COLOR_OFFSET_SHARE = 0.01  # weight of color offsets relative to their changes in time
 ADAM_EPS = 1e-15  # as 3D Gaussian splatting has it (Kerbl et al. 2023)
 
 
@@ -246,25 +247,67 @@ class Splat(nn.Module):
         """
         knot = self.knot(batch.time)
         flow_turn = batch.seed % 2 == 0
-        offsets = self.choose_neighbor(batch) if flow_turn else []
+        offsets = neighbor_in_turn(batch) if flow_turn else []
         alive = self.alive(knot)
-        cloud = self.cloud(knot, alive)
-        flows = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
-        render, drawn = self.composite(self.expose(batch, cloud, alive, flows))
-        # features are premultiplied by opacity
-        flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
-        certain = torch.ones_like(render.opacity)
+        if self.can_fuse(batch):
+            maps, terms = self.draw_fused(batch, knot, alive, offsets, not flow_turn)
+            least = MIN_DEPTH_SHARE * self.unit
+            numbers = self.bounded, self.far, least, MIN_ALPHA
+            render, flow = fused_composite(maps, self.background, *numbers)
+        else:
+            maps, terms = self.draw_terms(batch, knot, alive, offsets, not flow_turn)
+            render, drawn = self.composite(maps)
+            # features are premultiplied by opacity
+            flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
+        certain = constant((1.0,), flow.device, flow.dtype).expand(len(render.opacity))
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)
-        self.trajectories.mark(knot)
-        self.local.mark(alive)
-        terms = self.regularizers(cloud, knot)
-        if not flow_turn:
-            terms["rigidity"] = self.rigidity()
-            terms["evenness"] = self.local.unevenness(alive, self.unit)
         if not batch.whole:
             render = select_pixels(render, batch.camera, batch.pixels)
         return render, terms
+
+    def draw_terms(
+        self, batch: PixelBatch, knot: float, alive: Tensor, offsets: list[int], rigidity: bool
+    ) -> tuple[Maps, dict[str, Tensor]]:
+        """What the batch sees, with flow to `offsets`, and the field's terms."""
+        cloud = self.cloud(knot, alive)
+        flows = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
+        maps = self.expose(batch, cloud, alive, flows)
+        self.trajectories.mark(knot)
+        self.local.mark(alive)
+        terms = regularizers(self.model(), cloud, knot)
+        if rigidity:
+            terms["rigidity"] = mixture_difference(self.mixture_logits, self.neighbors)
+            terms["evenness"] = self.local.unevenness(alive, self.unit)
+        return maps, terms
+
+    def can_fuse(self, batch: PixelBatch) -> bool:
+        """Whether kernels make the Gaussians of the batch's moment: on a GPU, without
+        view dependence, shutter or learned cameras.
+        """
+        cameras = batch.camera, *batch.neighbors.values()
+        learned = any(c.c2w.requires_grad or c.K.requires_grad for c in cameras)
+        special = learned or self.shutter is not None or self.config.view_dependence
+        return not special and kernels_on(self.background.device)
+
+    def draw_fused(
+        self, batch: PixelBatch, knot: float, alive: Tensor, offsets: list[int], rigidity: bool
+    ) -> tuple[Maps, dict[str, Tensor]]:
+        """`draw_terms` by CUDA kernels, with flow to one neighbor at most."""
+        neighbor = None
+        for offset in offsets:
+            there = min(max(knot + offset, 0), len(self.times) - 1)
+            neighbor = there, self.time(there), batch.neighbors[offset]
+        when = knot, self.time(knot), self.share(knot)
+        moment = Moment(*when, batch.camera, neighbor, rigidity)
+        cloud = fused_cloud(self.model(), moment, alive)
+        gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
+        return rasterize(*gaussians, cloud.features, batch.camera), cloud.terms
+
+    def model(self) -> Model:
+        """All kinds of Gaussians together."""
+        kinds = self.static, self.moving, self.local, self.trajectories
+        return Model(*kinds, self.opacity_offsets, self.mixture_logits, self.neighbors, self.unit)
 
     def expose(
         self, batch: PixelBatch, cloud: GaussianCloud, alive: Tensor, extra: list[Tensor]
@@ -287,13 +330,6 @@ class Splat(nn.Module):
         motion = apparent_motion(batch.camera, neighbors, cloud.means, batch.time)
         return Maps(*self.shutter.expose(draw, batch.camera, cloud.means, motion, batch.bracket))
 
-    @staticmethod
-    def choose_neighbor(batch: PixelBatch) -> list[int]:
-        """The offset of the one neighbor with known flow whose turn it is, if any."""
-        offsets = [o for o in batch.neighbors if o in batch.flow]
-        turn = batch.seed // 2 % max(len(offsets), 1)
-        return offsets[turn : turn + 1]
-
     def flow_to_neighbor(
         self, batch: PixelBatch, means: Tensor, alive: Tensor, knot: float, offset: int
     ) -> Tensor:
@@ -307,38 +343,6 @@ class Splat(nn.Module):
         camera, neighbor = batch.camera, batch.neighbors[offset]
         limit = MAX_FLOW * camera.width
         return (neighbor.project(moved)[0] - camera.project(means)[0]).clamp(-limit, limit)
-
-    def regularizers(self, cloud: GaussianCloud, knot: float) -> dict[str, Tensor]:
-        """The field's own terms of the `cloud` at `knot`, by their `LossWeights` names.
-
-        Mean opacity and scale keep Gaussians few and small (3DGS-MCMC, Kheradmand et
-        al. 2024); the others keep poses smooth and changes in time small.
-        """
-        static, moving = self.static, self.moving
-        visible = cloud.opacities.detach() > MIN_OPACITY
-        color_change = mean_square(moving.log_radiance_offsets.diff(dim=0))
-        color_offset = mean_square(moving.log_radiance_offsets)
-        terms = {
-            "opacity": (cloud.opacities * visible).mean(),
-            "scale": (cloud.scales * visible[:, None]).mean() / self.unit,
-            "trajectory": self.trajectories.roughness(knot, self.unit),
-            "brightness_drift": mean_square(static.log_radiance_offsets),
-            "opacity_offsets": mean_square(self.opacity_offsets.diff(dim=0)),
-            "color_change": color_change + COLOR_OFFSET_SHARE * color_offset,
-        }
-        if self.config.view_dependence:
-            terms["sh1"] = mean_square(static.sh1) + mean_square(moving.sh1)
-        return terms
-
-    def rigidity(self) -> Tensor:
-        """Mean square difference of the mixtures of neighboring moving Gaussians.
-
-        Gaussians with the same mixture of motions keep their distances.
-        """
-        mixture = self.mixture_logits.softmax(0)  # (B, M)
-        of_neighbors = mixture[:, self.neighbors.long().flatten()]
-        own = mixture.repeat_interleave(self.neighbors.shape[1], 1)
-        return mean_square(of_neighbors - own)
 
     @torch.no_grad()
     def find_neighbors(self) -> None:
@@ -442,8 +446,3 @@ class Splat(nn.Module):
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""
         return []
-
-
-def mean_square(values: Tensor) -> Tensor:
-    """Mean of the squares; 0 of no values."""
-    return values.square().sum() / max(values.numel(), 1)

@@ -12,9 +12,9 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +22,14 @@ from typing import Any
 from hdr_nsff.fields.kernels import compositing, footprint
 from hdr_nsff.fields.kernels.cuda import layout
 
+# groups of arguments of the kernels that make the Gaussians of a moment: what was
+# learned of each kind, time and cameras, and what is made
+STATIC, MOVING, LOCAL = "f2 f2 f2 f1 f2 f3", "f2 f2 f2 f1 f2 f3 f3 f2", "f2 f2 f2 f2 f2"
+SIGHT, CLOUD = "d1 f2 f2 f2 f2", "f2 f2 f2 f1 f2 f1"
+PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and known before
+MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
+# what a tone mapper has learned and holds, and which of it is wanted
+TONE = "f3 f1 i1 f1 f1 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 d1 i0 i0 f2 f1 s2 i1",
@@ -29,7 +37,32 @@ SIGNATURES = {
     "forward": "i1 s1 f2 f2 f3 f2",
     "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2",
     "project_backward": "f2 f2 f2 f1 d1 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
+    "cloud": f"{STATIC} {MOVING} f2 f2 f2 {LOCAL} i1 s2 s2 {SIGHT} {CLOUD}",
+    "static_backward": f"f2 f2 f1 f2 f3 {SIGHT} {CLOUD} {STATIC}",
+    "moving_backward": f"{MOVING} f2 f2 f2 s2 i0 {SIGHT} {CLOUD} {MOVING} f2",
+    "trajectory_backward": "f2 f2 f2 d1 i0 f2 f1 f2 f2 b1 b1",
+    "adam_rows": "f2 f2 f2 f2 b1 d0 d0 d0 d0 d0 d0",
+    "respond": "f2 f1 f2 f1 i0 d0 f2",
+    "respond_backward": "f2 f1 f2 f1 i0 d0 f2 f2 f1 f2",
+    "shade": "f2 f2 f2 f1 f2 i0 d0 f2",
+    "shade_backward": "f2 f2 f2 f1 f2 i0 d0 f2 f2 f2",
+    "losses": f"{PIXELS} d0 d0 d0 d0 f1",
+    "losses_backward": f"{PIXELS} d0 d0 d0 d0 f1 f1 f2 f1 f1 f2",
+    "compose": f"{MAPS} f2 f1 f1 f2",
+    "compose_backward": f"{MAPS} f2 f1 f1 f2 f2 f1 f1 f1",
+    "tone": f"{TONE} f3 f1 f1",
+    "tone_backward": f"{TONE} f3 f1 f3 f1 f1 f3 f1 f2 f2 f2",
+    "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",
 }
+MODULES = (
+    "gaussian_kernels",
+    "tile_kernels",
+    "cloud_kernels",
+    "cloud_gradients",
+    "adam_kernels",
+    "picture_kernels",
+    "tone_kernels",
+)  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
 FAST = ("forward", "backward")
 PACKAGES = ("numba", "numba-cuda", "cuda-bindings", "nvidia-nvvm", "nvidia-cuda-nvcc-cu12")
@@ -46,14 +79,20 @@ def compile_kernel(name: str, capability: tuple[int, int]) -> bytes:
         return ptx.encode() + b"\0"
 
 
+def kernel_function(name: str) -> Callable[..., None]:
+    """The Python function of a kernel."""
+    modules = [import_module(f"hdr_nsff.fields.kernels.cuda.{m}") for m in MODULES]
+    found: Callable[..., None] = next(getattr(m, name) for m in modules if hasattr(m, name))
+    return found
+
+
 def compile_ptx(name: str, capability: tuple[int, int]) -> str:
     """The PTX of a kernel for GPUs of a compute capability such as (8, 9)."""
     from numba import cuda, types
     from numba.cuda import dispatcher
 
-    from hdr_nsff.fields.kernels.cuda import kernels
-
     kinds = {"f": types.float32, "d": types.float64, "s": types.int32, "i": types.int64}
+    kinds["b"] = types.uint8
 
     def type_of(code: str) -> Any:
         kind, dimensions = kinds[code[0]], int(code[1])
@@ -65,7 +104,7 @@ def compile_ptx(name: str, capability: tuple[int, int]) -> str:
     dispatcher.get_current_device = lambda: device
     try:
         ptx, _ = cuda.compile(
-            getattr(kernels, name),
+            kernel_function(name),
             signature,
             device=False,
             fastmath=name in FAST,
@@ -127,7 +166,8 @@ def cache_folder() -> Path:
 def fingerprint() -> str:
     """Changes with the sources of the kernels and the versions of the compiler."""
     here = Path(__file__)
-    sources = [here, here.with_name("kernels.py"), Path(layout.__file__)]
+    sources = [here, here.with_name("device.py"), Path(layout.__file__)]
+    sources += [here.with_name(f"{module}.py") for module in MODULES]
     sources += [Path(str(m.__file__)) for m in (compositing, footprint)]
     digest = hashlib.sha256()
     for path in sources:

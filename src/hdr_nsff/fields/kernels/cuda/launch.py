@@ -18,13 +18,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels.cuda.compile import load_kernel
+from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES, kernel_function, load_kernel
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
 
 # the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
 BUFFER_END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
 
 
-def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
+def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | float) -> None:
     """Run a kernel in `grid` blocks of `threads`, all tensors on one device.
 
     Tensors are contiguous, and of the types in `compile.SIGNATURES`.
@@ -41,18 +42,26 @@ def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | 
         driver().launch(function, grid, threads, stream, pack(*arguments))
 
 
-def pack(*arguments: Tensor | int) -> bytes:
+def blocks_for(count: int) -> tuple[int, int]:
+    """The grid of a kernel with a thread for each of `count`, THREADS in a block."""
+    return -(-count // THREADS), 1
+
+
+def pack(*arguments: Tensor | float) -> bytes:
     """Arguments as a kernel's parameters lie in memory."""
-    numbers: list[int] = []
+    numbers: list[float] = []
+    kinds = ""
     for a in arguments:
         if isinstance(a, Tensor):
             assert a.is_contiguous(), f"strides {a.stride()} of shape {tuple(a.shape)}"
             size = a.element_size()
             numbers += (0, 0, a.numel(), size, a.data_ptr(), *a.shape)
             numbers += (stride * size for stride in a.stride())
+            kinds += "q" * (5 + 2 * a.ndim)
         else:
             numbers.append(a)
-    return struct.pack(f"{len(numbers)}q", *numbers)
+            kinds += "d" if isinstance(a, float) else "q"
+    return struct.pack(kinds, *numbers)
 
 
 @cache
@@ -60,6 +69,13 @@ def loaded_kernel(name: str, device: int) -> ctypes.c_void_p:
     """A kernel in the memory of a CUDA device, which is the current one."""
     image = load_kernel(name, torch.cuda.get_device_capability(device))
     return driver().load(image, name, device)
+
+
+def load_all(device: torch.device) -> None:
+    """Compile every kernel for a CUDA device, and load it there."""
+    with torch.cuda.device(device):
+        for name in SIGNATURES:
+            loaded_kernel(name, torch.cuda.current_device())
 
 
 @cache
@@ -123,15 +139,13 @@ class Driver:
         self.call("cuLaunchKernel", function, *blocks, shared_bytes, queue, None, extra)
 
 
-def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | int) -> None:
+def simulate(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | float) -> None:
     """Run a kernel on tensors of the CPU by numba-cuda's simulator, in Python."""
     from numba import cuda
     from numba.core import config
 
     if not config.ENABLE_CUDASIM:
         raise RuntimeError("CUDA kernels take tensors of the CPU with NUMBA_ENABLE_CUDASIM=1")
-    from hdr_nsff.fields.kernels.cuda import kernels
-
-    kernel = cuda.jit(getattr(kernels, name))
+    kernel = cuda.jit(kernel_function(name))
     values = (a.detach().numpy() if isinstance(a, Tensor) else a for a in arguments)
     kernel[grid, threads](*values)

@@ -1,0 +1,146 @@
+"""CUDA kernels with a thread per Gaussian: into the picture, its tiles, and backwards.
+
+They call the CPU's functions for everything about one Gaussian (`footprint.py`).
+Shapes: G Gaussians, P (Gaussian, tile) pairs. The simulator of numba-cuda replaces the
+name `cuda` in this module.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import cuda
+
+from hdr_nsff.fields.kernels import footprint
+from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
+from hdr_nsff.fields.kernels.cuda.layout import TILE
+from hdr_nsff.fields.kernels.footprint import MOMENTS
+from hdr_nsff.fields.kernels.projection import ZERO
+
+FOOTPRINT = device_functions(footprint, fastmath=False)
+footprint_of, ellipse_of = FOOTPRINT["footprint"], FOOTPRINT["ellipse"]
+world_gradients = FOOTPRINT["world_gradients"]
+
+
+@exact_device
+def read_gaussian(g, means, quaternions, scales):
+    """Mean, quaternion and scales of a Gaussian in float64."""
+    m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+    q = (
+        float(quaternions[g, 0]),
+        float(quaternions[g, 1]),
+        float(quaternions[g, 2]),
+        float(quaternions[g, 3]),
+    )
+    return m, q, (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+
+
+@exact_device
+def read_camera(camera):
+    """World-to-camera matrix, row by row, and (fx, fy, cx, cy) of `camera` (16,)."""
+    view = (
+        (camera[0], camera[1], camera[2], camera[3]),
+        (camera[4], camera[5], camera[6], camera[7]),
+        (camera[8], camera[9], camera[10], camera[11]),
+    )
+    return view, (camera[12], camera[13], camera[14], camera[15])
+
+
+def project(
+    means, quaternions, scales, opacities, camera, width, height, ellipses, depths, boxes, counts
+):  # fmt: skip
+    """Project world Gaussians, one thread each, as `projection.project` does.
+
+    `camera` (16,) float64 is the world-to-camera matrix row by row, then fx, fy, cx,
+    cy. Fills `ellipses` (G, ELLIPSE), z-`depths` (G,), tile `boxes` (G, 4: x0, y0, x1,
+    y1; ends excluded) and `counts` (G,), the number of tiles; 0 where nothing shows.
+    """
+    g = cuda.grid(1)
+    if g >= means.shape[0]:
+        return
+    m, q, s = read_gaussian(g, means, quaternions, scales)
+    view, k = read_camera(camera)
+    t, _, _, _, _, covariance = footprint_of(m, q, s, view, k, width, height)
+    shows, center, conic, bounds = ellipse_of(t, covariance, float(opacities[g]), k, width, height)
+    depths[g] = t[2]
+    ellipses[g, 0], ellipses[g, 1] = center[0], center[1]
+    ellipses[g, 2], ellipses[g, 3], ellipses[g, 4] = conic[0], conic[1], conic[2]
+    ellipses[g, 5] = opacities[g]
+    x0 = y0 = x1 = y1 = 0
+    if shows:
+        tiles_x, tiles_y = (width + TILE - 1) // TILE, (height + TILE - 1) // TILE
+        x0, y0 = int(bounds[0]) // TILE, int(bounds[1]) // TILE
+        x1 = min(int(bounds[2]) // TILE + 1, tiles_x)
+        y1 = min(int(bounds[3]) // TILE + 1, tiles_y)
+    boxes[g, 0], boxes[g, 1], boxes[g, 2], boxes[g, 3] = x0, y0, x1, y1
+    counts[g] = (x1 - x0) * (y1 - y0)
+
+
+def list_pairs(boxes, ends, depth_bits, tiles_x, keys, owners):
+    """List every Gaussian's tiles, one thread per Gaussian.
+
+    `ends` (G,) are the running sums of `counts`, `depth_bits` (G,) the bits of the
+    depths, which sort like these where they are positive. Fills `keys` (P,), tile in
+    the upper and depth in the lower half, and `owners` (P,), the Gaussians.
+    """
+    g = cuda.grid(1)
+    if g >= boxes.shape[0]:
+        return
+    x0, y0, x1, y1 = boxes[g, 0], boxes[g, 1], boxes[g, 2], boxes[g, 3]
+    i = ends[g] - (x1 - x0) * (y1 - y0)
+    depth = np.int64(depth_bits[g])
+    for y in range(y0, y1):
+        for x in range(x0, x1):
+            keys[i] = (np.int64(y * tiles_x + x) << 32) | depth
+            owners[i] = g
+            i += 1
+
+
+def project_backward(
+    means, quaternions, scales, opacities, camera, width, height, counts, sums, depth_channel,
+    grad_means, grad_quaternions, grad_scales, grad_opacities, grad_view,
+):  # fmt: skip
+    """Carry `sums` of `backward` back to the world, one thread per Gaussian.
+
+    Arguments as in `project`; `depth_channel` is the feature that is the z-depth. Fills
+    the `grad_...`, shaped like what they belong to. `grad_view` is (G, 12), or (0, 12)
+    if it is not wanted.
+    """
+    g = cuda.grid(1)
+    if g >= means.shape[0]:
+        return
+    if counts[g] == 0:
+        for n in range(3):
+            grad_means[g, n] = ZERO
+            grad_scales[g, n] = ZERO
+        for n in range(4):
+            grad_quaternions[g, n] = ZERO
+        grad_opacities[g] = ZERO
+        if grad_view.shape[0] > 0:
+            for n in range(12):
+                grad_view[g, n] = ZERO
+        return
+    m, q, s = read_gaussian(g, means, quaternions, scales)
+    view, k = read_camera(camera)
+    u = (
+        float(sums[g, 0]),
+        float(sums[g, 1]),
+        float(sums[g, 2]),
+        float(sums[g, 3]),
+        float(sums[g, 4]),
+        float(sums[g, 5]),
+    )
+    grad_opacities[g] = -sums[g, 0] / opacities[g]  # dL / do = dL / dalpha * alpha / o
+    d_depth = float(sums[g, MOMENTS + depth_channel])
+    d_mean, d_quaternion, d_scales, d_view = world_gradients(
+        m, q, s, view, k, width, height, u, d_depth
+    )
+    for n in range(3):
+        grad_means[g, n] = d_mean[n]
+        grad_scales[g, n] = d_scales[n]
+    for n in range(4):
+        grad_quaternions[g, n] = d_quaternion[n]
+    if grad_view.shape[0] > 0:
+        for n in range(4):
+            grad_view[g, n] = d_view[0][n]
+            grad_view[g, 4 + n] = d_view[1][n]
+            grad_view[g, 8 + n] = d_view[2][n]

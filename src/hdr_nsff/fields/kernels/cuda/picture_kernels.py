@@ -1,0 +1,308 @@
+"""CUDA kernels of a picture's pixels: what a lens passes, what a camera records of it,
+and the differences to the recording and the priors; with their gradients.
+
+A thread takes every so many pixels. Sums over pixels are added up in shared memory
+first. The plain-torch twins are `Vignetting`, `curve.record` and `maths/losses.py`.
+Shapes: N pixels, K <= MAX_KNOTS points of a response curve. The simulator of numba-cuda
+replaces the name `cuda` in this module.
+"""
+
+from __future__ import annotations
+
+import math
+
+from numba import cuda, float32
+
+from hdr_nsff.fields.kernels.cuda.cloud_kernels import radiance_of
+from hdr_nsff.fields.kernels.cuda.device import exact_device
+from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS, PICTURE_SUMS, THREADS
+
+CURVES = 3 * MAX_KNOTS
+# positions in `sums` of `losses`: the terms, valid pixels of flow, blocks that are done
+PHOTOMETRIC, DEPTH, MASK, FLOW, VALID, DONE = 0, 1, 2, 3, 4, 5
+
+
+@exact_device
+def bin_of(x, knots):
+    """Bin with knots[bin] < x <= knots[bin + 1], the first one for 0; x in [0, 1]."""
+    low, high = 0, knots.shape[0] - 1
+    while high - low > 1:
+        middle = (low + high) // 2
+        if x > knots[middle]:
+            low = middle
+        else:
+            high = middle
+    return low
+
+
+def respond(radiance, gain, values, knots, leaky, leak, rgb):
+    """`tonemap.kernel.forward`: fill `rgb` (N, 3) with the recording of `radiance`."""
+    i = cuda.grid(1)
+    if i >= radiance.shape[0]:
+        return
+    for c in range(3):
+        x = radiance[i, c] * gain[c]
+        if x >= 0 and x <= 1:
+            b = bin_of(x, knots)
+            share = (x - knots[b]) / (knots[b + 1] - knots[b])
+            rgb[i, c] = values[c, b] + (values[c, b + 1] - values[c, b]) * share
+        elif x > 1:
+            rgb[i, c] = 1 + leak - leak / math.sqrt(x) if leaky != 0 else values[c, -1]
+        elif x < 0:
+            rgb[i, c] = leak * x if leaky != 0 else values[c, 0]
+        else:
+            rgb[i, c] = x  # NaN
+
+
+@exact_device
+def recorded_slope(x, g, c, values, knots, leaky, leak, curves):
+    """Slope of the recording at x; adds the gradient g to shared `curves` (CURVES,)."""
+    at = c * MAX_KNOTS
+    if x >= 0 and x <= 1:
+        b = bin_of(x, knots)
+        inverse = 1 / (knots[b + 1] - knots[b])
+        right = g * (x - knots[b]) * inverse
+        cuda.atomic.add(curves, at + b, float32(g - right))
+        cuda.atomic.add(curves, at + b + 1, float32(right))
+        return (values[c, b + 1] - values[c, b]) * inverse
+    if leaky != 0:
+        return 0.5 * leak / (x * math.sqrt(x)) if x > 1 else leak
+    if x > 1:
+        cuda.atomic.add(curves, at + values.shape[1] - 1, float32(g))
+    elif x < 0:
+        cuda.atomic.add(curves, at, float32(g))
+    return 0.0
+
+
+def respond_backward(
+    radiance, gain, values, knots, leaky, leak, d_rgb, g_radiance, g_gain, g_values
+):  # fmt: skip
+    """Fill `g_radiance`, and add to the gradients of gain (3,) and curve (3, K)."""
+    curves = cuda.shared.array(CURVES, float32)
+    gains = cuda.shared.array(3, float32)
+    thread = cuda.threadIdx.x
+    for n in range(thread, CURVES, THREADS):
+        curves[n] = 0.0
+    if thread < 3:
+        gains[thread] = 0.0
+    cuda.syncthreads()
+    total0 = total1 = total2 = 0.0
+    for i in range(cuda.grid(1), radiance.shape[0], cuda.gridDim.x * THREADS):
+        for c in range(3):
+            r, g = radiance[i, c], d_rgb[i, c]
+            x = r * gain[c]
+            slope = 0.0
+            if x != x:  # NaN has no bin and no slope, but the curve shall not hide it
+                cuda.atomic.add(curves, c * MAX_KNOTS, x)
+            else:
+                slope = recorded_slope(x, g, c, values, knots, leaky, leak, curves)
+            g_radiance[i, c] = g * slope * gain[c]
+            d = g * slope * r
+            total0 += d if c == 0 else 0.0
+            total1 += d if c == 1 else 0.0
+            total2 += d if c == 2 else 0.0
+    cuda.atomic.add(gains, 0, float32(total0))
+    cuda.atomic.add(gains, 1, float32(total1))
+    cuda.atomic.add(gains, 2, float32(total2))
+    cuda.syncthreads()
+    if thread < 3:
+        cuda.atomic.add(g_gain, thread, gains[thread])
+    for c in range(3):
+        for k in range(thread, values.shape[1], THREADS):
+            cuda.atomic.add(g_values, (c, k), curves[c * MAX_KNOTS + k])
+
+
+@exact_device
+def squared_radius(i, pixels, K, corner):
+    """Squared tangent of pixel i to the axis, 1 at the `corner`."""
+    x = (pixels[i, 0] - K[0, 2]) / K[0, 0]
+    y = (pixels[i, 1] - K[1, 2]) / K[1, 1]
+    return (x * x + y * y) / corner
+
+
+@exact_device
+def transmission(r2, v):
+    """Share of light at a squared radius, of coefficients v (3,), not held yet."""
+    return 1 + r2 * (v[0] + r2 * (v[1] + r2 * v[2]))
+
+
+def shade(radiance, pixels, K, corners, coefficients, camera_id, least, shaded):
+    """Fill `shaded` (N, 3) with what the lens of a camera passes of `radiance`."""
+    i = cuda.grid(1)
+    if i >= radiance.shape[0]:
+        return
+    r2 = squared_radius(i, pixels, K, corners[camera_id])
+    share = max(transmission(r2, coefficients[camera_id]), least)
+    for c in range(3):
+        shaded[i, c] = radiance[i, c] * share
+
+
+def shade_backward(
+    radiance, pixels, K, corners, coefficients, camera_id, least, d_shaded, g_radiance, g
+):  # fmt: skip
+    """Fill `g_radiance`, and add to the gradients `g` (C, 3) of the coefficients."""
+    sums = cuda.shared.array(3, float32)
+    thread = cuda.threadIdx.x
+    if thread < 3:
+        sums[thread] = 0.0
+    cuda.syncthreads()
+    d0 = d1 = d2 = 0.0
+    for i in range(cuda.grid(1), radiance.shape[0], cuda.gridDim.x * THREADS):
+        r2 = squared_radius(i, pixels, K, corners[camera_id])
+        free = transmission(r2, coefficients[camera_id])
+        share = max(free, least)
+        d = 0.0
+        for c in range(3):
+            g_radiance[i, c] = d_shaded[i, c] * share
+            d += d_shaded[i, c] * radiance[i, c]
+        if free >= least:
+            d0 += d * r2
+            d1 += d * r2 * r2
+            d2 += d * r2 * r2 * r2
+    cuda.atomic.add(sums, 0, float32(d0))
+    cuda.atomic.add(sums, 1, float32(d1))
+    cuda.atomic.add(sums, 2, float32(d2))
+    cuda.syncthreads()
+    if thread < 3:
+        cuda.atomic.add(g, (camera_id, thread), sums[thread])
+
+
+@exact_device
+def flow_error(i, flow, flow_target):
+    """Absolute difference of flow at pixel i, both axes added up."""
+    return abs(flow[i, 0] - flow_target[i, 0]) + abs(flow[i, 1] - flow_target[i, 1])
+
+
+def losses(
+    rgb, recorded, depth, disparity, confidence, motion, moving, outline, flow, flow_target,
+    flow_valid, near, fade, margin, limit, sums,
+):  # fmt: skip
+    """Add up the terms of the objective in `sums` (PICTURE_SUMS,), which start at 0.
+
+    A prior that is missing has no pixels.
+    """
+    shared = cuda.shared.array(PICTURE_SUMS, float32)
+    thread, count = cuda.threadIdx.x, rgb.shape[0]
+    if thread < PICTURE_SUMS:
+        shared[thread] = 0.0
+    cuda.syncthreads()
+    picture = far = mask = moved = valid = 0.0
+    for i in range(cuda.grid(1), count, cuda.gridDim.x * THREADS):
+        for c in range(3):
+            picture += abs(rgb[i, c] - recorded[i, c])
+        if disparity.shape[0] > 0:
+            trust = confidence[i] if confidence.shape[0] > 0 else float32(1.0)
+            far += trust * abs(1 / depth[i] - disparity[i])
+        if moving.shape[0] > 0 and (outline.shape[0] == 0 or outline[i] == 0):
+            inside = motion[i] * (1 - 2 * margin) + margin
+            mask -= math.log(inside if moving[i] != 0 else 1 - inside)
+        if flow_valid.shape[0] > 0 and flow_valid[i] != 0:
+            moved += min(flow_error(i, flow, flow_target), limit)
+            valid += 1
+    cuda.atomic.add(shared, PHOTOMETRIC, float32(picture))
+    cuda.atomic.add(shared, DEPTH, float32(far))
+    cuda.atomic.add(shared, MASK, float32(mask))
+    cuda.atomic.add(shared, FLOW, float32(moved))
+    cuda.atomic.add(shared, VALID, float32(valid))
+    cuda.syncthreads()
+    if thread == 0:
+        cuda.atomic.add(sums, PHOTOMETRIC, float32(shared[PHOTOMETRIC] / (3 * count)))
+        cuda.atomic.add(sums, DEPTH, float32(shared[DEPTH] * near * fade / count))
+        cuda.atomic.add(sums, MASK, float32(shared[MASK] / count))
+        cuda.atomic.add(sums, FLOW, float32(shared[FLOW] * fade))
+        cuda.atomic.add(sums, VALID, shared[VALID])
+        cuda.threadfence()
+        if cuda.atomic.add(sums, DONE, float32(1)) == cuda.gridDim.x - 1:
+            total, pixels = cuda.atomic.add(sums, FLOW, float32(0)), sums[VALID]
+            sums[FLOW] = total / max(pixels, float32(1))
+
+
+@exact_device
+def sign(x):
+    """-1, 0 or 1."""
+    return (1.0 if x > 0 else 0.0) - (1.0 if x < 0 else 0.0)
+
+
+def losses_backward(
+    rgb, recorded, depth, disparity, confidence, motion, moving, outline, flow, flow_target,
+    flow_valid, near, fade, margin, limit, sums, d_terms, g_rgb, g_depth, g_motion, g_flow,
+):  # fmt: skip
+    """Fill the gradients of what was rendered, a thread per pixel."""
+    i, count = cuda.grid(1), rgb.shape[0]
+    if i >= count:
+        return
+    for c in range(3):
+        g_rgb[i, c] = d_terms[PHOTOMETRIC] / (3 * count) * sign(rgb[i, c] - recorded[i, c])
+    g_depth[i] = g_motion[i] = 0.0
+    if disparity.shape[0] > 0:
+        trust = confidence[i] if confidence.shape[0] > 0 else float32(1.0)
+        inverse = 1 / depth[i]
+        d = trust * sign(inverse - disparity[i]) * near * fade / count
+        g_depth[i] = -d_terms[DEPTH] * d * inverse * inverse
+    if moving.shape[0] > 0 and (outline.shape[0] == 0 or outline[i] == 0):
+        inside = motion[i] * (1 - 2 * margin) + margin
+        d = -1 / inside if moving[i] != 0 else 1 / (1 - inside)
+        g_motion[i] = d_terms[MASK] * d * (1 - 2 * margin) / count
+    if flow.shape[0] > 0:
+        weight = 0.0
+        if flow_valid[i] != 0 and flow_error(i, flow, flow_target) <= limit:
+            weight = d_terms[FLOW] * fade / max(sums[VALID], float32(1))
+        for axis in range(2):
+            g_flow[i, axis] = weight * sign(flow[i, axis] - flow_target[i, axis])
+
+
+def compose(
+    planes, depths, alphas, background, bounded, far, least, least_alpha,
+    radiance, depth, motion, flow,
+):  # fmt: skip
+    """Fill the picture (N, 3), z-depth, motion and flow (N, 2 or 0 of them) over the
+    background, of premultiplied `planes` (D, N), `depths` and `alphas` (N,).
+    """
+    i = cuda.grid(1)
+    if i >= alphas.shape[0]:
+        return
+    alpha = float(alphas[i])
+    for c in range(3):
+        behind, _ = radiance_of(background[c], bounded)
+        radiance[i, c] = planes[c, i] + (1 - alpha) * behind
+    z = far
+    if alphas[i] > float32(least_alpha):
+        z = depths[i] / alpha
+    depth[i] = max(z, least)
+    motion[i] = planes[3, i]
+    if flow.shape[0] > 0:
+        for axis in range(2):
+            flow[i, axis] = planes[4 + axis, i] / max(alpha, least_alpha)
+
+
+def compose_backward(
+    planes, depths, alphas, background, bounded, far, least, least_alpha,
+    d_radiance, d_depth, d_motion, d_flow, g_planes, g_depths, g_alphas, g_background,
+):  # fmt: skip
+    """Fill the gradients of the maps, and add to those of the background (3,)."""
+    sums = cuda.shared.array(3, float32)
+    thread = cuda.threadIdx.x
+    if thread < 3:
+        sums[thread] = 0.0
+    cuda.syncthreads()
+    for i in range(cuda.grid(1), alphas.shape[0], cuda.gridDim.x * THREADS):
+        alpha = float(alphas[i])
+        g_alpha = g_depth = 0.0
+        for c in range(3):
+            behind, slope = radiance_of(background[c], bounded)
+            g_planes[c, i] = d_radiance[i, c]
+            g_alpha -= d_radiance[i, c] * behind
+            cuda.atomic.add(sums, c, float32(d_radiance[i, c] * (1 - alpha) * slope))
+        if alphas[i] > float32(least_alpha) and depths[i] / alpha >= least:
+            g_depth = d_depth[i] / alpha
+            g_alpha -= g_depth * depths[i] / alpha
+        g_planes[3, i] = d_motion[i]
+        for axis in range(planes.shape[0] - 4):
+            d = d_flow[i, axis] / max(alpha, least_alpha)
+            g_planes[4 + axis, i] = d
+            if alphas[i] >= float32(least_alpha):
+                g_alpha -= d * planes[4 + axis, i] / alpha
+        g_depths[i], g_alphas[i] = g_depth, g_alpha
+    cuda.syncthreads()
+    if thread < 3:
+        cuda.atomic.add(g_background, thread, sums[thread])

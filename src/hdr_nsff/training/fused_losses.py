@@ -1,0 +1,92 @@
+"""The terms of whole frames by CUDA kernels: picture, depth, moving mask and flow in
+one launch, their gradients in another. The plain-torch twin is `Objective.terms`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from hdr_nsff.fields.base import Render
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, PICTURE_SUMS, THREADS
+from hdr_nsff.maths.losses import MASK_MARGIN
+from hdr_nsff.scene.batch import PixelBatch
+
+TERM_NAMES = ("photometric", "depth", "mask", "flow")
+
+
+def can_fuse(render: Render, batch: PixelBatch) -> bool:
+    """Whether these are all terms that there are: of a whole frame that a field without
+    branches draws, with flow to one neighbor at most.
+    """
+    warps = [warp for warp in render.warps if warp.offset in batch.flow]
+    branches = render.dynamic_radiance is not None or render.scene_flow
+    warped = any(warp.radiance is not None for warp in render.warps)
+    return batch.whole and len(warps) <= 1 and not branches and not warped
+
+
+def fused_terms(
+    render: Render, rgb: Tensor, batch: PixelBatch, near: float, fade: float, limit: float
+) -> dict[str, Tensor]:
+    """The terms of a whole frame whose picture is `rgb` (N, 3)."""
+    nothing = rgb.detach()[:0, 0]
+    no_flow, no_mask = rgb.detach()[:0, :2], nothing.to(torch.uint8)
+    flow, target, valid = no_flow, no_flow, no_mask
+    for warp in render.warps:
+        if warp.offset in batch.flow:
+            flow, target = warp.flow, batch.flow[warp.offset]
+            valid = batch.flow_valid[warp.offset].view(torch.uint8)
+    known = (
+        nothing if batch.disparity is None else batch.disparity,
+        nothing if batch.disparity_confidence is None else batch.disparity_confidence,
+        no_mask if batch.moving is None else batch.moving.view(torch.uint8),
+        no_mask if batch.outline is None else batch.outline.view(torch.uint8),
+        target,
+        valid,
+    )
+    numbers = float(near), float(fade), MASK_MARGIN, float(limit)
+    rendered = rgb, render.depth, render.motion, flow
+    terms = FusedLosses.apply(*rendered, batch.rgb, known, numbers).unbind()
+    has = True, batch.disparity is not None, batch.moving is not None, len(valid) > 0
+    return {name: term for name, term, h in zip(TERM_NAMES, terms, has, strict=True) if h}
+
+
+class FusedLosses(torch.autograd.Function):
+    """The four terms of `TERM_NAMES`; 0 where what they compare with is missing."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rgb: Tensor,
+        depth: Tensor,
+        motion: Tensor,
+        flow: Tensor,
+        recorded: Tensor,
+        known: tuple[Tensor, ...],
+        numbers: tuple[float, ...],
+    ) -> Tensor:
+        disparity, confidence, moving, outline, target, valid = known
+        tensors = (
+            *(rgb, recorded, depth, disparity, confidence, motion, moving, outline),
+            *(flow, target, valid),
+        )
+        sums = rgb.new_zeros(PICTURE_SUMS)
+        ctx.given = *(t.detach().contiguous() for t in tensors), *numbers, sums
+        grid = min(blocks_for(len(rgb))[0], MAX_BLOCKS), 1
+        launch("losses", grid, THREADS, *ctx.given)
+        return sums[: len(TERM_NAMES)].view(-1)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, d_terms: Tensor) -> Any:
+        rgb, flow = ctx.given[0], ctx.given[8]
+        g_rgb, g_flow = torch.empty_like(rgb), torch.empty_like(flow)
+        g_depth, g_motion = (torch.empty_like(rgb[:, 0]) for _ in range(2))
+        made = g_rgb, g_depth, g_motion, g_flow
+        grid = blocks_for(len(rgb))
+        launch("losses_backward", grid, THREADS, *ctx.given, d_terms.contiguous(), *made)
+        return *made, None, None, None

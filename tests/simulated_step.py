@@ -1,0 +1,118 @@
+"""A step of `splat` with its CUDA kernels, on the pretend device: what it launches.
+`test_cuda_step.py` runs these tests in a process with NUMBA_ENABLE_CUDASIM=1, where a
+simulator runs the kernels.
+"""
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from presets import small
+from pretend_device import COUNTING, PretendTensor, counted, pretend_device, unwrap
+from torch import Tensor
+
+from hdr_nsff.core import distributed
+from hdr_nsff.fields.kernels.cuda.launch import launch
+from hdr_nsff.fields.nsff import encodings
+from hdr_nsff.fields.splat import fused_cloud, fused_picture, rasterize_cuda, splat
+from hdr_nsff.fields.splat.rasterize import Maps, rasterize
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap import bracketed, curve, fused_tone, kernel_cuda, vignetting
+from hdr_nsff.training import fused_losses, objective
+from hdr_nsff.training.run_folder import open_folder
+from hdr_nsff.training.train import Trainer
+
+
+def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
+    """A kernel on tensors of the pretend device."""
+    if 0 in grid:
+        return
+    for counts in COUNTING:
+        counts.launches[name] += 1
+    launch(name, grid, threads, *(unwrap(v) for v in values))
+
+
+class NothingDrawn(torch.autograd.Function):
+    """Gray maps of all Gaussians, by no launch at all."""
+
+    @staticmethod
+    def forward(ctx: Any, camera: Camera, *gaussians: Tensor) -> tuple[Tensor, ...]:
+        ctx.shapes = [g.shape for g in gaussians]
+        size = camera.height, camera.width
+        shapes = (*size, gaussians[-1].shape[1]), size, size
+        return tuple(PretendTensor(torch.full(shape, 0.5)) for shape in shapes)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> Any:
+        return None, *(PretendTensor(torch.zeros(shape)) for shape in ctx.shapes)
+
+
+def draw_nothing(*arguments: Any) -> Maps:
+    *gaussians, camera = arguments
+    if not isinstance(gaussians[0], PretendTensor):
+        return rasterize(*arguments)
+    return Maps(*NothingDrawn.apply(camera, *gaussians))
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
+    """The pretend device, on which our kernels run."""
+    for module in (
+        rasterize_cuda,
+        fused_cloud,
+        fused_picture,
+        encodings,
+        kernel_cuda,
+        fused_losses,
+        fused_tone,
+    ):
+        monkeypatch.setattr(module, "launch", launch_there)
+    monkeypatch.setattr(splat, "rasterize", draw_nothing)
+    for module in (splat, encodings, curve, vignetting, objective, bracketed):
+        monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
+    with pretend_device() as found:
+        yield found
+
+
+def trainer_on(device: torch.device, scene: Scene, folder: Path, out: Path) -> Trainer:
+    config = small("splat", folder, out)
+    open_folder(config)
+    return Trainer(config, scene, device, distributed.Ranks())
+
+
+# launches of a step without the rasterizer's: where rigidity is due, and where flow is;
+# those of the rasterizer, forward and backward
+MAX_LAUNCHES, RASTERIZER = (52, 50), 18
+
+
+def test_launches_of_a_step(
+    toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run")
+    found = {}
+    for step in (1, 2, 1, 2):  # every constant is on the device by the second time
+        trainer.clock = replace(trainer.clock, step=step)
+        flow_turn = trainer.draw(0).seed % 2 == 0
+        with counted() as counts:
+            trainer.step()
+        found[flow_turn] = counts
+    for counts, most in zip((found[False], found[True]), MAX_LAUNCHES, strict=True):
+        assert counts.launches.total() <= most, counts.launches.most_common()
+        assert not counts.waits
+
+
+def test_launches_of_the_rasterizer(device: torch.device) -> None:
+    parts = (3, 4, 3, 1, 6)
+    gaussians = [torch.ones(1, n, device=device).requires_grad_() for n in parts]
+    gaussians[3] = gaussians[3].detach()[:, 0].requires_grad_()
+    w2c, K = torch.eye(4, device=device)[:3], torch.eye(3, device=device)
+    for _ in range(2):  # constants are on the device by the second time
+        with counted() as counts:
+            maps, depth, alpha = rasterize_cuda.composite(*gaussians, w2c, K, (3, 3))
+            torch.autograd.grad([maps, depth, alpha], gaussians, [maps, depth, alpha])
+    assert counts.launches.total() <= RASTERIZER, counts.launches
+    assert set(counts.waits) <= {"aten._local_scalar_dense.default"}  # the number of pairs

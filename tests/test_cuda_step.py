@@ -1,0 +1,16 @@
+"""A training step of `splat` by CUDA kernels, without a GPU: every test of four
+files, in processes with numba-cuda's simulator.
+"""
+
+from pathlib import Path
+
+import pytest
+from simulator import assert_passed, names_in
+
+FILES = ("cloud", "picture", "tone", "step")
+PATHS = [Path(__file__).with_name(f"simulated_{name}.py") for name in FILES]
+
+
+@pytest.mark.parametrize(("path", "name"), [(p, name) for p in PATHS for name in names_in(p)])
+def test_simulated(path: Path, name: str) -> None:
+    assert_passed(path, name)
