@@ -185,4 +185,4 @@ def test_a_field_without_local_ones_is_as_before() -> None:
     field = local_field(count=0)
     batch = batch_of(4, 1, seed=1)
     _, own = field(replace(batch, flow={}))
-    assert float(own["evenness"]) == 0 and len(field.alive(3.0)) == 0
+    assert float(own["evenness"].detach()) == 0 and len(field.alive(3.0)) == 0

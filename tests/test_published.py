@@ -116,7 +116,7 @@ def test_blended_weights_are_those_of_eq_6_and_7_with_v_of_the_static_branch(cas
         transmitted = 1.0
         for k in range(case.num_samples):
             length = float(samples.deltas[i, k]) if k + 1 < case.num_samples else 1e10
-            v = float(static.blend[i, k])
+            v = float(static.blend[i, k].detach())
             a_st = (1 - math.exp(-float(static.density[i, k]) * length)) * v
             a_dy = (1 - math.exp(-float(dynamic.density[i, k]) * length)) * (1 - v)
             assert float(case.base.weights.static[i, k]) == pytest.approx(transmitted * a_st)
