@@ -119,8 +119,12 @@ def test_blended_weights_are_those_of_eq_6_and_7_with_v_of_the_static_branch(cas
             v = float(static.blend[i, k].detach())
             a_st = (1 - math.exp(-float(static.density[i, k].detach()) * length)) * v
             a_dy = (1 - math.exp(-float(dynamic.density[i, k].detach()) * length)) * (1 - v)
-            assert float(case.base.weights.static[i, k]) == pytest.approx(transmitted * a_st)
-            assert float(case.base.weights.dynamic[i, k]) == pytest.approx(transmitted * a_dy)
+            assert float(case.base.weights.static[i, k].detach()) == pytest.approx(
+                transmitted * a_st
+            )
+            assert float(case.base.weights.dynamic[i, k].detach()) == pytest.approx(
+                transmitted * a_dy
+            )
             transmitted *= (1 - a_st) * (1 - a_dy)
 
 
