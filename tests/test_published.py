@@ -149,7 +149,7 @@ def test_depth_and_dynamic_radiance_are_of_the_dynamic_branch_alone(case: Case) 
     for i in range(RAYS):
         transmitted, disparity, red = 1.0, 0.0, 0.0
         for k in range(case.num_samples):
-            alpha = 1 - math.exp(-float(dynamic.density[i, k] * samples.deltas[i, k]))
+            alpha = 1 - math.exp(-float(dynamic.density[i, k].detach() * samples.deltas[i, k]))
             disparity += transmitted * alpha / float(samples.depths[i, k])
             red += transmitted * alpha * float(dynamic.radiance[i, k, 0])
             transmitted *= 1 - alpha
@@ -164,7 +164,7 @@ def test_rendered_flow_projects_the_weighted_sum_of_displaced_samples(case: Case
     for i in range(RAYS):
         transmitted, point = 1.0, [0.0, 0.0, 0.0]
         for k in range(case.num_samples):
-            alpha = 1 - math.exp(-float(dynamic.density[i, k] * samples.deltas[i, k]))
+            alpha = 1 - math.exp(-float(dynamic.density[i, k].detach() * samples.deltas[i, k]))
             moved = add(samples.coords[i, k].tolist(), case.flow(i, k, 0))
             point = add(point, [transmitted * alpha * x for x in moved])
             transmitted *= 1 - alpha
