@@ -151,7 +151,7 @@ def test_depth_and_dynamic_radiance_are_of_the_dynamic_branch_alone(case: Case) 
         for k in range(case.num_samples):
             alpha = 1 - math.exp(-float(dynamic.density[i, k].detach() * samples.deltas[i, k]))
             disparity += transmitted * alpha / float(samples.depths[i, k])
-            red += transmitted * alpha * float(dynamic.radiance[i, k, 0])
+            red += transmitted * alpha * float(dynamic.radiance[i, k, 0].detach())
             transmitted *= 1 - alpha
         disparity += transmitted / case.field.far
         assert float(render.dynamic_depth[i]) == pytest.approx(1 / disparity)
