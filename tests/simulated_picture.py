@@ -13,6 +13,7 @@ from torch import Tensor
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
+from hdr_nsff.tonemap.base import Recordings, ToneMapConfig
 from hdr_nsff.tonemap.curve import GAMMA, knot_positions, leaky_ends, piecewise_linear
 from hdr_nsff.tonemap.identity import IdentityToneMapper
 from hdr_nsff.tonemap.kernel_cuda import RespondCuda, ShadeCuda
@@ -118,6 +119,7 @@ EVERY = ("moving", "outline", "disparity", "disparity_confidence", "flow", "flow
 def test_losses(names: tuple[str, ...]) -> None:
     batch = batch_with(names)
     objective = Objective({}, "scene", near=0.7)
+    tonemap = IdentityToneMapper(ToneMapConfig(), Recordings((0,), (0,), (0.0,), 0, 1))
     generator = torch.Generator().manual_seed(0)
 
     def rendered(rgb: Tensor, depth: Tensor, motion: Tensor, flow: Tensor) -> Render:
@@ -125,7 +127,7 @@ def test_losses(names: tuple[str, ...]) -> None:
         return Render(rgb, depth, motion, motion, warps=(warp,), rgb=rgb)
 
     def plain(*maps: Tensor) -> Tensor:
-        terms = objective.terms(rendered(*maps), batch, IdentityToneMapper, 1.3)  # type: ignore
+        terms = objective.terms(rendered(*maps), batch, tonemap, 1.3)
         return torch.stack([terms[name] for name in sorted(terms)])
 
     def ours(*maps: Tensor) -> Tensor:
@@ -134,9 +136,9 @@ def test_losses(names: tuple[str, ...]) -> None:
         terms = fused_terms(render, maps[0], batch, 0.7, objective.fade, FLOW_LIMIT_PX)
         return torch.stack([terms[name] for name in sorted(terms)])
 
-    maps = [torch.rand(N, 3), 1 + torch.rand(N), torch.rand(N), 30 * torch.rand(N, 2)]
-    for m in maps:
-        m.copy_(m[torch.randperm(N, generator=generator)])
-    expected = sorted(objective.terms(rendered(*maps), batch, IdentityToneMapper, 0.0))  # type: ignore
+    shapes = (N, 3), (N,), (N,), (N, 2)
+    drawn = [torch.rand(shape, generator=generator) for shape in shapes]
+    maps = [drawn[0], 1 + drawn[1], drawn[2], 30 * drawn[3]]
+    expected = sorted(objective.terms(rendered(*maps), batch, tonemap, 0.0))
     assert sorted(fused_terms(rendered(*maps), maps[0], batch, 0.7, 1.0, 1.0)) == expected
     compare(ours, plain, *maps)

@@ -50,8 +50,8 @@ def gradients(tonemapper: SharedToneMapper, outputs: list[Tensor]) -> dict[str, 
 def compare(ours: dict[str, Tensor], theirs: dict[str, Tensor]) -> None:
     for name, b in theirs.items():
         largest = float(b.abs().max()) if b.numel() else 0.0
-        # plain torch takes second differences of float32 curves
-        off = 1e-3 if name.endswith("logits") else 1e-5
+        # second differences of float32 curves: both are 1e-5 off the same in float64
+        off = 5e-5 if name.endswith("logits") else 1e-5
         torch.testing.assert_close(ours[name], b, rtol=1e-4, atol=off * largest)
 
 

@@ -204,7 +204,9 @@ def test_crops_scale_and_mirror_flow_with_the_pixels():
 
 
 def test_an_example_is_a_matter_of_its_seed():
-    draw = lambda seed: training_example(sample(), 4, (96, 128), np.random.default_rng(seed)).images  # noqa: E731
+    def draw(seed):
+        return training_example(sample(), 4, (96, 128), np.random.default_rng(seed)).images
+
     assert (draw(1) == draw(1)).all()
     assert not (draw(1) == draw(2)).all()
 

@@ -59,9 +59,7 @@ def share_poses(work: Work, poses: Poses, track: int) -> Poses:
 
 
 def share_masks(work: Work, moving: np.ndarray) -> np.ndarray:
-    """Moving pixels (T, H, W): what moves in a frame of any track moves in the frames
-    of all tracks at that time.
-    """
+    """Moving masks (T, H, W), each the union of those of all tracks at its time."""
     manifest = work.manifest
     if manifest.num_tracks == 1:
         return moving

@@ -46,7 +46,7 @@ class GappedCycle:
     # (T,) numbers of the frames if none were missing, the first one 0; what is missing
     # is known up to whole cycles
     slots: np.ndarray
-    gaps: tuple[int, ...]  # positions of the frames after a gap that nobody told of
+    gaps: tuple[int, ...]  # positions of the first frames after gaps
 
     def period(self) -> int:
         """The smallest number of slots after which all exposures repeat."""
