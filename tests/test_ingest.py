@@ -87,6 +87,28 @@ def test_cameras_of_a_rig_need_the_same_number_of_frames(tmp_path):
         open_footage(tmp_path)
 
 
+def test_a_folder_of_videos_is_a_rig(tmp_path):
+    for name, value in (("cam10.mp4", 0.6), ("cam2.mp4", 0.3)):
+        write_video(tmp_path / name, [picture(value)] * 4, fps=12)
+    footage, frames = open_footage(tmp_path), all_frames(tmp_path, start=2)
+    assert footage.root == tmp_path
+    assert [(f.camera_id, f.number, f.source) for f in frames] == [
+        (0, 2, "cam2.mp4#2"),
+        (0, 3, "cam2.mp4#3"),
+        (1, 2, "cam10.mp4#2"),
+        (1, 3, "cam10.mp4#3"),
+    ]
+    assert np.allclose([f.rgb.mean() for f in frames], [0.3, 0.3, 0.6, 0.6], atol=0.03)
+
+
+@pytest.mark.parametrize(("frames", "fps"), [(5, 12), (4, 24)])
+def test_videos_of_a_rig_need_one_length_and_one_rate(tmp_path, frames, fps):
+    write_video(tmp_path / "a.mp4", [picture(0.5)] * 4, fps=12)
+    write_video(tmp_path / "b.mp4", [picture(0.5)] * frames, fps=fps)
+    with pytest.raises(InputError, match=r"b\.mp4: a\.mp4 and this video have"):
+        open_footage(tmp_path)
+
+
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov"])
 def test_a_video_gives_its_frames_and_rate(tmp_path, suffix):
     clip = tmp_path / f"clip{suffix}"

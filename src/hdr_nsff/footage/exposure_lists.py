@@ -108,9 +108,9 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
 
 def csv_path(footage: Footage) -> Path:
     """Where the CSV of a clip is."""
-    if footage.video and not footage.same_camera:
-        return footage.path.with_suffix(".csv")
-    return footage.path / "exposures.csv"
+    if footage.path.is_dir():
+        return footage.path / "exposures.csv"
+    return footage.path.with_suffix(".csv")
 
 
 def read_utf8(path: Path) -> str:

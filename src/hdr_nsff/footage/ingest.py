@@ -1,4 +1,4 @@
-"""Footage: a video, a folder of frames, or a folder of such folders (one per
+"""Footage: a video, a folder of frames, or a folder of several of either (one per
 synchronized camera), read frame by frame.
 
 Frames come out as recorded rgb in [0, 1]. EXR and DNG are linear: they are scaled by
@@ -13,7 +13,7 @@ import hashlib
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -36,9 +36,10 @@ from hdr_nsff.maths.hdr_signal import (
 RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
 FRAMES = RECORDED | LINEAR
+VIDEOS = {".mp4", ".mov", ".mkv", ".m4v", ".avi", ".webm", ".mxf", ".mts"}
 ACCEPTED = (
     "a video file, a folder of PNG, JPEG, TIFF, EXR or DNG frames, "
-    "or a folder of such folders (one per camera)"
+    "or a folder of such folders or videos (one per camera)"
 )
 LOSSY = {".jpg", ".jpeg"}  # formats of frames
 TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}  # by their codes in H.273
@@ -52,6 +53,7 @@ MIN_SIDE = 11
 MIN_MAX_SIZE = 32  # pixels: least longest side that frames may be shrunk to
 # frames that may be missing at the end of a video: containers round durations
 MAX_MISSING_FRAMES = 3
+MAX_RATE_DIFFERENCE = 0.01  # of synchronized cameras: headers round the rate
 HOLD_OUT = 8  # every this many frames are held out where nothing else is asked for
 
 
@@ -73,7 +75,7 @@ class Footage:
     @property
     def root(self) -> Path:
         """The folder that names of files are relative to."""
-        return self.path.parent if self.video and not self.same_camera else self.path
+        return self.path if self.path.is_dir() else self.path.parent
 
     @property
     def files(self) -> dict[str, Path]:
@@ -116,7 +118,7 @@ def open_footage(clip: Path) -> Footage:
         cameras = [frame_files(folder) for folder in sorted_folders(clip)]
         cameras = [files for files in cameras if files]
     if not cameras:
-        raise InputError(f"{clip}: no frames in this folder; give {ACCEPTED}")
+        return open_videos(clip)
     first = cameras[0]
     for files in cameras[1:]:
         if len(files) != len(first):
@@ -144,6 +146,35 @@ def open_video(clip: Path) -> Footage:
     return Footage(clip, [[clip]], True, info.frames, info.fps, False, transfer=transfer)
 
 
+def open_videos(folder: Path) -> Footage:
+    """The footage of a folder of videos, one per synchronized camera.
+
+    InputError without videos, and where they differ in length, rate or transfer function.
+    """
+    files = video_files(folder)
+    if not files:
+        raise InputError(f"{folder}: no frames and no videos in this folder; give {ACCEPTED}")
+    first, *others = (open_video(file) for file in files)
+    for other in others:
+        names = f"{other.path}: {first.path.name} and this video"
+        if other.count != first.count:
+            raise InputError(
+                f"{names} have {first.count} and {other.count} frames; synchronized cameras "
+                "need the same number each, cut both to the same moments"
+            )
+        if abs(other.fps - first.fps) > MAX_RATE_DIFFERENCE * first.fps:
+            raise InputError(
+                f"{names} have {first.fps:.3g} and {other.fps:.3g} frames per second; "
+                "synchronized cameras need one rate"
+            )
+        if other.transfer != first.transfer:
+            raise InputError(
+                f"{names} differ in their transfer functions by their tags; "
+                "export both in one format"
+            )
+    return replace(first, path=folder, cameras=[[file] for file in files])
+
+
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """A key that sorts frame2 before frame10."""
     key = []
@@ -159,6 +190,13 @@ def frame_files(folder: Path) -> list[Path]:
     """The frames directly in `folder`, in order."""
     shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
     found = [p for p in shown if p.suffix.lower() in FRAMES and p.is_file()]
+    return sorted(found, key=natural_key)
+
+
+def video_files(folder: Path) -> list[Path]:
+    """The videos directly in `folder`, in order."""
+    shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    found = [p for p in shown if p.suffix.lower() in VIDEOS and p.is_file()]
     return sorted(found, key=natural_key)
 
 
