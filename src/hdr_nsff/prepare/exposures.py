@@ -82,9 +82,10 @@ def exposures_by(
         cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
         if gapped is not None:
             cycles = [gapped.cycle]
-        brackets = [b for camera in exposure.common_brackets(cycles) for b in camera]
+        group = exposure.exposure_groups([work.video[own] for own in cameras], cycles)
+        brackets = [b for camera in exposure.common_brackets(cycles, group) for b in camera]
         unknown: list[float | None] = [None] * (max(brackets) + 1)
-        notes = cycle_notes(work, cycles)
+        notes = cycle_notes(work, cycles, group)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
     many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
     if source == GOPRO or (many and len(cameras) == 1):
@@ -293,9 +294,18 @@ def check_cycle(work: Work, cycle: list[float], numbers: list[int]) -> None:
         )
 
 
-def cycle_notes(work: Work, cycles: list[exposure.Cycle]) -> list[str]:
-    """What the brightness of each camera's frames shows, in sentences."""
+def cycle_notes(work: Work, cycles: list[exposure.Cycle], group: list[int]) -> list[str]:
+    """What the brightness of each camera's frames shows, in sentences.
+
+    `group` (C,): the cameras that are equally exposed.
+    """
     notes = []
+    if max(group):
+        members = [[c for c, own in enumerate(group) if own == g] for g in range(max(group) + 1)]
+        listed = ", ".join(str(cameras) for cameras in members)
+        notes.append(f"by their brightness, these cameras are equally exposed: {listed}")
+        if all(cycle.length == 1 for cycle in cycles):
+            return notes
     lengths = [cycle.length for cycle in cycles]
     if len(set(lengths)) > 1:
         notes.append(
