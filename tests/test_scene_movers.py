@@ -67,6 +67,14 @@ def test_two_movers_do_not_mix_their_depths() -> None:
     assert nearest_mover(movers, 1, pixels).tolist() == [0, 1]
 
 
+def test_another_camera_sees_the_points_of_a_mover_elsewhere() -> None:
+    movers = [mover([[0.5, 0.5]], [[0, 0, 2]]), mover([[7.5, 2.5]], [[1, 0, 2]])]
+    K = np.array([[10.0, 0, 4], [0, 10.0, 2], [0, 0, 1]])
+    mirrored = np.array([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 4]])  # from behind
+    pixels = np.array([[4.0, 2.0], [-1.0, 2.0]])
+    assert nearest_mover(movers, 1, pixels, (K, mirrored)).tolist() == [0, 1]
+
+
 def test_a_mover_without_a_shape_gives_no_depth() -> None:
     disparity, confidence = np.full((4, 4), 0.4, np.float32), np.zeros((4, 4), np.float32)
     shapeless = [mover([[1.5, 1.5]], [[np.nan] * 3], error=np.inf)]

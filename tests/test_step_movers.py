@@ -29,7 +29,9 @@ def work(still: np.ndarray | None, masks: str = "estimated") -> SimpleNamespace:
     none = np.zeros((TIMES, H, W), bool)
     steps = {"masks": SimpleNamespace(provenance=masks)}
     return SimpleNamespace(
-        manifest=SimpleNamespace(depth_kind="scene", steps=steps, parallax="full"),
+        manifest=SimpleNamespace(
+            depth_kind="scene", steps=steps, parallax="full", synchronized=False
+        ),
         train=[SimpleNamespace(index=k) for k in range(TIMES)],
         refined_flows=(),
         training_flows=lambda _: (np.zeros((0, H, W, 2)), np.zeros((0, H, W)), np.zeros((0, 2))),

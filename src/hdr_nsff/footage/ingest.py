@@ -149,7 +149,8 @@ def open_video(clip: Path) -> Footage:
 def open_videos(folder: Path) -> Footage:
     """The footage of a folder of videos, one per synchronized camera.
 
-    InputError without videos, and where they differ in length, rate or transfer function.
+    InputError without videos, and where they differ in length, rate or transfer
+    function.
     """
     files = video_files(folder)
     if not files:

@@ -340,6 +340,12 @@ class Work:
         kept = np.isin(pairs, index).all(1)
         return flow[kept], valid[kept], np.searchsorted(index, pairs[kept])
 
+    def static_points(self) -> np.ndarray:
+        """The static points (N, 3) of structure from motion; (0, 3) without any."""
+        if not self.manifest.points:
+            return np.zeros((0, 3))
+        return np.array(read_npy(self.folder / self.manifest.points))
+
     def static_depth(self) -> tuple[Stack, Stack]:
         """Disparity and confidence (T, H, W) of the training frames, without movers."""
         disparity = self.maps([str(f.static_disparity) for f in self.train])

@@ -44,8 +44,8 @@ class ExposureCycleTuning:
     # measured ones, or when it is off by more than this factor
     min_same_sign: float = 0.8
     max_ev_ratio: float = 2.0
-    # EV between two cameras of a rig that are exposed differently; what they see differs
-    # by less, and the response has a gain per camera for that
+    # EV between two cameras of a rig that are exposed differently; smaller differences
+    # are of what they see, and the response has a gain per camera for them
     min_camera_step_ev: float = 0.7
     well_exposed_low: float = 0.05  # recorded value, for the choice of the reference
     # share of the darkest pixels that is the black of a camera with a pedestal

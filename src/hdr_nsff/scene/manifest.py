@@ -172,6 +172,12 @@ class Manifest(Strict):
         return max((f.track for f in self.frames), default=0) + 1
 
     @property
+    def synchronized(self) -> bool:
+        """Whether several cameras record at the same times."""
+        instants = {(f.camera_id, f.time) for f in self.frames}
+        return len({time for _, time in instants}) < len(instants)
+
+    @property
     def places(self) -> list[int]:
         """Per frame the camera of the rig that took it; 0 where there is no rig."""
         return [f.index % self.rig for f in self.frames]

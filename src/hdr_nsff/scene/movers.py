@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
+from hdr_nsff.geometry import pinhole
 
 VERSION = 2  # of movers.npz
 NUM_NEAREST_TRACKS = 4  # tracks that a pixel's depth is interpolated from
@@ -115,16 +116,37 @@ def track_depths(
     return np.concatenate(pixels), np.concatenate(inverse_depths), np.concatenate(owners)
 
 
-def nearest_mover(movers: Sequence[Mover], t: int, pixels: np.ndarray) -> np.ndarray:
+def nearest_mover(
+    movers: Sequence[Mover],
+    t: int,
+    pixels: np.ndarray,
+    camera: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """The mover (P,) whose track is nearest to `pixels` (P, 2) at the t-th time.
 
-    0 where no mover has a track at that time.
+    0 where no mover has a track at that time. The pixels are of the movers' own frame,
+    or of another `camera` at that time, K (3, 3) and c2w (3, 4): there, tracks are
+    where it sees the points of the movers' shapes.
     """
-    tracks = [m.pixels[:, t][np.isfinite(m.pixels[:, t, 0])] for m in movers]
+    tracks = [tracks_in_picture(mover, t, camera) for mover in movers]
     owners = np.repeat(np.arange(len(tracks)), [len(p) for p in tracks])
     if not len(owners) or not len(pixels):
         return np.zeros(len(pixels), np.int64)
     return owners[cKDTree(np.concatenate(tracks)).query(pixels)[1]]
+
+
+def tracks_in_picture(
+    mover: Mover, t: int, camera: tuple[np.ndarray, np.ndarray] | None
+) -> np.ndarray:
+    """The pixels (N, 2) of a mover's tracks at the t-th time, in its own frame or in
+    the picture of another `camera` (see `nearest_mover`).
+    """
+    if camera is None:
+        own = mover.pixels[:, t]
+        return own[np.isfinite(own[:, 0])]
+    points = mover.at(t)
+    pixels, depth = pinhole.project(points[np.isfinite(points[:, 0])], *camera)
+    return pixels[depth > pinhole.MIN_DEPTH]
 
 
 def write_movers(path: Path, movers: Sequence[Mover]) -> None:

@@ -32,7 +32,7 @@ from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.detail import cell_sizes, detail_density, scale_by_size
 from hdr_nsff.fields.splat.free_space import remove_fog
 from hdr_nsff.fields.splat.gaussians import START_LOGIT, Gaussians, from_log_radiance
-from hdr_nsff.fields.splat.initialize_local import local_mask, place_local
+from hdr_nsff.fields.splat.initialize_local import local_mask, other_camera, place_local
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
@@ -208,7 +208,9 @@ def place_movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[i
     position = {f.index: i for i, f in enumerate(scene.train)}
     frames = [position[int(index)] for index in movers[0].frames]
     parts = [
-        mover_points(scene, frames[t], t, movers, to_radiance) for t in key_times(scene, frames)
+        mover_points(scene, i, t, movers, to_radiance)
+        for t in key_times(scene, frames)
+        for i in frames_at(scene, frames[t])
     ]
     points, owner = concatenate([p for p, _ in parts]), torch.cat([o for _, o in parts])
     limit = int(FILL * len(field.moving))
@@ -231,17 +233,30 @@ def key_times(scene: Scene, frames: list[int]) -> list[int]:
     return sorted({seen[round(i)] for i in chosen.tolist()})
 
 
+def frames_at(scene: Scene, i: int) -> list[int]:
+    """Training frame `i`, and those of other cameras at its time."""
+    frame = scene.train[i]
+    others = [
+        k
+        for k, f in enumerate(scene.train)
+        if f.time == frame.time and f.camera_id != frame.camera_id
+    ]
+    return [i, *others]
+
+
 def mover_points(
     scene: Scene, i: int, t: int, movers: Sequence[Mover], to_radiance: ToRadiance
 ) -> tuple[PointCloud, Tensor]:
     """The pixels of rigid `movers` in training frame `i`, at the t-th time of these, as
     points at their canonical places, and the mover of each (P,).
     """
-    f = with_mover_depth(scene.train[i], t, movers)
+    f, camera = scene.train[i], other_camera(scene, i)
+    if camera is None:
+        f = with_mover_depth(f, t, movers)
     moving = surely_moving(f) & ~local_mask(scene, i)
     points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
     y, x = np.nonzero(moving.numpy())
-    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
+    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5, camera)
     canonical = points.positions.double().numpy().copy()
     for k, mover in enumerate(movers):
         canonical[owner == k] = mover.canonical(canonical[owner == k], t)

@@ -61,9 +61,9 @@ def local_mask(scene: Scene, i: int) -> Tensor:
         return moving
     if all(rigid):
         return torch.zeros_like(moving)
-    t = time_of(scene, i)
     y, x = np.nonzero(moving.numpy())
-    owner = nearest_mover(scene.movers, t, np.stack([x, y], -1) + 0.5)
+    pixels = np.stack([x, y], -1) + 0.5
+    owner = nearest_mover(scene.movers, time_of(scene, i), pixels, other_camera(scene, i))
     result = torch.zeros_like(moving)
     result[y, x] = torch.from_numpy(~np.array(rigid)[owner])
     return result
@@ -72,6 +72,17 @@ def local_mask(scene: Scene, i: int) -> Tensor:
 def time_of(scene: Scene, i: int) -> int:
     """The position of a training frame's time among the movers' times."""
     return int(torch.searchsorted(scene.times, scene.train[i].time))
+
+
+def other_camera(scene: Scene, i: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """K (3, 3) and c2w (3, 4) of training frame `i`; None where its camera took the
+    frames that the movers' tracks are of.
+    """
+    f = scene.train[i]
+    tracked = set(scene.movers[0].frames.tolist())
+    if any(g.index in tracked and g.camera_id == f.camera_id for g in scene.train):
+        return None
+    return f.camera.K.double().numpy(), f.camera.c2w.double().numpy()
 
 
 def count_local_pixels(scene: Scene) -> int:

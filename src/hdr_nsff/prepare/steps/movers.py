@@ -11,10 +11,11 @@ import torch
 from hdr_nsff.core.stack import ArrayStack, by_key, map_stack
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges
+from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges, same_time_depth
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.priors.movers.rigidity import judge_rigidity
+from hdr_nsff.priors.movers.synchronized import take_same_time_depth
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, write_movers
 from hdr_nsff.scene.posed_video import PosedVideo
@@ -48,6 +49,12 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         clip = replace(clip, moving=masks & ~still)
         moving = clip.moving
         found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
+        if work.manifest.synchronized:
+            seen = same_time_depth(clip, work.static_points())
+            if seen is not None:
+                found, trust = take_same_time_depth(
+                    found, trust, *seen, clip.moving, tuning.synchronized
+                )
         disparity = found  # that of the static scene elsewhere
         confidence = map_stack(lambda c, k: np.where(moving[k], trust[k], c), confidence)
         maps["mover_disparity"] = by_key(indices.tolist(), found)

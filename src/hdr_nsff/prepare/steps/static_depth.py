@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.stack import ArrayStack, by_key
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
@@ -74,14 +73,14 @@ def find_static_depth(work: Work) -> StepResult:
 def geometric_depth(work: Work) -> Depth:
     """Depth from the parallax of the static scene."""
     m = work.manifest
-    points = np.zeros((0, 3))
-    if m.points:
-        points = np.array(read_npy(work.folder / m.points))
+    points = work.static_points()
     if m.rig > 1:
         disparity, confidence, still = rig_depth(work, points)
     else:
         flow = work.training_flows(work.raw_flows)
         disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
+        if m.synchronized:  # the same depth explains what moves, at one instant
+            still = np.zeros(still.shape, bool)
     known = np.mean([(map > 0.5).mean() for map in confidence])
     note = f"{known:.0%} of the pixels well known"
     return Depth(disparity, confidence, note, "geometric", still=still)

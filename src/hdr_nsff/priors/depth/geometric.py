@@ -9,7 +9,7 @@ path and shape afterwards (`priors/movers`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -44,6 +44,9 @@ class DepthTuning:
     """
 
     num_candidates: int = 64  # disparities tried per pixel
+    # movers that several cameras see at once are tried up to this many times the
+    # disparity of the nearest static point
+    mover_factor: float = 2.0
     max_views: int = 12  # other frames compared per frame
     # below this, between any two frames, there is no depth
     min_parallax_px: float = 1.0
@@ -93,19 +96,45 @@ def static_geometric_depth(
     if num_visible < tuning.min_points * count:
         from_flow = triangulate(clip, flow, valid, pairs, tuning.parallax)
         points = np.concatenate([np.asarray(points).reshape(-1, 3), from_flow])
-    views: list[list[int]] = []
-    parallax = 0.0
-    if len(points) >= tuning.min_points:
-        views, parallax = choose_views(clip, points, tuning.max_views, tuning.parallax)
+    found = depth_from_views(clip, points, False, tuning)
+    if found is not None:
+        return found
+    say("depth: there is too little parallax between the frames: everything is put at distance 1")
+    shape = (count, *clip.size)
+    flat = np.ones(shape, np.float32)
+    return flat, np.zeros(shape, np.float32), np.zeros(shape, bool)
+
+
+def same_time_depth(
+    clip: PosedVideo, points: np.ndarray, tuning: DepthTuning = DepthTuning()
+) -> tuple[ArrayStack, ArrayStack] | None:
+    """Depth of everything, movers too, from what other cameras see at the same instant:
+    disparity (T, H, W) in 1 / scene units and its confidence (T, H, W) in [0, 1].
+
+    `points` (N, 3) are static. None without parallax between such frames.
+    """
+    found = depth_from_views(clip, points, True, tuning)
+    return None if found is None else found[:2]
+
+
+def depth_from_views(
+    clip: PosedVideo, points: np.ndarray, same_time: bool, tuning: DepthTuning
+) -> tuple[ArrayStack, ArrayStack, ArrayStack] | None:
+    """Disparity, confidence and the moving pixels that are static after all, (T, H, W)
+    each, from the frames that see most parallax; None where there is too little.
+
+    `points` (N, 3) are static; `same_time`: from frames of the same instant only.
+    """
+    if len(points) < tuning.min_points:
+        return None
+    views, parallax = choose_views(clip, points, tuning.max_views, tuning.parallax, same_time)
     if parallax < tuning.min_parallax_px:
-        say(
-            f"depth: a parallax of {parallax:.1f} pixels between the frames is too small: "
-            "everything is put at distance 1"
-        )
-        shape = (count, *clip.size)
-        flat = np.ones(shape, np.float32)
-        return flat, np.zeros(shape, np.float32), np.zeros(shape, bool)
+        return None
     low, high = disparity_range(clip, points, tuning.parallax)
+    if same_time:  # movers may be nearer than all that is static; the spacing stays
+        count = tuning.num_candidates * (tuning.mover_factor * high - low) / (high - low)
+        high *= tuning.mover_factor
+        tuning = replace(tuning, num_candidates=round(count))
     factor = coarseness(clip.size, tuning.coarse)
     if factor == 1:
         return static_depth(clip, views, low, high, tuning)

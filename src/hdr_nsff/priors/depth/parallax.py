@@ -78,19 +78,21 @@ def choose_views(
     points: np.ndarray,
     max_views: int,
     tuning: ParallaxTuning = ParallaxTuning(),
+    same_time: bool = False,
 ) -> tuple[list[list[int]], float]:
     """For each frame the up to `max_views` frames that determine its depth best, best
     first; and the largest parallax of all pairs, in pixels.
 
     Good views share most of the picture, are about `best_parallax` apart, and are near
-    in time, since light changes. `points` (P, 3): static.
+    in time, since light changes. `points` (P, 3): static. `same_time`: only what other
+    cameras see at the instant of the frame.
     """
     count, width = len(clip.c2w), clip.size[1]
     chosen, largest = [], 0.0
     for i in range(count):
         visible = points[clip.project(i, points)[2]]
         scores = np.zeros(count)
-        others = candidates(i, count, tuning) if len(visible) else []
+        others = candidates(clip.times, i, tuning, same_time) if len(visible) else []
         for j in others:
             moved, share = parallax(clip, i, j, visible)
             ratio = max(moved / (tuning.best_parallax * width), 1e-9)
@@ -104,18 +106,24 @@ def choose_views(
     return chosen, largest
 
 
-def candidates(i: int, count: int, tuning: ParallaxTuning = ParallaxTuning()) -> list[int]:
-    """The frames that may determine the depth of frame `i` of `count`: all of a short
-    clip; of a long one the nearest, and every few of those farther away.
+def candidates(
+    times: np.ndarray,
+    i: int,
+    tuning: ParallaxTuning = ParallaxTuning(),
+    same_time: bool = False,
+) -> list[int]:
+    """The frames that may determine the depth of frame `i`, whose `times` are (T,): all
+    of a short clip; of a long one those of the nearest times, and of every few of those
+    farther away. `same_time`: those of its own time only.
     """
-    reach = range(-tuning.max_gap, tuning.max_gap + 1)
-    return [
-        i + gap
-        for gap in reach
-        if gap
-        and 0 <= i + gap < count
-        and (abs(gap) <= tuning.near_gap or gap % tuning.far_gap_step == 0)
-    ]
+    _, rank = np.unique(times, return_inverse=True)
+    gap = np.abs(rank - rank[i])
+    if same_time:
+        used = gap == 0
+    else:
+        far = (gap % tuning.far_gap_step == 0) & (gap <= tuning.max_gap)
+        used = (gap <= tuning.near_gap) | far
+    return [int(j) for j in np.flatnonzero(used) if j != i]
 
 
 def triangulate(
