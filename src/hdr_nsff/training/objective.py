@@ -179,6 +179,25 @@ class Objective:
         return (values * constant(weights, values.device, values.dtype)).sum()
 
 
+    def backward(self, terms: dict[str, Tensor], batches: int) -> None:
+        """Add the gradients of `total`, as one of the `batches` of a step."""
+        device = next(iter(terms.values())).device
+        if not kernels_on(device):
+            (self.total(terms) / batches).backward()
+            return
+        # a kernel's terms are parts of one vector, which takes their weights as they are
+        weights: dict[Tensor, list[float]] = {}
+        for name, term in terms.items():
+            if not term.requires_grad or not self.weights[name]:
+                continue
+            whole = term if term._base is None else term._base
+            of_parts = weights.setdefault(whole, [0.0] * whole.numel())
+            of_parts[term.storage_offset() - whole.storage_offset()] += self.weights[name] / batches
+        vectors = list(weights)
+        given = [constant(tuple(w), device, torch.float32).view_as(v) for v, w in weights.items()]
+        torch.autograd.backward(vectors, given)
+
+
 def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
     """What the batch's camera would have recorded of `radiance` (N, 3)."""
     shaded = tonemap.shade(radiance, batch.camera, batch.camera_id, batch.pixels)

@@ -96,7 +96,7 @@ class LocalGaussians(nn.Module):
     def alive(self, time: float) -> Tensor:
         """Indices (A,) of the Gaussians that are alive at a time."""
         if not len(self):  # the host need not wait for a GPU
-            return torch.arange(0, device=self.means.device)
+            return self.means.new_empty(0, dtype=torch.int64)
         return (self.window(self.means, self.log_scales, time) > MIN_WINDOW).nonzero()[:, 0]
 
     @staticmethod
