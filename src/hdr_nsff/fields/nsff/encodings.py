@@ -2,8 +2,8 @@
 
 Coordinates are in [0, 1]^3. No network follows a grid: at equal CPU time, dense and
 hashed grids that add up beat hash features with an MLP (Müller et al. 2022) by 5 to 9
-dB on rendered scenes. Grids run as numba kernels on the CPU and as plain torch
-elsewhere.
+dB on rendered scenes. Grids run as numba kernels on the CPU, as CUDA kernels on GPUs,
+and as plain torch elsewhere.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.kernels import grid as kernels
 from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
 from hdr_nsff.fields.kernels.cuda.layout import THREADS
+from hdr_nsff.fields.nsff.fused_grid import GridFunctionCuda, Layout
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 
 Shape = tuple[int, int, int, int]  # x, y, z grid points and time slices
@@ -74,7 +75,22 @@ class AdditiveGrid(nn.Module):
         slices, weights = self.time_slices(knot)
         if coords.device.type == "cpu" and coords.dtype == torch.float32:
             return GridFunction.apply(coords, self.table, self.touched, self, slices, weights)
+        if coords.dtype == torch.float32 and kernels_on(coords.device):
+            layout = self.layout_on(coords.device, slices, weights)
+            return GridFunctionCuda.apply(coords, self.table, self.touched, layout)
         return self.reference(coords, slices, weights)
+
+    def layout_on(self, device: torch.device, slices: np.ndarray, weights: np.ndarray) -> Layout:
+        """Where CUDA kernels find what is read of these time slices (L, 2)."""
+        rows = self.offset, self.size, self.hashed
+        levels = np.column_stack([self.res.astype(np.int64), *rows])
+
+        def table(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+            numbers = tuple(values.ravel().tolist())
+            return constant(numbers, device, dtype).view(values.shape)
+
+        whole = torch.int64
+        return Layout(table(levels, whole), table(slices, whole), table(weights, torch.float32))
 
     def scatter_level(
         self, level: int, coords: Tensor, values: Tensor, knot: float = 0.0

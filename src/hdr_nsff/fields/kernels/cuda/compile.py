@@ -19,7 +19,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hdr_nsff.fields.kernels import compositing, footprint
+from hdr_nsff.fields.kernels import compositing, footprint, grid
 from hdr_nsff.fields.kernels.cuda import layout
 
 # groups of arguments of the kernels that make the Gaussians of a moment: what was
@@ -30,6 +30,7 @@ PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and kn
 MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f1 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
+LEVELS = "i2 i2 f2"  # of a grid, and its slices of time
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 f2 f2 f2 i0 i0 f2 f1 f2 s2 i1",
@@ -42,6 +43,9 @@ SIGNATURES = {
     "static_backward": f"f2 f2 f1 f2 f3 {SIGHT} {CLOUD} {STATIC}",
     "moving_backward": f"{MOVING} f2 f2 f2 s2 i0 {SIGHT} {CLOUD} {MOVING} f2",
     "trajectory_backward": "f2 f2 f2 d1 i0 f2 f1 f2 f2 b1 b1",
+    "interpolate": f"f2 f2 {LEVELS} f2",
+    "table_backward": f"f2 f2 {LEVELS} f2 b1",
+    "coords_backward": f"f2 f2 f2 {LEVELS} f2",
     "adam_rows": "f2 f2 f2 f2 b1 d0 d0 d0 d0 d0 d0",
     "respond": "f2 f1 f2 f1 i0 d0 f2",
     "respond_backward": "f2 f1 f2 f1 i0 d0 f2 f2 f1 f2",
@@ -61,6 +65,7 @@ MODULES = (
     "cloud_kernels",
     "cloud_gradients",
     "adam_kernels",
+    "grid_kernels",
     "picture_kernels",
     "tone_kernels",
 )  # that hold the kernels
@@ -169,7 +174,7 @@ def fingerprint() -> str:
     here = Path(__file__)
     sources = [here, here.with_name("device.py"), Path(layout.__file__)]
     sources += [here.with_name(f"{module}.py") for module in MODULES]
-    sources += [Path(str(m.__file__)) for m in (compositing, footprint)]
+    sources += [Path(str(m.__file__)) for m in (compositing, footprint, grid)]
     digest = hashlib.sha256()
     for path in sources:
         digest.update(path.read_bytes())
