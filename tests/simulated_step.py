@@ -3,7 +3,7 @@
 simulator runs the kernels.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from hdr_nsff.core import distributed
 from hdr_nsff.fields.kernels.cuda.launch import launch
-from hdr_nsff.fields.nsff import encodings
+from hdr_nsff.fields.nsff import encodings, fused_grid
 from hdr_nsff.fields.splat import fused_cloud, fused_picture, rasterize_cuda, splat
 from hdr_nsff.fields.splat.rasterize import Maps, composite_view, rasterize
 from hdr_nsff.geometry.cameras import Camera
@@ -26,6 +26,17 @@ from hdr_nsff.training import fused_losses, objective
 from hdr_nsff.training.run_folder import open_folder
 from hdr_nsff.training.train import Trainer
 
+WITH_LAUNCHES = (
+    rasterize_cuda,
+    fused_cloud,
+    fused_picture,
+    fused_grid,
+    encodings,
+    kernel_cuda,
+    fused_losses,
+    fused_tone,
+)
+
 
 def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
     """A kernel on tensors of the pretend device."""
@@ -34,6 +45,16 @@ def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor
     for counts in COUNTING:
         counts.launches[name] += 1
     launch(name, grid, threads, *(unwrap(v) for v in values))
+
+
+def count_launch(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
+    """A kernel that does nothing; what it fills, or the last part of it, is 0."""
+    if 0 in grid:
+        return
+    for counts in COUNTING:
+        counts.launches[name] += 1
+    if isinstance(values[-1], Tensor):
+        unwrap(values[-1]).zero_()
 
 
 class NothingDrawn(torch.autograd.Function):
@@ -58,19 +79,17 @@ def draw_nothing(*arguments: Any) -> Maps:
     return Maps(*NothingDrawn.apply(camera, *gaussians))
 
 
+def launch_by(monkeypatch: pytest.MonkeyPatch, launched: Callable[..., None]) -> None:
+    for module in WITH_LAUNCHES:
+        monkeypatch.setattr(module, "launch", launched)
+
+
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """The pretend device, on which our kernels run."""
-    for module in (
-        rasterize_cuda,
-        fused_cloud,
-        fused_picture,
-        encodings,
-        kernel_cuda,
-        fused_losses,
-        fused_tone,
-    ):
-        monkeypatch.setattr(module, "launch", launch_there)
+    launch_by(monkeypatch, launch_there)
+    for module in (fused_picture, kernel_cuda, fused_losses):
+        monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     monkeypatch.setattr(splat, "rasterize", draw_nothing)
     for module in (splat, encodings, curve, vignetting, objective, bracketed):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
@@ -78,31 +97,58 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
         yield found
 
 
-def trainer_on(device: torch.device, scene: Scene, folder: Path, out: Path) -> Trainer:
-    config = small("splat", folder, out)
+def trainer_on(
+    device: torch.device, scene: Scene, folder: Path, out: Path, preset: str = "splat"
+) -> Trainer:
+    config = small(preset, folder, out)
     open_folder(config)
     return Trainer(config, scene, device, distributed.Ranks())
 
 
-# launches of a step without the rasterizer's: where rigidity is due, and where flow is;
-# those of the rasterizer, forward and backward
-MAX_LAUNCHES, RASTERIZER = (52, 50), 10
+# launches of a step of `splat` without the rasterizer's, where rigidity is due, and where
+# flow is; those of the rasterizer, forward and backward, and a number that the host
+# reads; those of a step of `grid`
+SPLAT, RASTERIZER, GRID = (28, 27), 10, 962
 
 
 def test_launches_of_a_step(
-    toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    assert max(SPLAT) + RASTERIZER <= 40
     trainer = trainer_on(device, toy, toy_folder, tmp_path / "run")
     found = {}
-    for step in (1, 2, 1, 2):  # every constant is on the device by the second time
+    for number, step in enumerate((1, 2, 1, 2)):  # constants are there by the second time
+        if number == 2:
+            launch_by(monkeypatch, count_launch)
         trainer.clock = replace(trainer.clock, step=step)
         flow_turn = trainer.draw(0).seed % 2 == 0
         with counted() as counts:
             trainer.step()
         found[flow_turn] = counts
-    for counts, most in zip((found[False], found[True]), MAX_LAUNCHES, strict=True):
+    for counts, most in zip((found[False], found[True]), SPLAT, strict=True):
         assert counts.launches.total() <= most, counts.launches.most_common()
         assert not counts.waits
+
+
+def test_launches_of_a_step_of_grid(
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launch_by(monkeypatch, count_launch)
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", "grid")
+    for _ in range(2):
+        with counted() as counts:
+            trainer.step()
+    assert counts.launches.total() <= GRID, counts.launches.most_common()
+    kinds = ("interpolate", "table_backward", "coords_backward")
+    assert [counts.launches[kind] for kind in kinds] == [7, 7, 3]
 
 
 def test_launches_of_the_rasterizer(device: torch.device) -> None:
