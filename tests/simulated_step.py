@@ -105,9 +105,9 @@ def trainer_on(
     return Trainer(config, scene, device, distributed.Ranks())
 
 
-# launches of a step of `splat` without the rasterizer's, where rigidity is due, and where
-# flow is; those of the rasterizer, forward and backward, and a number that the host
-# reads; those of a step of `grid`
+# launches of a step of `splat` without the rasterizer's, where rigidity is due, and
+# where flow is; those of the rasterizer, forward and backward, and of a number that the
+# host reads; those of a step of `grid`
 SPLAT, RASTERIZER, GRID = (28, 27), 10, 962
 
 

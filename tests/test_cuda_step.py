@@ -1,5 +1,5 @@
-"""A training step of `splat` by CUDA kernels, without a GPU: every test of these
-files, in processes with numba-cuda's simulator.
+"""Training steps of `splat` and `grid` by CUDA kernels, without a GPU: every test of
+these files, in processes with numba-cuda's simulator.
 """
 
 from pathlib import Path

@@ -178,14 +178,13 @@ class Objective:
         weights = tuple(self.weights[name] for name in counting)
         return (values * constant(weights, values.device, values.dtype)).sum()
 
-
     def backward(self, terms: dict[str, Tensor], batches: int) -> None:
         """Add the gradients of `total`, as one of the `batches` of a step."""
         device = next(iter(terms.values())).device
         if not kernels_on(device):
             (self.total(terms) / batches).backward()
             return
-        # a kernel's terms are parts of one vector, which takes their weights as they are
+        # a kernel's terms are parts of one vector, whose gradient are their weights
         weights: dict[Tensor, list[float]] = {}
         for name, term in terms.items():
             if not term.requires_grad or not self.weights[name]:

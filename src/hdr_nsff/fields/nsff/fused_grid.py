@@ -37,9 +37,7 @@ class GridFunctionCuda(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, coords: Tensor, table: Tensor, touched: Tensor, layout: Layout
-    ) -> Tensor:
+    def forward(ctx: Any, coords: Tensor, table: Tensor, touched: Tensor, layout: Layout) -> Tensor:
         coords = coords.contiguous()
         ctx.save_for_backward(coords, table)
         ctx.touched, ctx.layout = touched, layout

@@ -68,9 +68,7 @@ def rasterize(
             return dense(*gaussians, camera)
 
 
-def composite_view(
-    composite: Composite, gaussians: tuple[Tensor, ...], camera: Camera
-) -> Maps:
+def composite_view(composite: Composite, gaussians: tuple[Tensor, ...], camera: Camera) -> Maps:
     """`rasterize` by a rasterizer of CUDA devices."""
     if camera.c2w.requires_grad or camera.K.requires_grad:
         w2c = world_to_camera_and_focal(camera)

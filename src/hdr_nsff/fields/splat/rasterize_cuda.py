@@ -97,9 +97,9 @@ class RasterizeCuda(torch.autograd.Function):
         values = means.new_empty(count, num_chunks * CHANNELS)
         boxes = means.new_empty((count, 4), dtype=torch.int32)
         counts = means.new_empty(count, dtype=torch.int64)
-        given = (*gaussians, features.detach().contiguous(), *view)
+        copied = features.detach().contiguous()
         projected = ellipses, depths, values, boxes, counts
-        launch("project", blocks_for(count), THREADS, *given, *projected)
+        launch("project", blocks_for(count), THREADS, *gaussians, copied, *view, *projected)
         starts, owners = sort_pairs(boxes, counts, depths, size)
         maps = means.new_empty(num_features + 1, height, width)
         alpha = means.new_empty(height, width)

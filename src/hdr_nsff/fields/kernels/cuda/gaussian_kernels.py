@@ -106,8 +106,8 @@ def order_pairs(keys, order, owners, starts, ordered):
     """Put the pairs in the order of their keys, and find where the tiles' lists start.
 
     A thread per pair and one more. `keys` (P,) are sorted, and `order` (P,) is where
-    they were before. Fills `ordered` (P,), the `owners` (P,) in that order, and `starts`
-    (tiles + 1,).
+    they were before. Fills `ordered` (P,), the `owners` (P,) in that order, and the
+    tiles' `starts` (tiles + 1,).
     """
     i, count = cuda.grid(1), keys.shape[0]
     if i > count:
