@@ -17,7 +17,13 @@ from torch import Tensor
 from hdr_nsff.core import distributed
 from hdr_nsff.fields.kernels.cuda.launch import launch
 from hdr_nsff.fields.nsff import encodings, fused_grid
-from hdr_nsff.fields.splat import fused_cloud, fused_picture, rasterize_cuda, splat
+from hdr_nsff.fields.splat import (
+    fused_cloud,
+    fused_picture,
+    local_gaussians,
+    rasterize_cuda,
+    splat,
+)
 from hdr_nsff.fields.splat.rasterize import Maps, composite_view, rasterize
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
@@ -35,6 +41,7 @@ WITH_LAUNCHES = (
     kernel_cuda,
     fused_losses,
     fused_tone,
+    local_gaussians,
 )
 
 
@@ -48,13 +55,13 @@ def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor
 
 
 def count_launch(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
-    """A kernel that does nothing; what it fills, or the last part of it, is 0."""
+    """A kernel that does nothing but fill its last result with one number."""
     if 0 in grid:
         return
     for counts in COUNTING:
         counts.launches[name] += 1
-    if isinstance(values[-1], Tensor):
-        unwrap(values[-1]).zero_()
+    if isinstance(values[-1], Tensor):  # every time-local Gaussian is alive
+        unwrap(values[-1]).fill_(name == "living")
 
 
 class NothingDrawn(torch.autograd.Function):
@@ -91,24 +98,30 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     for module in (fused_picture, kernel_cuda, fused_losses):
         monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     monkeypatch.setattr(splat, "rasterize", draw_nothing)
-    for module in (splat, encodings, curve, vignetting, objective, bracketed):
+    for module in (splat, local_gaussians, encodings, curve, vignetting, objective, bracketed):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
     with pretend_device() as found:
         yield found
 
 
 def trainer_on(
-    device: torch.device, scene: Scene, folder: Path, out: Path, preset: str = "splat"
+    device: torch.device,
+    scene: Scene,
+    folder: Path,
+    out: Path,
+    preset: str = "splat",
+    **settings: int,
 ) -> Trainer:
     config = small(preset, folder, out)
+    config = replace(config, field=replace(config.field, **settings))
     open_folder(config)
     return Trainer(config, scene, device, distributed.Ranks())
 
 
-# launches of a step of `splat` without the rasterizer's, where rigidity is due, and
-# where flow is; those of the rasterizer, forward and backward, and of a number that the
-# host reads; those of a step of `grid`
-SPLAT, RASTERIZER, GRID = (28, 27), 10, 962
+# launches of a step of `splat` without the rasterizer's, one of which clears numbers
+# for many steps, and with time-local Gaussians; those of the rasterizer, forward and
+# backward, and of a number that the host reads; those of a step of `grid`
+SPLAT, SPLAT_LOCAL, RASTERIZER, GRID = 27, 30, 10, 962
 
 
 def test_launches_of_a_step(
@@ -118,20 +131,36 @@ def test_launches_of_a_step(
     device: torch.device,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert max(SPLAT) + RASTERIZER <= 40
+    assert SPLAT_LOCAL + RASTERIZER <= 40
     trainer = trainer_on(device, toy, toy_folder, tmp_path / "run")
-    found = {}
     for number, step in enumerate((1, 2, 1, 2)):  # constants are there by the second time
         if number == 2:
             launch_by(monkeypatch, count_launch)
         trainer.clock = replace(trainer.clock, step=step)
-        flow_turn = trainer.draw(0).seed % 2 == 0
         with counted() as counts:
             trainer.step()
-        found[flow_turn] = counts
-    for counts, most in zip((found[False], found[True]), SPLAT, strict=True):
-        assert counts.launches.total() <= most, counts.launches.most_common()
-        assert not counts.waits
+        if number >= 2:
+            assert counts.launches.total() <= SPLAT, counts.launches.most_common()
+            assert not counts.waits
+
+
+def test_launches_of_a_step_with_time_local_gaussians(
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launch_by(monkeypatch, count_launch)
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", local=9)
+    assert len(trainer.field.local) == 9
+    for step in (1, 2, 1, 2):
+        trainer.clock = replace(trainer.clock, step=step)
+        with counted() as counts:
+            trainer.step()
+    assert counts.launches.total() <= SPLAT_LOCAL, counts.launches.most_common()
+    assert counts.launches["local_backward"] == 1
+    assert set(counts.waits) == {"aten.nonzero.default"}  # the number of those alive
 
 
 def test_launches_of_a_step_of_grid(

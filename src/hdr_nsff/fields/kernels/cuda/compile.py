@@ -31,6 +31,7 @@ MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f1 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 LEVELS = "i2 i2 f2"  # of a grid, and its slices of time
+ROWS = "f2 f2 f2 f2 b1 d0 d0 "  # a table, what moves it, and how much
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 f2 f2 f2 i0 i0 f2 f1 f2 s2 i1",
@@ -46,7 +47,8 @@ SIGNATURES = {
     "interpolate": f"f2 f2 {LEVELS} f2",
     "table_backward": f"f2 f2 {LEVELS} f2 b1",
     "coords_backward": f"f2 f2 f2 {LEVELS} f2",
-    "adam_rows": "f2 f2 f2 f2 b1 d0 d0 d0 d0 d0 d0",
+    "adam_rows": f"{ROWS * layout.ADAM_TABLES}d0 d0 d0 d0",
+    "living": "f2 f2 d0 d0 b1",
     "respond": "f2 f1 f2 f1 i0 d0 f2",
     "respond_backward": "f2 f1 f2 f1 i0 d0 f2 f2 f1 f2",
     "shade": "f2 f2 f2 f1 f2 i0 d0 f2",
