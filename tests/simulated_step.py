@@ -3,6 +3,7 @@
 simulator runs the kernels.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +25,7 @@ from hdr_nsff.fields.splat import (
     rasterize_cuda,
     splat,
 )
-from hdr_nsff.fields.splat.rasterize import Maps, composite_view, rasterize
+from hdr_nsff.fields.splat.rasterize import Maps, composite_view
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import bracketed, curve, fused_tone, kernel_cuda, vignetting
@@ -65,24 +66,31 @@ def count_launch(name: str, grid: tuple[int, int], threads: int, *values: Tensor
 
 
 class NothingDrawn(torch.autograd.Function):
-    """Gray maps of all Gaussians, by no launch at all."""
+    """Maps that brighten, of all Gaussians, by no launch at all."""
 
     @staticmethod
     def forward(ctx: Any, camera: Camera, *gaussians: Tensor) -> tuple[Tensor, ...]:
         ctx.shapes = [g.shape for g in gaussians]
         size = camera.height, camera.width
+        ctx.there = isinstance(gaussians[0], PretendTensor)
         shapes = (*size, gaussians[-1].shape[1]), size, size
-        return tuple(PretendTensor(torch.full(shape, 0.5)) for shape in shapes)
+        return tuple(like_those(ramp(shape), ctx.there) for shape in shapes)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        return None, *(PretendTensor(torch.zeros(shape)) for shape in ctx.shapes)
+        return None, *(like_those(torch.zeros(shape), ctx.there) for shape in ctx.shapes)
+
+
+def ramp(shape: tuple[int, ...]) -> Tensor:
+    return torch.linspace(0.1, 0.9, math.prod(shape)).view(shape)
+
+
+def like_those(made: Tensor, there: bool) -> Tensor:
+    return PretendTensor(made) if there else made
 
 
 def draw_nothing(*arguments: Any) -> Maps:
     *gaussians, camera = arguments
-    if not isinstance(gaussians[0], PretendTensor):
-        return rasterize(*arguments)
     return Maps(*NothingDrawn.apply(camera, *gaussians))
 
 
@@ -132,16 +140,47 @@ def test_launches_of_a_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert SPLAT_LOCAL + RASTERIZER <= 40
+    launch_by(monkeypatch, count_launch)
     trainer = trainer_on(device, toy, toy_folder, tmp_path / "run")
     for number, step in enumerate((1, 2, 1, 2)):  # constants are there by the second time
-        if number == 2:
-            launch_by(monkeypatch, count_launch)
         trainer.clock = replace(trainer.clock, step=step)
         with counted() as counts:
             trainer.step()
         if number >= 2:
             assert counts.launches.total() <= SPLAT, counts.launches.most_common()
             assert not counts.waits
+
+
+def gradients_of_a_step(trainer: Trainer, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """Terms, and gradients by the names of parameters; nothing is moved."""
+    trainer.clock, trainer.read_every = replace(trainer.clock, step=step), 1
+    found = {}
+
+    def keep(*arguments: float) -> None:
+        for module in (trainer.field, trainer.tonemapper):
+            for name, p in module.named_parameters():
+                if p.grad is not None:
+                    found[name], p.grad = unwrap(p.grad).clone(), None
+
+    trainer.optimizers.step = keep  # type: ignore[method-assign]
+    return trainer.step(), found
+
+
+@pytest.mark.parametrize("step", [1, 2])
+def test_a_step_has_the_terms_and_gradients_of_the_cpu(
+    step: int, toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    cpu = trainer_on(torch.device("cpu"), toy, toy_folder, tmp_path / "cpu")
+    terms, gradients = gradients_of_a_step(cpu, step)
+    there = trainer_on(device, toy, toy_folder, tmp_path / "there")
+    found_terms, found = gradients_of_a_step(there, step)
+    assert found_terms == pytest.approx(terms, rel=1e-4, abs=1e-7)
+    assert set(gradients) <= set(found)
+    for name, gradient in found.items():
+        expected = gradients.get(name, torch.zeros_like(gradient))
+        largest = float(expected.abs().max()) if expected.numel() else 0.0
+        off = float((gradient - expected).abs().max()) if expected.numel() else 0.0
+        assert off <= 1e-3 * largest + 1e-7, (name, off, largest)
 
 
 def test_launches_of_a_step_with_time_local_gaussians(

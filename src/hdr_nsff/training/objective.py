@@ -204,7 +204,7 @@ def vector_of(term: Tensor) -> tuple[Tensor, int]:
     whole = term._base
     if whole is None or whole.ndim != 1 or not whole.is_contiguous() or not whole.requires_grad:
         return term, 0
-    return whole, term.storage_offset() - whole.storage_offset()
+    return whole, int(term.storage_offset() - whole.storage_offset())
 
 
 def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
