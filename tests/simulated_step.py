@@ -122,6 +122,8 @@ def trainer_on(
 ) -> Trainer:
     config = small(preset, folder, out)
     config = replace(config, field=replace(config.field, **settings))
+    if config.rays:
+        config = replace(config, rays=8, moving_rays=8)
     open_folder(config)
     return Trainer(config, scene, device, distributed.Ranks())
 
@@ -166,13 +168,13 @@ def gradients_of_a_step(trainer: Trainer, step: int) -> tuple[dict[str, float], 
     return trainer.step(), found
 
 
-@pytest.mark.parametrize("step", [1, 2])
+@pytest.mark.parametrize(("preset", "step"), [("splat", 1), ("splat", 2), ("grid", 1)])
 def test_a_step_has_the_terms_and_gradients_of_the_cpu(
-    step: int, toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+    preset: str, step: int, toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
 ) -> None:
-    cpu = trainer_on(torch.device("cpu"), toy, toy_folder, tmp_path / "cpu")
+    cpu = trainer_on(torch.device("cpu"), toy, toy_folder, tmp_path / "cpu", preset)
     terms, gradients = gradients_of_a_step(cpu, step)
-    there = trainer_on(device, toy, toy_folder, tmp_path / "there")
+    there = trainer_on(device, toy, toy_folder, tmp_path / "there", preset)
     found_terms, found = gradients_of_a_step(there, step)
     assert found_terms == pytest.approx(terms, rel=1e-4, abs=1e-7)
     assert set(gradients) <= set(found)
