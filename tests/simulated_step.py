@@ -1,6 +1,6 @@
-"""A step of `splat` with its CUDA kernels, on the pretend device: what it launches.
-`test_cuda_step.py` runs these tests in a process with NUMBA_ENABLE_CUDASIM=1, where a
-simulator runs the kernels.
+"""Steps of `splat` and `grid` by CUDA kernels, on the pretend device: their launches,
+and that terms and gradients are those of the CPU. `test_cuda_step.py` runs these tests
+in a process with NUMBA_ENABLE_CUDASIM=1, where a simulator runs the kernels.
 """
 
 import math
