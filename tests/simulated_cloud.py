@@ -11,7 +11,7 @@ import torch
 from test_splat import BESIDE, TIMES, batch_of, scattered
 from torch import Tensor
 
-from hdr_nsff.fields.splat import splat
+from hdr_nsff.fields.splat import local_gaussians, splat
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.rasterize import Maps
@@ -163,3 +163,15 @@ def test_flow_is_limited_near_the_camera() -> None:
         field.static.means[5:8, 2] = -1.0
     assert float(BESIDE.project(field.static.means.detach())[0].abs().max()) > 100
     compare(field, 4.0, 1, rigidity=False)
+
+
+@pytest.mark.parametrize("knot", [0.0, 2.4, 4.0])
+def test_time_local_gaussians_that_are_alive(knot: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    field = random_field()
+    with torch.no_grad():
+        field.local.log_scales[:, 3] = -1.0
+        field.local.means[:, 3] = torch.linspace(0, 4, len(field.local))
+    expected = field.alive(knot)
+    monkeypatch.setattr(local_gaussians, "kernels_on", lambda device: True)
+    assert torch.equal(field.alive(knot), expected)
+    assert 0 < len(expected) < len(field.local)

@@ -17,6 +17,7 @@ from hdr_nsff.fields.kernels import footprint, grid
 from hdr_nsff.fields.kernels.cuda import launch as launching
 from hdr_nsff.fields.kernels.cuda.compile import SIGNATURES
 from hdr_nsff.fields.kernels.cuda.launch import Driver, launch, pack
+from hdr_nsff.fields.kernels.cuda.layout import ADAM_TABLES
 from hdr_nsff.fields.splat import rasterize_cuda
 from hdr_nsff.fields.splat.rasterize import (
     Maps,
@@ -221,14 +222,19 @@ def test_tensors_of_the_cpu_are_refused_without_the_simulator(
 
 def test_adam_moves_the_rows_that_it_moves_on_the_cpu() -> None:
     generator = torch.Generator().manual_seed(0)
-    tables = [torch.rand(9, 4, generator=generator) for _ in range(4)]
-    marks = torch.tensor([1, 0, 1, 0, 1, 1, 0, 0, 1], dtype=torch.uint8)
-    tables[1][marks == 0] = 0.0
-    tables[1][0] = 0.0  # a mark without a gradient moves on
-    numbers = 0.1, 0.9, 0.99, 1e-12, 0.19, 0.0199
-    expected = [t.clone() for t in (*tables, marks)]
-    grid.adam_rows(*(t.numpy() for t in expected), *numbers)
-    found = [t.clone() for t in (*tables, marks)]
-    launch("adam_rows", (1, 1), 16, *found, *numbers)
-    for i in (0, 2, 3, 4):
-        torch.testing.assert_close(found[i], expected[i])
+    shared = 0.9, 0.99, 0.19, 0.0199
+    given, expected = [], []
+    for n in range(ADAM_TABLES):
+        tables = [torch.rand(9 * (n % 3), 4, generator=generator) for _ in range(4)]
+        marks = torch.tensor([1, 0, 1, 0, 1, 1, 0, 0, 1], dtype=torch.uint8).repeat(n % 3)
+        tables[1][marks == 0] = 0.0
+        tables[1][:1] = 0.0  # a mark without a gradient moves on
+        lr, eps = 0.1 * (n + 1), 10.0**-n
+        twins = [t.clone() for t in (*tables, marks)]
+        grid.adam_rows(*(t.numpy() for t in twins), lr, *shared[:2], eps, *shared[2:])
+        given += [*tables, marks, lr, eps]
+        expected.append(twins)
+    launch("adam_rows", (2, 1), 16, *given, *shared)
+    for n, twins in enumerate(expected):
+        for i in (0, 2, 3, 4):
+            torch.testing.assert_close(given[7 * n + i], twins[i])

@@ -1,9 +1,10 @@
-"""A step of `splat` with its CUDA kernels, on the pretend device: what it launches.
-`test_cuda_step.py` runs these tests in a process with NUMBA_ENABLE_CUDASIM=1, where a
-simulator runs the kernels.
+"""Steps of `splat` and `grid` by CUDA kernels, on the pretend device: their launches,
+and that terms and gradients are those of the CPU. `test_cuda_step.py` runs these tests
+in a process with NUMBA_ENABLE_CUDASIM=1, where a simulator runs the kernels.
 """
 
-from collections.abc import Iterator
+import math
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,15 +17,33 @@ from torch import Tensor
 
 from hdr_nsff.core import distributed
 from hdr_nsff.fields.kernels.cuda.launch import launch
-from hdr_nsff.fields.nsff import encodings
-from hdr_nsff.fields.splat import fused_cloud, fused_picture, rasterize_cuda, splat
-from hdr_nsff.fields.splat.rasterize import Maps, rasterize
+from hdr_nsff.fields.nsff import encodings, fused_grid
+from hdr_nsff.fields.splat import (
+    fused_cloud,
+    fused_picture,
+    local_gaussians,
+    rasterize_cuda,
+    splat,
+)
+from hdr_nsff.fields.splat.rasterize import Maps, composite_view
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import bracketed, curve, fused_tone, kernel_cuda, vignetting
 from hdr_nsff.training import fused_losses, objective
 from hdr_nsff.training.run_folder import open_folder
 from hdr_nsff.training.train import Trainer
+
+WITH_LAUNCHES = (
+    rasterize_cuda,
+    fused_cloud,
+    fused_picture,
+    fused_grid,
+    encodings,
+    kernel_cuda,
+    fused_losses,
+    fused_tone,
+    local_gaussians,
+)
 
 
 def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
@@ -36,83 +55,180 @@ def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor
     launch(name, grid, threads, *(unwrap(v) for v in values))
 
 
+def count_launch(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
+    """A kernel that does nothing but fill its last result with one number."""
+    if 0 in grid:
+        return
+    for counts in COUNTING:
+        counts.launches[name] += 1
+    if isinstance(values[-1], Tensor):  # every time-local Gaussian is alive
+        unwrap(values[-1]).fill_(name == "living")
+
+
 class NothingDrawn(torch.autograd.Function):
-    """Gray maps of all Gaussians, by no launch at all."""
+    """Maps that brighten, of all Gaussians, by no launch at all."""
 
     @staticmethod
     def forward(ctx: Any, camera: Camera, *gaussians: Tensor) -> tuple[Tensor, ...]:
         ctx.shapes = [g.shape for g in gaussians]
         size = camera.height, camera.width
+        ctx.there = isinstance(gaussians[0], PretendTensor)
         shapes = (*size, gaussians[-1].shape[1]), size, size
-        return tuple(PretendTensor(torch.full(shape, 0.5)) for shape in shapes)
+        return tuple(like_those(ramp(shape), ctx.there) for shape in shapes)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        return None, *(PretendTensor(torch.zeros(shape)) for shape in ctx.shapes)
+        return None, *(like_those(torch.zeros(shape), ctx.there) for shape in ctx.shapes)
+
+
+def ramp(shape: tuple[int, ...]) -> Tensor:
+    return torch.linspace(0.1, 0.9, math.prod(shape)).view(shape)
+
+
+def like_those(made: Tensor, there: bool) -> Tensor:
+    return PretendTensor(made) if there else made
 
 
 def draw_nothing(*arguments: Any) -> Maps:
     *gaussians, camera = arguments
-    if not isinstance(gaussians[0], PretendTensor):
-        return rasterize(*arguments)
     return Maps(*NothingDrawn.apply(camera, *gaussians))
+
+
+def launch_by(monkeypatch: pytest.MonkeyPatch, launched: Callable[..., None]) -> None:
+    for module in WITH_LAUNCHES:
+        monkeypatch.setattr(module, "launch", launched)
 
 
 @pytest.fixture
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """The pretend device, on which our kernels run."""
-    for module in (
-        rasterize_cuda,
-        fused_cloud,
-        fused_picture,
-        encodings,
-        kernel_cuda,
-        fused_losses,
-        fused_tone,
-    ):
-        monkeypatch.setattr(module, "launch", launch_there)
+    launch_by(monkeypatch, launch_there)
+    for module in (fused_picture, kernel_cuda, fused_losses):
+        monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     monkeypatch.setattr(splat, "rasterize", draw_nothing)
-    for module in (splat, encodings, curve, vignetting, objective, bracketed):
+    for module in (splat, local_gaussians, encodings, curve, vignetting, objective, bracketed):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
     with pretend_device() as found:
         yield found
 
 
-def trainer_on(device: torch.device, scene: Scene, folder: Path, out: Path) -> Trainer:
-    config = small("splat", folder, out)
+def trainer_on(
+    device: torch.device,
+    scene: Scene,
+    folder: Path,
+    out: Path,
+    preset: str = "splat",
+    **settings: int,
+) -> Trainer:
+    config = small(preset, folder, out)
+    config = replace(config, field=replace(config.field, **settings))
+    if config.rays:
+        config = replace(config, rays=8, moving_rays=8)
     open_folder(config)
     return Trainer(config, scene, device, distributed.Ranks())
 
 
-# launches of a step without the rasterizer's: where rigidity is due, and where flow is;
-# those of the rasterizer, forward and backward
-MAX_LAUNCHES, RASTERIZER = (52, 50), 18
+# launches of a step of `splat` without the rasterizer's, one of which clears numbers
+# for many steps, and with time-local Gaussians; those of the rasterizer, forward and
+# backward, and of a number that the host reads; those of a step of `grid`
+SPLAT, SPLAT_LOCAL, RASTERIZER, GRID = 27, 30, 10, 962
 
 
 def test_launches_of_a_step(
-    toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    assert SPLAT_LOCAL + RASTERIZER <= 40
+    launch_by(monkeypatch, count_launch)
     trainer = trainer_on(device, toy, toy_folder, tmp_path / "run")
-    found = {}
-    for step in (1, 2, 1, 2):  # every constant is on the device by the second time
+    for number, step in enumerate((1, 2, 1, 2)):  # constants are there by the second time
         trainer.clock = replace(trainer.clock, step=step)
-        flow_turn = trainer.draw(0).seed % 2 == 0
         with counted() as counts:
             trainer.step()
-        found[flow_turn] = counts
-    for counts, most in zip((found[False], found[True]), MAX_LAUNCHES, strict=True):
-        assert counts.launches.total() <= most, counts.launches.most_common()
-        assert not counts.waits
+        if number >= 2:
+            assert counts.launches.total() <= SPLAT, counts.launches.most_common()
+            assert not counts.waits
+
+
+def gradients_of_a_step(trainer: Trainer, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
+    """Terms, and gradients by the names of parameters; nothing is moved."""
+    trainer.clock, trainer.read_every = replace(trainer.clock, step=step), 1
+    found = {}
+
+    def keep(*arguments: float) -> None:
+        for module in (trainer.field, trainer.tonemapper):
+            for name, p in module.named_parameters():
+                if p.grad is not None:
+                    found[name], p.grad = unwrap(p.grad).clone(), None
+
+    trainer.optimizers.step = keep  # type: ignore[method-assign]
+    return trainer.step(), found
+
+
+@pytest.mark.parametrize(("preset", "step"), [("splat", 1), ("splat", 2), ("grid", 1)])
+def test_a_step_has_the_terms_and_gradients_of_the_cpu(
+    preset: str, step: int, toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    cpu = trainer_on(torch.device("cpu"), toy, toy_folder, tmp_path / "cpu", preset)
+    terms, gradients = gradients_of_a_step(cpu, step)
+    there = trainer_on(device, toy, toy_folder, tmp_path / "there", preset)
+    found_terms, found = gradients_of_a_step(there, step)
+    assert found_terms == pytest.approx(terms, rel=1e-4, abs=1e-7)
+    assert set(gradients) <= set(found)
+    for name, gradient in found.items():
+        expected = gradients.get(name, torch.zeros_like(gradient))
+        largest = float(expected.abs().max()) if expected.numel() else 0.0
+        off = float((gradient - expected).abs().max()) if expected.numel() else 0.0
+        assert off <= 1e-3 * largest + 1e-7, (name, off, largest)
+
+
+def test_launches_of_a_step_with_time_local_gaussians(
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launch_by(monkeypatch, count_launch)
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", local=9)
+    assert len(trainer.field.local) == 9
+    for step in (1, 2, 1, 2):
+        trainer.clock = replace(trainer.clock, step=step)
+        with counted() as counts:
+            trainer.step()
+    assert counts.launches.total() <= SPLAT_LOCAL, counts.launches.most_common()
+    assert counts.launches["local_backward"] == 1
+    assert set(counts.waits) == {"aten.nonzero.default"}  # the number of those alive
+
+
+def test_launches_of_a_step_of_grid(
+    toy: Scene,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    launch_by(monkeypatch, count_launch)
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", "grid")
+    for _ in range(2):
+        with counted() as counts:
+            trainer.step()
+    assert counts.launches.total() <= GRID, counts.launches.most_common()
+    kinds = ("interpolate", "table_backward", "coords_backward")
+    assert [counts.launches[kind] for kind in kinds] == [7, 7, 3]
 
 
 def test_launches_of_the_rasterizer(device: torch.device) -> None:
     parts = (3, 4, 3, 1, 6)
     gaussians = [torch.ones(1, n, device=device).requires_grad_() for n in parts]
     gaussians[3] = gaussians[3].detach()[:, 0].requires_grad_()
-    w2c, K = torch.eye(4, device=device)[:3], torch.eye(3, device=device)
+    view = Camera(torch.eye(3, device=device), torch.eye(4, device=device)[:3], 3, 3)
     for _ in range(2):  # constants are on the device by the second time
         with counted() as counts:
-            maps, depth, alpha = rasterize_cuda.composite(*gaussians, w2c, K, (3, 3))
-            torch.autograd.grad([maps, depth, alpha], gaussians, [maps, depth, alpha])
+            maps = composite_view(rasterize_cuda.composite, tuple(gaussians), view)
+            torch.autograd.grad(maps, gaussians, maps)
     assert counts.launches.total() <= RASTERIZER, counts.launches
     assert set(counts.waits) <= {"aten._local_scalar_dense.default"}  # the number of pairs

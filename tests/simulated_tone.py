@@ -7,9 +7,22 @@ import pytest
 import torch
 from torch import Tensor
 
+from hdr_nsff.fields.kernels.cuda import tone_kernels
+from hdr_nsff.tonemap import base, bracketed, fused_tone
 from hdr_nsff.tonemap.base import Recordings, ToneMapConfig
 from hdr_nsff.tonemap.bracketed import SharedToneMapper
-from hdr_nsff.tonemap.fused_tone import fused_recording, fused_regularizers
+from hdr_nsff.tonemap.curve import knot_positions
+from hdr_nsff.tonemap.fused_tone import Recording, fused_recording
+
+FEW = 32  # knots; the simulator has a thread of the CPU for each
+
+
+@pytest.fixture
+def few_knots(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As many knots and threads as one launch takes, but of blocks that are smaller."""
+    for module in (fused_tone, tone_kernels):
+        monkeypatch.setattr(module, "MAX_KNOTS", FEW)
+    monkeypatch.setattr(base, "knot_positions", lambda spacing: knot_positions(spacing, FEW))
 
 
 def random_tone_mapper(num_cameras: int, anchored: bool, **settings: bool) -> SharedToneMapper:
@@ -55,27 +68,55 @@ def compare(ours: dict[str, Tensor], theirs: dict[str, Tensor]) -> None:
         torch.testing.assert_close(ours[name], b, rtol=1e-4, atol=off * largest)
 
 
+@pytest.mark.usefixtures("few_knots")
 @pytest.mark.parametrize(
-    ("frame", "num_cameras", "residual"),
-    [(2, 1, True), (None, 2, True), (2, 2, False), (None, 1, False)],
-)
-def test_gain_and_curve(frame: int | None, num_cameras: int, residual: bool) -> None:
-    tonemapper = random_tone_mapper(num_cameras, True, residual=residual)
-    state, camera = (tonemapper.learned(), tonemapper.held()), num_cameras - 1
-    ours = fused_recording(*state, 2, camera, frame)
+    ("frame", "num_cameras", "anchored", "residual", "vignetting"),
+    [(2, 1, True, True, True), (None, 2, False, True, True), (2, 2, True, False, False),
+     (None, 1, False, False, False)],
+)  # fmt: skip
+def test_gain_curve_and_regularizers(
+    frame: int | None, num_cameras: int, anchored: bool, residual: bool, vignetting: bool
+) -> None:
+    settings = {"residual": residual, "vignetting": vignetting}
+    tonemapper, camera = random_tone_mapper(num_cameras, anchored, **settings), num_cameras - 1
+    ours = tonemapper.recording(2, camera, frame)
+    terms = tonemapper.regularizers()
     theirs = tonemapper.log_gain(2, camera, frame).exp(), tonemapper.curve_values(camera, frame)
-    compare(gradients(tonemapper, [*ours]), gradients(tonemapper, [*theirs]))
-
-
-@pytest.mark.parametrize(
-    ("anchored", "num_cameras", "vignetting"),
-    [(True, 1, True), (False, 2, True), (True, 2, False), (False, 1, False)],
-)
-def test_regularizers(anchored: bool, num_cameras: int, vignetting: bool) -> None:
-    tonemapper = random_tone_mapper(num_cameras, anchored, vignetting=vignetting)
-    ours = fused_regularizers(tonemapper.learned(), tonemapper.held())
-    theirs = tonemapper.regularizers()
-    assert list(ours) == list(theirs)
+    assert list(ours.terms) == list(terms)
     compare(
-        gradients(tonemapper, list(ours.values())), gradients(tonemapper, list(theirs.values()))
+        gradients(tonemapper, [ours.gain, ours.curve, *ours.terms.values()]),
+        gradients(tonemapper, [*theirs, *terms.values()]),
     )
+
+
+@pytest.mark.usefixtures("few_knots")
+@pytest.mark.parametrize("wanted", ["terms", "curve"])
+def test_gradients_of_some_results(wanted: str) -> None:
+    tonemapper = random_tone_mapper(1, True)
+    recording = fused_recording(tonemapper.learned(), tonemapper.held(), 2, 0, 2)
+    theirs = [tonemapper.curve_values(0, 2)]
+    ours = [recording.curve]
+    if wanted == "terms":
+        ours, theirs = list(recording.terms.values()), list(tonemapper.regularizers().values())
+    compare(gradients(tonemapper, ours), gradients(tonemapper, theirs))
+
+
+def test_a_curve_of_as_many_knots_as_there_are() -> None:
+    tonemapper = random_tone_mapper(1, True)
+    ours, theirs = tonemapper.recording(2, 0, 2).curve, tonemapper.curve_values(0, 2)
+    compare(gradients(tonemapper, [ours]), gradients(tonemapper, [theirs]))
+
+
+def test_the_terms_of_a_recording_are_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    tonemapper = random_tone_mapper(1, True)
+    gain, curve = torch.ones(3), tonemapper.curve_values(0, 0)
+    made = [Recording(gain, curve, {"gain_residual": gain[0]}) for _ in range(4)]
+    remaining = iter(made)
+    monkeypatch.setattr(bracketed, "kernels_on", lambda device: True)
+    monkeypatch.setattr(bracketed, "fused_recording", lambda *arguments: next(remaining))
+    for _ in range(2):
+        tonemapper(torch.rand(2, 3), 2, 0, 2)
+    with torch.no_grad():
+        tonemapper(torch.rand(2, 3), 2, 0, 2)
+    assert tonemapper.regularizers() is made[1].terms
+    assert tonemapper.regularizers() is made[3].terms

@@ -85,6 +85,16 @@ def test_kernels_of_a_step_that_cannot_be_loaded_are_reported_once(
     assert messages == ["training steps are plain torch, which is slower: RuntimeError: no room"]
 
 
+def test_kernels_that_draw_nothing_leave_a_step_to_plain_torch(
+    messages: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    faults(monkeypatch, "no compiler", None)
+    cuda_backends.kernels_on.cache_clear()
+    assert not cuda_backends.kernels_on(torch.device("cuda"))
+    cuda_backends.kernels_on.cache_clear()
+    assert messages == ["training steps are plain torch, which is slower: no compiler"]
+
+
 def test_the_cpu_has_no_kernels_of_a_gpu() -> None:
     assert not cuda_backends.kernels_on(torch.device("cpu"))
 

@@ -1,5 +1,5 @@
-"""A training step of `splat` by CUDA kernels, without a GPU: every test of four
-files, in processes with numba-cuda's simulator.
+"""Training steps of `splat` and `grid` by CUDA kernels, without a GPU: every test of
+these files, in processes with numba-cuda's simulator.
 """
 
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from simulator import assert_passed, names_in
 
-FILES = ("cloud", "picture", "tone", "step")
+FILES = ("cloud", "picture", "tone", "grid", "step")
 PATHS = [Path(__file__).with_name(f"simulated_{name}.py") for name in FILES]
 
 

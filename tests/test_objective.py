@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from presets import small, trainer
+from torch import Tensor
 
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.fields.nsff.nsff import SceneFlowLosses
@@ -19,6 +20,7 @@ from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.objective import LossWeights, Objective, merge_weights
 from hdr_nsff.training.presets import PRESETS
 
+KERNELS_ON = "hdr_nsff.training.objective.kernels_on"
 N = 20
 WEIGHTS = merge_weights(LossWeights(), asdict(SceneFlowLosses()), asdict(ToneMapLosses()))
 OBJECTIVE = Objective(WEIGHTS, "scene", near=1.8)
@@ -74,6 +76,25 @@ def test_the_total_is_the_weighted_sum_and_weight_zero_lets_no_gradient_through(
     total = objective.total({"photometric": a, "depth": b, "mask": c})
     total.backward()
     assert float(total.detach()) == 3.5 and float(b.grad) == 0.5 and c.grad is None
+
+
+def test_the_gradients_of_terms_in_vectors_are_those_of_their_total(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = ["photometric", "depth", "mask", "flow", "dynamic"]
+    objective = replace(OBJECTIVE, weights=dict(zip(names, (1.0, 0.5, 0.0, 3.0, 2.0), strict=True)))
+
+    def gradient(with_kernels: bool) -> Tensor:
+        leaf = torch.tensor([1.0, 2.0, 3.0, 4.0], requires_grad=True)
+        parts, alone = (2 * leaf).unbind(), leaf.square().sum()
+        monkeypatch.setattr(KERNELS_ON, lambda device: with_kernels)
+        objective.backward(dict(zip(names, (*parts, alone), strict=True)), 2)
+        assert leaf.grad is not None
+        return leaf.grad
+
+    torch.testing.assert_close(gradient(True), gradient(False))
+    with pytest.raises(AssertionError, match="sparkle"):
+        objective.backward({"sparkle": torch.tensor(1.0)}, 1)
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -3,6 +3,7 @@ numba-cuda's simulator, and every kernel compiled for four kinds of GPU.
 """
 
 import re
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 
@@ -22,6 +23,7 @@ def test_simulated(name: str) -> None:
     assert_passed(SIMULATED, name)
 
 
+ptx_of = cache(compile_ptx)
 needs_compiler = pytest.mark.skipif(
     not any(d.name == "numba-cuda" for d in metadata.distributions()),
     reason="THE CUDA KERNELS ARE NOT COMPILED: numba-cuda is missing (extra gpu)",
@@ -32,7 +34,7 @@ needs_compiler = pytest.mark.skipif(
 @pytest.mark.parametrize("capability", CAPABILITIES)
 @pytest.mark.parametrize("name", list(SIGNATURES))
 def test_a_kernel_becomes_machine_code(name: str, capability: tuple[int, int]) -> None:
-    ptx = compile_ptx(name, capability)
+    ptx = ptx_of(name, capability)
     assert "\n.target sm_{}{}".format(*capability) in ptx
     assert f".visible .entry {name}(" in ptx
     assert not re.search(r"(ld|st)\.local", ptx)  # everything is in registers
@@ -42,7 +44,7 @@ def test_a_kernel_becomes_machine_code(name: str, capability: tuple[int, int]) -
 @needs_compiler
 @pytest.mark.parametrize("name", list(SIGNATURES))
 def test_a_kernel_takes_eight_byte_numbers_as_many_as_are_packed(name: str) -> None:
-    ptx = compile_ptx(name, (8, 0))
+    ptx = ptx_of(name, (8, 0))
     parameters = ptx.partition(f".entry {name}(")[2].partition(")")[0]
     dimensions = [int(code[1]) for code in SIGNATURES[name].split()]
     expected = sum(5 + 2 * d if d else 1 for d in dimensions)

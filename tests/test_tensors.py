@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.tensors import pick_device, tree_map
+from hdr_nsff.core.tensors import generator_for, pick_device, tree_map
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,21 @@ def test_a_function_is_applied_to_every_tensor_and_nothing_else() -> None:
     pair = Pair(torch.tensor(1.0), {"a": (torch.tensor(2.0), torch.tensor(3.0))}, "pair")
     doubled = tree_map(lambda t: 2 * t, pair)
     assert (doubled.first, doubled.others, doubled.name) == (2.0, {"a": (4.0, 6.0)}, "pair")
+
+
+def test_random_numbers_for_cuda_are_drawn_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert generator_for(torch.device("cpu"), 7).initial_seed() == 7
+    assert generator_for(torch.device("meta"), 7).device.type == "cpu"
+    asked: list[torch.device] = []
+    on_cpu = torch.Generator
+
+    def generator(device: torch.device) -> torch.Generator:
+        asked.append(device)
+        return on_cpu()
+
+    monkeypatch.setattr(torch, "Generator", generator)
+    assert generator_for(torch.device("cuda:1"), 7).initial_seed() == 7
+    assert asked == [torch.device("cuda:1")]
 
 
 def with_cuda_devices(monkeypatch: pytest.MonkeyPatch, count: int) -> None:

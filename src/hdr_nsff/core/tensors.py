@@ -62,6 +62,15 @@ def table_on(table: Tensor, device: torch.device, dtype: torch.dtype) -> Tensor:
         return table.to(device, dtype)
 
 
+def generator_for(device: torch.device, seed: int) -> torch.Generator:
+    """A generator that draws for `device`: on CUDA there, elsewhere on the CPU.
+
+    What is drawn on the CPU must be copied, and the host waits for every copy. The same
+    seed draws the same numbers again, but others than on another kind of device.
+    """
+    return torch.Generator(device if device.type == "cuda" else CPU).manual_seed(seed)
+
+
 def pick_device(name: str) -> torch.device:
     """The device of a `--device` flag: auto, cpu, cuda or cuda:N. InputError for any
     other name, and for a CUDA device that is not there.

@@ -24,7 +24,8 @@ def stratified_disparity(
     `jitter` (N, S) in [0, 1) places each sample within its bin; None: at its center.
     """
     offset = 0.5 if jitter is None else jitter
-    bins = torch.arange(num_samples).expand(num_rays, num_samples) + offset
+    device = None if jitter is None else jitter.device
+    bins = torch.arange(num_samples, device=device).expand(num_rays, num_samples) + offset
     fraction = bins / num_samples
     return 1.0 / (1 / near + fraction * (1 / far - 1 / near))
 

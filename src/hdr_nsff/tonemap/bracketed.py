@@ -16,7 +16,7 @@ from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import curve
 from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper
 from hdr_nsff.tonemap.curve import GAMMA
-from hdr_nsff.tonemap.fused_tone import Held, Learned, fused_recording, fused_regularizers
+from hdr_nsff.tonemap.fused_tone import Held, Learned, Recording, fused_recording
 from hdr_nsff.tonemap.kernel import bin_table
 from hdr_nsff.tonemap.responses import NetworkResponse, SharedResponse
 from hdr_nsff.tonemap.vignetting import Vignetting
@@ -158,6 +158,7 @@ class SharedToneMapper(BracketedToneMapper):
         self.register_buffer("anchor_curve", torch.zeros(count, 3, len(self.knots)))
         self.register_buffer("anchor_ev", torch.zeros(len(recordings.ev)))
         self.register_buffer("anchor_white_balance", torch.zeros(count - 1, 3))
+        self.unread_terms: dict[str, Tensor] | None = None  # of the last recording
         self.vignetting: Vignetting | None = None
         if config.vignetting and recordings.corners:
             self.vignetting = Vignetting(recordings.corners)
@@ -190,11 +191,16 @@ class SharedToneMapper(BracketedToneMapper):
         if not kernels_on(self.knots.device):
             return super().forward(radiance, bracket, camera_id, frame, leaky)
         assert radiance.shape[-1] == 3, radiance.shape
-        state = self.learned(), self.held()
-        gain, values = fused_recording(*state, bracket, camera_id, frame)
+        recording = self.recording(bracket, camera_id, frame)
+        if torch.is_grad_enabled():
+            self.unread_terms = recording.terms
         leak = self.config.leak if leaky else None
-        rgb = radiance.float()
-        return curve.record(rgb, gain, values, self.knots, self.bins, self.power, leak)
+        given = self.knots, self.bins, self.power, leak
+        return curve.record(radiance.float(), recording.gain, recording.curve, *given)
+
+    def recording(self, bracket: int, camera_id: int, frame: int | None) -> Recording:
+        """What records a frame, by CUDA kernels."""
+        return fused_recording(self.learned(), self.held(), bracket, camera_id, frame)
 
     def learned(self) -> Learned:
         """What is learned, for CUDA kernels."""
@@ -243,9 +249,13 @@ class SharedToneMapper(BracketedToneMapper):
         `gain_residual` is the mean square of the frames' residuals and of the log white
         balances: for a camera that recorded one bracket only, exposure and white
         balance cannot be separated. `response_anchor` is 0 until `anchor()`.
+
+        CUDA kernels make the terms with a recording: those of the last one are read,
+        once.
         """
         if kernels_on(self.knots.device):
-            return fused_regularizers(self.learned(), self.held())
+            terms, self.unread_terms = self.unread_terms, None
+            return self.recording(0, 0, None).terms if terms is None else terms
         gain = self.bracket_gain
         small = [t for t in (gain.residual, gain.white_balance) if t is not None and t.numel()]
         residual = self.knots.new_zeros(())

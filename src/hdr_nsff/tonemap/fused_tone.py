@@ -1,5 +1,5 @@
-"""Curve, gain and regularizers of the shared tone mapper by CUDA kernels: one launch
-each, where plain torch takes about fifty for these few numbers.
+"""Curve, gain and regularizers of the shared tone mapper by CUDA kernels: one launch,
+where plain torch takes about a hundred for these few numbers.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hdr_nsff.fields.kernels.cuda.launch import launch
+from hdr_nsff.fields.kernels.cuda.launch import few_zeros, launch
 from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS
 
 TERM_NAMES = ("response_smoothness", "gain_residual", "response_anchor", "vignetting")
@@ -46,44 +46,44 @@ class Held:
     min_step: float
 
 
+@dataclass(frozen=True)
+class Recording:
+    """What records a frame, and the terms that keep all that was learned in place."""
+
+    gain: Tensor  # (3,) of the frame
+    curve: Tensor  # (3, K) of its camera
+    terms: dict[str, Tensor]
+
+
 def fused_recording(
     learned: Learned, held: Held, bracket: int, camera_id: int, frame: int | None
-) -> tuple[Tensor, Tensor]:
-    """The gain (3,) of a frame, and the curve (3, K) of its camera."""
+) -> Recording:
+    """Everything of one frame, in one launch; without a `frame`, of any other view."""
     which = camera_id, bracket, -1 if frame is None else frame
-    curves, gain, _ = Tone.apply(held, which, *learned.tensors())
-    return gain, curves[0]
-
-
-def fused_regularizers(learned: Learned, held: Held) -> dict[str, Tensor]:
-    """The terms of all curves, and of everything that keeps them in place."""
-    _, _, terms = Tone.apply(held, None, *learned.tensors())
+    curve, gain, terms = Tone.apply(held, which, *learned.tensors())
     names = TERM_NAMES if len(learned.vignetting) else TERM_NAMES[:3]
-    return dict(zip(names, terms.unbind(), strict=False))
+    return Recording(gain, curve, dict(zip(names, terms.unbind(), strict=False)))
 
 
 class Tone(torch.autograd.Function):
-    """Curves (1, 3, K), gain (3,), nothing; or without `which`, the terms (4,) last."""
+    """The curve (3, K) of `which` camera, the gain (3,) and the terms (4,)."""
 
     @staticmethod
     def forward(
-        ctx: Any, held: Held, which: tuple[int, int, int] | None, *learned: Tensor
+        ctx: Any, held: Held, which: tuple[int, int, int], *learned: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         logits, ev, white, residual, vignetting = (t.detach().contiguous() for t in learned)
-        num_cameras = len(logits) if which is None else 1
         num_knots = logits.shape[2] + 1
         assert num_knots <= MAX_KNOTS, num_knots
         anchors = held.curve, held.ev, held.white_balance
         parts = logits, held.known, held.unknown, ev, held.drift, white, residual, *anchors
-        numbers = held.min_step, *(which or (0, 0, -1)), int(held.anchored)
-        ctx.given = *parts, vignetting, *numbers
-        values = logits.new_empty(num_cameras, 3, num_knots)
-        gain = logits.new_empty(3)
-        terms = logits.new_zeros(len(TERM_NAMES)) if which is None else logits.new_empty(0)
-        launch("tone", (3 * num_cameras, 1), MAX_KNOTS, *ctx.given, values, gain, terms)
-        ctx.made, ctx.of_terms = (values, gain), which is None
+        ctx.given = *parts, vignetting, held.min_step, *which, int(held.anchored)
+        values = logits.new_empty(len(logits), 3, num_knots)
+        gain, terms = logits.new_empty(3), few_zeros(logits, len(TERM_NAMES))
+        launch("tone", (3 * len(logits), 1), MAX_KNOTS, *ctx.given, values, gain, terms)
+        ctx.made = values, gain.detach()  # a result itself would hold on to its own graph
         ctx.set_materialize_grads(False)
-        return values, gain, terms
+        return values[which[0]], gain, terms
 
     @staticmethod
     @once_differentiable
@@ -92,12 +92,8 @@ class Tone(torch.autograd.Function):
         vignetting = ctx.given[10]
         values, gain = ctx.made
         made = [torch.empty_like(t) for t in (logits, ev, white, residual, vignetting)]
-        missing = values[:0], gain[:0], gain[:0]
-        d = [m if g is None or not g.numel() else g for g, m in zip(grads, missing, strict=True)]
-        if len(values) < len(logits):  # of the other cameras
-            made[0].zero_()
-        grid = 3 * len(values), 1
-        given = (*ctx.given, values, gain, *(g.contiguous() for g in d))
-        launch("tone_backward", grid, MAX_KNOTS, *given, *made)
-        unused = not ctx.of_terms
-        return None, None, *made[:4], None if unused else made[4]
+        missing = values[:0, 0], gain[:0], gain[:0]
+        d = [m if g is None else g.contiguous() for g, m in zip(grads, missing, strict=True)]
+        launch("tone_backward", (3 * len(logits), 1), MAX_KNOTS, *ctx.given, *ctx.made, *d, *made)
+        shaped = None if d[2] is missing[2] else made[4]  # the lens has no part in the others
+        return None, None, *made[:4], shaped

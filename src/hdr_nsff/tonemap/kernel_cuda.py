@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
 from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, MAX_KNOTS, THREADS
 
 
@@ -44,8 +44,7 @@ class RespondCuda(torch.autograd.Function):
     def backward(ctx: Any, d_rgb: Tensor) -> Any:
         radiance, gain, values, knots = ctx.saved_tensors
         g_radiance = torch.empty_like(radiance)
-        sums = values.new_zeros(3 + values.numel())
-        g_gain, g_values = sums[:3], sums[3:].view(values.shape)
+        g_gain, g_values = few_zeros(gain, 3), few_zeros(values, *values.shape)
         given = radiance, gain, values, knots, *ctx.ends, d_rgb.contiguous()
         grid = few_blocks(len(radiance))
         launch("respond_backward", grid, THREADS, *given, g_radiance, g_gain, g_values)
@@ -80,7 +79,7 @@ class ShadeCuda(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, d_shaded: Tensor) -> Any:
         radiance, coefficients = ctx.given[0], ctx.given[4]
-        g_radiance, g = torch.empty_like(radiance), torch.zeros_like(coefficients)
+        g_radiance, g = torch.empty_like(radiance), few_zeros(radiance, *coefficients.shape)
         grid = few_blocks(len(radiance))
         given = *ctx.given, d_shaded.contiguous(), g_radiance, g
         launch("shade_backward", grid, THREADS, *given)

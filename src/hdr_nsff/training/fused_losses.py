@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hdr_nsff.fields.base import Render
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
 from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, PICTURE_SUMS, THREADS
 from hdr_nsff.maths.losses import MASK_MARGIN
 from hdr_nsff.scene.batch import PixelBatch
@@ -34,7 +34,7 @@ def fused_terms(
 ) -> dict[str, Tensor]:
     """The terms of a whole frame whose picture is `rgb` (N, 3)."""
     nothing = rgb.detach()[:0, 0]
-    no_flow, no_mask = rgb.detach()[:0, :2], nothing.to(torch.uint8)
+    no_flow, no_mask = rgb.detach()[:0, :2], rgb.new_empty(0, dtype=torch.uint8)
     flow, target, valid = no_flow, no_flow, no_mask
     for warp in render.warps:
         if warp.offset in batch.flow:
@@ -50,13 +50,15 @@ def fused_terms(
     )
     numbers = float(near), float(fade), MASK_MARGIN, float(limit)
     rendered = rgb, render.depth, render.motion, flow
-    terms = FusedLosses.apply(*rendered, batch.rgb, known, numbers).unbind()
+    terms = FusedLosses.apply(*rendered, batch.rgb, known, numbers).unbind()[: len(TERM_NAMES)]
     has = True, batch.disparity is not None, batch.moving is not None, len(valid) > 0
     return {name: term for name, term, h in zip(TERM_NAMES, terms, has, strict=True) if h}
 
 
 class FusedLosses(torch.autograd.Function):
-    """The four terms of `TERM_NAMES`; 0 where what they compare with is missing."""
+    """The four terms of `TERM_NAMES`, 0 where what they compare with is missing, and
+    two numbers that the kernels need (PICTURE_SUMS,).
+    """
 
     @staticmethod
     def forward(
@@ -74,11 +76,12 @@ class FusedLosses(torch.autograd.Function):
             *(rgb, recorded, depth, disparity, confidence, motion, moving, outline),
             *(flow, target, valid),
         )
-        sums = rgb.new_zeros(PICTURE_SUMS)
-        ctx.given = *(t.detach().contiguous() for t in tensors), *numbers, sums
+        sums = few_zeros(rgb, PICTURE_SUMS)
+        # `detach`: a result itself would hold on to its own graph
+        ctx.given = *(t.detach().contiguous() for t in tensors), *numbers, sums.detach()
         grid = min(blocks_for(len(rgb))[0], MAX_BLOCKS), 1
         launch("losses", grid, THREADS, *ctx.given)
-        return sums[: len(TERM_NAMES)].view(-1)
+        return sums
 
     @staticmethod
     @once_differentiable

@@ -169,14 +169,42 @@ class Objective:
             terms["mask"] = losses.motion_mask(render.motion, batch.moving, certain)
         return terms
 
-    def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """The weighted sum; a term without a weight is an error."""
+    def counting(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Those of the terms that count; one without a weight is an error."""
         unknown = set(terms) - set(self.weights)
         assert not unknown, f"terms without a weight: {sorted(unknown)}"
-        counting = {name: value for name, value in terms.items() if self.weights[name]}
+        return {name: value for name, value in terms.items() if self.weights[name]}
+
+    def total(self, terms: dict[str, Tensor]) -> Tensor:
+        """The weighted sum."""
+        counting = self.counting(terms)
         values = torch.stack(list(counting.values()))
         weights = tuple(self.weights[name] for name in counting)
         return (values * constant(weights, values.device, values.dtype)).sum()
+
+    def backward(self, terms: dict[str, Tensor], batches: int) -> None:
+        """Add the gradients of `total`, as one of the `batches` of a step."""
+        device = next(iter(terms.values())).device
+        if not kernels_on(device):
+            (self.total(terms) / batches).backward()
+            return
+        # a kernel's terms are parts of one vector: its gradient are their weights
+        weights: dict[Tensor, list[float]] = {}
+        for name, term in self.counting(terms).items():
+            if term.requires_grad:
+                vector, position = vector_of(term)
+                of_parts = weights.setdefault(vector, [0.0] * vector.numel())
+                of_parts[position] += self.weights[name] / batches
+        given = [constant(tuple(w), device, v.dtype).view_as(v) for v, w in weights.items()]
+        torch.autograd.backward(list(weights), given)
+
+
+def vector_of(term: Tensor) -> tuple[Tensor, int]:
+    """The vector of which a scalar is a part, and its place there; or the scalar."""
+    whole = term._base
+    if whole is None or whole.ndim != 1 or not whole.is_contiguous() or not whole.requires_grad:
+        return term, 0
+    return whole, int(term.storage_offset() - whole.storage_offset())
 
 
 def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:

@@ -197,7 +197,7 @@ class Trainer:
             if log_due or clock.step % self.read_every == 0:
                 values = self.read_terms()
             check_finite(values, clock.step, batch, render.radiance)
-            (self.objective.total(terms) / config.batches).backward()
+            self.objective.backward(terms, config.batches)
             if log_due:
                 values["mse"] = squared_error(render, batch, self.tonemapper)
             for name, value in values.items():

@@ -26,6 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
+from hdr_nsff.core.tensors import generator_for
 from hdr_nsff.fields.base import FrameError, ParamGroup, Render
 from hdr_nsff.fields.baselines.planes import Planes
 from hdr_nsff.fields.knots import knot_of
@@ -191,7 +192,7 @@ class HexPlane(nn.Module):
     def forward(self, batch: PixelBatch) -> tuple[Render, dict[str, Tensor]]:
         """A render of the batch's pixels, recorded, and the planes' total variation."""
         assert batch.recorder is not None
-        generator = torch.Generator().manual_seed(batch.seed)
+        generator = generator_for(batch.rgb.device, batch.seed)
         samples = self.sample(batch.camera, batch.pixels, self.config.samples, generator)
         render, weights = self.render_samples(samples, batch.time, [batch.recorder], generator)
         self.cells.observe(samples.coords.reshape(-1, 3), weights.reshape(-1))

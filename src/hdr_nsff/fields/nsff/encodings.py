@@ -2,8 +2,8 @@
 
 Coordinates are in [0, 1]^3. No network follows a grid: at equal CPU time, dense and
 hashed grids that add up beat hash features with an MLP (Müller et al. 2022) by 5 to 9
-dB on rendered scenes. Grids run as numba kernels on the CPU and as plain torch
-elsewhere.
+dB on rendered scenes. Grids run as numba kernels on the CPU, as CUDA kernels on GPUs,
+and as plain torch elsewhere.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.kernels import grid as kernels
 from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
-from hdr_nsff.fields.kernels.cuda.layout import THREADS
+from hdr_nsff.fields.kernels.cuda.layout import ADAM_TABLES, THREADS
+from hdr_nsff.fields.nsff.fused_grid import GridFunctionCuda, Layout
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 
 Shape = tuple[int, int, int, int]  # x, y, z grid points and time slices
@@ -74,7 +75,22 @@ class AdditiveGrid(nn.Module):
         slices, weights = self.time_slices(knot)
         if coords.device.type == "cpu" and coords.dtype == torch.float32:
             return GridFunction.apply(coords, self.table, self.touched, self, slices, weights)
+        if coords.dtype == torch.float32 and kernels_on(coords.device):
+            layout = self.layout_on(coords.device, slices, weights)
+            return GridFunctionCuda.apply(coords, self.table, self.touched, layout)
         return self.reference(coords, slices, weights)
+
+    def layout_on(self, device: torch.device, slices: np.ndarray, weights: np.ndarray) -> Layout:
+        """Where CUDA kernels find what is read of these time slices (L, 2)."""
+        rows = self.offset, self.size, self.hashed
+        levels = np.column_stack([self.res.astype(np.int64), *rows])
+
+        def table(values: np.ndarray, dtype: torch.dtype) -> Tensor:
+            numbers = tuple(values.ravel().tolist())
+            return constant(numbers, device, dtype).view(values.shape)
+
+        whole = torch.int64
+        return Layout(table(levels, whole), table(slices, whole), table(weights, torch.float32))
 
     def scatter_level(
         self, level: int, coords: Tensor, values: Tensor, knot: float = 0.0
@@ -211,6 +227,7 @@ class TouchedAdam(torch.optim.Optimizer):
     def step(self, closure: Any = None) -> None:  # type: ignore[override]
         """One step on every parameter that has a gradient."""
         assert closure is None
+        moved: list[tuple[Tensor, dict[str, Any]]] = []
         for group in self.param_groups:
             for p in group["params"]:
                 state = self.state[p]
@@ -222,7 +239,32 @@ class TouchedAdam(torch.optim.Optimizer):
                 # unbroken one
                 state["step"] += 1
                 if p.grad is not None:
-                    self.update(p, group)
+                    moved.append((p, group))
+        if moved and kernels_on(moved[0][0].device):
+            self.launch_updates(moved)
+            return
+        for p, group in moved:
+            self.update(p, group)
+
+    def launch_updates(self, moved: list[tuple[Tensor, dict[str, Any]]]) -> None:
+        """`update` by a CUDA kernel, of several parameters at a time."""
+        batches: dict[tuple[float, ...], list[tuple[Any, ...]]] = {}
+        for p, group in moved:
+            assert p.grad is not None
+            state, t = self.state[p], float(self.state[p]["step"])
+            tensors = p.detach(), p.grad.contiguous(), state["exp_avg"], state["exp_avg_sq"]
+            given = *tensors, self.marks[p], float(group["lr"]), float(group["eps"])
+            batches.setdefault((*group["betas"], t), []).append(given)
+            p.grad = None  # the next one is taken as it is, not added to zeros
+        for (beta1, beta2, t), tables in batches.items():
+            numbers = beta1, beta2, 1 - beta1**t, 1 - beta2**t
+            for first in range(0, len(tables), ADAM_TABLES):
+                batch = tables[first : first + ADAM_TABLES]
+                rows = max(len(table[0]) for table in batch)
+                missing = *(tensor[:0] for tensor in batch[0][:5]), 0.0, 0.0
+                batch += [missing] * (ADAM_TABLES - len(batch))
+                flat = [value for table in batch for value in table]
+                launch("adam_rows", blocks_for(rows), THREADS, *flat, *numbers)
 
     def update(self, p: Tensor, group: dict[str, Any]) -> None:
         """Move the touched rows of a parameter (rows, 4), clear marks and gradient."""
@@ -237,12 +279,6 @@ class TouchedAdam(torch.optim.Optimizer):
             tensors = (p, p.grad, m, v, self.marks[p])
             arrays = [tensor.detach().numpy() for tensor in tensors]
             kernels.adam_rows(*arrays, lr, beta1, beta2, eps, correction1, correction2)
-            return
-        if kernels_on(p.device):
-            tensors = (p.detach(), p.grad.contiguous(), m, v, self.marks[p])
-            numbers = float(lr), beta1, beta2, eps, correction1, correction2
-            launch("adam_rows", blocks_for(len(p)), THREADS, *tensors, *numbers)
-            p.grad = None  # the next one is taken as it is, not added to zeros
             return
         rows = (p.grad != 0).any(-1, keepdim=True)
         m.copy_(torch.where(rows, beta1 * m + (1 - beta1) * p.grad, m))

@@ -58,8 +58,9 @@ class Occupancy(nn.Module):
         cells = self.cell_index(coords, knot)
         keep = self.mask.view(-1)[cells]
         if explore and generator is not None:
-            drawn = torch.rand(len(coords), generator=generator).to(coords.device) < explore
-            keep = keep | (drawn & self.allowed.view(-1)[cells])
+            where = generator.device
+            drawn = torch.rand(len(coords), generator=generator, device=where).to(coords.device)
+            keep = keep | ((drawn < explore) & self.allowed.view(-1)[cells])
         return keep
 
     @torch.no_grad()

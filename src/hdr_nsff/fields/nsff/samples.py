@@ -62,7 +62,8 @@ def sample_rays(
     num_rays = len(pixels)
     jitter = None
     if generator is not None:
-        jitter = torch.rand(num_rays, num_samples, generator=generator)
+        shape, where = (num_rays, num_samples), generator.device
+        jitter = torch.rand(shape, generator=generator, device=where)
     depths = volume.stratified_disparity(num_rays, num_samples, near, far, jitter).to(pixels)
     points = rays.origins[:, None] + depths[..., None] * rays.directions[:, None]  # (N, S, 3)
     coords = space.encode(points)

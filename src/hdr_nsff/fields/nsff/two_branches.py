@@ -18,6 +18,7 @@ from pydantic import Discriminator
 from torch import Tensor, nn
 
 from hdr_nsff.core.settings import Advanced, Count, Number, Share, Weight
+from hdr_nsff.core.tensors import generator_for
 from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE, FrameError, ParamGroup
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.branches import (
@@ -163,7 +164,8 @@ class TwoBranches(nn.Module):
     def to_density(self, raw: Tensor, bias: float) -> Tensor:
         """Density per cube side, >= 0; with noise while training, by the settings."""
         if self.training and self.config.density_noise:
-            noise = torch.randn(raw.shape, generator=self.generator).to(raw)
+            where = self.generator.device
+            noise = torch.randn(raw.shape, generator=self.generator, device=where).to(raw)
             raw = raw + self.config.density_noise * noise
         if self.config.density == "exp":
             return (raw + bias).clamp(max=MAX_LOG_DENSITY).exp()
@@ -262,7 +264,7 @@ class TwoBranches(nn.Module):
 
         With `motion`, the pass has raw motion.
         """
-        generator = torch.Generator().manual_seed(batch.seed)
+        generator = generator_for(batch.rgb.device, batch.seed)
         self.generator = generator
         knot = self.knot(batch.time)
         samples = self.sample(batch.camera, batch.pixels, self.config.samples, generator)

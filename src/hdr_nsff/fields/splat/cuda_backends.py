@@ -51,16 +51,19 @@ def fault(device: str = "cuda") -> str | None:
 
 @cache
 def kernels_on(device: torch.device) -> bool:
-    """Whether all of our own kernels run on a device; says once where only some do."""
-    if device.type != "cuda" or rasterize_cuda.fault(str(device)) is not None:
+    """Whether all of our own kernels run on a device; says once why they do not."""
+    if device.type != "cuda":
         return False
-    try:
-        load_all(device)
-    except Exception as error:  # of any type: compilers and drivers take part
-        reason = f"{type(error).__name__}: {str(error).strip().partition(chr(10))[0]:.120}"
+    reason = rasterize_cuda.fault(str(device))
+    if reason is None:
+        try:
+            load_all(device)
+        except Exception as error:  # of any type: compilers and drivers take part
+            first_line = str(error).strip().partition("\n")[0]
+            reason = f"{type(error).__name__}: {first_line:.120}"
+    if reason is not None:
         say(f"training steps are plain torch, which is slower: {reason}")
-        return False
-    return True
+    return reason is None
 
 
 @cache

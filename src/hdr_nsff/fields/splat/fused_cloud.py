@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.core.tensors import constant
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
 from hdr_nsff.fields.kernels.cuda.layout import NUMBERS, POSE, TERMS, THREADS
 from hdr_nsff.fields.knots import catmull_rom_weights, linear_position
 from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY, Model
@@ -120,7 +120,7 @@ class MakeCloud(torch.autograd.Function):
         columns = (3, 4, 3, 1, 6 if moment.neighbor else 4)
         made = [first.new_empty(count, c) for c in columns]
         made[3] = made[3][:, 0]
-        terms = first.new_zeros(TERMS if moment.rigidity else EVERY_STEP)
+        terms = few_zeros(first, TERMS if moment.rigidity else EVERY_STEP)
         rest, tables = learned[:16], learned[16:]
         shared = alive, model.neighbors, model.local.neighbors, numbers, *views
         centers = model.trajectories.centers

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from hdr_nsff.fields.base import Render
-from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
 from hdr_nsff.fields.kernels.cuda.layout import MAX_BLOCKS, THREADS
 from hdr_nsff.fields.splat.rasterize import Maps
 
@@ -57,7 +57,7 @@ class Compose(torch.autograd.Function):
     def backward(ctx: Any, *grads: Tensor) -> Any:
         planes, depths, alphas, background, *_ = ctx.given
         made = [torch.empty_like(t) for t in (planes, depths, alphas)]
-        g_background = torch.zeros_like(background)
+        g_background = few_zeros(background, 3)
         given = *ctx.given, *(g.contiguous() for g in grads)
         grid = min(blocks_for(len(alphas))[0], MAX_BLOCKS), 1
         launch("compose_backward", grid, THREADS, *given, *made, g_background)

@@ -17,7 +17,10 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
 from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.fields.splat.gaussians import START_LOG_SCALE, START_LOGIT, to_radiance
 
 MIN_WINDOW = 0.02  # below this share of its opacity, a Gaussian is not alive: 2.8 durations
@@ -96,8 +99,13 @@ class LocalGaussians(nn.Module):
     def alive(self, time: float) -> Tensor:
         """Indices (A,) of the Gaussians that are alive at a time."""
         if not len(self):  # the host need not wait for a GPU
-            return torch.arange(0, device=self.means.device)
-        return (self.window(self.means, self.log_scales, time) > MIN_WINDOW).nonzero()[:, 0]
+            return self.means.new_empty(0, dtype=torch.int64)
+        if not kernels_on(self.means.device):
+            return (self.window(self.means, self.log_scales, time) > MIN_WINDOW).nonzero()[:, 0]
+        tables = self.means.detach().contiguous(), self.log_scales.detach().contiguous()
+        alive = self.means.new_empty(len(self), dtype=torch.uint8)
+        launch("living", blocks_for(len(self)), THREADS, *tables, float(time), MIN_WINDOW, alive)
+        return alive.nonzero()[:, 0]
 
     @staticmethod
     def window(means: Tensor, log_scales: Tensor, time: float) -> Tensor:

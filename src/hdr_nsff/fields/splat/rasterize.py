@@ -8,6 +8,7 @@ features, pictures of (H, W).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from torch import Tensor
 
 from hdr_nsff.core.tensors import table_on, to_device
 from hdr_nsff.fields.kernels import compositing, footprint, projection
-from hdr_nsff.fields.splat.cuda_backends import composite_on
+from hdr_nsff.fields.splat.cuda_backends import Composite, composite_on
 from hdr_nsff.geometry.cameras import Camera
 
 ALPHA_MIN, ALPHA_MAX = float(footprint.ALPHA_MIN), float(compositing.ALPHA_MAX)
@@ -62,16 +63,36 @@ def rasterize(
                 # not `dense`, which would hold every Gaussian at every pixel
                 on_cpu = rasterize(*to_device(gaussians, "cpu"), to_device(camera, "cpu"))
                 return Maps(*(m.to(means.device) for m in on_cpu))
-            w2c, size = world_to_camera_and_focal(camera), (camera.width, camera.height)
-            return Maps(*composite(*gaussians, w2c, camera.K.detach(), size))
+            return composite_view(composite, gaussians, camera)
         case _:
             return dense(*gaussians, camera)
 
 
+def composite_view(composite: Composite, gaussians: tuple[Tensor, ...], camera: Camera) -> Maps:
+    """`rasterize` by a rasterizer of CUDA devices."""
+    if camera.c2w.requires_grad or camera.K.requires_grad:
+        w2c = world_to_camera_and_focal(camera)
+    else:
+        w2c = held_pose(camera.c2w)
+    return Maps(*composite(*gaussians, w2c, camera.K.detach(), (camera.width, camera.height)))
+
+
+@lru_cache(maxsize=4096)
+def held_pose(c2w: Tensor) -> Tensor:
+    """World to camera (3, 4) of a pose that does not change, made once."""
+    with torch.inference_mode(False), torch.no_grad():
+        return invert_pose(c2w)
+
+
+def invert_pose(c2w: Tensor) -> Tensor:
+    """World to camera (3, 4) of camera to world (3, 4)."""
+    rotation = c2w[:, :3].T
+    return torch.cat([rotation, -rotation @ c2w[:, 3:]], 1)
+
+
 def world_to_camera(camera: Camera) -> Tensor:
     """World to camera (3, 4), differentiable in the pose."""
-    rotation = camera.c2w[:, :3].T
-    return torch.cat([rotation, -rotation @ camera.c2w[:, 3:]], 1)
+    return invert_pose(camera.c2w)
 
 
 def world_to_camera_and_focal(camera: Camera) -> Tensor:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.kernels.cuda.launch import launch
+from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
 from hdr_nsff.fields.kernels.cuda.layout import CHANNELS, ELLIPSE, PIXELS, THREADS, TILE
 from hdr_nsff.fields.kernels.footprint import MOMENTS
 from hdr_nsff.fields.splat.try_out import fault_of
@@ -63,14 +63,12 @@ def composite(
     reach everything but `K`.
     """
     gaussians = means, quaternions, scales, opacities, features
-    maps, alpha = RasterizeCuda.apply(*gaussians, w2c, K, size)
-    # `split` joins the two gradients, where slices' would be added up
-    seen, depth = maps.split([len(maps) - 1, 1])
-    return seen.permute(1, 2, 0), depth[0], alpha
+    seen, depth, alpha = RasterizeCuda.apply(*gaussians, w2c, K, size)
+    return seen.permute(1, 2, 0), depth, alpha
 
 
 class RasterizeCuda(torch.autograd.Function):
-    """Maps (D + 1, H, W), the last one z-depth, and alpha (H, W).
+    """Features (D, H, W), z-depth (H, W) and alpha (H, W).
 
     Gradients reach everything but `K`, the pose `w2c` (3, 4) included. Those of a
     Gaussian are sums in no fixed order, so that their last digits differ between runs.
@@ -87,54 +85,46 @@ class RasterizeCuda(torch.autograd.Function):
         w2c: Tensor,
         K: Tensor,
         size: tuple[int, int],
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[Tensor, Tensor, Tensor]:
         parts = (means, quaternions, scales, opacities)
         gaussians = [t.detach().contiguous() for t in parts]
-        camera = torch.cat([w2c.flatten(), K.diagonal()[:2], K[:2, 2]]).double()
+        view = w2c.detach().contiguous(), K.detach().contiguous(), *size
         count, (width, height) = len(means), size
+        num_features = features.shape[1]  # z-depth comes after them
+        num_chunks = -(-(num_features + 1) // CHANNELS)
         ellipses = means.new_empty(count, ELLIPSE)
         depths = means.new_empty(count)
+        values = means.new_empty(count, num_chunks * CHANNELS)
         boxes = means.new_empty((count, 4), dtype=torch.int32)
         counts = means.new_empty(count, dtype=torch.int64)
-        projected = ellipses, depths, boxes, counts
-        blocks = (-(-count // THREADS), 1)
-        launch("project", blocks, THREADS, *gaussians, camera, width, height, *projected)
+        copied = features.detach().contiguous()
+        projected = ellipses, depths, values, boxes, counts
+        launch("project", blocks_for(count), THREADS, *gaussians, copied, *view, *projected)
         starts, owners = sort_pairs(boxes, counts, depths, size)
-        channels = features.shape[1] + 1  # z-depth is the last one
-        num_chunks = -(-channels // CHANNELS)
-        values = means.new_zeros(count, num_chunks * CHANNELS)
-        values[:, : channels - 1] = features
-        values[:, channels - 1] = depths
-        maps = means.new_empty(channels, height, width)
+        maps = means.new_empty(num_features + 1, height, width)
         alpha = means.new_empty(height, width)
         grid = (len(starts) - 1, num_chunks)
         tiles = starts, owners, ellipses, values, maps, alpha
         launch("forward", grid, PIXELS, *tiles)
-        ctx.gaussians, ctx.camera, ctx.size, ctx.counts = gaussians, camera, size, counts
-        ctx.tiles, ctx.grid = tiles[:4], grid
-        ctx.save_for_backward(maps, alpha)
-        return maps, alpha
+        ctx.gaussians, ctx.view, ctx.counts = gaussians, view, counts
+        # a result itself would hold on to its own graph
+        ctx.tiles, ctx.grid, ctx.num_features = (*tiles[:-1], alpha.detach()), grid, num_features
+        return maps[:num_features], maps[num_features], alpha
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> Any:
-        maps, alpha = ctx.saved_tensors
         means, values = ctx.gaussians[0], ctx.tiles[3]
         sums = means.new_zeros(len(means), MOMENTS + values.shape[1])
-        grad_maps, grad_alpha = (g.contiguous() for g in grads)
-        seen = maps, alpha, grad_maps, grad_alpha
-        launch("backward", ctx.grid, PIXELS, *ctx.tiles, *seen, sums)
+        launch("backward", ctx.grid, PIXELS, *ctx.tiles, *(g.contiguous() for g in grads), sums)
         needs_pose = ctx.needs_input_grad[5]
         out = [torch.empty_like(t) for t in ctx.gaussians]
         poses = means.new_empty(len(means) if needs_pose else 0, 12)
-        depth_channel = len(maps) - 1
-        view = ctx.camera, *ctx.size
-        blocks = (-(-len(means) // THREADS), 1)
-        arguments = (*ctx.gaussians, *view, ctx.counts, sums, depth_channel, *out, poses)
-        launch("project_backward", blocks, THREADS, *arguments)
+        given = (*ctx.gaussians, *ctx.view, ctx.counts, sums, ctx.num_features)
+        launch("project_backward", blocks_for(len(means)), THREADS, *given, *out, poses)
         grad_pose = None
         if needs_pose:
-            grad_pose = poses.sum(0, dtype=torch.float64).view(3, 4).to(maps)
-        grad_features = sums[:, MOMENTS : MOMENTS + depth_channel]
+            grad_pose = poses.sum(0, dtype=torch.float64).view(3, 4).to(means)
+        grad_features = sums[:, MOMENTS : MOMENTS + ctx.num_features]
         return *out, grad_features, grad_pose, None, None
 
 
@@ -151,16 +141,12 @@ def sort_pairs(
     ends = counts.cumsum(0)
     num_pairs = int(ends[-1]) if len(ends) else 0  # the host waits here
     keys = counts.new_empty(num_pairs)
-    owners = boxes.new_empty(num_pairs)
-    blocks = (-(-len(counts) // THREADS), 1)
+    owners, ordered = boxes.new_empty(num_pairs), boxes.new_empty(num_pairs)
     bits = depths.view(torch.int32)  # which grow with a positive float
-    launch("list_pairs", blocks, THREADS, boxes, ends, bits, tiles_x, keys, owners)
+    listed = tiles_x, keys, owners
+    launch("list_pairs", blocks_for(len(counts)), THREADS, boxes, ends, bits, *listed)
     keys, order = torch.sort(keys, stable=True)
-    starts = torch.searchsorted(keys, first_keys(tiles_x * tiles_y, counts.device))
-    return starts, owners[order]
-
-
-@cache
-def first_keys(num_tiles: int, device: torch.device) -> Tensor:
-    """The smallest key of every tile, and one that no tile reaches."""
-    return torch.arange(num_tiles + 1, device=device) << 32
+    starts = counts.new_empty(tiles_x * tiles_y + 1)
+    given = keys, order, owners
+    launch("order_pairs", blocks_for(num_pairs + 1), THREADS, *given, starts, ordered)
+    return starts, ordered

@@ -8,17 +8,13 @@ import math
 
 from numba import cuda
 
+from hdr_nsff.fields.kernels.cuda.device import exact_device
 from hdr_nsff.fields.kernels.grid import CHANNELS
 
 
-def adam_rows(
-    table, grad, exp_avg, exp_avg_sq, touched, lr, beta1, beta2, eps, correction1, correction2
-):  # fmt: skip
-    """`grid.adam_rows` with a thread per row: on rows with a mark or a gradient.
-
-    Marks are cleared; gradients are to be dropped.
-    """
-    r = cuda.grid(1)
+@exact_device
+def move_row(r, table, grad, exp_avg, exp_avg_sq, touched, lr, eps, shared):
+    """Move row r of a table if it has a mark or a gradient, and clear the mark."""
     if r >= table.shape[0]:
         return
     moves = touched[r] != 0
@@ -27,6 +23,7 @@ def adam_rows(
     if not moves:
         return
     touched[r] = 0
+    beta1, beta2, correction1, correction2 = shared
     for c in range(CHANNELS):
         g = grad[r, c]
         m = beta1 * exp_avg[r, c] + (1 - beta1) * g
@@ -34,3 +31,31 @@ def adam_rows(
         exp_avg[r, c] = m
         exp_avg_sq[r, c] = v
         table[r, c] -= lr * (m / correction1) / (math.sqrt(v / correction2) + eps)
+
+
+def adam_rows(
+    p0, g0, m0, v0, k0, lr0, eps0,
+    p1, g1, m1, v1, k1, lr1, eps1,
+    p2, g2, m2, v2, k2, lr2, eps2,
+    p3, g3, m3, v3, k3, lr3, eps3,
+    p4, g4, m4, v4, k4, lr4, eps4,
+    p5, g5, m5, v5, k5, lr5, eps5,
+    p6, g6, m6, v6, k6, lr6, eps6,
+    p7, g7, m7, v7, k7, lr7, eps7,
+    beta1, beta2, correction1, correction2,
+):  # fmt: skip
+    """`grid.adam_rows` of ADAM_TABLES tables p, a thread for a row of each of them.
+
+    `g` are gradients, which are to be dropped, `m` and `v` moments, and `k` marks. Of a
+    table that is missing, there are no rows.
+    """
+    r = cuda.grid(1)
+    shared = beta1, beta2, correction1, correction2
+    move_row(r, p0, g0, m0, v0, k0, lr0, eps0, shared)
+    move_row(r, p1, g1, m1, v1, k1, lr1, eps1, shared)
+    move_row(r, p2, g2, m2, v2, k2, lr2, eps2, shared)
+    move_row(r, p3, g3, m3, v3, k3, lr3, eps3, shared)
+    move_row(r, p4, g4, m4, v4, k4, lr4, eps4, shared)
+    move_row(r, p5, g5, m5, v5, k5, lr5, eps5, shared)
+    move_row(r, p6, g6, m6, v6, k6, lr6, eps6, shared)
+    move_row(r, p7, g7, m7, v7, k7, lr7, eps7, shared)

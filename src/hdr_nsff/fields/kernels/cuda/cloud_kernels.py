@@ -313,6 +313,17 @@ def local_at(r, means, velocities, quaternions, log_scales, colors, numbers):
     return x, there, q, math.exp(-0.5 * lives * lives) * sigmoid(colors[r, 3])
 
 
+def living(means, log_scales, time, least, alive):
+    """Fill `alive` (L,): which time-local Gaussians show more than a share of their
+    opacity at a time, as `LocalGaussians.window` has it.
+    """
+    r = cuda.grid(1)
+    if r >= means.shape[0]:
+        return
+    lives = (time - means[r, 3]) / math.exp(log_scales[r, 3])
+    alive[r] = 1 if math.exp(-0.5 * lives * lives) > least else 0
+
+
 @exact_device
 def finish(g, pose_term, x, there, q, log_scales, i, opacity, sight, made):
     """Write a Gaussian's mean, shape, opacity and flow; its opacity and scale terms."""

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hdr_nsff.fields.kernels import compositing, footprint
+from hdr_nsff.fields.kernels import compositing, footprint, grid
 from hdr_nsff.fields.kernels.cuda import layout
 
 # groups of arguments of the kernels that make the Gaussians of a moment: what was
@@ -30,18 +30,25 @@ PIXELS = "f2 f2 f1 f1 f1 f1 b1 b1 f2 f2 b1"  # what is rendered, recorded and kn
 MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f1 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
+LEVELS = "i2 i2 f2"  # of a grid, and its slices of time
+ROWS = "f2 f2 f2 f2 b1 d0 d0 "  # a table, what moves it, and how much
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
-    "project": "f2 f2 f2 f1 d1 i0 i0 f2 f1 s2 i1",
+    "project": "f2 f2 f2 f1 f2 f2 f2 i0 i0 f2 f1 f2 s2 i1",
     "list_pairs": "s2 i1 s1 i0 i1 s1",
+    "order_pairs": "i1 i1 s1 i1 s1",
     "forward": "i1 s1 f2 f2 f3 f2",
-    "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2",
-    "project_backward": "f2 f2 f2 f1 d1 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
+    "backward": "i1 s1 f2 f2 f3 f2 f3 f2 f2 f2",
+    "project_backward": "f2 f2 f2 f1 f2 f2 i0 i0 i1 f2 i0 f2 f2 f2 f1 f2",
     "cloud": f"{STATIC} {MOVING} f2 f2 f2 {LOCAL} i1 s2 s2 {SIGHT} {CLOUD}",
     "static_backward": f"f2 f2 f1 f2 f3 {SIGHT} {CLOUD} {STATIC}",
     "moving_backward": f"{MOVING} f2 f2 f2 s2 i0 {SIGHT} {CLOUD} {MOVING} f2",
     "trajectory_backward": "f2 f2 f2 d1 i0 f2 f1 f2 f2 b1 b1",
-    "adam_rows": "f2 f2 f2 f2 b1 d0 d0 d0 d0 d0 d0",
+    "interpolate": f"f2 f2 {LEVELS} f2",
+    "table_backward": f"f2 f2 {LEVELS} f2 b1",
+    "coords_backward": f"f2 f2 f2 {LEVELS} f2",
+    "adam_rows": f"{ROWS * layout.ADAM_TABLES}d0 d0 d0 d0",
+    "living": "f2 f2 d0 d0 b1",
     "respond": "f2 f1 f2 f1 i0 d0 f2",
     "respond_backward": "f2 f1 f2 f1 i0 d0 f2 f2 f1 f2",
     "shade": "f2 f2 f2 f1 f2 i0 d0 f2",
@@ -51,7 +58,7 @@ SIGNATURES = {
     "compose": f"{MAPS} f2 f1 f1 f2",
     "compose_backward": f"{MAPS} f2 f1 f1 f2 f2 f1 f1 f1",
     "tone": f"{TONE} f3 f1 f1",
-    "tone_backward": f"{TONE} f3 f1 f3 f1 f1 f3 f1 f2 f2 f2",
+    "tone_backward": f"{TONE} f3 f1 f2 f1 f1 f3 f1 f2 f2 f2",
     "local_backward": f"{LOCAL} i1 s2 i0 {SIGHT} {CLOUD} {LOCAL} b1 b1 b1 b1 b1",
 }
 MODULES = (
@@ -60,6 +67,7 @@ MODULES = (
     "cloud_kernels",
     "cloud_gradients",
     "adam_kernels",
+    "grid_kernels",
     "picture_kernels",
     "tone_kernels",
 )  # that hold the kernels
@@ -168,7 +176,7 @@ def fingerprint() -> str:
     here = Path(__file__)
     sources = [here, here.with_name("device.py"), Path(layout.__file__)]
     sources += [here.with_name(f"{module}.py") for module in MODULES]
-    sources += [Path(str(m.__file__)) for m in (compositing, footprint)]
+    sources += [Path(str(m.__file__)) for m in (compositing, footprint, grid)]
     digest = hashlib.sha256()
     for path in sources:
         digest.update(path.read_bytes())

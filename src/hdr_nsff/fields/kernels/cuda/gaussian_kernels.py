@@ -35,33 +35,40 @@ def read_gaussian(g, means, quaternions, scales):
 
 
 @exact_device
-def read_camera(camera):
-    """World-to-camera matrix, row by row, and (fx, fy, cx, cy) of `camera` (16,)."""
+def read_camera(w2c, K):
+    """World-to-camera matrix (3, 4), row by row, and (fx, fy, cx, cy), in float64."""
     view = (
-        (camera[0], camera[1], camera[2], camera[3]),
-        (camera[4], camera[5], camera[6], camera[7]),
-        (camera[8], camera[9], camera[10], camera[11]),
+        (float(w2c[0, 0]), float(w2c[0, 1]), float(w2c[0, 2]), float(w2c[0, 3])),
+        (float(w2c[1, 0]), float(w2c[1, 1]), float(w2c[1, 2]), float(w2c[1, 3])),
+        (float(w2c[2, 0]), float(w2c[2, 1]), float(w2c[2, 2]), float(w2c[2, 3])),
     )
-    return view, (camera[12], camera[13], camera[14], camera[15])
+    return view, (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
 
 def project(
-    means, quaternions, scales, opacities, camera, width, height, ellipses, depths, boxes, counts
+    means, quaternions, scales, opacities, features, w2c, K, width, height,
+    ellipses, depths, values, boxes, counts,
 ):  # fmt: skip
     """Project world Gaussians, one thread each, as `projection.project` does.
 
-    `camera` (16,) float64 is the world-to-camera matrix row by row, then fx, fy, cx,
-    cy. Fills `ellipses` (G, ELLIPSE), z-`depths` (G,), tile `boxes` (G, 4: x0, y0, x1,
-    y1; ends excluded) and `counts` (G,), the number of tiles; 0 where nothing shows.
+    Fills `ellipses` (G, ELLIPSE), z-`depths` (G,), `values` (G, D) that are composited:
+    the features, z-depth, and zeros; tile `boxes` (G, 4: x0, y0, x1, y1; ends excluded)
+    and `counts` (G,), the number of tiles, 0 where nothing shows.
     """
     g = cuda.grid(1)
     if g >= means.shape[0]:
         return
     m, q, s = read_gaussian(g, means, quaternions, scales)
-    view, k = read_camera(camera)
+    view, k = read_camera(w2c, K)
     t, _, _, _, _, covariance = footprint_of(m, q, s, view, k, width, height)
     shows, center, conic, bounds = ellipse_of(t, covariance, float(opacities[g]), k, width, height)
     depths[g] = t[2]
+    num_features = features.shape[1]
+    for n in range(num_features):
+        values[g, n] = features[g, n]
+    values[g, num_features] = t[2]
+    for n in range(num_features + 1, values.shape[1]):
+        values[g, n] = ZERO
     ellipses[g, 0], ellipses[g, 1] = center[0], center[1]
     ellipses[g, 2], ellipses[g, 3], ellipses[g, 4] = conic[0], conic[1], conic[2]
     ellipses[g, 5] = opacities[g]
@@ -95,8 +102,27 @@ def list_pairs(boxes, ends, depth_bits, tiles_x, keys, owners):
             i += 1
 
 
+def order_pairs(keys, order, owners, starts, ordered):
+    """Put the pairs in the order of their keys, and find where the tiles' lists start.
+
+    A thread per pair and one more. `keys` (P,) are sorted, and `order` (P,) is where
+    they were before. Fills `ordered` (P,), the `owners` (P,) in that order, and the
+    tiles' `starts` (tiles + 1,).
+    """
+    i, count = cuda.grid(1), keys.shape[0]
+    if i > count:
+        return
+    before = keys[i - 1] >> 32 if i > 0 else -1
+    tile = starts.shape[0] - 1
+    if i < count:
+        tile = keys[i] >> 32
+        ordered[i] = owners[order[i]]
+    for t in range(before + 1, tile + 1):
+        starts[t] = i
+
+
 def project_backward(
-    means, quaternions, scales, opacities, camera, width, height, counts, sums, depth_channel,
+    means, quaternions, scales, opacities, w2c, K, width, height, counts, sums, depth_channel,
     grad_means, grad_quaternions, grad_scales, grad_opacities, grad_view,
 ):  # fmt: skip
     """Carry `sums` of `backward` back to the world, one thread per Gaussian.
@@ -120,7 +146,7 @@ def project_backward(
                 grad_view[g, n] = ZERO
         return
     m, q, s = read_gaussian(g, means, quaternions, scales)
-    view, k = read_camera(camera)
+    view, k = read_camera(w2c, K)
     u = (
         float(sums[g, 0]),
         float(sums[g, 1]),

@@ -11,8 +11,10 @@ of CUDA runs the kernels on them, in Python.
 from __future__ import annotations
 
 import ctypes
+import math
 import struct
 from functools import cache
+from threading import Lock
 from typing import Any
 
 import torch
@@ -45,6 +47,27 @@ def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | 
 def blocks_for(count: int) -> tuple[int, int]:
     """The grid of a kernel with a thread for each of `count`, THREADS in a block."""
     return -(-count // THREADS), 1
+
+
+ZEROS = 2**18  # numbers that are cleared at a time, and then given out in small parts
+unused_zeros: dict[tuple[torch.device, int], Tensor] = {}  # by device and stream
+zeros_lock = Lock()  # gradients are made by a thread of their own
+
+
+def few_zeros(like: Tensor, *shape: int) -> Tensor:
+    """Float32 zeros on the device of `like`, for sums of a few numbers.
+
+    They are parts of a block that was cleared at once: a launch for each such sum would
+    take longer than most kernels.
+    """
+    device, count = like.device, math.prod(shape)
+    stream = torch.cuda.current_stream(device).cuda_stream if device.type == "cuda" else 0
+    with zeros_lock, torch.inference_mode(False), torch.no_grad():
+        left = unused_zeros.get((device, stream))
+        if left is None or len(left) < count:
+            left = torch.zeros(max(ZEROS, count), device=device)
+        unused_zeros[device, stream] = left[count:]
+        return left[:count].view(shape).data  # to autograd, it is no part of the block
 
 
 def pack(*arguments: Tensor | float) -> bytes:

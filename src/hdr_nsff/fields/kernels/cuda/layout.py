@@ -11,6 +11,7 @@ CHANNELS = 8  # features that one block composites
 THREADS = 128  # of a block, in kernels with one thread per Gaussian
 ELLIPSE = 6  # numbers of a projected Gaussian: pixel center, conic, opacity
 POSE = 16  # numbers of a basis at a time: a 3x4 matrix and a quaternion
+ADAM_TABLES = 8  # whose rows one launch moves
 TERMS = 8  # of the field's own, that the kernel `cloud` adds up
 NUMBERS = 27  # that it takes of the time
 MAX_LOG_RADIANCE = 16.0  # of a Gaussian, as in `splat/gaussians.py`

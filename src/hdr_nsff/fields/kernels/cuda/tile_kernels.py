@@ -119,7 +119,9 @@ def forward(starts, owners, ellipses, values, maps, alpha):
 
 
 @device
-def load_slopes(x, y, chunk, thread, maps, alpha, grad_maps, grad_alpha, slopes):
+def load_slopes(
+    x, y, chunk, thread, maps, alpha, grad_features, grad_depth, grad_alpha, slopes
+):  # fmt: skip
     """Fill this thread's column of `slopes` with the gradients of its pixel's maps.
 
     Returns the gradient of alpha, and the sum of weight * value over all Gaussians that
@@ -127,15 +129,18 @@ def load_slopes(x, y, chunk, thread, maps, alpha, grad_maps, grad_alpha, slopes)
     """
     height, width = alpha.shape
     inside = x < width and y < height
-    channel = chunk * CHANNELS
+    channel, depth_channel = chunk * CHANNELS, grad_features.shape[0]
     d_alpha = behind = ZERO
     if inside and chunk == 0:
         d_alpha = grad_alpha[y, x]
         behind = d_alpha * alpha[y, x]
     for d in range(CHANNELS):
         slope = ZERO
-        if inside and channel + d < maps.shape[0]:
-            slope = grad_maps[channel + d, y, x]
+        if inside and channel + d <= depth_channel:
+            if channel + d < depth_channel:
+                slope = grad_features[channel + d, y, x]
+            else:
+                slope = grad_depth[y, x]
             behind += slope * maps[channel + d, y, x]
         slopes[d, thread] = slope
     return d_alpha, behind
@@ -221,12 +226,14 @@ def add_columns(thread, count, channel, members, columns, sums):
             cuda.atomic.add(sums, (members[member], at), total)
 
 
-def backward(starts, owners, ellipses, values, maps, alpha, grad_maps, grad_alpha, sums):
+def backward(
+    starts, owners, ellipses, values, maps, alpha, grad_features, grad_depth, grad_alpha, sums
+):  # fmt: skip
     """Add every Gaussian's gradients to `sums` (G, MOMENTS + D).
 
     They are moments of u = dL / ds over its pixels, then its features, as those of the
     pairs in `compositing.backward`. Arguments are those of `forward`, its results and
-    their gradients.
+    the gradients of these; z-depth is the last map.
     """
     batch = (
         cuda.shared.array((BATCH, ELLIPSE), float32),
@@ -242,7 +249,9 @@ def backward(starts, owners, ellipses, values, maps, alpha, grad_maps, grad_alph
     px, py = float32(x) + HALF, float32(y) + HALF
     left = ONE if x < alpha.shape[1] and y < alpha.shape[0] else ZERO  # transmittance
     channel = chunk * CHANNELS
-    d_alpha, behind = load_slopes(x, y, chunk, thread, maps, alpha, grad_maps, grad_alpha, slopes)
+    d_alpha, behind = load_slopes(
+        x, y, chunk, thread, maps, alpha, grad_features, grad_depth, grad_alpha, slopes
+    )
     first, last = starts[tile], starts[tile + 1]
     while first < last:
         if not cuda.syncthreads_or(1 if left >= MIN_TRANSMITTANCE else 0):

@@ -4,8 +4,8 @@ gain, and the regularizers; with their gradients.
 A block per curve, a thread per knot; the first block does everything that is not a
 curve. The plain-torch twins are `BracketGain`, `SharedResponse.values` and
 `SharedToneMapper.regularizers`. Shapes: C cameras, B brackets, U of them unknown, F
-training frames, K knots. A first camera, a bracket and a frame choose what is made; a
-frame of -1 is any other view. The simulator of numba-cuda replaces the name `cuda` in
+training frames, K knots. A camera, a bracket and a frame choose the gain; a frame of -1
+is any other view. The simulator of numba-cuda replaces the name `cuda` in
 this module.
 """
 
@@ -78,15 +78,13 @@ def tone(
     anchor_white, vignetting, least, camera, bracket, frame, anchored,
     values, gain, terms,
 ):  # fmt: skip
-    """Fill the curves `values` (., 3, K) of cameras from `camera` on, and `gain` (3,);
-    add up `terms` (4,). Without terms, these are not made.
-    """
+    """Fill the curves `values` (C, 3, K) and `gain` (3,), and add up `terms` (4,)."""
     sums = cuda.shared.array(MAX_KNOTS, float64)
     curve = cuda.shared.array(MAX_KNOTS, float64)
     means = cuda.shared.array(3, float64)
     totals = cuda.shared.array(4, float64)
     k, block = cuda.threadIdx.x, cuda.blockIdx.x
-    of_camera, channel = block // 3, block % 3
+    curve_camera, channel = block // 3, block % 3
     num_steps, num_curves = logits.shape[2], logits.shape[0] * 3
     sums[k] = 0.0
     if k < 4:
@@ -94,9 +92,9 @@ def tone(
     if k < 3:
         means[k] = 0.0
     cuda.syncthreads()
-    top = largest(logits[camera + of_camera, channel])
+    top = largest(logits[curve_camera, channel])
     if k < num_steps:
-        sums[k] = math.exp(logits[camera + of_camera, channel, k] - top)
+        sums[k] = math.exp(logits[curve_camera, channel, k] - top)
     reach = 1
     while reach < MAX_KNOTS:
         cuda.syncthreads()
@@ -107,7 +105,7 @@ def tone(
     cuda.syncthreads()
     curve[k] = curve_at(k, num_steps, sums, least)
     if k <= num_steps:
-        values[of_camera, channel, k] = curve[k]
+        values[curve_camera, channel, k] = curve[k]
     if block == 0:
         for i in range(k, residual.size, MAX_KNOTS):
             cuda.atomic.add(means, i % 3, residual[i // 3, i % 3] / residual.shape[0])
@@ -118,12 +116,10 @@ def tone(
                 k, known, unknown, learned, drift, white, residual, means, camera, bracket, frame
             )
         )
-    if terms.shape[0] == 0:
-        return
     b = bend(curve, k, num_steps + 1)
     cuda.atomic.add(totals, SMOOTHNESS, b * b / num_curves)
     if anchored != 0 and k <= num_steps:
-        d = curve[k] - anchor_curve[of_camera, channel, k]
+        d = curve[k] - anchor_curve[curve_camera, channel, k]
         cuda.atomic.add(totals, ANCHOR, d * d / anchor_curve.size)
     if block == 0:
         add_small_terms(
@@ -165,26 +161,27 @@ def tone_backward(
     values, gain, d_values, d_gain, d_terms,
     g_logits, g_learned, g_white, g_residual, g_vignetting,
 ):  # fmt: skip
-    """Fill the gradients of everything that is learned, of these curves alone.
+    """Fill the gradients of everything that is learned.
 
-    Without gradients of values and gain, or of the terms, the others count.
+    `d_values` (3, K) is the gradient of the curve of `camera`. Without gradients of
+    values and gain, or of the terms, the others count.
     """
     suffix = cuda.shared.array(MAX_KNOTS, float64)
     totals = cuda.shared.array(2, float64)  # of the softmax, and weighted by gradients
     k, block = cuda.threadIdx.x, cuda.blockIdx.x
-    of_camera, channel = block // 3, block % 3
+    curve_camera, channel = block // 3, block % 3
     num_steps = logits.shape[2]
-    curve = values[of_camera, channel]
+    curve = values[curve_camera, channel]
     d = 0.0
     if k > 0 and k < num_steps:
-        if d_values.shape[0] > 0:
-            d += d_values[of_camera, channel, k]
+        if d_values.shape[0] > 0 and curve_camera == camera:
+            d += d_values[channel, k]
         if d_terms.shape[0] > 0:
             bends = bend(curve, k, num_steps + 1) - 2 * bend(curve, k - 1, num_steps + 1)
             bends += bend(curve, k - 2, num_steps + 1)
             d += d_terms[SMOOTHNESS] * 2 * bends / (logits.shape[0] * 3)
             if anchored != 0:
-                off = curve[k] - anchor_curve[of_camera, channel, k]
+                off = curve[k] - anchor_curve[curve_camera, channel, k]
                 d += d_terms[ANCHOR] * 2 * off / anchor_curve.size
     suffix[k] = d
     if k < 2:
@@ -197,17 +194,17 @@ def tone_backward(
         suffix[k] += after
         reach *= 2
     cuda.syncthreads()
-    top = largest(logits[camera + of_camera, channel])
+    top = largest(logits[curve_camera, channel])
     weight = d_share = 0.0
     if k < num_steps:
-        weight = math.exp(logits[camera + of_camera, channel, k] - top)
+        weight = math.exp(logits[curve_camera, channel, k] - top)
         d_share = (1 - least) * suffix[k + 1] if k + 1 < MAX_KNOTS else 0.0
         cuda.atomic.add(totals, 0, weight)
         cuda.atomic.add(totals, 1, weight * d_share)
     cuda.syncthreads()
     if k < num_steps:
         share, mean = weight / totals[0], totals[1] / totals[0]
-        g_logits[camera + of_camera, channel, k] = share * (d_share - mean)
+        g_logits[curve_camera, channel, k] = share * (d_share - mean)
     if block == 0:
         fill_small_gradients(
             k, known, unknown, learned, white, residual, anchor_ev, anchor_white, vignetting,
