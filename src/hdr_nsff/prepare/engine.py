@@ -41,6 +41,7 @@ class Step:
     complete: Callable[[Manifest], bool] = field(default=lambda m: True)
     forgets: tuple[str, ...] = ()  # cached properties of `Work` that it changes
     depends: tuple[Any, ...] = ()  # what else its result depends on: plain data
+    quiet: bool = False  # its note is not printed
 
 
 def run_step(work: Work, name: StepName, step: Step) -> None:
@@ -72,7 +73,8 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     )
     work.save()
     work.forget(step.forgets)
-    say(f"{name}: {result.note}")
+    if not step.quiet:
+        say(f"{name}: {result.note}")
 
 
 def step_key(work: Work, name: StepName, step: Step) -> str:

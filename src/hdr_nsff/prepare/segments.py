@@ -1,11 +1,12 @@
-"""A long clip as segments: scene folders that overlap in time and share poses, exposures
-and one response.
+"""A long clip as segments: scene folders that overlap in time and share poses,
+exposures and one response.
 
-The folder `clip` holds what is found once, of the whole clip: frames, exposures, flow as
-matched, poses. A segment takes its part of them, and finds masks and depth of its own.
-Static points of all segments give the one response. Then each segment refines its flow
-and finds its movers and its depth. Files that segments take are links where the disk
-has them, so they need no space. Times are those of the whole clip.
+The folder `clip` holds what is found once, of the whole clip: frames, exposures, flow
+as matched, poses. A segment takes its part of them, and finds masks and depth of its
+own. Static points of all segments give the one response. Then each segment refines its
+flow and finds its movers and its depth. Files that segments take are second names of
+the same files where the disk allows it, so they need no space. Times are those of the
+whole clip.
 """
 
 from __future__ import annotations
@@ -146,12 +147,11 @@ def open_segment(clip: Work, segment: Segment) -> Work:
 
 
 def take_step(clip: Work, segment: Segment, name: StepName, take: Take) -> Step:
-    """The step `name` of a segment, which takes its part of the same step of the clip."""
+    """The step `name` of a segment: it takes its part of that step of the clip."""
     record = clip.manifest.steps[name]
+    run = partial(run_take, clip, name, take)
     depends = (record.key, record.details.get("attempt"), list(segment.rows))
-    return replace(
-        STEPS[name], run=partial(run_take, clip, name, take), settings=(), depends=depends
-    )
+    return replace(STEPS[name], run=run, settings=(), depends=depends, quiet=True)
 
 
 def run_take(clip: Work, name: StepName, take: Take, work: Work) -> StepResult:
@@ -278,7 +278,7 @@ def link(source: Path, place: Path) -> None:
 
 
 def response_step(clip: Work, segments: Sequence[Segment]) -> Step:
-    """The step `response` of the whole clip, from the depth and masks of its segments."""
+    """The step `response` of the clip, from the depth and masks of its segments."""
     works = [open_segment(clip, segment) for segment in segments]
     records = [work.manifest.steps["static_depth"] for work in works]
     depends = tuple((record.key, record.details.get("attempt")) for record in records)
