@@ -69,7 +69,8 @@ def prepare_segments(clip: Work) -> list[Path]:
     segments = cut_clip(clip)
     for segment in segments:
         times = [clip.manifest.frames[row].time for row in segment.rows]
-        say(f"{segment.name}: {len(times)} frames, {min(times):g} to {max(times):g} of the clip")
+        place = f"{segment.name} of {len(segments)}"
+        say(f"{place}: {len(times)} frames, {min(times):g} to {max(times):g} of the clip")
         taken = {name: take_step(clip, segment, name, take) for name, take in TAKEN.items()}
         run_steps(open_segment(clip, segment), taken | {n: STEPS[n] for n in BEFORE_RESPONSE})
     run_steps(clip, {"response": response_step(clip, segments)})
