@@ -198,9 +198,15 @@ def test_segments_that_cannot_be_are_refused_in_a_sentence(config, changes, sent
         prepare(replace(config, out=tmp_path / "out", **changes))
 
 
-def test_a_folder_with_a_scene_of_the_whole_clip_is_not_cut(config):
-    with pytest.raises(InputError, match="choose another folder"):
-        prepare(replace(config, out=config.out / "segment_00"))
+def test_segments_do_not_go_into_a_folder_with_something_else(config, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    for out, sentence in (
+        (config.out / "segment_00", "holds the scene of a whole clip"),
+        (tmp_path, "holds other files"),
+        (tmp_path / "notes.txt", "is a file"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            prepare(replace(config, out=out))
 
 
 def test_folders_of_an_earlier_cut_are_named(config, tmp_path, capsys):

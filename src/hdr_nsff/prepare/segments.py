@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import read_npy, write_npy
+from hdr_nsff.core.io import is_leftover, read_npy, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.prepare.engine import Step, found_manifest
 from hdr_nsff.prepare.result import StepResult
@@ -54,10 +54,23 @@ def check_segments(config: PrepareConfig) -> None:
         raise InputError(
             "--segment and --mask-points both given: points name frames of one scene; leave one out"
         )
-    if (config.out / "scene.json").exists():
+    check_place(config.out)
+
+
+def check_place(out: Path) -> None:
+    """InputError where segments cannot go into the folder `out`."""
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise InputError(f"{out}: is a file; choose a folder to write the scenes to")
+    if (out / "scene.json").exists():
         raise InputError(
-            f"{config.out}: holds the scene of a whole clip; choose another folder for segments"
+            f"{out}: holds the scene of a whole clip; choose another folder for segments"
         )
+    begun = (out / CLIP_FOLDER / "scene.json").exists()
+    others = [path for path in out.iterdir() if path.name != CLIP_FOLDER and not is_leftover(path)]
+    if others and not begun:
+        raise InputError(f"{out}: holds other files and no scene; choose an empty or new folder")
 
 
 def prepare_segments(clip: Work) -> list[Path]:
