@@ -167,6 +167,14 @@ def test_the_readout_is_given_in_milliseconds_where_it_is_seen() -> None:
     assert "is not measured" in sentence(None)
 
 
+def test_a_clip_that_is_long_for_one_scene_is_offered_segments() -> None:
+    long = replace(good_facts(), file=replace(good_facts().file, frames=400))
+    (found,) = [f for f in judge(long) if f.subject == "length"]
+    assert "beyond 265 of this size" in found.text
+    assert "`hdr-nsff run CLIP OUT --segment 5`" in found.advice
+    assert not [f for f in judge(good_facts()) if f.subject == "length"]
+
+
 def test_frames_that_timestamps_miss_are_counted() -> None:
     good = good_facts()
     found = judge(replace(good, file=replace(good.file, missing=2, interval_ms=(41.0, 84.0))))

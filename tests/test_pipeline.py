@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from test_prepare import H, W, given
+from test_prepare import H, W, footage, given, stamps
 
 from hdr_nsff import cli, pipeline
 from hdr_nsff.core.errors import InputError
@@ -23,7 +23,7 @@ from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.reexpose import ReexposeConfig, reexpose
 from hdr_nsff.training.budget import Budget
-from hdr_nsff.training.config import check_config
+from hdr_nsff.training.config import TrainConfig, check_config
 from hdr_nsff.training.presets import PRESETS
 
 COUNT = 21
@@ -174,3 +174,47 @@ def test_the_shutter_reaches_the_field_that_has_one(tmp_path: Path) -> None:
         train_settings(replace(config, preset="grid"))
     with pytest.raises(InputError, match="shutter"):
         check_config(train_settings(replace(config, shutter=3.0)))
+
+
+def test_a_killed_run_of_segments_goes_on_with_the_segment_that_it_was_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each segment has a run, a report and scores of its own; none is trained twice."""
+    monkeypatch.setitem(
+        PRESETS, "tiny", replace(PRESETS["tiny"], budget=Budget(steps=4, minutes=None))
+    )
+    monkeypatch.setattr(pipeline, "render_all", lambda run, out: {})
+    count = 30
+    config = RunConfig(
+        footage(tmp_path / "clip", count),
+        tmp_path / "out",
+        preset="tiny",
+        segment=0.8,
+        device="cpu",
+        **given(tmp_path / "given", count),
+    )
+    train, begun = pipeline.train, []
+
+    def killed_in_the_second(settings: TrainConfig) -> Path:
+        begun.append(settings.scene.name)
+        if begun == ["segment_00", "segment_01"]:
+            raise KeyboardInterrupt
+        return train(settings)
+
+    monkeypatch.setattr(pipeline, "train", killed_in_the_second)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline.run_all(config)
+    first = tmp_path / "out/segment_00/run/checkpoints"
+    written = stamps(first)
+    pipeline.run_all(config)
+    assert written and stamps(first) == written
+    for name in ("segment_00", "segment_01"):
+        metrics = json.loads((tmp_path / f"out/{name}/run/metrics.json").read_text())
+        assert metrics["kind"] == "held-out frames"
+        assert (tmp_path / f"out/{name}/report.html").is_file()
+
+
+def test_a_truth_of_the_whole_clip_is_refused_for_segments(tmp_path: Path) -> None:
+    config = RunConfig(tmp_path, tmp_path, segment=2, truth=truth_of(tmp_path / "truth", (4.0, 4)))
+    with pytest.raises(InputError, match="leave --segment or --truth out"):
+        pipeline.check_truth(config)

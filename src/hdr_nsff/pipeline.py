@@ -20,7 +20,7 @@ from hdr_nsff.evaluation.report import check_place, write_report
 from hdr_nsff.fields.build import device_for
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.footage.ingest import hold_out_spacing
-from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
+from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare_scenes
 from hdr_nsff.rendering import export_page
 from hdr_nsff.rendering.export_gaussians import GaussianField
 from hdr_nsff.rendering.render import render_all
@@ -38,7 +38,8 @@ class RunConfig(PrepareConfig):
     Does everything: exposures, poses, flow, masks and depth (`prepare`), training
     (`train`), EXR sequence, videos and LDR views (`render`), a page to look around in
     (`export`), held-out quality (`evaluate`), report.html. Killed? The same command
-    continues where it was. Every option of `prepare` works here too.
+    continues where it was. Every option of `prepare` works here too; with `--segment`
+    each part of a long clip is trained on its own, in OUT/segment_00 and so on.
     """
 
     out: Positional[Path]
@@ -54,7 +55,7 @@ class RunConfig(PrepareConfig):
     to try things out.
     """
     minutes: float | None = None
-    """Training time instead of the preset's."""
+    """Training time instead of the preset's; with --segment of each segment."""
     readout: float = 0.0
     """Milliseconds from a rolling shutter's first row to its last (`splat`)."""
     shutter: float = 0.0
@@ -83,19 +84,38 @@ def run_all(config: RunConfig) -> None:
     export_page.check_place(config.out / "scene.html")
     check_config(settings)
     footage = prepare_settings(config)
+    results: dict[str, Path] = {}
     with writing_to(config.out), lock_output(config.out):
-        scene = prepare(footage)
+        scenes = prepare_scenes(footage)
         truth = config.truth or held_out_truth(footage)
-        folder = train(replace(settings, scene=scene, device=device))
-        run = Run.open(folder, device)
-        results = render_all(run, config.out / "render")
-        if isinstance(run.field, GaussianField):
-            results["viewer"] = export_page.export_page(run, config.out / "scene.html")
-        evaluate_run(run, truth)
-        results["report"] = write_report(run, config.out / "report.html", config.out / "render")
+        for scene in scenes:
+            if config.segment is None:
+                results = finish_scene(replace(settings, scene=scene, device=device), truth)
+                continue
+            say(f"{scene.name}: training")
+            out = config.out / scene.name / "run"
+            own = finish_scene(replace(settings, scene=scene, out=out, device=device), truth)
+            results |= {f"{scene.name} {name}": path for name, path in own.items()}
     say(f"done in {(time.monotonic() - start) / 60:.1f} minutes; results:")
+    width = max(len(name) for name in results)
     for name, path in results.items():
-        say(f"  {name:<16} {path}")
+        say(f"  {name:<{width}} {path}")
+
+
+def finish_scene(settings: TrainConfig, truth: Path | None) -> dict[str, Path]:
+    """All that follows `prepare` for one scene; what it made, by name.
+
+    Results lie beside the run, in the folder that holds it.
+    """
+    assert settings.out is not None
+    out = settings.out.parent
+    run = Run.open(train(settings), settings.device)
+    results = render_all(run, out / "render")
+    if isinstance(run.field, GaussianField):
+        results["viewer"] = export_page.export_page(run, out / "scene.html")
+    evaluate_run(run, truth)
+    results["report"] = write_report(run, out / "report.html", out / "render")
+    return results
 
 
 def train_settings(config: RunConfig) -> TrainConfig:
@@ -137,6 +157,11 @@ def check_truth(config: RunConfig) -> None:
         raise InputError(
             f"--truth {config.truth}: no such folder; `synth` and `reexpose` write one, "
             "or leave the option out"
+        )
+    if config.segment is not None:
+        raise InputError(
+            f"--truth {config.truth}: its views belong to the whole clip; leave --segment or "
+            "--truth out (segments are evaluated on the frames they hold out)"
         )
     if config.start != 0 or config.stride != 1:
         raise InputError(

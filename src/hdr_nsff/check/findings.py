@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hdr_nsff.check.facts import ClipFacts
+from hdr_nsff.prepare.length import offered_segments
+from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.radiometry.exposure_cycle import MAX_CYCLE, MIN_STEP
 
 Level = Literal["good", "note", "warning", "problem"]
@@ -228,7 +230,13 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     if 0 < file.frames < tuning.few_frames:
         text = f"{file.frames} frames are few"
         yield Finding("warning", "length", text, "record two seconds or more")
-    if file.frames > tuning.many_frames:
+    shrink = min(1.0, PrepareConfig.max_size / max(file.width, file.height))
+    num_pixels = round(shrink * file.width) * round(shrink * file.height)
+    offer = offered_segments(file.frames, num_pixels, file.fps)
+    if offer is not None:
+        advice = f"{offer.advice('hdr-nsff run')}, or choose a part with --start and --end"
+        yield Finding("note", "length", offer.sentence(file.frames), advice)
+    elif file.frames > tuning.many_frames:
         text = f"{file.frames} frames take long, and most of that time repeats itself"
         yield Finding("note", "length", text, "choose a part with --start and --end")
     if facts.exposure.missing_before:

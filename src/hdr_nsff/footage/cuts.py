@@ -13,6 +13,7 @@ from itertools import pairwise
 import cv2
 import numpy as np
 
+from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import ArrayStack
 
 
@@ -31,7 +32,7 @@ def find_cuts(video: ArrayStack, tuning: CutTuning = CutTuning()) -> list[int]:
     """The first frames of new scenes, in `video` (T, H, W, 3) at one brightness."""
     height, width = video.shape[1:3]
     size = (tuning.thumbnail_px, max(2, round(tuning.thumbnail_px * height / width)))
-    thumbnails = [thumbnail(frame, size) for frame in video]
+    thumbnails = [thumbnail(frame, size) for frame in track(video, "exposure: cuts", len(video))]
     alike = np.array([correlation(a, b, tuning) for a, b in pairwise(thumbnails)])
     cuts = []
     for k, here in enumerate(alike):

@@ -17,13 +17,15 @@ from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
 from typing import Any
 
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import is_leftover
 from hdr_nsff.core.process import cpu_seconds, peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Picture
 from hdr_nsff.prepare.result import StepResult, store
 from hdr_nsff.prepare.steps.neural import weights_of
-from hdr_nsff.prepare.work import StepName, Work
+from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
 from hdr_nsff.scene.manifest import Manifest, Split, StepRecord
 
 
@@ -38,6 +40,8 @@ class Step:
     # whether the manifest names all it should
     complete: Callable[[Manifest], bool] = field(default=lambda m: True)
     forgets: tuple[str, ...] = ()  # cached properties of `Work` that it changes
+    depends: tuple[Any, ...] = ()  # what else its result depends on: plain data
+    quiet: bool = False  # its note is not printed
 
 
 def run_step(work: Work, name: StepName, step: Step) -> None:
@@ -69,7 +73,8 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     )
     work.save()
     work.forget(step.forgets)
-    say(f"{name}: {result.note}")
+    if not step.quiet:
+        say(f"{name}: {result.note}")
 
 
 def step_key(work: Work, name: StepName, step: Step) -> str:
@@ -94,6 +99,7 @@ def step_key(work: Work, name: StepName, step: Step) -> str:
     from_capture = [capture_part(work, name)] if work.capture is not None else []
     lens = lens_part(work, name)
     parts = [settings, before, inputs, *from_capture, *lens, *weights_of(work.config, name)]
+    parts += step.depends
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 
 
@@ -137,6 +143,35 @@ def capture_part(work: Work, name: StepName) -> Any:
             maps = [files(lambda p: p.depth), files(lambda p: p.confidence)]
             return [capture.depth_kind, capture.depth_units, *maps]
     return None
+
+
+def found_manifest(config: PrepareConfig) -> Manifest | None:
+    """The manifest in the output folder; None where it is missing or to be redone.
+
+    A broken one is redone where `--redo frames` asks for it.
+    """
+    if not config.out.exists():
+        return None
+    if not config.out.is_dir():
+        raise InputError(f"{config.out}: is a file; choose a folder to write the scene to")
+    if not (config.out / "scene.json").exists():
+        if not all(is_leftover(path) for path in config.out.iterdir()):
+            raise InputError(
+                f"{config.out}: holds other files and no scene; choose an empty or new folder"
+            )
+        return None
+    try:
+        found = Manifest.load(config.out)
+        if [f.index for f in found.frames] != list(range(len(found.frames))):
+            raise InputError(
+                f"{config.out / 'scene.json'}: frames are missing or out of order; "
+                "restore it or use `--redo frames`"
+            )
+        return found
+    except InputError:
+        if "frames" not in config.redo:
+            raise
+        return None
 
 
 def hash_of(path: Path) -> str:

@@ -29,7 +29,7 @@ class StepResult:
     # the same of maps (H, W), which become files (`MAPS`)
     maps: dict[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
     # name of a file of the folder -> what writes it
-    files: dict[str, Callable[[Path], None]] = field(default_factory=dict)
+    files: Mapping[str, Callable[[Path], None]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

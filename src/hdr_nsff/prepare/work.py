@@ -76,6 +76,13 @@ class PrepareConfig:
     """Frame to stop before."""
     stride: int = 1
     """Use every STRIDE-th frame."""
+    segment: float | None = None
+    """Cut a long clip into scenes of SEGMENT seconds of video: OUT/segment_00,
+    OUT/segment_01 and so on, each to be trained on its own. Neighbors overlap by an
+    exposure cycle. All share the poses, the response and the exposures of the whole
+    clip, and their times count its frames. Memory and time of training then follow
+    SEGMENT and not the clip.
+    """
     hold_out: int | None = None
     """Keep every N-th frame out of training, for `evaluate`; 0 keeps all in. Default
     8; 0 for a data set with held-out views.
@@ -165,6 +172,15 @@ class PrepareConfig:
     """Where networks and the search for their features run: auto, cpu or cuda."""
 
 
+@dataclass(frozen=True)
+class Segment:
+    """A part of a long clip that becomes a scene folder of its own."""
+
+    name: str  # of its folder
+    rows: tuple[int, ...]  # indices of its frames in the whole clip, rising
+    clip_frames: int  # of the whole clip
+
+
 @dataclass
 class Work:
     """The unfinished scene folder, with what steps read of it."""
@@ -173,6 +189,7 @@ class Work:
     footage: ingest.Footage
     manifest: Manifest
     capture: Capture | None = None  # the training pictures of a public data set
+    segment: Segment | None = None  # where the folder holds a part of the clip
 
     @property
     def folder(self) -> Path:

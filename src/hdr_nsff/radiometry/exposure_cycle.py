@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import ArrayStack, Stack
 
 MAX_CYCLE = 6  # frames: the longest cycle looked for, two more than cameras offer
@@ -331,7 +332,8 @@ def reference_bracket(
     of recorded values between `well_exposed_low` and `high`.
     """
     low, high = tuning.well_exposed_low, tuning.high
-    share = np.array([((frame > low) & (frame < high)).mean() for frame in video])  # (T,)
+    shown = track(video, "exposure: levels", len(video))
+    share = np.array([((frame > low) & (frame < high)).mean() for frame in shown])  # (T,)
     bracket = np.array(brackets)
     shares = np.zeros(bracket.max() + 1)
     for b in np.unique(bracket):

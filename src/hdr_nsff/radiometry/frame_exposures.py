@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.maths.color import srgb_decode
@@ -70,7 +71,7 @@ def read_points(
     patches = LazyList(lambda k: view_patches(views[k], points), len(views), KEPT_PATCHES)
     per_view = max(1, tuning.num_samples // len(views))
     parts, frames = [], []
-    for source, view in enumerate(views):
+    for source, view in enumerate(track(views, "response: exposures", len(views))):
         pixels = spread_over_levels(view.image, patches[source].good, per_view, rng, points)
         depth = 1 / np.maximum(view.disparity[pixels[:, 1], pixels[:, 0]], 1e-9)
         world = pinhole.unproject(pixels + 0.5, depth, view.K, view.c2w)

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import LazyList
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.radiometry.debevec import HIGH, LOW, SATURATED, Samples
@@ -83,7 +84,7 @@ def static_samples(
     points_per_view = max(1, num // max(len(views), 1))
     parts = [
         samples_of_view(source, views, patches, num_brackets, points_per_view, rng, tuning)
-        for source in range(len(views))
+        for source in track(range(len(views)), "response: points")
     ]
     if not parts:
         parts = [empty_samples(0, num_brackets)]

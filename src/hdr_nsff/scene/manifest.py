@@ -205,6 +205,11 @@ class Manifest(Strict):
         version or makes no sense.
         """
         path = Path(folder) / "scene.json"
+        segment = Path(folder) / "segment_00"
+        if not path.is_file() and segment.is_dir():
+            raise InputError(
+                f"{folder}: holds the segments of a long clip; name one of them, such as {segment}"
+            )
         if not path.is_file():
             raise InputError(
                 f"{folder}: no scene.json here; "

@@ -173,6 +173,13 @@ class Scene:
 def check_complete(folder: Path, m: Manifest) -> tuple[float, float]:
     """Near and far of a scene; InputError where `prepare` has not finished it."""
     again = "run `hdr-nsff prepare` again"
+    segment = folder.parent / "segment_00"
+    is_segment = folder.name.startswith("segment_")
+    if not is_segment and "masks" not in m.steps and (segment / "scene.json").is_file():
+        raise InputError(
+            f"{folder}: holds what the segments of a clip share, and is no scene; "
+            f"name a segment, such as {segment}"
+        )
     if not m.frames:
         raise InputError(f"{folder}: the scene has no frames; {again}")
     posed = all(f.c2w is not None and f.K is not None for f in m.frames)

@@ -49,6 +49,11 @@ def minutes_for(num_pixels: int, num_frames: int) -> float:
     return round(min(max(SMALL_CLIP_MINUTES * share**0.5, SMALL_CLIP_MINUTES), MAX_MINUTES), 1)
 
 
+def longest_clip(num_pixels: int) -> int:
+    """The frames of `num_pixels` each from which on the default time grows no more."""
+    return int(SMALL_CLIP_PIXELS * (MAX_MINUTES / SMALL_CLIP_MINUTES) ** 2 / num_pixels)
+
+
 @dataclass(frozen=True)
 class Schedule:
     """How learning rates and terms change over a run."""

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
@@ -39,7 +40,8 @@ def find_depth(work: Work) -> StepResult:
     sampled = []
     total = len(work.train) * work.manifest.height * work.manifest.width
     step = max(1, int(np.sqrt(total / MAX_SAMPLES)))
-    for own_disparity, own_confidence in depth_with_movers(work, still):
+    maps = depth_with_movers(work, still)
+    for own_disparity, own_confidence in track(maps, "depth", len(work.train)):
         sampled.append((own_disparity[::step, ::step], own_confidence[::step, ::step]))
         disparity.append(halve(own_disparity))
         confidence.append(halve(own_confidence))

@@ -14,6 +14,7 @@ from hdr_nsff.footage import ingest
 from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.footage.turns import find_cameras_in_turn
 from hdr_nsff.prepare.exposures import frame_exposures
+from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.lens import describe, undistorted
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.times import leave_gaps, times_of_slots
@@ -74,6 +75,10 @@ def frames_step(work: Work) -> StepResult:
         note += f", undistorted ({describe(m.lens)})"
     if missing:
         note += f"; {missing} are missing by the timestamps, and their times are left out"
+    if c.segment is None and work.capture is None:
+        offer = offered_segments(len(entries), m.width * m.height, m.fps)
+        if offer is not None:
+            note += f"; {offer.sentence(len(entries))}; {offer.advice('hdr-nsff prepare')}"
     return StepResult(provenance="given", note=note, details={"missing": missing})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -105,9 +106,12 @@ def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
         for path in sorted(each.iterdir(), key=ingest.natural_key)
         if path.suffix.lower() in suffixes
     ]
-    frames = work.manifest.frames
-    if len(found) != len(frames):
+    count = len(work.manifest.frames)
+    rows: Sequence[int] = range(count)
+    if work.segment is not None:
+        count, rows = work.segment.clip_frames, work.segment.rows
+    if len(found) != count:
         raise InputError(
-            f"{folder}: {len(found)} maps for {len(frames)} frames; one per used frame, in order"
+            f"{folder}: {len(found)} maps for {count} frames; one per used frame, in order"
         )
-    return found
+    return [found[row] for row in rows]

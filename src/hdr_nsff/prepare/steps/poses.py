@@ -28,6 +28,7 @@ MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the sam
 # z-depth around distance 1, where everything lies when there is no parallax:
 SPHERE_NEAR = 0.5
 SPHERE_FAR = 2.0
+SIGHTINGS = "poses/sightings.npy"  # (O, 2) int32: a frame, and a point that it sees
 FIRST_ROUND = "poses/first_round.npz"  # lets a killed run go on with the second round
 
 
@@ -51,6 +52,8 @@ def find_poses(work: Work) -> StepResult:
     if len(poses.points):
         points = poses.points.astype(np.float32)
         files["points.npy"] = lambda path: write_npy(path, points)
+        sightings = poses.tracks[:, :2].astype(np.int32)
+        files[SIGHTINGS] = lambda path: write_npy(path, sightings)
     registered = poses.registered.tolist()
     return StepResult(
         provenance="given" if given else "estimated",

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import fields
+from typing import Self
 
 import numpy as np
 
+from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
@@ -17,12 +20,13 @@ from hdr_nsff.scene.manifest import FrameEntry
 from hdr_nsff.scene.response import write_response
 
 
-def find_response(work: Work) -> StepResult:
+def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> StepResult:
     """What static points that several exposures of the training frames recorded tell of
-    the cameras.
+    the cameras. `views`: these frames, where their maps lie in other folders.
     """
     m = work.manifest
-    views = [StoredView(work, f) for f in work.train]
+    if views is None:
+        views = [StoredView(work, f) for f in work.train]
     cameras = [f.camera_id for f in work.train]
     response = estimate_response(
         views,
@@ -133,9 +137,9 @@ class StoredView(ResponseView):
     @property
     def moving(self) -> np.ndarray:
         """(H, W) bool."""
-        return self.work.masks[self.frame.index]
+        return read_mask(self.work.folder / str(self.frame.mask))
 
-    def in_bracket(self, bracket: int) -> StoredView:
+    def in_bracket(self, bracket: int) -> Self:
         """The same frame, counted as one of another bracket."""
         view = copy(self)
         object.__setattr__(view, "bracket", bracket)

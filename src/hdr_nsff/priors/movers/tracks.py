@@ -16,6 +16,7 @@ from typing import Any, Protocol
 import numpy as np
 from scipy import ndimage
 
+from hdr_nsff.core.progress import track
 from hdr_nsff.geometry.round_trip import flow_at
 from hdr_nsff.priors.movers.tuning import TRACK_TUNING, TrackTuning
 
@@ -66,7 +67,7 @@ def follow_moving_pixels(views: list[MovingView], tuning: TrackTuning = TRACK_TU
     num = len(views)
     spread = np.linspace(0, num - 1, min(tuning.start_frames, num))
     starts = sorted({round(start) for start in spread.tolist()})
-    smooth_views = [smooth_flows(view, tuning) for view in views]
+    smooth_views = [smooth_flows(view, tuning) for view in track(views, "movers: tracks")]
 
     chains = [chain_flow(smooth_views, start, tuning) for start in starts]
     pixels = np.concatenate(chains)
