@@ -25,9 +25,9 @@ PAGE = ROOT / "docs" / "results.md"
 INTRO = """# Results
 
 `python benchmarks/results.py` writes this page from the JSON files in `benchmarks/results`:
-one current number per claim, with its command, machine, commit and seed. PSNR is of recorded values in dB, over full pictures and over moving pixels;
-HDR is the mu-law PSNR of linear radiance (mu = 5000) after one scale per sequence; lights
-that no exposure recorded decide it. [Metrics](metrics.md) defines them."""
+one current number per claim, with its command, machine, commit and seed. PSNR is
+of recorded values in dB, over full pictures and over moving pixels; HDR is the mu-law
+PSNR of linear radiance (mu = 5000) after one scale; lights beyond every exposure decide it. [Metrics](metrics.md) defines them."""
 
 LPIPS = """## LPIPS
 
@@ -165,7 +165,7 @@ def bench_clips(document: Document) -> Lines:
 
 
 def bench_rig(document: Document) -> Lines:
-    """One line per scene: from frames alone, from given priors, and what lies between."""
+    """One line per scene: from frames alone, from given priors, and between them."""
     found = {run["scene"]: run["values"] for run in document["results"]}
     rows = []
     for scene in (name.removesuffix("-frames") for name in found if name.endswith("-frames")):
