@@ -3,7 +3,7 @@
 import numpy as np
 from posed_planes import RAYS, SWEEPING, H, W, cameras_at, exact_flow, neighbors, plane, posed_video
 
-from hdr_nsff.priors.depth.parallax import choose_views, points_ahead, triangulate
+from hdr_nsff.priors.depth.parallax import choose_views, triangulate
 
 
 def test_points_triangulated_from_exact_flow_are_exact():
@@ -15,25 +15,6 @@ def test_points_triangulated_from_exact_flow_are_exact():
     )
     assert len(points) > 500
     assert np.abs(points[:, 2] - (4.0 + 0.5 * points[:, 0])).max() < 1e-3
-
-
-def test_without_points_cameras_see_what_is_around_the_place_that_they_look_at():
-    turned = []
-    for angle in (-0.6, 0.0, 0.6):
-        axis = np.array([np.sin(angle), 0, np.cos(angle)])
-        right = np.array([np.cos(angle), 0, -np.sin(angle)])
-        turned.append(np.stack([right, [0, 1, 0], axis, [1, 2, 3] - 5 * axis], 1))
-    points = points_ahead(posed_video(np.stack(turned)), 100)
-    assert np.abs(points.mean(0) - [1, 2, 3]).max() < 0.5
-    assert np.linalg.norm(points - [1, 2, 3], axis=-1).max() < 2.51
-
-
-def test_cameras_that_look_alongside_or_apart_meet_nowhere():
-    assert not len(points_ahead(posed_video(SWEEPING), 100))
-    apart = cameras_at((1, 0, 0), (-1, 0, 0))
-    for camera, angle in zip(apart, (0.6, -0.6), strict=True):
-        camera[:, 2] = [np.sin(angle), 0, np.cos(angle)]
-    assert not len(points_ahead(posed_video(apart), 100))
 
 
 def test_views_with_good_parallax_are_chosen_first():

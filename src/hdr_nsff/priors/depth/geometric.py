@@ -29,7 +29,6 @@ from hdr_nsff.priors.depth.parallax import (
     ParallaxTuning,
     choose_views,
     disparity_range,
-    points_ahead,
     triangulate,
 )
 from hdr_nsff.priors.depth.plane_sweep import PlaneSweepTuning, sweep
@@ -58,7 +57,6 @@ class DepthTuning:
     # all
     min_static_match: float = 0.7
     min_static_confidence: float = 0.5
-    points_ahead: int = 400  # stand for static points that nobody found, see there
     static_median_px: int = 5  # window of the median over those pixels
     # relative step of disparity, within `edge_px`, at which a pixel may be on either
     # side of an edge, and the factor on its confidence
@@ -127,9 +125,6 @@ def depth_from_views(
 
     `points` (N, 3) are static; `same_time`: from frames of the same instant only.
     """
-    several_cameras = len(np.unique(clip.times)) < len(clip.times)
-    if len(points) < tuning.min_points and several_cameras:
-        points = points_ahead(clip, tuning.points_ahead, tuning.parallax)
     if len(points) < tuning.min_points:
         return None
     views, parallax = choose_views(clip, points, tuning.max_views, tuning.parallax, same_time)

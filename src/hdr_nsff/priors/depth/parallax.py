@@ -29,11 +29,6 @@ class ParallaxTuning:
     near_gap: int = 48
     far_gap_step: int = 6
     max_gap: int = 144
-    # mean square sine of the angles between optical axes and their common direction:
-    # from about 3 degrees on, they meet at a certain place
-    min_convergence: float = 0.003
-    # radius of what cameras look at, as a share of the distance of the nearest of them
-    ahead_radius: float = 0.5
     time_decay: float = 0.02  # of a view's score per frame of distance in time ...
     min_time_weight: float = 0.3  # ... down to this
     # the candidates reach from and to these percentiles of the points' disparities,
@@ -60,28 +55,6 @@ def disparity_range(
     percentiles = [tuning.far_percentile, tuning.near_percentile]
     low, high = np.percentile(np.concatenate(disparities), percentiles)
     return tuning.far_factor * float(low), tuning.near_factor * float(high)
-
-
-def points_ahead(
-    clip: PosedVideo, count: int, tuning: ParallaxTuning = ParallaxTuning()
-) -> np.ndarray:
-    """`count` points (N, 3) around the place that all cameras look at, where no static
-    points are known: they stand for the distance of what is seen. None where the
-    optical axes do not meet before the cameras.
-    """
-    eyes, axes = clip.c2w[:, :, 3], clip.c2w[:, :, 2]
-    across = np.eye(3) - axes[:, :, None] * axes[:, None]  # (T, 3, 3)
-    system = across.sum(0)
-    if np.linalg.eigvalsh(system)[0] < tuning.min_convergence * len(eyes):
-        return np.zeros((0, 3))
-    middle = np.linalg.solve(system, np.einsum("tij,tj->i", across, eyes))
-    distance = ((middle - eyes) * axes).sum(-1)
-    if (distance <= 0).any():
-        return np.zeros((0, 3))
-    directions = np.random.default_rng(0).normal(size=(count, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    radii = tuning.ahead_radius * distance.min() * np.linspace(0, 1, count)[:, None]
-    return middle + radii * directions
 
 
 def parallax(clip: PosedVideo, i: int, j: int, points: np.ndarray) -> tuple[float, float]:
