@@ -2,9 +2,10 @@
 
 import { readScene, unpack } from "./format.js";
 import { Renderer, driverName, openContext } from "./renderer.js";
+import { openHdrScreen } from "./hdr.js";
 import { Player } from "./player.js";
 import { Frames, SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
-import { connectControls, find, limitControls, note } from "./controls.js";
+import { connectControls, find, limitControls, note, offerExtended } from "./controls.js";
 
 const WORKER = "sorter.js";
 const FOLLOW_MILLISECONDS = 5000; // between two looks at the version of the scene
@@ -30,7 +31,7 @@ async function start() {
   globalThis.viewer = player; // for scripts and tests
   connectControls(player);
   showVideos(settings.videos);
-  if (scene.groups.length) draw(player, settings);
+  if (scene.groups.length) await draw(player, settings);
   else showFrames(player);
   if (player.renderer) await player.renderer.sort(player.view());
   find("loading").hidden = true;
@@ -47,7 +48,7 @@ async function start() {
 }
 
 /** Draw in this browser, if it can; else have the server render. */
-function draw(player, settings) {
+async function draw(player, settings) {
   const gpuWanted = location.hash === "#draw"; // to see what a browser without a GPU does
   try {
     const gl = openContext(player.canvas);
@@ -58,6 +59,8 @@ function draw(player, settings) {
     player.canvas.addEventListener("webglcontextlost", () =>
       note("The graphics driver was reset. Reload the page.", 0),
     );
+    if (player.renderer.readsHalves()) player.hdr = await openHdrScreen(find("hdr"));
+    if (player.hdr) offerExtended(player);
     if (!software) return;
     const videos = settings.videos.length ? " The videos below the settings play smoothly." : "";
     note(`This browser draws without a GPU, so playback is slow.${videos}`, 8);
@@ -76,6 +79,8 @@ function shaderSources() {
 function showFrames(player) {
   player.renderer?.dispose();
   player.renderer = null;
+  player.hdr?.hide();
+  player.hdr = null;
   player.frames = new Frames(find("frame"), player.scene.width, (problem) => note(problem, 0));
   const { curve, show } = player.state;
   player.set({

@@ -9,6 +9,7 @@ import {
   pointAhead,
   scaleK,
 } from "./cameras.js";
+import { EXTENDED } from "./curves.js";
 import { encodePng } from "./png.js";
 import { BLUR, Renderer } from "./renderer.js";
 
@@ -29,6 +30,7 @@ export class Player {
     this.canvas = canvas;
     this.renderer = null; // set where the browser can draw
     this.frames = null; // else pictures come from the server
+    this.hdr = null; // shows light above white, where browser and screen do
     this.changed = () => {}; // called after every change of `state`
     this.first = scene.times[0];
     this.last = scene.times[scene.times.length - 1];
@@ -223,12 +225,21 @@ export class Player {
     }
     this.dirty = false;
     const target = this.renderer.composite(view, "screen");
-    this.renderer.develop(target, this.state);
+    if (this.isBeyondWhite()) this.hdr.present(this.renderer.halves(target, this.state));
+    else this.renderer.develop(target, this.state);
     this.frameTimes.push(now);
     if (this.frameTimes.length > MEASURED_FRAMES) this.frameTimes.shift();
     if (this.frameTimes.length >= LEAST_FRAMES) {
       this.rate = (1000 * (this.frameTimes.length - 1)) / (now - this.frameTimes[0]);
     }
+  }
+
+  /** Whether light above white is shown now; else the canvas for it is hidden. */
+  isBeyondWhite() {
+    const { curve, show, falseColor } = this.state;
+    if (this.hdr && curve === EXTENDED && show === "radiance" && !falseColor) return true;
+    this.hdr?.hide();
+    return false;
   }
 
   /** Pictures drawn per second, when last they were drawn one after the other; or null. */
