@@ -59,6 +59,16 @@ def check_encoder(codec: Codec) -> None:
         raise InputError(f"HDR video: this PyAV has no encoder {encoder}; {advice}") from error
 
 
+def can_encode(codec: Codec, width: int, height: int) -> bool:
+    """Whether this PyAV writes HDR video of this size."""
+    try:
+        check_encoder(codec)
+        check_side("", width, height)
+    except InputError:
+        return False
+    return True
+
+
 def write_hdr_video(
     path: Path | str,
     frames: Iterable[Planes],

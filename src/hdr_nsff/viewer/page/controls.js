@@ -208,7 +208,7 @@ function connectDivider(player) {
 
 function connectKeyboard(player) {
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || find("help").open) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     if (usesKey(event.target, event.key)) return;
     const { state } = player;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -309,7 +309,8 @@ async function savePng(player, bits) {
   if (!player.renderer) return note("Pictures can be saved where the browser draws them.");
   const link = document.createElement("a");
   link.href = URL.createObjectURL(await player.png(bits));
-  link.download = `${player.scene.title}_${player.state.time.toFixed(2)}.png`;
+  const signal = bits === 16 && player.isBeyondWhite() ? "_pq" : "";
+  link.download = `${player.scene.title}_${player.state.time.toFixed(2)}${signal}.png`;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }

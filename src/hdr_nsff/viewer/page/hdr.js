@@ -7,9 +7,14 @@
 const HIGH_RANGE = "(dynamic-range: high)";
 const MAX_WAIT_MILLISECONDS = 2000; // for the graphics driver
 
+/** Whether the window is on a screen of high dynamic range. */
+export function hasHighRange() {
+  return matchMedia(HIGH_RANGE).matches;
+}
+
 /** The screen of extended range on `canvas`; null where browser or screen have none. */
 export async function openHdrScreen(canvas) {
-  if (!navigator.gpu || !matchMedia(HIGH_RANGE).matches) return null;
+  if (!navigator.gpu || !hasHighRange()) return null;
   const late = new Promise((done) => setTimeout(done, MAX_WAIT_MILLISECONDS, null));
   try {
     return await Promise.race([connect(canvas), late]);

@@ -2,7 +2,8 @@
 
 import { readScene, unpack } from "./format.js";
 import { Renderer, driverName, openContext } from "./renderer.js";
-import { openHdrScreen } from "./hdr.js";
+import { offerClip } from "./clip.js";
+import { hasHighRange, openHdrScreen } from "./hdr.js";
 import { Player } from "./player.js";
 import { Frames, SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
 import { connectControls, find, limitControls, note, offerExtended } from "./controls.js";
@@ -30,10 +31,11 @@ async function start() {
   const player = new Player(scene, find("canvas"));
   globalThis.viewer = player; // for scripts and tests
   connectControls(player);
-  showVideos(settings.videos);
+  showVideos(settings);
   if (scene.groups.length) await draw(player, settings);
   else showFrames(player);
   if (player.renderer) await player.renderer.sort(player.view());
+  if (hasHighRange() && !player.hdr) explainRange(settings);
   find("loading").hidden = true;
   const loop = (now) => {
     player.tick(now);
@@ -107,12 +109,24 @@ async function followVersion(player) {
   }
 }
 
-function showVideos(videos) {
-  for (const { href, text } of videos) {
+function showVideos({ videos, hdr_clip: clip, server }) {
+  const data = held("clip-data");
+  const played = clip && (data || server); // here; else a file beside the page
+  for (const { href, text } of clip && !played ? [clip, ...videos] : videos) {
     const link = document.createElement("a");
     Object.assign(link, { href, textContent: text, target: "_blank" });
     find("videos").append(link);
   }
+  if (played) offerClip(clip, data);
+}
+
+/** On an HDR screen: what shows the light that this page does not draw. */
+function explainRange({ hdr_clip: clip }) {
+  find("range-note").textContent = clip
+    ? "Drawn here, light ends at white. The HDR clip shows it on this screen."
+    : "Drawn here, light ends at white. For this screen, make an HDR clip: " +
+      "hdr-nsff render RUN --path training --hdr-video hlg";
+  find("range-note").hidden = false;
 }
 
 function showStats(player) {

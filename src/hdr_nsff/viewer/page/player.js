@@ -11,6 +11,7 @@ import {
 } from "./cameras.js";
 import { EXTENDED } from "./curves.js";
 import { encodePng } from "./png.js";
+import { PQ_TAGS, encodePq } from "./pq.js";
 import { BLUR, Renderer } from "./renderer.js";
 
 const STILL_VIEWS = 24; // of a camera path between two views at the same time
@@ -274,7 +275,10 @@ export class Player {
     return values;
   }
 
-  /** What is shown as a PNG file of 8 or 16 bits, as fine as the screen. */
+  /**
+   * What is shown as a PNG file of 8 or 16 bits, as fine as the screen. Light above white
+   * is kept with 16 bits, as PQ.
+   */
   async png(bits) {
     const { renderer } = this;
     const view = this.view(this.fullSize);
@@ -283,7 +287,11 @@ export class Player {
     const picture = renderer.target("png", view.width, view.height, renderer.deepFormat());
     renderer.develop(maps, this.state, picture);
     this.sortedFor = ""; // what is shown is sorted again
-    return encodePng(renderer.read(picture), view.width, view.height, bits);
+    const values = renderer.read(picture);
+    const size = [view.width, view.height];
+    if (bits === 16 && this.isBeyondWhite())
+      return encodePng(encodePq(values), ...size, bits, PQ_TAGS);
+    return encodePng(values, ...size, bits);
   }
 
   /** Remember the camera and time of now for a path. */
