@@ -123,7 +123,9 @@ class Page:
         code = {"windowsVirtualKeyCode": 27} if key == "Escape" else {}  # closes dialogs
         for kind in ("keyDown", "keyUp"):
             modifiers = 8 if shift else 0
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **code, **text)
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **code, **text
+            )
             text = {}
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:

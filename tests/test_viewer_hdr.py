@@ -117,9 +117,7 @@ def test_an_hdr_screen_gets_light_above_white(hdr_tab: Page, toy: Scene, tmp_pat
     assert hdr_tab.problems() == []
 
 
-def test_other_curves_and_views_stay_below_white(
-    hdr_tab: Page, toy: Scene, tmp_path: Path
-) -> None:
+def test_other_curves_and_views_stay_below_white(hdr_tab: Page, toy: Scene, tmp_path: Path) -> None:
     open_page(hdr_tab, tmp_path / "scene.html", scene_file(toy))
     hidden = "document.getElementById('hdr').hidden"
     hdr_tab.wait(f"!{hidden}")

@@ -68,8 +68,8 @@ class Output:
     1000.
     """
     hdr_codec: Codec = "hevc"
-    """Of HDR videos: hevc plays on more screens, av1 is royalty-free, prores (4444, MOV)
-    is for editing programs.
+    """Of HDR videos: hevc plays on more screens, av1 is royalty-free, prores (4444,
+    MOV) is for editing programs.
     """
     hdr_still: tuple[HdrStill, ...] = ()
     """HDR picture of every view: ultrahdr (JPEG with a gain map, for phones and

@@ -40,8 +40,8 @@ async function start() {
   const loop = (now) => {
     player.tick(now);
     if (player.state.stats) showStats(player);
-    if (settings.server && player.isSlow()) showFrames(player);
-    else player.easeOff();
+    if (player.renderer && settings.server && player.isSlow()) showFrames(player);
+    else if (player.renderer) player.easeOff();
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);
