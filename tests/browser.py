@@ -120,9 +120,12 @@ class Page:
     def press(self, key: str, shift: bool = False) -> None:
         """Press and release a key."""
         text = {"text": key} if len(key) == 1 else {}
+        code = {"windowsVirtualKeyCode": 27} if key == "Escape" else {}  # closes dialogs
         for kind in ("keyDown", "keyUp"):
             modifiers = 8 if shift else 0
-            self.call("Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **text)
+            self.call(
+                "Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, **code, **text
+            )
             text = {}
 
     def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
@@ -153,7 +156,7 @@ class Page:
     def problems(self) -> list[str]:
         """Errors and warnings of the console, and exceptions, since the last `goto`.
 
-        Chromium's own warnings about software WebGL are left out.
+        Chromium's own warnings about software WebGL and missing WebGPU are left out.
         """
         found = []
         for event in self.events:
@@ -165,7 +168,7 @@ class Page:
                     found.append(str(params["args"]))
                 case "Log.entryAdded" if params["entry"]["level"] in ("error", "warning"):
                     found.append(params["entry"]["text"])
-        software = ("swiftshader", "gpu stall due to readpixels")
+        software = ("swiftshader", "gpu stall due to readpixels", "no available adapters")
         return [text for text in found if not any(word in text.lower() for word in software)]
 
     def requests(self) -> list[str]:
@@ -176,8 +179,8 @@ class Page:
 
 
 @contextmanager
-def browser(profile: Path) -> Iterator[Page]:
-    """A tab of a new browser whose profile is the folder `profile`."""
+def browser(profile: Path, *more: str) -> Iterator[Page]:
+    """A tab of a new browser whose profile is the folder `profile`; `more` options."""
     found = find_browser()
     assert found is not None
     browser_reads, to_browser = os.pipe()
@@ -190,7 +193,7 @@ def browser(profile: Path) -> Iterator[Page]:
         os.dup2(writes, 4)
 
     process = subprocess.Popen(
-        [found, *OPTIONS, f"--user-data-dir={profile}", "about:blank"],
+        [found, *OPTIONS, *more, f"--user-data-dir={profile}", "about:blank"],
         preexec_fn=connect,
         close_fds=False,
         stdout=subprocess.DEVNULL,

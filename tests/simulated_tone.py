@@ -34,6 +34,7 @@ def random_tone_mapper(num_cameras: int, anchored: bool, **settings: bool) -> Sh
         1,
         num_cameras,
         drift=(0.1, 0, 0.2, 0.3, 0, 0, 0.1),
+        balance=((0.05, 0, -0.05), (0.1, -0.2, 0.1)) + ((0, 0, 0),) * 4 + ((0.2, 0, -0.2),),
         corners=(0.4,) * num_cameras,
     )
     found = SharedToneMapper(ToneMapConfig(**settings), recordings)

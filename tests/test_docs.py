@@ -47,9 +47,10 @@ INLINE = re.compile(r"`([^`\n]+)`")
 FLAG = re.compile(r"(?<![\w-])--[a-z][\w.-]*")
 COMMAND = re.compile(r"hdr-nsff +([a-z][a-z-]*)([^\n#&|;)]*)")
 SETTING = re.compile(r"--set ([\w.]+)=([\w.]+)")
-# of pip, torchrun and other programs that the documentation calls
+# of pip, torchrun, Chromium and other programs that the documentation calls
 FOREIGN_FLAGS = {"--no-deps", "--local-dir", "--version", "--help"}
 FOREIGN_FLAGS |= {"--nproc-per-node", "--no-python", "--array", "--tyro-print-completion"}
+FOREIGN_FLAGS |= {"--use-angle", "--enable-unsafe-swiftshader"}
 
 by_name = pytest.mark.parametrize("page", DOCUMENTS, ids=lambda p: p.name)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from pathlib import Path
 
 import pytest
@@ -43,6 +44,23 @@ def test_videos_below_the_page_are_linked(toy: Scene, tmp_path: Path) -> None:
     (tmp_path / "render" / "training.mp4").write_bytes(b"")
     assert [link.href for link in find_videos(run, tmp_path)] == ["render/training.mp4"]
     assert find_videos(run, tmp_path / "elsewhere") == []
+
+
+def test_an_hdr_video_is_inside_the_page_if_it_is_small(
+    toy: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = make_run(toy, tmp_path / "run")
+    (tmp_path / "render").mkdir()
+    (tmp_path / "render" / "training_pq.mp4").write_bytes(b"pq")
+    (tmp_path / "render" / "training_hlg_av1.mp4").write_bytes(b"hlg")
+    held = base64.b64encode(b"hlg").decode()
+    page = export_page(run, tmp_path / "scene.html").read_text()
+    assert f'<script id="clip-data" type="text/plain">{held}</script>' in page
+    assert '{"href": "training_hlg_av1.mp4", "text": "HDR clip"}' in page
+    monkeypatch.setattr("hdr_nsff.rendering.export_page.MAX_CLIP_BYTES", 2)
+    page = export_page(run, tmp_path / "scene.html").read_text()
+    assert '<script id="clip-data"' not in page
+    assert '{"href": "render/training_hlg_av1.mp4", "text": "HDR clip"}' in page
 
 
 @pytest.mark.parametrize("options", [{"ply": True}, {"time": 1.0}, {"layout": "nerfstudio"}])

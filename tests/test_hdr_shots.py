@@ -35,6 +35,16 @@ def test_a_shot_has_its_radiance_in_hlg_and_pq(tmp_path: Path) -> None:
         assert np.abs(luma(frames[1]) - expected.astype(int)).mean() < 2
 
 
+def test_prores_is_a_mov_of_the_same_light(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    render_shot(run, large_shot(), tmp_path, Output(hdr_video=("hlg", "pq"), hdr_codec="prores"))
+    render_shot(run, large_shot(), tmp_path, Output(hdr_video=("pq",)))
+    _, frames = decoded(tmp_path / "some_pq_prores.mov")
+    _, expected = decoded(tmp_path / "some_pq.mp4")
+    assert (tmp_path / "some_hlg_prores.mov").is_file()
+    assert np.abs(luma(frames[1]) / 4 - luma(expected[1])).mean() < 2
+
+
 def test_hdr_videos_are_added_without_rendering_again(tmp_path: Path) -> None:
     run = fake_run(tmp_path)
     render_shot(run, large_shot(), tmp_path, Output())

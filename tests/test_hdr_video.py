@@ -25,22 +25,28 @@ W, H = 704, 64
 kinds = pytest.mark.parametrize(
     ("codec", "transfer"), [("hevc", "pq"), ("hevc", "hlg"), ("av1", "pq"), ("av1", "hlg")]
 )
+transfers = pytest.mark.parametrize("transfer", ["pq", "hlg"])
 
 
-def ramp(transfer: Transfer) -> Planes:
+def ramp(transfer: Transfer, full_chroma: bool = False) -> Planes:
     """Diffuse white on the left, beside it a gray ramp from 0 to 1000 nits."""
     signal = np.zeros((H, W, 3))
     signal[:, :64] = encode(np.full(3, 203.0), transfer)
     top = encode(np.full(3, 1000.0), transfer)[0]
     signal[:, 64:] = np.linspace(0, top, W - 64)[:, None]
-    return ycbcr_planes(signal)
+    return ycbcr_planes(signal, full_chroma)
 
 
 def luma(frame: Any) -> np.ndarray:
     """Y codes (H, W) of a decoded frame."""
-    plane = frame.planes[0]
+    return plane_codes(frame, 0)
+
+
+def plane_codes(frame: Any, index: int) -> np.ndarray:
+    """Codes (H, W) of a plane of a decoded frame."""
+    plane = frame.planes[index]
     rows = np.frombuffer(plane, "<u2").reshape(-1, plane.line_size // 2)
-    return rows[:, : frame.width].astype(int)
+    return rows[:, : plane.width].astype(int)
 
 
 def decoded(path: Path) -> tuple[Any, list[Any]]:
@@ -68,6 +74,28 @@ def test_tags_and_codes_are_read_back(tmp_path: Path, codec: Codec, transfer: Tr
     given = planes[0].astype(int)
     assert np.abs(seen[:, 72:] - given[:, 72:]).max() <= 8
     assert len(np.unique(seen[:, 64:])) >= 0.9 * len(np.unique(given[:, 64:]))  # no bands
+
+
+@transfers
+def test_prores_4444_keeps_tags_codes_and_sharp_chroma(tmp_path: Path, transfer: Transfer) -> None:
+    path = tmp_path / "a.mov"
+    planes = ramp(transfer, full_chroma=True)
+    planes[1][:, 71::2] = 560  # columns of one pixel, which 4:2:0 would blur
+    assert write_hdr_video(path, [planes] * 3, 24, transfer, "prores") == 3
+    stream, frames = decoded(path)
+    context = stream.codec_context
+    assert (context.name, context.profile, context.codec_tag) == ("prores", "4444", "ap4h")
+    assert len(frames) == 3 and frames[0].format.name == "yuv444p12le"  # as FFmpeg decodes it
+    code = {"pq": 16, "hlg": 18}[transfer]
+    for tagged in (context, *frames):
+        assert (tagged.color_primaries, tagged.color_trc, tagged.colorspace) == (9, code, 9)
+    seen = luma(frames[1]) / 4
+    assert np.abs(seen[:, 8:56] - {"pq": 573, "hlg": 721}[transfer]).max() <= 2
+    given = planes[0].astype(int)
+    assert np.abs(seen[:, 72:] - given[:, 72:]).max() <= 4
+    assert len(np.unique(np.rint(seen[:, 64:]))) >= 0.9 * len(np.unique(given[:, 64:]))
+    blue = plane_codes(frames[1], 1) / 4
+    assert np.abs(blue[:, 72:] - planes[1][:, 72:]).mean() < 2
 
 
 @pytest.mark.parametrize("codec", ["hevc", "av1"])

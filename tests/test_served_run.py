@@ -113,6 +113,21 @@ def test_the_newest_checkpoint_is_opened_again(
     assert from_bytes(served.scene()).background == pytest.approx([np.exp(-1)] * 3)
 
 
+def test_videos_of_render_and_of_run_are_served(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    save_run(toy, toy_folder, tmp_path / "run")
+    served = ServedRun(tmp_path / "run", "cpu")
+    assert served.videos() == {} and '"hdr_clip": null' in served.page()
+    renders = tmp_path / "render"  # where `run` puts them
+    renders.mkdir()
+    for name in ("training.mp4", "training_hlg.mp4", "other.mp4"):
+        (renders / name).write_bytes(b"")
+    videos = {f"/video/{name}": renders / name for name in ("training.mp4", "training_hlg.mp4")}
+    assert served.videos() == videos
+    assert '{"href": "video/training_hlg.mp4", "text": "HDR clip"}' in served.page()
+
+
 def test_ctrl_c_ends_the_verb(toy: Scene, toy_folder: Path, tmp_path: Path) -> None:
     save_run(toy, toy_folder, tmp_path / "run")
     code = "import sys; from hdr_nsff.cli import main; main(sys.argv[1:])"

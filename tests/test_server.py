@@ -6,6 +6,7 @@ import http.client
 import json
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -28,6 +29,9 @@ REQUEST = {
 class Fake:
     """A source that answers with short texts."""
 
+    def __init__(self, folder: Path) -> None:
+        self.video = folder / "b.mp4"
+
     def page(self) -> str:
         return "<p>page</p>"
 
@@ -37,6 +41,9 @@ class Fake:
     def version(self) -> str:
         return "7"
 
+    def videos(self) -> dict[str, Path]:
+        return {"/video/a.mp4": self.video}
+
     def frame(self, request: FrameRequest) -> bytes:
         if request.time > 4:
             raise InputError("outside the clip")
@@ -44,8 +51,8 @@ class Fake:
 
 
 @pytest.fixture
-def port() -> Iterator[int]:
-    with ViewerServer(Fake()) as server:
+def port(tmp_path: Path) -> Iterator[int]:
+    with ViewerServer(Fake(tmp_path)) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         yield server.server_port
         server.shutdown()
@@ -79,9 +86,32 @@ def test_other_names_for_this_machine_are_refused(port: int) -> None:
     assert ask(port, "GET", "/version", host=f"localhost:{port}")[0] == 200
 
 
-def test_a_port_that_is_taken_is_one_sentence(port: int) -> None:
+def test_a_port_that_is_taken_is_one_sentence(port: int, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not free"):
-        ViewerServer(Fake(), port)
+        ViewerServer(Fake(tmp_path), port)
+
+
+@pytest.mark.parametrize(
+    ("asked", "status", "body", "part"),
+    [
+        ("", 200, b"0123456789", None),
+        ("bytes=0-", 206, b"0123456789", "bytes 0-9/10"),
+        ("bytes=4-6", 206, b"456", "bytes 4-6/10"),
+        ("bytes=8-99", 206, b"89", "bytes 8-9/10"),
+        ("bytes=-5", 200, b"0123456789", None),
+    ],
+)
+def test_videos_are_served_whole_or_in_part(
+    port: int, tmp_path: Path, asked: str, status: int, body: bytes, part: str | None
+) -> None:
+    assert ask(port, "GET", "/video/a.mp4")[0] == 404
+    (tmp_path / "b.mp4").write_bytes(b"0123456789")
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.request("GET", "/video/a.mp4", headers={"Range": asked} if asked else {})
+    answer = connection.getresponse()
+    assert (answer.status, answer.read()) == (status, body)
+    assert answer.getheader("Content-Range") == part
+    assert answer.getheader("Content-Type") == "video/mp4"
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fakes import fake_run
+from fakes import camera, fake_run
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import ENCODERS
 from hdr_nsff.core.images import read_image
-from hdr_nsff.rendering.shots import Output
-from hdr_nsff.rendering.standard_set import cut, render_all
+from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.rendering.shots import Output, Shot
+from hdr_nsff.rendering.standard_set import cut, render_all, with_hdr_clip
 
 NAMES = {
     "EXR sequence",
@@ -40,6 +42,20 @@ def test_the_set_is_complete_and_restarts_without_work(tmp_path: Path) -> None:
     before = run.field.calls
     render_all(run, out)
     assert run.field.calls - before <= 1  # the focus depth of bullet time
+
+
+def test_the_shot_as_filmed_has_an_hdr_video_where_one_can_be_encoded(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    view = PathView(camera(), 0.0)
+    small = Shot("training", [view], 24)
+    large = Shot("training", [view.resized(2)], 24)
+    assert with_hdr_clip(Output(), small) == Output()
+    assert with_hdr_clip(Output(), large) == Output(hdr_video=("hlg",))
+    asked = Output(hdr_video=("pq",))
+    assert with_hdr_clip(asked, large) == asked
+    monkeypatch.setitem(ENCODERS, "hevc", "libnone")
+    assert with_hdr_clip(Output(), large) == Output()
 
 
 def test_without_parallax_the_set_leaves_out_bullet_time(tmp_path: Path) -> None:

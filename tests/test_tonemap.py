@@ -76,6 +76,14 @@ def test_drift_is_a_known_offset_of_single_frames():
     assert t.log_gain(0, 0, None)[0].item() == pytest.approx(-2 * np.log(2), abs=1e-5)
 
 
+def test_the_white_balance_of_single_frames_is_a_known_offset():
+    balance = ((0.1, 0.0, -0.1), (0.0, 0.0, 0.0), (-0.1, 0.0, 0.1))
+    recordings = Recordings((0, 0, 1), (0, 0, 0), (-2.0, 0.0), 1, 1, balance=balance)
+    t = build_tone_mapper(ToneMapConfig(), recordings)
+    torch.testing.assert_close(t.log_gain(0, 0, 0) / np.log(2), torch.tensor([-1.9, -2.0, -2.1]))
+    torch.testing.assert_close(t.log_gain(1, 0, None), torch.zeros(3))
+
+
 def test_known_exposures_are_exact_and_not_learned():
     t = mapper([-4.0, None, 0.0])
     t.set_exposures([-9.0, -1.5, 7.0])

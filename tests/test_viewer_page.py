@@ -374,6 +374,21 @@ def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: 
     assert tab.problems() == []
 
 
+def test_a_browser_that_draws_too_slowly_asks_the_server(tab: Page, address: str) -> None:
+    tab.goto(f"{address}#draw", 500, 300)
+    tab.run(
+        "viewer.renderer.composite = (draw => function (...view) {"
+        "for (const end = performance.now() + 250; performance.now() < end;);"
+        "return draw.apply(this, view); })(viewer.renderer.composite)"
+    )
+    tab.press(" ")
+    tab.wait("viewer.frames?.shown > 0")
+    assert tab.run("viewer.renderer") is None
+    tab.press(" ")
+    tab.wait("!viewer.frames.busy")
+    assert tab.problems() == []
+
+
 def test_a_served_page_can_draw_and_follows_the_run(
     tab: Page, address: str, tmp_path: Path
 ) -> None:

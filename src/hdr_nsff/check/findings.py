@@ -117,7 +117,7 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
         yield Finding("warning", "exposure", text, advice)
     if exposure.color_drift_ev > tuning.max_color_drift_ev:
         text = f"colors drift by about {exposure.color_drift_ev:.2f} EV: auto white balance"
-        advice = "lock white balance; training follows only a part of its drift"
+        advice = "`prepare` follows a slow drift, but lock white balance if you can"
         yield Finding("warning", "color", text, advice)
     if exposure.banding_ev > tuning.min_banding_ev:
         text = f"bands of about {exposure.banding_ev:.2f} EV run through the picture: mains flicker"

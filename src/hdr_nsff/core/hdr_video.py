@@ -1,8 +1,9 @@
-"""HDR video: planes of 10-bit codes to HEVC Main 10 or AV1 in MP4, through PyAV.
+"""HDR video: planes of 10-bit codes to HEVC Main 10, AV1 or ProRes, through PyAV.
 
-The codes are Y, Cb and Cr of BT.2100, limited range, 4:2:0. Stream and frames are
-tagged; PQ carries the metadata of HDR10: the mastering display (SMPTE ST 2086) and the
-content's light levels (CTA-861.3).
+The codes are Y, Cb and Cr of BT.2100, limited range: 4:2:0 in MP4, and for ProRes 4444,
+which editing programs take, 4:4:4 in MOV. Stream and frames are tagged. PQ in MP4
+carries the metadata of HDR10: the mastering display (SMPTE ST 2086) and the content's
+light levels (CTA-861.3).
 """
 
 from __future__ import annotations
@@ -19,16 +20,18 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
 
-Codec = Literal["hevc", "av1"]
+Codec = Literal["hevc", "av1", "prores"]
 Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-ENCODERS = {"hevc": "libx265", "av1": "libsvtav1"}
+ENCODERS = {"hevc": "libx265", "av1": "libsvtav1", "prores": "prores_ks"}
 # Codes of H.273, the same in both codecs
 REC2020_PRIMARIES = 9
 REC2020_MATRIX = 9  # non-constant luminance
 LIMITED_RANGE = 1
 TRANSFERS = {"pq": 16, "hlg": 18}
 PIXELS = "yuv420p10le"
+FULL_CHROMA_PIXELS = "yuv444p10le"  # of ProRes 4444
+PRORES_OPTIONS = {"profile": "4444", "vendor": "apl0"}  # the vendor that editors expect
 # Constant quality (hand-chosen: a gray patch and a ramp keep their codes within 2)
 HEVC_CRF = 14
 AV1_CRF = 18
@@ -56,6 +59,16 @@ def check_encoder(codec: Codec) -> None:
         raise InputError(f"HDR video: this PyAV has no encoder {encoder}; {advice}") from error
 
 
+def can_encode(codec: Codec, width: int, height: int) -> bool:
+    """Whether this PyAV writes HDR video of this size."""
+    try:
+        check_encoder(codec)
+        check_side("", width, height)
+    except InputError:
+        return False
+    return True
+
+
 def write_hdr_video(
     path: Path | str,
     frames: Iterable[Planes],
@@ -65,10 +78,10 @@ def write_hdr_video(
     light: LightLevels | None = None,
     peak_nits: float = 1000.0,
 ) -> int:
-    """Write planes Y (H, W), Cb, Cr (H/2, W/2) uint16 as MP4, atomically; their number.
+    """Write planes Y (H, W), Cb, Cr uint16 as MP4 or MOV, atomically; their number.
 
     `transfer` is `pq` or `hlg`. With `light` and the mastering display's `peak_nits`
-    the file is HDR10. H and W are even.
+    an MP4 is HDR10. H and W are even; chroma is (H, W) for ProRes, else (H/2, W/2).
     """
     import av
 
@@ -88,11 +101,11 @@ def write_hdr_video(
                 options = encoder_options(codec, transfer, light, peak_nits)
                 stream = container.add_stream(ENCODERS[codec], rate=rate, options=options)
                 stream.width, stream.height = width, height
-                stream.pix_fmt = PIXELS
+                stream.pix_fmt = pixel_format(codec)
                 if codec == "hevc":  # Apple's players take no other tag
                     stream.codec_context.codec_tag = "hvc1"
                 tag_rec2020(stream.codec_context, transfer)
-            container.mux(stream.encode(to_frame(planes, transfer)))
+            container.mux(stream.encode(to_frame(planes, transfer, pixel_format(codec))))
             count += 1
         if stream is None:
             raise InputError(f"{path}: no frames to write")
@@ -108,12 +121,22 @@ def check_side(path: Path | str, width: int, height: int) -> None:
         raise InputError(f"{path}: {size}; {limit}")
 
 
-def to_frame(planes: Planes, transfer: str) -> Any:
+def has_full_chroma(codec: Codec) -> bool:
+    """Whether chroma has the size of luma (4:4:4) instead of half of it (4:2:0)."""
+    return codec == "prores"
+
+
+def pixel_format(codec: Codec) -> str:
+    """FFmpeg's name of the planes of a codec."""
+    return FULL_CHROMA_PIXELS if has_full_chroma(codec) else PIXELS
+
+
+def to_frame(planes: Planes, transfer: str, pixels: str = PIXELS) -> Any:
     """A tagged frame of PyAV with these planes."""
     import av
 
     height, width = planes[0].shape
-    frame = av.VideoFrame(width, height, PIXELS)
+    frame = av.VideoFrame(width, height, pixels)
     tag_rec2020(frame, transfer)
     for target, codes in zip(frame.planes, planes, strict=True):
         rows = np.zeros((codes.shape[0], target.line_size // 2), "<u2")
@@ -134,6 +157,8 @@ def encoder_options(
     codec: Codec, transfer: str, light: LightLevels | None, peak_nits: float
 ) -> dict[str, str]:
     """Options of FFmpeg for the encoder: quality, and the metadata of HDR10."""
+    if codec == "prores":
+        return PRORES_OPTIONS
     levels = ""
     if light is not None:
         levels = f"{round(light.max_cll)},{round(light.max_fall)}"

@@ -132,6 +132,7 @@ def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
     By the learned camera, at every bracket that the target has.
     """
     brackets = list(target.rgb)
+    radiance = radiance * 2.0 ** torch.tensor(target.white_balance)
     if target.drift:
         exposures = run.tonemapper.exposures()
         evs = [float(exposures[b]) + target.drift for b in brackets]

@@ -59,6 +59,8 @@ class Target:
     # {EV: (H, W, 3)} recorded, at exposures of no frame of the clip
     novel: dict[float, Tensor] = field(default_factory=dict)
     drift: float = 0.0  # stops by which its exposure differs from its bracket's
+    # stops by which its white balance differs from the clip's
+    white_balance: tuple[float, ...] = (0.0, 0.0, 0.0)
 
     def protocol(self, times: Sequence[float]) -> Protocol | None:
         """The published comparison that the view belongs to; None if it was trained on.
@@ -134,6 +136,7 @@ def frame_targets(frames: Sequence[Frame], group: str) -> list[Target]:
             radiance=None,
             moving=frame.moving,
             drift=frame.drift,
+            white_balance=frame.white_balance,
         )
         for frame in frames
     ]

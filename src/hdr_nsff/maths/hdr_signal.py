@@ -136,25 +136,33 @@ def hlg_scene_light(nits: np.ndarray) -> np.ndarray:
     return light * luminance[..., None] ** (1 / HLG_GAMMA - 1)
 
 
-def ycbcr_planes(signal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def ycbcr_planes(
+    signal: np.ndarray, full_chroma: bool = False
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """10-bit codes Y (H, W), Cb and Cr (H/2, W/2) uint16 of rgb signals (H, W, 3).
 
     BT.2020 non-constant luminance, limited range, 4:2:0. H and W are even. Chroma is
     averaged, weights 1-2-1 along rows: its samples lie at the left, where players
-    expect them.
+    expect them. With `full_chroma` (4:4:4) it is (H, W).
     """
     red_weight, _, blue_weight = REC2020_LUMINANCE
     luma = signal @ np.array(REC2020_LUMINANCE)
     blue = (signal[..., 2] - luma) / (2 * (1 - blue_weight))
     red = (signal[..., 0] - luma) / (2 * (1 - red_weight))
     y = np.rint(LUMA_BLACK + LUMA_RANGE * luma).astype(np.uint16)
+    if not full_chroma:
+        blue, red = halve_chroma(blue), halve_chroma(red)
     return y, chroma_codes(blue), chroma_codes(red)
 
 
 def chroma_codes(chroma: np.ndarray) -> np.ndarray:
-    """Codes (H/2, W/2) of a color difference (H, W) in [-0.5, 0.5]."""
+    """Codes of a color difference in [-0.5, 0.5]."""
+    return np.rint(CHROMA_ZERO + CHROMA_RANGE * chroma).astype(np.uint16)
+
+
+def halve_chroma(chroma: np.ndarray) -> np.ndarray:
+    """A color difference (H, W) at half of the size along each side."""
     rows = (chroma[0::2] + chroma[1::2]) / 2
     middle, right = rows[:, 0::2], rows[:, 1::2]
     left = np.concatenate([rows[:, :1], right[:, :-1]], 1)
-    average = (left + 2 * middle + right) / 4
-    return np.rint(CHROMA_ZERO + CHROMA_RANGE * average).astype(np.uint16)
+    return (left + 2 * middle + right) / 4

@@ -11,7 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.hdr_video import Codec, LightLevels, Planes, write_hdr_video
+from hdr_nsff.core.hdr_video import (
+    Codec,
+    LightLevels,
+    Planes,
+    has_full_chroma,
+    write_hdr_video,
+)
 from hdr_nsff.maths.hdr_signal import PEAK_NITS, Transfer, display_light, encode, ycbcr_planes
 
 
@@ -36,7 +42,7 @@ def write_radiance_video(
 
     def planes() -> Iterator[Planes]:
         for nits in light():
-            yield ycbcr_planes(encode(nits, transfer))
+            yield ycbcr_planes(encode(nits, transfer), has_full_chroma(codec))
 
     levels = None  # HLG has none: its signal is relative to the display's peak
     if transfer == "pq":

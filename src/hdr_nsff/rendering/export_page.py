@@ -9,9 +9,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import Codec
 from hdr_nsff.core.io import atomic, write_text
 from hdr_nsff.core.progress import say
 from hdr_nsff.rendering.export_gaussians import NOT_OURS, ColorTransform, exposure_of
+from hdr_nsff.rendering.hdr_shots import TRANSFERS, hdr_path
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import scene_of
 from hdr_nsff.viewer.page_file import MARK, Link, PageSettings, make_page
@@ -20,6 +22,9 @@ from hdr_nsff.viewer.scene_file import KEY, SceneFile, to_bytes
 PAGE, BARE = ".html", ".hdr4d"  # endings of the two kinds of files
 HEAD_BYTES = 4096  # of a file, in which its mark is
 # videos of `render` that a page without a GPU offers, if they are beside it
+HDR_CLIP = "HDR clip"
+MAX_CLIP_BYTES = 4_000_000  # of an HDR video inside a page (hand-chosen: easily sent)
+PLAYED_CODECS: tuple[Codec, ...] = ("hevc", "av1")  # by browsers; hevc by more of them in HDR
 VIDEOS = {"training": "Video", "bullet": "Bullet time", "slowmo": "Slow motion"}
 
 
@@ -32,14 +37,25 @@ def export_page(run: Run, path: Path) -> Path:
         raise InputError(f"{run.folder}: {problem}; use `hdr-nsff view`, or train `splat`")
     data = to_bytes(scene)
     if path.suffix.lower() == PAGE:
-        settings = PageSettings(videos=find_videos(run, path.parent))
-        write_text(path, make_page(scene.title, data, settings))
+        write_text(path, single_page(run, path.parent, scene.title, data))
     else:
         with atomic(path) as temporary:
             temporary.write_bytes(data)
     size = path.stat().st_size / 1e6
     say(f"{path}: {scene.count()} Gaussians over {len(scene.times)} times, {size:.1f} MB")
     return path
+
+
+def single_page(run: Run, folder: Path, title: str, data: bytes) -> str:
+    """The page with the scene `data` inside, to be written into `folder`."""
+    videos = find_videos(run, folder)
+    clip = find_hdr_clip(run, folder)
+    if clip is None:
+        return make_page(title, data, PageSettings(videos=videos))
+    if clip.stat().st_size <= MAX_CLIP_BYTES:
+        settings = PageSettings(videos, Link(clip.name, HDR_CLIP))
+        return make_page(title, data, settings, clip.read_bytes())
+    return make_page(title, data, PageSettings(videos, link_below(clip, folder, HDR_CLIP)))
 
 
 def check_place(path: Path) -> None:
@@ -65,11 +81,30 @@ def find_videos(run: Run, folder: Path) -> list[Link]:
     links = []
     for name, text in VIDEOS.items():
         for place in (folder / "render", run.folder / "render"):
-            video = (place / f"{name}.mp4").resolve()
-            if video.is_file() and video.is_relative_to(folder.resolve()):
-                links.append(Link(video.relative_to(folder.resolve()).as_posix(), text))
+            link = link_below(place / f"{name}.mp4", folder, text)
+            if link is not None:
+                links.append(link)
                 break
     return links
+
+
+def link_below(video: Path, folder: Path, text: str) -> Link | None:
+    """A link from `folder` to a video, if that exists and lies below it."""
+    target, base = video.resolve(), folder.resolve()
+    if not (target.is_file() and target.is_relative_to(base)):
+        return None
+    return Link(target.relative_to(base).as_posix(), text)
+
+
+def find_hdr_clip(run: Run, folder: Path) -> Path | None:
+    """The HDR video as filmed that `render` has made for a page in `folder`, if any."""
+    for place in (folder / "render", run.folder / "render"):
+        for transfer in TRANSFERS:
+            for codec in PLAYED_CODECS:
+                video = hdr_path(place, "training", transfer, codec)
+                if video.is_file():
+                    return video
+    return None
 
 
 def is_ours(path: Path) -> bool:

@@ -19,13 +19,13 @@ from hdr_nsff.rendering.exr_header import WhiteBalance, balance, unbalance
 from hdr_nsff.training.run_folder import Run
 
 TRANSFERS: tuple[Transfer, ...] = ("hlg", "pq")
-CODECS: tuple[Codec, ...] = ("hevc", "av1")
+CODECS: tuple[Codec, ...] = ("hevc", "av1", "prores")
+ENDINGS = {"hevc": ".mp4", "av1": "_av1.mp4", "prores": "_prores.mov"}
 
 
 def hdr_path(out: Path, name: str, transfer: Transfer, codec: Codec) -> Path:
-    """`NAME_hlg.mp4` or `NAME_pq.mp4`, with `_av1` before the dot where it is AV1."""
-    suffix = "" if codec == "hevc" else f"_{codec}"
-    return out / f"{name}_{transfer}{suffix}.mp4"
+    """`NAME_hlg.mp4` or `NAME_pq.mp4`; of other codecs `NAME_hlg_av1.mp4` and so on."""
+    return out / f"{name}_{transfer}{ENDINGS[codec]}"
 
 
 def hdr_paths(

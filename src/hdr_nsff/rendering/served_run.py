@@ -18,13 +18,13 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
-from hdr_nsff.rendering.export_page import find_videos, run_scene
+from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clip, run_scene
 from hdr_nsff.rendering.shot_views import check_views
 from hdr_nsff.rendering.shots import develop_view
 from hdr_nsff.rendering.stills import Still, render_still
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import jpeg
-from hdr_nsff.viewer.page_file import PageSettings, make_page
+from hdr_nsff.viewer.page_file import Link, PageSettings, make_page
 from hdr_nsff.viewer.scene_file import to_bytes
 from hdr_nsff.viewer.server import FrameRequest
 
@@ -49,8 +49,27 @@ class ServedRun:
         self.title, self.data = scene.title, to_bytes(scene)
 
     def page(self) -> str:
-        settings = PageSettings(videos=find_videos(self.run, self.folder), server=True)
-        return make_page(self.title, None, settings)
+        names = {path.name: address.removeprefix("/") for address, path in self.videos().items()}
+        videos = [
+            Link(names[f"{name}.mp4"], text)
+            for name, text in VIDEOS.items()
+            if f"{name}.mp4" in names
+        ]
+        clip = find_hdr_clip(self.run, self.renders().parent)
+        link = None if clip is None else Link(names[clip.name], HDR_CLIP)
+        return make_page(self.title, None, PageSettings(videos, link, server=True))
+
+    def renders(self) -> Path:
+        """The folder of the run's videos: that of `render`, else that of `run`."""
+        own = self.folder / "render"
+        beside = self.folder.resolve().parent / "render"
+        return beside if self.folder.resolve().name == "run" and not own.is_dir() else own
+
+    def videos(self) -> dict[str, Path]:
+        files = [self.renders() / f"{name}.mp4" for name in VIDEOS]
+        clip = find_hdr_clip(self.run, self.renders().parent)
+        files += [] if clip is None else [clip]
+        return {f"/video/{file.name}": file for file in files if file.is_file()}
 
     def scene(self) -> bytes:
         with self.lock:

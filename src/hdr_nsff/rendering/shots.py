@@ -64,11 +64,13 @@ class Output:
     video: bool = True
     """8-bit H.264 MP4."""
     hdr_video: tuple[Transfer, ...] = ()
-    """10-bit HDR MP4: hlg, pq (HDR10) or both. Diffuse white is 203 nits, the peak
+    """10-bit HDR video: hlg, pq (HDR10) or both. Diffuse white is 203 nits, the peak
     1000.
     """
     hdr_codec: Codec = "hevc"
-    """Of HDR videos: hevc plays on more screens, av1 is royalty-free."""
+    """Of HDR videos: hevc plays on more screens, av1 is royalty-free, prores (4444,
+    MOV) is for editing programs.
+    """
     hdr_still: tuple[HdrStill, ...] = ()
     """HDR picture of every view: ultrahdr (JPEG with a gain map, for phones and
     browsers), avif (PQ, 10 bits), png16 (PQ, 16 bits).

@@ -17,6 +17,7 @@ import numpy as np
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hdr_video import can_encode
 from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
@@ -76,13 +77,25 @@ def render_all(
     results: dict[str, Path] = {}
     for shot in fit_to_budget(run, out, budget, shots, refused):
         if shot.name == "training":
-            video = render_shot(run, shot, out, output)
+            filmed = with_hdr_clip(output, shot)
+            video = render_shot(run, shot, out, filmed)
             results["EXR sequence"] = out / "training"
-            results |= write_pictures(run, out, shot, output)
+            results |= write_pictures(run, out, shot, filmed)
+            results |= name_results(out, shot, LABELS[shot.name], filmed, video)
         else:
-            video = render_shot(run, shot, out, replace(output, exr="none", hdr_still=()))
-        results |= name_results(out, shot, LABELS[shot.name], output, video)
+            others = replace(output, exr="none", hdr_still=())
+            video = render_shot(run, shot, out, others)
+            results |= name_results(out, shot, LABELS[shot.name], others, video)
     return results
+
+
+def with_hdr_clip(output: Output, shot: Shot) -> Output:
+    """The output with the HDR video for the viewer's page, if it can be encoded."""
+    camera = shot.views[0].camera
+    width, height = camera.width // 2 * 2, camera.height // 2 * 2
+    if output.hdr_video or not can_encode(output.hdr_codec, width, height):
+        return output
+    return replace(output, hdr_video=("hlg",))
 
 
 def check_folder(out: Path) -> None:

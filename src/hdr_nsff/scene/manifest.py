@@ -84,6 +84,8 @@ class FrameEntry(Strict):
     ev: float | None = None  # log2 exposure relative to the reference bracket, if known
     # stops by which it differs from its bracket's (auto exposure), None: not at all
     drift: float | None = None
+    # stops (3,) by which its white balance differs from the clip's, None: not at all
+    white_balance: list[float] | None = None
     split: Split = "train"
     K: list[list[float]] | None = None  # 3x3 px
     c2w: list[list[float]] | None = None  # 3x4 OpenCV, scene units

@@ -49,6 +49,8 @@ class Frame:
     bracket: int
     image: Tensor  # (H, W, 3) recorded rgb in [0, 1]
     drift: float = 0.0  # stops by which its exposure differs from its bracket's
+    # stops by which its white balance differs from the clip's
+    white_balance: tuple[float, ...] = (0.0, 0.0, 0.0)
     # {+-1: position in `Scene.train`} of the neighbors in time, same physical camera
     neighbors: dict[int, int] = field(default_factory=dict)
     moving: Tensor | None = None  # (H, W) bool
@@ -291,6 +293,7 @@ def load_frame(
         bracket=entry.bracket,
         image=image,
         drift=entry.drift or 0.0,
+        white_balance=tuple(entry.white_balance or (0.0, 0.0, 0.0)),
         neighbors=positions,
         moving=moving,
         outline=outline(moving) if moving is not None and estimated else None,

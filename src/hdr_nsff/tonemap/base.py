@@ -103,6 +103,8 @@ class Recordings:
     # stops by which every training frame differs from its bracket (auto exposure);
     # empty: none does
     drift: tuple[float, ...] = ()
+    # stops (3,) by which its white balance differs from the clip's; empty: none does
+    balance: tuple[tuple[float, ...], ...] = ()
     # of every camera, where vignetting can be learned (see `vignetting_corners`)
     corners: tuple[float, ...] = ()
 

@@ -27,7 +27,7 @@ class BracketGain(nn.Module):
     """Log gain: exposure + white balance + the frame's drift and residual.
 
     The exposure is the bracket's, the white balance the camera's. Drift is that of auto
-    exposure, as `prepare` estimated it; residuals are learned. See
+    exposure and white balance, as `prepare` estimated it; residuals are learned. See
     docs/method.md#eq-9 and #eq-10.
 
     Known exposures are buffers and stay exactly what they are; unknown ones are
@@ -36,7 +36,7 @@ class BracketGain(nn.Module):
 
     known: Tensor  # (B,) EV, 0 where unknown
     unknown: Tensor  # (U,) brackets to learn
-    drift: Tensor  # (frames,) natural log, of every training frame
+    drift: Tensor  # (frames, 3) natural log, of every training frame
 
     def __init__(self, recordings: Recordings, with_residuals: bool) -> None:
         super().__init__()
@@ -46,8 +46,7 @@ class BracketGain(nn.Module):
         self.register_buffer("known", known, persistent=False)
         self.register_buffer("unknown", torch.tensor(unknown, dtype=torch.int64), persistent=False)
         self.learned_ev = nn.Parameter(torch.zeros(len(unknown)), requires_grad=bool(unknown))
-        drift = torch.tensor(recordings.drift or [0.0] * len(recordings.brackets))
-        self.register_buffer("drift", drift.float() * LN2, persistent=False)
+        self.register_buffer("drift", drift_of(recordings) * LN2, persistent=False)
         others = recordings.num_cameras - 1
         self.white_balance = nn.Parameter(  # natural log
             torch.zeros(others, 3), requires_grad=others > 0
@@ -73,6 +72,14 @@ class BracketGain(nn.Module):
             # Their mean is 0: the residuals cannot carry scale.
             log_gain = log_gain + self.residual[frame] - self.residual.mean(0)
         return log_gain
+
+
+def drift_of(recordings: Recordings) -> Tensor:
+    """Stops (frames, 3) by which every training frame differs from its bracket."""
+    count = len(recordings.brackets)
+    exposure = torch.tensor(recordings.drift or [0.0] * count, dtype=torch.float32)
+    balance = torch.tensor(recordings.balance or [[0.0] * 3] * count, dtype=torch.float32)
+    return exposure[:, None] + balance.view(count, 3)
 
 
 class BracketedToneMapper(ToneMapper):

@@ -43,6 +43,7 @@ def tone_mapper_for(config: ToneMapConfig, scene: Scene) -> ToneMapper:
         ev=tuple(m.known_ev),
         reference=m.reference_bracket,
         drift=tuple(f.drift for f in scene.train),
+        balance=tuple(f.white_balance for f in scene.train),
         num_cameras=num_cameras,
         corners=vignetting_corners(scene, num_cameras) if shared else (),
     )

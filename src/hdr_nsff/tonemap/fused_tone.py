@@ -38,7 +38,7 @@ class Held:
 
     known: Tensor  # (B,) EV, 0 where unknown
     unknown: Tensor  # (U,) brackets to learn
-    drift: Tensor  # (F,) natural log
+    drift: Tensor  # (F, 3) natural log
     curve: Tensor  # (C, 3, K) that `anchor` held
     ev: Tensor  # (B,)
     white_balance: Tensor  # (C - 1, 3)

@@ -26,7 +26,8 @@ EXPORT = re.compile(r"^export\s+(?=(async\s+)?(function|class|const|let)\b)", re
 # what the page may load: nothing, but what it holds itself
 POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' blob:; worker-src blob:; "
-    "style-src 'unsafe-inline'; img-src data: blob:; connect-src {server}"
+    "style-src 'unsafe-inline'; img-src data: blob:; media-src blob:{media}; "
+    "connect-src {server}"
 )
 
 
@@ -43,21 +44,27 @@ class PageSettings:
     """What the scripts know besides the scene."""
 
     videos: Sequence[Link] = field(default_factory=list)
+    hdr_clip: Link | None = None
+    """An HDR video, for screens whose browser draws no light above white."""
     server: bool = False
     """The page comes from a server, which has the scene and renders frames."""
 
 
-def make_page(title: str, scene: bytes | None, settings: PageSettings) -> str:
+def make_page(
+    title: str, scene: bytes | None, settings: PageSettings, hdr_clip: bytes | None = None
+) -> str:
     """The HTML of the page; `scene` are the bytes of a scene file.
 
-    Without them the page asks its server for `scene.hdr4d`.
+    Without them the page asks its server for `scene.hdr4d`. `hdr_clip` are the bytes of
+    the video that `settings` names.
     """
     server = "'self'" if settings.server else "'none'"
+    media = " 'self'" if settings.server else ""
     parts = {
-        "POLICY": POLICY.format(server=server),
+        "POLICY": POLICY.format(server=server, media=media),
         "TITLE": html.escape(title),
         "STYLE": read("page.css"),
-        "SOURCES": "\n".join(sources(scene, settings)),
+        "SOURCES": "\n".join(sources(scene, settings, hdr_clip)),
     }
     page = read("page.html")
     for name, text in parts.items():
@@ -65,7 +72,9 @@ def make_page(title: str, scene: bytes | None, settings: PageSettings) -> str:
     return page
 
 
-def sources(scene: bytes | None, settings: PageSettings) -> list[str]:
+def sources(
+    scene: bytes | None, settings: PageSettings, hdr_clip: bytes | None = None
+) -> list[str]:
     """The script elements of the page, the one that runs last."""
     elements = [script("settings", "application/json", json.dumps(asdict(settings)))]
     elements += [script(name, "text/plain", read(name)) for name in SHADERS]
@@ -73,6 +82,8 @@ def sources(scene: bytes | None, settings: PageSettings) -> list[str]:
     if scene is not None:
         packed = base64.b64encode(gzip.compress(scene, mtime=0)).decode()
         elements.append(script("scene", "text/plain", packed))
+    if hdr_clip is not None:
+        elements.append(script("clip-data", "text/plain", base64.b64encode(hdr_clip).decode()))
     elements.append(f'<script type="module">\n{join_modules(ENTRY)}</script>')
     return elements
 

@@ -1,15 +1,17 @@
 """A server for the viewer's page on this machine alone: 127.0.0.1, standard library.
 
-It answers four addresses: the page, its scene file, the version of both, and frames
-that this machine renders for browsers without a GPU. What it serves is a `Source`.
+It has the page, its scene file, the version of both, videos of the run, and frames that
+this machine renders for browsers without a GPU. What it serves is a `Source`.
 """
 
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -23,6 +25,7 @@ MAX_REQUEST_BYTES = 10_000
 MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
 CURVES = ("camera", "reinhard", "clip")  # that this machine develops frames with
 VIEWS = ("radiance", "depth", "motion")  # that it renders
+RANGE = re.compile(r"bytes=(\d+)-(\d*)")  # of a file, as players ask for it
 
 
 @dataclass(frozen=True)
@@ -53,6 +56,10 @@ class Source(Protocol):
 
     def version(self) -> str:
         """A text that changes with the scene."""
+        ...
+
+    def videos(self) -> dict[str, Path]:
+        """MP4 files by their addresses, which begin with a slash."""
         ...
 
     def frame(self, request: FrameRequest) -> bytes:
@@ -95,6 +102,8 @@ class Handler(BaseHTTPRequestHandler):
                 self.answer(HTTPStatus.OK, "application/octet-stream", source.scene())
             case "/version":
                 self.answer(HTTPStatus.OK, "text/plain", source.version().encode())
+            case address if (video := source.videos().get(address)) and video.is_file():
+                self.answer_video(video)
             case _:
                 self.answer(HTTPStatus.NOT_FOUND, "text/plain", b"nothing here")
 
@@ -111,6 +120,18 @@ class Handler(BaseHTTPRequestHandler):
         else:
             self.answer(HTTPStatus.OK, "image/jpeg", frame)
 
+    def answer_video(self, path: Path) -> None:
+        """Send an MP4 file, or the part of it that a player asks for."""
+        data = path.read_bytes()
+        asked = RANGE.fullmatch(self.headers.get("Range", ""))
+        first = int(asked[1]) if asked else 0
+        if asked is None or first >= len(data):
+            self.answer(HTTPStatus.OK, "video/mp4", data, {"Accept-Ranges": "bytes"})
+            return
+        last = min(int(asked[2] or len(data)), len(data) - 1)
+        part = {"Content-Range": f"bytes {first}-{last}/{len(data)}", "Accept-Ranges": "bytes"}
+        self.answer(HTTPStatus.PARTIAL_CONTENT, "video/mp4", data[first : last + 1], part)
+
     def is_local(self) -> bool:
         """Whether the address was this machine's.
 
@@ -119,13 +140,17 @@ class Handler(BaseHTTPRequestHandler):
         port = self.server.server_port
         return self.headers.get("Host") in (f"{HOST}:{port}", f"localhost:{port}")
 
-    def answer(self, status: HTTPStatus, kind: str, body: bytes) -> None:
+    def answer(
+        self, status: HTTPStatus, kind: str, body: bytes, more: dict[str, str] | None = None
+    ) -> None:
         """Send an answer; a browser that has gone away is no fault."""
         try:
             self.send_response(status)
             self.send_header("Content-Type", kind)
             self.send_header("Content-Length", str(len(body)))
             self.send_header("Cache-Control", "no-store")
+            for name, value in (more or {}).items():
+                self.send_header(name, value)
             self.end_headers()
             self.wfile.write(body)
         except ConnectionError:

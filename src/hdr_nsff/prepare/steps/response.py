@@ -13,6 +13,7 @@ from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.radiometry.frame_colors import frame_white_balance
 from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
@@ -38,8 +39,11 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         drift=given_drift(work),
         may_drift=may_drift(work),
     )
+    colors = None
+    if m.rig == m.num_cameras == 1:
+        colors = frame_white_balance(views, response.x, response.y[0])
     return StepResult(
-        note=describe(response, m.known_ev),
+        note=describe(response, m.known_ev) + describe_colors(colors),
         details={
             "misfit": response.misfit,
             "ev": response.ev.round(4).tolist(),
@@ -47,9 +51,21 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
             "scale_interval": [round(response.scale_low, 4), round(response.scale_high, 4)],
         },
         manifest={"response": "response.json"},
-        frames={"drift": drift_of_frames(work, response.drift)},
+        frames={
+            "drift": drift_of_frames(work, response.drift),
+            "white_balance": white_balance_of_frames(work, colors),
+        },
         files={"response.json": lambda path: write_response(path, response)},
     )
+
+
+def describe_colors(colors: np.ndarray | None) -> str:
+    """What a note says of the white balance (V, 3) of frames."""
+    if colors is None:
+        return ""
+    low, high = colors.min(0), colors.max(0)
+    red, blue = high[0] - low[0], high[2] - low[2]
+    return f"; white balance drifts: red by {red:.2f}, blue by {blue:.2f} stops"
 
 
 def may_drift(work: Work) -> bool:
@@ -85,6 +101,21 @@ def drift_of_frames(work: Work, drift: np.ndarray | None) -> dict[int, float]:
         same = [k for k, other in enumerate(work.train) if other.bracket == f.bracket]
         times = [work.train[k].time for k in same]
         found[f.index] = round(float(np.interp(f.time, times, drift[same])), 5)
+    return found
+
+
+def white_balance_of_frames(work: Work, colors: np.ndarray | None) -> dict[int, list[float]]:
+    """The white balance (3,) of every frame by its index, from that of the training
+    frames (V, 3) in stops.
+    """
+    if colors is None:
+        return {}
+    order = np.argsort([f.time for f in work.train])
+    times = np.array([f.time for f in work.train])[order]
+    found = {}
+    for f in work.manifest.frames:
+        balance = [float(np.interp(f.time, times, colors[order, c])) for c in range(3)]
+        found[f.index] = [round(value, 5) for value in balance]
     return found
 
 

@@ -1,6 +1,6 @@
 // What people touch: buttons, sliders, keys, the pointer on the picture.
 
-import { CURVES } from "./curves.js";
+import { CURVES, EXTENDED } from "./curves.js";
 import { MODES } from "./cameras.js";
 import { SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
 import { VIEWS } from "./renderer.js";
@@ -27,7 +27,6 @@ const BANDS = [
 ];
 const PLAY = "M7 4v16l13-8z",
   PAUSE = "M6 4h4v16H6zm8 0h4v16h-4z";
-const CURVE_IDS = CURVES.map((curve) => curve.id);
 const NOTE_SECONDS = 4;
 const WHEEL_STEP = 0.0006; // near distances per unit of scrolling
 const FLY_KEYS = ["w", "a", "s", "d", "q", "e"];
@@ -56,6 +55,20 @@ export function limitControls() {
   for (const id of ["clipping", "false-color", "save-8", "save-16"]) find(id).disabled = true;
 }
 
+/** Offer the curve of HDR screens, and take it, while the window is on such a screen. */
+export function offerExtended(player) {
+  const label = CURVES.find(({ id }) => id === EXTENDED).label;
+  const option = new Option(label, `${EXTENDED} 0`);
+  const refresh = () => {
+    option.disabled = !player.hdr?.usable;
+    if (!option.disabled) player.set({ curve: EXTENDED });
+    else if (player.state.curve === EXTENDED) player.set({ curve: "reinhard" });
+  };
+  find("curve").add(option, 0);
+  player.hdr.watch(refresh);
+  refresh();
+}
+
 /** A message that goes away after some seconds; 0: it stays. */
 export function note(text, seconds = NOTE_SECONDS) {
   const place = find("note");
@@ -73,6 +86,7 @@ function fillChoices(player) {
   const { scene } = player;
   const many = scene.responses.length > 1;
   for (const { id, label } of CURVES) {
+    if (id === EXTENDED) continue; // offered where the screen can show it
     if (id !== "camera" || !many) find("curve").add(new Option(label, `${id} 0`));
     else
       scene.responses.forEach((_, k) =>
@@ -194,7 +208,7 @@ function connectDivider(player) {
 
 function connectKeyboard(player) {
   addEventListener("keydown", (event) => {
-    if (event.ctrlKey || event.metaKey || event.altKey || find("help").open) return;
+    if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]")) return;
     if (usesKey(event.target, event.key)) return;
     const { state } = player;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
@@ -209,7 +223,7 @@ function connectKeyboard(player) {
       End: () => player.set({ time: player.last }),
       "?": () => find("help").showModal(),
       v: () => player.set({ show: after(player.frames ? SERVER_VIEWS : VIEWS, state.show) }),
-      c: () => player.set({ curve: after(player.frames ? SERVER_CURVES : CURVE_IDS, state.curve) }),
+      c: () => player.set({ curve: after(offeredCurves(), state.curve) }),
       x: () => player.set({ split: !state.split }),
       r: () => player.resetCamera(),
       k: () => addView(player),
@@ -248,6 +262,12 @@ function usesKey(element, key) {
   if (element.matches('input[type="range"]'))
     return key.startsWith("Arrow") || key === "Home" || key === "End";
   return key === " " && element.matches("button, a, input");
+}
+
+/** The curves that can be chosen now. */
+function offeredCurves() {
+  const options = [...find("curve").options].filter((option) => !option.disabled);
+  return [...new Set(options.map((option) => option.value.split(" ")[0]))];
 }
 
 function after(list, value) {
@@ -289,7 +309,8 @@ async function savePng(player, bits) {
   if (!player.renderer) return note("Pictures can be saved where the browser draws them.");
   const link = document.createElement("a");
   link.href = URL.createObjectURL(await player.png(bits));
-  link.download = `${player.scene.title}_${player.state.time.toFixed(2)}.png`;
+  const signal = bits === 16 && player.isBeyondWhite() ? "_pq" : "";
+  link.download = `${player.scene.title}_${player.state.time.toFixed(2)}${signal}.png`;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }

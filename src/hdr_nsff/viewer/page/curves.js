@@ -1,11 +1,13 @@
 // The curves that develop radiance. Their formulas are in develop.frag, in this order.
 
+export const EXTENDED = "extended"; // light above white, on screens that have it
 export const CURVES = [
   { id: "camera", label: "Camera (learned)" },
   { id: "agx", label: "AgX" },
   { id: "neutral", label: "Khronos PBR Neutral" },
   { id: "reinhard", label: "Reinhard" },
   { id: "clip", label: "sRGB, clipped" },
+  { id: EXTENDED, label: "HDR screen" },
 ];
 const SIZE = 1024; // entries, as in develop.frag
 const GAMMA = 2.2;

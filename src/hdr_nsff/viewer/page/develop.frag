@@ -4,14 +4,18 @@ precision highp float;
 precision highp int;
 precision highp sampler2D;
 
-const int CAMERA = 0, AGX = 1, PBR_NEUTRAL = 2, REINHARD = 3, CLIP = 4;
+const int CAMERA = 0, AGX = 1, PBR_NEUTRAL = 2, REINHARD = 3, CLIP = 4, EXTENDED = 5;
 const int VIEW_RADIANCE = 0, VIEW_DEPTH = 1, VIEW_MOTION = 2, VIEW_FLOW = 3;
 const float CURVE_SIZE = 1024.0; // entries of the learned curve, even in x^(1/2.2)
 const float REINHARD_WHITE = 40.0; // exposed luminance that becomes white, as `render` has it
 const float MID_GRAY = 0.18;
+// Of HDR screens, as the HDR videos have them: 1 is diffuse white, 203 nits; light above
+// 500 nits rolls off into the peak of 1000.
+const float KNEE = 500.0 / 203.0, PEAK = 1000.0 / 203.0;
 
 uniform sampler2D u_maps;
 uniform sampler2D u_response;
+uniform bool u_flipped; // rows from the top
 uniform int u_view, u_curve;
 uniform vec3 u_gain; // exposure times white balance
 uniform bool u_clipping, u_falseColor;
@@ -25,10 +29,14 @@ float luminance(vec3 rgb) {
   return dot(rgb, vec3(0.2126, 0.7152, 0.0722));
 }
 
-vec3 encode(vec3 linear) { // sRGB
-  vec3 x = clamp(linear, 0.0, 1.0);
+vec3 encodeExtended(vec3 linear) { // sRGB, which continues above 1 by its formula
+  vec3 x = max(linear, 0.0);
   vec3 power = 1.055 * pow(max(x, 0.0031308), vec3(1.0 / 2.4)) - 0.055;
   return mix(power, 12.92 * x, vec3(lessThanEqual(x, vec3(0.0031308))));
+}
+
+vec3 encode(vec3 linear) { // sRGB
+  return encodeExtended(min(linear, 1.0));
 }
 
 float response(float exposed, int channel) {
@@ -89,6 +97,14 @@ vec3 reinhard(vec3 rgb) {
   return mix(scaled, vec3(mapped), gray);
 }
 
+// By one factor per pixel, so that hue is kept; a hyperbola whose slope at the knee is 1.
+vec3 rollOff(vec3 rgb) {
+  float level = max(rgb.r, max(rgb.g, rgb.b));
+  if (level <= KNEE) return rgb;
+  float excess = (level - KNEE) / (PEAK - KNEE);
+  return rgb * ((KNEE + (PEAK - KNEE) * excess / (1.0 + excess)) / level);
+}
+
 vec3 develop(vec3 exposed) {
   switch (u_curve) {
     case CAMERA:
@@ -96,6 +112,7 @@ vec3 develop(vec3 exposed) {
     case AGX: return encode(agx(exposed));
     case PBR_NEUTRAL: return encode(pbrNeutral(exposed));
     case REINHARD: return encode(reinhard(exposed));
+    case EXTENDED: return encodeExtended(rollOff(exposed));
   }
   return encode(exposed);
 }
@@ -136,7 +153,8 @@ vec3 flowColor(vec2 flow) {
 
 void main() {
   ivec2 size = textureSize(u_maps, 0);
-  vec4 maps = texelFetch(u_maps, min(ivec2(v_position * vec2(size)), size - 1), 0);
+  vec2 place = u_flipped ? vec2(v_position.x, 1.0 - v_position.y) : v_position;
+  vec4 maps = texelFetch(u_maps, min(ivec2(place * vec2(size)), size - 1), 0);
   color.a = 1.0;
   if (u_view == VIEW_DEPTH) {
     float near = u_depthRange.x, far = u_depthRange.y;
@@ -161,7 +179,7 @@ void main() {
   float stripe = mod(gl_FragCoord.x + gl_FragCoord.y, 12.0);
   if (u_clipping && stripe < 6.0) {
     float brightest = max(color.r, max(color.g, color.b));
-    if (brightest > 0.997) color.rgb = vec3(0.95, 0.1, 0.15);
+    if (brightest > 0.997 && u_curve != EXTENDED) color.rgb = vec3(0.95, 0.1, 0.15);
     if (brightest < 0.004) color.rgb = vec3(0.15, 0.3, 1.0);
   }
 }

@@ -2,9 +2,11 @@
 
 import { readScene, unpack } from "./format.js";
 import { Renderer, driverName, openContext } from "./renderer.js";
+import { offerClip } from "./clip.js";
+import { hasHighRange, openHdrScreen } from "./hdr.js";
 import { Player } from "./player.js";
 import { Frames, SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
-import { connectControls, find, limitControls, note } from "./controls.js";
+import { connectControls, find, limitControls, note, offerExtended } from "./controls.js";
 
 const WORKER = "sorter.js";
 const FOLLOW_MILLISECONDS = 5000; // between two looks at the version of the scene
@@ -29,16 +31,17 @@ async function start() {
   const player = new Player(scene, find("canvas"));
   globalThis.viewer = player; // for scripts and tests
   connectControls(player);
-  showVideos(settings.videos);
-  if (scene.groups.length) draw(player, settings);
+  showVideos(settings);
+  if (scene.groups.length) await draw(player, settings);
   else showFrames(player);
   if (player.renderer) await player.renderer.sort(player.view());
+  if (hasHighRange() && !player.hdr) explainRange(settings);
   find("loading").hidden = true;
   const loop = (now) => {
     player.tick(now);
     if (player.state.stats) showStats(player);
-    if (settings.server && player.isSlow()) showFrames(player);
-    else player.easeOff();
+    if (player.renderer && settings.server && player.isSlow()) showFrames(player);
+    else if (player.renderer) player.easeOff();
     requestAnimationFrame(loop);
   };
   requestAnimationFrame(loop);
@@ -47,7 +50,7 @@ async function start() {
 }
 
 /** Draw in this browser, if it can; else have the server render. */
-function draw(player, settings) {
+async function draw(player, settings) {
   const gpuWanted = location.hash === "#draw"; // to see what a browser without a GPU does
   try {
     const gl = openContext(player.canvas);
@@ -58,6 +61,8 @@ function draw(player, settings) {
     player.canvas.addEventListener("webglcontextlost", () =>
       note("The graphics driver was reset. Reload the page.", 0),
     );
+    if (player.renderer.readsHalves()) player.hdr = await openHdrScreen(find("hdr"));
+    if (player.hdr) offerExtended(player);
     if (!software) return;
     const videos = settings.videos.length ? " The videos below the settings play smoothly." : "";
     note(`This browser draws without a GPU, so playback is slow.${videos}`, 8);
@@ -76,6 +81,8 @@ function shaderSources() {
 function showFrames(player) {
   player.renderer?.dispose();
   player.renderer = null;
+  player.hdr?.hide();
+  player.hdr = null;
   player.frames = new Frames(find("frame"), player.scene.width, (problem) => note(problem, 0));
   const { curve, show } = player.state;
   player.set({
@@ -102,12 +109,24 @@ async function followVersion(player) {
   }
 }
 
-function showVideos(videos) {
-  for (const { href, text } of videos) {
+function showVideos({ videos, hdr_clip: clip, server }) {
+  const data = held("clip-data");
+  const played = clip && (data || server); // here; else a file beside the page
+  for (const { href, text } of clip && !played ? [clip, ...videos] : videos) {
     const link = document.createElement("a");
     Object.assign(link, { href, textContent: text, target: "_blank" });
     find("videos").append(link);
   }
+  if (played) offerClip(clip, data);
+}
+
+/** On an HDR screen: what shows the light that this page does not draw. */
+function explainRange({ hdr_clip: clip }) {
+  find("range-note").textContent = clip
+    ? "Drawn here, light ends at white. The HDR clip shows it on this screen."
+    : "Drawn here, light ends at white. For this screen, make an HDR clip: " +
+      "hdr-nsff render RUN --path training --hdr-video hlg";
+  find("range-note").hidden = false;
 }
 
 function showStats(player) {

@@ -9,7 +9,9 @@ import {
   pointAhead,
   scaleK,
 } from "./cameras.js";
+import { EXTENDED } from "./curves.js";
 import { encodePng } from "./png.js";
+import { PQ_TAGS, encodePq } from "./pq.js";
 import { BLUR, Renderer } from "./renderer.js";
 
 const STILL_VIEWS = 24; // of a camera path between two views at the same time
@@ -29,6 +31,7 @@ export class Player {
     this.canvas = canvas;
     this.renderer = null; // set where the browser can draw
     this.frames = null; // else pictures come from the server
+    this.hdr = null; // shows light above white, where browser and screen do
     this.changed = () => {}; // called after every change of `state`
     this.first = scene.times[0];
     this.last = scene.times[scene.times.length - 1];
@@ -223,12 +226,21 @@ export class Player {
     }
     this.dirty = false;
     const target = this.renderer.composite(view, "screen");
-    this.renderer.develop(target, this.state);
+    if (this.isBeyondWhite()) this.hdr.present(this.renderer.halves(target, this.state));
+    else this.renderer.develop(target, this.state);
     this.frameTimes.push(now);
     if (this.frameTimes.length > MEASURED_FRAMES) this.frameTimes.shift();
     if (this.frameTimes.length >= LEAST_FRAMES) {
       this.rate = (1000 * (this.frameTimes.length - 1)) / (now - this.frameTimes[0]);
     }
+  }
+
+  /** Whether light above white is shown now; else the canvas for it is hidden. */
+  isBeyondWhite() {
+    const { curve, show, falseColor } = this.state;
+    if (this.hdr && curve === EXTENDED && show === "radiance" && !falseColor) return true;
+    this.hdr?.hide();
+    return false;
   }
 
   /** Pictures drawn per second, when last they were drawn one after the other; or null. */
@@ -263,7 +275,10 @@ export class Player {
     return values;
   }
 
-  /** What is shown as a PNG file of 8 or 16 bits, as fine as the screen. */
+  /**
+   * What is shown as a PNG file of 8 or 16 bits, as fine as the screen. Light above white
+   * is kept with 16 bits, as PQ.
+   */
   async png(bits) {
     const { renderer } = this;
     const view = this.view(this.fullSize);
@@ -272,7 +287,11 @@ export class Player {
     const picture = renderer.target("png", view.width, view.height, renderer.deepFormat());
     renderer.develop(maps, this.state, picture);
     this.sortedFor = ""; // what is shown is sorted again
-    return encodePng(renderer.read(picture), view.width, view.height, bits);
+    const values = renderer.read(picture);
+    const size = [view.width, view.height];
+    if (bits === 16 && this.isBeyondWhite())
+      return encodePng(encodePq(values), ...size, bits, PQ_TAGS);
+    return encodePng(values, ...size, bits);
   }
 
   /** Remember the camera and time of now for a path. */

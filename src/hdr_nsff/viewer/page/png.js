@@ -2,8 +2,11 @@
 
 const SIGNATURE = [137, 80, 78, 71, 13, 10, 26, 10];
 
-/** A PNG file of 8 or 16 bits of rgb in [0, 1], four numbers a pixel, from the top. */
-export async function encodePng(values, width, height, bits) {
+/**
+ * A PNG file of 8 or 16 bits of rgb in [0, 1], four numbers a pixel, from the top. Colors
+ * are sRGB, or what `tags`, the content of the chunk cICP, say.
+ */
+export async function encodePng(values, width, height, bits, tags = null) {
   const bytes = bits / 8;
   const largest = 2 ** bits - 1;
   const rowBytes = 1 + 3 * bytes * width; // filter type 0, then three samples a pixel
@@ -29,7 +32,7 @@ export async function encodePng(values, width, height, bits) {
   const parts = [
     Uint8Array.from(SIGNATURE),
     chunk("IHDR", new Uint8Array(header.buffer)),
-    chunk("sRGB", Uint8Array.of(0)),
+    tags ? chunk("cICP", Uint8Array.from(tags)) : chunk("sRGB", Uint8Array.of(0)),
     chunk("IDAT", data),
     chunk("IEND", new Uint8Array()),
   ];

@@ -171,8 +171,11 @@ export class Renderer {
     splat.set("u_blur", blur);
   }
 
-  /** Show a composited picture on the canvas, or in the picture `into`. */
-  develop(target, look, into = null) {
+  /**
+   * Show a composited picture on the canvas, or in the picture `into`; its rows from the
+   * top with `flipped`.
+   */
+  develop(target, look, into = null, flipped = false) {
     const { gl, screen, scene } = this;
     const [width, height] = into
       ? [into.width, into.height]
@@ -182,6 +185,7 @@ export class Renderer {
     screen.use();
     screen.texture("u_maps", 0, { kind: gl.TEXTURE_2D, texture: target.texture });
     screen.texture("u_response", 1, this.responses[look.camera]);
+    screen.set("u_flipped", flipped ? 1 : 0);
     screen.set("u_view", VIEWS.indexOf(look.show));
     screen.set(
       "u_curve",
@@ -195,6 +199,25 @@ export class Renderer {
     gl.bindVertexArray(this.vertices);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     gl.bindVertexArray(null);
+  }
+
+  /** Whether pictures can be read as half floats. */
+  readsHalves() {
+    const { gl } = this;
+    gl.bindFramebuffer(gl.FRAMEBUFFER, this.target("halves", 1, 1).framebuffer);
+    return gl.getParameter(gl.IMPLEMENTATION_COLOR_READ_TYPE) === gl.HALF_FLOAT;
+  }
+
+  /** A composited picture developed as half floats, for a screen beyond white. */
+  halves(target, look) {
+    const { gl } = this;
+    const [width, height] = [gl.drawingBufferWidth, gl.drawingBufferHeight];
+    const picture = this.target("halves", width, height);
+    this.develop(target, look, picture, true);
+    const count = 4 * width * height;
+    if (this.halfValues?.length !== count) this.halfValues = new Uint16Array(count);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.HALF_FLOAT, this.halfValues);
+    return { values: this.halfValues, width, height };
   }
 
   /** The format of pictures with the most precision that this browser can draw. */

@@ -39,7 +39,7 @@ def log_gain(c, known, unknown, learned, drift, white, residual, means, camera, 
     if camera > 0:
         log += white[camera - 1, c]
     if frame >= 0:
-        log += drift[frame]
+        log += drift[frame, c]
         if residual.shape[0] > 0:
             log += residual[frame, c] - means[c]
     return log
