@@ -66,7 +66,7 @@ def test_frames_of_two_segments_have_one_camera_exposure_and_picture(config):
     shared = in_both(config.out)
     assert len(shared) >= 3
     for a, b in shared:
-        for name in ("K", "c2w", "bracket", "ev", "drift", "split", "source"):
+        for name in ("K", "c2w", "bracket", "ev", "drift", "white_balance", "split", "source"):
             assert getattr(a, name) == getattr(b, name), name
         pictures = [config.out / f"segment_{k:02d}" / f.image for k, f in enumerate((a, b))]
         assert (read_codes(pictures[0]) == read_codes(pictures[1])).all()

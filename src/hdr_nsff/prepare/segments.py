@@ -260,12 +260,15 @@ def take_poses(clip: Work, work: Work) -> StepResult:
 
 
 def take_response(clip: Work, work: Work) -> StepResult:
-    """The response and the exposure of every frame."""
+    """The response, and exposure and white balance of every frame."""
     own = own_frames(clip, work)
     return StepResult(
         note="",
         manifest={"response": clip.manifest.response},
-        frames={"drift": {index: f.drift for index, f in enumerate(own)}},
+        frames={
+            name: {index: getattr(f, name) for index, f in enumerate(own)}
+            for name in ("drift", "white_balance")
+        },
         files={"response.json": partial(link, clip.folder / "response.json")},
     )
 
