@@ -167,6 +167,15 @@ def test_the_readout_is_given_in_milliseconds_where_it_is_seen() -> None:
     assert "is not measured" in sentence(None)
 
 
+def test_still_cameras_of_a_rig_give_viewpoints_between_them() -> None:
+    good = good_facts()
+    still = replace(good.camera, motion="tripod")
+    alone = outlook(replace(good, camera=still))
+    rig = outlook(replace(good, camera=still, file=replace(good.file, cameras=4)))
+    assert alone["new viewpoints"].startswith("no")
+    assert rig["new viewpoints"].startswith("yes, between cameras")
+
+
 def test_a_clip_that_is_long_for_one_scene_is_offered_segments() -> None:
     long = replace(good_facts(), file=replace(good_facts().file, frames=400))
     (found,) = [f for f in judge(long) if f.subject == "length"]

@@ -77,6 +77,10 @@ def outlook(facts: ClipFacts) -> dict[str, str]:
         "tripod": "no: the camera stands still, so there is no depth",
         "unknown": "unknown: too few points match between distant frames",
     }[camera.motion]
+    if facts.file.cameras > 1:
+        views = "yes, between cameras that see the same (of them, only the first was looked at)"
+        if not varies:
+            hdr = "only if the cameras are exposed differently: only the first was looked at"
     times = "yes" if not camera.cuts else "only within a shot: the clip has cuts"
     return {"HDR": hdr, "new viewpoints": views, "times between frames": times}
 
@@ -160,6 +164,9 @@ def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         did = "stands still" if camera.motion == "tripod" else "turns, or hardly moves"
         text = f"the camera {did}: turns alone explain {share:.0%} of the matches"
         advice = "for new viewpoints, move sideways or in an arc; HDR and slow motion work as it is"
+        if facts.file.cameras > 1:
+            text = f"the first of {facts.file.cameras} cameras {did}"
+            advice = "for new viewpoints, the cameras have to see the same from different places"
         yield Finding("note", "camera", text, advice)
     if camera.long_sharpness is not None and camera.long_sharpness < tuning.min_sharpness:
         text = f"the longest exposure has {camera.long_sharpness:.0%} of the shortest one's edges"
