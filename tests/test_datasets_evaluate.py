@@ -246,13 +246,13 @@ def test_run_measures_on_what_the_data_set_held_out(
 ) -> None:
     run, seen = fake_run(tmp_path / "run"), []
 
-    def prepare(config: PrepareConfig) -> Path:
+    def prepare_scenes(config: PrepareConfig) -> list[Path]:
         place = config.out.with_name("scene_truth")
         write_json(place / "made_of.json", {"key": ""})
         write_truth(place, run, radiance="")
-        return config.out
+        return [config.out]
 
-    monkeypatch.setattr(run_all, "prepare", prepare)
+    monkeypatch.setattr(run_all, "prepare_scenes", prepare_scenes)
     monkeypatch.setattr(run_all, "train", lambda settings: tmp_path)
     monkeypatch.setattr(run_all.Run, "open", staticmethod(lambda folder, device: run))
     monkeypatch.setattr(run_all, "render_all", lambda run, out: {})
