@@ -11,6 +11,7 @@ import numpy as np
 
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.core.io import read_npy
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry.frame_colors import frame_white_balance
@@ -19,6 +20,8 @@ from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry
 from hdr_nsff.scene.response import write_response
+
+UNLIMITED_PX = 2**31  # as the longest side of a frame: none is shrunk
 
 
 def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> StepResult:
@@ -35,7 +38,7 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         m.known_ev,
         m.reference_bracket,
         m.num_cameras,
-        lossless=work.footage.lossless,
+        lossless=shows_noise(work),
         drift=given_drift(work),
         may_drift=may_drift(work),
     )
@@ -57,6 +60,17 @@ def find_response(work: Work, views: Sequence[ResponseView] | None = None) -> St
         },
         files={"response.json": lambda path: write_response(path, response)},
     )
+
+
+def shows_noise(work: Work) -> bool:
+    """Whether the frames hold the noise of the sensor: compressed without loss, and of
+    the size and shape in which they were recorded, since interpolation averages noise.
+    """
+    if not work.footage.lossless or work.manifest.lens:
+        return False
+    start = work.config.start
+    recorded = next(read_frames(work.footage, start, start + 1, 1, UNLIMITED_PX))
+    return recorded.rgb.shape[:2] == (work.manifest.height, work.manifest.width)
 
 
 def describe_colors(colors: np.ndarray | None) -> str:
