@@ -27,8 +27,7 @@ INTRO = """# Results
 `python benchmarks/results.py` writes this page from the JSON files in `benchmarks/results`:
 one current number per claim, with its command, machine, commit and seed. PSNR is
 of recorded values in dB, over full pictures and over moving pixels; HDR is the mu-law
-PSNR of linear radiance (mu = 5000) after one scale; lights beyond every exposure decide it.
-[Metrics](metrics.md) defines them."""
+PSNR of linear radiance after one scale, which unrecorded lights decide ([metrics](metrics.md))."""
 
 LPIPS = """## LPIPS
 
