@@ -17,6 +17,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from markdown_tables import Lines, number, pair, table
 from record import RESULTS, ROOT
 
 from hdr_nsff.core.io import write_text
@@ -40,7 +41,6 @@ hdr-nsff evaluate RUN --lpips alex.pth
 ```"""
 
 Document = dict[str, Any]
-Lines = list[str]
 
 
 @dataclass(frozen=True)
@@ -55,22 +55,6 @@ class Section:
 
 
 SHOWN_CONSTANTS = 2  # of those whose half and double were measured
-
-
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Lines:
-    """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return [f"| {' | '.join(line)} |" for line in lines]
-
-
-def pair(values: dict[str, float], full: str, moving: str) -> str:
-    """Two scores of a run, "full / moving"; a dash for one that it has not."""
-    return " / ".join(number(values.get(key), 1) for key in (full, moving))
-
-
-def number(value: float | None, digits: int) -> str:
-    """A number with these digits; a dash for None."""
-    return "-" if value is None else f"{value:,.{digits}f}"
 
 
 def origin(document: Document) -> str:

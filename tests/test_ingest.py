@@ -19,8 +19,6 @@ from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.exposure_lists import read_exif_ev
 from hdr_nsff.footage.ingest import (
     hash_file,
-    hold_out_every,
-    hold_out_spacing,
     open_footage,
     read_frame,
     read_frames,
@@ -172,15 +170,6 @@ def test_damaged_videos_are_read_or_refused(tmp_path):
     check_reader(path, lambda: all_frames(path), 60)
 
 
-def test_held_out_frames_cover_all_exposures():
-    chosen = hold_out_every(100, 8, 4)
-    assert np.diff(chosen).tolist() == [9] * (len(chosen) - 1)
-    assert {k % 4 for k in chosen} == {0, 1, 2, 3}
-    assert hold_out_every(100, 0, 3) == []
-    assert 0 not in hold_out_every(9, 2, 1)
-    assert 8 not in hold_out_every(9, 2, 1)
-
-
 @pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="Linux alone has it")
 def test_a_file_that_cannot_be_read_is_named():
     with pytest.raises(InputError, match="/proc/self/mem: cannot be read"):
@@ -261,24 +250,6 @@ def test_a_broken_raw_photograph_is_named(tmp_path):
     (tmp_path / "a.dng").write_bytes(b"II*\x00 not a photograph")
     with pytest.raises(InputError, match=r"a.dng: not a readable DNG"):
         all_frames(tmp_path)
-
-
-@pytest.mark.parametrize("every", range(2, 12))
-@pytest.mark.parametrize("cycle", [1, 2, 3])
-def test_the_spacing_of_held_out_frames_is_found_again(every: int, cycle: int) -> None:
-    """For a clip of any length, the spacing found holds out the same frames."""
-    for count in range(every + 2, 40):
-        frames = hold_out_every(count, every, cycle)
-        if frames:
-            found = hold_out_spacing(frames)
-            assert found is not None
-            assert hold_out_every(frames[-1] + 2, found, cycle) == frames
-
-
-def test_unevenly_spaced_frames_have_no_spacing() -> None:
-    assert hold_out_spacing([0, 8]) is None
-    assert hold_out_spacing([4, 8]) is None
-    assert hold_out_spacing([1, 2, 4]) is None
 
 
 @pytest.mark.parametrize("transfer", ["hlg", "pq"])

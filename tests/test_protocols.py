@@ -19,7 +19,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json
-from hdr_nsff.footage.ingest import frames_between
+from hdr_nsff.footage.hold_out import frames_between
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene

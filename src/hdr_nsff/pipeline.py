@@ -19,7 +19,7 @@ from hdr_nsff.evaluation.evaluate import evaluate_run, views_of_clip
 from hdr_nsff.evaluation.report import check_place, write_report
 from hdr_nsff.fields.build import device_for
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.footage.ingest import hold_out_spacing
+from hdr_nsff.footage.hold_out import hold_out_spacing
 from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare_scenes
 from hdr_nsff.rendering import export_page
 from hdr_nsff.rendering.export_gaussians import GaussianField

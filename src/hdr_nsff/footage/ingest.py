@@ -10,9 +10,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -429,43 +428,3 @@ def shrink(image: np.ndarray, max_size: int) -> np.ndarray:
     width = max(1, round(w * factor))
     height = max(1, round(h * factor))
     return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
-
-
-# Frames to hold out
-
-
-def hold_out_every(count: int, every: int, cycle: int) -> list[int]:
-    """Which of `count` frames are held out of training: every `every`-th.
-
-    Never the first or the last; none for 0. `every` grows until it has no common factor
-    with the exposure cycle, so that all exposures are held out in turn.
-    """
-    if every <= 0:
-        return []
-    while math.gcd(every, cycle) > 1:
-        every += 1
-    return list(range(every // 2, count - 1, every))
-
-
-def hold_out_spacing(frames: Sequence[int]) -> int | None:
-    """The smallest `every` for which `hold_out_every` gives just these `frames`.
-
-    The clip ends soon after them. None where there is no such number.
-    """
-    for every in range(2, 2 * frames[0] + 2):
-        if hold_out_every(frames[-1] + 2, every, 1) == list(frames):
-            return every
-    return None
-
-
-def frames_between(count: int, cycle: int) -> list[int]:
-    """Which of `count` frames the protocol novel-view-time holds out of training.
-
-    Every second one, never the first or the last. With an even exposure cycle every
-    second frame would always show the same exposures: there, each cycle begins with the
-    other half, so that of a cycle of 2 the frames 0, 3, 4, 7, 8, ... are trained on.
-    """
-    inner = range(1, count - 1)
-    if cycle % 2:
-        return [k for k in inner if k % 2]
-    return [k for k in inner if (k + k // cycle) % 2]

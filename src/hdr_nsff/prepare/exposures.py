@@ -23,6 +23,7 @@ from hdr_nsff.footage.gpmf import read_gopro_ev
 from hdr_nsff.prepare.times import by_timestamps, evenly_spaced
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
+from hdr_nsff.radiometry.camera_brackets import common_brackets, exposure_groups
 from hdr_nsff.radiometry.dropped_frames import GappedCycle, find_cycle
 from hdr_nsff.scene.manifest import FrameEntry
 
@@ -82,8 +83,8 @@ def exposures_by(
         cycles = [exposure.detect_cycle(work.video[own]) for own in cameras]
         if gapped is not None:
             cycles = [gapped.cycle]
-        group = exposure.exposure_groups([work.video[own] for own in cameras], cycles)
-        brackets = [b for camera in exposure.common_brackets(cycles, group) for b in camera]
+        group = exposure_groups([work.video[own] for own in cameras], cycles)
+        brackets = [b for camera in common_brackets(cycles, group) for b in camera]
         unknown: list[float | None] = [None] * (max(brackets) + 1)
         notes = cycle_notes(work, cycles, group)
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))

@@ -32,6 +32,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.exposure_lists import parse_exposures
+from hdr_nsff.footage.hold_out import hold_out_every
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.maths.hdr_signal import Transfer
@@ -249,7 +250,7 @@ def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePla
 
     The cycle runs over the recorded frames without a break.
     """
-    test = ingest.hold_out_every(count, hold_out, cycle)
+    test = hold_out_every(count, hold_out, cycle)
     missing = set(test) if remove else set()
     kept = [k for k in range(count) if k not in missing]
     if len(kept) < MIN_FRAMES:

@@ -12,6 +12,7 @@ from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
 from hdr_nsff.footage.cuts import find_cuts
+from hdr_nsff.footage.hold_out import frames_between, hold_out_every
 from hdr_nsff.footage.turns import find_cameras_in_turn
 from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
@@ -250,9 +251,9 @@ def frames_to_hold_out(work: Work) -> set[int]:
             case "novel-view":
                 numbers = []
             case "novel-view-time":
-                numbers = ingest.frames_between(len(frames), cycle)
+                numbers = frames_between(len(frames), cycle)
             case None:
-                numbers = ingest.hold_out_every(len(frames), hold_out_spacing(work), cycle)
+                numbers = hold_out_every(len(frames), hold_out_spacing(work), cycle)
         chosen.update(frames[k] for k in numbers)
     return chosen
 

@@ -79,7 +79,7 @@ def geometric_depth(work: Work) -> Depth:
     else:
         flow = work.training_flows(work.raw_flows)
         disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
-        if m.synchronized:  # the same depth explains what moves, at one instant
+        if m.synchronized:  # views of one instant fit moving pixels too
             still = np.zeros(still.shape, bool)
     known = np.mean([(map > 0.5).mean() for map in confidence])
     note = f"{known:.0%} of the pixels well known"

@@ -31,7 +31,7 @@ MAPS = "f2 f1 f1 f1 i0 d0 d0 d0"  # what is drawn, and what lies behind it
 # what a tone mapper has learned and holds, and which of it is wanted
 TONE = "f3 f1 i1 f1 f2 f2 f2 f3 f1 f2 f2 d0 i0 i0 i0 i0"
 LEVELS = "i2 i2 f2"  # of a grid, and its slices of time
-ROWS = "f2 f2 f2 f2 b1 d0 d0 "  # a table, what moves it, and how much
+ROWS = "f2 f2 f2 f2 b1 d0 d0 "  # a table, gradient, moments, marks; lr, eps
 # argument types of the kernels, in order: type and number of dimensions, 0 for a number
 SIGNATURES = {
     "project": "f2 f2 f2 f1 f2 f2 f2 i0 i0 f2 f1 f2 s2 i1",
