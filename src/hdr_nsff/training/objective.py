@@ -188,7 +188,7 @@ class Objective:
         if not kernels_on(device):
             (self.total(terms) / batches).backward()
             return
-        # a kernel's terms are parts of one vector: its gradient are their weights
+        # a kernel's terms are parts of one vector: their weights are its gradient
         weights: dict[Tensor, list[float]] = {}
         for name, term in self.counting(terms).items():
             if term.requires_grad:
