@@ -39,6 +39,21 @@ def test_whole_stops_outside_of_the_interval_are_not_chosen():
     assert not scale.is_moved and scale.high * 1.75 < 2
 
 
+def test_whole_stops_need_the_whole_interval_and_halves_its_middle():
+    evidence = known_to(0.05, 0.94)
+    whole = likely_scale([-2.2, 0, 2.2], None, evidence)
+    assert whole.factor * 2.2 == pytest.approx(2)
+    half = likely_scale([-1.64, 0, 1.64], None, evidence)
+    assert not half.is_moved and half.low * 1.64 < 1.5
+
+
+def test_two_exposures_with_noise_leave_more_of_the_curve_open():
+    evidence = known_to(0.12, 0.85)
+    two, three = likely_scale([0, 3.7], None, evidence), likely_scale([0, 3.7, 7.4], None, evidence)
+    assert two.high / two.low > three.high / three.low
+    assert two.factor * 3.7 == pytest.approx(3)
+
+
 def test_thirds_are_known_steps_where_the_interval_leaves_no_other_one():
     fine = likely_scale([0, 1.655, 3.31], None, known_to(0.01))
     assert fine.is_moved and fine.factor * 1.655 == pytest.approx(5 / 3, abs=0.002)
