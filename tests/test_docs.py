@@ -17,8 +17,8 @@ import pytest
 
 from hdr_nsff import cli
 from hdr_nsff.core.settings import to_plain
-from hdr_nsff.training.objective import merge_weights
 from hdr_nsff.training.presets import PRESETS
+from hdr_nsff.training.weighted_terms import merge_weights
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "hdr_nsff"

@@ -17,10 +17,11 @@ from hdr_nsff.scene.batch import PixelBatch, draw_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapLosses, ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
-from hdr_nsff.training.objective import LossWeights, Objective, merge_weights
+from hdr_nsff.training.objective import LossWeights, Objective
 from hdr_nsff.training.presets import PRESETS
+from hdr_nsff.training.weighted_terms import backward, merge_weights, weighted_sum
 
-KERNELS_ON = "hdr_nsff.training.objective.kernels_on"
+KERNELS_ON = "hdr_nsff.training.weighted_terms.kernels_on"
 N = 20
 WEIGHTS = merge_weights(LossWeights(), asdict(SceneFlowLosses()), asdict(ToneMapLosses()))
 OBJECTIVE = Objective(WEIGHTS, "scene", near=1.8)
@@ -67,13 +68,13 @@ def test_a_perfect_render_costs_nothing(batch: PixelBatch, tonemap: ToneMapper) 
 
 def test_a_term_without_a_weight_is_an_error() -> None:
     with pytest.raises(AssertionError, match="sparkle"):
-        OBJECTIVE.total({"photometric": torch.tensor(1.0), "sparkle": torch.tensor(1.0)})
+        weighted_sum({"photometric": torch.tensor(1.0), "sparkle": torch.tensor(1.0)}, WEIGHTS)
 
 
 def test_the_total_is_the_weighted_sum_and_weight_zero_lets_no_gradient_through() -> None:
     a, b, c = (torch.tensor(v, requires_grad=True) for v in (2.0, 3.0, math.inf))
-    objective = replace(OBJECTIVE, weights={"photometric": 1.0, "depth": 0.5, "mask": 0.0})
-    total = objective.total({"photometric": a, "depth": b, "mask": c})
+    weights = {"photometric": 1.0, "depth": 0.5, "mask": 0.0}
+    total = weighted_sum({"photometric": a, "depth": b, "mask": c}, weights)
     total.backward()
     assert float(total.detach()) == 3.5 and float(b.grad) == 0.5 and c.grad is None
 
@@ -82,19 +83,19 @@ def test_the_gradients_of_terms_in_vectors_are_those_of_their_total(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     names = ["photometric", "depth", "mask", "flow", "dynamic"]
-    objective = replace(OBJECTIVE, weights=dict(zip(names, (1.0, 0.5, 0.0, 3.0, 2.0), strict=True)))
+    weights = dict(zip(names, (1.0, 0.5, 0.0, 3.0, 2.0), strict=True))
 
     def gradient(with_kernels: bool) -> Tensor:
         leaf = torch.tensor([1.0, 2.0, 3.0, 4.0], requires_grad=True)
         parts, alone = (2 * leaf).unbind(), leaf.square().sum()
         monkeypatch.setattr(KERNELS_ON, lambda device: with_kernels)
-        objective.backward(dict(zip(names, (*parts, alone), strict=True)), 2)
+        backward(dict(zip(names, (*parts, alone), strict=True)), weights, 2)
         assert leaf.grad is not None
         return leaf.grad
 
     torch.testing.assert_close(gradient(True), gradient(False))
     with pytest.raises(AssertionError, match="sparkle"):
-        objective.backward({"sparkle": torch.tensor(1.0)}, 1)
+        backward({"sparkle": torch.tensor(1.0)}, weights, 1)
 
 
 @pytest.mark.parametrize("preset", PRESETS)
@@ -102,7 +103,7 @@ def test_every_term_of_every_preset_has_a_weight(
     preset: str, toy: Scene, toy_folder: Path, tmp_path: Path
 ) -> None:
     t = trainer(small(preset, toy_folder, tmp_path / "run"), toy)
-    values = t.step()  # `total` asserts that each term has a weight
+    values = t.step()  # `weighted_sum` asserts that each term has a weight
     assert set(values) - {"psnr"} <= set(t.objective.weights)
 
 

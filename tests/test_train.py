@@ -31,7 +31,7 @@ from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run, read_log, snapshots
 from hdr_nsff.training.run_writer import RunWriter
-from hdr_nsff.training.train import Trainer, train, with_budget
+from hdr_nsff.training.train import Trainer, train
 
 STEPS = 24  # over them the culling grids refresh and the tone mapper is anchored
 
@@ -202,12 +202,11 @@ def test_a_finished_run_stays_finished(unbroken: Path, toy_folder: Path) -> None
     assert_same(before, final(unbroken))
 
 
-def test_without_steps_and_minutes_the_time_follows_the_clip(toy: Scene, toy_folder: Path) -> None:
-    open_budget = replace(config(toy_folder, Path("run")), budget=Budget())
-    assert with_budget(open_budget, toy).budget == Budget(minutes=5.0)
+def test_without_steps_and_minutes_the_time_follows_the_clip() -> None:
+    assert Budget().for_clip(64 * 36, 10) == Budget(minutes=5.0)
     assert minutes_for(640 * 360, 65) > 10 and minutes_for(1920 * 1080, 300) == 30
-    given = replace(open_budget, budget=Budget(steps=7))
-    assert with_budget(given, toy) == given
+    for given in (Budget(steps=7), Budget(minutes=2.0)):
+        assert given.for_clip(1920 * 1080, 300) == given
 
 
 def test_a_minute_limit_holds(toy_folder: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 from annotated_types import Ge, Gt, Le
@@ -38,6 +38,12 @@ class Budget:
             return step / self.steps
         assert self.minutes is not None
         return min(seconds / (60 * self.minutes), 1.0)
+
+    def for_clip(self, num_pixels: int, num_frames: int) -> Budget:
+        """This budget, or where it is open, the minutes that follow the clip."""
+        if self.steps is not None or self.minutes is not None:
+            return self
+        return replace(self, minutes=minutes_for(num_pixels, num_frames))
 
 
 def minutes_for(num_pixels: int, num_frames: int) -> float:

@@ -2,19 +2,18 @@
 
 Everything here needs a `Render` and a tone mapper only. docs/method.md#eq-16 lists the
 terms beside the paper's. Terms of some fields only, and of the tone mapper, have their
-weights there; `total` sums all terms by name. `phase` is the time since the start in
-units of the schedule's period K.
+weights there; `weighted_terms.py` sums all terms by name. `phase` is the time since the
+start in units of the schedule's period K.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from hdr_nsff.core.settings import Weight
-from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.base import Render, Warp
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.maths import losses
@@ -169,55 +168,8 @@ class Objective:
             terms["mask"] = losses.motion_mask(render.motion, batch.moving, certain)
         return terms
 
-    def counting(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Those of the terms that count; one without a weight is an error."""
-        unknown = set(terms) - set(self.weights)
-        assert not unknown, f"terms without a weight: {sorted(unknown)}"
-        return {name: value for name, value in terms.items() if self.weights[name]}
-
-    def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """The weighted sum."""
-        counting = self.counting(terms)
-        values = torch.stack(list(counting.values()))
-        weights = tuple(self.weights[name] for name in counting)
-        return (values * constant(weights, values.device, values.dtype)).sum()
-
-    def backward(self, terms: dict[str, Tensor], batches: int) -> None:
-        """Add the gradients of `total`, as one of the `batches` of a step."""
-        device = next(iter(terms.values())).device
-        if not kernels_on(device):
-            (self.total(terms) / batches).backward()
-            return
-        # a kernel's terms are parts of one vector: their weights are its gradient
-        weights: dict[Tensor, list[float]] = {}
-        for name, term in self.counting(terms).items():
-            if term.requires_grad:
-                vector, position = vector_of(term)
-                of_parts = weights.setdefault(vector, [0.0] * vector.numel())
-                of_parts[position] += self.weights[name] / batches
-        given = [constant(tuple(w), device, v.dtype).view_as(v) for v, w in weights.items()]
-        torch.autograd.backward(list(weights), given)
-
-
-def vector_of(term: Tensor) -> tuple[Tensor, int]:
-    """The vector of which a scalar is a part, and its place there; or the scalar."""
-    whole = term._base
-    if whole is None or whole.ndim != 1 or not whole.is_contiguous() or not whole.requires_grad:
-        return term, 0
-    return whole, int(term.storage_offset() - whole.storage_offset())
-
 
 def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
     """What the batch's camera would have recorded of `radiance` (N, 3)."""
     shaded = tonemap.shade(radiance, batch.camera, batch.camera_id, batch.pixels)
     return tonemap(shaded, batch.bracket, batch.camera_id, batch.frame, leaky=True)
-
-
-def merge_weights(shared: LossWeights, *others: dict[str, float]) -> dict[str, float]:
-    """All weights of a run by the names of their terms; no name may occur twice."""
-    merged = asdict(shared)
-    for weights in others:
-        repeated = set(merged) & set(weights)
-        assert not repeated, f"weights of one name in two places: {sorted(repeated)}"
-        merged |= weights
-    return merged

@@ -16,7 +16,7 @@ from torch import nn
 from hdr_nsff.core.checkpoints import latest_checkpoint, pack, save_checkpoint, unpack
 from hdr_nsff.core.progress import bar, say
 from hdr_nsff.fields.base import RadianceField
-from hdr_nsff.scene.scene import Frame
+from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Clock
@@ -50,6 +50,19 @@ class RunWriter:
         """Print a line, if there is one, from the main process only."""
         if message and self.main:
             say(message)
+
+    def announce(self, clock: Clock, scene: Scene) -> None:
+        """Report how long this takes, where that is known."""
+        minutes = clock.budget.minutes
+        if clock.budget.steps is not None or minutes is None:
+            return
+        left = minutes * 60 - clock.seconds
+        end = time.strftime("%H:%M", time.localtime(time.time() + left))
+        camera = scene.train[0].camera
+        self.say(
+            f"train: {left / 60:.1f} minutes for {len(scene.train)} frames of "
+            f"{camera.width}x{camera.height}, until about {end}"
+        )
 
     def resume(self, clock: Clock) -> Clock | None:
         """Load the newest checkpoint; the clock then, or None where there is none."""

@@ -8,7 +8,6 @@ an unbroken single one does.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -27,15 +26,16 @@ from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training import run_folder
-from hdr_nsff.training.budget import Clock, Stopwatch, minutes_for
+from hdr_nsff.training.budget import Clock, Stopwatch
 from hdr_nsff.training.config import TrainConfig, check_config
 from hdr_nsff.training.measure import check_finite, frame_error, spread_frames, squared_error
-from hdr_nsff.training.objective import Objective, merge_weights
+from hdr_nsff.training.objective import Objective
 from hdr_nsff.training.optimizers import Optimizers
 from hdr_nsff.training.pose_corrections import PoseCorrections
 from hdr_nsff.training.run_writer import LOG_EVERY, RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
 from hdr_nsff.training.start import start_field
+from hdr_nsff.training.weighted_terms import backward, merge_weights
 
 CHECK_SAME_EVERY = 1000  # steps after which several processes compare their parameters
 REARRANGE_UNTIL = 0.8  # share of the run after which the field rearranges nothing (hand-chosen)
@@ -57,20 +57,13 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
             )
         device = device_for(config.field, config.device)
         scene = Scene.open(config.scene)
-        config = with_budget(config, scene)
+        camera = scene.train[0].camera
+        budget = config.budget.for_clip(camera.width * camera.height, len(scene.train))
+        config = replace(config, budget=budget)
         if ranks.main:
             run_folder.open_folder(config)
         Trainer(config, scene, device, ranks).loop(keep_at, previews)
     return config.out
-
-
-def with_budget(config: TrainConfig, scene: Scene) -> TrainConfig:
-    """The config with minutes that follow the clip, where it has no budget."""
-    if config.budget.steps is not None or config.budget.minutes is not None:
-        return config
-    camera = scene.train[0].camera
-    minutes = minutes_for(camera.width * camera.height, len(scene.train))
-    return replace(config, budget=replace(config.budget, minutes=minutes))
 
 
 class Trainer:
@@ -136,7 +129,7 @@ class Trainer:
             self.writer.say(f"training was finished already, at step {self.clock.step}")
             return
         shares = sorted(share for share in keep_at if share > self.clock.progress)
-        self.announce()
+        self.writer.announce(self.clock, self.scene)
         watch = Stopwatch(self.clock.seconds)
         if self.clock.step == 0:
             self.save()
@@ -155,19 +148,6 @@ class Trainer:
         self.save(previews)
         if self.poses:
             self.writer.say(self.poses.describe())
-
-    def announce(self) -> None:
-        """Report how long this takes, where that is known."""
-        minutes = self.clock.budget.minutes
-        if self.clock.budget.steps is not None or minutes is None:
-            return
-        left = minutes * 60 - self.clock.seconds
-        end = time.strftime("%H:%M", time.localtime(time.time() + left))
-        camera = self.scene.train[0].camera
-        self.writer.say(
-            f"train: {left / 60:.1f} minutes for {len(self.scene.train)} frames of "
-            f"{camera.width}x{camera.height}, until about {end}"
-        )
 
     def step(self) -> dict[str, float]:
         """One optimizer step over this process's share of the batches.
@@ -197,7 +177,7 @@ class Trainer:
             if log_due or clock.step % self.read_every == 0:
                 values = self.read_terms()
             check_finite(values, clock.step, batch, render.radiance)
-            self.objective.backward(terms, config.batches)
+            backward(terms, self.objective.weights, config.batches)
             if log_due:
                 values["mse"] = squared_error(render, batch, self.tonemapper)
             for name, value in values.items():
