@@ -7,7 +7,7 @@ import pytest
 from painted_clips import H, K, W, cameras, painted_clip
 
 from hdr_nsff.priors.masks import geometric
-from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
+from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask, texture_confidence
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING
 
 
@@ -69,3 +69,11 @@ def test_large_frames_are_judged_on_a_coarser_grid():
     found = geometric_mask(*given, K, cameras(), tuning)
     assert found.shape == truth.shape
     assert iou(found, truth) > 0.6
+
+
+def test_texture_beside_black_has_a_confidence_in_large_frames():
+    gray = np.zeros((720, 1280), np.float32)
+    gray[:360, :640] = np.random.default_rng(0).random((360, 640)) ** 8
+    confidence = texture_confidence(gray)
+    assert np.isfinite(confidence).all()
+    assert np.median(confidence[:350, :630]) > 0.9 and confidence[400:].max() < 0.01

@@ -220,7 +220,9 @@ def texture_confidence(
     """
     window = (tuning.window_px, tuning.window_px)
     laplacian = cv2.Laplacian(gray, cv2.CV_32F, ksize=1)
-    deviation = np.sqrt(cv2.boxFilter(laplacian**2, -1, window) / LAPLACIAN_GAIN)
+    # running sums end a little below 0 where texture stops
+    variance = np.maximum(cv2.boxFilter(laplacian**2, -1, window), 0) / LAPLACIAN_GAIN
+    deviation = np.sqrt(variance)
     noise = np.percentile(deviation, tuning.image_noise_percentile)
     noise = np.clip(noise, tuning.min_image_noise, tuning.max_image_noise)
 
