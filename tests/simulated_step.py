@@ -29,7 +29,7 @@ from hdr_nsff.fields.splat.rasterize import Maps, composite_view
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import bracketed, curve, fused_tone, kernel_cuda, vignetting
-from hdr_nsff.training import fused_losses, objective
+from hdr_nsff.training import fused_losses, objective, weighted_terms
 from hdr_nsff.training.run_folder import open_folder
 from hdr_nsff.training.train import Trainer
 
@@ -106,7 +106,8 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     for module in (fused_picture, kernel_cuda, fused_losses):
         monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     monkeypatch.setattr(splat, "rasterize", draw_nothing)
-    for module in (splat, local_gaussians, encodings, curve, vignetting, objective, bracketed):
+    objectives = (objective, weighted_terms)
+    for module in (splat, local_gaussians, encodings, curve, vignetting, bracketed, *objectives):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
     with pretend_device() as found:
         yield found
