@@ -9,17 +9,20 @@ from estimates import with_movers
 from test_initialize_gaussians import recorded
 from toy_scene import CARD, card_offset
 
+from hdr_nsff.fields.point_cloud import PointCloud
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import (
     count_local_pixels,
+    gap_beside,
     local_mask,
     place_local,
     start_duration,
+    start_durations,
     velocities_around,
 )
 from hdr_nsff.fields.splat.splat import Splat
-from hdr_nsff.scene.scene import Scene, surely_moving
+from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 
 @pytest.fixture(scope="module")
@@ -104,6 +107,35 @@ def test_two_movers_share_the_mask_by_their_tracks(soft: Scene) -> None:
     east = replace(mover, pixels=mover.pixels + np.array([1000.0, 0.0]))
     near = replace(mover, rigid=True)
     assert not local_mask(replace(soft, movers=(east, near)), 2).any()
+
+
+def test_velocities_need_no_believed_flow(soft: Scene) -> None:
+    def doubted(frame: Frame) -> Frame:
+        nothing = {k: torch.zeros_like(v) for k, v in frame.flow_valid.items()}
+        return replace(frame, flow_valid=nothing)
+
+    scene = replace(soft, train=[doubted(frame) for frame in soft.train])
+    field = Splat(SplatConfig(static=400, moving=0, local=600), scene.times, 1.0, 6.0, 60 * 34)
+    with torch.no_grad():
+        place_local(field.local, scene, recorded, scene.near)
+    test_velocities_are_those_of_the_card(field)
+
+
+def test_fast_lives_are_short_but_bridge_a_missing_frame(soft: Scene) -> None:
+    f = soft.train[2]
+    on_axis = f.camera.c2w[:, 3] + 2 * f.camera.c2w[:, 2]
+    points = PointCloud(
+        on_axis.repeat(4, 1), torch.zeros(4, 3), torch.ones(4), torch.full((4,), 0.01)
+    )
+    width = 0.01 * f.camera.width  # of the picture there, in scene units
+    right, ahead = f.camera.c2w[:, 0], f.camera.c2w[:, 2]
+    velocities = width * torch.stack([0 * right, right / 60, right, ahead])
+    slow = start_duration(soft)
+    found = start_durations(soft, f, points, velocities)
+    torch.testing.assert_close(found, torch.tensor([slow, 60 * 0.023, 0.8, slow]))
+    missing = replace(soft, train=[g for g in soft.train if g.time != 3])
+    assert (gap_beside(soft, f), gap_beside(missing, f)) == (1, 2)
+    assert float(start_durations(missing, f, points, velocities)[2]) == pytest.approx(1.6)
 
 
 def test_lives_last_a_cycle_of_exposures(soft: Scene) -> None:

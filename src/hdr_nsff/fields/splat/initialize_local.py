@@ -1,8 +1,8 @@
 """Start time-local Gaussians on the movers that are not rigid, in every training frame.
 
-One per square cell of mask pixels. Its velocity is that of believed flow around it, its
-radiance that of its pixel and of where flow leads in the two neighboring frames, so
-that a value that clipped is taken from another exposure.
+One per square cell of mask pixels. Its velocity is that of the flow around it that
+lands on what moves, its radiance that of its pixel and of where believed flow leads in
+the two neighboring frames, so that a value that clipped is taken from another exposure.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn import functional
 
 from hdr_nsff.fields.point_cloud import (
     MIN_RADIANCE,
@@ -33,11 +34,14 @@ OVERLAP = 0.5  # standard deviation relative to the side of a cell (hand-chosen 
 OPACITY = 0.7
 NEVER = -1e6  # center time, in frames, of a Gaussian without a place
 NEIGHBOR_TRUST = 0.5  # of a color that flow brought, relative to the pixel's own
-NUM_FLOW_PIXELS = 24  # nearest ones with believed flow, whose median is a velocity
+NUM_FLOW_PIXELS = 24  # nearest ones with flow, whose median is a velocity
 # standard deviation of a life in cycles of exposures and at least, in frames: every
 # exposure sees it, and little bends meanwhile (0.5 to 1 cycle is best on real clips)
-
 DURATION_CYCLES, MIN_DURATION = 0.7, 1.4
+# what is fast bends within that time: its path in one standard deviation, in widths of
+# the picture; and the least duration, in gaps between frames, which leaves no hole
+# where one is missing (on real clips, twice the path gains less)
+DURATION_PATH, MIN_DURATION_GAPS = 0.023, 0.8
 
 
 @dataclass(frozen=True)
@@ -46,6 +50,7 @@ class LocalSeeds:
 
     points: PointCloud  # P of them
     velocities: Tensor  # (P, 3) scene units a frame
+    durations: Tensor  # (P,) standard deviations of their lives, in frames
     time: float  # in frames
 
 
@@ -111,6 +116,7 @@ def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, un
     local.velocities[:n, :3] = torch.cat([seed.velocities for seed in seeds])
     local.log_scales[:n, :3] = (OVERLAP * side * points.footprint).log()[:, None]
     local.log_scales[:, 3] = math.log(start_duration(scene))
+    local.log_scales[:n, 3] = torch.cat([seed.durations for seed in seeds]).log()
     local.colors[:n, :3] = from_log_radiance(points.log_radiance, local.bounded)
     local.colors[:n, 3] = math.log(OPACITY / (1 - OPACITY))
     local.find_neighbors(unit)
@@ -118,11 +124,38 @@ def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, un
 
 
 def start_duration(scene: Scene) -> float:
-    """Standard deviation of a life, in frames."""
-    times = scene.times
-    step = float(times.diff().median()) if len(times) > 1 else 1.0
+    """The standard deviation of the life of what is slow, in frames."""
+    step = frame_step(scene)
     cycle = scene.manifest.num_brackets * step
     return max(DURATION_CYCLES * cycle, MIN_DURATION * step)
+
+
+def frame_step(scene: Scene) -> float:
+    """The typical time between two captured times, in frames."""
+    times = scene.times
+    return float(times.diff().median()) if len(times) > 1 else 1.0
+
+
+def start_durations(scene: Scene, f: Frame, points: PointCloud, velocities: Tensor) -> Tensor:
+    """Standard deviations (P,) of the lives of a frame's points, shorter for fast ones.
+
+    What counts is the part of `velocities` (P, 3) across the ray: along it, most is
+    noise of depth.
+    """
+    rays = functional.normalize(points.positions - f.camera.c2w[:, 3], dim=1)
+    across = velocities - (velocities * rays).sum(1, keepdim=True) * rays
+    speeds = across.norm(dim=1) / (points.footprint * f.camera.width)
+    longest = start_duration(scene)
+    shortest = min(MIN_DURATION_GAPS * gap_beside(scene, f), longest)
+    return (DURATION_PATH / speeds.clamp_min(1e-9)).clamp(shortest, longest)
+
+
+def gap_beside(scene: Scene, f: Frame) -> float:
+    """The longest time from a frame to the ones before and after, in frames."""
+    times = scene.times
+    k = int(torch.searchsorted(times, f.time))
+    beside = times[max(k - 1, 0) : k + 2]
+    return float(beside.diff().max()) if len(beside) > 1 else 1.0
 
 
 def cells_of(mask: Tensor, side: float) -> Tensor:
@@ -155,7 +188,9 @@ def frame_seeds(
     pixels = mask.nonzero().flip(1) + 0.5
     centers = mean_by_cell(pixels, cells)
     velocities = velocities_around(centers, *flow_velocities(scene, f, mask, points.positions))
-    return LocalSeeds(merge_by_cell(points, cells), velocities, f.time)
+    seeds = merge_by_cell(points, cells)
+    durations = start_durations(scene, f, seeds, velocities)
+    return LocalSeeds(seeds, velocities, durations, f.time)
 
 
 def mean_by_cell(values: Tensor, cells: Tensor) -> Tensor:
@@ -165,18 +200,18 @@ def mean_by_cell(values: Tensor, cells: Tensor) -> Tensor:
     return sums / counts[:, None]
 
 
-def landing(scene: Scene, f: Frame, mask: Tensor, offset: int) -> tuple[Tensor, Tensor, Tensor]:
+def landing(f: Frame, mask: Tensor, offset: int) -> tuple[Tensor, Tensor, Tensor]:
     """Where flow leads the pixels of a mask in a neighbor.
 
     Pixels (P, 2) with centers at +0.5, the integer pixels (P, 2) that hold them, and
-    whether the flow is believed (P,).
+    whether they are inside the picture (P,).
     """
     target = mask.nonzero().flip(1) + 0.5 + f.flow[offset][mask]
     height, width = mask.shape
     cell = target.floor().long()
     inside = (cell >= 0).all(1) & (cell[:, 0] < width) & (cell[:, 1] < height)
     cell = cell.clamp_min(0).minimum(torch.tensor([width - 1, height - 1]))
-    return target, cell, inside & f.flow_valid[offset][mask]
+    return target, cell, inside
 
 
 def colors_along_flow(
@@ -184,19 +219,21 @@ def colors_along_flow(
 ) -> tuple[Tensor, Tensor]:
     """Log radiance (P, 3) that a neighbor recorded of them, and its trust (P,)."""
     j = f.neighbors[offset]
-    _, cell, believed = landing(scene, f, mask, offset)
+    _, cell, inside = landing(f, mask, offset)
     rgb = scene.train[j].image[cell[:, 1], cell[:, 0]]
     log = to_radiance(rgb, j).clamp_min(MIN_RADIANCE).log()
-    return log, exposure_trust(rgb) * believed
+    return log, exposure_trust(rgb) * (inside & f.flow_valid[offset][mask])
 
 
 def flow_velocities(
     scene: Scene, f: Frame, mask: Tensor, positions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Pixels (Q, 2) with believed flow and their velocities (Q, 3), units a frame.
+    """Pixels (Q, 2) whose flow lands on what moves, and their velocities (Q, 3).
 
-    From the pixels' `positions` (P, 3) to where the neighbors' depth puts what flow
-    finds there; the mean of both sides.
+    In scene units a frame, from the pixels' `positions` (P, 3) to where the neighbors'
+    depth puts what flow finds there; the mean of both sides. Flow need not be believed:
+    what is fast, near or blurred passes no check in both directions, and would start at
+    rest.
     """
     total = torch.zeros_like(positions)
     count = torch.zeros(len(positions))
@@ -204,16 +241,16 @@ def flow_velocities(
         neighbor = scene.train[f.neighbors[offset]]
         if neighbor.disparity is None:
             continue
-        target, cell, believed = landing(scene, f, mask, offset)
+        target, cell, lands = landing(f, mask, offset)
         column, row = cell.unbind(1)
         if neighbor.moving is not None:  # else it landed on what is behind
-            believed = believed & neighbor.moving[row, column]
+            lands = lands & neighbor.moving[row, column]
         disparity = neighbor.disparity[row, column].clamp(1 / scene.far, 1 / scene.near)
         rays = neighbor.camera.rays(target)
         points = rays.origins + rays.directions / disparity[:, None]
         step = (points - positions) / (neighbor.time - f.time)
-        total += torch.where(believed[:, None], step, torch.zeros_like(step))
-        count += believed
+        total += torch.where(lands[:, None], step, torch.zeros_like(step))
+        count += lands
     known = count > 0
     pixels = mask.nonzero().flip(1)[known] + 0.5
     return pixels, total[known] / count[known, None]
