@@ -19,6 +19,7 @@ from hdr_nsff.radiometry.exposure_cycle import (
     ExposureCycleTuning,
     cycle_of_steps,
     fit_cycle,
+    information_criterion,
     share_brackets,
 )
 
@@ -99,9 +100,8 @@ def find_cycle(
 def criterion(
     misfit: float, length: int, gaps: int, count: int, tuning: DroppedFramesTuning = TUNING
 ) -> float:
-    """The Bayesian information criterion of `count` steps under Laplace noise."""
-    parameters = length + tuning.gap_parameters * gaps
-    return 2 * count * float(np.log(misfit)) + parameters * float(np.log(count))
+    """The information criterion of a cycle of `length` with `gaps`."""
+    return information_criterion(misfit, count, length - 1 + tuning.gap_parameters * gaps)
 
 
 def plausible(advance: np.ndarray, length: int, tuning: DroppedFramesTuning) -> bool:
