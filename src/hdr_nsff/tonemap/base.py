@@ -26,8 +26,8 @@ from annotated_types import Ge, Le
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Weight
-from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.batch import Recorder

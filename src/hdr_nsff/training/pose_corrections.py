@@ -25,7 +25,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Frame, Scene
