@@ -7,7 +7,7 @@ killed run does what an unbroken one does.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ class RunWriter:
     def __init__(
         self,
         config: TrainConfig,
-        modules: dict[str, nn.Module],
+        modules: Mapping[str, nn.Module],
         optimizers: Optimizers,
         num_rays: int,
         main: bool,

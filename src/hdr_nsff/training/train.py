@@ -23,7 +23,7 @@ from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.build import build_field, device_for
 from hdr_nsff.scene.batch import PixelBatch
-from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Clock, Stopwatch
@@ -31,7 +31,7 @@ from hdr_nsff.training.config import TrainConfig, check_config
 from hdr_nsff.training.measure import check_finite, frame_error, spread_frames, squared_error
 from hdr_nsff.training.objective import Objective
 from hdr_nsff.training.optimizers import Optimizers
-from hdr_nsff.training.pose_corrections import PoseCorrections
+from hdr_nsff.training.pose_corrections import poses_for
 from hdr_nsff.training.run_writer import LOG_EVERY, RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
 from hdr_nsff.training.start import start_field
@@ -81,7 +81,7 @@ class Trainer:
         self.clock = Clock(config.budget, config.schedule, len(scene.train))
         self.field = build_field(config.field, scene)
         self.tonemapper = tone_mapper_for(config.tonemap, scene)
-        self.poses = PoseCorrections(scene) if config.refine_poses else None
+        self.poses = poses_for(scene, config.refine_poses)
         self.objective = Objective(
             weights=merge_weights(
                 config.loss,
@@ -96,11 +96,10 @@ class Trainer:
             fade=config.schedule.prior_fade,
             published=config.published,
         )
-        groups = self.field.param_groups() + self.tonemapper.param_groups(config.tonemap_lr)
-        modules: dict[str, torch.nn.Module] = {"field": self.field, "tonemapper": self.tonemapper}
-        if self.poses:
-            groups += self.poses.param_groups(config.pose_lr)
-            modules["poses"] = self.poses
+        modules = {"field": self.field, "tonemapper": self.tonemapper, "poses": self.poses}
+        groups = self.field.param_groups()
+        groups += self.tonemapper.param_groups(config.tonemap_lr)
+        groups += self.poses.param_groups(config.pose_lr)
         self.optimizers = Optimizers(groups)
         num_rays = rays_per_step(config, scene)
         self.writer = RunWriter(config, modules, self.optimizers, num_rays, ranks.main)
@@ -146,8 +145,7 @@ class Trainer:
                         self.save(previews)
                         self.writer.finish_checkpoint(self.clock)
         self.save(previews)
-        if self.poses:
-            self.writer.say(self.poses.describe())
+        self.writer.say(self.poses.describe())
 
     def step(self) -> dict[str, float]:
         """One optimizer step over this process's share of the batches.
@@ -162,15 +160,12 @@ class Trainer:
         slots = range(self.ranks.rank, config.batches, self.ranks.world)
         totals: dict[str, float] = {}
         for slot in slots:
-            batch = self.draw(slot)
-            if self.poses:
-                batch = self.poses(batch)
+            batch = self.poses(self.draw(slot))
             with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
                 render, field_terms = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase)
             terms |= self.objective.reduce(field_terms) | self.tonemapper.regularizers()
-            if self.poses:
-                terms |= self.poses.regularizers(batch.frame)
+            terms |= self.poses.regularizers(batch.frame)
             log_due = (clock.step + 1) % LOG_EVERY == 0
             self.latest = {name: value.detach() for name, value in terms.items()}
             values: dict[str, float] = {}
@@ -185,8 +180,7 @@ class Trainer:
         self.ranks.sum_gradients(self.optimizers.parameters())
         self.ranks.max_buffers(self.optimizers.row_marks)
         self.optimizers.step(clock.lr_share, clock.progress)
-        if self.poses:
-            self.poses.fix_gauge()
+        self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
         rearranging = clock.progress < REARRANGE_UNTIL
         if self.field.after_step(clock.step + 1, self.frame_errors if rearranging else None):
@@ -211,18 +205,10 @@ class Trainer:
         which = batch.bracket, batch.camera_id, batch.frame
         return replace(batch, recorder=self.tonemapper.recorder(*which, leaky=True))
 
-    def frame(self, position: int) -> Frame:
-        """A training frame, with its camera as corrected so far."""
-        frame = self.scene.train[position]
-        if self.poses is None:
-            return frame
-        camera = self.poses.camera(frame.camera, *self.poses.frames[position])
-        return replace(frame, camera=camera)
-
     def frame_errors(self, count: int) -> list[FrameError]:
         """How wrong pictures of `count` training frames are; others every step."""
         chosen = spread_frames(count, len(self.scene.train), self.clock.step)
-        return [frame_error(self.tonemapper, self.frame(i), i) for i in chosen]
+        return [frame_error(self.tonemapper, self.poses.frame(self.scene, i), i) for i in chosen]
 
     def save(self, preview: bool = False) -> None:
         """Save a checkpoint, and a `preview` of the frame in the middle."""
@@ -232,5 +218,5 @@ class Trainer:
         self.writer.save_checkpoint(self.clock)
         if preview:
             middle = len(self.scene.train) // 2
-            frame = self.frame(middle)
+            frame = self.poses.frame(self.scene, middle)
             self.writer.save_preview(self.clock.step, self.field, self.tonemapper, frame, middle)
