@@ -21,9 +21,8 @@ from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Clock
 from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.measure import LOG_EVERY
 from hdr_nsff.training.optimizers import Optimizers
-
-LOG_EVERY = 25  # steps
 
 
 class RunWriter:

@@ -7,7 +7,6 @@ an unbroken single one does.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -28,11 +27,11 @@ from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Clock, Stopwatch
 from hdr_nsff.training.config import TrainConfig, check_config
-from hdr_nsff.training.measure import check_finite, frame_error, spread_frames, squared_error
+from hdr_nsff.training.measure import Monitor, averaged, frame_error, spread_frames
 from hdr_nsff.training.objective import Objective
 from hdr_nsff.training.optimizers import Optimizers
 from hdr_nsff.training.pose_corrections import poses_for
-from hdr_nsff.training.run_writer import LOG_EVERY, RunWriter
+from hdr_nsff.training.run_writer import RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
 from hdr_nsff.training.start import start_field
 from hdr_nsff.training.weighted_terms import backward, merge_weights
@@ -75,13 +74,11 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.config = config
         self.ranks = ranks
-        # steps after which terms are read: the host would wait for a GPU at every one
-        self.read_every = 1 if device.type == "cpu" else LOG_EVERY
-        self.latest: dict[str, torch.Tensor] = {}  # the last step's terms
         self.clock = Clock(config.budget, config.schedule, len(scene.train))
         self.field = build_field(config.field, scene)
         self.tonemapper = tone_mapper_for(config.tonemap, scene)
         self.poses = poses_for(scene, config.refine_poses)
+        self.monitor = Monitor(self.tonemapper, device)
         self.objective = Objective(
             weights=merge_weights(
                 config.loss,
@@ -158,7 +155,7 @@ class Trainer:
         if clock.progress >= config.anchor_at and not self.tonemapper.is_anchored():
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)
-        totals: dict[str, float] = {}
+        measured = []
         for slot in slots:
             batch = self.poses(self.draw(slot))
             with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
@@ -166,17 +163,8 @@ class Trainer:
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase)
             terms |= self.objective.reduce(field_terms) | self.tonemapper.regularizers()
             terms |= self.poses.regularizers(batch.frame)
-            log_due = (clock.step + 1) % LOG_EVERY == 0
-            self.latest = {name: value.detach() for name, value in terms.items()}
-            values: dict[str, float] = {}
-            if log_due or clock.step % self.read_every == 0:
-                values = self.read_terms()
-            check_finite(values, clock.step, batch, render.radiance)
+            measured.append(self.monitor.measure(clock.step, terms, render, batch))
             backward(terms, self.objective.weights, config.batches)
-            if log_due:
-                values["mse"] = squared_error(render, batch, self.tonemapper)
-            for name, value in values.items():
-                totals[name] = totals.get(name, 0.0) + value / len(slots)
         self.ranks.sum_gradients(self.optimizers.parameters())
         self.ranks.max_buffers(self.optimizers.row_marks)
         self.optimizers.step(clock.lr_share, clock.progress)
@@ -187,16 +175,7 @@ class Trainer:
             self.ranks.follow_first([*self.field.parameters(), *self.field.buffers()])
         if (clock.step + 1) % CHECK_SAME_EVERY == 0:
             self.ranks.check_same(self.optimizers.parameters())
-        if "mse" in totals:
-            totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
-        return totals
-
-    def read_terms(self) -> dict[str, float]:
-        """The values of the last step's terms; the host waits once for all of them."""
-        if not self.latest:
-            return {}
-        values = torch.stack(list(self.latest.values())).tolist()
-        return dict(zip(self.latest, values, strict=True))
+        return averaged(measured)
 
     def draw(self, slot: int) -> PixelBatch:
         """The batch of a slot of this step, with its recorder."""
@@ -212,9 +191,7 @@ class Trainer:
 
     def save(self, preview: bool = False) -> None:
         """Save a checkpoint, and a `preview` of the frame in the middle."""
-        wrong = [name for name, value in self.read_terms().items() if not math.isfinite(value)]
-        if wrong:
-            raise FloatingPointError(f"step {self.clock.step}: {', '.join(wrong)} not finite")
+        self.monitor.check_latest(self.clock.step)
         self.writer.save_checkpoint(self.clock)
         if preview:
             middle = len(self.scene.train) // 2
