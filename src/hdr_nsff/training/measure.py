@@ -94,9 +94,7 @@ def squared_error(render: Render, batch: PixelBatch, tonemapper: ToneMapper) -> 
     """Mean square difference of rendered and recorded rgb at uniformly drawn pixels."""
     rgb = render.rgb
     if rgb is None:
-        which = batch.bracket, batch.camera_id, batch.frame
-        shaded = tonemapper.shade(render.radiance, batch.camera, batch.camera_id, batch.pixels)
-        rgb = tonemapper(shaded, *which, leaky=False)
+        rgb = tonemapper.record(render.radiance, batch, leaky=False)
     return float((rgb.clamp(0, 1) - batch.rgb)[batch.uniform].square().mean())
 
 
