@@ -149,12 +149,8 @@ class Objective:
         if batch.disparity is not None and relative:
             terms["depth"] = fade * losses.depth_relative(depth, batch.disparity)
         elif batch.disparity is not None:
-            confidence = batch.disparity_confidence
-            if confidence is None:
-                confidence = torch.ones_like(batch.disparity)
-            terms["depth"] = fade * losses.depth_scene(
-                depth, batch.disparity, confidence, self.near
-            )
+            trust = batch.disparity_confidence
+            terms["depth"] = fade * losses.depth_scene(depth, batch.disparity, trust, self.near)
         flows = []
         limit = None if self.published else FLOW_LIMIT_PX
         for warp in render.warps:

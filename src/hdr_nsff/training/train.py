@@ -33,7 +33,7 @@ from hdr_nsff.training.optimizers import Optimizers
 from hdr_nsff.training.pose_corrections import poses_for
 from hdr_nsff.training.run_writer import RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
-from hdr_nsff.training.start import start_field
+from hdr_nsff.training.start import start_run
 from hdr_nsff.training.weighted_terms import backward, merge_weights
 
 CHECK_SAME_EVERY = 1000  # steps after which several processes compare their parameters
@@ -102,7 +102,9 @@ class Trainer:
         self.writer = RunWriter(config, modules, self.optimizers, num_rays, ranks.main)
         resumed = self.writer.resume(self.clock)
         if resumed is None:
-            self.start(scene)
+            with_flow = config.loss.flow > 0
+            note = start_run(self.field, self.tonemapper, scene, config.from_priors, with_flow)
+            self.writer.say(note)
         else:
             self.clock = resumed
         # frames on the CPU stay where they are: read when they are drawn
@@ -110,14 +112,6 @@ class Trainer:
         for module in modules.values():
             module.to(device)
         self.optimizers.follow_parameters()
-
-    def start(self, scene: Scene) -> None:
-        """Start tone mapper and field from what `prepare` estimated."""
-        self.tonemapper.start(scene.response)
-        self.tonemapper.start_vignetting(scene)
-        with_flow = bool(self.objective.weights["flow"])
-        from_priors = self.config.from_priors
-        self.writer.say(start_field(self.field, self.tonemapper, scene, from_priors, with_flow))
 
     def loop(self, keep_at: Sequence[float] = (), previews: bool = True) -> None:
         """Train until the clock runs out; it counts neither compiling nor writing."""
