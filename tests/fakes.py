@@ -13,7 +13,8 @@ import torch
 from estimates import tone_mapper
 from torch import Tensor
 
-from hdr_nsff.fields.base import ParamGroup, Render
+from hdr_nsff.core.param_group import ParamGroup
+from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.outputs import Layers
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import from_brightness

@@ -156,7 +156,7 @@ def test_launches_of_a_step(
 
 def gradients_of_a_step(trainer: Trainer, step: int) -> tuple[dict[str, float], dict[str, Tensor]]:
     """Terms, and gradients by the names of parameters; nothing is moved."""
-    trainer.clock, trainer.read_every = replace(trainer.clock, step=step), 1
+    trainer.clock, trainer.monitor.read_every = replace(trainer.clock, step=step), 1
     found = {}
 
     def keep(*arguments: float) -> None:

@@ -92,7 +92,7 @@ def test_a_step_has_the_losses_of_the_cpu(
         of_folder = replace(config, out=out)
         open_folder(of_folder)
         trainer = Trainer(of_folder, toy, where, distributed.Ranks())
-        trainer.read_every = 1
+        trainer.monitor.read_every = 1
         return trainer.step()
 
     expected = first_step(tmp_path / "cpu", torch.device("cpu"))

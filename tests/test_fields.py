@@ -7,12 +7,13 @@ import pytest
 import torch
 from presets import NETWORKS, random_field, small, trainer
 
-from hdr_nsff.fields.base import RadianceField, RecordingField
+from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.baselines.hexplane import HexPlane
 from hdr_nsff.fields.build import AnyField
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
 from hdr_nsff.fields.nsff.two_branches import TwoBranches
 from hdr_nsff.fields.outputs import record_pixels
+from hdr_nsff.fields.recording_field import RecordingField
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths.volume import transmittance, weighted_sum
 from hdr_nsff.scene.batch import Recorder, draw_pixels

@@ -56,6 +56,8 @@ def test_scene_depth_is_weighted_by_the_confidence() -> None:
     depth, prior = torch.tensor([1.0, 1.0]), torch.tensor([0.5, 0.9])
     loss = losses.depth_scene(depth, prior, torch.tensor([0.0, 1.0]), near=2.0)
     assert math.isclose(float(loss), 0.1 / 2 * 2, rel_tol=1e-5)
+    everywhere = losses.depth_scene(depth, prior, None, near=2.0)
+    assert float(everywhere) == float(losses.depth_scene(depth, prior, torch.ones(2), near=2.0))
 
 
 def test_optical_flow_counts_valid_pixels_only_and_caps_outliers() -> None:

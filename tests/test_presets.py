@@ -7,8 +7,8 @@ import pytest
 import torch
 from presets import random_field, small, trainer
 
-from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.build import build_field, initialize_field
+from hdr_nsff.fields.point_cloud import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.batch import whole_frame

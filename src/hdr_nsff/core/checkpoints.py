@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import zlib
 from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,7 +121,7 @@ def latest_checkpoint(folder: Path) -> Checkpoint | None:
 
 
 def pack(
-    modules: dict[str, torch.nn.Module], optimizers: dict[str, torch.optim.Optimizer]
+    modules: Mapping[str, torch.nn.Module], optimizers: dict[str, torch.optim.Optimizer]
 ) -> dict[str, Tensor]:
     """State of modules and optimizers as one flat dict of tensors."""
     tensors: dict[str, Tensor] = {}
@@ -136,7 +137,7 @@ def pack(
 
 def unpack(
     tensors: dict[str, Tensor],
-    modules: dict[str, torch.nn.Module],
+    modules: Mapping[str, torch.nn.Module],
     optimizers: dict[str, torch.optim.Optimizer],
 ) -> None:
     """Put a packed state back. InputError where it does not fit a module."""

@@ -3,23 +3,20 @@ pixels, in linear HDR radiance. Everything that training asks of a field stands 
 
 Fields know nothing of exposure, white balance or response curves: tone mapping happens
 outside. `S` is the number of pixels asked for. A field is given pixels, not rays: an
-NSFF casts rays through them, a splat field rasterizes the frame and reads them off. Two
-published baselines need to know what was recorded (`RecordingField`): they are handed a
-`Recorder` from outside.
+NSFF casts rays through them, a splat field rasterizes the frame and reads them off.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from torch import Tensor
 
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.batch import PixelBatch, Recorder
-
-MAX_SIGMOID_RADIANCE = 0.999  # that a sigmoid is asked to start from at most
+from hdr_nsff.scene.batch import PixelBatch
 
 
 @dataclass(frozen=True)
@@ -56,22 +53,6 @@ class FrameError:
     time: float  # in frames
     # radiance (S, 3) of its picture to (S,) mean absolute difference of recorded values
     error: Callable[[Tensor], Tensor]
-
-
-@dataclass(frozen=True)
-class ParamGroup:
-    """Parameters that share their learning rate.
-
-    With `row_marks`, one (rows,) uint8 tensor per parameter (rows, 4), only marked rows
-    are moved (`TouchedAdam`), and the optimizer clears the marks.
-    """
-
-    params: Sequence[Tensor]
-    lr: float
-    betas: tuple[float, float] | None = None  # the optimizer's default where None
-    eps: float | None = None
-    row_marks: list[Tensor] | None = None
-    start: float = 0.0  # share of the run before which the rate is 0
 
 
 @runtime_checkable
@@ -113,17 +94,4 @@ class RadianceField(Protocol):
 
     def shared_maxima(self) -> list[Tensor]:
         """Buffers of which several processes must all hold the maximum."""
-        ...
-
-
-@runtime_checkable
-class RecordingField(RadianceField, Protocol):
-    """A field whose recordings do not follow from its composited radiance, because the
-    camera acts on samples (HDR-HexPlane) or inside the network (NeRF-W).
-    """
-
-    def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
-        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by
-        row, without gradients; chunks itself.
-        """
         ...

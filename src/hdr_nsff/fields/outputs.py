@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from hdr_nsff.core.tensors import tree_map
-from hdr_nsff.fields.base import RadianceField, RecordingField, Render
+from hdr_nsff.fields.base import RadianceField, Render
+from hdr_nsff.fields.recording_field import RecordingField
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Recorder
 

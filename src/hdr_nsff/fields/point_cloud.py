@@ -20,6 +20,7 @@ MAX_CELLS_ACROSS = 2.0**18  # along the longest side; leaves one bit of room
 CELL_PRECISION = 1.01  # the cells' size is found to 1 %
 
 MIN_RADIANCE = 1e-5  # of a point: keeps the logarithm of black finite
+MAX_SIGMOID_RADIANCE = 0.999  # that a sigmoid is asked to start from at most
 MIN_CONFIDENCE = 0.02  # added to the prior's: a point of confidence 0 still counts a little
 # recorded values outside this range count as clipped (hand-chosen on rendered scenes)
 UNCLIPPED = (0.01, 0.97)

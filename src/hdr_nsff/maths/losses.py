@@ -131,13 +131,17 @@ def depth_relative(depth: Tensor, prior_disparity: Tensor) -> Tensor:
     return difference.square().mean()
 
 
-def depth_scene(depth: Tensor, prior_disparity: Tensor, confidence: Tensor, near: float) -> Tensor:
+def depth_scene(
+    depth: Tensor, prior_disparity: Tensor, confidence: Tensor | None, near: float
+) -> Tensor:
     """`L_depth` of eq. 14 for a prior in scene units.
 
-    Mean of the confidence times the absolute difference of disparities, in units of 1 /
-    near. All inputs are (N,).
+    Mean of the confidence (1 where None) times the absolute difference of disparities,
+    in units of 1 / near. All inputs are (N,).
     """
     error = (1 / depth - prior_disparity).abs()
+    if confidence is None:
+        return error.mean() * near
     return (confidence * error).mean() * near
 
 

@@ -26,11 +26,11 @@ from annotated_types import Ge, Le
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Weight
-from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
-from hdr_nsff.scene.batch import Recorder
+from hdr_nsff.scene.batch import PixelBatch, Recorder
 from hdr_nsff.scene.manifest import bracket_problem
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.curve import knot_positions
@@ -212,6 +212,11 @@ class ToneMapper(nn.Module, ABC):
         default all of a picture: pass it on to `forward` or a recorder.
         """
         return radiance
+
+    def record(self, radiance: Tensor, batch: PixelBatch, leaky: bool) -> Tensor:
+        """What the camera of a `batch` records of `radiance` (N, 3) at its pixels."""
+        shaded = self.shade(radiance, batch.camera, batch.camera_id, batch.pixels)
+        return self(shaded, batch.bracket, batch.camera_id, batch.frame, leaky)
 
     def develop(self, radiance: Tensor, ev: float, camera_id: int = 0) -> Tensor:
         """The picture (..., 3) in [0, 1] that camera `camera_id` would record of

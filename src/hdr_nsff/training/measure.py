@@ -5,6 +5,7 @@ wrong.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 import torch
@@ -15,7 +16,65 @@ from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.tonemap.base import ToneMapper
 
+LOG_EVERY = 25  # steps from one line of the log to the next
 ROTATION = 97  # steps after which the same frames are measured again, a prime
+
+
+class Monitor:
+    """Reads the terms of the steps for the log, and notices those that are not finite.
+
+    To read a number of a GPU, the host waits for it. There, terms are read every
+    `LOG_EVERY` steps and where a line of the log is due; on the CPU, at every step.
+    """
+
+    def __init__(self, tonemapper: ToneMapper, device: torch.device) -> None:
+        self.tonemapper = tonemapper
+        self.read_every = 1 if device.type == "cpu" else LOG_EVERY  # steps
+        self.latest: dict[str, Tensor] = {}  # the last batch's terms
+
+    def measure(
+        self, step: int, terms: dict[str, Tensor], render: Render, batch: PixelBatch
+    ) -> dict[str, float]:
+        """The terms of a batch as numbers, none where this step is not read.
+
+        `mse`, the picture's mean square error, is added where a line of the log is due.
+        """
+        self.latest = {name: value.detach() for name, value in terms.items()}
+        log_due = (step + 1) % LOG_EVERY == 0
+        if not log_due and step % self.read_every != 0:
+            return {}
+        values = self.read()
+        check_finite(values, step, batch, render.radiance)
+        if log_due:
+            values["mse"] = squared_error(render, batch, self.tonemapper)
+        return values
+
+    def read(self) -> dict[str, float]:
+        """The last batch's terms as numbers; the host waits once for all of them."""
+        if not self.latest:
+            return {}
+        values = torch.stack(list(self.latest.values())).tolist()
+        return dict(zip(self.latest, values, strict=True))
+
+    def check_latest(self, step: int) -> None:
+        """FloatingPointError where a term of the last batch is NaN or infinite."""
+        wrong = [name for name, value in self.read().items() if not math.isfinite(value)]
+        if wrong:
+            raise FloatingPointError(f"step {step}: {', '.join(wrong)} not finite")
+
+
+def averaged(measured: Sequence[dict[str, float]]) -> dict[str, float]:
+    """What was `measured` of a step's batches, averaged, and `psnr` in place of `mse`.
+
+    A term that a batch lacks counts as 0 there.
+    """
+    means: dict[str, float] = {}
+    for values in measured:
+        for name, value in values.items():
+            means[name] = means.get(name, 0.0) + value / len(measured)
+    if "mse" in means:
+        means["psnr"] = -10 * math.log10(max(means.pop("mse"), 1e-10))
+    return means
 
 
 def check_finite(values: dict[str, float], step: int, batch: PixelBatch, radiance: Tensor) -> None:
@@ -35,9 +94,7 @@ def squared_error(render: Render, batch: PixelBatch, tonemapper: ToneMapper) -> 
     """Mean square difference of rendered and recorded rgb at uniformly drawn pixels."""
     rgb = render.rgb
     if rgb is None:
-        which = batch.bracket, batch.camera_id, batch.frame
-        shaded = tonemapper.shade(render.radiance, batch.camera, batch.camera_id, batch.pixels)
-        rgb = tonemapper(shaded, *which, leaky=False)
+        rgb = tonemapper.record(render.radiance, batch, leaky=False)
     return float((rgb.clamp(0, 1) - batch.rgb)[batch.uniform].square().mean())
 
 

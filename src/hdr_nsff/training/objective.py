@@ -58,7 +58,7 @@ class Objective:
         """All terms that need only the render, unweighted."""
         rgb = render.rgb
         if rgb is None:
-            rgb = record(render.radiance, batch, tonemap)
+            rgb = tonemap.record(render.radiance, batch, leaky=True)
         relative = self.published or self.depth_kind == "relative"
         plain = relative or self.squared or not can_fuse(render, batch)
         if not plain and kernels_on(rgb.device):
@@ -103,7 +103,7 @@ class Objective:
         such a branch, the extra moving pixels count.
         """
         if render.dynamic_radiance is not None:
-            rgb = record(render.dynamic_radiance, batch, tonemap)
+            rgb = tonemap.record(render.dynamic_radiance, batch, leaky=True)
             weight = self.trust(batch)
             if phase >= 1:
                 weight = weight * render.motion.detach()[:, None]
@@ -123,7 +123,7 @@ class Objective:
 
         def term(warp: Warp) -> Tensor:
             assert warp.radiance is not None
-            rgb = record(warp.radiance, batch, tonemap)
+            rgb = tonemap.record(warp.radiance, batch, leaky=True)
             share = warp.confidence
             if phase >= 1:
                 share = share * render.motion.detach()
@@ -149,12 +149,8 @@ class Objective:
         if batch.disparity is not None and relative:
             terms["depth"] = fade * losses.depth_relative(depth, batch.disparity)
         elif batch.disparity is not None:
-            confidence = batch.disparity_confidence
-            if confidence is None:
-                confidence = torch.ones_like(batch.disparity)
-            terms["depth"] = fade * losses.depth_scene(
-                depth, batch.disparity, confidence, self.near
-            )
+            trust = batch.disparity_confidence
+            terms["depth"] = fade * losses.depth_scene(depth, batch.disparity, trust, self.near)
         flows = []
         limit = None if self.published else FLOW_LIMIT_PX
         for warp in render.warps:
@@ -167,9 +163,3 @@ class Objective:
             certain = None if batch.outline is None else (~batch.outline).float()
             terms["mask"] = losses.motion_mask(render.motion, batch.moving, certain)
         return terms
-
-
-def record(radiance: Tensor, batch: PixelBatch, tonemap: ToneMapper) -> Tensor:
-    """What the batch's camera would have recorded of `radiance` (N, 3)."""
-    shaded = tonemap.shade(radiance, batch.camera, batch.camera_id, batch.pixels)
-    return tonemap(shaded, batch.bracket, batch.camera_id, batch.frame, leaky=True)

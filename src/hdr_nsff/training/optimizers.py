@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.fields.nsff.encodings import TouchedAdam
 
 

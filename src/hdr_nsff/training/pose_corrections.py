@@ -25,10 +25,11 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.training.given_poses import GivenPoses
 
 # All of these are hand-chosen on rendered scenes.
 # points along each side of the picture, of which a camera's visible motion is measured
@@ -56,7 +57,7 @@ CAUCHY_SCALE = 0.1
 FOCAL = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0, 0, 0]])  # entries of K that are focal lengths
 
 
-class PoseCorrections(nn.Module):
+class PoseCorrections(GivenPoses):
     """Corrections for the training cameras of a scene, which start at 0.
 
     InputError for a camera that stands still.
@@ -119,6 +120,11 @@ class PoseCorrections(nn.Module):
         links = self.links[batch.frame]
         neighbors = {o: self.camera(c, *self.frames[links[o]]) for o, c in batch.neighbors.items()}
         return replace(batch, camera=camera, neighbors=neighbors)
+
+    def frame(self, scene: Scene, position: int) -> Frame:
+        """A training frame with its camera as corrected so far."""
+        frame = scene.train[position]
+        return replace(frame, camera=self.camera(frame.camera, *self.frames[position]))
 
     def regularizers(self, frame: int) -> dict[str, Tensor]:
         """The penalty `pose` of the corrections of a training frame's camera.
@@ -186,6 +192,11 @@ class PoseCorrections(nn.Module):
         entries = [e.model_copy(update=cameras.get(e.index, {})) for e in scene.manifest.frames]
         manifest = scene.manifest.model_copy(update={"frames": entries})
         return replace(scene, train=train, test=test, manifest=manifest)
+
+
+def poses_for(scene: Scene, refine: bool) -> GivenPoses:
+    """The cameras of a run: with corrections that start at 0 if `refine`."""
+    return PoseCorrections(scene) if refine else GivenPoses()
 
 
 def pose_key(f: Frame) -> tuple[Any, ...]:

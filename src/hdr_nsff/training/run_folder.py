@@ -29,7 +29,7 @@ from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training.budget import Clock
 from hdr_nsff.training.config import TrainConfig
-from hdr_nsff.training.pose_corrections import PoseCorrections
+from hdr_nsff.training.pose_corrections import poses_for
 
 CONFIG = "config.json"
 MANIFEST = "scene.json"  # of the scene folder
@@ -79,16 +79,14 @@ class Run:
             raise InputError(f"{folder}: no checkpoint yet; run `hdr-nsff train` to the first one")
         field = build_field(config.field, scene)
         tonemapper = tone_mapper_for(config.tonemap, scene)
-        modules: dict[str, torch.nn.Module] = {"field": field, "tonemapper": tonemapper}
-        poses = PoseCorrections(scene) if config.refine_poses else None
-        if poses is not None:
-            modules["poses"] = poses
+        poses = poses_for(scene, config.refine_poses)
+        modules = {"field": field, "tonemapper": tonemapper, "poses": poses}
         unpack(found.tensors, modules, {})
         target = device_for(config.field, device)
         return Run(
             folder=folder,
             config=config,
-            scene=scene if poses is None else poses.correct(scene),
+            scene=poses.correct(scene),
             field=field.to(target).eval(),
             tonemapper=tonemapper.to(target).eval(),
             step=found.step,

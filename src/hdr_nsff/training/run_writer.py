@@ -7,7 +7,7 @@ killed run does what an unbroken one does.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -21,9 +21,8 @@ from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Clock
 from hdr_nsff.training.config import TrainConfig
+from hdr_nsff.training.measure import LOG_EVERY
 from hdr_nsff.training.optimizers import Optimizers
-
-LOG_EVERY = 25  # steps
 
 
 class RunWriter:
@@ -32,7 +31,7 @@ class RunWriter:
     def __init__(
         self,
         config: TrainConfig,
-        modules: dict[str, nn.Module],
+        modules: Mapping[str, nn.Module],
         optimizers: Optimizers,
         num_rays: int,
         main: bool,

@@ -1,4 +1,6 @@
-"""The start of a run: brightness and surfaces of the field, from `prepare`."""
+"""The start of a run, from `prepare`: the tone mapper, and brightness and surfaces of
+the field.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,15 @@ from hdr_nsff.tonemap.base import ToneMapper, informative
 
 SUBSAMPLING = 4  # pixels: spacing, along x and y, of those that the typical radiance is from
 MIN_RADIANCE = 1e-6  # linear HDR, so that its logarithm is finite
+
+
+def start_run(
+    field: AnyField, tonemapper: ToneMapper, scene: Scene, from_priors: bool, with_flow: bool
+) -> str | None:
+    """Start an untrained tone mapper, and then the field as `start_field` does."""
+    tonemapper.start(scene.response)
+    tonemapper.start_vignetting(scene)
+    return start_field(field, tonemapper, scene, from_priors, with_flow)
 
 
 def start_field(

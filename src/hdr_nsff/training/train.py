@@ -7,7 +7,6 @@ an unbroken single one does.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,18 +22,18 @@ from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.build import build_field, device_for
 from hdr_nsff.scene.batch import PixelBatch
-from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training import run_folder
 from hdr_nsff.training.budget import Clock, Stopwatch
 from hdr_nsff.training.config import TrainConfig, check_config
-from hdr_nsff.training.measure import check_finite, frame_error, spread_frames, squared_error
+from hdr_nsff.training.measure import Monitor, averaged, frame_error, spread_frames
 from hdr_nsff.training.objective import Objective
 from hdr_nsff.training.optimizers import Optimizers
-from hdr_nsff.training.pose_corrections import PoseCorrections
-from hdr_nsff.training.run_writer import LOG_EVERY, RunWriter
+from hdr_nsff.training.pose_corrections import poses_for
+from hdr_nsff.training.run_writer import RunWriter
 from hdr_nsff.training.sampling import draw_batch, rays_per_step
-from hdr_nsff.training.start import start_field
+from hdr_nsff.training.start import start_run
 from hdr_nsff.training.weighted_terms import backward, merge_weights
 
 CHECK_SAME_EVERY = 1000  # steps after which several processes compare their parameters
@@ -75,13 +74,11 @@ class Trainer:
         torch.manual_seed(config.seed)
         self.config = config
         self.ranks = ranks
-        # steps after which terms are read: the host would wait for a GPU at every one
-        self.read_every = 1 if device.type == "cpu" else LOG_EVERY
-        self.latest: dict[str, torch.Tensor] = {}  # the last step's terms
         self.clock = Clock(config.budget, config.schedule, len(scene.train))
         self.field = build_field(config.field, scene)
         self.tonemapper = tone_mapper_for(config.tonemap, scene)
-        self.poses = PoseCorrections(scene) if config.refine_poses else None
+        self.poses = poses_for(scene, config.refine_poses)
+        self.monitor = Monitor(self.tonemapper, device)
         self.objective = Objective(
             weights=merge_weights(
                 config.loss,
@@ -96,17 +93,18 @@ class Trainer:
             fade=config.schedule.prior_fade,
             published=config.published,
         )
-        groups = self.field.param_groups() + self.tonemapper.param_groups(config.tonemap_lr)
-        modules: dict[str, torch.nn.Module] = {"field": self.field, "tonemapper": self.tonemapper}
-        if self.poses:
-            groups += self.poses.param_groups(config.pose_lr)
-            modules["poses"] = self.poses
+        modules = {"field": self.field, "tonemapper": self.tonemapper, "poses": self.poses}
+        groups = self.field.param_groups()
+        groups += self.tonemapper.param_groups(config.tonemap_lr)
+        groups += self.poses.param_groups(config.pose_lr)
         self.optimizers = Optimizers(groups)
         num_rays = rays_per_step(config, scene)
         self.writer = RunWriter(config, modules, self.optimizers, num_rays, ranks.main)
         resumed = self.writer.resume(self.clock)
         if resumed is None:
-            self.start(scene)
+            with_flow = config.loss.flow > 0
+            note = start_run(self.field, self.tonemapper, scene, config.from_priors, with_flow)
+            self.writer.say(note)
         else:
             self.clock = resumed
         # frames on the CPU stay where they are: read when they are drawn
@@ -114,14 +112,6 @@ class Trainer:
         for module in modules.values():
             module.to(device)
         self.optimizers.follow_parameters()
-
-    def start(self, scene: Scene) -> None:
-        """Start tone mapper and field from what `prepare` estimated."""
-        self.tonemapper.start(scene.response)
-        self.tonemapper.start_vignetting(scene)
-        with_flow = bool(self.objective.weights["flow"])
-        from_priors = self.config.from_priors
-        self.writer.say(start_field(self.field, self.tonemapper, scene, from_priors, with_flow))
 
     def loop(self, keep_at: Sequence[float] = (), previews: bool = True) -> None:
         """Train until the clock runs out; it counts neither compiling nor writing."""
@@ -146,8 +136,7 @@ class Trainer:
                         self.save(previews)
                         self.writer.finish_checkpoint(self.clock)
         self.save(previews)
-        if self.poses:
-            self.writer.say(self.poses.describe())
+        self.writer.say(self.poses.describe())
 
     def step(self) -> dict[str, float]:
         """One optimizer step over this process's share of the batches.
@@ -160,49 +149,27 @@ class Trainer:
         if clock.progress >= config.anchor_at and not self.tonemapper.is_anchored():
             self.tonemapper.anchor()
         slots = range(self.ranks.rank, config.batches, self.ranks.world)
-        totals: dict[str, float] = {}
+        measured = []
         for slot in slots:
-            batch = self.draw(slot)
-            if self.poses:
-                batch = self.poses(batch)
+            batch = self.poses(self.draw(slot))
             with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
                 render, field_terms = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase)
             terms |= self.objective.reduce(field_terms) | self.tonemapper.regularizers()
-            if self.poses:
-                terms |= self.poses.regularizers(batch.frame)
-            log_due = (clock.step + 1) % LOG_EVERY == 0
-            self.latest = {name: value.detach() for name, value in terms.items()}
-            values: dict[str, float] = {}
-            if log_due or clock.step % self.read_every == 0:
-                values = self.read_terms()
-            check_finite(values, clock.step, batch, render.radiance)
+            terms |= self.poses.regularizers(batch.frame)
+            measured.append(self.monitor.measure(clock.step, terms, render, batch))
             backward(terms, self.objective.weights, config.batches)
-            if log_due:
-                values["mse"] = squared_error(render, batch, self.tonemapper)
-            for name, value in values.items():
-                totals[name] = totals.get(name, 0.0) + value / len(slots)
         self.ranks.sum_gradients(self.optimizers.parameters())
         self.ranks.max_buffers(self.optimizers.row_marks)
         self.optimizers.step(clock.lr_share, clock.progress)
-        if self.poses:
-            self.poses.fix_gauge()
+        self.poses.fix_gauge()
         self.ranks.max_buffers(self.field.shared_maxima())
         rearranging = clock.progress < REARRANGE_UNTIL
         if self.field.after_step(clock.step + 1, self.frame_errors if rearranging else None):
             self.ranks.follow_first([*self.field.parameters(), *self.field.buffers()])
         if (clock.step + 1) % CHECK_SAME_EVERY == 0:
             self.ranks.check_same(self.optimizers.parameters())
-        if "mse" in totals:
-            totals["psnr"] = -10 * math.log10(max(totals.pop("mse"), 1e-10))
-        return totals
-
-    def read_terms(self) -> dict[str, float]:
-        """The values of the last step's terms; the host waits once for all of them."""
-        if not self.latest:
-            return {}
-        values = torch.stack(list(self.latest.values())).tolist()
-        return dict(zip(self.latest, values, strict=True))
+        return averaged(measured)
 
     def draw(self, slot: int) -> PixelBatch:
         """The batch of a slot of this step, with its recorder."""
@@ -211,26 +178,16 @@ class Trainer:
         which = batch.bracket, batch.camera_id, batch.frame
         return replace(batch, recorder=self.tonemapper.recorder(*which, leaky=True))
 
-    def frame(self, position: int) -> Frame:
-        """A training frame, with its camera as corrected so far."""
-        frame = self.scene.train[position]
-        if self.poses is None:
-            return frame
-        camera = self.poses.camera(frame.camera, *self.poses.frames[position])
-        return replace(frame, camera=camera)
-
     def frame_errors(self, count: int) -> list[FrameError]:
         """How wrong pictures of `count` training frames are; others every step."""
         chosen = spread_frames(count, len(self.scene.train), self.clock.step)
-        return [frame_error(self.tonemapper, self.frame(i), i) for i in chosen]
+        return [frame_error(self.tonemapper, self.poses.frame(self.scene, i), i) for i in chosen]
 
     def save(self, preview: bool = False) -> None:
         """Save a checkpoint, and a `preview` of the frame in the middle."""
-        wrong = [name for name, value in self.read_terms().items() if not math.isfinite(value)]
-        if wrong:
-            raise FloatingPointError(f"step {self.clock.step}: {', '.join(wrong)} not finite")
+        self.monitor.check_latest(self.clock.step)
         self.writer.save_checkpoint(self.clock)
         if preview:
             middle = len(self.scene.train) // 2
-            frame = self.frame(middle)
+            frame = self.poses.frame(self.scene, middle)
             self.writer.save_preview(self.clock.step, self.field, self.tonemapper, frame, middle)

@@ -25,9 +25,10 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Count, Number, Rate, Share, Weight
 from hdr_nsff.core.tensors import generator_for
-from hdr_nsff.fields.base import FrameError, ParamGroup, Render
+from hdr_nsff.fields.base import FrameError, Render
 from hdr_nsff.fields.baselines.planes import Planes
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.encodings import frequencies

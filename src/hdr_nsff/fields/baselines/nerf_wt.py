@@ -23,8 +23,9 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Count, Rate, Weight
-from hdr_nsff.fields.base import ParamGroup, Render
+from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.knots import interpolate_linear
 from hdr_nsff.fields.nsff.branches import (
     DYNAMIC,

@@ -14,8 +14,8 @@ import torch
 from annotated_types import Ge, Le
 from torch import Tensor, nn
 
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Count, Number, Positive, Rate
-from hdr_nsff.fields.base import ParamGroup
 from hdr_nsff.fields.nsff.encodings import AdditiveGrid, Shape, frequencies
 
 STATIC = 5  # raw radiance (3), raw density, raw blend weight v (eq. 5)

@@ -17,9 +17,10 @@ import torch
 from pydantic import Discriminator
 from torch import Tensor, nn
 
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Count, Number, Share, Weight
 from hdr_nsff.core.tensors import generator_for
-from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE, FrameError, ParamGroup
+from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.knots import knot_of
 from hdr_nsff.fields.nsff.branches import (
     Branches,
@@ -36,6 +37,7 @@ from hdr_nsff.fields.nsff.samples import (
     ray_of,
     sample_rays,
 )
+from hdr_nsff.fields.point_cloud import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.space import Space
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import volume

@@ -12,8 +12,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.knots import interpolate_linear
+from hdr_nsff.fields.point_cloud import MAX_SIGMOID_RADIANCE
 
 MAX_LOG_RADIANCE = 16.0  # of a Gaussian: keeps its exponential and sums of it finite
 # an untrained Gaussian is tiny and invisible

@@ -16,7 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from hdr_nsff.fields.base import ParamGroup
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.fields.kernels.cuda.launch import blocks_for, launch
 from hdr_nsff.fields.kernels.cuda.layout import THREADS
 from hdr_nsff.fields.splat.config import SplatConfig

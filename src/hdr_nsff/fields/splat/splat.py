@@ -16,8 +16,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
+from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.tensors import constant, tree_map
-from hdr_nsff.fields.base import FrameError, ParamGroup, Render, Warp
+from hdr_nsff.fields.base import FrameError, Render, Warp
 from hdr_nsff.fields.knots import interpolate_linear, knot_of, time_at
 from hdr_nsff.fields.outputs import GaussianCloud, select_pixels
 from hdr_nsff.fields.splat.config import SplatConfig

@@ -1,0 +1,28 @@
+"""Fields that record their pictures themselves: two published baselines, whose camera
+acts on samples (HDR-HexPlane) or inside the network (NeRF-W).
+
+They are handed a `Recorder` from outside. What any other field records follows from its
+composited radiance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+from torch import Tensor
+
+from hdr_nsff.fields.base import RadianceField
+from hdr_nsff.geometry.cameras import Camera
+from hdr_nsff.scene.batch import Recorder
+
+
+@runtime_checkable
+class RecordingField(RadianceField, Protocol):
+    """A field whose recordings do not follow from its composited radiance."""
+
+    def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
+        """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by
+        row, without gradients; chunks itself.
+        """
+        ...
