@@ -2,6 +2,7 @@
 cameras of a rig that take turns.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import numpy as np
 import pytest
 
 from hdr_nsff.geometry.pinhole import project
+from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.scene import Frame, Scene
+from hdr_nsff.synth import oracle as synth_oracle
 from hdr_nsff.synth.motion import depth_there, exact_flow
 from hdr_nsff.synth.oracle import OracleNoise, visible, write_oracle
 from hdr_nsff.synth.scenes.geometry import back_project, intrinsics, look_at
@@ -99,6 +102,19 @@ def test_depth_and_flow_have_the_requested_noise(tmp_path: Path, noise: OracleNo
         [(n.flow[s] - e.flow[s]).numpy() for n, e in zip(noisy, exact, strict=True) for s in n.flow]
     )
     assert flow.std() == pytest.approx(noise.flow, rel=0.03)
+
+
+def test_movers_are_judged_by_their_flow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    judged = []
+
+    def judge(movers: Sequence[Mover], *arguments: object) -> Sequence[Mover]:
+        judged.append(len(movers))
+        return [replace(mover, rigid=False) for mover in movers]
+
+    monkeypatch.setattr(synth_oracle, "judge_rigidity", judge)
+    oracle(tmp_path, EXACT)
+    assert len(judged) == 1
+    assert not any(mover.rigid for mover in Scene.open(tmp_path / "oracle").movers)
 
 
 def test_the_seed_decides_the_noise(tmp_path: Path) -> None:

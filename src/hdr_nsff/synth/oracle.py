@@ -20,6 +20,7 @@ from hdr_nsff.core.exr import MOTION_DIRECTIONS
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.priors.movers.rigidity import judge_rigidity
 from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, StepRecord
@@ -121,7 +122,9 @@ def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None
     flow = read_maps(folder, [f.flow for f in files])
     valid = np.stack([read_mask(folder / f.valid) for f in files])
     confidence = np.ones_like(disparity)
-    movers = estimate_movers(clip, flow, valid, np.array(pairs), disparity, confidence)
+    links = flow, valid, np.array(pairs)
+    movers = estimate_movers(clip, *links, disparity, confidence)
+    movers = judge_rigidity(movers, clip, *links, disparity)
     write_movers(folder / "movers.npz", movers)
 
 
