@@ -9,6 +9,7 @@ from wall import S_CURVE, SRGB, wall_view
 from hdr_nsff.radiometry.debevec import DebevecTuning, Samples
 from hdr_nsff.radiometry.frame_exposures import (
     Readings,
+    drift_is_shared,
     drift_within_brackets,
     frame_log_exposures,
     read_points,
@@ -132,3 +133,18 @@ def test_points_are_read_in_their_own_frame_and_its_neighbors():
 def test_a_power_of_srgb_is_undone():
     x = np.linspace(0, 1, 2001) ** 2.2
     assert steepness_factor(x**1.5, SRGB, DebevecTuning()) == pytest.approx(1 / 1.5, rel=1e-3)
+
+
+def test_light_in_one_bracket_is_not_auto_exposure():
+    """A lamp that only the darkest bracket records unclipped fades out."""
+    drift = np.zeros(NUM)
+    drift[::3] = np.linspace(-1.5, 1.5, NUM // 3)
+    brackets = np.arange(NUM) % 3
+    assert not drift_is_shared(drift, brackets)
+    assert drift_is_shared(smooth_drift(3.0), brackets)
+    steps = drift_within_brackets(np.where(np.arange(NUM) < 10, 0.0, 1.0), brackets)
+    assert drift_is_shared(steps, brackets)  # one jump of the exposure
+    views = drifting_views(SRGB, drift, (0, 1, 2))
+    response = estimate_response(views, [0] * NUM, [None] * 3, reference=2, num_cameras=1)
+    assert response.drift is None and response.source == "static points"
+    assert "not taken for auto exposure" in describe(response, [None] * 3)

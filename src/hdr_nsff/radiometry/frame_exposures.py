@@ -50,6 +50,9 @@ class FrameExposuresTuning:
     min_readings: int = 30  # of a frame, for an exposure of its own
     # stops: drift of less than this (95 % of the frames) is none
     min_drift: float = 0.15
+    # of the drift's root mean square: by how much a frame may differ from the ones
+    # before and after it, of other brackets
+    max_disagreement: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -178,6 +181,21 @@ def drift_within_brackets(exposures: np.ndarray, brackets: np.ndarray) -> np.nda
     for bracket in np.unique(brackets):
         drift[brackets == bracket] -= drift[brackets == bracket].mean()
     return drift
+
+
+def drift_is_shared(
+    drift: np.ndarray,
+    brackets: np.ndarray,
+    tuning: FrameExposuresTuning = FrameExposuresTuning(),
+) -> bool:
+    """Whether all brackets drift together, as auto exposure makes them: a `drift` (T,)
+    of one bracket alone is that of the light in what this bracket shows.
+    """
+    if len(np.unique(brackets)) == 1 or len(drift) < 3:
+        return True
+    beside = (drift[:-2] + drift[2:]) / 2
+    disagreement = np.sqrt(np.mean((drift[1:-1] - beside) ** 2))
+    return bool(disagreement <= tuning.max_disagreement * np.sqrt(np.mean(drift**2)))
 
 
 def steepness_factor(x: np.ndarray, y: np.ndarray, tuning: DebevecTuning) -> float:

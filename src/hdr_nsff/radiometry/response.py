@@ -28,6 +28,7 @@ from hdr_nsff.radiometry.debevec import (
 )
 from hdr_nsff.radiometry.frame_exposures import (
     FrameExposuresTuning,
+    drift_is_shared,
     drift_within_brackets,
     fit_curve_and_exposures,
     frame_log_exposures,
@@ -42,6 +43,7 @@ NUM_KNOTS = 256
 LEVEL_EV = 0.4  # frames this close in exposure count as one where noise is measured
 SEED = 0  # of the choice of static points
 DRIFTING_SHARE = 0.95  # quantile of the frames that has to drift for any to count
+CHANGING_LIGHT = "light that changes in some brackets only is not taken for auto exposure"
 
 Source = Literal["static points", "brightness", "one exposure"]
 
@@ -197,6 +199,8 @@ def with_drift(
     if problem := problem_of(x, y, misfit, tuning):
         return replace(response, problem=problem)
     drift = drift_within_brackets(exposures, brackets)
+    if not drift_is_shared(drift, brackets, tuning.frames):
+        return replace(response, problem=CHANGING_LIGHT)
     level = exposures - drift  # (V,) of the frame's bracket
     found = np.zeros(len(ev))
     for bracket in np.unique(brackets):
