@@ -1,8 +1,9 @@
 """Start time-local Gaussians on the movers that are not rigid, in every training frame.
 
-One per square cell of mask pixels. Its velocity is that of the flow around it that
-lands on what moves, its radiance that of its pixel and of where believed flow leads in
-the two neighboring frames, so that a value that clipped is taken from another exposure.
+One per square cell of mask pixels. Its velocity is the median of the nearby flow that
+ends inside a moving mask. Its radiance is the mean of its pixel's and of those that
+believed flow leads to in the two neighboring frames, so that a clipped value is taken
+from another exposure.
 """
 
 from __future__ import annotations
@@ -228,12 +229,12 @@ def colors_along_flow(
 def flow_velocities(
     scene: Scene, f: Frame, mask: Tensor, positions: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Pixels (Q, 2) whose flow lands on what moves, and their velocities (Q, 3).
+    """Pixels (Q, 2) whose flow ends inside a moving mask, and their velocities (Q, 3).
 
     In scene units a frame, from the pixels' `positions` (P, 3) to where the neighbors'
-    depth puts what flow finds there; the mean of both sides. Flow need not be believed:
-    what is fast, near or blurred passes no check in both directions, and would start at
-    rest.
+    depth puts what flow finds there; the mean of both sides. Flow that fails the
+    forward-backward check counts too: that of fast, near or blurred content mostly
+    does, which would otherwise start at rest.
     """
     total = torch.zeros_like(positions)
     count = torch.zeros(len(positions))
