@@ -39,6 +39,13 @@ def test_without_a_drift_there_is_none(exposure: float) -> None:
     assert frame_white_balance(views, X, S_CURVE) is None
 
 
+@pytest.mark.parametrize("bracket", CYCLE)
+def test_a_change_that_one_bracket_shows_is_that_of_a_light(bracket: int) -> None:
+    seen = np.resize(CYCLE, NUM) == bracket
+    views = drifting_views(S_CURVE, slow_balance(0.9) * seen[:, None], CYCLE)
+    assert frame_white_balance(views, X, S_CURVE) is None
+
+
 def test_frames_in_any_order_give_the_same() -> None:
     views = drifting_views(S_CURVE, slow_balance(0.3), CYCLE)
     order = np.random.default_rng(1).permutation(NUM)

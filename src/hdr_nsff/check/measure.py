@@ -30,6 +30,7 @@ from hdr_nsff.priors.poses.matching import (
 )
 from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.priors.poses.rotation import fit_panorama, rotation_share
+from hdr_nsff.priors.poses.still_camera import still_camera_shifts
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.dropped_frames import find_cycle
 
@@ -239,7 +240,7 @@ def measure_camera(
     `scale` is the pixels of the clip per pixel of these.
     """
     cuts = find_cuts(equalized, following, tuning)
-    motion, share = find_motion(equalized, keypoints)
+    motion, share = find_motion(equalized, clipped, keypoints)
     shifts = [np.linalg.norm(pair.q - pair.p, axis=1) for pair in following if len(pair.p)]
     per_frame = float(np.median(np.concatenate(shifts))) if shifts else 0.0
     lens = None
@@ -261,13 +262,16 @@ def measure_camera(
 
 
 def find_motion(
-    equalized: np.ndarray, keypoints: list[Keypoints]
+    equalized: np.ndarray, clipped: np.ndarray, keypoints: list[Keypoints]
 ) -> tuple[CameraMotion, float | None]:
     """What the camera does, and the share of static matches that rotations explain.
 
-    As `prepare` decides it, on frames spread over the clip.
+    As `prepare` decides it, on frames spread over the clip; the share is None where
+    matches did not decide it.
     """
     tuning = PosesTuning()
+    if still_camera_shifts(equalized, clipped, tuning.still) is not None:
+        return "tripod", None
     matching, rotation = tuning.reconstruction.matching, tuning.reconstruction.rotation
     chosen = spread_frames(len(equalized), tuning.reconstruction.max_sampled_frames)
     pairs = view_pairs([list(range(len(chosen)))], matching)

@@ -3,19 +3,17 @@ other, as in the capture of HDR-NSFF: frame t is what camera t modulo N records.
 
 Such a clip jumps from frame to frame, and shows the same picture again every N frames,
 movers apart. A tripod's clip never jumps, and a moving camera's does not come back.
-Fine detail tells: what a Gaussian blur takes away, at one local contrast, correlates
-between two pictures of one still camera, also in noise and across exposures.
+Fine detail tells (`local_detail.py`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from hdr_nsff.core.stack import ArrayStack
-from hdr_nsff.radiometry.common_range import LUMA
+from hdr_nsff.radiometry.local_detail import LocalDetailTuning, local_detail
 
 
 @dataclass(frozen=True)
@@ -25,17 +23,13 @@ class TurnsTuning:
     one camera by more than 0.55 from frame to frame, or nowhere.
     """
 
-    max_width: int = 320  # pixels: larger frames are shrunk
-    blur_px: float = 1.0  # standard deviations: of noise ...
-    detail_px: float = 3.0  # ... of the blur that detail stands out from ...
-    contrast_px: float = 6.0  # ... and of the neighborhood of local contrast
-    min_contrast: float = 0.01  # of gray in [0, 1], below which detail is noise
     min_same: float = 0.45  # correlation between frames of one camera
     max_other: float = 0.4  # correlation between frames of two cameras ...
     min_ratio: float = 1.7  # ... and the ratio of both
     min_cameras: int = 3
     max_cameras: int = 64
     max_frames: int = 160  # that are looked at: the first ones
+    detail: LocalDetailTuning = field(default_factory=LocalDetailTuning)
 
 
 def find_cameras_in_turn(video: ArrayStack, tuning: TurnsTuning = TurnsTuning()) -> int:
@@ -46,7 +40,8 @@ def find_cameras_in_turn(video: ArrayStack, tuning: TurnsTuning = TurnsTuning())
     longest = min(tuning.max_cameras, count // 2)
     if longest < tuning.min_cameras:
         return 1
-    details = np.stack([local_detail(video[t], tuning).ravel() for t in range(count)])
+    details = np.stack([local_detail(video[t], tuning.detail).ravel() for t in range(count)])
+    details /= np.maximum(np.linalg.norm(details, axis=1, keepdims=True), 1e-9)
     correlation = details @ details.T
     # beyond two periods nothing new is learned
     gaps = range(1, min(2 * longest, count - 1) + 1)
@@ -65,18 +60,3 @@ def is_period(alike: dict[int, float], cameras: int, tuning: TurnsTuning = Turns
     same = min(alike[gap] for gap in gaps if gap % cameras == 0)
     other = max(alike[gap] for gap in gaps if gap % cameras)
     return same > max(tuning.min_same, tuning.min_ratio * other) and other < tuning.max_other
-
-
-def local_detail(frame: np.ndarray, tuning: TurnsTuning = TurnsTuning()) -> np.ndarray:
-    """The fine detail (h, w) of a frame (H, W, 3) in gray, at most `max_width` wide, at
-    one local contrast, of length 1.
-    """
-    gray: np.ndarray = np.asarray(frame, np.float32) @ LUMA
-    if gray.shape[1] > tuning.max_width:
-        height = round(gray.shape[0] * tuning.max_width / gray.shape[1])
-        gray = cv2.resize(gray, (tuning.max_width, height), interpolation=cv2.INTER_AREA)
-    gray = cv2.GaussianBlur(gray, (0, 0), tuning.blur_px)
-    detail = gray - cv2.GaussianBlur(gray, (0, 0), tuning.detail_px)
-    strength = np.sqrt(cv2.GaussianBlur(detail**2, (0, 0), tuning.contrast_px))
-    detail = detail / (strength + tuning.min_contrast)
-    return detail / max(float(np.linalg.norm(detail)), 1e-9)

@@ -3,8 +3,9 @@ that drifts.
 
 A static point that frames t recorded gives a log exposure per frame and channel
 (`frame_exposures.py`). What its channels have in common is exposure; the rest is white
-balance. A drift is believed only where it exceeds its own uncertainty: that by which
-two halves of the points differ.
+balance. A drift is believed only where it exceeds its own uncertainty, that by which
+two halves of the points differ, and where all brackets show it: a lamp that changes its
+color does so in the exposures that record it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from scipy.ndimage import gaussian_filter1d
 from hdr_nsff.radiometry.frame_exposures import (
     FrameExposuresTuning,
     Readings,
+    drift_is_shared,
     drift_within_brackets,
     frame_log_exposures,
     is_determined,
@@ -64,10 +66,15 @@ def frame_white_balance(
     halves = [half_of(readings, k) for k in (0, 1)]
     if not all(is_determined(half, len(views), tuning.frames) for half in halves):
         return None
-    first, second = (smooth_colors(half, x, y, brackets, tuning) for half in halves)
+    one, other = (frame_colors(half, x, y, brackets, tuning) for half in halves)
+    first, second = (smooth(half, tuning.smoothing_frames) for half in (one, other))
     drift = (first + second) / 2
     uncertainty = float(np.sqrt(np.mean((first - second) ** 2))) / 2
     if np.abs(drift).max() < max(tuning.min_drift, tuning.sigmas * uncertainty):
+        return None
+    apart = smooth_within_brackets((one + other) / 2, brackets, tuning.smoothing_frames)
+    largest = int(np.abs(drift).max(0).argmax())
+    if not drift_is_shared(apart[:, largest], brackets, tuning.frames):
         return None
     in_order = np.zeros((len(views), 3))
     in_order[ordered] = drift
@@ -88,14 +95,14 @@ def half_of(readings: Readings, half: int) -> Readings:
     )
 
 
-def smooth_colors(
+def frame_colors(
     readings: Readings,
     x: np.ndarray,
     y: np.ndarray,
     brackets: np.ndarray,
     tuning: FrameColorsTuning,
 ) -> np.ndarray:
-    """The white balance (T, 3) of frames in stops, smooth in time."""
+    """The white balance (T, 3) of frames in stops, mean 0 in every bracket."""
     samples = readings.samples
     whole = samples.valid.all(-1)  # of all channels, so that these see the same points
     channels = []
@@ -106,6 +113,19 @@ def smooth_colors(
         exposures = frame_log_exposures(own, x, y, brackets, tuning.frames)
         channels.append(drift_within_brackets(exposures, brackets))
     colors = np.stack(channels, -1)
-    colors = colors - colors.mean(1, keepdims=True)
-    smooth = gaussian_filter1d(colors, tuning.smoothing_frames, axis=0, mode="nearest")
-    return smooth - smooth.mean(0)
+    return colors - colors.mean(1, keepdims=True)
+
+
+def smooth(colors: np.ndarray, sigma: float) -> np.ndarray:
+    """White balance (T, 3) without what changes within `sigma` frames, mean 0."""
+    means = gaussian_filter1d(colors, sigma, axis=0, mode="nearest")
+    return means - means.mean(0)
+
+
+def smooth_within_brackets(colors: np.ndarray, brackets: np.ndarray, sigma: float) -> np.ndarray:
+    """White balance (T, 3), smoothed over the frames of each bracket alone."""
+    means = np.empty_like(colors)
+    for bracket in np.unique(brackets):
+        own = brackets == bracket
+        means[own] = smooth(colors[own], sigma * own.mean())
+    return means

@@ -1,8 +1,9 @@
 """Camera poses from frames alone: structure from motion on exposure-equalized frames
 with moving objects left out.
 
-Footage without parallax (tripod, pan) is recognized first and gets rotations instead
-(`rotation.py`); all other footage goes to structure from motion (`reconstruct.py`).
+Footage without parallax is recognized first: a tripod (`still_camera.py`), or a camera
+that turns in place, which gets rotations (`rotation.py`). All other footage goes to
+structure from motion (`reconstruct.py`).
 Poses are camera to world, OpenCV axes; the world's +z is the mean viewing direction,
 near is 1.
 """
@@ -49,7 +50,14 @@ from hdr_nsff.priors.poses.reconstruct import (
     spread_frames,
     views_of_images,
 )
-from hdr_nsff.priors.poses.rotation import Panorama, fit_panorama, fit_video, rotation_share
+from hdr_nsff.priors.poses.rotation import (
+    Panorama,
+    default_focal,
+    fit_panorama,
+    fit_video,
+    rotation_share,
+)
+from hdr_nsff.priors.poses.still_camera import StillCameraTuning, still_camera_shifts
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import VisitImages
 
@@ -67,6 +75,7 @@ class PosesTuning:
     # the same where structure from motion has failed (hand-chosen)
     min_rotation_share_fallback: float = 0.5
     reconstruction: ReconstructionTuning = field(default_factory=ReconstructionTuning)
+    still: StillCameraTuning = field(default_factory=StillCameraTuning)
 
 
 def estimate_poses(
@@ -107,10 +116,11 @@ def estimate_poses(
                 ignore[t] |= mask[t]
     cameras = camera_ids or [0] * count
     groups = camera_groups(cameras)
-    share = None
+    poses, share = None, None
     if len(groups) == 1 and views is None:
-        share = parallax_free_share(video, ignore, tuning)
-    poses = None
+        poses = still_poses(video, clipped, tuning, lens)
+        if poses is None:
+            share = parallax_free_share(video, ignore, tuning)
     if share is not None and share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning, lens)
     if poses is None:
@@ -245,6 +255,32 @@ def parallax_free_share(
     return share
 
 
+def still_poses(
+    video: ArrayStack,
+    clipped: ArrayStack | None,
+    tuning: PosesTuning = PosesTuning(),
+    lens: LensChoice = "none",
+) -> Poses | None:
+    """Poses of a camera that stands still, from all frames (T, H, W, 3) and where they
+    are `clipped` (T, H, W) bool; None where it moves.
+    """
+    shifts = still_camera_shifts(video, clipped, tuning.still)
+    if shifts is None:
+        return None
+    count, height, width = video.shape[:3]
+    panorama = Panorama(
+        rotations=np.tile(np.eye(3), (count, 1, 1)),
+        linked=np.ones(count, bool),
+        focal=default_focal(width, tuning.reconstruction.rotation),
+        focal_known=False,
+        slides=False,
+        explained=1.0,
+        frame_errors=np.full(count, np.median(shifts)),
+        max_displacement=0.0,
+    )
+    return panorama_poses(panorama, height, width, tuning, lens)
+
+
 def rotation_poses(
     video: ArrayStack,
     ignore: np.ndarray,
@@ -253,7 +289,6 @@ def rotation_poses(
 ) -> Poses | None:
     """Poses of a camera on a tripod or turning in place, from all frames (T, H, W, 3);
     `ignore` (T, H, W) bool. None where rotations do not explain the footage after all.
-    A given `lens` gets the focal length; none is estimated.
     """
     rotation = tuning.reconstruction.rotation
     panorama = fit_video(video, ignore, tuning.reconstruction.matching, rotation)
@@ -261,7 +296,22 @@ def rotation_poses(
         return None
     if panorama.linked.mean() < tuning.reconstruction.min_registered:
         return None
-    count, height, width = video.shape[:3]
+    height, width = video.shape[1:3]
+    return panorama_poses(panorama, height, width, tuning, lens)
+
+
+def panorama_poses(
+    panorama: Panorama,
+    height: int,
+    width: int,
+    tuning: PosesTuning = PosesTuning(),
+    lens: LensChoice = "none",
+) -> Poses:
+    """Poses of a camera without parallax. A given `lens` gets the focal length; none is
+    estimated.
+    """
+    rotation = tuning.reconstruction.rotation
+    count = len(panorama.rotations)
     still = panorama.max_displacement < rotation.max_tripod_motion_px
     c2w = np.zeros((count, 3, 4))
     c2w[:, :, :3] = np.eye(3) if still else panorama.rotations

@@ -1,0 +1,76 @@
+"""A camera that stands still is recognized, whatever moves before it."""
+
+import numpy as np
+import pytest
+from posed_clips import PLACES, H, W, panning, sliding, texture
+
+from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.still_camera import shift_of, still_camera_shifts
+from hdr_nsff.radiometry.local_detail import local_detail
+
+NUM = 12
+WALL = panning(np.zeros(1))[0]
+
+
+def noisy(video: np.ndarray) -> np.ndarray:
+    """The clip (T, H, W, 3) with a sensor's noise."""
+    noise = np.random.default_rng(0).normal(0, 0.01, video.shape)
+    return np.clip(video + noise, 0, 1).astype(np.float32)
+
+
+def behind_a_box() -> np.ndarray:
+    """A tripod's clip (NUM, H, W, 3): a textured box covers most of the picture, and
+    moves through it.
+    """
+    video = np.repeat(WALL[None], NUM, 0)
+    box = 1.5 * (texture(7, 90, 70) - 0.5) + 0.5  # more contrast than the wall
+    for t in range(NUM):
+        x, y = 2 * t, t
+        video[t, y : y + 70, x : x + 90] = box
+    return noisy(video)
+
+
+def test_a_still_camera_behind_a_mover_that_fills_the_picture(tmp_path):
+    shifts = still_camera_shifts(behind_a_box())
+    assert shifts is not None and len(shifts) == NUM and shifts.max() < 0.2
+    poses = estimate_poses(behind_a_box(), None, tmp_path)
+    assert poses.parallax == "none" and poses.registered.all()
+    assert np.array_equal(poses.c2w, np.tile(np.eye(4)[:3], (NUM, 1, 1)))
+
+
+@pytest.mark.parametrize(
+    "video",
+    [panning(np.linspace(-4, 4, NUM)), sliding(PLACES), panning(np.tile([0.0, 0.6], NUM // 2))],
+    ids=["pan", "slide", "shake of 1.6 pixels"],
+)
+def test_a_camera_that_moves_does_not_stand_still(video):
+    assert still_camera_shifts(noisy(video)) is None
+
+
+def test_clipped_pixels_are_left_out():
+    video = noisy(np.repeat(WALL[None], NUM, 0))
+    clipped = np.zeros(video.shape[:3], bool)
+    for t in range(NUM):  # every frame shows something else in a part of its own
+        part = np.s_[t, :, W // 4 * (t % 3) : W // 4 * (t % 3 + 1)]
+        video[part], clipped[part] = 0.5 + 0.5 * texture(t, W // 4, H), True
+    assert still_camera_shifts(video, clipped) is not None
+    assert still_camera_shifts(video, np.ones_like(clipped)) is None
+
+
+def test_one_color_tells_nothing():
+    assert still_camera_shifts(np.full((NUM, H, W, 3), 0.5, np.float32)) is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.2, 0.5])
+def test_a_shift_comes_back(shift):
+    x, y = np.meshgrid(np.arange(W), np.arange(H))
+    waves = lambda x: np.sin(x / 3) * np.cos(y / 4)  # noqa: E731
+    background, moved = waves(x), waves(x - shift)
+    assert shift_of(moved, background, np.ones((H, W), bool)) == pytest.approx(shift, abs=0.02)
+    assert shift_of(moved, background, np.zeros((H, W), bool)) == np.inf
+
+
+def test_detail_does_not_depend_on_contrast():
+    dim = 0.3 + 0.4 * (WALL - 0.5)
+    same = np.corrcoef(local_detail(WALL).ravel(), local_detail(dim).ravel())[0, 1]
+    assert same > 0.99
