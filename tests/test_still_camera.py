@@ -3,7 +3,13 @@
 import numpy as np
 import pytest
 from posed_clips import PLACES, H, W, panning, sliding, texture
+from test_prepare_footage import work_on
 
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.prepare.prepare import check_settings
+from hdr_nsff.prepare.steps.footage import exposure_step
+from hdr_nsff.prepare.steps.poses import find_poses
+from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.priors.poses.estimate import estimate_poses
 from hdr_nsff.priors.poses.still_camera import shift_of, still_camera_shifts
 from hdr_nsff.radiometry.local_detail import local_detail
@@ -74,3 +80,24 @@ def test_detail_does_not_depend_on_contrast():
     dim = 0.3 + 0.4 * (WALL - 0.5)
     same = np.corrcoef(local_detail(WALL).ravel(), local_detail(dim).ravel())[0, 1]
     assert same > 0.99
+
+
+def test_the_user_may_say_that_the_camera_stood_still(tmp_path):
+    video = np.full((6, 24, 32, 3), 0.5, np.float32)  # nothing that could be matched
+    work = work_on(tmp_path, video, tripod=True, ev="0,2")
+    exposure_step(work)
+    found = find_poses(work)
+    assert found.note == "6 of 6 frames placed, parallax: none"
+    assert all(np.array_equal(c2w, np.eye(4)[:3]) for c2w in found.frames["c2w"].values())
+
+
+def test_a_tripod_holds_one_camera(tmp_path):
+    work = work_on(tmp_path, np.full((6, 24, 32, 3), 0.5, np.float32), tripod=True, rig=3)
+    exposure_step(work)
+    with pytest.raises(InputError, match="--tripod is for one camera"):
+        find_poses(work)
+
+
+def test_a_tripod_with_poses_is_refused(tmp_path):
+    with pytest.raises(InputError, match="--tripod and --poses both given"):
+        check_settings(PrepareConfig(tmp_path, tmp_path / "out", poses=tmp_path, tripod=True))

@@ -15,8 +15,9 @@ from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens
 
 ADVICE = (
-    "film with the camera moving sideways past textured, static surfaces, give masks of the "
-    "moving objects (--mask FOLDER), or import poses (--poses FOLDER or FILE)"
+    "film with the camera moving sideways past textured, static surfaces, say `--tripod` if "
+    "it stood still, give masks of the moving objects (--mask FOLDER), or import poses "
+    "(--poses FOLDER or FILE)"
 )
 # share of frames with poses of their own below which poses have failed (hand-chosen)
 MIN_REGISTERED_SHARE = 0.6

@@ -154,6 +154,8 @@ def check_settings(config: PrepareConfig) -> None:
     parse_lens(config.lens_distortion)
     if config.rig is not None and config.rig < 1:
         raise InputError(f"--rig {config.rig}: give the number of cameras, or 1 for one camera")
+    if config.tripod and config.poses is not None:
+        raise InputError("--tripod and --poses both given; leave one out")
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "

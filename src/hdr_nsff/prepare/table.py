@@ -64,7 +64,7 @@ STEPS: dict[StepName, Step] = {
     "poses": Step(
         find_poses,
         needs=("flow",),
-        settings=("poses", "masks", "matcher"),
+        settings=("poses", "masks", "matcher", "tripod"),
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),

@@ -107,6 +107,10 @@ class PrepareConfig:
     """Given poses (COLMAP model folder, transforms.json, poses_bounds.npy) instead of
     structure from motion.
     """
+    tripod: bool = False
+    """The camera stood still: no poses are estimated, and there is no depth. Default:
+    found.
+    """
     lens_distortion: str = "auto"
     """Radial distortion of the lens. auto: estimated, and left at none where the clip
     does not show any; none: a pinhole camera; K1 or K1,K2: as OpenCV has them, such as

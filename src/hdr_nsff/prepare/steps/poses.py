@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import pick_device
@@ -19,7 +20,12 @@ from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.tracks import best_track, share_masks, share_poses, track_frames
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
-from hdr_nsff.priors.poses.estimate import estimate_poses, rig_views
+from hdr_nsff.priors.poses.estimate import (
+    estimate_poses,
+    panorama_poses,
+    rig_views,
+    still_panorama,
+)
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import choose_visits
 
@@ -43,6 +49,8 @@ def find_poses(work: Work) -> StepResult:
         size, sources = (m.height, m.width), [f.source for f in m.frames if not f.track]
         poses = import_poses(c.poses, sources, size, lens_of_clip(work))
         poses = share_poses(work, poses, track=0)
+    elif c.tripod:
+        poses = tripod_poses(work)
     elif isinstance(c.masks, Path) or work.capture_with("masks") is not None:
         poses, given = estimate(work, given_masks(work)), False
     else:
@@ -81,6 +89,20 @@ def data_set_poses(work: Work) -> Poses:
     size = (m.height, m.width)
     poses = fit_poses(capture.root, capture.poses, rows, size, lens_of_clip(work))
     return poses if capture.points is None else replace(poses, points=capture.points)
+
+
+def tripod_poses(work: Work) -> Poses:
+    """One pose for all frames, with the default focal length."""
+    m = work.manifest
+    if m.num_cameras > 1 or m.rig > 1:
+        raise InputError(
+            "--tripod is for one camera; leave it out: the poses of several are estimated"
+        )
+    panorama = still_panorama(len(m.frames), m.width)
+    poses = panorama_poses(panorama, m.height, m.width, lens=lens_to_find(work))
+    if poses.lenses:
+        raise DistortedFramesError(poses.lenses)
+    return poses
 
 
 def lens_of_clip(work: Work) -> Lens | None:

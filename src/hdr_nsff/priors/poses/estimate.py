@@ -268,17 +268,24 @@ def still_poses(
     if shifts is None:
         return None
     count, height, width = video.shape[:3]
-    panorama = Panorama(
+    panorama = still_panorama(count, width, float(np.median(shifts)), tuning)
+    return panorama_poses(panorama, height, width, tuning, lens)
+
+
+def still_panorama(
+    count: int, width: int, error_px: float = 0.0, tuning: PosesTuning = PosesTuning()
+) -> Panorama:
+    """`count` frames of a camera that stands still, `width` pixels wide."""
+    return Panorama(
         rotations=np.tile(np.eye(3), (count, 1, 1)),
         linked=np.ones(count, bool),
         focal=default_focal(width, tuning.reconstruction.rotation),
         focal_known=False,
         slides=False,
         explained=1.0,
-        frame_errors=np.full(count, np.median(shifts)),
+        frame_errors=np.full(count, error_px),
         max_displacement=0.0,
     )
-    return panorama_poses(panorama, height, width, tuning, lens)
 
 
 def rotation_poses(
