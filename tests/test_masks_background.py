@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hdr_nsff.priors.masks.background import correct_by_background
+from hdr_nsff.priors.masks.background import BackgroundTuning, correct_by_background
 
 T, H, W = 12, 40, 60
 BODY = np.s_[10:34, 20:34]
@@ -58,9 +58,33 @@ def test_a_body_that_flow_marked_once_is_followed_through_time():
     assert not corrected[[0, 1, 2, 3, 9, 10, 11]].any()
 
 
-def test_what_flow_has_not_marked_stays_static():
+def test_a_solid_body_needs_no_mark_before_a_still_camera():
     nothing = np.zeros((T, H, W), bool)
-    assert not correct_by_background(nothing, clip(), ONE_GROUP, ALL, K, STILL).any()
+    corrected = correct_by_background(nothing, clip(), ONE_GROUP, ALL, K, STILL)
+    assert corrected[5][BODY].mean() > 0.95
+    assert not corrected[np.arange(T) != 5].any()
+    turning = STILL.copy()
+    turning[0, :, :3] = Rotation.from_euler("y", 0.01).as_matrix()
+    assert not correct_by_background(nothing, clip(), ONE_GROUP, ALL, K, turning).any()
+
+
+def test_thin_changes_need_a_mark():
+    video = clip()
+    video[5] = video[4]
+    for row in (6, 18, 30):  # of branches in the wind
+        video[5, row : row + 3, 10:50] = 0.05
+    nothing, tuning = np.zeros((T, H, W), bool), BackgroundTuning(solid_radius_share=0.1)
+    assert not correct_by_background(nothing, video, ONE_GROUP, ALL, K, STILL, tuning).any()
+    corrected = correct_by_background(nothing, clip(), ONE_GROUP, ALL, K, STILL, tuning)
+    assert corrected[5][BODY].mean() > 0.95
+
+
+def test_a_faint_change_needs_a_mark():
+    video = clip()
+    video[5] = video[4]
+    video[5][BODY] -= 0.08
+    nothing = np.zeros((T, H, W), bool)
+    assert not correct_by_background(nothing, video, ONE_GROUP, ALL, K, STILL).any()
 
 
 def test_frames_of_other_exposures_show_no_background():

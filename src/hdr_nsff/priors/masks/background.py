@@ -5,8 +5,9 @@ and crosses the picture within a few frames; around outlines and in clipped sky 
 motion where there is none. A camera without parallax shows the background behind movers
 at other times: the median of what frames of the same exposure recorded there. A region
 that differs from it joins the mask where flow has marked part of it, there or in the
-frames before; so clouds and leaves stay static. Marked pixels without a trace of
-difference around them leave it.
+frames before, so clouds and leaves stay static. Before a camera that stands still, what
+differs much and is solid joins without a mark: a hand that enters within a frame.
+Marked pixels without a trace of difference around them leave the mask.
 """
 
 from __future__ import annotations
@@ -44,6 +45,13 @@ class BackgroundTuning:
     """Standard deviations of the background's own changes that it must also exceed."""
     min_marked_share: float = 0.2
     """Share of a region that flow must have marked."""
+    solid_difference: float = 0.1
+    """Of recorded values in [0, 1]: a pixel differs much beyond this and twice the
+    `deviations`."""
+    solid_share: float = 0.5
+    """Share of a region that must differ much to join without a mark, ..."""
+    solid_radius_share: float = 0.03
+    """... and radius of a disc in it that does, of the picture's height."""
     min_trace: float = 0.02
     """Of recorded values in [0, 1]; below, nothing hints at a mover."""
     trace_deviations: float = 3.0
@@ -101,7 +109,11 @@ def correct_by_background(
         if difference.certain.mean() <= tuning.max_share:
             differences[t] = difference
 
-    grown = grow_masks(masks, differences, sources, tuning.min_marked_share)
+    marked = list(masks)
+    if np.allclose(c2w, c2w[0]):
+        for t, difference in differences.items():
+            marked[t] = masks[t] | difference.solid
+    grown = grow_masks(marked, differences, sources, tuning.min_marked_share)
     reach = max(1, round(tuning.trace_reach_share * size[1]))
     corrected = moving.copy()
     for t, difference in differences.items():
@@ -196,6 +208,7 @@ class Difference:
     """Where a frame differs from the background, (H, W) bool."""
 
     certain: np.ndarray
+    solid: np.ndarray  # regions of it that differ much
     possible: np.ndarray  # at least a hint, or the background is not known
 
 
@@ -215,7 +228,11 @@ def compare(frame: np.ndarray, samples: np.ndarray, tuning: BackgroundTuning) ->
     closing = np.ones((tuning.closing_px,) * 2, np.uint8)
     opened = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, opening)
     certain = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, closing) > 0
-    return Difference(certain, (difference > hint).any(-1) | ~known)
+    much = np.maximum(tuning.solid_difference, 2 * tuning.deviations * deviation)
+    differs_much = (difference > much).any(-1) & known
+    solid = marked_regions(certain, differs_much, tuning.solid_share)
+    solid &= regions_with_disc(certain, differs_much, tuning.solid_radius_share * len(frame))
+    return Difference(certain, solid, (difference > hint).any(-1) | ~known)
 
 
 def known_median(samples: np.ndarray, count: np.ndarray) -> np.ndarray:
@@ -245,3 +262,12 @@ def marked_regions(differs: np.ndarray, marked: np.ndarray, min_share: float) ->
     kept = marked_pixels >= min_share * pixels
     kept[0] = False  # what does not differ
     return kept[labels]
+
+
+def regions_with_disc(differs: np.ndarray, much: np.ndarray, radius: float) -> np.ndarray:
+    """The connected regions (H, W) of `differs` with a disc of `radius` pixels that is
+    all `much` (H, W).
+    """
+    _, labels = cv2.connectedComponents(differs.astype(np.uint8))
+    inside = cv2.distanceTransform((much & differs).astype(np.uint8), cv2.DIST_L2, 3)
+    return np.isin(labels, np.unique(labels[inside > radius]))
