@@ -18,6 +18,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
 from hdr_nsff.footage.timestamps import frame_gaps
 from hdr_nsff.priors.poses.estimate import PosesTuning
@@ -50,11 +51,6 @@ class CheckTuning:
     max_band_shift: float = 1.0
     edge_blur_px: float = 1.2  # keeps noise out of edges
     edge_share: float = 0.1  # of pixels: the strongest edges are compared
-    # a cut: equalized thumbnails correlate less than this, and fewer points match than
-    # this share of the median
-    cut_correlation: float = 0.4
-    cut_matches: float = 0.1
-    thumbnail: tuple[int, int] = (48, 27)
     min_band_cycles: int = 2  # of bands in a picture's height
     max_band_cycles: int = 24
     # share of the power of row changes in one frequency, above which they are bands
@@ -239,7 +235,7 @@ def measure_camera(
 
     `scale` is the pixels of the clip per pixel of these.
     """
-    cuts = find_cuts(equalized, following, tuning)
+    cuts = find_cuts(equalized)
     motion, share = find_motion(equalized, clipped, keypoints)
     shifts = [np.linalg.norm(pair.q - pair.p, axis=1) for pair in following if len(pair.p)]
     per_frame = float(np.median(np.concatenate(shifts))) if shifts else 0.0
@@ -287,22 +283,6 @@ def find_motion(
         return "parallax", share
     still = panorama.max_displacement < rotation.max_tripod_motion_px
     return ("tripod" if still else "rotation"), share
-
-
-def find_cuts(
-    equalized: np.ndarray, following: list[PairMatches], tuning: CheckTuning
-) -> list[int]:
-    """Frames that neither look like the one before nor share points with it."""
-    small = [cv2.resize(f, tuning.thumbnail, interpolation=cv2.INTER_AREA) for f in equalized]
-    usual = float(np.median([len(pair.p) for pair in following]))
-    cuts = []
-    for pair in following:
-        a, b = (small[t] - small[t].mean((0, 1)) for t in (pair.i, pair.j))
-        correlation = float((a * b).sum() / max(np.sqrt((a**2).sum() * (b**2).sum()), 1e-9))
-        few = len(pair.p) < tuning.cut_matches * usual
-        if few and correlation < tuning.cut_correlation:
-            cuts.append(pair.j)
-    return cuts
 
 
 def compare_sharpness(
