@@ -1,5 +1,6 @@
 """The white balance of single frames comes back from a wall in closed form."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -43,6 +44,17 @@ def test_without_a_drift_there_is_none(exposure: float) -> None:
 def test_a_change_that_one_bracket_shows_is_that_of_a_light(bracket: int) -> None:
     seen = np.resize(CYCLE, NUM) == bracket
     views = drifting_views(S_CURVE, slow_balance(0.9) * seen[:, None], CYCLE)
+    assert frame_white_balance(views, X, S_CURVE) is None
+
+
+@pytest.mark.parametrize("part", [np.s_[:, :32], np.s_[:24]], ids=["left", "top"])
+def test_a_change_in_a_part_of_the_picture_is_that_of_a_light(part: tuple[slice, ...]) -> None:
+    lit = drifting_views(S_CURVE, slow_balance(0.9), CYCLE)
+    views = []
+    for view, of_lit in zip(drifting_views(S_CURVE, 0 * slow_balance(0), CYCLE), lit, strict=True):
+        image = view.image.copy()
+        image[part] = of_lit.image[part]
+        views.append(replace(view, image=image))
     assert frame_white_balance(views, X, S_CURVE) is None
 
 

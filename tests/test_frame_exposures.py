@@ -112,7 +112,7 @@ def test_exposures_are_the_offsets_between_readings():
     rgb = np.random.default_rng(0).uniform(0.1, 0.4, (200, 1, 3)) * [[[1.0]], [[2.0]]][1]
     rgb = np.concatenate([rgb / 2, rgb], 1)
     samples = Samples(rgb, np.ones(rgb.shape, bool), np.zeros(rgb.shape, bool))
-    readings = Readings(samples, np.tile([0, 1], (200, 1)))
+    readings = Readings(samples, np.tile([0, 1], (200, 1)), np.zeros((200, 2)))
     x = np.linspace(0, 1, 9)
     found = frame_log_exposures(readings, x, np.tile(x, (3, 1)), np.zeros(2, int))
     np.testing.assert_allclose(found, [-0.5, 0.5], atol=1e-3)

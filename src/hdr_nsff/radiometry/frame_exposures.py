@@ -61,6 +61,7 @@ class Readings:
 
     samples: Samples  # (P, K, 3): one slot per frame that a point is read in
     frame: np.ndarray  # (P, K) position of that frame
+    place: np.ndarray  # (P, 2) x, y in the frame that it is of, in [0, 1]
 
 
 def read_points(
@@ -73,7 +74,7 @@ def read_points(
     points = points or StaticSamplesTuning()
     patches = LazyList(lambda k: view_patches(views[k], points), len(views), KEPT_PATCHES)
     per_view = max(1, tuning.num_samples // len(views))
-    parts, frames = [], []
+    parts, frames, places = [], [], []
     for source, view in enumerate(track(views, "response: exposures", len(views))):
         pixels = spread_over_levels(view.image, patches[source].good, per_view, rng, points)
         depth = 1 / np.maximum(view.disparity[pixels[:, 1], pixels[:, 0]], 1e-9)
@@ -86,6 +87,8 @@ def read_points(
                 enter_readings(samples, slot, patches[other], *seen)
         parts.append(samples)
         frames.append(np.tile(np.clip(others, 0, len(views) - 1), (len(world), 1)))
+        height, width = view.image.shape[:2]
+        places.append((pixels + 0.5) / [width, height])
     return Readings(
         Samples(
             np.concatenate([p.rgb for p in parts]),
@@ -93,6 +96,7 @@ def read_points(
             np.concatenate([p.saturated for p in parts]),
         ),
         np.concatenate(frames),
+        np.concatenate(places),
     )
 
 
