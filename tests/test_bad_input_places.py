@@ -25,6 +25,8 @@ from toy_scene import ToyScene
 
 from hdr_nsff.core.io import write_text
 from hdr_nsff.core.lock import absolute, acquire, release
+from hdr_nsff.prepare.prepare import truth_place
+from hdr_nsff.prepare.work import PrepareConfig
 
 
 def test_there_is_a_command_of_every_verb_to_try() -> None:
@@ -99,6 +101,24 @@ def test_a_place_that_is_a_link_to_itself_is_named(
     out.symlink_to(out)
     footage = clip(tmp_path / "clip", recorded(3))
     assert "loop" in refused(capsys, *commands(run_folder, footage, out)[verb])
+
+
+def test_the_folder_at_hand_may_hold_a_scene(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for place in (".", "", "../here", ".."):
+        assert truth_place(PrepareConfig(tmp_path, Path(place))).name.endswith("_truth")
+    assert "name a folder" in refused(capsys, "prepare", clip(tmp_path / "clip"), "/")
+
+
+def test_a_picture_of_check_replaces_no_frame(tmp_path: Path, capsys: Capture) -> None:
+    footage = clip(tmp_path / "clip")
+    before = snapshot(footage)
+    sentence = refused(capsys, "check", footage, "--picture", footage / "000.png")
+    assert "is part of the clip" in sentence
+    assert snapshot(footage) == before
 
 
 # Two at once: `report` and `check` write one file in one go and need no lock

@@ -337,3 +337,9 @@ def test_ctrl_c_while_training_keeps_the_last_checkpoint(toy_folder: Path, tmp_p
     assert process.returncode == 130
     assert "Traceback" not in error and "the same command continues" in error
     assert 0 < Run.open(tmp_path / "run").step < 100_000
+
+
+def test_ctrl_c_inside_a_library_that_wraps_it_exits_with_130(act: Act, capsys: Capture) -> None:
+    act(raising(ValueError("Field '4':\n  KeyboardInterrupt:")))
+    assert call("evaluate", "run") == 130
+    assert "the same command continues" in one_sentence(capsys.readouterr().err)

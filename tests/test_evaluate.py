@@ -119,6 +119,9 @@ def test_metrics_and_pictures_are_written_and_a_restart_renders_nothing(tmp_path
     before = field_of(run).calls
     again = evaluate_run(run, truth)
     assert field_of(run).calls == before and again["headline"] == result["headline"]
+    (run.folder / "evaluation/a.exr").write_bytes(b"cut short")
+    repaired = evaluate_run(run, truth)
+    assert field_of(run).calls > before and repaired["headline"] == result["headline"]
 
 
 def test_a_scale_of_the_radiance_is_aligned_and_reported(tmp_path: Path) -> None:

@@ -74,6 +74,14 @@ def test_a_drift_below_its_uncertainty_is_none() -> None:
     assert frame_white_balance(views[:4], X, S_CURVE) is None
 
 
+def test_without_points_there_is_none() -> None:
+    views = [
+        replace(v, moving=np.ones(v.image.shape[:2], bool))
+        for v in drifting_views(S_CURVE, smooth_drift(0), CYCLE)
+    ]
+    assert frame_white_balance(views, X, S_CURVE) is None
+
+
 def test_held_out_frames_lie_between_their_neighbors() -> None:
     train = [FrameEntry(index=i, time=i, bracket=0, image="", source="") for i in (0, 2, 3)]
     test = FrameEntry(index=1, time=1, bracket=0, image="", source="", split="test")

@@ -51,6 +51,19 @@ def test_exposures_of_other_frames_are_not_taken(track: list[bytes]) -> None:
     assert gpmf.read_gopro_ev(Path("clip.mp4"), 4) is None
 
 
+@pytest.mark.parametrize("seconds", [np.nan, np.inf, 0.0])
+def test_impossible_exposures_are_not_taken(track: list[bytes], seconds: float) -> None:
+    track[:] = [packet([0.01, seconds, 0.01, 0.01], [100] * 4)]
+    assert gpmf.read_gopro_ev(Path("clip.mp4"), 4) is None
+
+
+def test_entries_are_read_to_a_depth_that_cameras_write() -> None:
+    content = packet([0.01], [100])
+    for _ in range(2000):
+        content = entry(b"DEVC", b"\0", 1, content) if len(content) < 60_000 else content
+    assert list(gpmf.entries(content)) == []
+
+
 @given(st.binary(max_size=200), st.integers(0, 80))
 def test_damaged_tracks_end_and_do_not_raise(noise: bytes, cut: int) -> None:
     whole = packet([0.01] * 3, [100] * 3)

@@ -85,6 +85,15 @@ def test_cameras_of_a_rig_need_the_same_number_of_frames(tmp_path):
         open_footage(tmp_path)
 
 
+def test_a_scene_folder_among_the_cameras_is_none_of_them(tmp_path):
+    for camera in ("a", "b"):
+        for t in range(3):
+            write_png(tmp_path / f"{camera}/{t}.png", np.zeros((16, 16, 3)))
+    write_png(tmp_path / "out/contact_sheet.png", np.zeros((16, 16, 3)))
+    (tmp_path / "out/scene.json").write_text("{}")
+    assert len(open_footage(tmp_path).cameras) == 2
+
+
 def test_a_folder_of_videos_is_a_rig(tmp_path):
     for name, value in (("cam10.mp4", 0.6), ("cam2.mp4", 0.3)):
         write_video(tmp_path / name, [picture(value)] * 4, fps=12)

@@ -54,7 +54,7 @@ def test_exposures_beyond_all_light_are_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "clip").mkdir()
     (tmp_path / "clip/exposures.csv").write_text(f"file,exposure\n{rows}")
     work = work_on(tmp_path, clip([-2, 0, 2], frames=12))
-    with pytest.raises(InputError, match=r"exposures\.csv: bracket_ev holds"):
+    with pytest.raises(InputError, match=r"exposures\.csv, line 3: -100 stops"):
         exposure_step(work)
 
 
@@ -83,3 +83,13 @@ def test_a_listed_alternation_with_drift_on_top_keeps_its_brackets(tmp_path: Pat
     assert [f.bracket for f in frames] == [0, 1] * 10
     found = [work.manifest.bracket_ev[f.bracket] + f.drift for f in frames]
     np.testing.assert_allclose(np.diff(found), np.diff(ev), atol=1e-9)
+
+
+def test_a_mask_of_another_size_is_named_with_the_way_out(tmp_path: Path) -> None:
+    work = work_on(tmp_path, np.full((6, 24, 32, 3), 0.5, np.float32), ev="0,2")
+    exposure_step(work)
+    for f in work.manifest.frames:
+        f.mask = f"masks/{f.index}.png"
+        write_png(work.folder / f.mask, np.zeros((24, 32 + (f.index == 4), 3)))
+    with pytest.raises(InputError, match=r"4\.png: the mask is 33x24, the frames are 32x24.*redo"):
+        _ = work.masks

@@ -7,6 +7,8 @@ import pytest
 import torch
 from presets import random_field, small, trainer
 
+from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.settings import with_changes
 from hdr_nsff.fields.build import build_field, initialize_field
 from hdr_nsff.fields.point_cloud import MAX_SIGMOID_RADIANCE
 from hdr_nsff.fields.splat.config import SplatConfig
@@ -178,3 +180,22 @@ def test_ablations_train(name: str, toy: Scene, toy_folder: Path, tmp_path: Path
     for _ in range(2):
         assert all(v == v for v in t.step().values())
         t.clock = replace(t.clock, step=t.clock.step + 1)
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        ("field.encoding.max_rows=1000000", "choose a power of two"),
+        ("field.samples=1", "choose a number from 2"),
+        ("tonemap.min_step=1", "choose a number below 1"),
+        ("field.no_such_key=1", "like --set schedule.lr_final=0.1"),
+    ],
+)
+def test_a_setting_out_of_bounds_is_refused_in_a_sentence(change: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        with_changes(PRESETS["grid"], (change,))
+
+
+def test_the_example_of_a_setting_exists_in_every_preset() -> None:
+    for settings in PRESETS.values():
+        assert with_changes(settings, ("schedule.lr_final=0.1",)).schedule.lr_final == 0.1

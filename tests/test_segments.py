@@ -190,6 +190,7 @@ def test_every_cut_covers_the_clip_and_ends_in_training_frames(config, seconds, 
     [
         ({"segment": 0.1}, "at least 0.5 seconds"),
         ({"segment": -1.0}, "give the seconds of a segment"),
+        ({"segment": 1e308}, "give the seconds of a segment"),
         ({"mask_points": Path("points.json")}, "--mask-points"),
     ],
 )

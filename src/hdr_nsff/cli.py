@@ -186,8 +186,17 @@ def run_verb(name: str, verb: Verb, options: list[str]) -> None:
     except InputError as error:
         fail(str(error))
     except KeyboardInterrupt:
-        print("hdr-nsff: stopped; the same command continues where it was", file=sys.stderr)
-        raise SystemExit(INTERRUPTED) from None
+        stop()
+    except Exception as error:
+        if "KeyboardInterrupt" not in str(error):  # pydantic's core wraps one in its own
+            raise
+        stop()
+
+
+def stop() -> NoReturn:
+    """Say that Ctrl-C was heard, and exit."""
+    print("hdr-nsff: stopped; the same command continues where it was", file=sys.stderr)
+    raise SystemExit(INTERRUPTED) from None
 
 
 def load(place: str) -> Any:

@@ -41,7 +41,7 @@ class CheckConfig:
 def check(config: CheckConfig) -> Path:
     """The verb: the picture that was written."""
     picture = config.picture or Path(f"{config.clip.resolve().stem}_check.png")
-    check_place(picture)
+    check_place(picture, config.clip)
     facts, video, brackets = measure_clip(config.clip)
     findings, works = judge(facts), outlook(facts)
     with writing_to(picture):
@@ -61,8 +61,12 @@ def check(config: CheckConfig) -> Path:
     return picture
 
 
-def check_place(picture: Path) -> None:
-    """InputError where the picture is none, or would replace something else."""
+def check_place(picture: Path, clip: Path) -> None:
+    """InputError where the picture is none, or would replace something else, such as a
+    frame of the clip.
+    """
+    if picture.exists() and picture.resolve().is_relative_to(clip.resolve()):
+        raise InputError(f"--picture {picture}: is part of the clip; name another file")
     if picture.suffix.lower() != ".png":
         raise InputError(f"--picture {picture}: give a name that ends in .png")
     if picture.is_dir():

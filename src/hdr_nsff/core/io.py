@@ -228,6 +228,31 @@ def read_npy(path: Path | str) -> np.ndarray:
         return map_npy(path)
     except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
-            f"{path}: not a readable .npy array ({shorten(error)}); "
-            "run `hdr-nsff prepare` with `--redo`"
+            f"{path}: not a readable .npy array ({shorten(error)}); {how_to_get_back(path)}"
         ) from error
+
+
+# folders of a scene folder, by the step of `prepare` that fills them
+FOLDER_STEPS = {
+    "images": "frames",
+    "raw_flow": "flow",
+    "poses": "poses",
+    "masks": "masks",
+    "static_disparity": "static_depth",
+    "static_confidence": "static_depth",
+    "still": "static_depth",
+    "refined_flow": "refined_flow",
+    "mover_disparity": "movers",
+    "mover_confidence": "movers",
+    "disparity": "depth",
+    "disparity_confidence": "depth",
+}
+
+
+def how_to_get_back(path: Path | str) -> str:
+    """What mends a damaged file: the step that made it, in a scene folder."""
+    folder = Path(path).parent
+    step = FOLDER_STEPS.get(folder.name)
+    if step is None or not (folder.parent / "scene.json").is_file():
+        return "copy it again"
+    return f"run `hdr-nsff prepare` with `--redo {step}`"

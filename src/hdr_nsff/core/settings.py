@@ -82,6 +82,10 @@ def explain(error: ErrorDetails, command: str) -> str:
             return f"{option} {shown}: choose a number above {context['gt']:g}"
         case "less_than_equal":
             return f"{option} {shown}: choose a number up to {context['le']:g}"
+        case "less_than":
+            return f"{option} {shown}: choose a number below {context['lt']:g}"
+        case "value_error":
+            return f"{option} {shown}: {context['error']}"
         case "missing":
             return f"{option}: missing"
     explained = f"; `{command}` lists what there is" if command else ""
@@ -104,7 +108,7 @@ def with_changes(settings: T, changes: tuple[str, ...], command: str = "") -> T:
         if not equals or not isinstance(place, dict) or last not in place:
             raise InputError(
                 f"--set {change[:MAX_SHOWN]!r}: not KEY=VALUE with a key of config.json, "
-                "like --set field.lr=0.5"
+                "like --set schedule.lr_final=0.1"
             )
         try:
             place[last] = json.loads(text)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS, read_exr, write_exr
 from hdr_nsff.core.io import write_text
 from hdr_nsff.core.progress import track
@@ -55,9 +56,17 @@ def predict(
         write_text(path, key)
     files = {name: folder / f"{name}.exr" for name in views}
     for name, view in track(list(views.items()), description):
-        if not files[name].exists():
+        if not is_readable(files[name]):
             write_exr(files[name], render_maps(run, view, motion), half=False)
     return list(files.values())
+
+
+def is_readable(path: Path) -> bool:
+    """Whether there is a prediction that is not damaged."""
+    try:
+        return bool(read_exr(path))
+    except InputError:
+        return False
 
 
 def render_maps(run: Run, view: PathView, motion: bool) -> dict[str, np.ndarray]:

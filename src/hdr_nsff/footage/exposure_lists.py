@@ -98,6 +98,10 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
             if name == "frame":
                 key = f"#{key}"
             rows[key] = sum(ev_of_cell(column, row[column], where) for column in values)
+            if abs(rows[key]) > MAX_EV:
+                raise InputError(
+                    f"{where}: {rows[key]:.0f} stops from one second at ISO 100; correct it"
+                )
     except csv.Error as error:
         line = reader.line_num + 1
         raise InputError(

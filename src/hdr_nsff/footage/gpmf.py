@@ -18,6 +18,7 @@ NESTED = 0  # the type of an entry that holds entries
 TYPES = {b"f": ">f4", b"S": ">u2", b"L": ">u4", b"s": ">i2", b"l": ">i4"}
 # of frames, by which their number may differ from that of the written exposures
 MAX_MISSING_SHARE = 0.02
+MAX_DEPTH = 16  # of entries in entries: cameras write four
 
 
 def read_gopro_ev(path: Path, num_frames: int) -> np.ndarray | None:
@@ -33,9 +34,9 @@ def read_gopro_ev(path: Path, num_frames: int) -> np.ndarray | None:
                 seconds += values.tolist()
             elif key == b"ISOE":
                 iso += values.tolist()
-    if not seconds or min(seconds) <= 0:
+    if not seconds or not all(0 < value < np.inf for value in seconds):
         return None
-    if len(iso) != len(seconds) or min(iso) <= 0:
+    if len(iso) != len(seconds) or not all(0 < value < np.inf for value in iso):
         iso = [100.0] * len(seconds)
     if abs(len(seconds) - num_frames) > max(1, MAX_MISSING_SHARE * num_frames):
         return None
@@ -57,8 +58,8 @@ def metadata_packets(path: Path) -> Iterator[bytes]:
         return  # the frames were read: whatever is wrong with this track, they count
 
 
-def entries(data: bytes) -> Iterator[tuple[bytes, np.ndarray]]:
-    """Keys and values of all entries of numbers in a packet, however nested.
+def entries(data: bytes, depth: int = 0) -> Iterator[tuple[bytes, np.ndarray]]:
+    """Keys and values of all entries of numbers in a packet, nested up to `MAX_DEPTH`.
 
     An entry that is cut short, as in a damaged file, ends its level.
     """
@@ -70,7 +71,8 @@ def entries(data: bytes) -> Iterator[tuple[bytes, np.ndarray]]:
         if len(content) < size:
             return
         if kind[0] == NESTED:
-            yield from entries(content)
+            if depth < MAX_DEPTH:
+                yield from entries(content, depth + 1)
         elif kind in TYPES and size % np.dtype(TYPES[kind]).itemsize == 0:
             yield key, np.frombuffer(content, TYPES[kind]).astype(np.float64)
         start += HEADER_BYTES + -(-size // 4) * 4

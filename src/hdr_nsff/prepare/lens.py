@@ -22,6 +22,7 @@ from hdr_nsff.priors.poses.lens import LensChoice
 from hdr_nsff.scene.manifest import LensEntry, Manifest
 
 MAX_K = 10.0  # no lens has more: beyond it, a number is a mistake
+LENS_ADVICE = "write auto, none, K1, or K1,K2, such as -0.2,0.03, or the file of a calibration"
 
 
 class DistortedFramesError(Exception):
@@ -41,16 +42,19 @@ def parse_lens(text: str) -> LensChoice | Path:
     if text == "none":
         return "none"
     try:
-        k1, k2, *more = [float(word) for word in f"{text},0".split(",")]
+        numbers = [float(word) for word in text.split(",")]
     except ValueError:
         if text and Path(text).exists():
             return Path(text)
-        more = [0.0, 0.0]
-    if len(more) > 1 or not abs(k1) + abs(k2) < MAX_K:
         raise InputError(
-            f"--lens-distortion {shorten(text)!r}: no such file; write auto, none, K1, or K1,K2, "
-            "such as -0.2,0.03, or the file of a calibration"
+            f"--lens-distortion {shorten(text)!r}: no such file; {LENS_ADVICE}"
+        ) from None
+    if len(numbers) > 2 or not sum(map(abs, numbers)) < MAX_K:
+        raise InputError(
+            f"--lens-distortion {shorten(text)!r}: one or two numbers, whose sizes add up to less "
+            f"than {MAX_K:g}; {LENS_ADVICE}"
         )
+    k1, k2, *_ = [*numbers, 0.0]
     return (k1, k2)
 
 

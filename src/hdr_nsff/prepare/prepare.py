@@ -67,7 +67,12 @@ def prepare_scenes(config: PrepareConfig) -> list[Path]:
 
 def truth_place(config: PrepareConfig) -> Path:
     """Where the held-out views of a public data set go."""
-    return config.truth_out or config.out.with_name(f"{config.out.name}_truth")
+    if config.truth_out is not None:
+        return config.truth_out
+    out = config.out if config.out.name not in ("", "..") else config.out.resolve()
+    if not out.name:
+        raise InputError(f"{config.out}: no place for a scene; name a folder")
+    return out.with_name(f"{out.name}_truth")
 
 
 def held_out_truth(config: PrepareConfig) -> Path | None:

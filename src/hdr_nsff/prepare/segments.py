@@ -35,6 +35,7 @@ from hdr_nsff.prepare.work import PrepareConfig, Segment, StepName, Work
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 
 CLIP_FOLDER = "clip"  # of what is found once
+MAX_SECONDS = 1e6  # of a segment: eleven days
 MIN_OVERLAP = 3  # frames; more where the exposure cycle is longer (hand-chosen)
 MIN_FRAMES = 12  # of a segment: fewer show little motion (hand-chosen, as in `check`)
 OF_CLIP: tuple[StepName, ...] = ("frames", "exposure", "flow", "poses")
@@ -48,7 +49,7 @@ def check_segments(config: PrepareConfig) -> None:
     seconds = config.segment
     if seconds is None:
         return
-    if not 0 < seconds < float("inf"):
+    if not 0 < seconds < MAX_SECONDS:
         raise InputError(f"--segment {seconds:g}: give the seconds of a segment, such as 4")
     if config.mask_points is not None:
         raise InputError(

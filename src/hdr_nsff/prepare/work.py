@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import numpy as np
 from tyro.conf import Positional, arg
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import codes_to_rgb, read_codes, read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.stack import ArrayStack, RecentArrays, Stack
@@ -337,8 +338,19 @@ class Work:
 
     @cached_property
     def masks(self) -> np.ndarray:
-        """Moving pixels (T, H, W) of all frames."""
-        return np.stack([read_mask(self.folder / str(f.mask)) for f in self.manifest.frames])
+        """Moving pixels (T, H, W) of all frames; InputError for one of another size."""
+        m = self.manifest
+        masks = []
+        for f in m.frames:
+            path = self.folder / str(f.mask)
+            mask = read_mask(path)
+            if mask.shape != (m.height, m.width):
+                raise InputError(
+                    f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, the frames are "
+                    f"{m.width}x{m.height}; make it that size, or add `--redo masks`"
+                )
+            masks.append(mask)
+        return np.stack(masks)
 
     def training_masks(self) -> np.ndarray:
         """Moving pixels (T, H, W) of the training frames."""

@@ -69,6 +69,8 @@ def frame_white_balance(
     in_time = [views[i] for i in ordered]
     brackets = np.array([v.bracket for v in in_time])
     readings = read_points(in_time, np.random.default_rng(SEED), tuning.frames)
+    if not len(readings.frame):
+        return None
     by_place = [readings.place[:, axis] < np.median(readings.place[:, axis]) for axis in (0, 1)]
     pairs = determined_halves(readings, by_place, len(views), tuning)
     if not pairs:  # points on one side only: any halves

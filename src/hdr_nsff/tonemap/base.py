@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import torch
-from annotated_types import Ge, Le
+from annotated_types import Ge, Le, Lt
 from torch import Tensor, nn
 
 from hdr_nsff.core.errors import InputError
@@ -84,7 +84,7 @@ class ToneMapConfig:
     """per_image: start at the response that `prepare` estimated; else at gamma 2.2 and
     gains of 1, as published.
     """
-    min_step: Advanced[Annotated[float, Ge(0), Le(1)]] = 1e-3
+    min_step: Advanced[Annotated[float, Ge(0), Lt(1)]] = 1e-3
     """shared: smallest step of the curve between two points as a share of the mean
     step; keeps it invertible.
     """

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 import torch
 from annotated_types import Ge, Le
+from pydantic import AfterValidator
 from torch import Tensor, nn
 
 from hdr_nsff.core.param_group import ParamGroup
@@ -27,6 +28,13 @@ MOTION_LEVELS = 2  # of the scene-flow grids: smooth by construction
 MOTION_DEPTH_SHARE = 8  # times fewer grid points of scene flow than `depth_cells`
 
 
+def power_of_two(number: int) -> int:
+    """The number above 0; ValueError where it is not 1, 2, 4, 8 and so on."""
+    if number & (number - 1):
+        raise ValueError("choose a power of two")
+    return number
+
+
 @dataclass(frozen=True)
 class GridConfig:
     """Additive multiresolution grids without a network behind them."""
@@ -38,7 +46,7 @@ class GridConfig:
     """Grid points along the third axis at the finest level."""
     levels: Advanced[Count] = 4
     """Levels of the appearance grids, each twice as fine as the one before."""
-    max_rows: Advanced[Annotated[int, Ge(1), Le(10**9)]] = 2**20
+    max_rows: Advanced[Annotated[int, Ge(1), Le(10**9), AfterValidator(power_of_two)]] = 2**20
     """Rows of a hashed level (a power of two)."""
     motion_cell: Advanced[Positive] = 8.0
     """Cell size of the finer of the two scene-flow grids, in pixels."""

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import torch
+from annotated_types import Ge, Le
 from pydantic import Discriminator
 from torch import Tensor, nn
 
@@ -69,7 +70,7 @@ class BranchesConfig:
     encoding: Annotated[GridConfig | MlpConfig, Discriminator("type")] = field(
         default_factory=GridConfig
     )
-    samples: Count = 32
+    samples: Annotated[int, Ge(2), Le(10**6)] = 32
     """Samples along a ray while training."""
     render_samples: Count = 64
     """Samples along a ray when rendering."""
