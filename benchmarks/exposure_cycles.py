@@ -41,9 +41,9 @@ from hdr_nsff.footage.ingest import open_footage, read_frames
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.response import response_view
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import record, response_curve
-from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.truth import Truth

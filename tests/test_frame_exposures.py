@@ -7,6 +7,7 @@ import pytest
 from wall import S_CURVE, SRGB, wall_view
 
 from hdr_nsff.radiometry.debevec import DebevecTuning, Samples
+from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.frame_exposures import (
     Readings,
     drift_is_shared,
@@ -16,7 +17,6 @@ from hdr_nsff.radiometry.frame_exposures import (
     second_differences,
     steepness_factor,
 )
-from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
 

@@ -1,6 +1,6 @@
 """`response.json` of a scene folder: its cameras' curves, exposures and white balance.
 
-`prepare` estimates them (`radiometry/response.py`).
+`prepare` estimates them (`radiometry/estimate_response.py`).
 """
 
 from __future__ import annotations

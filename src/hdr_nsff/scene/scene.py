@@ -16,9 +16,9 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -353,9 +353,9 @@ def without_outline(moving: Tensor, outline: Tensor) -> Tensor:
     """(H, W) bool: a moving mask without its doubtful outline; small and thin objects
     stay whole.
     """
-    objects, count = ndimage.label(moving.numpy())
+    count, objects = cv2.connectedComponents(moving.numpy().astype(np.uint8), connectivity=4)
     sure = moving & ~outline
-    whole = ~np.isin(np.arange(count + 1), np.unique(objects[sure.numpy()]))
+    whole = ~np.isin(np.arange(count), np.unique(objects[sure.numpy()]))
     return sure | (moving & torch.from_numpy(whole[objects]))
 
 

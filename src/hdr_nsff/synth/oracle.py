@@ -21,7 +21,7 @@ from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import read_npy, write_npy
 from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.priors.movers.rigidity import judge_rigidity
-from hdr_nsff.radiometry.response import estimate_response
+from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.movers import write_movers

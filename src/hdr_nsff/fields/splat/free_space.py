@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.fields.splat.gaussians import START_LOGIT
+from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Frame
 
@@ -88,7 +89,8 @@ def vote(field: Splat, frame: Frame, surface: Tensor) -> Tensor:
     features = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
     disparity, confidence = surface.unbind(1)
     with torch.enable_grad():
-        _, drawn = field.composite(field.draw(frame.camera, cloud, [features]))
+        shapes = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
+        drawn = rasterize(*shapes, features, frame.camera).features.flatten(0, 1)
         pixel_weights = torch.stack([confidence * disparity, confidence], 1)
         (sums,) = torch.autograd.grad((drawn * pixel_weights).sum(), features)
     total, weight = sums[: len(field.static)].unbind(1)

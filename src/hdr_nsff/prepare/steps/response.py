@@ -14,8 +14,8 @@ from hdr_nsff.core.io import read_npy
 from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.radiometry.estimate_response import estimate_response
 from hdr_nsff.radiometry.frame_colors import frame_white_balance
-from hdr_nsff.radiometry.response import estimate_response
 from hdr_nsff.radiometry.response_words import describe
 from hdr_nsff.radiometry.static_samples import ResponseView
 from hdr_nsff.scene.manifest import FrameEntry
