@@ -113,6 +113,15 @@ def test_the_folder_at_hand_may_hold_a_scene(
     assert "name a folder" in refused(capsys, "prepare", clip(tmp_path / "clip"), "/")
 
 
+def test_a_run_does_not_go_into_its_scene(
+    toy_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    folder = shutil.copytree(toy_folder, tmp_path / "scene")
+    before = snapshot(folder)
+    assert "holds a scene" in refused(capsys, *training(folder, folder, 2))
+    assert snapshot(folder) == before
+
+
 def test_a_picture_of_check_replaces_no_frame(tmp_path: Path, capsys: Capture) -> None:
     footage = clip(tmp_path / "clip")
     before = snapshot(footage)

@@ -104,6 +104,8 @@ def open_folder(config: TrainConfig) -> None:
     The path of a scene that has moved is updated.
     """
     out = config.out
+    if (out / MANIFEST).exists():
+        raise InputError(f"{out}: holds a scene; choose another --out for the run")
     if (out / CONFIG).exists():
         before, places = stored_config(out)
         if replace(before, scene=config.scene, out=out, device=config.device) != config:

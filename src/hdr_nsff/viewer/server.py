@@ -22,6 +22,7 @@ from hdr_nsff.geometry.paths import parse_intrinsics, parse_numbers, parse_pose
 HOST = "127.0.0.1"
 MAX_PIXELS = 4_000_000  # of a frame
 MAX_REQUEST_BYTES = 10_000
+NUM_PORTS = 2**16
 MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf
 CURVES = ("camera", "reinhard", "clip")  # that this machine develops frames with
 VIEWS = ("radiance", "depth", "motion")  # that it renders
@@ -77,6 +78,8 @@ class ViewerServer(ThreadingHTTPServer):
             super().__init__((HOST, port), Handler)
         except (OSError, OverflowError) as error:
             problem = "this port is not free"
+            if not 0 <= port < NUM_PORTS:
+                problem = f"ports are from 0 to {NUM_PORTS - 1}"
             raise InputError(f"--port {port}: {problem}; leave the option out") from error
         self.source = source
 
