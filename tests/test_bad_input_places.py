@@ -126,7 +126,7 @@ def test_a_picture_of_check_replaces_no_frame(tmp_path: Path, capsys: Capture) -
     footage = clip(tmp_path / "clip")
     before = snapshot(footage)
     sentence = refused(capsys, "check", footage, "--picture", footage / "000.png")
-    assert "is part of the clip" in sentence
+    assert "is a frame of the clip" in sentence
     assert snapshot(footage) == before
 
 

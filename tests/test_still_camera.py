@@ -1,5 +1,6 @@
 """A camera that stands still is recognized, whatever moves before it."""
 
+import cv2
 import numpy as np
 import pytest
 from posed_clips import PLACES, H, W, panning, sliding, texture
@@ -44,10 +45,25 @@ def test_a_still_camera_behind_a_mover_that_fills_the_picture(tmp_path):
     assert np.array_equal(poses.c2w, np.tile(np.eye(4)[:3], (NUM, 1, 1)))
 
 
+def zoomed(factors: np.ndarray) -> np.ndarray:
+    """The wall (T, H, W, 3) as a zoom shows it, by `factors` (T,)."""
+    center = np.array([W, H]) / 2 - 0.5
+    frames = []
+    for factor in factors:
+        matrix = np.concatenate([factor * np.eye(2), ((1 - factor) * center)[:, None]], 1)
+        frames.append(cv2.warpAffine(WALL, matrix, (W, H), borderMode=cv2.BORDER_REFLECT))
+    return np.stack(frames)
+
+
 @pytest.mark.parametrize(
     "video",
-    [panning(np.linspace(-4, 4, NUM)), sliding(PLACES), panning(np.tile([0.0, 0.6], NUM // 2))],
-    ids=["pan", "slide", "shake of 1.6 pixels"],
+    [
+        panning(np.linspace(-4, 4, NUM)),
+        sliding(PLACES),
+        panning(np.tile([0.0, 0.6], NUM // 2)),
+        zoomed(np.linspace(0.97, 1.03, NUM)),
+    ],
+    ids=["pan", "slide", "shake of 1.6 pixels", "zoom"],
 )
 def test_a_camera_that_moves_does_not_stand_still(video):
     assert still_camera_shifts(noisy(video)) is None

@@ -18,7 +18,9 @@ from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.check.picture import MARKS, draw
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
+from hdr_nsff.footage.ingest import open_footage
 
+ENDING = "_check.png"  # of the picture's name, by default
 PNG_START = b"\x89PNG"
 WIDTH = 100  # characters of a line
 
@@ -40,7 +42,7 @@ class CheckConfig:
 
 def check(config: CheckConfig) -> Path:
     """The verb: the picture that was written."""
-    picture = config.picture or Path(f"{config.clip.resolve().stem}_check.png")
+    picture = config.picture or Path(f"{config.clip.resolve().stem}{ENDING}")
     check_place(picture, config.clip)
     facts, video, brackets = measure_clip(config.clip)
     findings, works = judge(facts), outlook(facts)
@@ -65,14 +67,16 @@ def check_place(picture: Path, clip: Path) -> None:
     """InputError where the picture is none, or would replace something else, such as a
     frame of the clip.
     """
-    if picture.exists() and picture.resolve().is_relative_to(clip.resolve()):
-        raise InputError(f"--picture {picture}: is part of the clip; name another file")
     if picture.suffix.lower() != ".png":
         raise InputError(f"--picture {picture}: give a name that ends in .png")
     if picture.is_dir():
         raise InputError(f"--picture {picture}: is a folder; name a file")
     if picture.is_file() and picture.read_bytes()[:4] != PNG_START:
         raise InputError(f"--picture {picture}: exists and is no picture; name another file")
+    if picture.is_file() and not picture.name.endswith(ENDING):
+        frames = [frame for files in open_footage(clip).cameras for frame in files]
+        if picture.resolve() in [frame.resolve() for frame in frames]:
+            raise InputError(f"--picture {picture}: is a frame of the clip; name another file")
 
 
 def print_findings(works: dict[str, str], findings: list[Finding]) -> None:
