@@ -23,12 +23,12 @@ from record import RESULTS, ROOT
 from hdr_nsff.core.io import write_text
 
 PAGE = ROOT / "docs" / "results.md"
-INTRO = """# Results
-
-`python benchmarks/results.py` writes this page from the JSON files in `benchmarks/results`:
-one current number per claim, with its command, machine, commit and seed. PSNR is
-of recorded values in dB, over full pictures and over moving pixels; HDR is the mu-law
-PSNR of linear radiance after one scale, which unrecorded lights decide ([metrics](metrics.md))."""
+INTRO = "# Results\n\n" + (
+    "`python benchmarks/results.py` writes this page from the JSON files in `benchmarks/results`: "
+    "one current number per claim, with its command,\nmachine, commit and seed. PSNR is of "
+    "recorded values in dB, over full pictures and over moving pixels; HDR is the mu-law PSNR of "
+    "linear\nradiance after one scale, which unrecorded lights decide ([metrics](metrics.md))."
+)
 
 Document = dict[str, Any]
 
@@ -44,6 +44,7 @@ class Section:
     body: Callable[[Document], Lines]
 
 
+FIELDS = "bench-fields"  # both fields on real clips, in equal time
 SHOWN_CONSTANTS = 2  # of those whose half and double were measured
 
 
@@ -123,14 +124,24 @@ def mean_of(runs: Sequence[dict[str, float]]) -> dict[str, float]:
 
 
 def bench_clips(document: Document) -> Lines:
-    """One line per real clip."""
+    """One line per real clip: after equal steps, and both fields after equal time."""
+    timed: dict[tuple[str, str], dict[str, float]] = {}
+    path = RESULTS / f"{FIELDS}.json"
+    if path.is_file():
+        fields = json.loads(path.read_text())
+        timed = {(run["scene"], run["method"]): run["values"] for run in fields["results"]}
+    methods = list(dict.fromkeys(method for _, method in timed))
     rows = []
     for run in document["results"]:
         values = run["values"]
         row = [f"`{run['scene']}`", pair(values, "psnr", "psnr_moving")]
-        row += [number(values.get("ssim"), 3), number(values.get("steps"), 0)]
-        rows.append(row if run["status"] == "done" else [row[0], run["status"], "-", "-"])
-    return table(["clip", "PSNR", "SSIM", "steps"], rows)
+        row += [number(values.get("ssim"), 3)]
+        for method in methods:
+            row.append(pair(timed.get((run["scene"], method), {}), "psnr", "psnr_moving"))
+        rows.append(row if run["status"] == "done" else [row[0], run["status"], "-", *row[3:]])
+    heads = [f"`{method}`, 2 minutes" for method in methods]
+    lines = table(["clip", "PSNR, 800 steps", "SSIM", *heads], rows)
+    return [*lines, "", f"2 minutes: {origin(fields)}"] if timed else lines
 
 
 def bench_rig(document: Document) -> Lines:
@@ -159,11 +170,8 @@ def exposure_steps(document: Document) -> Lines:
         rows.append(row)
     filmed = [run for run in results if run.get("noise") is None]
     clips = len({run["clip"] for run in filmed})
-    return [
-        *table(["re-exposed clip", *kinds], rows),
-        "",
-        f"As filmed, {clips} clips: {worst_step(filmed)}.",
-    ]
+    rows.append([f"{clips} clips as filmed", worst_step(filmed), "-"])
+    return table(["re-exposed clip", *kinds], rows)
 
 
 def worst_step(runs: Sequence[dict[str, Any]]) -> str:
@@ -319,8 +327,9 @@ SECTIONS = (
         "Alternating exposures as filmed (`hand_books`, `nv_balloon1`: re-exposed; `gopro`: auto "
         "exposure), nothing given but the poses of the two and the GoPro's metadata. Measured on "
         "every eighth frame, of the two on other frames of the original. Moving pixels are those "
-        "of the estimated masks.",
-        "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --views 0",
+        "of the estimated masks. 2 minutes of training are on one thread, beside another run.",
+        "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --views 0` and "
+        "`--methods splat,grid --budget 2min --views 0 --jobs 2",
         bench_clips,
     ),
     Section(
