@@ -33,9 +33,9 @@ from hdr_nsff.priors.masks.geometric import geometric_mask
 from hdr_nsff.priors.masks.geometric_tuning import GeometricMaskTuning
 from hdr_nsff.priors.movers.tuning import MoversTuning
 from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses
+from hdr_nsff.radiometry.estimate_response import ResponseTuning, estimate_response
 from hdr_nsff.radiometry.exposure_cycle import ExposureCycleTuning, detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
-from hdr_nsff.radiometry.response import ResponseTuning, estimate_response
 from hdr_nsff.scene.movers import fill_mover_depth, read_movers
 
 CODES = 255  # of 8 bits
