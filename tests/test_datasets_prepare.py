@@ -7,6 +7,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import miniatures as mini
 import numpy as np
 import pytest
@@ -244,3 +245,8 @@ def test_a_folder_of_other_files_is_not_overwritten_with_truth(
     with pytest.raises(InputError, match="not made by prepare"):
         prepare(replace(gopro, truth_out=tmp_path / "mine"))
     assert (tmp_path / "mine/photo.png").is_file()
+
+
+def test_an_empty_map_is_refused() -> None:
+    with pytest.raises(InputError, match="0x0 for frames of 60x34"):
+        maps.fit_size(Path("a.npy"), np.zeros((0, 0)), (34, 60), cv2.INTER_NEAREST)

@@ -117,6 +117,7 @@ def test_more_radial_terms_become_two_that_bend_alike(tmp_path: Path) -> None:
         ("a.json", "{", "not"),
         ("a.txt", ROS, "no known calibration"),
         ("cameras.txt", "1 OPENCV_FISHEYE 640 480 500 505 322 241 0.1 0 0 0\n", "OPENCV_FISHEYE"),
+        ("cameras.txt", f"1 RADIAL {10**10} 480 500 320 240 0.1 0\n", "impossible numbers"),
         (
             "cameras.txt",
             "1 RADIAL 640 480 500 320 240 0.1 0\n2 RADIAL 640 480 500 320 240 0.2 0\n",

@@ -47,6 +47,7 @@ SIZE_NAMES = ("imagesize", "resolution", "size")
 WIDTH_NAMES, HEIGHT_NAMES = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 MODEL_NAMES = ("distortionmodel", "cameramodel", "model")
 OTHER_MODELS = ("fish", "equi", "kannala", "omni", "fov", "eucm", "division", "prism")
+MAX_SIDE = 10**6  # pixels of a picture
 # of the picture's width: how well k1 and k2 have to stand for more radial terms
 MAX_FIT_ERROR = 1e-3
 NUM_RADII = 200
@@ -238,6 +239,7 @@ def lens_of_opencv(
     coefficients = np.pad(np.asarray(distortion, np.float64), (0, 14))[:14]
     numbers = (K, coefficients)
     possible = all(np.isfinite(n).all() for n in numbers) and min(K[0, 0], K[1, 1]) > 0
+    possible = possible and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE
     if not possible or abs(K[0, 1]) > 1e-6 * K[0, 0]:
         raise InputError(f"{path}: impossible numbers in the calibration; calibrate again")
     if coefficients[8:].any():

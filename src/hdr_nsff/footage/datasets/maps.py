@@ -42,7 +42,7 @@ def fit_size(
     height, width = size
     if (h, w) == size:
         return array
-    if abs(w / h / (width / height) - 1) > MAX_ASPECT_ERROR:
+    if not h or abs(w / h / (width / height) - 1) > MAX_ASPECT_ERROR:
         raise InputError(
             f"{path}: {w}x{h} for frames of {width}x{height}, another shape; "
             "make it the shape of the frames"
