@@ -139,9 +139,12 @@ def bench_clips(document: Document) -> Lines:
         for method in methods:
             row.append(pair(timed.get((run["scene"], method), {}), "psnr", "psnr_moving"))
         rows.append(row if run["status"] == "done" else [row[0], run["status"], "-", *row[3:]])
-    heads = [f"`{method}`, 2 minutes" for method in methods]
-    lines = table(["clip", "PSNR, 800 steps", "SSIM", *heads], rows)
-    return [*lines, "", f"2 minutes: {origin(fields)}"] if timed else lines
+    steps = f"PSNR, {document['settings']['steps']} steps"
+    if not timed:
+        return table(["clip", steps, "SSIM"], rows)
+    budget = fields["settings"]["budget"]
+    heads = [f"`{method}`, {budget}" for method in methods]
+    return [*table(["clip", steps, "SSIM", *heads], rows), "", f"{budget}: {origin(fields)}"]
 
 
 def bench_rig(document: Document) -> Lines:

@@ -12,7 +12,7 @@ from estimates import forget_movers
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
-from hdr_nsff.core.io import how_to_get_back, write_npy
+from hdr_nsff.core.io import how_to_restore, write_npy
 from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
@@ -344,9 +344,11 @@ def test_missing_maps_and_maps_of_the_wrong_size(
 @pytest.mark.parametrize(
     ("place", "step"), [("images/00002.png", "frames"), ("raw_flow/00002_00003.npy", "flow")]
 )
-def test_the_step_that_mends_a_damaged_file_is_named(place: str, step: str, folder: Path) -> None:
+def test_the_step_that_restores_a_damaged_file_is_named(
+    place: str, step: str, folder: Path
+) -> None:
     files = sorted((folder / place).parent.iterdir())
     for file in files:
         file.write_bytes(b"cut short")
-    assert how_to_get_back(files[0]) == f"run `hdr-nsff prepare` with `--redo {step}`"
-    assert how_to_get_back(folder.parent / "photo.png") == "copy it again"
+    assert how_to_restore(files[0]) == f"run `hdr-nsff prepare` with `--redo {step}`"
+    assert how_to_restore(folder.parent / "photo.png") == "copy it again"

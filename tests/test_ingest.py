@@ -97,6 +97,8 @@ def test_a_scene_folder_among_the_cameras_is_none_of_them(tmp_path):
 def test_a_folder_of_videos_is_a_rig(tmp_path):
     for name, value in (("cam10.mp4", 0.6), ("cam2.mp4", 0.3)):
         write_video(tmp_path / name, [picture(value)] * 4, fps=12)
+    write_png(tmp_path / "out/contact_sheet.png", np.zeros((16, 16, 3)))
+    (tmp_path / "out/scene.json").write_text("{}")  # what `prepare` wrote there
     footage, frames = open_footage(tmp_path), all_frames(tmp_path, start=2)
     assert footage.root == tmp_path
     assert [(f.camera_id, f.number, f.source) for f in frames] == [

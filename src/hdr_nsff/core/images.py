@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import atomic, how_to_get_back
+from hdr_nsff.core.io import atomic, how_to_restore
 from hdr_nsff.core.picture_size import check_size, encoded_size
 
 PNG_END = b"IEND\xaeB`\x82"
@@ -89,9 +89,9 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
     data = path.read_bytes()
     suffix = path.suffix.lower()
     if suffix == ".png" and not data.rstrip(b"\0").endswith(PNG_END):
-        raise InputError(f"{path}: the PNG is cut short; {how_to_get_back(path)}")
+        raise InputError(f"{path}: the PNG is cut short; {how_to_restore(path)}")
     if suffix in {".jpg", ".jpeg"} and JPEG_END not in data[-JPEG_TAIL_BYTES:]:
-        raise InputError(f"{path}: the JPEG is cut short; {how_to_get_back(path)}")
+        raise InputError(f"{path}: the JPEG is cut short; {how_to_restore(path)}")
     size = encoded_size(data)
     if size is not None:
         check_size(path, *size)
@@ -103,7 +103,7 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
         image = None
     if image is None:
         raise InputError(
-            f"{path}: not a readable image (PNG, JPEG or TIFF); {how_to_get_back(path)}"
+            f"{path}: not a readable image (PNG, JPEG or TIFF); {how_to_restore(path)}"
         )
     if image.dtype not in (np.uint8, np.uint16):
         advice = "convert to 8 or 16 bits, or to EXR for linear data"

@@ -228,10 +228,11 @@ def read_npy(path: Path | str) -> np.ndarray:
         return map_npy(path)
     except Exception as error:  # many unrelated types, for a damaged header alone
         raise InputError(
-            f"{path}: not a readable .npy array ({shorten(error)}); {how_to_get_back(path)}"
+            f"{path}: not a readable .npy array ({shorten(error)}); {how_to_restore(path)}"
         ) from error
 
 
+SCENE_FILE = "scene.json"  # what makes a folder a scene folder
 # folders of a scene folder, by the step of `prepare` that fills them
 FOLDER_STEPS = {
     "images": "frames",
@@ -249,10 +250,10 @@ FOLDER_STEPS = {
 }
 
 
-def how_to_get_back(path: Path | str) -> str:
-    """What mends a damaged file: the step that made it, in a scene folder."""
+def how_to_restore(path: Path | str) -> str:
+    """How to restore a damaged file: in a scene folder, by the step that made it."""
     folder = Path(path).parent
     step = FOLDER_STEPS.get(folder.name)
-    if step is None or not (folder.parent / "scene.json").is_file():
+    if step is None or not (folder.parent / SCENE_FILE).is_file():
         return "copy it again"
     return f"run `hdr-nsff prepare` with `--redo {step}`"

@@ -100,7 +100,8 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
             rows[key] = sum(ev_of_cell(column, row[column], where) for column in values)
             if abs(rows[key]) > MAX_EV:
                 raise InputError(
-                    f"{where}: {rows[key]:.0f} stops from one second at ISO 100; correct it"
+                    f"{where}: {rows[key]:.0f} EV is beyond all light (at most {MAX_EV:g}); "
+                    "correct it"
                 )
     except csv.Error as error:
         line = reader.line_num + 1

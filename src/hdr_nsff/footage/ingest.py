@@ -21,6 +21,7 @@ import numpy as np
 from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.exr import REC709, read_exr
 from hdr_nsff.core.images import read_image
+from hdr_nsff.core.io import SCENE_FILE
 from hdr_nsff.core.picture_size import check_size
 from hdr_nsff.core.video import read_video, video_info
 from hdr_nsff.maths.hdr_signal import (
@@ -53,7 +54,6 @@ MIN_MAX_SIZE = 32  # pixels: least longest side that frames may be shrunk to
 # frames that may be missing at the end of a video: containers round durations
 MAX_MISSING_FRAMES = 3
 MAX_RATE_DIFFERENCE = 0.01  # of synchronized cameras: headers round the rate
-SCENE_FILE = "scene.json"  # a folder with it is no camera's, but a scene of `prepare`
 HOLD_OUT = 8  # every this many frames are held out where nothing else is asked for
 
 
@@ -114,10 +114,10 @@ def open_footage(clip: Path) -> Footage:
     if not clip.is_dir():
         raise InputError(f"{clip}: no such file or folder; give {ACCEPTED}")
     cameras = [frame_files(clip)]
-    if not cameras[0] and not video_files(clip):
+    if not cameras[0]:
         cameras = [frame_files(f) for f in sorted_folders(clip) if not (f / SCENE_FILE).exists()]
         cameras = [files for files in cameras if files]
-    if not cameras or not cameras[0]:
+    if not cameras:
         return open_videos(clip)
     first = cameras[0]
     for files in cameras[1:]:

@@ -42,7 +42,7 @@ class FrameColorsTuning:
     min_drift: float = 0.1
     sigmas: float = 4.0  # a drift exceeds half the difference of halves this many times
     # stops, or share of the drift: beyond, half their difference is that of a light (at
-    # most 0.03 on eight clips with a drift of 0.15 put in; 0.04 of 0.33 on rendered
+    # most 0.03 on nine clips with a drift of 0.15 put in; 0.04 of 0.33 on rendered
     # `night`, whose lamps move)
     max_difference: float = 0.03
     max_difference_share: float = 0.1

@@ -24,7 +24,7 @@ from torch.nn.functional import max_pool2d
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, read_mask
-from hdr_nsff.core.io import how_to_get_back, read_npy
+from hdr_nsff.core.io import how_to_restore, read_npy
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord, inside
@@ -326,7 +326,7 @@ class MapReader:
             return None
         array = read(inside(self.folder, name))
         place = f"{self.folder / name}: {what} of frame {self.index}"
-        again = how_to_get_back(self.folder / name)
+        again = how_to_restore(self.folder / name)
         expected = self.size + channels
         if array.shape != expected:
             raise InputError(f"{place} has shape {array.shape}, expected {expected}; {again}")

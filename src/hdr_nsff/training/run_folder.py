@@ -19,7 +19,7 @@ from torch import Tensor
 from hdr_nsff.core.checkpoints import latest_checkpoint, read_checkpoint, unpack, write_checkpoint
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
-from hdr_nsff.core.io import read_json, write_json
+from hdr_nsff.core.io import SCENE_FILE, read_json, write_json
 from hdr_nsff.core.notes import LogLine
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.build import build_field, device_for
@@ -32,7 +32,6 @@ from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import poses_for
 
 CONFIG = "config.json"
-MANIFEST = "scene.json"  # of the scene folder
 SCENE_FROM_RUN = "scene_from_run"  # key of config.json: the scene's path from the run folder
 
 
@@ -104,7 +103,7 @@ def open_folder(config: TrainConfig) -> None:
     The path of a scene that has moved is updated.
     """
     out = config.out
-    if (out / MANIFEST).exists():
+    if (out / SCENE_FILE).exists():
         raise InputError(f"{out}: holds a scene; choose another --out for the run")
     if (out / CONFIG).exists():
         before, places = stored_config(out)
@@ -128,8 +127,8 @@ def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:
     `places` are where its own scene may be. The scene of `config` is another one where
     it is neither of them, nor a copy, and one of them still exists.
     """
-    known = [place / MANIFEST for place in places if (place / MANIFEST).is_file()]
-    given = config.scene / MANIFEST
+    known = [place / SCENE_FILE for place in places if (place / SCENE_FILE).is_file()]
+    given = config.scene / SCENE_FILE
     same = any(given.samefile(path) or given.read_bytes() == path.read_bytes() for path in known)
     if known and not same:
         raise InputError(
@@ -145,7 +144,7 @@ def read_config(folder: Path) -> TrainConfig:
     """
     config, places = stored_config(folder)
     for scene in places:
-        if (scene / MANIFEST).is_file():
+        if (scene / SCENE_FILE).is_file():
             return replace(config, scene=scene)
     raise InputError(
         f"{folder}: its scene is not at {config.scene} any more; put it back, or say where it is: "
