@@ -1,9 +1,10 @@
 """Keeps a finished `hdr-nsff bench` as benchmarks/results/bench-NAME.json.
 
     hdr-nsff bench OUT --scenes ... --methods ...
-    python benchmarks/take_bench.py NAME OUT
+    python benchmarks/take_bench.py NAME OUT [OUT ...]
 
-The file holds one object per run: scene, method, status and every number of the run.
+The file holds one object per run: scene, method, status and every number of the run,
+and its settings where these differ between several benchmarks.
 Scenes are kept by name; no path of the machine is.
 """
 
@@ -29,16 +30,27 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("name", help="what the benchmark compares: camera, rig, real, ablations")
-    parser.add_argument("bench", type=Path, help="the folder that `hdr-nsff bench` wrote")
+    parser.add_argument(
+        "bench", type=Path, nargs="+", help="the folders that `hdr-nsff bench` wrote"
+    )
     args = parser.parse_args()
-    found = json.loads((args.bench / "results.json").read_text())
-    settings = {key: found["settings"].get(key) for key in SETTINGS}
+    found = [json.loads((folder / "results.json").read_text()) for folder in args.bench]
+    settings = [{key: each["settings"].get(key) for key in SETTINGS} for each in found]
+    common = {key: value for key, value in settings[0].items() if all_equal(settings, key)}
     out = RESULTS / f"bench-{args.name}.json"
-    options = argparse.Namespace(out=out, **settings)
-    record = Record(f"bench-{args.name}", options, seed=found["seed"])
-    for run in found["runs"]:
-        record.add(one_run(run), show=False)
+    record = Record(
+        f"bench-{args.name}", argparse.Namespace(out=out, **common), seed=found[0]["seed"]
+    )
+    for each, own in zip(found, settings, strict=True):
+        differing = {key: value for key, value in own.items() if key not in common}
+        for run in each["runs"]:
+            record.add(one_run(run) | differing, show=False)
     record.save()
+
+
+def all_equal(settings: list[dict[str, Any]], key: str) -> bool:
+    """Whether all benchmarks have one value of a setting."""
+    return all(each[key] == settings[0][key] for each in settings)
 
 
 def one_run(run: dict[str, Any]) -> dict[str, Any]:

@@ -139,7 +139,7 @@ def test_means_are_over_all_scenes_and_name_the_best_and_the_worst(finished: Pat
 def test_curves_end_at_the_run_and_start_before(finished: Path) -> None:
     for run in results(finished)["runs"]:
         points = [(point["share"], point["step"]) for point in run["curve"]]
-        assert points == [(0.125, 1), (0.25, 1), (0.5, 2), (1.0, 4)]
+        assert points == [(0.125, 1), (0.25, 1), (0.5, 2), (0.8, 4), (1.0, 4)]
         if run["values"]["views"] <= 4:  # then the curve is of all views, and ends at the headline
             assert run["curve"][-1]["scores"]["psnr"] == pytest.approx(run["values"]["psnr"])
 
@@ -244,7 +244,7 @@ def test_a_killed_bench_continues_with_the_same_command(
     assert 0 < reached < 300 and not (run / "metrics.json").exists()
     assert call(*command) == 0
     assert f"continuing at step {reached}," in (tmp_path / "out/logs/toy/a.log").read_text()
-    assert Run.open(run).step == 300 and list(snapshots(run)) == [0.125, 0.25, 0.5]
+    assert Run.open(run).step == 300 and list(snapshots(run)) == [0.125, 0.25, 0.5, 0.8]
 
 
 def command_lines() -> list[bytes]:

@@ -72,8 +72,8 @@ class BenchConfig:
     lpips: str | None = None
     """LPIPS: a file with AlexNet weights, or `hub` to download them."""
     views: int = 4
-    """Held-out views that are also measured after 1/8, 1/4 and 1/2 of the training, and
-    of which pictures are shown; 0: none.
+    """Held-out views that are also measured after 1/8, 1/4, 1/2 and 4/5 of training,
+    and of which pictures are shown; 0: none.
     """
     max_size: int = 640
     """Longest side in pixels of footage; larger frames are shrunk."""

@@ -24,7 +24,7 @@ from hdr_nsff.evaluation.scores.rgb import score_rgb
 from hdr_nsff.evaluation.targets import Target, moving_of
 from hdr_nsff.training.run_folder import Run, snapshots
 
-SHARES = (0.125, 0.25, 0.5)  # of the training; its end is measured anyway
+SHARES = (0.125, 0.25, 0.5, 0.8)  # of the training; its end is measured anyway
 CURVE_SCORES = ("psnr", "psnr_moving", "ssim", "ssim_moving", "mu5000", "mu5000_moving")
 
 Scores = dict[str, Any]

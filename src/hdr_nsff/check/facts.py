@@ -15,7 +15,7 @@ class FileFacts:
     name: str
     frames: int  # of one camera; 0: unknown
     cameras: int
-    width: int  # as players show it, pixels
+    width: int  # as players show it, without black bars, pixels
     height: int
     fps: float
     bits: int
@@ -23,6 +23,7 @@ class FileFacts:
     # milliseconds: the shortest and longest time between frames, of videos
     interval_ms: tuple[float, float] | None
     missing: int = 0  # frames by the timestamps of a video
+    bars: str = ""  # what `prepare` does with black bars, in words
 
 
 @dataclass(frozen=True)

@@ -234,6 +234,8 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         count = f"{file.cameras} cameras of {count}"
     size = f"{file.width} x {file.height}, {file.fps:.4g} a second"
     yield Finding("note", "file", f"{count} of {size}; {kinds[file.kind]}")
+    if file.bars:
+        yield Finding("note", "file", file.bars)
     if 0 < file.frames < tuning.few_frames:
         text = f"{file.frames} frames are few"
         yield Finding("warning", "length", text, "record two seconds or more")

@@ -18,6 +18,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
 from hdr_nsff.footage.timestamps import frame_gaps
@@ -65,7 +66,7 @@ def measure_clip(
     Of several cameras, the first is looked at. InputError for footage that cannot be
     read, and where all is black or white.
     """
-    footage = ingest.open_footage(clip)
+    footage = with_bars(ingest.open_footage(clip))
     frames = ingest.read_frames(footage, 0, tuning.max_frames, 1, tuning.max_size)
     total = min(footage.count or tuning.max_frames, tuning.max_frames)
     pictures = []
@@ -121,7 +122,8 @@ def describe_file(footage: ingest.Footage) -> FileFacts:
         bits = 16
     cameras = len(footage.cameras)
     name, count, fps = footage.path.name, footage.count, footage.fps
-    return FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing)
+    bars = footage.bars.sentence() if footage.bars else ""
+    return FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing, bars)
 
 
 # Exposure

@@ -58,6 +58,31 @@ HOLD_OUT = 8  # every this many frames are held out where nothing else is asked 
 
 
 @dataclass(frozen=True)
+class Bars:
+    """Black bars of equal width at opposite sides of the frames (`bars.py`), pixels."""
+
+    rows: int = 0  # at the top, and as many at the bottom
+    columns: int = 0  # at the left, and as many at the right
+
+    def __bool__(self) -> bool:
+        return self.rows > 0 or self.columns > 0
+
+    def sentence(self) -> str:
+        """What is cut off, in words."""
+        sides = []
+        if self.rows:
+            sides.append(f"{self.rows} rows at the top and the bottom")
+        if self.columns:
+            sides.append(f"{self.columns} columns on the left and the right")
+        return f"black bars are cut off: {' and '.join(sides)}"
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """An image (H, W, ...) without its bars."""
+        height, width = image.shape[:2]
+        return image[self.rows : height - self.rows, self.columns : width - self.columns]
+
+
+@dataclass(frozen=True)
 class Footage:
     """What a clip consists of; nothing is decoded yet."""
 
@@ -71,6 +96,7 @@ class Footage:
     over: float | None = None
     transfer: Transfer | None = None  # of HDR video, by its tags
     same_camera: bool = False  # the `cameras` are tracks of one (`tracks.py`)
+    bars: Bars = Bars()  # that are cut off the frames
 
     @property
     def root(self) -> Path:
@@ -286,7 +312,7 @@ def read_frames(
                     f"{source}: {w}x{h} pixels, but {name} has {width}x{height}; "
                     "all frames must have one size"
                 )
-            rgb = shrink(image, max_size)
+            rgb = shrink(footage.bars.cut(image), max_size)
             if footage.linear:
                 rgb = np.clip(rgb * scale, 0, 1) ** np.float32(1 / GAMMA)
             yield FootageFrame(camera_id, number, source, rgb, track, seconds)

@@ -97,8 +97,9 @@ def step_key(work: Work, name: StepName, step: Step) -> str:
     before = [(n, records[n].key, records[n].details.get("attempt")) for n in step.needs]
     inputs = work.manifest.inputs if name == "frames" else {}
     from_capture = [capture_part(work, name)] if work.capture is not None else []
+    cut = [asdict(work.footage.bars)] if name == "frames" and work.footage.bars else []
     lens = lens_part(work, name)
-    parts = [settings, before, inputs, *from_capture, *lens, *weights_of(work.config, name)]
+    parts = [settings, before, inputs, *from_capture, *cut, *lens, *weights_of(work.config, name)]
     parts += step.depends
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
 

@@ -20,6 +20,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.capture import Capture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
@@ -123,10 +124,17 @@ def begin(config: PrepareConfig) -> Work:
 
 
 def open_clip(config: PrepareConfig, capture: Capture | None) -> ingest.Footage:
-    """The footage of a data set, of tracks of one camera, or at `config.clip`."""
+    """The footage of a data set, of tracks of one camera, or at `config.clip`.
+
+    Black bars are cut off where nothing else is given pixel by pixel.
+    """
     if config.same_camera:
         return open_tracks(config.clip, config.same_camera)
-    return capture.footage() if capture else ingest.open_footage(config.clip)
+    if capture is not None:
+        return capture.footage()
+    footage = ingest.open_footage(config.clip)
+    given = (config.poses, config.flow, config.masks, config.mask_points, config.depth)
+    return footage if any(isinstance(value, Path) for value in given) else with_bars(footage)
 
 
 def report_data_set(work: Work) -> None:

@@ -48,8 +48,8 @@ class BracketingTuning:
     # of the natural logarithm of the factor that a typical curve is off by
     mean_log_factor: float = -0.06
     log_factor_deviation: float = 0.1
-    # the same of two exposures that show noise: they leave more of the curve open. One
-    # film curve needs 0.73 to 0.83 on three clips (0.80 to 0.82 with three exposures).
+    # the same of two exposures, which leave more of the curve open: one film curve
+    # needs 0.73 to 0.85 on six clips (0.80 to 0.82 with three exposures)
     one_step_log_factor_deviation: float = 0.15
     odd_curve_share: float = 0.05  # of cameras whose curve is nothing like typical ones
     odd_log_factor_deviation: float = 0.35
@@ -102,7 +102,7 @@ def likely_scale(
     steps, step_deviations = steps[is_step], step_deviations[is_step]
     if not len(steps):
         return StepScale(1.0, 1.0, 1.0, 1.0)
-    if len(steps) == 1 and noise_log_likelihood is not None:
+    if len(steps) == 1:
         tuning = replace(tuning, log_factor_deviation=tuning.one_step_log_factor_deviation)
     log_evidence = log_evidence_of_factor(noise_log_likelihood, tuning)
     scale = measured_scale(noise_log_likelihood, tuning)

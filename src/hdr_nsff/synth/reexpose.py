@@ -31,6 +31,7 @@ from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writ
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage import ingest
+from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.hold_out import hold_out_every
 from hdr_nsff.footage.pose_files import import_poses
@@ -134,6 +135,10 @@ def reexpose(config: ReexposeConfig) -> Path:
                 f"{config.clip}: {len(footage.cameras)} cameras; "
                 "re-expose one camera's folder at a time"
             )
+        if config.poses is None and config.masks is None:
+            footage = with_bars(footage)
+        if footage.bars:
+            say(footage.bars.sentence())
         numbers, extents, size = look_through(config, footage)
         if config.hdr_video:
             check_side(config.clip, size[1], size[0])

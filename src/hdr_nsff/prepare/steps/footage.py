@@ -72,6 +72,8 @@ def frames_step(work: Work) -> StepResult:
     if work.footage.transfer is not None:
         kind = work.footage.transfer.upper()
         note += f"; {kind} by its tags, brought to linear light and encoded as x^(1/2.2)"
+    if work.footage.bars:
+        note += f"; {work.footage.bars.sentence()}"
     if m.lens:
         note += f", undistorted ({describe(m.lens)})"
     if missing:
