@@ -97,7 +97,13 @@ def test_without_a_step_the_factor_is_one(ev):
 
 def test_the_factor_stays_near_one_for_any_steps():
     for step in np.linspace(0.25, 20, 80):
-        assert 0.7 < likely_scale([0, step]).factor < 1.4
+        assert 0.75 < likely_scale([0, step]).factor < 1.3
+
+
+def test_two_exposures_are_known_less_well_and_move_no_farther_for_it():
+    two, three = likely_scale([0.0, 4.0]), likely_scale([0.0, 2.0, 4.0])
+    assert np.log(two.high / two.low) > 1.3 * np.log(three.high / three.low)
+    assert 0.9 < two.factor < 1.1, "four stops do not become three"
 
 
 def test_usual_steps_are_chances():

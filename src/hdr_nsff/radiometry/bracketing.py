@@ -102,10 +102,13 @@ def likely_scale(
     steps, step_deviations = steps[is_step], step_deviations[is_step]
     if not len(steps):
         return StepScale(1.0, 1.0, 1.0, 1.0)
+    uncertain = tuning
     if len(steps) == 1:
-        tuning = replace(tuning, log_factor_deviation=tuning.one_step_log_factor_deviation)
+        uncertain = replace(tuning, log_factor_deviation=tuning.one_step_log_factor_deviation)
+    scale = measured_scale(noise_log_likelihood, uncertain)
+    if noise_log_likelihood is not None:  # else no step moves farther than typical curves vary
+        tuning = uncertain
     log_evidence = log_evidence_of_factor(noise_log_likelihood, tuning)
-    scale = measured_scale(noise_log_likelihood, tuning)
     evidence = np.exp(log_evidence)
     intended = usual_assignment(steps, step_deviations, log_evidence, tuning)
     if intended is not None:
