@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from test_hdr_video import decoded, luma
@@ -15,7 +16,7 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.footage.pose_files import import_poses
-from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
+from hdr_nsff.maths.hdr_signal import display_light, encode, pq_decode, ycbcr_planes
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
 from hdr_nsff.radiometry.recording import response_curve
 from hdr_nsff.scene.truth import Truth
@@ -210,7 +211,10 @@ def test_hdr_references_hold_the_linearized_clip(tmp_path):
         write_png(clip / f"{t:03d}.png", np.full((64, 64, 3), 0.1 * (t + 1)))
     config = ReexposeConfig(clip, tmp_path / "out", hdr_video=("pq", "hlg"))
     out = reexpose(config)
-    reexpose(replace(config, hdr_video=("pq",)))  # the same problem
+    reexpose(replace(config, hdr_video=("pq",), hdr_still=("png16",)))  # the same problem
+    still = cv2.imread(str(out / "reference/00003_pq.png"), cv2.IMREAD_UNCHANGED)
+    light = display_light(np.full((1, 1, 3), 0.4**2.2), 1.0, "pq")
+    assert np.allclose(pq_decode(still / 65535), light, rtol=0.01)
     for transfer in ("pq", "hlg"):
         _, frames = decoded(out / f"reference_{transfer}.mp4")
         assert len(frames) == 8

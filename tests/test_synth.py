@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from synth_scene import Flat, plane
 from test_hdr_video import decoded, luma
+from test_ultra_hdr import decode
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
@@ -195,6 +196,11 @@ def test_hdr_references_hold_the_radiance_of_the_clip(flat: SynthConfig) -> None
     light = display_light(np.full((2, 2, 3), 0.18), 1.0, "pq")  # an even wall is mid gray
     expected = ycbcr_planes(encode(light, "pq"))[0][0, 0]
     assert abs(float(np.median(luma(frames[1]))) - expected) <= 4
+    synth(replace(config, hdr_video=(), hdr_still=("ultrahdr", "png16")))  # the same problem
+    stills = flat.out / "reference"
+    assert len(list(stills.glob("*"))) == 2 * flat.frames
+    found = decode((stills / "00001_ultrahdr.jpg").read_bytes())
+    assert np.allclose(np.median(found, (0, 1)), 0.18, rtol=0.03)
 
 
 def test_hdr_references_of_too_small_frames_are_refused_before_rendering(

@@ -35,9 +35,9 @@ from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
 from hdr_nsff.maths.hdr_signal import Transfer
+from hdr_nsff.radiometry.hdr_stills import HdrStill, still_path, still_paths, write_hdr_still
 from hdr_nsff.rendering.exr_header import WhiteBalance, balance, radiance_header
 from hdr_nsff.rendering.hdr_shots import hdr_path, hdr_paths, neutral_radiance, write_hdr_shot
-from hdr_nsff.rendering.hdr_stills import HdrStill, still_path, still_paths, write_hdr_still
 from hdr_nsff.rendering.interpolate import Mode
 from hdr_nsff.rendering.lens import LensView, original_lens
 from hdr_nsff.rendering.mattes import ObjectMattes
@@ -304,8 +304,9 @@ def write_hdr_stills(
         missing = [kind for kind in output.hdr_still if not still_path(picture, kind).exists()]
         if missing:
             radiance = next(neutral_radiance(run, [picture.with_suffix(".exr")], *balanced))
+            sdr = read_image(picture)
             for kind in missing:
-                write_hdr_still(picture, kind, radiance, exposure)
+                write_hdr_still(still_path(picture, kind), kind, radiance, exposure, sdr)
 
 
 def write_sheet(path: Path, pictures: Sequence[Path]) -> None:

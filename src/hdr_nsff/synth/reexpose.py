@@ -25,7 +25,6 @@ from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import write_exr
-from hdr_nsff.core.hdr_video import check_side
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -38,7 +37,8 @@ from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.maths.hdr_signal import Transfer
 from hdr_nsff.radiometry import exposure_cycle as exposure
-from hdr_nsff.radiometry.hdr_footage import write_radiance_video
+from hdr_nsff.radiometry.hdr_references import check_references, write_references
+from hdr_nsff.radiometry.hdr_stills import HdrStill
 from hdr_nsff.radiometry.recording import Curve, record, response_curve
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.settings import MAX_NOISE, sensor_noise
@@ -71,6 +71,10 @@ class ReexposeConfig:
     hdr_video: tuple[Transfer, ...] = ()
     """Also write the linearized clip as 10-bit HDR video, reference_hlg.mp4 and
     reference_pq.mp4: hlg, pq or both. Its white is diffuse white.
+    """
+    hdr_still: tuple[HdrStill, ...] = ()
+    """Also write its frames as HDR stills into reference/: ultrahdr (JPEG with a gain
+    map), avif, png16 (both PQ).
     """
     hold_out: int = ingest.HOLD_OUT
     """Spacing of the frames that are held out as truth."""
@@ -140,8 +144,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         if footage.bars:
             say(footage.bars.sentence())
         numbers, extents, size = look_through(config, footage)
-        if config.hdr_video:
-            check_side(config.clip, size[1], size[0])
+        check_references(config.clip, (size[1], size[0]), config.hdr_video, config.hdr_still)
         plan = plan_frames(len(numbers), len(evs), config.hold_out, config.poses is not None)
         poses = None
         if config.poses is not None:
@@ -161,7 +164,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         claim(config, footage)  # once nothing can be wrong with the settings any more
         write_frames(config, footage, plan, evs, drift, response)
         write_truth(config.out, plan, evs, drift, response, poses, masks)
-        write_references(config, footage)
+        write_linearized(config, footage, len(numbers))
         given = f"--hold-out {config.hold_out}"
         if poses is not None:
             path = config.out / "poses_bounds.npy"
@@ -216,7 +219,7 @@ def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
     """Write `reexpose.json`; InputError where the output holds something else."""
     settings: dict[str, Any] = {"clip": str(config.clip)}
     for name, value in asdict(config).items():
-        if name not in ("clip", "out", "hdr_video"):
+        if name not in ("clip", "out", "hdr_video", "hdr_still"):
             settings[name] = str(value) if isinstance(value, Path) else value
     settings["inputs"] = {name: ingest.hash_file(file) for name, file in footage.files.items()}
     path = config.out / "reexpose.json"
@@ -316,17 +319,15 @@ def write_frames(
                 write_exr(exr, {"RGB": radiance.astype(np.float32)})
 
 
-def write_references(config: ReexposeConfig, footage: ingest.Footage) -> None:
-    """Write the linearized clip as HDR videos, where they are asked for."""
+def write_linearized(config: ReexposeConfig, footage: ingest.Footage, num_frames: int) -> None:
+    """Write the linearized clip as the HDR references that are asked for."""
 
     def radiance() -> Iterator[np.ndarray]:
         return (frame.rgb.astype(np.float64) ** GAMMA for frame in chosen(config, footage))
 
-    for transfer in config.hdr_video:
-        path = config.out / f"reference_{transfer}.mp4"
-        fps = footage.fps / config.stride
-        write_radiance_video(path, radiance, transfer, "hevc", fps, 1.0)
-        say(f"{path}: the linearized clip")
+    fps = footage.fps / config.stride
+    kinds = config.hdr_video, config.hdr_still
+    write_references(config.out, radiance, num_frames, fps, 1.0, *kinds)
 
 
 def write_truth(

@@ -12,6 +12,7 @@ from tyro.conf import Positional
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.maths.hdr_signal import Transfer
+from hdr_nsff.radiometry.hdr_stills import HdrStill
 from hdr_nsff.radiometry.recording import Noise, response_curve
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
@@ -80,6 +81,10 @@ class SynthConfig:
     hdr_video: tuple[Transfer, ...] = ()
     """Also write the clip's radiance as 10-bit HDR video, reference_hlg.mp4 and
     reference_pq.mp4: hlg, pq or both.
+    """
+    hdr_still: tuple[HdrStill, ...] = ()
+    """Also write its frames as HDR stills into reference/: ultrahdr (JPEG with a gain
+    map), avif, png16 (both PQ).
     """
     oracle: bool = False
     """Also write a scene folder with exact poses and masks, and with depth and flow

@@ -27,6 +27,7 @@ import hashlib
 import json
 import time as clock
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -34,7 +35,6 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS, REC709, read_exr, write_exr
-from hdr_nsff.core.hdr_video import check_side
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json, write_text, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -43,7 +43,7 @@ from hdr_nsff.core.video import DEFAULT_FPS, write_video
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.maths import color
-from hdr_nsff.radiometry.hdr_footage import write_radiance_video
+from hdr_nsff.radiometry.hdr_references import check_references, write_references
 from hdr_nsff.radiometry.recording import record, response_curve, vignette
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.motion import UV, exact_flow, view_geometry
@@ -68,6 +68,7 @@ from hdr_nsff.synth.views import TracedView, clip_views, held_out_views
 
 __all__ = ["SynthConfig", "synth"]
 
+NOT_OF_THE_SCENE = ("out", "variant", "hdr_video", "hdr_still")  # settings
 VIDEO_FPS = DEFAULT_FPS  # of all videos
 LENS_PREFIX = "lens"  # of their names
 VIDEO_CRF = 4  # an error of 1.4 levels, below the recording's own noise
@@ -87,8 +88,7 @@ def synth(config: SynthConfig) -> None:
     size = parse_size(config.size)
     evs = parse_ev(ev)
     check(config, min(spp, truth_spp))
-    if config.hdr_video:
-        check_side(config.out, *size)
+    check_references(config.out, size, config.hdr_video, config.hdr_still)
     clip = clip_views(scene, config.frames, spp, config.seed, config.views)
     held_out = held_out_views(scene, config.frames, truth_spp, config.seed, config.views)
     K = intrinsics(*size)
@@ -105,7 +105,7 @@ def synth(config: SynthConfig) -> None:
         if config.views == "rig":
             list_exposures(evs, config)
         write_truth(clip, held_out, K, relative, reference, config)
-        write_references(clip, config)
+        write_traced(clip, config)
         if config.oracle:
             noise = OracleNoise(
                 config.depth_noise, config.depth_grain, config.flow_noise, config.seed
@@ -287,19 +287,19 @@ def lens_radiance(view: TracedView, lens: Lens | None, out: Path) -> np.ndarray:
     return fine.reshape(lens.height, 2, lens.width, 2, 3).mean((1, 3))
 
 
-def write_references(clip: list[TracedView], config: SynthConfig) -> None:
-    """Write the radiance of the clip as HDR videos, where they are asked for."""
-    if not config.hdr_video:
+def write_traced(clip: list[TracedView], config: SynthConfig) -> None:
+    """Write the radiance of the clip as the HDR references that are asked for."""
+    kinds = config.hdr_video, config.hdr_still
+    if not any(kinds):
         return
     frames = [exact_path(config.out, view) for view in clip]
     probes = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
     white = color.auto_exposure(np.concatenate([read_exr(p)["RGB"] for p in probes]))
-    for transfer in config.hdr_video:
-        path = config.out / f"reference_{transfer}.mp4"
-        write_radiance_video(
-            path, lambda: (read_exr(p)["RGB"] for p in frames), transfer, "hevc", VIDEO_FPS, white
-        )
-        say(f"{path}: the clip's radiance")
+
+    def radiance() -> Iterator[np.ndarray]:
+        return (read_exr(path)["RGB"] for path in frames)
+
+    write_references(config.out, radiance, len(frames), VIDEO_FPS, white, *kinds)
 
 
 def list_exposures(evs: list[float], config: SynthConfig) -> None:
@@ -354,9 +354,7 @@ def write_truth(
         white_balance=list(parse_white_balance(config.white_balance)),
         vignetting=config.vignetting,
         lens=None if lens is None else list(lens.distortion[:2]),
-        settings={
-            k: v for k, v in asdict(config).items() if k not in ("out", "variant", "hdr_video")
-        },
+        settings={k: v for k, v in asdict(config).items() if k not in NOT_OF_THE_SCENE},
         K=K.tolist(),
         clip_c2w=[view.c2w.tolist() for view in clip],
         views=entries,

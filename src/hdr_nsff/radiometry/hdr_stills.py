@@ -1,7 +1,7 @@
-"""HDR stills of a shot, made from its EXR files and the pictures beside them.
+"""HDR stills of linear radiance: diffuse white is 203 nits, the peak 1000.
 
-They show the light of the HDR videos: diffuse white is 203 nits, the peak 1000
-(`maths.hdr_signal`). An Ultra HDR JPEG shows the 8-bit picture on other screens.
+They show the light of the HDR videos (`maths.hdr_signal`). An Ultra HDR JPEG shows an
+8-bit picture on other screens.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ import numpy as np
 
 from hdr_nsff.core.exr import REC709
 from hdr_nsff.core.hdr_still import write_avif, write_pq_png
-from hdr_nsff.core.images import read_image
 from hdr_nsff.core.ultra_hdr import write_ultra_hdr
 from hdr_nsff.maths.color import srgb_decode
 from hdr_nsff.maths.gain_map import GainMap, make_gain_map
@@ -49,12 +48,14 @@ def still_paths(pictures: Sequence[Path], kinds: Sequence[HdrStill]) -> list[Pat
     return [still_path(picture, kind) for picture in pictures for kind in kinds]
 
 
-def write_hdr_still(picture: Path, kind: HdrStill, radiance: np.ndarray, exposure: float) -> None:
-    """Write the HDR still beside `picture`, the view's 8-bit PNG.
+def write_hdr_still(
+    path: Path, kind: HdrStill, radiance: np.ndarray, exposure: float, sdr: np.ndarray
+) -> None:
+    """Write radiance (H, W, 3), in linear Rec. 709 with gray neutral, as an HDR still.
 
-    `radiance` (H, W, 3) has gray neutral; `exposure` brings diffuse white to 1.
+    `exposure` brings diffuse white to 1; `sdr` (H, W, 3) in [0, 1] is the same picture
+    in sRGB, for screens without HDR.
     """
-    path = still_path(picture, kind)
     light = display_light(radiance, exposure, "pq")
     match kind:
         case "avif":
@@ -68,7 +69,7 @@ def write_hdr_still(picture: Path, kind: HdrStill, radiance: np.ndarray, exposur
             def gains_of(sdr: np.ndarray) -> GainMap:
                 return make_gain_map(srgb_decode(sdr), hdr, HEADROOM)
 
-            write_ultra_hdr(path, read_image(picture)[:height, :width], gains_of)
+            write_ultra_hdr(path, sdr[:height, :width], gains_of)
 
 
 def rec2020_to_rec709(rgb: np.ndarray) -> np.ndarray:
