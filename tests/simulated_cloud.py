@@ -54,7 +54,7 @@ def values_and_gradients(
     draw = field.draw_fused if fused else field.draw_terms
     offsets = [] if offset is None else [offset]
     batch = batch_of(0, offset or 1)
-    made, terms = draw(batch, knot, field.alive(knot), offsets, rigidity)
+    made, _, terms = draw(batch, knot, field.alive(knot), offsets, rigidity)
     values = {**dict(zip(NAMES, made, strict=True)), **terms}
     generator = torch.Generator().manual_seed(3)
     loss = sum((torch.randn(v.shape, generator=generator) * v).sum() for v in values.values())

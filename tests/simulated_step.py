@@ -119,7 +119,7 @@ def trainer_on(
     folder: Path,
     out: Path,
     preset: str = "splat",
-    **settings: int,
+    **settings: bool | int,
 ) -> Trainer:
     config = small(preset, folder, out)
     config = replace(config, field=replace(config.field, **settings))
@@ -131,11 +131,15 @@ def trainer_on(
 
 # launches of a step of `splat` without the rasterizer's, one of which clears numbers
 # for many steps, and with time-local Gaussians; those of the rasterizer, forward and
-# backward, and of a number that the host reads; those of a step of `grid`
+# backward, and of a number that the host reads; those of a step of `grid`; and what
+# late mixing launches besides
 SPLAT, SPLAT_LOCAL, RASTERIZER, GRID = 27, 30, 10, 962
+LATE_MIXING = 56
 
 
+@pytest.mark.parametrize("late_mixing", [False, True])
 def test_launches_of_a_step(
+    late_mixing: bool,
     toy: Scene,
     toy_folder: Path,
     tmp_path: Path,
@@ -144,13 +148,14 @@ def test_launches_of_a_step(
 ) -> None:
     assert SPLAT_LOCAL + RASTERIZER <= 40
     launch_by(monkeypatch, count_launch)
-    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run")
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", late_mixing=late_mixing)
+    most = SPLAT + late_mixing * LATE_MIXING
     for number, step in enumerate((1, 2, 1, 2)):  # constants are there by the second time
         trainer.clock = replace(trainer.clock, step=step)
         with counted() as counts:
             trainer.step()
         if number >= 2:
-            assert counts.launches.total() <= SPLAT, counts.launches.most_common()
+            assert counts.launches.total() <= most, counts.launches.most_common()
             assert not counts.waits
 
 
@@ -194,7 +199,8 @@ def test_launches_of_a_step_with_time_local_gaussians(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     launch_by(monkeypatch, count_launch)
-    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", local=9)
+    settings = {"local": 9, "late_mixing": False}
+    trainer = trainer_on(device, toy, toy_folder, tmp_path / "run", **settings)
     assert len(trainer.field.local) == 9
     for step in (1, 2, 1, 2):
         trainer.clock = replace(trainer.clock, step=step)

@@ -23,7 +23,7 @@ from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
 from hdr_nsff.fields.splat.trajectories import WINDOW
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.batch import PixelBatch, whole_frame
+from hdr_nsff.scene.batch import PixelBatch, Recorder, whole_frame
 from hdr_nsff.scene.scene import Scene
 
 TIMES = 10
@@ -191,9 +191,11 @@ def test_shares_stay_between_0_and_1(seed: int) -> None:
 
 def test_gradients_reach_every_parameter() -> None:
     field = scattered(view_dependence=True)
-    render, own = field(batch_of(4, 1))
+    recorder = Recorder(lambda radiance: (radiance / 2).clamp(0, 1), (0,))
+    render, own = field(replace(batch_of(4, 1), recorder=recorder))
     own |= field(replace(batch_of(4, 1), seed=1))[1]  # with rigidity and evenness
     flow = render.warps[0].flow
+    own["late"] = render.radiance.lerp(render.late, render.late_share).square().mean()
     linear, squared = (render.depth, render.motion), (render.radiance, flow)
     total = sum(v.sum() for v in linear) + sum(v.square().sum() for v in squared)
     (total + sum(own.values())).backward()

@@ -154,7 +154,7 @@ def recordings_at(run: Run, target: Target, radiance: Tensor, evs: Sequence[floa
     """The same at any exposures, `evs` relative to the reference bracket."""
     if not evs:
         return []
-    recorders = [run.tonemapper.recorder_at(ev, target.camera_id) for ev in evs]
+    recorders = [run.tonemapper.recorder_at(ev, target.camera_id, lens=True) for ev in evs]
     return record(run, target, radiance, recorders)
 
 
@@ -166,6 +166,5 @@ def record(
     camera = to_device(target.view.camera, device)
     flat = radiance.reshape(-1, 3).to(device)
     with torch.no_grad():
-        flat = run.tonemapper.shade(flat, camera, target.camera_id)
         pictures = record_pixels(run.field, camera, target.view.time, recorders, flat)
     return [picture.cpu().reshape(radiance.shape) for picture in pictures]

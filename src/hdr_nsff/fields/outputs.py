@@ -14,7 +14,7 @@ from torch import Tensor
 
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.base import RadianceField, Render
-from hdr_nsff.fields.recording_field import RecordingField
+from hdr_nsff.fields.recording_field import LateMixingField, RecordingField
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Recorder
 
@@ -56,13 +56,27 @@ def record_pixels(
 ) -> list[Tensor]:
     """What each of the `recorders` records of all pixels, row by row: (S, 3) in [0, 1].
 
-    `radiance` (S, 3) is what the field has rendered there, if it has.
+    `radiance` (S, 3) is what the field has rendered there, if it has. A pixel averages
+    recorded values too, where the field says so.
     """
     if isinstance(field, RecordingField):
         return field.record(camera, time, recorders)
     if radiance is None:
         radiance = field.render(camera, time, scene_flow=False).radiance
-    return [recorder.rgb(radiance) for recorder in recorders]
+    pictures = [record_light(recorder, camera, radiance) for recorder in recorders]
+    if not isinstance(field, LateMixingField):
+        return pictures
+    share, late = field.recorded_late(camera, time, recorders)
+    if not late:
+        return pictures
+    return [rgb.lerp(other, share) for rgb, other in zip(pictures, late, strict=True)]
+
+
+def record_light(recorder: Recorder, camera: Camera, radiance: Tensor) -> Tensor:
+    """What is recorded (S, 3) of all pixels' `radiance` (S, 3), row by row."""
+    if recorder.shade is not None:
+        radiance = recorder.shade(radiance, camera, camera.pixel_grid())
+    return recorder.rgb(radiance)
 
 
 def select_pixels(render: Render, camera: Camera, pixels: Tensor) -> Render:

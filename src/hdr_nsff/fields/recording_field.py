@@ -1,5 +1,6 @@
-"""Fields that record their pictures themselves: two published baselines, whose camera
-acts on samples (HDR-HexPlane) or inside the network (NeRF-W).
+"""Fields that take part in recording: two published baselines, whose camera acts on
+samples (HDR-HexPlane) or inside the network (NeRF-W), and Gaussians, of which a pixel
+may average recorded values.
 
 They are handed a `Recorder` from outside. What any other field records follows from its
 composited radiance.
@@ -24,5 +25,19 @@ class RecordingField(RadianceField, Protocol):
     def record(self, camera: Camera, time: float, recorders: Sequence[Recorder]) -> list[Tensor]:
         """What each of the `recorders` records (S, 3) in [0, 1] of every pixel, row by
         row, without gradients; chunks itself.
+        """
+        ...
+
+
+@runtime_checkable
+class LateMixingField(RadianceField, Protocol):
+    """A field of which a pixel may average recorded values, besides radiance."""
+
+    def recorded_late(
+        self, camera: Camera, time: float, recorders: Sequence[Recorder]
+    ) -> tuple[float, list[Tensor]]:
+        """The share of a pixel's averaging that comes after the recording, and the
+        averages (S, 3) in [0, 1] of what each of the `recorders` records, row by row,
+        without gradients; none where the share is 0.
         """
         ...

@@ -18,15 +18,14 @@ from hdr_nsff.scene.scene import Frame, Scene
 
 @dataclass(frozen=True)
 class Recorder:
-    """One recording, for fields that need it before samples are composited.
-
-    Only fields of baselines do.
-    """
+    """One recording, for fields that need it before samples are composited."""
 
     rgb: Callable[[Tensor], Tensor]  # radiance (M, 3) to recorded rgb (M, 3)
     # positions in `scene.train` of the images recorded like this one: the image itself,
     # or those of its exposure
     images: tuple[int, ...]
+    # what a lens passes of radiance (M, 3), in a camera, at pixels (M, 2); None: all
+    shade: Callable[[Tensor, Camera, Tensor], Tensor] | None = None
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -28,6 +29,7 @@ from torch import Tensor, nn
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.param_group import ParamGroup
 from hdr_nsff.core.settings import Advanced, Weight
+from hdr_nsff.fields.base import Render
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.batch import PixelBatch, Recorder
@@ -218,6 +220,15 @@ class ToneMapper(nn.Module, ABC):
         shaded = self.shade(radiance, batch.camera, batch.camera_id, batch.pixels)
         return self(shaded, batch.bracket, batch.camera_id, batch.frame, leaky)
 
+    def record_render(self, render: Render, batch: PixelBatch, leaky: bool) -> Tensor:
+        """What the camera of a `batch` records (N, 3) of all that a field rendered."""
+        if render.rgb is not None:
+            return render.rgb
+        rgb = self.record(render.radiance, batch, leaky)
+        if render.late is None or render.late_share is None:
+            return rgb
+        return torch.lerp(rgb, render.late, render.late_share)
+
     def develop(self, radiance: Tensor, ev: float, camera_id: int = 0) -> Tensor:
         """The picture (..., 3) in [0, 1] that camera `camera_id` would record of
         `radiance` (..., 3) at `ev` relative to the reference bracket.
@@ -238,16 +249,23 @@ class ToneMapper(nn.Module, ABC):
         """One recording, for fields that record before they composite."""
         images = self.images_of(bracket).tolist() if frame is None else [frame]
         return Recorder(
-            lambda radiance: self(radiance, bracket, camera_id, frame, leaky), tuple(images)
+            lambda radiance: self(radiance, bracket, camera_id, frame, leaky),
+            tuple(images),
+            self.shading(camera_id),
         )
 
-    def recorder_at(self, ev: float, camera_id: int = 0) -> Recorder:
+    def recorder_at(self, ev: float, camera_id: int = 0, lens: bool = False) -> Recorder:
         """The same of a picture developed at `ev`; it looks like the training images of
-        the nearest exposure.
+        the nearest exposure. With `lens` it is as dark towards the corners as these.
         """
         nearest = int((self.exposures() - ev).abs().argmin())
         images = tuple(self.images_of(nearest).tolist())
-        return Recorder(lambda radiance: self.develop(radiance, ev, camera_id), images)
+        shade = self.shading(camera_id) if lens else None
+        return Recorder(lambda radiance: self.develop(radiance, ev, camera_id), images, shade)
+
+    def shading(self, camera_id: int) -> Callable[[Tensor, Camera, Tensor], Tensor] | None:
+        """`shade` of a camera, for recorders; None where its lens passes all light."""
+        return None
 
     def neutral(self, camera_id: int = 0) -> Tensor:
         """Gains (3,), geometric mean 1, that make mid gray neutral.

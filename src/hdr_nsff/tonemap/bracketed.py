@@ -4,6 +4,7 @@ default, whose curve is learned; `fixed`, gamma 2.2; `mlp`, HDR-NeRF's network.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -183,6 +184,11 @@ class SharedToneMapper(BracketedToneMapper):
         if pixels is None:
             pixels = camera.pixel_grid()
         return self.vignetting.shade(radiance, camera, pixels, camera_id)
+
+    def shading(self, camera_id: int) -> Callable[[Tensor, Camera, Tensor], Tensor] | None:
+        if self.vignetting is None:
+            return None
+        return lambda radiance, camera, pixels: self.shade(radiance, camera, camera_id, pixels)
 
     def curve_values(self, camera_id: int, images: Tensor | int | None) -> Tensor:
         return self.response.values(camera_id)

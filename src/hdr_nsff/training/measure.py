@@ -92,9 +92,7 @@ def check_finite(values: dict[str, float], step: int, batch: PixelBatch, radianc
 @torch.no_grad()
 def squared_error(render: Render, batch: PixelBatch, tonemapper: ToneMapper) -> float:
     """Mean square difference of rendered and recorded rgb at uniformly drawn pixels."""
-    rgb = render.rgb
-    if rgb is None:
-        rgb = tonemapper.record(render.radiance, batch, leaky=False)
+    rgb = tonemapper.record_render(render, batch, leaky=False)
     return float((rgb.clamp(0, 1) - batch.rgb)[batch.uniform].square().mean())
 
 

@@ -56,9 +56,7 @@ class Objective:
         self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
         """All terms that need only the render, unweighted."""
-        rgb = render.rgb
-        if rgb is None:
-            rgb = tonemap.record(render.radiance, batch, leaky=True)
+        rgb = tonemap.record_render(render, batch, leaky=True)
         relative = self.published or self.depth_kind == "relative"
         plain = relative or self.squared or not can_fuse(render, batch)
         if not plain and kernels_on(rgb.device):

@@ -73,6 +73,10 @@ class SplatConfig:
     """
     view_dependence: bool = False
     """Let colors change with the direction of view, for shiny objects."""
+    late_mixing: Advanced[bool] = True
+    """Learn which share of a pixel's averaging comes after the recording, as in footage
+    that was shrunk.
+    """
     radiance: Advanced[Literal["exp", "sigmoid"]] = "exp"
     """Unbounded radiance, or one below 1."""
     readout: Annotated[float, Ge(0), Le(1000), arg(aliases=("--readout",))] = 0.0
@@ -95,6 +99,8 @@ class SplatConfig:
     """Learning rate of orientations and log scales."""
     opacity_lr: Advanced[Rate] = 5e-2
     """Learning rate of opacities."""
+    late_mixing_lr: Advanced[Rate] = 5e-3
+    """Learning rate of the share that is averaged late."""
 
     def counts(self, num_pixels: int, local_pixels: int, num_frames: int) -> tuple[int, int, int]:
         """How many static, moving and time-local Gaussians.

@@ -9,8 +9,9 @@ fade away draw nothing and cost next to nothing. docs/method.md, section "4D Gau
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
@@ -26,6 +27,7 @@ from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
+from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts, record_parts
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import LocalScores, relocate
@@ -33,7 +35,7 @@ from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
 from hdr_nsff.fields.splat.terms import MIN_OPACITY, Model, mixture_difference, regularizers
 from hdr_nsff.fields.splat.trajectories import Trajectories
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.batch import PixelBatch, neighbor_in_turn
+from hdr_nsff.scene.batch import PixelBatch, Recorder, neighbor_in_turn
 
 NUM_NEIGHBORS = 4  # of a moving Gaussian, for rigidity
 MAX_VIEW_LOG_FACTOR = 2.0  # by which log radiance may change with the direction of view
@@ -85,6 +87,10 @@ class Splat(nn.Module):
         self.register_buffer("neighbors", itself.repeat(1, NUM_NEIGHBORS))  # of moving ones
         # log radiance (or log odds) where no Gaussian is
         self.background = nn.Parameter(torch.zeros(3))
+        # of the averaging within a pixel, what comes after the recording, in [0, 1]
+        late = torch.full((1,), START_SHARE)
+        self.late_share = nn.Parameter(late) if config.late_mixing else None
+        self.register_load_state_dict_pre_hook(without_late_mixing)
 
     # Time
 
@@ -171,14 +177,18 @@ class Splat(nn.Module):
 
     def draw(self, camera: Camera, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
         """Rasterize radiance (3), motion (1) and `extra` features (G, ...)."""
-        radiance = cloud.radiance
-        if self.config.view_dependence:
-            log_factor = self.view_log_factor(camera, cloud.means)
-            radiance = scale_radiance(radiance, log_factor, self.bounded)
+        radiance = self.seen_radiance(camera, cloud)
         features = torch.cat([radiance, cloud.motion[:, None], *extra], 1)
         return rasterize(
             cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features, camera
         )
+
+    def seen_radiance(self, camera: Camera, cloud: GaussianCloud) -> Tensor:
+        """Radiance (G, 3) of the Gaussians in the direction of `camera`."""
+        if not self.config.view_dependence:
+            return cloud.radiance
+        log_factor = self.view_log_factor(camera, cloud.means)
+        return scale_radiance(cloud.radiance, log_factor, self.bounded)
 
     def view_log_factor(self, camera: Camera, means: Tensor) -> Tensor:
         """Change (G, 3) of log radiance with the direction in which `camera` sees.
@@ -224,6 +234,31 @@ class Splat(nn.Module):
         render = replace(render, depth=depth, scene_flow=flow)
         return render if pixels is None else select_pixels(render, camera, pixels)
 
+    @torch.no_grad()
+    def recorded_late(
+        self, camera: Camera, time: float, recorders: Sequence[Recorder]
+    ) -> tuple[float, list[Tensor]]:
+        """The share of a pixel's averaging that comes after the recording, and the
+        averages (S, 3) of what each of the `recorders` records, row by row; none where
+        the share is 0.
+        """
+        share = 0.0 if self.late_share is None else float(self.late_share.detach())
+        if not share:
+            return 0.0, []
+        cloud = self.cloud(self.knot(time))
+        pictures = []
+        for recorder in recorders:
+            parts = self.parts(recorder, camera, cloud)
+            render, drawn = self.composite(self.draw(camera, cloud, [parts.gaussians]))
+            pictures.append(parts.average(drawn, render.opacity))
+        return share, pictures
+
+    def parts(self, recorder: Recorder, camera: Camera, cloud: GaussianCloud) -> Parts:
+        """The Gaussians and the background, recorded."""
+        radiance = self.seen_radiance(camera, cloud)
+        background = to_radiance(self.background, self.bounded)
+        return record_parts(recorder, camera, radiance, cloud.means, background)
+
     def displacement(self, means: Tensor, alive: Tensor, knot: float, offset: int) -> Tensor:
         """From `means` (G, 3) at a knot to the means one training interval away.
 
@@ -251,36 +286,48 @@ class Splat(nn.Module):
         offsets = neighbor_in_turn(batch) if flow_turn else []
         alive = self.alive(knot)
         if self.can_fuse(batch):
-            maps, terms = self.draw_fused(batch, knot, alive, offsets, not flow_turn)
+            maps, parts, terms = self.draw_fused(batch, knot, alive, offsets, not flow_turn)
+            maps, late = split_late(maps, parts)
             least = MIN_DEPTH_SHARE * self.unit
             numbers = self.bounded, self.far, least, MIN_ALPHA
             render, flow = fused_composite(maps, self.background, *numbers)
         else:
-            maps, terms = self.draw_terms(batch, knot, alive, offsets, not flow_turn)
+            maps, parts, terms = self.draw_terms(batch, knot, alive, offsets, not flow_turn)
+            maps, late = split_late(maps, parts)
             render, drawn = self.composite(maps)
             # features are premultiplied by opacity
             flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
+        if parts is not None and late is not None:
+            render = replace(render, late=parts.average(late, render.opacity))
         certain = constant((1.0,), flow.device, flow.dtype).expand(len(render.opacity))
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)
         if not batch.whole:
             render = select_pixels(render, batch.camera, batch.pixels)
+        if render.late is not None:
+            render = replace(render, late_share=self.late_share)
         return render, terms
 
     def draw_terms(
         self, batch: PixelBatch, knot: float, alive: Tensor, offsets: list[int], rigidity: bool
-    ) -> tuple[Maps, dict[str, Tensor]]:
-        """What the batch sees, with flow to `offsets`, and the field's terms."""
+    ) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
+        """What the batch sees, with flow to `offsets`; the recorded parts, which the
+        maps hold last; and the field's terms.
+        """
         cloud = self.cloud(knot, alive)
-        flows = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
-        maps = self.expose(batch, cloud, alive, flows)
+        extra = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
+        parts = None
+        if self.late_share is not None and batch.recorder is not None:
+            parts = self.parts(batch.recorder, batch.camera, cloud)
+            extra.append(parts.gaussians)
+        maps = self.expose(batch, cloud, alive, extra)
         self.trajectories.mark(knot)
         self.local.mark(alive)
         terms = regularizers(self.model(), cloud, knot)
         if rigidity:
             terms["rigidity"] = mixture_difference(self.mixture_logits, self.neighbors)
             terms["evenness"] = self.local.unevenness(alive, self.unit)
-        return maps, terms
+        return maps, parts, terms
 
     def can_fuse(self, batch: PixelBatch) -> bool:
         """Whether kernels make the Gaussians of the batch's moment: on a GPU, without
@@ -293,7 +340,7 @@ class Splat(nn.Module):
 
     def draw_fused(
         self, batch: PixelBatch, knot: float, alive: Tensor, offsets: list[int], rigidity: bool
-    ) -> tuple[Maps, dict[str, Tensor]]:
+    ) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
         """`draw_terms` by CUDA kernels, with flow to one neighbor at most."""
         neighbor = None
         for offset in offsets:
@@ -303,7 +350,13 @@ class Splat(nn.Module):
         moment = Moment(*when, batch.camera, neighbor, rigidity)
         cloud = fused_cloud(self.model(), moment, alive)
         gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
-        return rasterize(*gaussians, cloud.features, batch.camera), cloud.terms
+        features, parts = cloud.features, None
+        if self.late_share is not None and batch.recorder is not None:
+            background = to_radiance(self.background, self.bounded)
+            given = batch.recorder, batch.camera, features[:, :3], cloud.means, background
+            parts = record_parts(*given)
+            features = torch.cat([features, parts.gaussians], 1)
+        return rasterize(*gaussians, features, batch.camera), parts, cloud.terms
 
     def model(self) -> Model:
         """All kinds of Gaussians together."""
@@ -391,12 +444,17 @@ class Splat(nn.Module):
             config.lr * config.pose_lr,
             row_marks=[t.rotations_touched, t.translations_touched],
         )
-        return [*groups, poses, *self.local.param_groups(config, self.unit)]
+        groups += [poses, *self.local.param_groups(config, self.unit)]
+        if self.late_share is not None:
+            groups.append(ParamGroup([self.late_share], config.lr * config.late_mixing_lr))
+        return groups
 
     # Relocation
 
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Relocate Gaussians every `relocate_every` steps."""
+        if self.late_share is not None:
+            self.late_share.data.clamp_(0, 1)
         every = self.config.relocate_every
         if frame_errors is None or not every or step % every:
             return False
@@ -447,3 +505,19 @@ class Splat(nn.Module):
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""
         return []
+
+
+def without_late_mixing(field: Splat, state: dict[str, Tensor], prefix: str, *args: Any) -> None:
+    """Runs from before late mixing was learned have none."""
+    if field.late_share is not None:
+        state.setdefault(f"{prefix}late_share", torch.zeros_like(field.late_share))
+
+
+def split_late(maps: Maps, parts: Parts | None) -> tuple[Maps, Tensor | None]:
+    """Drawn maps without the last three features, and these (S, 3), which are what was
+    recorded of the Gaussians; all maps and None where there are no `parts`.
+    """
+    if parts is None:
+        return maps, None
+    features, late = maps.features.split([maps.features.shape[-1] - 3, 3], -1)
+    return maps._replace(features=features), late.flatten(0, 1)
