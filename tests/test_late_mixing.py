@@ -94,6 +94,16 @@ def test_the_share_moves_to_how_the_recording_was_averaged(late: bool) -> None:
     assert float(field.late_share.grad) != 0
 
 
+def test_gaussians_behind_the_camera_leave_gradients_finite() -> None:
+    field = contrasty()
+    field.static.means.data[:5, 2] = torch.tensor([-3.0, -1e-6, 0.0, 1e-9, 1e-3])
+    render, _ = field(replace(batch_of(2, 1), recorder=DARKENING))
+    assert render.late is not None
+    render.late.mean().backward()
+    for name, p in field.named_parameters():
+        assert p.grad is None or torch.isfinite(p.grad).all(), name
+
+
 def test_the_share_stays_a_share() -> None:
     field = scattered()
     for value, kept in ((-0.2, 0.0), (1.3, 1.0), (0.4, 0.4)):

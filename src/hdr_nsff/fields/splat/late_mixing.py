@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from hdr_nsff.core.tensors import constant
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Recorder
 
@@ -43,9 +44,12 @@ def record_parts(
     recorder: Recorder, camera: Camera, radiance: Tensor, means: Tensor, background: Tensor
 ) -> Parts:
     """Gaussians of `radiance` (G, 3) at `means` (G, 3), and the `background` (3,),
-    recorded.
+    recorded. What lies outside the picture counts as on its edge.
     """
     if recorder.shade is not None:
-        radiance = recorder.shade(radiance, camera, camera.project(means)[0])
+        with torch.no_grad():
+            size = constant((camera.width, camera.height), means.device, means.dtype)
+            pixels = camera.project(means)[0].clamp_min(0).minimum(size)
+        radiance = recorder.shade(radiance, camera, pixels)
     recorded = recorder.rgb(torch.cat([radiance, background[None]]))
     return Parts(*recorded.split([len(means), 1]))

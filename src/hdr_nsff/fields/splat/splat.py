@@ -452,7 +452,7 @@ class Splat(nn.Module):
     # Relocation
 
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
-        """Relocate Gaussians every `relocate_every` steps."""
+        """Relocate Gaussians every `relocate_every` steps, and bound the late share."""
         if self.late_share is not None:
             self.late_share.data.clamp_(0, 1)
         every = self.config.relocate_every
