@@ -134,7 +134,7 @@ def trainer_on(
 # backward, and of a number that the host reads; those of a step of `grid`; and what
 # late mixing launches besides
 SPLAT, SPLAT_LOCAL, RASTERIZER, GRID = 27, 30, 10, 962
-LATE_MIXING = 58
+LATE_MIXING = 62
 
 
 @pytest.mark.parametrize("late_mixing", [False, True])

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts
+from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts, shares
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.scene import Scene
@@ -60,8 +60,8 @@ def test_what_is_recorded_late_is_the_sum_over_gaussians_one_by_one() -> None:
         for k in range(len(seen)):
             expected += weights[:, k : k + 1] * clip(seen[k])
         expected += (1 - render.opacity)[:, None] * clip(behind)
-    share, (found,) = field.recorded_late(CAMERA, 2.0, [CLIP])
-    assert share == float(field.late_share.detach())
+    ((found, share),) = field.recorded_late(CAMERA, 2.0, [CLIP])
+    torch.testing.assert_close(share[:, 0], field.late_share.detach() * (1 - render.motion))
     torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-3)
 
 
@@ -126,7 +126,16 @@ def test_late_mixing_starts_half_way_and_nothing_is_recorded_where_its_share_is_
     field = Splat(SplatConfig(static=10, moving=0, local=0), torch.arange(4), 1.0, 6.0, 100)
     assert float(field.late_share.detach()) == START_SHARE
     field.late_share.data.zero_()
-    assert field.recorded_late(CAMERA, 2.0, [CLIP]) == (0.0, [])
+    ((_, share),) = field.recorded_late(CAMERA, 2.0, [CLIP])
+    assert not share.any()
+
+
+def test_what_shines_through_a_mover_is_averaged_as_light() -> None:
+    motion = torch.tensor([0.0, 0.9, 1.0], requires_grad=True)
+    found = shares(torch.tensor([0.6], requires_grad=True), motion)
+    torch.testing.assert_close(found[:, 0], torch.tensor([0.6, 0.06, 0.0]))
+    found.sum().backward()
+    assert motion.grad is None  # nothing is gained by calling a pixel moving
 
 
 def test_recorders_darken_corners_where_vignetting_is_learned(toy: Scene, tmp_path: Path) -> None:

@@ -43,8 +43,8 @@ class Render:
     dynamic_radiance: Tensor | None = None  # (S, 3) the dynamic branch alone, in training
     dynamic_depth: Tensor | None = None  # (S,) z-depth of the dynamic branch, in training
     rgb: Tensor | None = None  # (S, 3) already recorded, of a field that composites rgb
-    # (S, 3) averages of recorded values, and the share (1,) of them in the recording
-    # of a pixel, in training
+    # (S, 3) averages of recorded values, and their shares (S, 1) in what the pixels
+    # record, in training
     late: Tensor | None = None
     late_share: Tensor | None = None
 

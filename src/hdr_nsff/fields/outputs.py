@@ -66,10 +66,10 @@ def record_pixels(
     pictures = [record_light(recorder, camera, radiance) for recorder in recorders]
     if not isinstance(field, LateMixingField):
         return pictures
-    share, late = field.recorded_late(camera, time, recorders)
+    late = field.recorded_late(camera, time, recorders)
     if not late:
         return pictures
-    return [rgb.lerp(other, share) for rgb, other in zip(pictures, late, strict=True)]
+    return [rgb.lerp(*other) for rgb, other in zip(pictures, late, strict=True)]
 
 
 def record_light(recorder: Recorder, camera: Camera, radiance: Tensor) -> Tensor:

@@ -35,9 +35,9 @@ class LateMixingField(RadianceField, Protocol):
 
     def recorded_late(
         self, camera: Camera, time: float, recorders: Sequence[Recorder]
-    ) -> tuple[float, list[Tensor]]:
-        """The share of a pixel's averaging that comes after the recording, and the
-        averages (S, 3) in [0, 1] of what each of the `recorders` records, row by row,
-        without gradients; none where the share is 0.
+    ) -> list[tuple[Tensor, Tensor]]:
+        """For each of the `recorders` the averages (S, 3) in [0, 1] of what it records,
+        row by row, and their shares (S, 1) in the pixels, without gradients; nothing
+        where all is averaged before.
         """
         ...

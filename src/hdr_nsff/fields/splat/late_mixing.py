@@ -5,11 +5,13 @@ radiance E that cover shares w of it. A pixel of footage that was shrunk or comp
 averages what finer pixels recorded: sum w f(E). Where a leaf stands before a sky that
 clips, the two are far apart, and exposures then contradict each other.
 
-A share s of the averaging, one number for a clip, comes late:
+A share of the averaging comes late:
 
-    rgb = (1 - s) f(sum w E) + s sum w f(E)
+    rgb = (1 - s) f(sum w E) + s sum w f(E),    s = (1 - m) s0
 
-The parts are the Gaussians and the background. Radiance is averaged as ever.
+with one number s0 for a clip and the share m of movers in the pixel: what shines
+through a mover is an error, which the average of light does not forgive. The parts are
+the Gaussians and the background. Radiance is averaged as ever.
 """
 
 from __future__ import annotations
@@ -38,6 +40,15 @@ class Parts:
         `opacity` (S,) in all; `drawn` (S, 3) is their share in it.
         """
         return torch.addcmul(drawn, (1 - opacity)[:, None], self.background)
+
+
+def shares(share: Tensor, motion: Tensor) -> Tensor:
+    """The share (S, 1) of every pixel's averaging that comes late.
+
+    It is that of the clip (1,), as far as the pixel shows what is at rest, by its
+    `motion` (S,) in [0, 1].
+    """
+    return share * (1 - motion.detach())[:, None]
 
 
 def record_parts(

@@ -27,7 +27,7 @@ from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
-from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts, record_parts
+from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts, record_parts, shares
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import LocalScores, relocate
@@ -237,21 +237,20 @@ class Splat(nn.Module):
     @torch.no_grad()
     def recorded_late(
         self, camera: Camera, time: float, recorders: Sequence[Recorder]
-    ) -> tuple[float, list[Tensor]]:
-        """The share of a pixel's averaging that comes after the recording, and the
-        averages (S, 3) of what each of the `recorders` records, row by row; none where
-        the share is 0.
+    ) -> list[tuple[Tensor, Tensor]]:
+        """For each of the `recorders` the averages (S, 3) of what it records, row by
+        row, and their shares (S, 1) in the pixels; nothing without late mixing.
         """
-        share = 0.0 if self.late_share is None else float(self.late_share.detach())
-        if not share:
-            return 0.0, []
+        if self.late_share is None:
+            return []
         cloud = self.cloud(self.knot(time))
         pictures = []
         for recorder in recorders:
             parts = self.parts(recorder, camera, cloud)
             render, drawn = self.composite(self.draw(camera, cloud, [parts.gaussians]))
-            pictures.append(parts.average(drawn, render.opacity))
-        return share, pictures
+            average = parts.average(drawn, render.opacity)
+            pictures.append((average, shares(self.late_share, render.motion)))
+        return pictures
 
     def parts(self, recorder: Recorder, camera: Camera, cloud: GaussianCloud) -> Parts:
         """The Gaussians and the background, recorded."""
@@ -297,15 +296,14 @@ class Splat(nn.Module):
             render, drawn = self.composite(maps)
             # features are premultiplied by opacity
             flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
-        if parts is not None and late is not None:
-            render = replace(render, late=parts.average(late, render.opacity))
+        if self.late_share is not None and parts is not None and late is not None:
+            share = shares(self.late_share, render.motion)
+            render = replace(render, late=parts.average(late, render.opacity), late_share=share)
         certain = constant((1.0,), flow.device, flow.dtype).expand(len(render.opacity))
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)
         if not batch.whole:
             render = select_pixels(render, batch.camera, batch.pixels)
-        if render.late is not None:
-            render = replace(render, late_share=self.late_share)
         return render, terms
 
     def draw_terms(
