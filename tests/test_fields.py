@@ -92,7 +92,7 @@ def test_what_is_recorded_of_a_field_has_the_shape_and_range_of_a_picture(
     )
     assert isinstance(field, RecordingField) != isinstance(field, NSFF | Splat)
     if isinstance(field, Splat):  # a part of a pixel's averaging is done behind the camera
-        field.late_share.data.zero_()
+        field.late_mixing.share.data.zero_()
         (rgb,) = record_pixels(field, camera, 2.0, [LOOK])
     if isinstance(field, NSFF | Splat):  # the camera stands behind the field
         torch.testing.assert_close(rgb, LOOK.rgb(field.render(camera, 2.0).radiance))

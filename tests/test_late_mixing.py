@@ -10,9 +10,10 @@ import torch
 from test_splat import CAMERA, batch_of, scattered
 from torch import Tensor
 
+from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts, shares
+from hdr_nsff.fields.splat.late_mixing import START_SHARE, LateMixing, Parts
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.scene import Scene
@@ -61,7 +62,7 @@ def test_what_is_recorded_late_is_the_sum_over_gaussians_one_by_one() -> None:
             expected += weights[:, k : k + 1] * clip(seen[k])
         expected += (1 - render.opacity)[:, None] * clip(behind)
     ((found, share),) = field.recorded_late(CAMERA, 2.0, [CLIP])
-    torch.testing.assert_close(share[:, 0], field.late_share.detach() * (1 - render.motion))
+    torch.testing.assert_close(share[:, 0], field.late_mixing.share.detach() * (1 - render.motion))
     torch.testing.assert_close(found, expected, atol=2e-4, rtol=1e-3)
 
 
@@ -90,8 +91,8 @@ def test_the_share_moves_to_how_the_recording_was_averaged(late: bool) -> None:
     truth = (render.late if late else clip(render.radiance)).detach()
     rgb = clip(render.radiance).lerp(render.late, render.late_share)
     (rgb - truth).abs().mean().backward()
-    assert (float(field.late_share.grad) < 0) == late  # a step goes against the gradient
-    assert float(field.late_share.grad) != 0
+    assert (float(field.late_mixing.share.grad) < 0) == late  # a step goes against the gradient
+    assert float(field.late_mixing.share.grad) != 0
 
 
 def test_gaussians_behind_the_camera_leave_gradients_finite() -> None:
@@ -107,15 +108,15 @@ def test_gaussians_behind_the_camera_leave_gradients_finite() -> None:
 def test_the_share_stays_a_share() -> None:
     field = scattered()
     for value, kept in ((-0.2, 0.0), (1.3, 1.0), (0.4, 0.4)):
-        field.late_share.data.fill_(value)
+        field.late_mixing.share.data.fill_(value)
         field.after_step(1, None)
-        assert float(field.late_share.detach()) == pytest.approx(kept)
+        assert float(field.late_mixing.share.detach()) == pytest.approx(kept)
 
 
 def test_without_late_mixing_light_alone_is_averaged() -> None:
     config = SplatConfig(static=10, moving=0, local=0, late_mixing=False)
     field = Splat(config, torch.arange(4), 1.0, 6.0, 100)
-    assert "late_share" not in dict(field.named_parameters())
+    assert "late_mixing.share" not in dict(field.named_parameters())
     render, _ = field(replace(batch_of(2, 1), recorder=CLIP))
     assert render.late is None
     (rgb,) = record_pixels(field, CAMERA, 2.0, [CLIP])
@@ -124,17 +125,21 @@ def test_without_late_mixing_light_alone_is_averaged() -> None:
 
 def test_late_mixing_starts_half_way_and_nothing_is_recorded_where_its_share_is_0() -> None:
     field = Splat(SplatConfig(static=10, moving=0, local=0), torch.arange(4), 1.0, 6.0, 100)
-    assert float(field.late_share.detach()) == START_SHARE
-    field.late_share.data.zero_()
+    assert float(field.late_mixing.share.detach()) == START_SHARE
+    field.late_mixing.share.data.zero_()
     ((_, share),) = field.recorded_late(CAMERA, 2.0, [CLIP])
     assert not share.any()
 
 
 def test_what_shines_through_a_mover_is_averaged_as_light() -> None:
     motion = torch.tensor([0.0, 0.9, 1.0], requires_grad=True)
-    found = shares(torch.tensor([0.6], requires_grad=True), motion)
-    torch.testing.assert_close(found[:, 0], torch.tensor([0.6, 0.06, 0.0]))
-    found.sum().backward()
+    opacity, parts = torch.ones(3), Parts(torch.zeros(1, 3), torch.zeros(1, 3))
+    render = Render(torch.zeros(3, 3), opacity, opacity, motion)
+    mixing = LateMixing()
+    mixing.share.data.fill_(0.6)
+    _, share = mixing(parts, torch.zeros(3, 3), render)
+    torch.testing.assert_close(share[:, 0], torch.tensor([0.6, 0.06, 0.0]))
+    share.sum().backward()
     assert motion.grad is None  # nothing is gained by calling a pixel moving
 
 
@@ -155,6 +160,8 @@ def test_recorders_darken_corners_where_vignetting_is_learned(toy: Scene, tmp_pa
 
 def test_runs_from_before_late_mixing_have_none() -> None:
     field = scattered()
-    state = {name: values for name, values in field.state_dict().items() if name != "late_share"}
+    state = {
+        name: values for name, values in field.state_dict().items() if name != "late_mixing.share"
+    }
     field.load_state_dict(state)
-    assert float(field.late_share.detach()) == 0
+    assert float(field.late_mixing.share.detach()) == 0

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
-from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
@@ -27,7 +26,7 @@ from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.gaussians import Gaussians, scale_radiance, to_radiance
-from hdr_nsff.fields.splat.late_mixing import START_SHARE, Parts, record_parts, shares
+from hdr_nsff.fields.splat.late_mixing import LateMixing, Parts, split_late
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.relocate import LocalScores, relocate
@@ -87,10 +86,7 @@ class Splat(nn.Module):
         self.register_buffer("neighbors", itself.repeat(1, NUM_NEIGHBORS))  # of moving ones
         # log radiance (or log odds) where no Gaussian is
         self.background = nn.Parameter(torch.zeros(3))
-        # of the averaging within a pixel, what comes after the recording, in [0, 1]
-        late = torch.full((1,), START_SHARE)
-        self.late_share = nn.Parameter(late) if config.late_mixing else None
-        self.register_load_state_dict_pre_hook(without_late_mixing)
+        self.late_mixing = LateMixing() if config.late_mixing else None
 
     # Time
 
@@ -241,22 +237,21 @@ class Splat(nn.Module):
         """For each of the `recorders` the averages (S, 3) of what it records, row by
         row, and their shares (S, 1) in the pixels; nothing without late mixing.
         """
-        if self.late_share is None:
+        if self.late_mixing is None:
             return []
         cloud = self.cloud(self.knot(time))
         pictures = []
         for recorder in recorders:
             parts = self.parts(recorder, camera, cloud)
             render, drawn = self.composite(self.draw(camera, cloud, [parts.gaussians]))
-            average = parts.average(drawn, render.opacity)
-            pictures.append((average, shares(self.late_share, render.motion)))
+            pictures.append(self.late_mixing(parts, drawn, render))
         return pictures
 
     def parts(self, recorder: Recorder, camera: Camera, cloud: GaussianCloud) -> Parts:
         """The Gaussians and the background, recorded."""
         radiance = self.seen_radiance(camera, cloud)
         background = to_radiance(self.background, self.bounded)
-        return record_parts(recorder, camera, radiance, cloud.means, background)
+        return Parts.of(recorder, camera, radiance, cloud.means, background)
 
     def displacement(self, means: Tensor, alive: Tensor, knot: float, offset: int) -> Tensor:
         """From `means` (G, 3) at a knot to the means one training interval away.
@@ -296,9 +291,9 @@ class Splat(nn.Module):
             render, drawn = self.composite(maps)
             # features are premultiplied by opacity
             flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
-        if self.late_share is not None and parts is not None and late is not None:
-            share = shares(self.late_share, render.motion)
-            render = replace(render, late=parts.average(late, render.opacity), late_share=share)
+        if self.late_mixing is not None and parts is not None and late is not None:
+            average, share = self.late_mixing(parts, late, render)
+            render = replace(render, late=average, late_share=share)
         certain = constant((1.0,), flow.device, flow.dtype).expand(len(render.opacity))
         warps = tuple(Warp(o, flow, certain, None) for o in offsets)
         render = replace(render, warps=warps)
@@ -315,7 +310,7 @@ class Splat(nn.Module):
         cloud = self.cloud(knot, alive)
         extra = [self.flow_to_neighbor(batch, cloud.means, alive, knot, o) for o in offsets]
         parts = None
-        if self.late_share is not None and batch.recorder is not None:
+        if self.late_mixing is not None and batch.recorder is not None:
             parts = self.parts(batch.recorder, batch.camera, cloud)
             extra.append(parts.gaussians)
         maps = self.expose(batch, cloud, alive, extra)
@@ -349,10 +344,10 @@ class Splat(nn.Module):
         cloud = fused_cloud(self.model(), moment, alive)
         gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
         features, parts = cloud.features, None
-        if self.late_share is not None and batch.recorder is not None:
+        if self.late_mixing is not None and batch.recorder is not None:
             background = to_radiance(self.background, self.bounded)
             given = batch.recorder, batch.camera, features[:, :3], cloud.means, background
-            parts = record_parts(*given)
+            parts = Parts.of(*given)
             features = torch.cat([features, parts.gaussians], 1)
         return rasterize(*gaussians, features, batch.camera), parts, cloud.terms
 
@@ -443,16 +438,17 @@ class Splat(nn.Module):
             row_marks=[t.rotations_touched, t.translations_touched],
         )
         groups += [poses, *self.local.param_groups(config, self.unit)]
-        if self.late_share is not None:
-            groups.append(ParamGroup([self.late_share], config.lr * config.late_mixing_lr))
+        if self.late_mixing is not None:
+            rate = config.lr * config.late_mixing_lr
+            groups.append(ParamGroup([self.late_mixing.share], rate))
         return groups
 
     # Relocation
 
     def after_step(self, step: int, frame_errors: Callable[[int], list[FrameError]] | None) -> bool:
         """Relocate Gaussians every `relocate_every` steps, and bound the late share."""
-        if self.late_share is not None:
-            self.late_share.data.clamp_(0, 1)
+        if self.late_mixing is not None:
+            self.late_mixing.share.data.clamp_(0, 1)
         every = self.config.relocate_every
         if frame_errors is None or not every or step % every:
             return False
@@ -503,19 +499,3 @@ class Splat(nn.Module):
     def shared_maxima(self) -> list[Tensor]:
         """Nothing that several processes must agree on besides gradients."""
         return []
-
-
-def without_late_mixing(field: Splat, state: dict[str, Tensor], prefix: str, *args: Any) -> None:
-    """Runs from before late mixing was learned have none."""
-    if field.late_share is not None:
-        state.setdefault(f"{prefix}late_share", torch.zeros_like(field.late_share))
-
-
-def split_late(maps: Maps, parts: Parts | None) -> tuple[Maps, Tensor | None]:
-    """Drawn maps without the last three features, and these (S, 3), which are what was
-    recorded of the Gaussians; all maps and None where there are no `parts`.
-    """
-    if parts is None:
-        return maps, None
-    features, late = maps.features.split([maps.features.shape[-1] - 3, 3], -1)
-    return maps._replace(features=features), late.flatten(0, 1)
