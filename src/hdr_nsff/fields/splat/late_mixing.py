@@ -28,7 +28,7 @@ from hdr_nsff.fields.splat.rasterize import Maps
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import Recorder
 
-START_SHARE = 0.5  # real clips that were shrunk end at 0.4 to 0.9, rendered ones at 0
+START_SHARE = 0.5  # real clips that were shrunk end at 0.4 to 0.8, rendered ones at 0
 
 
 @dataclass(frozen=True)
