@@ -6,6 +6,7 @@ import pytest
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.lens import Lens, distorted_picture
+from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.estimate import Mapper, estimate_poses
 
 LENS = Lens(posed_clips.K, (0.15, 0.0, 0.0, 0.0), posed_clips.W, posed_clips.H)
@@ -29,6 +30,20 @@ def test_the_distortion_of_a_clip_is_found(tmp_path, clip):
     lens = estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses[0]
     assert lens.max_displacement_px() == pytest.approx(LENS.max_displacement_px(), rel=0.25)
     assert lens.distortion[0] > 0 and lens.distortion[1:] == (0, 0, 0)
+
+
+def test_a_lens_is_found_from_the_poses_of_the_pinhole_camera(tmp_path, clip, monkeypatch):
+    tasks = []
+
+    def run(job):
+        tasks.append(job.task)
+        return map_images(job)
+
+    map_images = sfm.run
+    monkeypatch.setattr(sfm, "run", run)
+    bent = np.stack([distorted_picture(frame, posed_clips.K, LENS) for frame in clip])
+    assert estimate_poses(bent, None, tmp_path, threads=1, lens="auto").lenses
+    assert tasks == ["incremental", "adjust"]
 
 
 def test_given_distortion_is_held_and_gets_a_focal_length(tmp_path, clip):

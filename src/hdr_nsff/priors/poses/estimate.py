@@ -57,6 +57,7 @@ from hdr_nsff.priors.poses.rotation import (
     fit_video,
     rotation_share,
 )
+from hdr_nsff.priors.poses.sfm import LENS_FILE
 from hdr_nsff.priors.poses.still_camera import StillCameraTuning, still_camera_shifts
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import VisitImages
@@ -204,7 +205,8 @@ class Mapper:
         """Poses of a reconstruction with a lens, and the lenses unless they bend too
         little after all.
         """
-        round_of_its_own = EarlierRounds(self.earlier.matches)
+        start = {name: c for name, c in self.earlier.model.items() if name != LENS_FILE}
+        round_of_its_own = EarlierRounds(self.earlier.matches, start)
         model, scale = self.model(mapping, round_of_its_own)
         fit = lens_fit(round_of_its_own)
         tuning = self.tuning.lens

@@ -247,20 +247,27 @@ def fit_lens(model: Any, tuning: SfmTuning) -> LensFit:
     """Another lens for the cameras of an adjusted `model`, which stays as it is."""
     import pycolmap
 
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.function_tolerance = tuning.trimming_tolerance
-    options.ceres.solver_options.max_num_iterations = tuning.max_trimming_iterations
     other = pycolmap.Reconstruction(model)
     for camera in other.cameras.values():
         radial = list(camera.params[NUM_PINHOLE_PARAMS:])
         set_lens(camera, radial[:1] if radial else [0.0, 0.0])
-    pycolmap.bundle_adjustment(other, options)
+    pycolmap.bundle_adjustment(other, quick_adjustment(tuning))
     lenses = {}
     for key, camera in other.cameras.items():
         focal, _, _, k1, k2 = [*(float(value) for value in camera.params), 0.0][:5]
         lenses[int(key)] = (focal, k1, k2)
     return LensFit(lenses, mean_error(model), mean_error(other))
+
+
+def quick_adjustment(tuning: SfmTuning) -> Any:
+    """How cameras and points are adjusted where convergence comes later."""
+    import pycolmap
+
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.ceres.solver_options.function_tolerance = tuning.trimming_tolerance
+    options.ceres.solver_options.max_num_iterations = tuning.max_trimming_iterations
+    return options
 
 
 def incremental_options(job: Job, threads: int) -> Any:
@@ -317,13 +324,22 @@ def map_incrementally(job: Job, database: Path, threads: int) -> dict[int, Any]:
 
 
 def from_known_poses(job: Job, database: Path, threads: int) -> Any:
-    """The model of the poses in `job.start`, with points triangulated anew."""
+    """The model of the poses in `job.start`, with points triangulated anew. Where its
+    cameras are pinholes and those of the job are not, the poses first follow the lens.
+    """
     import pycolmap
 
     send("stage triangulation", 1)
+    start = pycolmap.Reconstruction(job.start)
+    pinholes = [c for c in start.cameras.values() if len(c.params) == NUM_PINHOLE_PARAMS]
+    if job.distortion and pinholes:
+        for camera in pinholes:
+            camera.focal_length = job.focal
+            set_lens(camera, job.distortion)
+        pycolmap.bundle_adjustment(start, quick_adjustment(job.tuning))
     options = incremental_options(job, threads)
     model = pycolmap.triangulate_points(
-        pycolmap.Reconstruction(job.start),
+        start,
         database,
         Path(job.folder) / "images",
         job.out,
@@ -344,15 +360,13 @@ def adjust(model: Any, job: Job, final: bool) -> None:
     import pycolmap
 
     tuning = job.tuning
-    held = pycolmap.BundleAdjustmentOptions()
-    held.print_summary = held.refine_focal_length = False
-    free = pycolmap.BundleAdjustmentOptions()
-    free.print_summary = False
+    held, free = [
+        pycolmap.BundleAdjustmentOptions() if final else quick_adjustment(tuning) for _ in range(2)
+    ]
+    held.refine_focal_length = False
     for options in (held, free):
+        options.print_summary = False
         options.refine_extra_params = job.refine_distortion
-        if not final:
-            options.ceres.solver_options.function_tolerance = tuning.trimming_tolerance
-            options.ceres.solver_options.max_num_iterations = tuning.max_trimming_iterations
     pycolmap.bundle_adjustment(model, held)
     before = {key: list(camera.params) for key, camera in model.cameras.items()}
     held_error = mean_error(model)
