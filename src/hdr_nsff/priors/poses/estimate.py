@@ -202,8 +202,8 @@ class Mapper:
         return self.of_model(model, scale)
 
     def bent_poses(self, mapping: Mapping) -> Poses:
-        """Poses of a reconstruction with a lens, and the lenses unless they bend too
-        little after all.
+        """Poses of a reconstruction with a lens, which starts from the earlier one's if
+        there is one, and the lenses unless they bend too little after all.
         """
         start = {name: c for name, c in self.earlier.model.items() if name != LENS_FILE}
         round_of_its_own = EarlierRounds(self.earlier.matches, start)

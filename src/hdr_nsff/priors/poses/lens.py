@@ -3,8 +3,8 @@ and by how much.
 
 A reconstruction with a pinhole camera is adjusted once more with radial distortion k1,
 k2 (COLMAP's RADIAL). Where that lowers the reprojection error clearly and moves the
-corners visibly, the views are mapped again with such a camera, and its lens is found;
-k2 only where k1 alone serves worse. Otherwise the clip is that of a pinhole camera.
+corners visibly, its poses start another one with such a camera, whose lens is found; k2
+only where k1 alone serves worse. Otherwise the clip is that of a pinhole camera.
 """
 
 from __future__ import annotations
