@@ -99,9 +99,8 @@ def test_a_drifting_object_seen_by_a_shaking_camera_gets_its_own_depth() -> None
     motions = [np.broadcast_to(center[j] - center[i], (H, W, 2)) for i, j in pairs]
     flow = np.stack(motions).astype(np.float32)
     wall = np.full((20, H, W), 0.25, np.float32)
-    disparity, confidence = mover_depth(
-        posed_video(cameras_at(*eyes), moving), flow, np.ones(flow.shape[:3], bool), pairs, wall
-    )
+    clip, valid = posed_video(cameras_at(*eyes), moving), np.ones(flow.shape[:3], bool)
+    disparity, confidence = map(np.asarray, mover_depth(clip, flow, valid, pairs, wall))
     assert np.abs(disparity[moving] * 2 - 1).mean() < 0.03
     assert (disparity[~moving] == 0.25).all()
     assert confidence[~moving].max() == 0 and 0.4 < confidence[moving].mean() <= 0.5

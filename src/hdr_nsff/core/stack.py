@@ -87,6 +87,19 @@ def map_stack(
     return Stack(lambda k: function(stack.make(k), k), (len(stack), *one))
 
 
+def with_pixels(stack: ArrayStack, masks: np.ndarray, values: Sequence[np.ndarray]) -> ArrayStack:
+    """The maps (N, H, W) of a stack with `values` (M,) of each at the pixels of its
+    mask, `masks` (N, H, W) bool.
+    """
+
+    def patched(array: np.ndarray, k: int) -> np.ndarray:
+        array = array.copy()
+        array[masks[k]] = values[k]
+        return array
+
+    return map_stack(patched, stack)
+
+
 class LazyMap(Mapping[int, np.ndarray]):
     """Arrays by key, made when they are asked for."""
 

@@ -72,6 +72,10 @@ class Lens:
                 break
         return pinhole.to_pixels(pinhole.homogeneous(plane), K)
 
+    def undistorted_pixels(self) -> np.ndarray:
+        """Where the camera `pinhole()` sees (H, W, 2) what the pixels recorded."""
+        return self.undistort(pinhole.pixel_centers(self.height, self.width), self.pinhole())
+
     def border(self) -> np.ndarray:
         """Points (N, 2) along the border of a picture, in pixels."""
         along = np.linspace(0, 1, BORDER_POINTS)
@@ -148,9 +152,10 @@ def distorted_picture(picture: np.ndarray, K: np.ndarray, lens: Lens) -> np.ndar
     return sample(picture, lens.undistort(pinhole.pixel_centers(lens.height, lens.width), K))
 
 
-def sample(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+def sample(picture: np.ndarray, pixels: np.ndarray, linear: bool = False) -> np.ndarray:
     """A picture (H, W) or (H, W, C) read at `pixels` (h, w, 2), between its pixels by a
-    cubic, and beyond its border as there.
+    cubic, or `linear`, and beyond its border as there. One of bool is read at the
+    nearest pixel.
     """
     places = np.ascontiguousarray(pixels - 0.5, np.float32)
     x, y = places[..., 0], places[..., 1]
@@ -159,5 +164,7 @@ def sample(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         marks = picture.astype(np.uint8)
         return np.asarray(cv2.remap(marks, x, y, cv2.INTER_NEAREST, borderMode=edge)) > 0
     values = np.ascontiguousarray(picture, np.float32)
+    if linear:
+        return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=edge))
     read = np.asarray(cv2.remap(values, x, y, cv2.INTER_CUBIC, borderMode=edge))
     return read.clip(values.min(), values.max())

@@ -52,8 +52,7 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     if record is None or record.key != key or name in work.config.redo:
         for output in step.outputs:
             remove(work.folder / output)
-        attempt = record.details.get("attempt", 0) + 1 if record else 1
-        record = StepRecord(key=key, details={"attempt": attempt})
+        record = next_attempt(record, key)
     elif record.done and step.complete(work.manifest) and present(work, step):
         return
     records[name] = record.model_copy(update={"done": False})
@@ -75,6 +74,12 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     work.forget(step.forgets)
     if not step.quiet:
         say(f"{name}: {result.note}")
+
+
+def next_attempt(record: StepRecord | None, key: str) -> StepRecord:
+    """The record of a step that starts over; the steps after it then do so too."""
+    attempt = record.details.get("attempt", 0) + 1 if record else 1
+    return StepRecord(key=key, details={"attempt": attempt})
 
 
 def step_key(work: Work, name: StepName, step: Step) -> str:

@@ -2,7 +2,7 @@
 and the frames as a pinhole camera would have recorded them.
 
 Frames are undistorted once, as they are decoded. A lens that structure from motion
-finds is known only later, so the steps before start over (`DistortedFramesError`).
+finds is known only later, see `undistort.py`.
 """
 
 from __future__ import annotations

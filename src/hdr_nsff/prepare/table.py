@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from hdr_nsff.core.progress import say
 from hdr_nsff.prepare.engine import Step, all_have, run_step
-from hdr_nsff.prepare.lens import DistortedFramesError, describe
+from hdr_nsff.prepare.lens import DistortedFramesError
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.depth import find_depth
-from hdr_nsff.prepare.steps.flow import find_flow
+from hdr_nsff.prepare.steps.flow import find_flow, has_flow
 from hdr_nsff.prepare.steps.masks import find_masks
 from hdr_nsff.prepare.steps.movers import find_movers
 from hdr_nsff.prepare.steps.poses import find_poses
@@ -17,8 +16,8 @@ from hdr_nsff.prepare.steps.refined_flow import refine_flow
 from hdr_nsff.prepare.steps.response import find_response
 from hdr_nsff.prepare.steps.sheet import draw_sheet
 from hdr_nsff.prepare.steps.static_depth import find_static_depth
+from hdr_nsff.prepare.undistort import UNDISTORTED_FLOW, start_over
 from hdr_nsff.prepare.work import StepName, Work
-from hdr_nsff.scene.manifest import LensEntry
 
 
 def run_steps(work: Work, steps: Mapping[StepName, Step]) -> None:
@@ -28,13 +27,8 @@ def run_steps(work: Work, steps: Mapping[StepName, Step]) -> None:
     try:
         for name, step in steps.items():
             run_step(work, name, step)
-    except DistortedFramesError as found:
-        given = work.config.lens_distortion != "auto"
-        lenses = {c: LensEntry.of(lens, given) for c, lens in found.lenses.items()}
-        say(f"poses: the lens distorts ({describe(lenses)}); frames are undistorted, once")
-        work.manifest.lens = lenses
-        work.save()
-        work.forget(("codes", "equalized", "raw_flows"))
+    except DistortedFramesError as distorted:
+        start_over(work, steps, distorted.lenses)
         for name, step in steps.items():
             run_step(work, name, step)
 
@@ -57,8 +51,8 @@ STEPS: dict[StepName, Step] = {
         find_flow,
         needs=("exposure",),
         settings=("flow", "flow_weights", "semantic"),
-        outputs=("raw_flow",),
-        complete=all_have("raw_flow"),
+        outputs=("raw_flow", UNDISTORTED_FLOW),
+        complete=has_flow,
         forgets=("raw_flows", "refined_flows"),
     ),
     "poses": Step(

@@ -15,7 +15,7 @@ from hdr_nsff.footage.datasets import maps
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.flow.sources import fallback_note, flow_source, resolve_source
-from hdr_nsff.scene.manifest import FlowFiles, FrameEntry
+from hdr_nsff.scene.manifest import FlowFiles, FrameEntry, Manifest
 
 FLOW_CHUNK = 8  # pairs between two savings
 
@@ -90,6 +90,12 @@ def flow_pairs(frames: list[FrameEntry]) -> list[Pair]:
         for line in (own, train):
             pairs |= dict.fromkeys(pairwise(f.index for f in line))
     return [pair for i, j in pairs for pair in ((i, j), (j, i))]
+
+
+def has_flow(m: Manifest) -> bool:
+    """Whether the manifest names the flow of every pair."""
+    pairs = flow_pairs(m.frames)
+    return bool(pairs) and all(j in m.frames[i].raw_flow for i, j in pairs)
 
 
 def learning_pairs(frames: list[FrameEntry]) -> tuple[list[Pair], list[Pair]]:

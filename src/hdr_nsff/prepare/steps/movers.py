@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from hdr_nsff.core.stack import ArrayStack, by_key, map_stack
+from hdr_nsff.core.stack import ArrayStack, by_key, map_stack, with_pixels
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges, same_time_depth
@@ -93,15 +93,18 @@ def within_outlines(moving: np.ndarray) -> np.ndarray:
 
 def with_shapes(
     movers: tuple[Mover, ...], clip: PosedVideo, disparity: ArrayStack, confidence: ArrayStack
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[ArrayStack, ArrayStack]:
     """Disparity and confidence (T, H, W) with moving pixels where the shapes are."""
-    disparity, confidence = np.array(disparity), np.array(confidence)
-    for t, k in enumerate(movers[0].frames.tolist()):
-        filled = fill_mover_depth(
-            movers, t, clip.moving[k], clip.c2w[k], disparity[k], confidence[k]
-        )
-        disparity[k], confidence[k] = filled[0], lower_confidence_at_edges(*filled)
-    return disparity, confidence
+    time_of = {k: t for t, k in enumerate(movers[0].frames.tolist())}
+    depths, trust = [], []
+    for k, moving in enumerate(clip.moving):
+        filled = disparity[k], confidence[k]
+        if k in time_of:
+            filled = fill_mover_depth(movers, time_of[k], moving, clip.c2w[k], *filled)
+            filled = filled[0], lower_confidence_at_edges(*filled)
+        depths.append(filled[0][moving])
+        trust.append(filled[1][moving])
+    return with_pixels(disparity, clip.moving, depths), with_pixels(confidence, clip.moving, trust)
 
 
 def result(

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.core.stack import ArrayStack, Stack, with_pixels
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.regions import (
     RegionTrack,
@@ -37,15 +37,16 @@ def mover_depth(
     pairs: np.ndarray,
     behind: ArrayStack,
     tuning: MoverDistanceTuning = MOVER_DISTANCE_TUNING,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[ArrayStack, ArrayStack]:
     """Disparity and confidence (T, H, W) of moving pixels, `behind` and 0 elsewhere.
 
     `behind` (T, H, W) is the static scene's disparity, also under the masks, in 1 /
     scene units. `flow` (P, H, W, 2) px and `valid` (P, H, W) are of `pairs` (P, 2) of
     frames.
     """
-    disparity = np.array(behind)
-    confidence = np.where(clip.moving, np.float32(tuning.min_confidence), np.float32(0))
+    moving = clip.moving
+    disparity = [behind[f][mask] for f, mask in enumerate(moving)]
+    confidence = [np.full(len(d), tuning.min_confidence, np.float32) for d in disparity]
     labels = label_regions(clip.moving, tuning)
     steps = flow_steps(clip.times, flow, valid, pairs)
     split_regions(labels, steps, tuning)
@@ -64,9 +65,11 @@ def mover_depth(
         for k, (f, mask) in enumerate(zip(track.frames, masks, strict=True)):
             lowest = np.median(behind[f][mask])
             highest = tuning.max_disparity_ratio * surface[k]
-            disparity[f][mask] = np.clip(track_disparity[k], lowest, highest)
-            confidence[f][mask] = track_confidence[k]
-    return disparity, confidence
+            own = mask[moving[f]]
+            disparity[f][own] = np.clip(track_disparity[k], lowest, highest)
+            confidence[f][own] = track_confidence[k]
+    nowhere = Stack(lambda f: np.zeros(clip.size, np.float32), moving.shape)
+    return with_pixels(behind, moving, disparity), with_pixels(nowhere, moving, confidence)
 
 
 def depth_confidence(

@@ -86,7 +86,7 @@ def label_regions(
 
     0 is static or in a region too small.
     """
-    labels = np.zeros(moving.shape, np.int32)
+    labels = np.zeros(moving.shape, np.uint16)
     for frame, result in zip(moving, labels, strict=True):
         _, components, stats, _ = cv2.connectedComponentsWithStats(
             frame.astype(np.uint8), connectivity=8

@@ -15,8 +15,8 @@ from hdr_nsff.priors.movers.tuning import SYNCHRONIZED_TUNING, SynchronizedTunin
 
 
 def take_same_time_depth(
-    disparity: np.ndarray,
-    confidence: np.ndarray,
+    disparity: ArrayStack,
+    confidence: ArrayStack,
     seen: ArrayStack,
     seen_confidence: ArrayStack,
     moving: np.ndarray,
@@ -28,7 +28,7 @@ def take_same_time_depth(
     `seen` and `seen_confidence` are of everything; `moving` is bool. A region of which
     too little was seen twice stays as it is.
     """
-    disparity, confidence = disparity.copy(), confidence.copy()
+    disparity, confidence = np.array(disparity), np.array(confidence)
     for k, mask in enumerate(moving):
         known = mask & (seen_confidence[k] > tuning.min_confidence)
         regions, count = ndimage.label(mask)

@@ -9,7 +9,7 @@ lies between two motions. The depth may be wrong; later steps correct it. Pixels
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -62,20 +62,23 @@ class Tracks:
         )
 
 
-def follow_moving_pixels(views: list[MovingView], tuning: TrackTuning = TRACK_TUNING) -> Tracks:
+def follow_moving_pixels(views: Sequence[MovingView], tuning: TrackTuning = TRACK_TUNING) -> Tracks:
     """Tracks through the moving pixels of consecutive times."""
     num = len(views)
     spread = np.linspace(0, num - 1, min(tuning.start_frames, num))
     starts = sorted({round(start) for start in spread.tolist()})
-    smooth_views = [smooth_flows(view, tuning) for view in track(views, "movers: tracks")]
-
-    chains = [chain_flow(smooth_views, start, tuning) for start in starts]
-    pixels = np.concatenate(chains)
-    ages = [
-        np.tile(np.abs(np.arange(num) - start), (len(c), 1))
-        for start, c in zip(starts, chains, strict=True)
-    ]
-    age = np.concatenate(ages)
+    begun = [starting_pixels(views, start, tuning) for start in starts]
+    pixels = np.concatenate(begun)
+    start_of = np.repeat(starts, [len(own) for own in begun])
+    forward = [(t, 1) for t in range(num - 1)]
+    backward = [(t, -1) for t in range(num - 1, 0, -1)]
+    for t, step in track(forward + backward, "movers: tracks"):
+        if step not in views[t].flow:
+            continue
+        own = (t - start_of) * step >= 0
+        view = smoothed(views[t], step, tuning)
+        pixels[own, t + step] = advance(view, views[t + step], step, pixels[own, t], tuning)
+    age = np.abs(np.arange(num) - start_of[:, None])
 
     points = np.full((*pixels.shape[:2], 3), np.nan)
     trust = np.zeros(pixels.shape[:2])
@@ -91,13 +94,22 @@ def follow_moving_pixels(views: list[MovingView], tuning: TrackTuning = TRACK_TU
     return Tracks(pixels[kept], points[kept], trust[kept], patch[kept], age[kept])
 
 
-def smooth_flows(view: MovingView, tuning: TrackTuning = TRACK_TUNING) -> MovingView:
-    """The view with its flow averaged over valid moving pixels, NaN elsewhere."""
-    smooth = {
-        step: smooth_flow(flow, view.valid[step] & view.moving, tuning)
-        for step, flow in view.flow.items()
-    }
-    return replace(view, flow=smooth)
+def starting_pixels(
+    views: Sequence[MovingView], start: int, tuning: TrackTuning = TRACK_TUNING
+) -> np.ndarray:
+    """Pixels (N, T, 2) of the tracks that start at one time, NaN at all others."""
+    inner = ndimage.binary_erosion(views[start].moving)
+    y, x = np.nonzero(inner)
+    on_grid = (x % tuning.stride_px == 0) & (y % tuning.stride_px == 0)
+    pixels = np.full((int(on_grid.sum()), len(views), 2), np.nan)
+    pixels[:, start] = np.stack([x[on_grid], y[on_grid]], -1) + 0.5
+    return pixels
+
+
+def smoothed(view: MovingView, step: int, tuning: TrackTuning = TRACK_TUNING) -> MovingView:
+    """The view with one flow, averaged over valid moving pixels, NaN elsewhere."""
+    known = view.valid[step] & view.moving
+    return replace(view, flow={step: smooth_flow(view.flow[step], known, tuning)})
 
 
 def smooth_flow(
@@ -131,23 +143,6 @@ def smooth_flow(
     height, width = known[around].shape
     result[around] = mean[radius : radius + height, radius : radius + width]
     return result
-
-
-def chain_flow(
-    views: list[MovingView], start: int, tuning: TrackTuning = TRACK_TUNING
-) -> np.ndarray:
-    """Pixels (N, T, 2) of the tracks that start in one frame, NaN where not visible."""
-    inner = ndimage.binary_erosion(views[start].moving)
-    y, x = np.nonzero(inner)
-    on_grid = (x % tuning.stride_px == 0) & (y % tuning.stride_px == 0)
-    pixels = np.full((int(on_grid.sum()), len(views), 2), np.nan)
-    pixels[:, start] = np.stack([x[on_grid], y[on_grid]], -1) + 0.5
-    for step in (1, -1):
-        t = start
-        while 0 <= t + step < len(views) and step in views[t].flow:
-            pixels[:, t + step] = advance(views[t], views[t + step], step, pixels[:, t], tuning)
-            t += step
-    return pixels
 
 
 def advance(
