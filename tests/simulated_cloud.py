@@ -11,7 +11,7 @@ import torch
 from test_splat import BESIDE, TIMES, batch_of, scattered
 from torch import Tensor
 
-from hdr_nsff.fields.splat import local_gaussians, splat
+from hdr_nsff.fields.splat import draw, local_gaussians, training_view
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.rasterize import Maps
@@ -24,7 +24,8 @@ ROUNDING = 2e-5  # of the largest number: plain torch computes in float32
 @pytest.fixture(autouse=True)
 def gaussians_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would be rasterized is the picture."""
-    monkeypatch.setattr(splat, "rasterize", lambda *arguments: arguments[:5])
+    for module in (draw, training_view):
+        monkeypatch.setattr(module, "rasterize", lambda *arguments: arguments[:5])
 
 
 def random_field(seed: int = 0, **settings: Any) -> Splat:
@@ -51,10 +52,11 @@ def values_and_gradients(
     field: Splat, knot: float, offset: int | None, rigidity: bool, fused: bool
 ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Gaussians and terms by name, and gradients and marks by parameters."""
-    draw = field.draw_fused if fused else field.draw_terms
+    draw_view = training_view.draw_by_kernels if fused else training_view.draw_by_torch
     offsets = [] if offset is None else [offset]
     batch = batch_of(0, offset or 1)
-    made, _, terms = draw(batch, knot, field.alive(knot), offsets, rigidity)
+    view = training_view.TrainingView(batch, knot, field.alive(knot), offsets, rigidity)
+    made, _, terms = draw_view(field.model(), view)
     values = {**dict(zip(NAMES, made, strict=True)), **terms}
     generator = torch.Generator().manual_seed(3)
     loss = sum((torch.randn(v.shape, generator=generator) * v).sum() for v in values.values())
@@ -135,11 +137,11 @@ def test_maps_over_the_background(radiance: str, channels: int) -> None:
         leaves = [m.clone().requires_grad_() for m in drawn_maps(channels)]
         maps = Maps(leaves[0].permute(1, 2, 0), leaves[1], leaves[2])
         if fused:
-            numbers = field.bounded, field.far, splat.MIN_DEPTH_SHARE, splat.MIN_ALPHA
+            numbers = field.bounded, field.far, draw.MIN_DEPTH_SHARE, draw.MIN_ALPHA
             render, flow = fused_composite(maps, field.background, *numbers)
         else:
-            render, drawn = field.composite(maps)
-            flow = drawn / render.opacity.clamp_min(splat.MIN_ALPHA)[:, None]
+            render, drawn = draw.composite(field.model(), maps)
+            flow = drawn / render.opacity.clamp_min(draw.MIN_ALPHA)[:, None]
         values = [render.radiance, render.depth, render.motion, flow]
         values = [v for v in values if v.numel()]
         generator = torch.Generator().manual_seed(1)

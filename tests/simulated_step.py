@@ -19,11 +19,12 @@ from hdr_nsff.core import distributed
 from hdr_nsff.fields.kernels.cuda.launch import launch
 from hdr_nsff.fields.nsff import encodings, fused_grid
 from hdr_nsff.fields.splat import (
+    draw,
     fused_cloud,
     fused_picture,
     local_gaussians,
     rasterize_cuda,
-    splat,
+    training_view,
 )
 from hdr_nsff.fields.splat.rasterize import Maps, composite_view
 from hdr_nsff.geometry.cameras import Camera
@@ -105,9 +106,11 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     launch_by(monkeypatch, launch_there)
     for module in (fused_picture, kernel_cuda, fused_losses):
         monkeypatch.setattr(module, "MAX_BLOCKS", 2)
-    monkeypatch.setattr(splat, "rasterize", draw_nothing)
+    for module in (draw, training_view):
+        monkeypatch.setattr(module, "rasterize", draw_nothing)
     objectives = (objective, weighted_terms)
-    for module in (splat, local_gaussians, encodings, curve, vignetting, bracketed, *objectives):
+    fields = training_view, local_gaussians, encodings
+    for module in (*fields, curve, vignetting, bracketed, *objectives):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")
     with pretend_device() as found:
         yield found

@@ -127,7 +127,7 @@ def test_a_step_launches_and_waits_no_more_than_it_did(
     device: torch.device,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("hdr_nsff.fields.splat.splat.rasterize", flat_picture)
+    monkeypatch.setattr("hdr_nsff.fields.splat.draw.rasterize", flat_picture)
     config = small(preset.removesuffix("-late"), toy_folder, tmp_path / "run")
     if isinstance(config.field, SplatConfig):
         late_mixing = preset.endswith("-late")

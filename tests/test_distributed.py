@@ -17,14 +17,14 @@ from hdr_nsff.training.run_folder import Run
 SCRIPT = """
 import json, os, sys
 import torch
-from hdr_nsff.fields.splat import splat
+from hdr_nsff.fields.splat import relocate as relocation
 from hdr_nsff.training import run_folder, train
 from hdr_nsff.training.config import TrainConfig
 
 train.CHECK_SAME_EVERY = 1
 run_folder.write_preview = lambda *_: None
 relocated = []
-relocate = splat.relocate
+relocate = relocation.relocate
 
 def disagree(gaussians, scores, companions, generator):
     if os.environ["RANK"] == "1":  # sees errors elsewhere
@@ -32,7 +32,7 @@ def disagree(gaussians, scores, companions, generator):
     relocated.append(relocate(gaussians, scores, companions, generator))
     return relocated[-1]
 
-splat.relocate = disagree
+relocation.relocate = disagree
 if sys.argv[2] == "alone":
     train.distributed.Ranks.follow_first = lambda ranks, tensors: None
 train.train(TrainConfig.from_json(json.loads(open(sys.argv[1]).read())))

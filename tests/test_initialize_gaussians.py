@@ -13,6 +13,7 @@ from torch import Tensor
 from toy_scene import CARD, EV, WALL, ToyScene, card_offset
 
 from hdr_nsff.fields.point_cloud import PointCloud
+from hdr_nsff.fields.splat.cloud import opacities_at
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.initialize_gaussians import (
@@ -23,7 +24,8 @@ from hdr_nsff.fields.splat.initialize_gaussians import (
     spread_centers,
     surely_moving,
 )
-from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat
+from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.fields.splat.terms import MIN_OPACITY
 from hdr_nsff.scene.scene import Frame, Scene, outline
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -257,7 +259,7 @@ def test_movers_are_hidden_at_times_without_observations(toy: Scene) -> None:
     hidden = torch.zeros(34, 60, dtype=torch.bool)
     started, _ = seeded(changed(toy, lambda f: replace(f, moving=hidden) if f.time < 3 else f))
     share = [
-        float(started.opacities(t / 5).detach()[len(started.static) :].max())
+        float(opacities_at(started.model(), t / 5).detach()[len(started.static) :].max())
         for t in (0.0, 1.0, 2.0, 3.0, 5.0)
     ]
     assert max(share[:3]) < 0.01 and share[3:] == pytest.approx([0.7, 0.7])

@@ -13,6 +13,7 @@ from torch import Tensor
 from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.draw import composite, draw, seen_radiance
 from hdr_nsff.fields.splat.late_mixing import START_SHARE, LateMixing, Parts
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.batch import Recorder
@@ -54,8 +55,8 @@ def test_what_is_recorded_late_is_the_sum_over_gaussians_one_by_one() -> None:
     cloud = field.cloud(2.0)
     with torch.no_grad():
         shares = torch.eye(len(cloud.means))
-        render, weights = field.composite(field.draw(CAMERA, cloud, [shares]))
-        seen = field.seen_radiance(CAMERA, cloud)
+        render, weights = composite(field.model(), draw(field.model(), CAMERA, cloud, [shares]))
+        seen = seen_radiance(field.model(), CAMERA, cloud)
         behind = field.background.exp()
         expected = torch.zeros(len(weights), 3)
         for k in range(len(seen)):

@@ -12,7 +12,9 @@ from torch import Tensor
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.local_gaussians import MIN_WINDOW, LocalGaussians
+from hdr_nsff.fields.splat.relocate import relocate_unseen
 from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.fields.splat.training_view import TrainingView, flow_to_neighbor
 from hdr_nsff.training.optimizers import Optimizers
 
 DURATION = 1.5  # frames
@@ -142,7 +144,8 @@ def test_optical_flow_follows_the_velocity() -> None:
     field = local_field()
     alive = field.alive(4.0)
     means = field.positions(4.0, alive)
-    flow = field.flow_to_neighbor(batch_of(4, 1), means, alive, 4.0, 1).detach()
+    view = TrainingView(batch_of(4, 1), 4.0, alive, [1], rigidity=False)
+    flow = flow_to_neighbor(field.model(), view, means, 1).detach()
     life = -len(alive)  # the last ones are time-local
     moved = BESIDE.project(means[life:] + VELOCITY)[0] - CAMERA.project(means[life:])[0]
     torch.testing.assert_close(flow[life:], moved.detach(), atol=1e-3, rtol=1e-4)
@@ -159,7 +162,7 @@ def test_a_life_is_judged_by_the_frames_in_which_it_is_alive() -> None:
     frames = [FrameError(CAMERA, float(time), error) for time in range(10)]
     before = field.local.means.detach().clone()
     field.static.opacity_logits.data[:] = -20.0
-    count = field.relocate(frames, torch.Generator().manual_seed(0))
+    count = relocate_unseen(field.model(), frames, torch.Generator().manual_seed(0))
     assert count >= 1 and float(field.local.means.detach()[unseen, 2]) > 0
     kept = (field.local.means.detach() == before).all(1)
     assert int(kept.sum()) >= len(field.local) - 2 * count
@@ -174,7 +177,7 @@ def test_one_that_was_alive_in_no_judged_frame_stays() -> None:
 
     before = field.local.means.detach().clone()
     late = [FrameError(CAMERA, 9.0, error)]
-    field.relocate(late, torch.Generator().manual_seed(0))
+    relocate_unseen(field.model(), late, torch.Generator().manual_seed(0))
     asleep = torch.ones(len(field.local), dtype=torch.bool)
     asleep[field.alive(9.0)] = False
     assert asleep.any()

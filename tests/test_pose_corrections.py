@@ -20,7 +20,7 @@ from toy_scene import ToyScene
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.nsff.nsff import NSFF
-from hdr_nsff.fields.splat import splat
+from hdr_nsff.fields.splat import draw
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.rasterize import dense
 from hdr_nsff.fields.splat.splat import Splat
@@ -154,7 +154,7 @@ def test_a_camera_has_the_gradient_of_its_picture(
 ) -> None:
     # in float64 Gaussians are drawn by the plain-torch twin, here without the cut of
     # faint ones, which jumps; test_rasterize compares the kernels with it
-    monkeypatch.setattr(splat, "rasterize", partial(dense, cut=False))
+    monkeypatch.setattr(draw, "rasterize", partial(dense, cut=False))
     field, corrections, batch = random_field(preset, toy), PoseCorrections(toy), whole_frame(toy, 2)
     if hasattr(field.config, "opaque_end"):  # a step of opacity has no gradient
         field.config = replace(field.config, opaque_end=False)

@@ -15,7 +15,9 @@ from hdr_nsff.fields.splat.relocate import (
     HALF_OFFSET,
     HALF_SCALE,
     MAX_RELOCATED_SHARE,
+    error_scores,
     relocate,
+    relocate_unseen,
 )
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
@@ -45,7 +47,7 @@ def test_scores_are_the_weights_of_the_slow_twin_times_the_error() -> None:
     parts = (cloud.means, cloud.quaternions, cloud.scales, cloud.opacities)
     one_hot = torch.eye(len(cloud.means))
     weights = dense(*(p.detach() for p in parts), one_hot, CAMERA).features  # (H, W, G)
-    times_error, alone = field.error_scores(frame_error(error))[0].unbind(1)
+    times_error, alone = error_scores(field.model(), frame_error(error))[0].unbind(1)
     expected = (weights * error[..., None]).sum((0, 1))
     torch.testing.assert_close(times_error, expected, atol=1e-3, rtol=1e-3)
     torch.testing.assert_close(alone, weights.sum((0, 1)), atol=1e-3, rtol=1e-3)
@@ -63,7 +65,9 @@ def test_unseen_gaussians_move_to_where_the_error_is() -> None:
     field = card_field()
     field.static.opacity_logits.data[::20] = -10.0  # faded away; others lie outside the picture
     before = in_corner(field)
-    count = field.relocate([frame_error(corner())], torch.Generator().manual_seed(0))
+    count = relocate_unseen(
+        field.model(), [frame_error(corner())], torch.Generator().manual_seed(0)
+    )
     assert count == int(MAX_RELOCATED_SHARE * len(field.static))  # more are unseen
     # some that were relocated had faded in that very quarter
     assert before + 0.6 * count < in_corner(field) <= before + count
@@ -72,7 +76,7 @@ def test_unseen_gaussians_move_to_where_the_error_is() -> None:
 def test_floaters_that_no_view_sees_are_relocated() -> None:
     field = card_field()
     field.static.means.data[:5] = torch.tensor([0.0, 0.0, -3.0])  # behind every camera
-    field.relocate([frame_error()], torch.Generator().manual_seed(0))
+    relocate_unseen(field.model(), [frame_error()], torch.Generator().manual_seed(0))
     assert bool((field.static.means[:5, 2] > 3).all())
 
 
@@ -81,8 +85,8 @@ def test_a_gaussian_seen_in_any_frame_stays() -> None:
     away = CAMERA.moved(torch.tensor([[1.0, 0, 0, 50], [0, 1, 0, 0], [0, 0, 1, 0]]))  # sees nothing
     before = {n: p.detach().clone() for n, p in field.named_parameters()}
     errors = [frame_error(), frame_error(camera=away)]
-    field.relocate(errors, torch.Generator().manual_seed(0))
-    seen = field.error_scores(frame_error())[0][: len(field.static), 1] > 1
+    relocate_unseen(field.model(), errors, torch.Generator().manual_seed(0))
+    seen = error_scores(field.model(), frame_error())[0][: len(field.static), 1] > 1
     assert int(seen.sum()) > 200
     kept = (field.static.means == before["static.means"]).all(1)
     limit = 2 * MAX_RELOCATED_SHARE * len(field.static)  # the halves and what they were cut from
@@ -117,7 +121,7 @@ def test_without_error_nothing_moves() -> None:
     field = scattered()
     before = [p.detach().clone() for p in field.parameters()]
     no_error = frame_error(torch.zeros(CAMERA.height, CAMERA.width))
-    assert field.relocate([no_error], torch.Generator().manual_seed(0)) == 0
+    assert relocate_unseen(field.model(), [no_error], torch.Generator().manual_seed(0)) == 0
     assert all(torch.equal(a, b) for a, b in zip(before, field.parameters(), strict=True))
 
 

@@ -21,6 +21,7 @@ from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.gaussians import MAX_LOG_RADIANCE, Gaussians
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
+from hdr_nsff.fields.splat.training_view import TrainingView, flow_to_neighbor
 from hdr_nsff.fields.splat.trajectories import WINDOW
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, Recorder, whole_frame
@@ -400,8 +401,10 @@ def test_flow_has_a_gradient_to_the_neighbors_pose() -> None:
     pose = BESIDE.c2w.clone().requires_grad_()
     learned = replace(batch, neighbors={1: BESIDE.moved(pose)})
     means = field.cloud(4.0).means
-    flow = field.flow_to_neighbor(learned, means, field.alive(4.0), 4.0, 1)
-    torch.testing.assert_close(flow, field.flow_to_neighbor(batch, means, field.alive(4.0), 4.0, 1))
+    view = TrainingView(learned, 4.0, field.alive(4.0), [1], rigidity=False)
+    flow = flow_to_neighbor(field.model(), view, means, 1)
+    given = flow_to_neighbor(field.model(), replace(view, batch=batch), means, 1)
+    torch.testing.assert_close(flow, given)
     flow[:, 0].sum().backward()
     # a camera that goes right sees everything go left
     assert pose.grad is not None and float(pose.grad[0, 3]) < 0

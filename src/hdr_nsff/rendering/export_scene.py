@@ -13,7 +13,8 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import tree_map
 from hdr_nsff.fields.outputs import GaussianCloud
 from hdr_nsff.fields.splat.gaussians import to_radiance
-from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat
+from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.fields.splat.terms import MIN_OPACITY
 from hdr_nsff.rendering import usd
 from hdr_nsff.rendering.chan import is_chan, write_chan
 from hdr_nsff.rendering.export_gaussians import NOT_OURS

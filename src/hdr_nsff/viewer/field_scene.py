@@ -19,7 +19,8 @@ from torch import Tensor
 from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.splat.gaussians import Gaussians, to_radiance
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
-from hdr_nsff.fields.splat.splat import MIN_OPACITY, Splat
+from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.fields.splat.terms import MIN_OPACITY
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.viewer.scene_file import (

@@ -1,7 +1,7 @@
 """The Gaussians of a training moment by CUDA kernels: motion, activations, flow to a
 neighbor and the field's own terms in one launch, their gradients in four.
 
-Plain torch takes about 300 launches for this (`Splat.cloud` and what belongs to it),
+Plain torch takes about 300 launches for this (`cloud.py:cloud_at`, flow and terms),
 each of them shorter than a launch takes. It stays what the CPU does, and what view
 dependence, shutters and corrected cameras need.
 """
@@ -18,7 +18,8 @@ from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
 from hdr_nsff.fields.kernels.cuda.layout import NUMBERS, POSE, TERMS, THREADS
 from hdr_nsff.fields.knots import catmull_rom_weights, linear_position
-from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY, Model
+from hdr_nsff.fields.splat.model import Model
+from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.pinhole import MIN_DEPTH
 

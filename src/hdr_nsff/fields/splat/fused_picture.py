@@ -1,5 +1,5 @@
 """Drawn maps over the background by CUDA kernels, one launch forward and two back: the
-twin of `Splat.composite` while it trains.
+twin of `draw.py:composite` in training.
 """
 
 from __future__ import annotations

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hdr_nsff.fields.splat.draw import draw
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.movers import nearest_mover
@@ -93,5 +94,5 @@ def object_coverage(
     column = torch.cat([static, labels.moving + 2, labels.local[alive.cpu()] + 2])
     column[len(static) :].clamp_min_(1)
     shares = nn.functional.one_hot(column, 2 + count).to(cloud.means)
-    maps = field.draw(camera, cloud, [shares])
+    maps = draw(field.model(), camera, cloud, [shares])
     return maps.features.flatten(0, 1)[:, 4:].clamp(0, 1)

@@ -17,8 +17,12 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from hdr_nsff.fields.base import FrameError
+from hdr_nsff.fields.splat.cloud import alive_at, cloud_at
+from hdr_nsff.fields.splat.draw import composite, draw
 from hdr_nsff.fields.splat.gaussians import Gaussians
 from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
+from hdr_nsff.fields.splat.model import Model
 from hdr_nsff.fields.splat.rasterize import rotation_matrices
 
 # pixels: a Gaussian whose weights add up to less in the mean frame is unseen
@@ -30,6 +34,50 @@ MAX_RELOCATED_SHARE = 0.05  # of the Gaussians at a time (hand-chosen on rendere
 # it)
 HALF_OFFSET = 0.5
 HALF_SCALE = 0.7
+
+
+@torch.no_grad()
+def relocate_unseen(
+    model: Model, frame_errors: list[FrameError], generator: torch.Generator
+) -> int:
+    """Move unseen Gaussians to those of most error; how many were moved.
+
+    Static, moving and time-local ones are relocated separately.
+    """
+    num_static, num_moving = len(model.static), len(model.moving)
+    num_shared, device = num_static + num_moving, model.background.device
+    scores = torch.zeros(num_shared, 2, device=device)
+    local = LocalScores(len(model.local), device)
+    for frame_error in frame_errors:
+        of_frame, alive = error_scores(model, frame_error)
+        scores += of_frame[:num_shared] / len(frame_errors)
+        local.add(alive, of_frame[num_shared:])
+    static, moving = scores.split([num_static, num_moving])
+    companions = [model.opacity_offsets, model.mixture_logits]
+    count = relocate(model.static, static, [], generator)
+    count += relocate(model.moving, moving, companions, generator)
+    return count + relocate(model.local, local.mean(), [], generator)
+
+
+@torch.no_grad()
+def error_scores(model: Model, frame_error: FrameError) -> tuple[Tensor, Tensor]:
+    """Every Gaussian's weights in a frame, times the error and alone: (G, 2).
+
+    The order is that of `cloud_at`, with the time-local ones `alive` (A,) that are
+    returned too. Both are summed over the frame's pixels, as gradients of two drawn
+    features.
+    """
+    knot = model.knot(frame_error.time)
+    alive = alive_at(model, knot)
+    cloud = cloud_at(model, knot, alive)
+    features = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
+    with torch.enable_grad():
+        maps = draw(model, frame_error.camera, cloud, [features])
+        render, drawn = composite(model, maps)
+        error = frame_error.error(render.radiance.detach())
+        pixel_weights = torch.stack([error, torch.ones_like(error)], 1)
+        (scores,) = torch.autograd.grad((drawn * pixel_weights).sum(), features)
+    return scores, alive
 
 
 class LocalScores:

@@ -4,41 +4,14 @@ Gaussians, smooth motion, and little change in time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from torch import Tensor
 
 from hdr_nsff.fields.outputs import GaussianCloud
-from hdr_nsff.fields.splat.gaussians import Gaussians, mean_square
-from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
-from hdr_nsff.fields.splat.trajectories import Trajectories
+from hdr_nsff.fields.splat.gaussians import mean_square
+from hdr_nsff.fields.splat.model import Model
 
 MIN_OPACITY = 0.003  # below, a Gaussian draws nothing: less than ALPHA_MIN = 1/255
 COLOR_OFFSET_SHARE = 0.01  # weight of color offsets relative to their changes in time
-
-
-@dataclass(frozen=True)
-class Model:
-    """What a field of Gaussians has learned."""
-
-    static: Gaussians
-    moving: Gaussians
-    local: LocalGaussians
-    trajectories: Trajectories
-    opacity_offsets: Tensor  # (K, M)
-    mixture_logits: Tensor  # (B, M)
-    neighbors: Tensor  # (M, N) int32
-    unit: float  # the scene's typical length, scene units
-
-    def parameters(self) -> tuple[Tensor, ...]:
-        """Everything that is learned but view dependence, as CUDA kernels take it."""
-        s, m, t, local = self.static, self.moving, self.trajectories, self.local
-        of_static = s.means, s.quaternions, s.log_scales, s.opacity_logits, s.log_radiance
-        of_moving = m.means, m.quaternions, m.log_scales, m.opacity_logits, m.log_radiance
-        offsets = m.log_radiance_offsets, self.opacity_offsets[..., None], self.mixture_logits
-        tables = [getattr(local, name) for name in local.table_names()]
-        rows = t.rotations, t.translations
-        return (*of_static, s.log_radiance_offsets, *of_moving, *offsets, *rows, *tables)
 
 
 def regularizers(model: Model, cloud: GaussianCloud, knot: float) -> dict[str, Tensor]:

@@ -6,8 +6,8 @@ A thread per Gaussian: static ones first, then moving ones, then the time-local 
 that are alive. The rows of the shared motions get their gradients in two steps: blocks
 of moving Gaussians add up what each basis gets (`cloud_backward`), and a thread per
 basis carries that to the rows near the knot (`trajectory_backward`). The plain-torch
-twin is `Splat.cloud` with `Splat.flow_to_neighbor`, `Splat.regularizers` and
-`Splat.rigidity`; a test compares them.
+twin is `training_view.py:draw_by_torch`, of the fields' folder `splat`; a test compares
+them.
 
 Shapes: S static, M moving and A living time-local Gaussians, G of all, L time-local
 ones; B bases at T knots. `numbers` (NUMBERS,) float64 hold what depends on the time

@@ -1,0 +1,74 @@
+"""The Gaussians of a field at a time, in plain torch, differentiable in everything.
+
+Their order is everywhere the same: static ones, moving ones, and the time-local ones
+that are alive.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.fields.knots import interpolate_linear
+from hdr_nsff.fields.outputs import GaussianCloud
+from hdr_nsff.fields.splat.model import Model
+
+
+def alive_at(model: Model, knot: float) -> Tensor:
+    """Indices (A,) of the time-local Gaussians that are alive at a knot."""
+    return model.local.alive(model.time(knot))
+
+
+def cloud_at(model: Model, knot: float, alive: Tensor) -> GaussianCloud:
+    """All Gaussians at a knot, of the time-local ones those `alive` (A,)."""
+    time, local = model.time(knot), model.local
+    mixture, share = model.mixture_logits.softmax(0), model.share(knot)
+    static, moving = model.static, model.moving
+    pose = model.trajectories.pose(knot)
+    moved = model.trajectories.move(moving.means, mixture, pose)
+    turned = model.trajectories.turn(moving.quaternions, mixture, pose)
+    at_rest = static.means.new_zeros(len(static))
+    num_moving = len(moving) + len(alive)
+    log_scales = [static.log_scales, moving.log_scales, local.log_scales[alive, :3]]
+    radiance = [static.radiance(share), moving.radiance(share), local.radiance(alive)]
+    return GaussianCloud(
+        means=torch.cat([static.means, moved, local.positions(alive, time)]),
+        quaternions=torch.cat([static.quaternions, turned, local.quaternions[alive]]),
+        scales=torch.cat(log_scales).exp(),
+        opacities=torch.cat([opacities_at(model, share), local.opacities(alive, time)]),
+        radiance=torch.cat(radiance),
+        motion=torch.cat([at_rest, static.means.new_ones(num_moving)]),
+    )
+
+
+def opacities_at(model: Model, share: float) -> Tensor:
+    """Opacities (G,) in [0, 1] of static and moving ones at a share of the clip."""
+    position = share * (len(model.opacity_offsets) - 1)
+    offsets = interpolate_linear(model.opacity_offsets, position)
+    return torch.cat([model.static.opacity_logits, model.moving.opacity_logits + offsets]).sigmoid()
+
+
+def positions_at(model: Model, knot: float, alive: Tensor) -> Tensor:
+    """Means (G, 3) of all Gaussians at a knot, of the time-local ones those `alive`
+    (A,) at any knot.
+    """
+    mixture = model.mixture_logits.softmax(0)
+    pose = model.trajectories.pose(knot)
+    moved = model.trajectories.move(model.moving.means, mixture, pose)
+    lived = model.local.positions(alive, model.time(knot))
+    return torch.cat([model.static.means, moved, lived])
+
+
+def displacement(model: Model, means: Tensor, alive: Tensor, knot: float, offset: int) -> Tensor:
+    """From `means` (G, 3) at a knot to the means one training interval away.
+
+    `alive` (A,) are the time-local ones among them.
+
+    `offset` is +1 (later) or -1 (earlier). Beyond the clip's ends, the displacement
+    of the other direction is continued.
+    """
+    if model.has_knot(knot + offset):
+        return positions_at(model, knot + offset, alive) - means
+    if model.has_knot(knot - offset):
+        return means - positions_at(model, knot - offset, alive)
+    return torch.zeros_like(means)

@@ -1,0 +1,160 @@
+"""What a training step sees of its frame, and the field's own terms: by plain torch, or
+by CUDA kernels where they can do all that is asked for.
+
+A frame is seen through its shutter, with optical flow to one of its neighbors, and with
+what is recorded of the Gaussians one by one, each where it is due.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from hdr_nsff.fields.base import Render
+from hdr_nsff.fields.outputs import GaussianCloud
+from hdr_nsff.fields.splat.cloud import cloud_at, positions_at
+from hdr_nsff.fields.splat.cuda_backends import kernels_on
+from hdr_nsff.fields.splat.draw import (
+    MIN_ALPHA,
+    MIN_DEPTH_SHARE,
+    composite,
+    draw,
+    record_parts,
+    seen_radiance,
+)
+from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
+from hdr_nsff.fields.splat.fused_picture import fused_composite
+from hdr_nsff.fields.splat.late_mixing import Parts, split_late
+from hdr_nsff.fields.splat.model import Model
+from hdr_nsff.fields.splat.rasterize import Maps, rasterize
+from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
+from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
+from hdr_nsff.scene.batch import PixelBatch, Recorder
+
+
+@dataclass(frozen=True)
+class TrainingView:
+    """What a training step asks of the whole frame of its batch."""
+
+    batch: PixelBatch
+    knot: float  # of the frame
+    alive: Tensor  # (A,) the time-local Gaussians that are alive
+    offsets: list[int]  # of the neighbors that flow is due to, one at most
+    rigidity: bool  # whether rigidity and evenness are due
+    recorder: Recorder | None = None  # of the Gaussians one by one, with late mixing
+    shutter: Shutter | None = None  # None: a moment
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What a training step sees, S pixels row by row."""
+
+    render: Render
+    flow: Tensor  # (S, 2) px to the neighbor; (S, 0) where none is due
+    terms: dict[str, Tensor]  # the field's own, by the names of their weights
+    parts: Parts | None  # the Gaussians and the background, recorded
+    late: Tensor | None  # (S, 3) what is recorded of the Gaussians, by their weights
+
+
+def see(model: Model, view: TrainingView) -> Seen:
+    """What a training step sees, differentiable in everything."""
+    if can_fuse(model, view):
+        maps, parts, terms = draw_by_kernels(model, view)
+        maps, late = split_late(maps, parts)
+        least = MIN_DEPTH_SHARE * model.unit
+        numbers = model.bounded, model.far, least, MIN_ALPHA
+        render, flow = fused_composite(maps, model.background, *numbers)
+    else:
+        maps, parts, terms = draw_by_torch(model, view)
+        maps, late = split_late(maps, parts)
+        render, drawn = composite(model, maps)
+        # features are premultiplied by opacity
+        flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
+    return Seen(render, flow, terms, parts, late)
+
+
+def can_fuse(model: Model, view: TrainingView) -> bool:
+    """Whether kernels make the Gaussians of the view: on a GPU, without view
+    dependence, shutter or learned cameras.
+    """
+    cameras = view.batch.camera, *view.batch.neighbors.values()
+    learned = any(c.c2w.requires_grad or c.K.requires_grad for c in cameras)
+    special = learned or view.shutter is not None or model.view_dependence
+    return not special and kernels_on(model.background.device)
+
+
+def draw_by_torch(model: Model, view: TrainingView) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
+    """What the view sees, the recorded parts, which the maps hold last, and the field's
+    terms.
+    """
+    batch, knot, alive = view.batch, view.knot, view.alive
+    cloud = cloud_at(model, knot, alive)
+    extra = [flow_to_neighbor(model, view, cloud.means, o) for o in view.offsets]
+    parts = None
+    if view.recorder is not None:
+        radiance = seen_radiance(model, batch.camera, cloud)
+        parts = record_parts(model, view.recorder, batch.camera, radiance, cloud.means)
+        extra.append(parts.gaussians)
+    maps = expose(model, view, cloud, extra)
+    model.trajectories.mark(knot)
+    model.local.mark(alive)
+    terms = regularizers(model, cloud, knot)
+    if view.rigidity:
+        terms["rigidity"] = mixture_difference(model.mixture_logits, model.neighbors)
+        terms["evenness"] = model.local.unevenness(alive, model.unit)
+    return maps, parts, terms
+
+
+def draw_by_kernels(
+    model: Model, view: TrainingView
+) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
+    """The same by CUDA kernels, with flow to one neighbor at most."""
+    batch, knot = view.batch, view.knot
+    neighbor = None
+    for offset in view.offsets:
+        there = model.nearest_knot(knot + offset)
+        neighbor = there, model.time(there), batch.neighbors[offset]
+    when = knot, model.time(knot), model.share(knot)
+    moment = Moment(*when, batch.camera, neighbor, view.rigidity)
+    cloud = fused_cloud(model, moment, view.alive)
+    gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
+    features, parts = cloud.features, None
+    if view.recorder is not None:
+        radiance = features[:, :3]
+        parts = record_parts(model, view.recorder, batch.camera, radiance, cloud.means)
+        features = torch.cat([features, parts.gaussians], 1)
+    return rasterize(*gaussians, features, batch.camera), parts, cloud.terms
+
+
+def expose(model: Model, view: TrainingView, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
+    """What the frame sees of the `cloud` through its shutter, with `extra` features
+    (G, ...).
+    """
+    batch, shutter = view.batch, view.shutter
+
+    def draw_at(means: Tensor) -> Maps:
+        return draw(model, batch.camera, replace(cloud, means=means), extra)
+
+    if shutter is None or not batch.neighbors:
+        return draw_at(cloud.means)
+    neighbors = []
+    for offset in sorted(batch.neighbors):
+        knot = view.knot + offset
+        points = positions_at(model, knot, view.alive).detach()
+        neighbors.append((batch.neighbors[offset], points, model.time(knot)))
+    motion = apparent_motion(batch.camera, neighbors, cloud.means, batch.time)
+    return Maps(*shutter.expose(draw_at, batch.camera, cloud.means, motion, batch.bracket))
+
+
+def flow_to_neighbor(model: Model, view: TrainingView, means: Tensor, offset: int) -> Tensor:
+    """Optical flow (G, 2) in pixels, from the frame's camera to a neighboring one.
+
+    From where the camera sees each Gaussian's mean (G, 3) to where the neighbor sees it
+    at its own time.
+    """
+    moved = positions_at(model, model.nearest_knot(view.knot + offset), view.alive)
+    camera, neighbor = view.batch.camera, view.batch.neighbors[offset]
+    limit = MAX_FLOW * camera.width
+    return (neighbor.project(moved)[0] - camera.project(means)[0]).clamp(-limit, limit)
