@@ -37,7 +37,8 @@ from sensitivity import FRAMES, RENDERED, RecordedClip, open_rendered, prepared,
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image
 from hdr_nsff.footage.exposure_lists import read_exif_ev
-from hdr_nsff.footage.ingest import open_footage, read_frames
+from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.response import response_view
 from hdr_nsff.prepare.work import Work

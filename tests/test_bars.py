@@ -9,7 +9,8 @@ import pytest
 
 from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.bars import bars_of, find_bars, with_bars
-from hdr_nsff.footage.ingest import Bars, open_footage, read_frames
+from hdr_nsff.footage.footage import Bars, open_footage
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.prepare import open_clip
 from hdr_nsff.prepare.work import PrepareConfig
 

@@ -19,7 +19,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exif_ev,
     read_exposure_csv,
 )
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 
 GRAY = np.full((24, 32, 3), 0.5)
 

@@ -17,13 +17,9 @@ from hdr_nsff.core.hdr_video import write_hdr_video
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.exposure_lists import read_exif_ev
-from hdr_nsff.footage.ingest import (
-    hash_file,
-    open_footage,
-    read_frame,
-    read_frames,
-    shrink,
-)
+from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.footage.ingest import read_frames, shrink
+from hdr_nsff.footage.still_frames import read_frame
 from hdr_nsff.maths.hdr_signal import REC2020, hlg_oetf, pq_encode, rgb_to_xyz, ycbcr_planes
 
 
@@ -179,17 +175,6 @@ def test_damaged_videos_are_read_or_refused(tmp_path):
     path = tmp_path / "a.mp4"
     write_video(path, [picture(0.1 * k) for k in range(6)])
     check_reader(path, lambda: all_frames(path), 60)
-
-
-@pytest.mark.skipif(not Path("/proc/self/mem").exists(), reason="Linux alone has it")
-def test_a_file_that_cannot_be_read_is_named():
-    with pytest.raises(InputError, match="/proc/self/mem: cannot be read"):
-        hash_file(Path("/proc/self/mem"))
-
-
-def test_pipes_and_devices_are_not_read_without_end():
-    with pytest.raises(InputError, match="/dev/zero: missing, or no ordinary file"):
-        hash_file(Path("/dev/zero"))
 
 
 def write_dng(

@@ -8,7 +8,7 @@ from test_exposure_cycle import clip
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
 from hdr_nsff.prepare.work import Work

@@ -9,7 +9,7 @@ import pytest
 from test_exposure_cycle import clip
 from test_prepare_footage import work_on
 
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
 from hdr_nsff.prepare.work import Work

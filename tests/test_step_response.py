@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hdr_nsff.core.images import write_png
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.prepare.steps.response import shows_noise
 from hdr_nsff.prepare.work import PrepareConfig, Work
 from hdr_nsff.scene.manifest import LensEntry, Manifest

@@ -15,7 +15,7 @@ from hdr_nsff.core.images import read_image, read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.video import read_video
 from hdr_nsff.footage.exposure_lists import read_exposure_csv
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import pixel_centers, project

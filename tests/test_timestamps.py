@@ -7,7 +7,7 @@ import pytest
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.footage.timestamps import frame_gaps, read_timestamps
 
 

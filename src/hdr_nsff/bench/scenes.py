@@ -13,7 +13,7 @@ from hdr_nsff.bench.config import BenchConfig, BenchScene, safe_name
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.evaluation.evaluate import views_of_clip
 from hdr_nsff.footage.datasets import layout_of
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.pipeline import RunConfig, held_out_every
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.manifest import Manifest

@@ -18,7 +18,7 @@ from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.check.picture import MARKS, draw
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
-from hdr_nsff.footage.ingest import open_footage
+from hdr_nsff.footage.footage import open_footage
 
 ENDING = "_check.png"  # of the picture's name, by default
 PNG_START = b"\x89PNG"

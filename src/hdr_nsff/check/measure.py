@@ -17,10 +17,12 @@ from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.video import frame_times, video_info
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.cuts import find_cuts
 from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
+from hdr_nsff.footage.footage import Footage, open_footage
+from hdr_nsff.footage.frame_choice import check_frame_size
+from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
 from hdr_nsff.footage.timestamps import frame_gaps
 from hdr_nsff.priors.poses.estimate import PosesTuning
 from hdr_nsff.priors.poses.matching import (
@@ -66,8 +68,8 @@ def measure_clip(
     Of several cameras, the first is looked at. InputError for footage that cannot be
     read, and where all is black or white.
     """
-    footage = with_bars(ingest.open_footage(clip))
-    frames = ingest.read_frames(footage, 0, tuning.max_frames, 1, tuning.max_size)
+    footage = with_bars(open_footage(clip))
+    frames = read_frames(footage, 0, tuning.max_frames, 1, tuning.max_size)
     total = min(footage.count or tuning.max_frames, tuning.max_frames)
     pictures = []
     for frame in track(frames, "frames", total):
@@ -78,7 +80,7 @@ def measure_clip(
         count = f"{len(pictures)} frame{'s' * (len(pictures) != 1)}"
         raise InputError(f"{clip}: {count} to look at; at least {MIN_FRAMES} are needed")
     video = np.stack(pictures)
-    ingest.check_frame_size(clip, video.shape[2], video.shape[1])
+    check_frame_size(clip, video.shape[2], video.shape[1])
     nothing = exposure.all_clipped([exposure.extent(picture) for picture in video])
     if nothing is not None:
         raise InputError(f"{clip}: all frames are {nothing}; check that it plays")
@@ -100,11 +102,11 @@ def measure_clip(
     return facts, video, cycle.brackets
 
 
-def describe_file(footage: ingest.Footage) -> FileFacts:
+def describe_file(footage: Footage) -> FileFacts:
     """The file's header, or the first frame of a folder."""
     first = footage.cameras[0][0]
     kind = "linear" if footage.linear else (footage.transfer or "recorded")
-    frame = next(ingest.read_frames(footage, 0, 1, 1, ingest.MAX_FRAMES))
+    frame = next(read_frames(footage, 0, 1, 1, MAX_FRAMES))
     height, width = frame.rgb.shape[:2]
     bits, interval, missing = 8, None, 0
     if footage.video:
@@ -164,7 +166,7 @@ def measure_exposure(
     )
 
 
-def given_exposures(footage: ingest.Footage, count: int) -> tuple[str | None, list[float]]:
+def given_exposures(footage: Footage, count: int) -> tuple[str | None, list[float]]:
     """Where exposures are written down, and those of the first `count` frames."""
     table = read_exposure_csv(footage)
     if table is not None:

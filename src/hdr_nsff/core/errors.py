@@ -18,3 +18,11 @@ def shorten(text: object, limit: int = 80) -> str:
         return line
     half = (limit - 3) // 2
     return f"{line[:half]}...{line[-half:]}"
+
+
+def check_number(option: str, value: float, least: float, most: float) -> None:
+    """InputError for the value of an `option` that is not from `least` to `most`."""
+    if not least <= value <= most:
+        raise InputError(
+            f"{option} {shorten(value)}: it must be a number from {least:g} to {most:g}"
+        )

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hdr_nsff.footage.ingest import Bars, Footage, decode
+from hdr_nsff.footage.footage import Bars, Footage
+from hdr_nsff.footage.ingest import decode
 
 
 @dataclass(frozen=True)

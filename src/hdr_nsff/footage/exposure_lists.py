@@ -15,8 +15,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hdr_nsff.core.errors import InputError, shorten
-from hdr_nsff.footage.ingest import Footage, check_number
+from hdr_nsff.core.errors import InputError, check_number, shorten
+from hdr_nsff.footage.footage import Footage
 from hdr_nsff.scene.manifest import MAX_EV
 
 # columns of a CSV: times, and the seconds of their unit

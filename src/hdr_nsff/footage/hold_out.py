@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+HOLD_OUT = 8  # every this many frames are held out where nothing else is asked for
+
 
 def hold_out_every(count: int, every: int, cycle: int) -> list[int]:
     """Which of `count` frames are held out of training: every `every`-th.

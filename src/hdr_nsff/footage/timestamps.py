@@ -14,7 +14,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.exposure_lists import csv_path, parse_number, read_utf8
-from hdr_nsff.footage.ingest import Footage
+from hdr_nsff.footage.footage import Footage
 
 COLUMN = "timestamp_ns"
 # frames by which a gap is longer than the usual one before a frame counts as missing

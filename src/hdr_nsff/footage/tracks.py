@@ -12,10 +12,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage import ingest
+from hdr_nsff.footage.footage import Footage, open_footage
 
 
-def open_tracks(clip: Path, names: Sequence[str]) -> ingest.Footage:
+def open_tracks(clip: Path, names: Sequence[str]) -> Footage:
     """The footage of the tracks `names`, video files or folders of frames inside the
     folder `clip`; InputError where they cannot be tracks of one camera.
     """
@@ -46,14 +46,14 @@ def open_tracks(clip: Path, names: Sequence[str]) -> ingest.Footage:
     return replace(first, path=clip, cameras=cameras, same_camera=True)
 
 
-def open_track(clip: Path, name: str, option: str) -> ingest.Footage:
+def open_track(clip: Path, name: str, option: str) -> Footage:
     """The footage of one track; InputError where it is not in the folder `clip`."""
     path = clip / name
     if not path.resolve().is_relative_to(clip.resolve()) or not path.exists():
         raise InputError(
             f"{option}: no {name} in {clip}; name video files or folders of frames inside it"
         )
-    track = ingest.open_footage(path)
+    track = open_footage(path)
     if len(track.cameras) > 1:
         raise InputError(f"{path}: folders of several cameras; a track is one folder of frames")
     return track

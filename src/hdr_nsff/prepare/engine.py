@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.io import is_leftover
 from hdr_nsff.core.process import cpu_seconds, peak_memory
 from hdr_nsff.core.progress import say
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Picture
 from hdr_nsff.prepare.result import StepResult, store
 from hdr_nsff.prepare.steps.neural import weights_of
@@ -128,7 +128,7 @@ def capture_part(work: Work, name: StepName) -> Any:
 
     def files(of: Callable[[Picture], Path | None]) -> list[str | None]:
         paths = [of(p) for p in pictures]
-        return [None if path is None else ingest.hash_file(path) for path in paths]
+        return [None if path is None else hash_file(path) for path in paths]
 
     match name:
         case "frames":
@@ -138,7 +138,7 @@ def capture_part(work: Work, name: StepName) -> Any:
             return [capture.has_held_out, known, [(p.ev, p.bracket) for p in pictures]]
         case "flow" if work.capture_with("flow"):
             named = [sorted(p.flow.items()) for p in pictures]
-            return [[(to, ingest.hash_file(path)) for to, path in each] for each in named]
+            return [[(to, hash_file(path)) for to, path in each] for each in named]
         case "poses" if work.capture_with("poses") and (given := capture.poses) is not None:
             points = None if capture.points is None else capture.points.tolist()
             cameras = [given.K.tolist(), given.c2w.tolist(), given.size.tolist()]
@@ -183,9 +183,9 @@ def found_manifest(config: PrepareConfig) -> Manifest | None:
 def hash_of(path: Path) -> str:
     """The hash of a file, or of all files in a folder."""
     if path.is_file():
-        return ingest.hash_file(path)
+        return hash_file(path)
     files = sorted(p for p in path.rglob("*") if p.is_file())
-    listing = [(p.relative_to(path).as_posix(), ingest.hash_file(p)) for p in files]
+    listing = [(p.relative_to(path).as_posix(), hash_file(p)) for p in files]
     return hashlib.sha256(json.dumps(listing).encode()).hexdigest()
 
 

@@ -15,16 +15,19 @@ from dataclasses import replace
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.datasets import recognize
 from hdr_nsff.footage.datasets.capture import Capture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.footage.exposure_lists import parse_exposures
+from hdr_nsff.footage.footage import Footage, open_footage
+from hdr_nsff.footage.frame_choice import check_choice
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.footage.tracks import open_tracks
 from hdr_nsff.prepare.engine import found_manifest
 from hdr_nsff.prepare.lens import given_lenses, known_lenses, parse_lens
@@ -94,7 +97,7 @@ def begin(config: PrepareConfig) -> Work:
             "prepared as a whole; leave the option out"
         )
     footage = open_clip(config, capture)
-    inputs = {name: ingest.hash_file(path) for name, path in track(footage.files.items(), "inputs")}
+    inputs = {name: hash_file(path) for name, path in track(footage.files.items(), "inputs")}
     found = found_manifest(config)
     if found is not None and found.inputs != inputs:
         if not found.frames:
@@ -112,7 +115,7 @@ def begin(config: PrepareConfig) -> Work:
         found.lens |= given_lenses(work)
         return work
     start = config.start
-    first = next(ingest.read_frames(footage, start, start + 1, 1, config.max_size), None)
+    first = next(read_frames(footage, start, start + 1, 1, config.max_size), None)
     if first is None:
         raise InputError(f"{config.clip}: no frame {start}; choose a smaller `--start`")
     height, width = first.rgb.shape[:2]
@@ -123,7 +126,7 @@ def begin(config: PrepareConfig) -> Work:
     return work
 
 
-def open_clip(config: PrepareConfig, capture: Capture | None) -> ingest.Footage:
+def open_clip(config: PrepareConfig, capture: Capture | None) -> Footage:
     """The footage of a data set, of tracks of one camera, or at `config.clip`.
 
     Black bars are cut off where nothing else is given pixel by pixel.
@@ -132,7 +135,7 @@ def open_clip(config: PrepareConfig, capture: Capture | None) -> ingest.Footage:
         return open_tracks(config.clip, config.same_camera)
     if capture is not None:
         return capture.footage()
-    footage = ingest.open_footage(config.clip)
+    footage = open_footage(config.clip)
     given = (config.poses, config.flow, config.masks, config.mask_points, config.depth)
     return footage if any(isinstance(value, Path) for value in given) else with_bars(footage)
 
@@ -157,7 +160,7 @@ def report_data_set(work: Work) -> None:
 
 def check_settings(config: PrepareConfig) -> None:
     """InputError for settings that make no sense whatever the footage is."""
-    ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
+    check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
     if config.protocol is not None and config.hold_out is not None:
         raise InputError(
             "--protocol and --hold-out both given, and each decides what is kept out of "

@@ -14,8 +14,8 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import codes_to_rgb, read_codes, read_mask
 from hdr_nsff.core.io import read_npy
 from hdr_nsff.core.stack import ArrayStack, RecentArrays, Stack
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets.capture import Capture, Picture
+from hdr_nsff.footage.footage import Footage
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.flow.sources import FlowName
 from hdr_nsff.priors.masks.visits import StaticPictures, separate_movers
@@ -191,7 +191,7 @@ class Work:
     """The unfinished scene folder, with what steps read of it."""
 
     config: PrepareConfig
-    footage: ingest.Footage
+    footage: Footage
     manifest: Manifest
     capture: Capture | None = None  # the training pictures of a public data set
     segment: Segment | None = None  # where the folder holds a part of the clip

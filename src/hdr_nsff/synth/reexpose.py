@@ -23,16 +23,20 @@ from typing import Any, Literal
 import numpy as np
 from tyro.conf import Positional
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, check_number
 from hdr_nsff.core.exr import write_exr
+from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.exposure_lists import parse_exposures
-from hdr_nsff.footage.hold_out import hold_out_every
+from hdr_nsff.footage.footage import Footage, open_footage
+from hdr_nsff.footage.frame_choice import check_choice, check_frame_size
+from hdr_nsff.footage.frame_files import frame_files
+from hdr_nsff.footage.hold_out import HOLD_OUT, hold_out_every
+from hdr_nsff.footage.ingest import FootageFrame, read_frames
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.maths.hdr_signal import Transfer
@@ -76,7 +80,7 @@ class ReexposeConfig:
     """Also write its frames as HDR stills into reference/: ultrahdr (JPEG with a gain
     map), avif, png16 (both PQ).
     """
-    hold_out: int = ingest.HOLD_OUT
+    hold_out: int = HOLD_OUT
     """Spacing of the frames that are held out as truth."""
     poses: Path | None = None
     """Camera poses of all frames of the clip: COLMAP model folder, transforms.json,
@@ -133,7 +137,7 @@ def reexpose(config: ReexposeConfig) -> Path:
     with writing_to(config.out), lock_output(config.out):
         evs = check(config)
         response = response_curve(config.response)
-        footage = ingest.open_footage(config.clip)
+        footage = open_footage(config.clip)
         if len(footage.cameras) > 1:
             raise InputError(
                 f"{config.clip}: {len(footage.cameras)} cameras; "
@@ -188,14 +192,14 @@ def check(config: ReexposeConfig) -> list[float]:
             "--ev auto: there is nothing to detect; list the log2 exposures of one cycle, "
             "like -2,0,2"
         )
-    ingest.check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
-    ingest.check_number("--noise", config.noise, 0, MAX_NOISE)
-    ingest.check_number("--seed", config.seed, 0, MAX_SEED)
+    check_choice(config.start, config.end, config.stride, config.max_size, config.hold_out)
+    check_number("--noise", config.noise, 0, MAX_NOISE)
+    check_number("--seed", config.seed, 0, MAX_SEED)
     return evs
 
 
 def look_through(
-    config: ReexposeConfig, footage: ingest.Footage
+    config: ReexposeConfig, footage: Footage
 ) -> tuple[list[int], list[tuple[float, float]], tuple[int, int]]:
     """The numbers of the chosen frames in the footage, the extents of their values, and
     their size (H, W).
@@ -206,22 +210,22 @@ def look_through(
         numbers.append(frame.number)
         extents.append(exposure.extent(frame.rgb))
         size = (frame.rgb.shape[0], frame.rgb.shape[1])
-        ingest.check_frame_size(config.clip, size[1], size[0])
+        check_frame_size(config.clip, size[1], size[0])
     return numbers, extents, size
 
 
-def chosen(config: ReexposeConfig, footage: ingest.Footage) -> Iterator[ingest.FootageFrame]:
+def chosen(config: ReexposeConfig, footage: Footage) -> Iterator[FootageFrame]:
     """The frames to use."""
-    return ingest.read_frames(footage, config.start, config.end, config.stride, config.max_size)
+    return read_frames(footage, config.start, config.end, config.stride, config.max_size)
 
 
-def claim(config: ReexposeConfig, footage: ingest.Footage) -> None:
+def claim(config: ReexposeConfig, footage: Footage) -> None:
     """Write `reexpose.json`; InputError where the output holds something else."""
     settings: dict[str, Any] = {"clip": str(config.clip)}
     for name, value in asdict(config).items():
         if name not in ("clip", "out", "hdr_video", "hdr_still"):
             settings[name] = str(value) if isinstance(value, Path) else value
-    settings["inputs"] = {name: ingest.hash_file(file) for name, file in footage.files.items()}
+    settings["inputs"] = {name: hash_file(file) for name, file in footage.files.items()}
     path = config.out / "reexpose.json"
     if path.is_file():
         if not same_problem(path, settings):
@@ -293,7 +297,7 @@ def auto_exposure(plan: FramePlan, seed: int) -> np.ndarray:
 
 def write_frames(
     config: ReexposeConfig,
-    footage: ingest.Footage,
+    footage: Footage,
     plan: FramePlan,
     evs: list[float],
     drift: np.ndarray,
@@ -319,7 +323,7 @@ def write_frames(
                 write_exr(exr, {"RGB": radiance.astype(np.float32)})
 
 
-def write_linearized(config: ReexposeConfig, footage: ingest.Footage, num_frames: int) -> None:
+def write_linearized(config: ReexposeConfig, footage: Footage, num_frames: int) -> None:
     """Write the linearized clip as the HDR references that are asked for."""
 
     def radiance() -> Iterator[np.ndarray]:
@@ -375,7 +379,7 @@ def frame_masks(
     """The masks of `size` (H, W) bool of the held-out `frames`, from a folder with one
     image for every frame of the clip. `numbers` are the frames' places in the clip.
     """
-    files = ingest.frame_files(folder) if folder.is_dir() else []
+    files = frame_files(folder) if folder.is_dir() else []
     needed = max(numbers) + 1
     if len(files) < needed:
         raise InputError(
@@ -395,9 +399,7 @@ def frame_masks(
     return masks
 
 
-def read_poses(
-    path: Path, footage: ingest.Footage, numbers: list[int], size: tuple[int, int]
-) -> Poses:
+def read_poses(path: Path, footage: Footage, numbers: list[int], size: tuple[int, int]) -> Poses:
     """The poses of the frames at places `numbers` of the clip, for frames of `size`
     (H, W).
     """

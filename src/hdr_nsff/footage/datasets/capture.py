@@ -18,7 +18,8 @@ from typing import Literal
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.footage.ingest import LINEAR, Footage
+from hdr_nsff.footage.footage import Footage
+from hdr_nsff.footage.frame_files import LINEAR
 from hdr_nsff.footage.pose_formats import GivenPoses
 
 # frames: a time this near to a whole number is one, since files store rounded fractions

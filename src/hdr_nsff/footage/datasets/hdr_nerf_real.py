@@ -17,7 +17,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.datasets.capture import Capture, Picture, select_poses
 from hdr_nsff.footage.datasets.hdr_nerf import NUM_EXPOSURES, TRAINED
 from hdr_nsff.footage.datasets.set_files import source_of
-from hdr_nsff.footage.ingest import frame_files
+from hdr_nsff.footage.frame_files import frame_files
 from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
 
 NAME = "poses_bounds_exps.npy"

@@ -24,6 +24,7 @@ import numpy as np
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr, write_exr
+from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.io import write_json
 from hdr_nsff.core.progress import say, track
@@ -35,7 +36,7 @@ from hdr_nsff.footage.datasets.held_out_views import (
     read_views,
     training_poses,
 )
-from hdr_nsff.footage.ingest import hash_file, shrink
+from hdr_nsff.footage.ingest import shrink
 from hdr_nsff.footage.pose_files import fit_poses
 from hdr_nsff.footage.pose_formats import GivenPoses
 from hdr_nsff.geometry.poses import Poses

@@ -26,7 +26,7 @@ from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
 from hdr_nsff.footage.datasets.extra import Extra, parse_extra
 from hdr_nsff.footage.datasets.set_files import check_count, source_of
-from hdr_nsff.footage.ingest import frame_files, natural_key
+from hdr_nsff.footage.frame_files import frame_files, natural_key
 from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
 
 FLOWS = ("semantic_flow_i1", "flow_i1")

@@ -34,7 +34,7 @@ from hdr_nsff.footage.datasets.set_files import (
     read_document,
     source_of,
 )
-from hdr_nsff.footage.ingest import natural_key
+from hdr_nsff.footage.frame_files import natural_key
 from hdr_nsff.footage.pose_formats import GivenPoses, from_transforms
 
 NAME = "transforms.json"

@@ -13,7 +13,7 @@ from typing import Any
 from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.core.names import resolve_name
-from hdr_nsff.footage.ingest import FRAMES
+from hdr_nsff.footage.frame_files import FRAMES
 from hdr_nsff.scene.manifest import MAX_NUMBER
 
 

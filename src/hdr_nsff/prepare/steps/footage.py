@@ -10,9 +10,10 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.hold_out import frames_between, hold_out_every
+from hdr_nsff.footage.frame_choice import check_frame_size
+from hdr_nsff.footage.hold_out import HOLD_OUT, frames_between, hold_out_every
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.footage.turns import find_cameras_in_turn
 from hdr_nsff.prepare.exposures import frame_exposures
 from hdr_nsff.prepare.length import offered_segments
@@ -38,10 +39,10 @@ def frames_step(work: Work) -> StepResult:
     entries: list[FrameEntry] = []
     extents = []
     seconds: list[float | None] = []
-    frames = ingest.read_frames(work.footage, c.start, c.end, c.stride, c.max_size)
+    frames = read_frames(work.footage, c.start, c.end, c.stride, c.max_size)
     for frame in track(frames, "frames", expected_frames(work)):
         m.height, m.width = frame.rgb.shape[:2]
-        ingest.check_frame_size(c.clip, m.width, m.height)
+        check_frame_size(c.clip, m.width, m.height)
         entry = FrameEntry(
             index=len(entries),
             image=f"images/{len(entries):05d}.png",
@@ -268,7 +269,7 @@ def hold_out_spacing(work: Work) -> int:
     if work.config.hold_out is not None:
         return work.config.hold_out
     brings_views = work.capture is not None and work.capture.has_held_out
-    return 0 if brings_views else ingest.HOLD_OUT
+    return 0 if brings_views else HOLD_OUT
 
 
 def check_protocol(protocol: Protocol, brackets: list[int], held_out: set[int]) -> None:

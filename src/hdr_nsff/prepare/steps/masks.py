@@ -9,8 +9,8 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask
-from hdr_nsff.footage import ingest
 from hdr_nsff.footage.datasets import maps
+from hdr_nsff.footage.frame_files import RECORDED, natural_key, sorted_folders
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import sam2_masks
 from hdr_nsff.prepare.tracks import share_masks
@@ -82,7 +82,7 @@ def given_masks(work: Work) -> np.ndarray:
             masks.append(mask)
         return np.stack(masks)
     assert isinstance(folder, Path)
-    for f, path in zip(m.frames, given_files(work, folder, ingest.RECORDED), strict=True):
+    for f, path in zip(m.frames, given_files(work, folder, RECORDED), strict=True):
         mask = read_mask(path)
         if mask.shape != size:
             raise InputError(
@@ -99,11 +99,11 @@ def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
     """
     folders = [folder]
     if len(work.footage.cameras) > 1:
-        folders = ingest.sorted_folders(folder)
+        folders = sorted_folders(folder)
     found = [
         path
         for each in folders
-        for path in sorted(each.iterdir(), key=ingest.natural_key)
+        for path in sorted(each.iterdir(), key=natural_key)
         if path.suffix.lower() in suffixes
     ]
     count = len(work.manifest.frames)

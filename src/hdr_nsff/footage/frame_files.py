@@ -1,0 +1,43 @@
+"""Which files of a folder are frames or videos, in the order of their numbers."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
+LINEAR = {".exr", ".dng"}
+FRAMES = RECORDED | LINEAR
+LOSSY = {".jpg", ".jpeg"}  # formats of frames
+VIDEOS = {".mp4", ".mov", ".mkv", ".m4v", ".avi", ".webm", ".mxf", ".mts"}
+
+
+def natural_key(path: Path) -> list[tuple[int, int, str]]:
+    """A key that sorts frame2 before frame10."""
+    key = []
+    for part in re.split(r"(\d+)", path.name):
+        if part.isdecimal():  # not `isdigit`: ² is a digit, and no number
+            key.append((0, int(part), ""))
+        elif part:
+            key.append((1, 0, part.lower()))
+    return key
+
+
+def frame_files(folder: Path) -> list[Path]:
+    """The frames directly in `folder`, in order."""
+    shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    found = [p for p in shown if p.suffix.lower() in FRAMES and p.is_file()]
+    return sorted(found, key=natural_key)
+
+
+def video_files(folder: Path) -> list[Path]:
+    """The videos directly in `folder`, in order."""
+    shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    found = [p for p in shown if p.suffix.lower() in VIDEOS and p.is_file()]
+    return sorted(found, key=natural_key)
+
+
+def sorted_folders(folder: Path) -> list[Path]:
+    """The folders directly in `folder`, in order."""
+    shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    return sorted((p for p in shown if p.is_dir()), key=natural_key)

@@ -1,0 +1,69 @@
+"""Linear light as recorded values: scaled into [0, 1] and encoded as x^(1/2.2), so that
+what follows sees one kind of recording.
+
+EXR and DNG are linear; they are scaled by one constant for the whole footage. HLG and
+PQ video is brought to linear light first, by its tags.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+
+from hdr_nsff.core.exr import REC709
+from hdr_nsff.footage.still_frames import read_frame
+from hdr_nsff.maths.hdr_signal import (
+    PEAK_NITS,
+    REC2020,
+    Transfer,
+    hlg_inverse_oetf,
+    pq_decode,
+    rgb_to_xyz,
+)
+
+GAMMA = 2.2  # linear footage is encoded as x^(1 / GAMMA)
+WHITE_PERCENTILE = 99.9  # of linear radiance, becomes 1 (hand-chosen)
+
+
+def encode_light(light: np.ndarray) -> np.ndarray:
+    """Linear light, clipped to [0, 1], as recorded values."""
+    return np.clip(light, 0, 1) ** np.float32(1 / GAMMA)
+
+
+def encode_signal(signal: np.ndarray, transfer: Transfer, rec2020: bool) -> np.ndarray:
+    """HDR signals (H, W, 3) in [0, 1] as linear Rec. 709 light, encoded as x^(1/2.2).
+
+    1 is the brightest scene light of HLG, and 1000 nits of PQ. Colors outside Rec. 709
+    are clipped.
+    """
+    codes = np.rint(np.clip(signal, 0, 1) * 65535).astype(np.uint16)  # as decoded
+    light = light_table(transfer)[codes]
+    if rec2020:
+        matrix = np.linalg.solve(rgb_to_xyz(REC709), rgb_to_xyz(REC2020))
+        light = light @ matrix.T.astype(np.float32)
+    return encode_light(light)
+
+
+@functools.cache
+def light_table(transfer: Transfer) -> np.ndarray:
+    """Light (65536,) float32 of the signals of 16 bits, 1 is the peak."""
+    signal = np.linspace(0, 1, 65536)
+    light = pq_decode(signal) / PEAK_NITS if transfer == "pq" else hlg_inverse_oetf(signal)
+    return light.astype(np.float32)
+
+
+def linear_scale(files: list[Path]) -> float:
+    """The constant that brings linear frames into [0, 1].
+
+    1 where nothing is brighter than 1, else 1 / the 99.9th percentile. The same for all
+    frames, so that their exposures keep their ratios; what is brighter is saturated, as
+    on a sensor.
+    """
+    images = [read_frame(f) for f in files]
+    if not images or max(float(i.max()) for i in images) <= 1:
+        return 1.0
+    sampled = np.concatenate([i[::4, ::4].ravel() for i in images])
+    white = float(np.percentile(sampled, WHITE_PERCENTILE))
+    return 1 / max(white, 1e-12)
