@@ -18,8 +18,9 @@ from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.rasterize import Maps
+from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.shot_views import plan_shot
-from hdr_nsff.rendering.shots import Output, Shot, render_shot
+from hdr_nsff.rendering.shots import render_shot
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.presets import METHODS

@@ -19,7 +19,8 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.geometry.paths import read_path
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.maths.metrics import mu_law_psnr
-from hdr_nsff.rendering.shots import Output, render_shot
+from hdr_nsff.rendering.output import Output
+from hdr_nsff.rendering.shots import render_shot
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import scene_of

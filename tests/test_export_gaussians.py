@@ -19,6 +19,7 @@ from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.maths import color
 from hdr_nsff.rendering import ply
+from hdr_nsff.rendering.develop import develop
 from hdr_nsff.rendering.export_gaussians import (
     ColorTransform,
     GaussianField,
@@ -26,7 +27,6 @@ from hdr_nsff.rendering.export_gaussians import (
     export_sequence,
     exposure_of,
 )
-from hdr_nsff.rendering.shots import develop
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.tonemap.build import tone_mapper_for

@@ -16,7 +16,8 @@ from hdr_nsff.core.images import read_image
 from hdr_nsff.fields.base import Render
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.exr_header import WhiteBalance, rec709_to_xyz, white_of
-from hdr_nsff.rendering.shots import Output, Shot, render_shot
+from hdr_nsff.rendering.output import Output, Shot
+from hdr_nsff.rendering.shots import render_shot
 from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.training.run_folder import Run
 

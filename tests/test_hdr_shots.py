@@ -14,7 +14,8 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.radiometry.hdr_footage import measure_light
-from hdr_nsff.rendering.shots import Output, Shot, render_shot
+from hdr_nsff.rendering.output import Output, Shot
+from hdr_nsff.rendering.shots import render_shot
 
 
 def large_shot(scale: float = 2.0) -> Shot:

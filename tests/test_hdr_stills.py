@@ -16,7 +16,8 @@ from test_ultra_hdr import decode
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.maths.hdr_signal import KNEE_NITS, display_light, encode, pq_decode, ycbcr_planes
-from hdr_nsff.rendering.shots import Output, render_shot
+from hdr_nsff.rendering.output import Output
+from hdr_nsff.rendering.shots import render_shot
 
 ALL = Output(exr="float", hdr_still=("ultrahdr", "avif", "png16"), ev=-1.0)
 

@@ -16,8 +16,8 @@ from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
 from hdr_nsff.fields.baselines.hexplane import NUM_GROWTHS, HexPlane
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.rendering.export import ExportConfig, export
+from hdr_nsff.rendering.output import Output
 from hdr_nsff.rendering.render import RenderConfig, render
-from hdr_nsff.rendering.shots import Output
 from hdr_nsff.scene.batch import PixelBatch, Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.training.run_folder import Run

@@ -13,7 +13,8 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.core.ocio import Look
-from hdr_nsff.rendering.shots import Output, render_shot
+from hdr_nsff.rendering.output import Output
+from hdr_nsff.rendering.shots import render_shot
 
 pytest.importorskip("PyOpenColorIO")
 ACES = "ACES 2.0 - SDR 100 nits (Rec.709)"

@@ -11,8 +11,8 @@ from test_shot_views import path_file
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import ENCODERS
 from hdr_nsff.core.images import read_image
+from hdr_nsff.rendering.output import Output
 from hdr_nsff.rendering.render import RenderConfig, check_size, render
-from hdr_nsff.rendering.shots import Output
 from hdr_nsff.training.run_folder import Run
 
 

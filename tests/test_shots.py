@@ -17,7 +17,9 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.core.video import read_video
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.shots import Output, Shot, fingerprint, render_shot
+from hdr_nsff.rendering.fingerprint import fingerprint
+from hdr_nsff.rendering.output import Output, Shot
+from hdr_nsff.rendering.shots import render_shot
 
 
 def shot_of(*times: float) -> Shot:

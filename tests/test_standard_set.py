@@ -12,7 +12,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import ENCODERS
 from hdr_nsff.core.images import read_image
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.shots import Output, Shot
+from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.standard_set import cut, render_all, with_hdr_clip
 
 NAMES = {

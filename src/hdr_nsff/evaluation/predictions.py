@@ -22,8 +22,8 @@ from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.targets import Target
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.rendering.fingerprint import fingerprint
 from hdr_nsff.rendering.interpolate import LayeredField, render_at
-from hdr_nsff.rendering.shots import fingerprint
 from hdr_nsff.rendering.stills import device_of
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.training.run_folder import Run

@@ -24,7 +24,8 @@ from hdr_nsff.fields.base import RadianceField
 from hdr_nsff.fields.outputs import GaussianCloud
 from hdr_nsff.geometry.paths import training_path
 from hdr_nsff.rendering import ply
-from hdr_nsff.rendering.shots import develop, display_exposure, fingerprint
+from hdr_nsff.rendering.develop import develop, display_exposure
+from hdr_nsff.rendering.fingerprint import fingerprint
 from hdr_nsff.training.run_folder import Run
 
 NOT_OURS = "already exists and was not made by export"

@@ -15,9 +15,11 @@ from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.lens import original_lens
+from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.shot_views import MAX_VIEWS, plan_shot, short_count
-from hdr_nsff.rendering.shots import Output, Shot, name_results, open_look, render_shot
+from hdr_nsff.rendering.shots import name_results, render_shot
 from hdr_nsff.rendering.standard_set import render_all
+from hdr_nsff.rendering.write_view import open_look
 from hdr_nsff.training.run_folder import Run
 
 __all__ = ["RenderConfig", "render", "render_all"]

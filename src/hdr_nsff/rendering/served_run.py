@@ -18,9 +18,9 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.maths import color
+from hdr_nsff.rendering.develop import develop_view
 from hdr_nsff.rendering.export_page import HDR_CLIP, VIDEOS, find_hdr_clip, run_scene
 from hdr_nsff.rendering.shot_views import check_views
-from hdr_nsff.rendering.shots import develop_view
 from hdr_nsff.rendering.stills import Still, render_still
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.viewer.field_scene import jpeg

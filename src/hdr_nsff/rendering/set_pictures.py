@@ -18,8 +18,10 @@ from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import colorize, colorize_flow, contact_sheet, read_image, write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.rendering.develop import develop_view
 from hdr_nsff.rendering.exr_header import unbalance
-from hdr_nsff.rendering.shots import Output, Shot, develop_view, fingerprint
+from hdr_nsff.rendering.fingerprint import fingerprint
+from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 

@@ -15,7 +15,7 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.geometry import paths
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.shots import Shot
+from hdr_nsff.rendering.output import Shot
 from hdr_nsff.rendering.stills import device_of
 from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run

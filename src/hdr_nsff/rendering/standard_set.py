@@ -21,15 +21,11 @@ from hdr_nsff.core.hdr_video import can_encode
 from hdr_nsff.core.progress import say
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.rendering.fingerprint import fingerprint
+from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.set_pictures import write_pictures
 from hdr_nsff.rendering.shot_views import SHOTS, find_frame, plan_shot
-from hdr_nsff.rendering.shots import (
-    Output,
-    Shot,
-    fingerprint,
-    name_results,
-    render_shot,
-)
+from hdr_nsff.rendering.shots import name_results, render_shot
 from hdr_nsff.rendering.stills import render_still
 from hdr_nsff.training.run_folder import Run
 
