@@ -112,8 +112,14 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
 
 
 def read_mask(path: Path | str) -> np.ndarray:
-    """A mask image as bool (H, W): true above half."""
-    return read_image(path).mean(-1) > 0.5
+    """A mask image as bool (H, W): true above half of white, in the mean of rgb;
+    transparency is ignored.
+    """
+    codes = decode(Path(path), transparency=True)  # gray ones stay gray, which is faster
+    half = np.iinfo(codes.dtype).max / 2
+    if codes.ndim == 2:
+        return np.asarray(codes > half)
+    return np.asarray(codes[..., :3].mean(-1) > half)
 
 
 def contact_sheet(

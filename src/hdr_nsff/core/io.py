@@ -237,6 +237,7 @@ SCENE_FILE = "scene.json"  # what makes a folder a scene folder
 FOLDER_STEPS = {
     "images": "frames",
     "raw_flow": "flow",
+    "undistorted_flow": "flow",
     "poses": "poses",
     "masks": "masks",
     "static_disparity": "static_depth",

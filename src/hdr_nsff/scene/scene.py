@@ -20,7 +20,6 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, read_mask
@@ -343,10 +342,9 @@ class MapReader:
 
 def outline(mask: Tensor) -> Tensor:
     """(H, W) bool: pixels within `OUTLINE_PX` of the outline of a mask (H, W)."""
-    width, image = 2 * OUTLINE_PX + 1, mask[None, None].float()
-    grown = max_pool2d(image, width, 1, OUTLINE_PX)[0, 0] > 0
-    kept = -max_pool2d(-image, width, 1, OUTLINE_PX)[0, 0] > 0
-    return grown & ~kept
+    window = np.ones((2 * OUTLINE_PX + 1,) * 2, np.uint8)
+    marks = mask.numpy().astype(np.uint8)
+    return torch.from_numpy(cv2.dilate(marks, window) > cv2.erode(marks, window))
 
 
 def without_outline(moving: Tensor, outline: Tensor) -> Tensor:

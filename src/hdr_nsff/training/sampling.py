@@ -24,9 +24,7 @@ def draw_batch(
 
     If `chained`, it is also warped over two steps, forward and backward in turn.
     """
-    seed = np.random.SeedSequence([config.seed, clock.step, slot]).generate_state(1)
-    generator = torch.Generator().manual_seed(int(seed[0]))
-    frame = int(torch.randint(len(scene.train), (1,), generator=generator))
+    frame, generator = draw_frame(config, scene, clock.step, slot)
     if config.rays:
         num_moving = moving_rays(config, clock)
         batch = draw_pixels(scene, frame, config.rays, num_moving, generator)
@@ -35,6 +33,15 @@ def draw_batch(
     field_seed = int(torch.randint(2**31, (1,), generator=generator))
     direction = 1 if clock.step % 2 else -1
     return replace(batch, seed=field_seed, chain=direction if chained else 0)
+
+
+def draw_frame(
+    config: TrainConfig, scene: Scene, step: int, slot: int
+) -> tuple[int, torch.Generator]:
+    """The training frame of the slot-th place in a step, and what draws the rest."""
+    seed = np.random.SeedSequence([config.seed, step, slot]).generate_state(1)
+    generator = torch.Generator().manual_seed(int(seed[0]))
+    return int(torch.randint(len(scene.train), (1,), generator=generator)), generator
 
 
 def moving_rays(config: TrainConfig, clock: Clock) -> int:

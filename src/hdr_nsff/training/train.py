@@ -31,8 +31,9 @@ from hdr_nsff.training.measure import Monitor, averaged, frame_error, spread_fra
 from hdr_nsff.training.objective import Objective
 from hdr_nsff.training.optimizers import Optimizers
 from hdr_nsff.training.pose_corrections import poses_for
+from hdr_nsff.training.read_ahead import ReadAhead
 from hdr_nsff.training.run_writer import RunWriter
-from hdr_nsff.training.sampling import draw_batch, rays_per_step
+from hdr_nsff.training.sampling import draw_batch, draw_frame, rays_per_step
 from hdr_nsff.training.start import start_run
 from hdr_nsff.training.weighted_terms import backward, merge_weights
 
@@ -109,6 +110,7 @@ class Trainer:
             self.clock = resumed
         # frames on the CPU stay where they are: read when they are drawn
         self.scene = scene if device.type == "cpu" else to_device(scene, device)
+        self.read_ahead = ReadAhead(self.scene.train)
         for module in modules.values():
             module.to(device)
         self.optimizers.follow_parameters()
@@ -152,6 +154,7 @@ class Trainer:
         measured = []
         for slot in slots:
             batch = self.poses(self.draw(slot))
+            self.read_ahead(draw_frame(config, self.scene, clock.step + 1, slot)[0])
             with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
                 render, field_terms = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase)

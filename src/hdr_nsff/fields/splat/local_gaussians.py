@@ -12,6 +12,8 @@ them.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
@@ -23,7 +25,8 @@ from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.fields.splat.gaussians import START_LOG_SCALE, START_LOGIT, to_radiance
 
-MIN_WINDOW = 0.02  # below this share of its opacity, a Gaussian is not alive: 2.8 durations
+MIN_WINDOW = 0.02  # below this share of its opacity, a Gaussian is not alive ...
+MAX_AGE = math.sqrt(-2 * math.log(MIN_WINDOW))  # ... which are 2.8 durations
 VELOCITY_SHARE = 0.1  # learning rate of velocities per frame relative to positions
 NUM_NEIGHBORS = 4  # whose velocities are compared
 # scene lengths (in units of the near depth) that count as far as one frame, for
@@ -101,7 +104,11 @@ class LocalGaussians(nn.Module):
         if not len(self):  # the host need not wait for a GPU
             return self.means.new_empty(0, dtype=torch.int64)
         if not kernels_on(self.means.device):
-            return (self.window(self.means, self.log_scales, time) > MIN_WINDOW).nonzero()[:, 0]
+            centers, log_durations = self.means[:, 3], self.log_scales[:, 3]
+            longest = MAX_AGE * log_durations.max().exp()
+            near = ((time - centers).abs() < longest).nonzero()[:, 0]  # few of a long clip
+            reach = MAX_AGE * log_durations[near].exp()
+            return near[(time - centers[near]).abs() < reach]
         tables = self.means.detach().contiguous(), self.log_scales.detach().contiguous()
         alive = self.means.new_empty(len(self), dtype=torch.uint8)
         launch("living", blocks_for(len(self)), THREADS, *tables, float(time), MIN_WINDOW, alive)
