@@ -23,7 +23,12 @@ from tumbling_body import (
     tracked,
 )
 
-from hdr_nsff.priors.movers.bundle import MoverShape, adjust_bundle, path_without_rotation
+from hdr_nsff.priors.movers.bundle import (
+    MoverShape,
+    adjust_bundle,
+    path_without_rotation,
+    times_of_solution,
+)
 from hdr_nsff.priors.movers.bundle_problem import Cameras
 from hdr_nsff.priors.movers.rigid_motion import fit_motion
 from hdr_nsff.priors.movers.tracks import Tracks
@@ -143,10 +148,10 @@ def test_short_tracks_are_no_error(lasting: int) -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("times", [1, 2, 3, 4])
 def test_few_times_are_no_error(times: int) -> None:
-    some = tracked(pixels_of(TRUE)).during(4, 4 + times)
+    some = tracked(pixels_of(TRUE)).at(np.arange(4, 4 + times))
     visible = (some.trust > 0).any(1)
     tracks = Tracks(*(getattr(some, f.name)[visible] for f in fields(Tracks)))
-    shape = adjust(tracks, CAMERAS.during(4, 4 + times))
+    shape = adjust(tracks, CAMERAS.at(np.arange(4, 4 + times)))
     assert np.isfinite(shape.group.rotations).all()
     assert np.isinf(shape.error) if times == 1 else shape.error < 1
 
@@ -177,9 +182,40 @@ def test_times_at_which_nothing_is_visible_change_nothing() -> None:
     )
     cameras = Cameras(padded(K, 0, "edge"), padded(CAMERAS.c2w, 0, "edge"))
     found = adjust(longer, cameras)
-    inside = replace(found, group=found.group.during(3, 3 + TIMES))
+    inside = replace(found, group=found.group.at(np.arange(3, 3 + TIMES)))
     np.testing.assert_allclose(points_of_shape(inside), points_of_shape(shape), atol=1e-3)
     steps = np.diff(found.group.translations, axis=0)
     np.testing.assert_allclose(steps[:3], steps[[3] * 3], atol=1e-9)  # straight on
     np.testing.assert_allclose(steps[-4:], steps[[-5] * 4], atol=1e-9)
     assert found.group.rotations.shape == (TIMES + 7, 3, 3) and not found.group.known[hidden].any()
+
+
+def test_long_gaps_are_left_out_of_the_solution() -> None:
+    visible = np.zeros(40, bool)
+    visible[[3, 4, 7, 30, 31]] = True
+    assert times_of_solution(visible, 12).tolist() == [3, 4, 5, 6, 7, 30, 31]
+    assert times_of_solution(visible, 22).tolist() == list(range(3, 32))
+    assert times_of_solution(np.zeros(4, bool), 12).tolist() == [0, 1, 2, 3]
+
+
+def test_a_body_that_is_gone_for_long_has_one_shape_and_moves_on_evenly_meanwhile() -> None:
+    tracks, shape = adjusted()
+    gap, half = 30, TIMES // 2
+    old = np.concatenate([np.arange(half), np.arange(half, TIMES) + gap])
+    count, total = len(tracks.trust), TIMES + gap
+    longer = Tracks(
+        np.full((count, total, 2), np.nan),
+        np.full((count, total, 3), np.nan),
+        np.zeros((count, total)),
+        np.zeros((count, total), int),
+        np.zeros((count, total), int),
+    )
+    for name in ("pixels", "points", "trust", "patch", "age"):
+        getattr(longer, name)[:, old] = getattr(tracks, name)
+    K_then, c2w = np.tile(K[:1], (total, 1, 1)), np.tile(CAMERAS.c2w[:1], (total, 1, 1))
+    K_then[old], c2w[old] = K, CAMERAS.c2w
+    found = adjust(longer, Cameras(K_then, c2w))
+    assert found.error < 1.5 * shape.error + 0.1
+    steps = np.diff(found.group.translations[half - 1 : half + gap + 1], axis=0)
+    np.testing.assert_allclose(steps, steps[[0] * len(steps)], atol=1e-9)
+    assert not found.group.known[half : half + gap].any()

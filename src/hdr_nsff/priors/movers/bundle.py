@@ -37,20 +37,26 @@ def adjust_bundle(
 ) -> MoverShape:
     """The shape and motion that best explain the pixels of a group's tracks.
 
-    Times before the first and after the last visible one are left out of the solution,
-    which they would only slow down, and extrapolated.
+    Times before the first and after the last visible one, and in long gaps, are left
+    out of the solution, which they would only slow down, and interpolated.
     """
-    times = np.nonzero((tracks.trust[group.members] > 0).any(0))[0]
-    start, stop = 0, len(cameras.K)
-    if len(times):
-        start, stop = int(times[0]), int(times[-1]) + 1
+    visible = (tracks.trust[group.members] > 0).any(0)
+    times = times_of_solution(visible, tuning.max_gap_times)
     shape = adjust_visible_times(
-        tracks.during(start, stop),
-        group.during(start, stop),
-        cameras.during(start, stop),
-        tuning,
+        tracks.at(times), group.at(times), cameras.at(times), tuning, times
     )
-    return replace(shape, group=shape.group.extrapolate(start, group.known))
+    return replace(shape, group=shape.group.over_all_times(times, group.known))
+
+
+def times_of_solution(visible: np.ndarray, max_gap: int) -> np.ndarray:
+    """The times (S,) from the first `visible` (T,) one to the last, without gaps of
+    more than `max_gap`; all where none is visible.
+    """
+    seen = np.nonzero(visible)[0]
+    if not len(seen):
+        return np.arange(len(visible))
+    parts = np.split(seen, np.nonzero(np.diff(seen) > max_gap + 1)[0] + 1)
+    return np.concatenate([np.arange(part[0], part[-1] + 1) for part in parts])
 
 
 def adjust_visible_times(
@@ -58,8 +64,9 @@ def adjust_visible_times(
     group: RigidGroup,
     cameras: Cameras,
     tuning: BundleTuning = BUNDLE_TUNING,
+    times: np.ndarray | None = None,
 ) -> MoverShape:
-    """The shape of a group that is visible at the first and the last time.
+    """The shape of a group that is visible at the first and the last of the `times`.
 
     The solution starts from the group's motion and from its path without rotation; the
     better result counts.
@@ -68,7 +75,8 @@ def adjust_visible_times(
     chosen = group.members[longest_tracks(visible, tuning.max_tracks)]
     solutions = []
     for start in (group, path_without_rotation(tracks, group, tuning)):
-        problem = BundleProblem(tracks, replace(start, members=chosen), cameras, tuning)
+        own = replace(start, members=chosen)
+        problem = BundleProblem(tracks, own, cameras, tuning, times)
         if problem.usable.sum() < tuning.min_tracks:
             continue
         first = BundleState(problem.start, start.rotations, start.translations)
@@ -84,7 +92,7 @@ def adjust_visible_times(
         problem.fit_path_whitening(state)
         state, _ = problem.minimize(state, tuning.iterations)
 
-    complete = BundleProblem(tracks, start, cameras, tuning)
+    complete = BundleProblem(tracks, start, cameras, tuning, times)
     state = complete.solve_points(state)
     points[complete.usable] = state.points + group.center
     errors = np.linalg.norm(complete.reproject(state).error, axis=-1) / complete.noise

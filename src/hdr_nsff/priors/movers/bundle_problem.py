@@ -34,9 +34,9 @@ class Cameras:
     K: np.ndarray  # (T, 3, 3) pixels
     c2w: np.ndarray  # (T, 3, 4) OpenCV, scene units
 
-    def during(self, start: int, stop: int) -> Cameras:
-        """The cameras at the times from `start` to before `stop`."""
-        return Cameras(self.K[start:stop], self.c2w[start:stop])
+    def at(self, times: np.ndarray) -> Cameras:
+        """The cameras at the `times` (S,)."""
+        return Cameras(self.K[times], self.c2w[times])
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class PriorResiduals:
     """Residuals of the priors, in standard deviations."""
 
     depth: np.ndarray  # (T,) mean z-depth
-    path: np.ndarray  # (T - 3, 3) third differences of the path
-    rotation: np.ndarray  # (T - 2, 3) second differences of the rotation
+    path: np.ndarray  # (P, 3) third differences of the path
+    rotation: np.ndarray  # (R, 3) second differences of the rotation
     shape: np.ndarray  # (N, 3) distance of points from the middle
 
 
@@ -92,7 +92,8 @@ class BundleProblem:
     """Residuals of a state, their derivatives, and the minimization.
 
     `usable` (members,) bool marks the tracks that have a point; all other arrays of N
-    points are of those.
+    points are of those. `times` (T,) are positions in the clip, by default one after
+    the other: motion is smooth only between consecutive ones.
     """
 
     def __init__(
@@ -101,6 +102,7 @@ class BundleProblem:
         group: RigidGroup,
         cameras: Cameras,
         tuning: BundleTuning = BUNDLE_TUNING,
+        times: np.ndarray | None = None,
     ) -> None:
         self.tuning = tuning
         visible = (tracks.trust[group.members] > 0) & group.known
@@ -121,14 +123,19 @@ class BundleProblem:
         if len(members):
             self.middle = np.median(self.start, 0)
             self.size = np.median(np.linalg.norm(self.start - self.middle, axis=-1)) + 1e-9
-        self.init_differences()
+        self.init_differences(np.arange(len(self.K)) if times is None else times)
         self.init_depth_prior(prior_points[self.usable], tracks.trust[members])
 
-    def init_differences(self) -> None:
-        """Difference operators over time, and which rows of the path are supported."""
+    def init_differences(self, times: np.ndarray) -> None:
+        """Difference operators over the `times` (T,), one row for every three or four
+        consecutive ones, and which rows of the path are supported.
+        """
         num = len(self.K)
-        self.second_differences = np.diff(np.eye(num), n=2, axis=0)  # (T - 2, T)
-        self.third_differences = np.diff(np.eye(num), n=3, axis=0)  # (T - 3, T)
+        self.three_in_a_row = times[2:] - times[:-2] == 2  # (T - 2,)
+        four_in_a_row = times[3:] - times[:-3] == 3
+        second, third = (np.diff(np.eye(num), n=order, axis=0) for order in (2, 3))
+        self.second_differences = second[self.three_in_a_row]  # (R, T)
+        self.third_differences = third[four_in_a_row]  # (P, T)
         # makes third differences, as shares of z-depth, standard deviations
         self.path_whitening = np.eye(3) / self.tuning.initial_path_sigma  # (3, 3)
         min_tracks = self.tuning.min_tracks
@@ -136,9 +143,9 @@ class BundleProblem:
         linked = (self.visible[:, 1:] & self.visible[:, :-1]).sum(0) >= min_tracks
         # (T,) the run of linked times, within which depth has one unknown factor
         self.run = np.concatenate([[0], np.cumsum(~linked)])
-        in_one_run = self.run[3:] == self.run[:-3]
+        in_one_run = (self.run[3:] == self.run[:-3])[four_in_a_row]
         num_unknown = (np.abs(self.third_differences) > 0) @ ~self.depth_known
-        self.path_rows = (num_unknown == 0) & in_one_run  # (T - 3,)
+        self.path_rows = (num_unknown == 0) & in_one_run  # (P,)
 
     def init_depth_prior(self, prior_points: np.ndarray, trust: np.ndarray) -> None:
         """The prior of mean z-depth, from the tracks' points and trust in them.
@@ -241,7 +248,7 @@ class BundleProblem:
         return PriorResiduals(
             depth=np.where(self.depth_known, change, 0),
             path=path @ self.path_whitening,
-            rotation=np.diff(steps, axis=0) / self.tuning.rotation_sigma_rad,
+            rotation=np.diff(steps, axis=0)[self.three_in_a_row] / self.tuning.rotation_sigma_rad,
             shape=(state.points - self.middle) / self.shape_sigma(state),
         )
 
@@ -259,7 +266,7 @@ class BundleProblem:
         return sigma * self.distance(state) / self.prior_distance
 
     def path_jacobian(self, state: BundleState, path: np.ndarray) -> np.ndarray:
-        """Derivatives (T - 3, 3, T, 3) of the path's residuals by the translations.
+        """Derivatives (P, 3, T, 3) of the path's residuals by the translations.
 
         The residuals are shares of the distance. In scene units, every mover could
         lower them by approaching the camera, since near movers move less.

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.priors.movers.tracks import Tracks
@@ -34,9 +35,8 @@ class RigidGroup:
     # (T,) bool: enough was visible; poses between are interpolated, outer ones held
     known: np.ndarray
 
-    def during(self, start: int, stop: int) -> RigidGroup:
-        """The motion at the times from `start` to before `stop`."""
-        times = slice(start, stop)
+    def at(self, times: np.ndarray) -> RigidGroup:
+        """The motion at the `times` (S,)."""
         return RigidGroup(
             self.rotations[times],
             self.translations[times],
@@ -45,20 +45,25 @@ class RigidGroup:
             self.known[times],
         )
 
-    def extrapolate(self, start: int, known: np.ndarray) -> RigidGroup:
-        """A motion that begins at time `start`, over all times of `known` (T,).
+    def over_all_times(self, times: np.ndarray, known: np.ndarray) -> RigidGroup:
+        """A motion at the `times` (S,), which rise, over all times of `known` (T,).
 
-        Before and after, the path goes straight on and the rotation is held.
+        Between them the path is straight and the rotation even; before and after, the
+        path goes straight on and the rotation is held.
         """
-        num = len(self.translations)
-        times = np.arange(len(known)) - start
-        nearest = times.clip(0, num - 1)
+        num, every = len(times), np.arange(len(known))
+        place = np.interp(every, times, np.arange(num))
+        low = place.astype(int)
+        high, share = np.minimum(low + 1, num - 1), (place - low)[:, None]
         first_speed = self.translations[min(1, num - 1)] - self.translations[0]
         last_speed = self.translations[-1] - self.translations[max(num - 2, 0)]
-        speed = np.stack([first_speed, last_speed])[(times > 0).astype(int)]
-        beyond = (times - nearest)[:, None] * speed
-        translations = self.translations[nearest] + beyond
-        return RigidGroup(self.rotations[nearest], translations, self.center, self.members, known)
+        speed = np.stack([first_speed, last_speed])[(every > times[0]).astype(int)]
+        beyond = (every - every.clip(times[0], times[-1]))[:, None] * speed
+        straight = (1 - share) * self.translations[low] + share * self.translations[high]
+        turn = np.swapaxes(self.rotations[low], 1, 2) @ self.rotations[high]
+        part = Rotation.from_rotvec(share * Rotation.from_matrix(turn).as_rotvec()).as_matrix()
+        rotations = np.where(share[..., None] > 0, self.rotations[low] @ part, self.rotations[low])
+        return RigidGroup(rotations, straight + beyond, self.center, self.members, known)
 
 
 def fit_motion(

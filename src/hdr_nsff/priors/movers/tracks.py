@@ -50,9 +50,8 @@ class Tracks:
     patch: np.ndarray  # (N, T) connected patch of moving pixels, 0 where not visible
     age: np.ndarray  # (N, T) steps of flow since the start: errors accumulate
 
-    def during(self, start: int, stop: int) -> Tracks:
-        """The same tracks at the times from `start` to before `stop`."""
-        times = slice(start, stop)
+    def at(self, times: np.ndarray) -> Tracks:
+        """The same tracks at the `times` (S,)."""
         return Tracks(
             self.pixels[:, times],
             self.points[:, times],

@@ -144,6 +144,10 @@ class BundleTuning:
     """Damping at which a solution has converged."""
     max_tracks: int = 200
     """Tracks that poses are estimated from."""
+    max_gap_times: int = 12
+    """Times without a track, over which a motion is still smooth; longer gaps are left
+    out, since a solution costs the cube of its times.
+    """
     min_tracks: int = 3
     """Tracks that a shape, the depth of a time, and the link of two times need."""
     flow_noise_px: float = 0.4
