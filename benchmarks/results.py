@@ -316,9 +316,9 @@ SECTIONS = (
         "bench-rig",
         "A rig whose nine cameras take turns",
         "Rendered scenes of 240x136 pixels and 36 frames, held-out views of the other cameras; "
-        "PSNR after 1,500 steps. Given are exact poses and masks, depth and flow with noise.",
+        "PSNR after 3,000 steps. Given are exact poses and masks, depth and flow with noise.",
         "hdr-nsff bench OUT --scenes NAME-frames=SCENE:TRUTH,NAME-given=ORACLE:TRUTH,... "
-        "--methods splat --steps 1500",
+        "--methods splat --steps 3000 --jobs 2",
         bench_rig,
     ),
     Section(
