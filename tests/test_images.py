@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import (
@@ -20,6 +21,8 @@ from hdr_nsff.core.images import (
 )
 
 RGB = np.random.default_rng(0).random((5, 7, 3)).astype(np.float32)
+MASK = np.indices((16, 24))[1] > 10  # the right of the picture
+MASK[:5] = False
 
 
 @pytest.mark.parametrize("bits", [8, 16])
@@ -37,6 +40,24 @@ def test_a_mask_is_read_back(tmp_path: Path) -> None:
     mask = RGB[..., 0] > 0.5
     write_png(tmp_path / "a.png", mask)
     assert np.array_equal(read_mask(tmp_path / "a.png"), mask)
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA"])
+def test_a_mask_of_any_kind_is_read(mode: str, tmp_path: Path) -> None:
+    Image.fromarray(np.uint8(255 * MASK)).convert(mode).save(tmp_path / "a.png")
+    assert np.array_equal(read_mask(tmp_path / "a.png"), MASK)
+
+
+def test_a_mask_of_16_bits_is_read(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.png"), np.uint16(65535 * MASK))
+    assert np.array_equal(read_mask(tmp_path / "a.png"), MASK)
+
+
+def test_a_mask_is_turned_as_its_picture_is(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x112] = 6  # a quarter turn, clockwise
+    Image.fromarray(np.uint8(255 * MASK)).save(tmp_path / "a.jpg", exif=exif, quality=95)
+    assert np.array_equal(read_mask(tmp_path / "a.jpg"), np.rot90(MASK, -1))
 
 
 def test_gray_shows_through_transparent_pixels(tmp_path: Path) -> None:

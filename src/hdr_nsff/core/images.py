@@ -95,8 +95,8 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
     size = encoded_size(data)
     if size is not None:
         check_size(path, *size)
-    color_of_any_depth = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-    flags = cv2.IMREAD_UNCHANGED if transparency else color_of_any_depth
+    opaque = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH
+    flags = cv2.IMREAD_UNCHANGED if transparency else opaque
     try:
         image = None if size is None else cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -115,11 +115,9 @@ def read_mask(path: Path | str) -> np.ndarray:
     """A mask image as bool (H, W): true above half of white, in the mean of rgb;
     transparency is ignored.
     """
-    codes = decode(Path(path), transparency=True)  # gray ones stay gray, which is faster
-    half = np.iinfo(codes.dtype).max / 2
-    if codes.ndim == 2:
-        return np.asarray(codes > half)
-    return np.asarray(codes[..., :3].mean(-1) > half)
+    codes = decode(Path(path), transparency=False)
+    gray = codes if codes.ndim == 2 else codes.mean(-1)
+    return np.asarray(gray > np.iinfo(codes.dtype).max / 2)
 
 
 def contact_sheet(

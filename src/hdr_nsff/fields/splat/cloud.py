@@ -62,10 +62,9 @@ def positions_at(model: Model, knot: float, alive: Tensor) -> Tensor:
 def displacement(model: Model, means: Tensor, alive: Tensor, knot: float, offset: int) -> Tensor:
     """From `means` (G, 3) at a knot to the means one training interval away.
 
-    `alive` (A,) are the time-local ones among them.
-
-    `offset` is +1 (later) or -1 (earlier). Beyond the clip's ends, the displacement
-    of the other direction is continued.
+    `alive` (A,) are the time-local ones among them. `offset` is +1 (later) or -1
+    (earlier). Beyond the clip's ends, the displacement of the other direction is
+    continued.
     """
     if model.has_knot(knot + offset):
         return positions_at(model, knot + offset, alive) - means

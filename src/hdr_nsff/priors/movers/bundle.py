@@ -43,7 +43,7 @@ def adjust_bundle(
     visible = (tracks.trust[group.members] > 0).any(0)
     times = times_of_solution(visible, tuning.max_gap_times)
     shape = adjust_visible_times(
-        tracks.at(times), group.at(times), cameras.at(times), tuning, times
+        tracks.at(times), group.at(times), cameras.at(times), times, tuning
     )
     return replace(shape, group=shape.group.over_all_times(times, group.known))
 
@@ -63,10 +63,11 @@ def adjust_visible_times(
     tracks: Tracks,
     group: RigidGroup,
     cameras: Cameras,
+    times: np.ndarray,
     tuning: BundleTuning = BUNDLE_TUNING,
-    times: np.ndarray | None = None,
 ) -> MoverShape:
-    """The shape of a group that is visible at the first and the last of the `times`.
+    """The shape of a group that is visible at the first and the last of its `times`
+    (S,) in the clip.
 
     The solution starts from the group's motion and from its path without rotation; the
     better result counts.
