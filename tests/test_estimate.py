@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from posed_clips import FOCAL, PLACES, H, W, panning, sliding, texture
+from posed_clips import FOCAL, PLACES, H, K, W, panning, sliding, texture
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.geometry.lens import Lens, distorted_picture
 from hdr_nsff.geometry.poses import Poses, project
 from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses, parallax_free_share
 
@@ -31,6 +32,15 @@ def test_structure_from_motion_is_the_same_with_any_number_of_threads(mapped, tm
     again = estimate_poses(sliding(PLACES), None, tmp_path, threads=threads)
     for field in ("c2w", "K", "points"):
         assert np.array_equal(getattr(again, field), getattr(mapped, field))
+
+
+def test_an_ill_conditioned_clip_has_the_same_poses_in_every_run(tmp_path):
+    pytest.importorskip("pycolmap")
+    lens = Lens(K, (0.15, 0.0, 0.0, 0.0), W, H)  # which pinhole cameras have to explain
+    bent = np.stack([distorted_picture(frame, K, lens) for frame in sliding(PLACES)])
+    one, many = [estimate_poses(bent, None, tmp_path, threads=n) for n in (1, 4)]
+    for field in ("c2w", "K", "points"):
+        assert np.array_equal(getattr(one, field), getattr(many, field))
 
 
 def test_points_project_where_they_were_seen_and_near_is_one(mapped):

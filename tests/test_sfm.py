@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import asdict
 
+import numpy as np
 import pytest
 from posed_clips import PLACES, sliding
 
@@ -16,6 +17,7 @@ from hdr_nsff import cli
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import FULL
 from hdr_nsff.priors.poses import sfm
+from hdr_nsff.priors.poses.colmap_matches import MIN_PAIRS_OF_PROCESS
 from hdr_nsff.priors.poses.trimming import TrimmingTuning
 
 
@@ -30,7 +32,7 @@ def test_a_worker_that_crashes_reports_why(tmp_path):
 def test_a_worker_does_not_outlive_its_parent(tmp_path):
     code = (
         "import subprocess, sys, time\n"
-        "worker = 'import time; from hdr_nsff.priors.poses.sfm_worker import die_with_parent; '\n"
+        "worker = 'import time; from hdr_nsff.priors.poses.sfm_child import die_with_parent; '\n"
         "worker += 'die_with_parent(); time.sleep(60)'\n"
         "print(subprocess.Popen([sys.executable, '-c', worker]).pid, flush=True)\n"
         "time.sleep(60)\n"
@@ -47,6 +49,24 @@ def test_a_worker_does_not_outlive_its_parent(tmp_path):
         time.sleep(0.1)
     os.kill(worker, signal.SIGKILL)
     pytest.fail("the worker lives on")
+
+
+def test_processes_find_the_matches_of_one(tmp_path):
+    pytest.importorskip("pycolmap")
+    names = [f"{t:02d}.png" for t in range(15)]
+    pairs = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :]]
+    assert len(pairs) >= 2 * MIN_PAIRS_OF_PROCESS
+    found = []
+    for threads in (1, 3):
+        folder = tmp_path / str(threads)
+        for name, frame in zip(names, sliding(np.linspace(PLACES[0], PLACES[-1], 15)), strict=True):
+            write_png(folder / "images" / name, frame)
+        sfm.run_worker(sfm.Job(str(folder), [names], pairs, 150.0, "match", threads))
+        found.append(sfm.read_matches(folder, names, pairs))
+    (keypoints, matches), (others, other_matches) = found
+    assert all(len(rows) > 50 for rows in matches[:5])
+    for a, b in zip(keypoints + matches, others + other_matches, strict=True):
+        assert np.array_equal(a, b)
 
 
 FULL_DISK = """
