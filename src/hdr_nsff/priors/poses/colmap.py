@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 
+@cache
 def load_pycolmap() -> Any:
     """pycolmap, quiet and seeded. The system's zlib is in place before it brings its
     own.

@@ -127,6 +127,8 @@ def match(job: Job, ids: dict[str, int], database: Path, processes: int) -> list
             matches.extend(found)
             send("tick")
         send("end")
+    for own in database.parent.glob(f"{database.stem}-*"):
+        own.unlink()
     return matches
 
 
