@@ -9,18 +9,20 @@ goes front to back too, with one scalar per pixel: what is still to come behind.
 in a fixed order: no atomics, and the same result whatever the number of threads. The
 plain-torch twin is `rasterize.dense`.
 
-Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channels (a multiple of
-`BLOCK`), C <= D map channels, pictures of (H, W). A tile's working memory is a flat
+Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channels (`BLOCK`, or more in
+pairs), C <= D map channels, pictures of (H, W). A tile's working memory is a flat
 float32 array of planes, each with one number for every pixel of the tile.
 
 Loops over the pixels of a tile are written so that LLVM vectorizes them: one flat
 array, unsigned ranges, no library call, no maximum carried along, no error for a
 division by zero. `FAST` lets it reorder sums; NaN and Inf stay what they are. What a
-pixel does to its BLOCK of channels is written out in `add_to_block`, `dot_block` and
-`gather_block`: a loop inside would not be vectorized over pixels.
+pixel does to the first BLOCK of channels is written out in `add_to_block`, `dot_block`
+and `gather_block`: a loop inside would not be vectorized over pixels.
 """
 
 from __future__ import annotations
+
+import math
 
 import numba
 import numpy as np
@@ -30,7 +32,7 @@ from hdr_nsff.fields.kernels.footprint import ALPHA_MIN, MOMENTS
 from hdr_nsff.fields.kernels.projection import TILE_X, TILE_Y, ZERO
 
 PIXELS = TILE_X * TILE_Y  # of a tile
-BLOCK = 8  # channels that one pass over a Gaussian's pixels takes
+BLOCK = 8  # channels that the first pass over a Gaussian's pixels takes; others take 2
 
 # where a tile's planes begin in its working memory
 X = np.uint64(0 * PIXELS)  # pixel centers, in pixels
@@ -52,6 +54,7 @@ CHECK_EVERY = 16  # Gaussians after which a tile is tested for being opaque
 
 ONE = np.float32(1)
 HALF = np.float32(0.5)
+HALF_PIXEL = np.float32(0.51)  # from a row's edge to its center, and room for rounding
 EIGHTH = np.float32(0.125)
 ALPHA_MAX = np.float32(0.999)  # alpha above counts as this
 MIN_TRANSMITTANCE = np.float32(1e-4)  # a tile with less is finished (Kerbl et al. 2023)
@@ -148,15 +151,32 @@ def tile_planes(count, tile, tiles_x):
 
 
 @jit()
-def pixel_span(rows, g, y0):
-    """First and last + 1 of a tile's flat pixels that Gaussian g's rows cover.
+def half_chord(radius, x):
+    """Half of a circle's chord at a distance x from its center, at most its radius."""
+    return math.sqrt(max((radius - x) * (radius + x), ZERO))
 
-    `rows` are (G, 2). The span goes in pairs of rows: in unsigned numbers, or LLVM
-    would not vectorize over them, and in whole vectors that it can recognize, or it
-    would add a loop for what is left over.
+
+@jit()
+def pixel_span(outline, left, top):
+    """First and last + 1 of a tile's flat pixels between which a Gaussian shows.
+
+    The tile's columns cut a slice out of its `footprint.outline`, which ends at the
+    ellipse's own lowest and highest points, or where it comes nearest to them. `left`
+    and `top` are the tile's edges, from the Gaussian's center.
+
+    The span goes in pairs of rows: in unsigned numbers, or LLVM would not vectorize
+    over them, and in whole vectors that it can recognize, or it would add a loop for
+    what is left over.
     """
-    first = max(rows[g, 0] - y0, 0) // 2
-    last = (min(rows[g, 1] - y0, TILE_Y) + 1) // 2
+    half_width, slope, ratio, lowest = outline
+    left, right = left + HALF, left + TILE_X - HALF  # its first and last pixels' centers
+    if left > half_width or right < -half_width:
+        return np.uint64(0), np.uint64(0)
+    low, high = min(max(lowest, left), right), min(max(-lowest, left), right)
+    below = slope * low + ratio * half_chord(half_width, low) - top
+    above = slope * high - ratio * half_chord(half_width, high) - top
+    first = max(math.ceil(above - HALF_PIXEL), 0) // 2
+    last = (min(math.floor(below + HALF_PIXEL), TILE_Y) + 1) // 2
     start = np.uint64(first) * TWO_ROWS
     return start, start + np.uint64(max(last - first, 0)) * TWO_ROWS
 
@@ -171,10 +191,16 @@ def is_opaque(z):
 
 
 @jit()
-def load_block(features, g, d):
-    """BLOCK features of Gaussian `g` from channel `d` on, of `features` (G, D)."""
-    first = features[g, d], features[g, d + 1], features[g, d + 2], features[g, d + 3]
-    return (*first, features[g, d + 4], features[g, d + 5], features[g, d + 6], features[g, d + 7])
+def load_block(features, g):
+    """The first BLOCK features of Gaussian `g`, of `features` (G, D)."""
+    first = features[g, 0], features[g, 1], features[g, 2], features[g, 3]
+    return (*first, features[g, 4], features[g, 5], features[g, 6], features[g, 7])
+
+
+@jit()
+def row_of(table, g):
+    """Row g of a table (G, 4)."""
+    return table[g, 0], table[g, 1], table[g, 2], table[g, 3]
 
 
 @jit(inline="always")
@@ -235,12 +261,12 @@ def add_moments(m, u, dx, dy):
 
 
 @jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
-def forward(starts, members, centers, conics, opacities, features, rows, maps, alpha):
+def forward(starts, members, centers, conics, opacities, features, outlines, maps, alpha):
     """Composite Gaussians front to back into `maps` and `alpha`.
 
     `maps` (C, H, W) take the first C channels of `features` (G, D); `alpha` is (H, W).
     `starts` and `members` come from `bin_tiles`; pixel `centers` (G, 2), `conics` (G,
-    3) and pixel `rows` (G, 2) from `projection.project`; `opacities` are (G,).
+    3) and `outlines` (G, 4) from `projection.project`; `opacities` are (G,).
     """
     height, width = alpha.shape
     channels = features.shape[1]
@@ -252,8 +278,8 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
             o = opacities[g]
             cx, cy = centers[g, 0], centers[g, 1]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
-            first, last = pixel_span(rows, g, y0)
-            f = load_block(features, g, 0)
+            first, last = pixel_span(row_of(outlines, g), x0 - cx, y0 - cy)
+            f = load_block(features, g)
             for p in range(first, last):
                 dx, dy = z[X + p] - cx, z[Y + p] - cy
                 q = cut_alpha(full_alpha(o, a, b, c, dx, dy))
@@ -261,10 +287,12 @@ def forward(starts, members, centers, conics, opacities, features, rows, maps, a
                 z[WEIGHT + p] = v
                 z[LEFT + p] -= v
                 add_to_block(z, SUMS + p, v, f)
-            for d in range(BLOCK, channels, BLOCK):
-                plane, f = channel_plane(d), load_block(features, g, d)
+            for d in range(BLOCK, channels, 2):
+                plane, f0, f1 = channel_plane(d), features[g, d], features[g, d + 1]
                 for p in range(first, last):
-                    add_to_block(z, plane + p, z[WEIGHT + p], f)
+                    v = z[WEIGHT + p]
+                    z[plane + p] += f0 * v
+                    z[plane + PLANE_1 + p] += f1 * v
             if i % CHECK_EVERY == 0 and is_opaque(z):
                 break
         for y in range(min(TILE_Y, height - y0)):
@@ -295,17 +323,16 @@ def read_gradients(x0, y0, maps, alpha, grad_maps, grad_alpha, z):
 
 
 @jit()
-def store_block(grad, d, t):
-    """Store gradients `t` of BLOCK channels from `d` on in `grad` (MOMENTS + D,)."""
-    first = MOMENTS + d
-    grad[first] = t[0]
-    grad[first + 1] = t[1]
-    grad[first + 2] = t[2]
-    grad[first + 3] = t[3]
-    grad[first + 4] = t[4]
-    grad[first + 5] = t[5]
-    grad[first + 6] = t[6]
-    grad[first + 7] = t[7]
+def store_block(grad, t):
+    """Store gradients `t` of the first BLOCK channels in `grad` (MOMENTS + D,)."""
+    grad[MOMENTS] = t[0]
+    grad[MOMENTS + 1] = t[1]
+    grad[MOMENTS + 2] = t[2]
+    grad[MOMENTS + 3] = t[3]
+    grad[MOMENTS + 4] = t[4]
+    grad[MOMENTS + 5] = t[5]
+    grad[MOMENTS + 6] = t[6]
+    grad[MOMENTS + 7] = t[7]
 
 
 @jit(parallel=True, nogil=True, fastmath=FAST, error_model="numpy")
@@ -317,7 +344,7 @@ def backward(
     conics,
     opacities,
     features,
-    rows,
+    outlines,
     maps,
     alpha,
     grad_maps,
@@ -346,15 +373,15 @@ def backward(
             o = opacities[g]
             cx, cy = centers[g, 0], centers[g, 1]
             a, b, c = conics[g, 0], conics[g, 1], conics[g, 2]
-            first, last = pixel_span(rows, g, y0)
+            first, last = pixel_span(row_of(outlines, g), x0 - cx, y0 - cy)
             if channels > BLOCK:
                 for p in range(first, last):
                     z[VALUE + p] = ZERO
-            for d in range(BLOCK, channels, BLOCK):
-                plane, f = channel_plane(d), load_block(features, g, d)
+            for d in range(BLOCK, channels, 2):
+                plane, f0, f1 = channel_plane(d), features[g, d], features[g, d + 1]
                 for p in range(first, last):
-                    z[VALUE + p] += dot_block(z, plane + p, f)
-            f = load_block(features, g, 0)
+                    z[VALUE + p] += f0 * z[plane + p] + f1 * z[plane + PLANE_1 + p]
+            f = load_block(features, g)
             t, m = NO_GRADIENT, NO_GRADIENT[:MOMENTS]
             for p in range(first, last):
                 value = z[GRAD_ALPHA + p] + z[VALUE + p] + dot_block(z, SUMS + p, f)
@@ -371,11 +398,13 @@ def backward(
                 z[LEFT + p] = left - v
                 m, t = add_moments(m, u, dx, dy), gather_block(t, z, SUMS + p, v)
             grad[0], grad[1], grad[2], grad[3], grad[4], grad[5] = m
-            store_block(grad, 0, t)
-            for d in range(BLOCK, channels, BLOCK):
-                plane, t = channel_plane(d), NO_GRADIENT
+            store_block(grad, t)
+            for d in range(BLOCK, channels, 2):
+                plane, t0, t1 = channel_plane(d), ZERO, ZERO
                 for p in range(first, last):
-                    t = gather_block(t, z, plane + p, z[WEIGHT + p])
-                store_block(grad, d, t)
+                    v = z[WEIGHT + p]
+                    t0 += z[plane + p] * v
+                    t1 += z[plane + PLANE_1 + p] * v
+                grad[MOMENTS + d], grad[MOMENTS + d + 1] = t0, t1
             if i % CHECK_EVERY == 0:
                 done = is_opaque(z)

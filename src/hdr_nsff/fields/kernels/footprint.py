@@ -124,6 +124,25 @@ def footprint(m, q, s, v, k, width, height):
 
 
 @jit(fastmath=FAST, error_model="numpy")
+def reach_of(o):
+    """Standard deviations at which the alpha of an opacity o falls below ALPHA_MIN."""
+    return math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
+
+
+@jit(fastmath=FAST, error_model="numpy")
+def outline(covariance, o):
+    """The ellipse in pixels outside of which a Gaussian of opacity o shows nothing.
+
+    It is dy = slope dx +- ratio sqrt(half_width^2 - dx^2) around the center. Returns
+    half_width, slope, ratio, and the dx of its lowest point, where dy is largest.
+    """
+    xx, xy, yy = covariance
+    half_width = reach_of(o) * math.sqrt(xx)
+    ratio = math.sqrt(xx * yy - xy * xy) / xx
+    return half_width, xy / xx, ratio, half_width * xy / math.sqrt(xx * yy)
+
+
+@jit(fastmath=FAST, error_model="numpy")
 def ellipse(t, covariance, o, k, width, height):
     """What a Gaussian of camera point t (3,) and opacity o covers of the picture.
 
@@ -136,8 +155,7 @@ def ellipse(t, covariance, o, k, width, height):
     if not (t[2] > NEAREST and o >= ALPHA_MIN):
         return hidden  # behind, too faint, or not a number
     x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
-    # standard deviations at which alpha falls below 1/255
-    reach = math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
+    reach = reach_of(o)
     rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
     if not (x + rx > 0 and y + ry > 0 and x - rx < width and y - ry < height):
         return hidden  # outside, or not a number

@@ -7,8 +7,6 @@ what comes out. Shapes: G Gaussians, P (Gaussian, tile) pairs, D feature channel
 
 from __future__ import annotations
 
-import math
-
 import numba
 import numpy as np
 
@@ -18,6 +16,7 @@ from hdr_nsff.fields.kernels.footprint import (
     MOMENTS,
     ellipse,
     footprint,
+    outline,
     world_gradients,
 )
 
@@ -58,16 +57,16 @@ def project(
     centers,
     depths,
     conics,
-    rows,
+    outlines,
     boxes,
 ):
     """Project world Gaussians into the picture of a camera.
 
     `w2c` is (3, 4), `k` = (fx, fy, cx, cy). `means` (G, 3) and `scales` (G, 3) are in
     scene units, `quaternions` (G, 4) w x y z of any length, `opacities` (G,) in [0, 1].
-    Fills pixel `centers` (G, 2), z-`depths` (G,), `conics` (G, 3), pixel `rows` (G, 2)
-    and tile `boxes` (G, 4: x0, y0, x1, y1). Rows and boxes exclude their ends, and are
-    empty where nothing shows.
+    Fills pixel `centers` (G, 2), z-`depths` (G,), `conics` (G, 3), `outlines` (G, 4)
+    and tile `boxes` (G, 4: x0, y0, x1, y1). Boxes exclude their ends, and are empty
+    where nothing shows.
     """
     tiles_x, tiles_y = (width + TILE_X - 1) // TILE_X, (height + TILE_Y - 1) // TILE_Y
     for g in numba.prange(means.shape[0]):
@@ -80,10 +79,10 @@ def project(
         centers[g, 0], centers[g, 1] = center
         conics[g, 0], conics[g, 1], conics[g, 2] = conic
         boxes[g, 0] = boxes[g, 1] = boxes[g, 2] = boxes[g, 3] = 0
-        rows[g, 0] = rows[g, 1] = 0
         if not shows:
             continue
-        rows[g, 0], rows[g, 1] = int(top), math.ceil(bottom)
+        edge = outline(covariance, float(opacities[g]))
+        outlines[g, 0], outlines[g, 1], outlines[g, 2], outlines[g, 3] = edge
         boxes[g, 0], boxes[g, 1] = int(left) // TILE_X, int(top) // TILE_Y
         boxes[g, 2] = min(int(right) // TILE_X + 1, tiles_x)
         boxes[g, 3] = min(int(bottom) // TILE_Y + 1, tiles_y)

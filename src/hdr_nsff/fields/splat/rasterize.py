@@ -221,14 +221,14 @@ def depth_order(depths: np.ndarray) -> np.ndarray:
     return by_low[np.argsort(high[by_low], kind="stable")]
 
 
-def pad_to_blocks(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
+def pad_channels(features: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Features (G, D) and z-depths (G,) side by side, padded with zeros.
 
-    The number of columns is a multiple of the kernels' `BLOCK`.
+    As the kernels take them: the kernels' `BLOCK` of columns, or more in pairs.
     """
     count, channels = features.shape
-    num_blocks = -(-(channels + 1) // compositing.BLOCK)
-    values = np.zeros((count, num_blocks * compositing.BLOCK), np.float32)
+    columns = max(channels + 1 + (channels + 1) % 2, compositing.BLOCK)
+    values = np.zeros((count, columns), np.float32)
     values[:, :channels] = features
     values[:, channels] = depths
     return values
@@ -257,18 +257,18 @@ class RasterizeNumba(torch.autograd.Function):
         centers = np.empty((count, 2), np.float32)
         depths = np.empty(count, np.float32)
         conics = np.empty((count, 3), np.float32)
-        rows = np.empty((count, 2), np.int64)
+        outlines = np.empty((count, 4), np.float32)
         boxes = np.empty((count, 4), np.int64)
         view = (pose, k, width, height)
-        projection.project(*gaussians, *view, centers, depths, conics, rows, boxes)
+        projection.project(*gaussians, *view, centers, depths, conics, outlines, boxes)
         tiles_x = -(-width // projection.TILE_X)
         tiles_y = -(-height // projection.TILE_Y)
         order = depth_order(depths)
         starts, members, places, owned = compositing.bin_tiles(boxes, order, tiles_x, tiles_y)
-        values = pad_to_blocks(features.detach().numpy(), depths)
+        values = pad_channels(features.detach().numpy(), depths)
         maps = torch.empty(features.shape[1] + 1, height, width)
         alpha = torch.empty(height, width)
-        drawn = (centers, conics, gaussians[3], values, rows)
+        drawn = (centers, conics, gaussians[3], values, outlines)
         compositing.forward(starts, members, *drawn, maps.numpy(), alpha.numpy())
         ctx.gaussians, ctx.view, ctx.drawn = gaussians, view, drawn
         ctx.tiles = starts, members, places, owned
