@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.fields.splat.local_gaussians import MIN_WINDOW, LocalGaussians
+from hdr_nsff.fields.splat.local_gaussians import MIN_WINDOW, LocalGaussians, TakeRows
 from hdr_nsff.fields.splat.relocate import relocate_unseen
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.training_view import TrainingView, flow_to_neighbor
@@ -70,14 +70,15 @@ def test_lives_move_straight_and_fade_around_their_center(time: float) -> None:
     local, alive = three(), torch.tensor([0, 1])
     ages = time - CENTERS[:2]
     expected = torch.tensor([0.0, 0, 2.0]) + ages[:, None] * VELOCITY
-    torch.testing.assert_close(local.positions(alive, time).detach(), expected)
+    torch.testing.assert_close(local.living(alive).positions(time).detach(), expected)
     opacities = 0.5 * torch.exp(-0.5 * (ages / DURATION) ** 2)
-    torch.testing.assert_close(local.opacities(alive, time).detach(), opacities)
+    torch.testing.assert_close(local.living(alive).opacities(time).detach(), opacities)
 
 
 def test_the_center_time_has_no_gradient_and_all_else_has() -> None:
     local, alive = three(), torch.tensor([0, 1])
-    drawn = [local.positions(alive, 4.0), local.opacities(alive, 4.0), local.radiance(alive)]
+    living = local.living(alive)
+    drawn = [living.positions(4.0), living.opacities(4.0), living.radiance()]
     sum(values.square().sum() for values in drawn).backward()  # type: ignore[union-attr]
     assert local.means.grad is not None and local.velocities.grad is not None
     assert float(local.means.grad[:, 3].abs().max()) == 0
@@ -90,10 +91,12 @@ def test_the_center_time_has_no_gradient_and_all_else_has() -> None:
 def test_unevenness_is_the_mean_square_difference_to_the_neighbors() -> None:
     local = three()
     local.neighbors[:] = torch.tensor([[1] * 4, [0] * 4, [0] * 4], dtype=torch.int32)
-    assert float(local.unevenness(torch.arange(3), 2.0).detach()) == 0
+    everyone = torch.arange(3)
+    assert float(local.unevenness(everyone, local.living(everyone), 2.0).detach()) == 0
     with torch.no_grad():
         local.velocities[1, 0] += 0.6
-    alone = local.unevenness(torch.tensor([0]), 2.0)
+    first = torch.tensor([0])
+    alone = local.unevenness(first, local.living(first), 2.0)
     assert float(alone.detach()) == pytest.approx(0.3**2 / 3)
     alone.backward()
     assert local.velocities.grad is not None
@@ -145,7 +148,7 @@ def test_optical_flow_follows_the_velocity() -> None:
     alive = field.alive(4.0)
     means = field.positions(4.0, alive)
     view = TrainingView(batch_of(4, 1), 4.0, alive, [1], rigidity=False)
-    flow = flow_to_neighbor(field.model(), view, means, 1).detach()
+    flow = flow_to_neighbor(field.model(), view, field.local.living(view.alive), means, 1).detach()
     life = -len(alive)  # the last ones are time-local
     moved = BESIDE.project(means[life:] + VELOCITY)[0] - CAMERA.project(means[life:])[0]
     torch.testing.assert_close(flow[life:], moved.detach(), atol=1e-3, rtol=1e-4)
@@ -189,3 +192,15 @@ def test_a_field_without_local_ones_is_as_before() -> None:
     batch = batch_of(4, 1, seed=1)
     _, own = field(replace(batch, flow={}))
     assert float(own["evenness"].detach()) == 0 and len(field.alive(3.0)) == 0
+
+
+def test_gradients_of_rows_add_up_in_their_table() -> None:
+    table = torch.nn.Parameter(torch.arange(12.0).view(3, 4))
+    rows = torch.tensor([2, 0])
+    for weight in (1.0, 10.0):
+        taken = TakeRows.apply(table, rows)
+        assert torch.equal(taken, table.detach()[rows])
+        (weight * taken[:, 1] * torch.tensor([5.0, 7.0])).sum().backward()
+    expected = torch.zeros(3, 4)
+    expected[2, 1], expected[0, 1] = 55.0, 77.0
+    assert table.grad is not None and torch.equal(table.grad, expected)

@@ -402,8 +402,9 @@ def test_flow_has_a_gradient_to_the_neighbors_pose() -> None:
     learned = replace(batch, neighbors={1: BESIDE.moved(pose)})
     means = field.cloud(4.0).means
     view = TrainingView(learned, 4.0, field.alive(4.0), [1], rigidity=False)
-    flow = flow_to_neighbor(field.model(), view, means, 1)
-    given = flow_to_neighbor(field.model(), replace(view, batch=batch), means, 1)
+    living = field.local.living(view.alive)
+    flow = flow_to_neighbor(field.model(), view, living, means, 1)
+    given = flow_to_neighbor(field.model(), replace(view, batch=batch), living, means, 1)
     torch.testing.assert_close(flow, given)
     flow[:, 0].sum().backward()
     # a camera that goes right sees everything go left

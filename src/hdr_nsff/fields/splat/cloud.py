@@ -11,6 +11,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.knots import interpolate_linear
 from hdr_nsff.fields.outputs import GaussianCloud
+from hdr_nsff.fields.splat.local_gaussians import Living
 from hdr_nsff.fields.splat.model import Model
 
 
@@ -19,23 +20,23 @@ def alive_at(model: Model, knot: float) -> Tensor:
     return model.local.alive(model.time(knot))
 
 
-def cloud_at(model: Model, knot: float, alive: Tensor) -> GaussianCloud:
-    """All Gaussians at a knot, of the time-local ones those `alive` (A,)."""
-    time, local = model.time(knot), model.local
+def cloud_at(model: Model, knot: float, living: Living) -> GaussianCloud:
+    """All Gaussians at a knot, of the time-local ones those `living` (A)."""
+    time = model.time(knot)
     mixture, share = model.mixture_logits.softmax(0), model.share(knot)
     static, moving = model.static, model.moving
     pose = model.trajectories.pose(knot)
     moved = model.trajectories.move(moving.means, mixture, pose)
     turned = model.trajectories.turn(moving.quaternions, mixture, pose)
     at_rest = static.means.new_zeros(len(static))
-    num_moving = len(moving) + len(alive)
-    log_scales = [static.log_scales, moving.log_scales, local.log_scales[alive, :3]]
-    radiance = [static.radiance(share), moving.radiance(share), local.radiance(alive)]
+    num_moving = len(moving) + len(living.means)
+    log_scales = [static.log_scales, moving.log_scales, living.log_scales[:, :3]]
+    radiance = [static.radiance(share), moving.radiance(share), living.radiance()]
     return GaussianCloud(
-        means=torch.cat([static.means, moved, local.positions(alive, time)]),
-        quaternions=torch.cat([static.quaternions, turned, local.quaternions[alive]]),
+        means=torch.cat([static.means, moved, living.positions(time)]),
+        quaternions=torch.cat([static.quaternions, turned, living.quaternions]),
         scales=torch.cat(log_scales).exp(),
-        opacities=torch.cat([opacities_at(model, share), local.opacities(alive, time)]),
+        opacities=torch.cat([opacities_at(model, share), living.opacities(time)]),
         radiance=torch.cat(radiance),
         motion=torch.cat([at_rest, static.means.new_ones(num_moving)]),
     )
@@ -48,26 +49,25 @@ def opacities_at(model: Model, share: float) -> Tensor:
     return torch.cat([model.static.opacity_logits, model.moving.opacity_logits + offsets]).sigmoid()
 
 
-def positions_at(model: Model, knot: float, alive: Tensor) -> Tensor:
-    """Means (G, 3) of all Gaussians at a knot, of the time-local ones those `alive`
-    (A,) at any knot.
+def positions_at(model: Model, knot: float, living: Living) -> Tensor:
+    """Means (G, 3) of all Gaussians at a knot, of the time-local ones those `living`
+    (A) at any knot.
     """
     mixture = model.mixture_logits.softmax(0)
     pose = model.trajectories.pose(knot)
     moved = model.trajectories.move(model.moving.means, mixture, pose)
-    lived = model.local.positions(alive, model.time(knot))
-    return torch.cat([model.static.means, moved, lived])
+    return torch.cat([model.static.means, moved, living.positions(model.time(knot))])
 
 
-def displacement(model: Model, means: Tensor, alive: Tensor, knot: float, offset: int) -> Tensor:
+def displacement(model: Model, means: Tensor, living: Living, knot: float, offset: int) -> Tensor:
     """From `means` (G, 3) at a knot to the means one training interval away.
 
-    `alive` (A,) are the time-local ones among them. `offset` is +1 (later) or -1
+    `living` (A) are the time-local ones among them. `offset` is +1 (later) or -1
     (earlier). Beyond the clip's ends, the displacement of the other direction is
     continued.
     """
     if model.has_knot(knot + offset):
-        return positions_at(model, knot + offset, alive) - means
+        return positions_at(model, knot + offset, living) - means
     if model.has_knot(knot - offset):
-        return means - positions_at(model, knot - offset, alive)
+        return means - positions_at(model, knot - offset, living)
     return torch.zeros_like(means)

@@ -13,6 +13,8 @@ them.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 from scipy.spatial import cKDTree
@@ -32,6 +34,54 @@ NUM_NEIGHBORS = 4  # whose velocities are compared
 # scene lengths (in units of the near depth) that count as far as one frame, for
 # neighbors in space and time
 LENGTHS_PER_FRAME = 0.01
+
+
+class TakeRows(torch.autograd.Function):
+    """Rows (A, 4) of a learned table (G, 4), each taken once. Their gradients are added
+    to those of the table where these lie.
+
+    Autograd's own indexing would make a table of zeros for every gradient; few rows of
+    a long clip are alive.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, table: Tensor, rows: Tensor) -> Tensor:
+        ctx.table, ctx.rows = table, rows
+        return table[rows]
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Any:
+        table, rows = ctx.table, ctx.rows
+        if table.grad is None:
+            table.grad = torch.zeros_like(table)
+        table.grad[rows] += grad
+        return None, None
+
+
+@dataclass(frozen=True)
+class Living:
+    """Time-local Gaussians that are alive, as rows (A, 4) of the tables."""
+
+    means: Tensor
+    velocities: Tensor
+    quaternions: Tensor
+    log_scales: Tensor
+    colors: Tensor
+    bounded: bool
+
+    def positions(self, time: float) -> Tensor:
+        """Where they are at a time: (A, 3)."""
+        ages = (time - self.means[:, 3:]).detach()
+        return self.means[:, :3] + ages * self.velocities[:, :3]
+
+    def opacities(self, time: float) -> Tensor:
+        """Opacities (A,) in [0, 1] at a time."""
+        ages = (time - self.means[:, 3].detach()) / self.log_scales[:, 3].exp()
+        return (-0.5 * ages.square()).exp() * self.colors[:, 3].sigmoid()
+
+    def radiance(self) -> Tensor:
+        """Linear HDR radiance (A, 3)."""
+        return to_radiance(self.colors[:, :3], self.bounded)
 
 
 class LocalGaussians(nn.Module):
@@ -114,35 +164,20 @@ class LocalGaussians(nn.Module):
         launch("living", blocks_for(len(self)), THREADS, *tables, float(time), MIN_WINDOW, alive)
         return alive.nonzero()[:, 0]
 
-    @staticmethod
-    def window(means: Tensor, log_scales: Tensor, time: float) -> Tensor:
-        """Share (A,) of their opacity that Gaussians have at a time."""
-        ages = (time - means[:, 3]) / log_scales[:, 3].exp()
-        return (-0.5 * ages.square()).exp()
-
-    def positions(self, alive: Tensor, time: float) -> Tensor:
-        """Where the Gaussians `alive` (A,) are at a time: (A, 3)."""
-        means = self.means[alive]
-        ages = (time - means[:, 3:]).detach()
-        return means[:, :3] + ages * self.velocities[alive, :3]
-
-    def opacities(self, alive: Tensor, time: float) -> Tensor:
-        """Opacities (A,) in [0, 1] at a time."""
-        window = self.window(self.means[alive].detach(), self.log_scales[alive], time)
-        return window * self.colors[alive, 3].sigmoid()
-
-    def radiance(self, alive: Tensor) -> Tensor:
-        """Linear HDR radiance (A, 3)."""
-        return to_radiance(self.colors[alive, :3], self.bounded)
+    def living(self, alive: Tensor) -> Living:
+        """The Gaussians `alive` (A,), each of them once."""
+        rows = (TakeRows.apply(getattr(self, name), alive) for name in self.table_names())
+        return Living(*rows, bounded=self.bounded)
 
     # Evenness of motion
 
-    def unevenness(self, alive: Tensor, unit: float) -> Tensor:
-        """Mean square difference of the velocities of neighbors, in `unit` a frame.
+    def unevenness(self, alive: Tensor, living: Living, unit: float) -> Tensor:
+        """Mean square difference of the velocities of neighbors, in `unit` a frame, of
+        the Gaussians `alive` (A,), which are those `living`.
 
         The neighbors' velocities count as given.
         """
-        own = self.velocities[alive, None, :3]
+        own = living.velocities[:, None, :3]
         others = self.velocities[self.neighbors[alive].long(), :3].detach()
         differences = (own - others) / unit
         return differences.square().sum() / max(differences.numel(), 1)

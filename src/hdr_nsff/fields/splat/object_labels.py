@@ -60,7 +60,7 @@ def label_local(
     labels = torch.full((len(centers),), -1)
     for i in nearest.unique().tolist():
         rows = (nearest == i).nonzero()[:, 0]
-        means = field.local.positions(rows, float(times[i]))
+        means = field.local.living(rows).positions(float(times[i]))
         label, seen = labels_in_frame(scene, frames[i].camera, position[frames[i].index], means)
         labels[rows[seen]] = label[seen]
     return labels

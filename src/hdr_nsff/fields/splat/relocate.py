@@ -69,7 +69,7 @@ def error_scores(model: Model, frame_error: FrameError) -> tuple[Tensor, Tensor]
     """
     knot = model.knot(frame_error.time)
     alive = alive_at(model, knot)
-    cloud = cloud_at(model, knot, alive)
+    cloud = cloud_at(model, knot, model.local.living(alive))
     features = torch.zeros(len(cloud.means), 2, device=cloud.means.device, requires_grad=True)
     with torch.enable_grad():
         maps = draw(model, frame_error.camera, cloud, [features])

@@ -107,7 +107,7 @@ class Splat(nn.Module):
         default those alive at the knot.
         """
         alive = self.alive(knot) if alive is None else alive
-        return cloud_at(self.model(), knot, alive)
+        return cloud_at(self.model(), knot, self.local.living(alive))
 
     def positions(self, knot: float, alive: Tensor | None = None) -> Tensor:
         """Means (G, 3) of the Gaussians of `cloud` at a knot.
@@ -115,7 +115,7 @@ class Splat(nn.Module):
         The time-local ones are those `alive` (A,) at any knot; by default at this one.
         """
         alive = self.alive(knot) if alive is None else alive
-        return positions_at(self.model(), knot, alive)
+        return positions_at(self.model(), knot, self.local.living(alive))
 
     @torch.no_grad()
     def gaussians(self, time: float) -> GaussianCloud:
@@ -140,10 +140,10 @@ class Splat(nn.Module):
         """
         model = self.model()
         knot = model.knot(time)
-        alive = alive_at(model, knot)
-        cloud = cloud_at(model, knot, alive)
+        living = self.local.living(alive_at(model, knot))
+        cloud = cloud_at(model, knot, living)
         offsets = (1, -1) if scene_flow else ()
-        steps = [displacement(model, cloud.means, alive, knot, o) for o in offsets]
+        steps = [displacement(model, cloud.means, living, knot, o) for o in offsets]
         render, drawn = composite(model, draw(model, camera, cloud, steps))
         flow = {o: drawn[:, 3 * i : 3 * i + 3] for i, o in enumerate(offsets)}
         depth = render.depth.clamp(self.near, self.far)

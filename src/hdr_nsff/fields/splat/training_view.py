@@ -27,6 +27,7 @@ from hdr_nsff.fields.splat.draw import (
 from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.late_mixing import Parts, split_late
+from hdr_nsff.fields.splat.local_gaussians import Living
 from hdr_nsff.fields.splat.model import Model
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
@@ -90,20 +91,21 @@ def draw_by_torch(model: Model, view: TrainingView) -> tuple[Maps, Parts | None,
     terms.
     """
     batch, knot, alive = view.batch, view.knot, view.alive
-    cloud = cloud_at(model, knot, alive)
-    extra = [flow_to_neighbor(model, view, cloud.means, o) for o in view.offsets]
+    living = model.local.living(alive)
+    cloud = cloud_at(model, knot, living)
+    extra = [flow_to_neighbor(model, view, living, cloud.means, o) for o in view.offsets]
     parts = None
     if view.recorder is not None:
         radiance = seen_radiance(model, batch.camera, cloud)
         parts = record_parts(model, view.recorder, batch.camera, radiance, cloud.means)
         extra.append(parts.gaussians)
-    maps = expose(model, view, cloud, extra)
+    maps = expose(model, view, living, cloud, extra)
     model.trajectories.mark(knot)
     model.local.mark(alive)
     terms = regularizers(model, cloud, knot)
     if view.rigidity:
         terms["rigidity"] = mixture_difference(model.mixture_logits, model.neighbors)
-        terms["evenness"] = model.local.unevenness(alive, model.unit)
+        terms["evenness"] = model.local.unevenness(alive, living, model.unit)
     return maps, parts, terms
 
 
@@ -128,7 +130,9 @@ def draw_by_kernels(
     return rasterize(*gaussians, features, batch.camera), parts, cloud.terms
 
 
-def expose(model: Model, view: TrainingView, cloud: GaussianCloud, extra: list[Tensor]) -> Maps:
+def expose(
+    model: Model, view: TrainingView, living: Living, cloud: GaussianCloud, extra: list[Tensor]
+) -> Maps:
     """What the frame sees of the `cloud` through its shutter, with `extra` features
     (G, ...).
     """
@@ -142,19 +146,21 @@ def expose(model: Model, view: TrainingView, cloud: GaussianCloud, extra: list[T
     neighbors = []
     for offset in sorted(batch.neighbors):
         knot = view.knot + offset
-        points = positions_at(model, knot, view.alive).detach()
+        points = positions_at(model, knot, living).detach()
         neighbors.append((batch.neighbors[offset], points, model.time(knot)))
     motion = apparent_motion(batch.camera, neighbors, cloud.means, batch.time)
     return Maps(*shutter.expose(draw_at, batch.camera, cloud.means, motion, batch.bracket))
 
 
-def flow_to_neighbor(model: Model, view: TrainingView, means: Tensor, offset: int) -> Tensor:
+def flow_to_neighbor(
+    model: Model, view: TrainingView, living: Living, means: Tensor, offset: int
+) -> Tensor:
     """Optical flow (G, 2) in pixels, from the frame's camera to a neighboring one.
 
     From where the camera sees each Gaussian's mean (G, 3) to where the neighbor sees it
     at its own time.
     """
-    moved = positions_at(model, model.nearest_knot(view.knot + offset), view.alive)
+    moved = positions_at(model, model.nearest_knot(view.knot + offset), living)
     camera, neighbor = view.batch.camera, view.batch.neighbors[offset]
     limit = MAX_FLOW * camera.width
     return (neighbor.project(moved)[0] - camera.project(means)[0]).clamp(-limit, limit)

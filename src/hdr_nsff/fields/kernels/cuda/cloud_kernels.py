@@ -315,7 +315,7 @@ def local_at(r, means, velocities, quaternions, log_scales, colors, numbers):
 
 def living(means, log_scales, time, least, alive):
     """Fill `alive` (L,): which time-local Gaussians show more than a share of their
-    opacity at a time, as `LocalGaussians.window` has it.
+    opacity at a time, as `Living.opacities` has it.
     """
     r = cuda.grid(1)
     if r >= means.shape[0]:
