@@ -166,8 +166,8 @@ class LocalGaussians(nn.Module):
 
     def living(self, alive: Tensor) -> Living:
         """The Gaussians `alive` (A,), each of them once."""
-        rows = (TakeRows.apply(getattr(self, name), alive) for name in self.table_names())
-        return Living(*rows, bounded=self.bounded)
+        rows = {name: TakeRows.apply(getattr(self, name), alive) for name in self.table_names()}
+        return Living(**rows, bounded=self.bounded)
 
     # Evenness of motion
 
