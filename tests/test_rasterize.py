@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from hdr_nsff.fields.kernels import compositing, footprint
+from hdr_nsff.fields.kernels.projection import TILE_X, TILE_Y
 from hdr_nsff.fields.splat import rasterize as module
 from hdr_nsff.fields.splat import rasterize_cuda, rasterize_gsplat
 from hdr_nsff.fields.splat.rasterize import (
@@ -377,3 +378,26 @@ def test_cuda_equals_plain_torch(
     assert float(off.max()) < 1e-3 * float(expected.abs().max())
     for a, b in zip((*leaves, pose, focal), gradients, strict=True):
         assert float((a.grad.cpu() - b).abs().max()) < 5e-3 * float(b.abs().max())
+
+
+def test_a_tiles_span_holds_all_that_a_gaussian_shows_in_it_and_little_more() -> None:
+    rng = np.random.default_rng(0)
+    rows_in_all = rows_needed = 0
+    for _ in range(400):
+        deviations = np.exp(rng.uniform(-1, 6)), np.exp(rng.uniform(-1, 2))  # up to needles
+        turn = rng.uniform(0, np.pi)
+        axes = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        covariance = axes * np.square(deviations) @ axes.T
+        opacity, center = rng.uniform(0.01, 1), rng.uniform(-40, 40, 2)
+        y, x = np.mgrid[:TILE_Y, :TILE_X] + 0.5
+        offsets = np.stack([x - center[0], y - center[1]], -1)
+        squares = np.einsum("yxi,ij,yxj->yx", offsets, np.linalg.inv(covariance), offsets)
+        shown = (opacity * np.exp(-0.5 * squares) >= footprint.ALPHA_MIN).any(1).nonzero()[0]
+        edge = footprint.outline((covariance[0, 0], covariance[0, 1], covariance[1, 1]), opacity)
+        span = compositing.pixel_span(tuple(np.float32(edge)), -center[0], -center[1])
+        first, last = (int(end) // TILE_X for end in span)
+        if len(shown):
+            assert first <= shown[0] and shown[-1] < last
+            rows_needed += 2 * (shown[-1] // 2 - shown[0] // 2 + 1)  # they go in pairs
+        rows_in_all += last - first
+    assert rows_needed <= rows_in_all <= 1.02 * rows_needed
