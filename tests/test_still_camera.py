@@ -12,7 +12,11 @@ from hdr_nsff.prepare.steps.footage import exposure_step
 from hdr_nsff.prepare.steps.poses import find_poses
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.priors.poses.estimate import estimate_poses
-from hdr_nsff.priors.poses.still_camera import shift_of, still_camera_shifts
+from hdr_nsff.priors.poses.still_camera import (
+    StillCameraTuning,
+    shift_of,
+    still_camera_shifts,
+)
 from hdr_nsff.radiometry.local_detail import local_detail
 
 NUM = 12
@@ -43,6 +47,27 @@ def test_a_still_camera_behind_a_mover_that_fills_the_picture(tmp_path):
     poses = estimate_poses(behind_a_box(), None, tmp_path)
     assert poses.parallax == "none" and poses.registered.all()
     assert np.array_equal(poses.c2w, np.tile(np.eye(4)[:3], (NUM, 1, 1)))
+
+
+def shaken_below(row: int, above: bool) -> np.ndarray:
+    """A clip (NUM, H, W, 3) in which nothing but the rows `above` a row, or below it,
+    stays in its place.
+    """
+    video = noisy(panning(np.linspace(-30, 30, NUM)))
+    part = np.s_[:, :row] if above else np.s_[:, row:]
+    video[part] = noisy(np.repeat(WALL[None], NUM, 0))[part]
+    return video
+
+
+def test_a_wall_above_somebody_who_fills_the_picture_is_a_background():
+    clip = shaken_below(H // 3, above=True)
+    assert still_camera_shifts(clip) is not None
+    spread_out = StillCameraTuning(min_share_above=1.0)
+    assert still_camera_shifts(clip, tuning=spread_out) is None
+
+
+def test_a_dashboard_is_no_background():
+    assert still_camera_shifts(shaken_below(2 * H // 3, above=False)) is None
 
 
 def zoomed(factors: np.ndarray) -> np.ndarray:

@@ -6,17 +6,20 @@ import struct
 from pathlib import Path
 from types import SimpleNamespace
 
+import av
 import numpy as np
 import pytest
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.video import (
+    frame_times,
     is_mirrored,
     read_video,
     turn,
     video_info,
     write_video,
 )
+from hdr_nsff.footage.gpmf import read_gopro_ev
 
 FRAMES = [np.full((17, 33, 3), level) for level in (0.1, 0.5, 0.9)]
 
@@ -49,6 +52,23 @@ def test_videos_that_are_cut_short_or_none_are_refused(tmp_path: Path) -> None:
     (tmp_path / "b.mp4").write_text("<html>")
     with pytest.raises(InputError, match="not a readable video"):
         list(read_video(tmp_path / "b.mp4"))
+
+
+def test_a_title_in_another_encoding_is_no_damage(tmp_path: Path) -> None:
+    """Old cameras and editors write titles in Latin-1."""
+    with av.open(str(tmp_path / "a.avi"), "w") as container:
+        container.metadata["title"] = "Pippi och Michel"
+        stream = container.add_stream("mjpeg", rate=12)
+        stream.width, stream.height, stream.pix_fmt = 32, 16, "yuvj420p"
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame(32, 16, "yuvj420p")))
+        container.mux(stream.encode(None))
+    data = (tmp_path / "a.avi").read_bytes()
+    (tmp_path / "a.avi").write_bytes(data.replace(b"Pippi och", b"Pippi \xd3ch"))
+    assert video_info(tmp_path / "a.avi").frames == 3
+    assert len(list(read_video(tmp_path / "a.avi"))) == 3
+    assert len(frame_times(tmp_path / "a.avi")) == 3
+    assert read_gopro_ev(tmp_path / "a.avi", 3) is None
 
 
 def test_mirrored_display_matrices_are_taken_apart_as_ffmpeg_does() -> None:

@@ -78,6 +78,13 @@ def tag_rec709(target: Any) -> None:
     target.color_trc = REC709_TAG
 
 
+def open_video(path: Path | str) -> Any:
+    """PyAV's container of a video to be read, in whatever encoding its titles are."""
+    import av
+
+    return av.open(str(path), metadata_errors="replace")
+
+
 def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
     """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
 
@@ -87,7 +94,7 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
 
     path = Path(path)
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
             for frame in container.decode(video=0):
@@ -135,7 +142,7 @@ def video_info(path: Path | str) -> VideoInfo:
 
     path = Path(path)
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
             stream = container.streams.video[0]
@@ -190,7 +197,7 @@ def frame_times(path: Path | str) -> np.ndarray:
 
     path = Path(path)
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
             packets = container.demux(video=0)

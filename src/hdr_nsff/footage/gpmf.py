@@ -13,6 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
+from hdr_nsff.core.video import open_video
+
 HEADER_BYTES = 8
 NESTED = 0  # the type of an entry that holds entries
 TYPES = {b"f": ">f4", b"S": ">u2", b"L": ">u4", b"s": ">i2", b"l": ">i4"}
@@ -46,11 +48,10 @@ def read_gopro_ev(path: Path, num_frames: int) -> np.ndarray | None:
 
 def metadata_packets(path: Path) -> Iterator[bytes]:
     """The packets of a video's track of GPMF; none where it has none."""
-    import av
     from av.error import FFmpegError
 
     try:
-        with av.open(str(path)) as container:
+        with open_video(path) as container:
             tracks = [s for s in container.streams if "MET" in s.metadata.get("handler_name", "")]
             if tracks:
                 yield from (bytes(packet) for packet in container.demux(tracks[0]))
