@@ -24,6 +24,13 @@ def test_a_fast_pan_and_a_flash_are_no_cuts():
     assert find_cuts(flash) == []
 
 
+def test_black_frames_hide_no_cut():
+    black = np.full_like(SLOW[:2], 0.01)
+    assert find_cuts(np.concatenate([SLOW, black, SLOW[:2, ::-1, ::-1]])) == [8]
+    assert find_cuts(np.concatenate([black, SLOW[:4], black, SLOW[4:], black])) == []
+    assert find_cuts(black) == []
+
+
 def test_footage_with_a_cut_is_refused_in_one_sentence(tmp_path):
     work = work_on(tmp_path, np.concatenate([SLOW, SLOW[:, ::-1, ::-1]]))
     with pytest.raises(InputError, match=r"cuts between frames 7 and 8; .* `--end 8`"):
