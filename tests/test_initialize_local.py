@@ -13,6 +13,8 @@ from hdr_nsff.fields.point_cloud import PointCloud
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
 from hdr_nsff.fields.splat.initialize_local import (
+    MAX_APPROACH,
+    bound_approach,
     count_local_pixels,
     gap_beside,
     local_mask,
@@ -21,6 +23,7 @@ from hdr_nsff.fields.splat.initialize_local import (
     start_durations,
     velocities_around,
 )
+from hdr_nsff.fields.splat.local_gaussians import MAX_AGE
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
@@ -136,6 +139,19 @@ def test_fast_lives_are_short_but_bridge_a_missing_frame(soft: Scene) -> None:
     missing = replace(soft, train=[g for g in soft.train if g.time != 3])
     assert (gap_beside(soft, f), gap_beside(missing, f)) == (1, 2)
     assert float(start_durations(missing, f, points, velocities)[2]) == pytest.approx(1.6)
+
+
+def test_nothing_comes_right_before_the_lens_while_it_is_alive(soft: Scene) -> None:
+    f = soft.train[2]
+    position, right, ahead = (f.camera.c2w[:, k] for k in (3, 0, 2))
+    places = position + 2 * ahead.expand(4, 3)
+    points = PointCloud(places, torch.zeros(4, 3), torch.ones(4), torch.full((4,), 0.01))
+    slow, wild = 0.1 * ahead, right - 3 * ahead
+    given = torch.stack([slow, wild, right, 3 * ahead])
+    found = bound_approach(f, points, given, torch.full((4,), 1.5))
+    most = MAX_APPROACH * 2 / (MAX_AGE * 1.5)  # a frame, of a distance of 2
+    expected = torch.stack([slow, right - most * ahead, right, most * ahead])
+    torch.testing.assert_close(found, expected)
 
 
 def test_lives_last_a_cycle_of_exposures(soft: Scene) -> None:

@@ -27,7 +27,7 @@ from hdr_nsff.fields.point_cloud import (
     unproject_frame,
 )
 from hdr_nsff.fields.splat.gaussians import from_log_radiance
-from hdr_nsff.fields.splat.local_gaussians import LocalGaussians
+from hdr_nsff.fields.splat.local_gaussians import MAX_AGE, LocalGaussians
 from hdr_nsff.scene.movers import nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
@@ -43,6 +43,10 @@ DURATION_CYCLES, MIN_DURATION = 0.7, 1.4
 # the picture; and the least duration, in gaps between frames, which leaves no hole
 # where one is missing (on real clips, twice the path gains less)
 DURATION_PATH, MIN_DURATION_GAPS = 0.023, 0.8
+
+# share of its distance by which a Gaussian comes nearer or goes away while it is alive:
+# more is noise of depth, and would bring it right before the lens
+MAX_APPROACH = 0.5
 
 
 @dataclass(frozen=True)
@@ -143,12 +147,28 @@ def start_durations(scene: Scene, f: Frame, points: PointCloud, velocities: Tens
     What counts is the part of `velocities` (P, 3) across the ray: along it, most is
     noise of depth.
     """
-    rays = functional.normalize(points.positions - f.camera.c2w[:, 3], dim=1)
-    across = velocities - (velocities * rays).sum(1, keepdim=True) * rays
+    across = velocities - along_rays(f, points, velocities)
     speeds = across.norm(dim=1) / (points.footprint * f.camera.width)
     longest = start_duration(scene)
     shortest = min(MIN_DURATION_GAPS * gap_beside(scene, f), longest)
     return (DURATION_PATH / speeds.clamp_min(1e-9)).clamp(shortest, longest)
+
+
+def along_rays(f: Frame, points: PointCloud, velocities: Tensor) -> Tensor:
+    """The parts (P, 3) of velocities along the rays of a frame to its points."""
+    rays = functional.normalize(points.positions - f.camera.c2w[:, 3], dim=1)
+    return (velocities * rays).sum(1, keepdim=True) * rays
+
+
+def bound_approach(f: Frame, points: PointCloud, velocities: Tensor, durations: Tensor) -> Tensor:
+    """`velocities` (P, 3) with a bounded part along the ray, given the `durations` (P,)
+    of the points' lives.
+    """
+    along = along_rays(f, points, velocities)
+    distances = (points.positions - f.camera.c2w[:, 3]).norm(dim=1)
+    fastest = MAX_APPROACH * distances / (MAX_AGE * durations)
+    excess = (1 - fastest / along.norm(dim=1).clamp_min(1e-12)).clamp_min(0)
+    return velocities - excess[:, None] * along
 
 
 def gap_beside(scene: Scene, f: Frame) -> float:
@@ -191,6 +211,7 @@ def frame_seeds(
     velocities = velocities_around(centers, *flow_velocities(scene, f, mask, points.positions))
     seeds = merge_by_cell(points, cells)
     durations = start_durations(scene, f, seeds, velocities)
+    velocities = bound_approach(f, seeds, velocities, durations)
     return LocalSeeds(seeds, velocities, durations, f.time)
 
 
