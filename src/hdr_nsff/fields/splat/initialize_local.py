@@ -43,7 +43,6 @@ DURATION_CYCLES, MIN_DURATION = 0.7, 1.4
 # the picture; and the least duration, in gaps between frames, which leaves no hole
 # where one is missing (on real clips, twice the path gains less)
 DURATION_PATH, MIN_DURATION_GAPS = 0.023, 0.8
-
 # share of its distance by which a Gaussian comes nearer or goes away while it is alive:
 # more is noise of depth, and would bring it right before the lens
 MAX_APPROACH = 0.5
