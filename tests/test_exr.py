@@ -50,6 +50,13 @@ def test_files_that_are_missing_or_cut_short_are_refused(tmp_path: Path) -> None
         read_exr(tmp_path / "a.exr")
 
 
+def test_pixels_that_are_not_square_are_refused(tmp_path: Path) -> None:
+    picture = {"RGB": np.ones((4, 6, 3), np.float32)}
+    write_exr(tmp_path / "a.exr", picture, {"pixelAspectRatio": 2.0})
+    with pytest.raises(InputError, match="a.exr: pixels 2 times as wide as high"):
+        read_exr(tmp_path / "a.exr")
+
+
 def test_nothing_is_printed_of_damaged_pixels(
     tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -84,14 +84,17 @@ def quiet() -> Iterator[None]:
 def read_exr(path: Path | str) -> dict[str, np.ndarray]:
     """Channels of an EXR as float32: {"RGB": (H, W, 3)}, {name: (H, W)} for the others.
 
-    InputError for a file cut short, NaN or Inf.
+    InputError for a file cut short, NaN or Inf, and pixels that are not square.
     """
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such file; put it back or correct the name")
     try:
         with quiet(), OpenEXR.File(str(path), header_only=True) as file:
-            (left, top), (right, bottom) = file.header()["dataWindow"]
+            header = dict(file.header())
+        if (aspect := header.get("pixelAspectRatio", 1.0)) != 1:
+            raise InputError(f"{path}: pixels {aspect:g} times as wide as high; write square ones")
+        (left, top), (right, bottom) = header["dataWindow"]
         check_size(path, int(right) - int(left) + 1, int(bottom) - int(top) + 1)
         with quiet(), OpenEXR.File(str(path)) as file:
             if not file.parts:

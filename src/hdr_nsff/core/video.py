@@ -88,7 +88,8 @@ def open_video(path: Path | str) -> Any:
 def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
     """Frames of a video as float32 rgb (H, W, 3) in [0, 1] with their time in seconds.
 
-    Rotated and mirrored as the file says. InputError where nothing can be decoded.
+    Rotated, mirrored and with square pixels as the file says. InputError where nothing
+    can be decoded.
     """
     import av
 
@@ -97,14 +98,24 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
         with open_video(path) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
+            aspect = pixel_aspect(container.streams.video[0])
             for frame in container.decode(video=0):
                 deep = frame.format.components[0].bits > 8
-                array = frame.to_ndarray(format="rgb48le" if deep else "rgb24")
+                array = frame.reformat(
+                    format="rgb48le" if deep else "rgb24", width=round(frame.width * aspect)
+                ).to_ndarray()
                 turned = turn(array, frame.rotation, is_mirrored(frame))
                 top = np.float32(65535 if deep else 255)
                 yield turned.astype(np.float32) / top, float(frame.time or 0.0)
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
+
+
+def pixel_aspect(stream: Any) -> float:
+    """Width of a pixel over its height: not 1 for anamorphic lenses and HDV. Frames are
+    widened by it, as players show them, so that rows stay rows.
+    """
+    return float(stream.sample_aspect_ratio or 1)
 
 
 def is_mirrored(frame: Any) -> bool:
@@ -149,7 +160,7 @@ def video_info(path: Path | str) -> VideoInfo:
             codec = stream.codec_context
             if codec is None:
                 raise InputError(f"{path}: a video in an unknown format; convert it to H.264")
-            check_size(path, codec.width, codec.height)
+            check_size(path, round(codec.width * pixel_aspect(stream)), codec.height)
             end = max((entry.pos + entry.size for entry in stream.index_entries), default=0)
             if end > path.stat().st_size:  # decoders stop at the cut without a word
                 raise InputError(f"{path}: the video is cut short; copy it again")

@@ -21,9 +21,11 @@ from hdr_nsff.prepare.tracks import best_track, share_masks, share_poses, track_
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import (
+    PosesTuning,
     estimate_poses,
     panorama_poses,
     rig_views,
+    rotation_poses,
     still_panorama,
 )
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
@@ -35,7 +37,7 @@ MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the sam
 SPHERE_NEAR = 0.5
 SPHERE_FAR = 2.0
 SIGHTINGS = "poses/sightings.npy"  # (O, 2) int32: a frame, and a point that it sees
-FIRST_ROUND = "poses/first_round.npz"  # lets a killed run go on with the second round
+FIRST_ROUND = "poses/round.npz"  # lets a killed run go on with the second round
 
 
 def find_poses(work: Work) -> StepResult:
@@ -115,7 +117,9 @@ def poses_and_masks(work: Work) -> Poses:
     """Structure from motion in up to three rounds.
 
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
-    change any more. A rig needs one: its masks need no poses.
+    change any more. Where they do not come to rest and rotations explain much of the
+    footage, the camera counts as one that turns in place. A rig needs one round: its
+    masks need no poses.
     """
     if work.manifest.rig > 1:
         return estimate(work, work.visits.moving)
@@ -127,6 +131,7 @@ def poses_and_masks(work: Work) -> Poses:
         before = share_masks(work, rough_mask(*work.raw_flows, work.equalized[0]))
         poses = estimate(work, before, earlier)
         write_round(cache, poses, before)
+    first, rough = poses, before
     for _ in range(MAX_ROUNDS if poses.parallax == "full" else 0):
         found = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
         moving = share_masks(work, found)
@@ -135,9 +140,32 @@ def poses_and_masks(work: Work) -> Poses:
         outcome = ": once more" if again else ""
         say(f"poses: masks from these poses agree to {agreement:.0%} with those before{outcome}")
         if not again:
-            break
+            return poses
         poses, before = estimate(work, moving, earlier), moving
-    return poses
+    return turning_poses(work, first, rough) or poses
+
+
+def turning_poses(work: Work, poses: Poses, moving: np.ndarray) -> Poses | None:
+    """Poses of a camera that turns in place, if rotations explain enough of what is not
+    `moving` (T, H, W) bool; None otherwise, and where `poses` have no parallax anyway.
+    """
+    share = poses.rotation_share
+    if poses.parallax != "full" or share is None:
+        return None
+    if share < PosesTuning().min_rotation_share_fallback:
+        return None
+    video, clipped = work.equalized
+    track = best_track(work)
+    own = track_frames(work.manifest, track)
+    turning = rotation_poses(video[own], moving[own] | np.array(clipped[own]))
+    if turning is None:
+        return None
+    note = (
+        "treated as a camera that turns in place, since masks did not come to rest and "
+        f"rotations explain {share:.0%} of the matches"
+    )
+    say(f"poses: {note}")
+    return share_poses(work, replace(turning, notes=(note, *turning.notes)), track)
 
 
 def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = None) -> Poses:
@@ -205,7 +233,8 @@ ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_e
 def write_round(path: Path, poses: Poses, moving: np.ndarray) -> None:
     """Keep poses and the masks (T, H, W) they were estimated with."""
     arrays = {name: np.asarray(getattr(poses, name)) for name in ARRAYS}
-    arrays["range"] = np.array([poses.near or np.nan, poses.far or np.nan])
+    known = (poses.near, poses.far, poses.rotation_share)
+    arrays["known"] = np.array([np.nan if v is None else v for v in known])
     arrays["words"] = np.array([poses.parallax, *poses.notes])
     arrays["moving"] = np.packbits(moving, axis=-1)
     arrays["width"] = np.array(moving.shape[-1])
@@ -216,10 +245,12 @@ def write_round(path: Path, poses: Poses, moving: np.ndarray) -> None:
 def read_round(path: Path) -> tuple[Poses, np.ndarray]:
     """What `write_round` wrote."""
     with np.load(path, allow_pickle=False) as arrays:
-        near, far = (None if np.isnan(v) else float(v) for v in arrays["range"])
+        near, far, share = (None if np.isnan(v) else float(v) for v in arrays["known"])
         parallax, *notes = arrays["words"].tolist()
         packed, width = arrays["moving"], int(arrays["width"])
         moving = np.unpackbits(packed, axis=-1, count=width).astype(bool)
         values = {name: arrays[name] for name in ARRAYS}
-    poses = Poses(**values, parallax=parallax, near=near, far=far, notes=tuple(notes))
+    poses = Poses(
+        **values, parallax=parallax, near=near, far=far, notes=tuple(notes), rotation_share=share
+    )
     return poses, moving

@@ -73,8 +73,9 @@ class PosesTuning:
     # without parallax (measured on rendered and real clips: above 0.84 without, below
     # 0.42 with parallax; 0.70 and 0.73 on two that have it before a background far
     # away, of which structure from motion succeeds on the first alone)
-    min_rotation_share: float = 0.7
-    # the same where structure from motion has failed (hand-chosen)
+    min_rotation_share: float = 0.8
+    # the same where structure from motion fails, or its masks do not come to rest; it
+    # then tries no lens (hand-chosen)
     min_rotation_share_fallback: float = 0.5
     reconstruction: ReconstructionTuning = field(default_factory=ReconstructionTuning)
     still: StillCameraTuning = field(default_factory=StillCameraTuning)
@@ -125,7 +126,10 @@ def estimate_poses(
             share = parallax_free_share(video, ignore, tuning)
     if share is not None and share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning, lens)
+    undecided = share is not None and share >= tuning.min_rotation_share_fallback
     if poses is None:
+        if undecided and lens == "auto":
+            lens = "none"
         if views is None:
             views = sfm_views(video, ignore, groups, tuning.reconstruction)
         mapper = Mapper(
@@ -135,12 +139,13 @@ def estimate_poses(
         try:
             poses = mapper.poses(lens)
         except InputError as error:
-            if share is not None and share >= tuning.min_rotation_share_fallback:
+            if undecided:
                 poses = rotation_poses(video, ignore, tuning, lens)
             if poses is None:
                 raise
             note = f"treated as a camera that turns in place, since {error}"
             poses = replace(poses, notes=(note, *poses.notes))
+    poses = replace(poses, rotation_share=share)
     if poses.lenses:
         return replace(poses, lenses={cameras[groups[k][0]]: v for k, v in poses.lenses.items()})
     for note in poses.notes:

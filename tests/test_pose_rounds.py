@@ -1,0 +1,82 @@
+"""Rounds of poses and masks: when they end, and what they end with."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from posed_clips import H, W, panning
+
+from hdr_nsff.geometry.poses import Poses
+from hdr_nsff.prepare.steps import poses as step
+
+T = 8
+PLACED = Poses(
+    K=np.tile(np.eye(3), (T, 1, 1)),
+    c2w=np.tile(np.eye(4)[:3], (T, 1, 1)),
+    registered=np.ones(T, bool),
+    parallax="full",
+    near=1.0,
+    far=9.0,
+)
+
+
+@pytest.fixture
+def rounds(tmp_path, monkeypatch):
+    """Runs the rounds on a pan whose structure from motion is said to find parallax;
+    the masks of every round are those given.
+    """
+
+    def run(share: float | None, *masks: np.ndarray) -> tuple[Poses, int]:
+        estimates = []
+
+        def estimate(work, moving, earlier):
+            estimates.append(moving)
+            return replace(PLACED, rotation_share=share)
+
+        after = iter(masks[1:])
+        monkeypatch.setattr(step, "estimate", estimate)
+        monkeypatch.setattr(step, "rough_mask", lambda *_: masks[0])
+        monkeypatch.setattr(step, "geometric_mask", lambda *_: next(after))
+        frames = [SimpleNamespace(index=t, track=0, camera_id=0) for t in range(T)]
+        work = SimpleNamespace(
+            folder=tmp_path,
+            manifest=SimpleNamespace(rig=1, num_tracks=1, frames=frames),
+            raw_flows=(None, None),
+            equalized=(panning(np.linspace(-10, 10, T)), np.zeros((T, H, W), bool)),
+        )
+        (tmp_path / "poses").mkdir(exist_ok=True)
+        return step.poses_and_masks(work), len(estimates)
+
+    return run
+
+
+def mask(column: int) -> np.ndarray:
+    moving = np.zeros((T, H, W), bool)
+    moving[:, 40:60, column : column + 20] = True
+    return moving
+
+
+def test_masks_that_come_to_rest_keep_the_parallax(rounds):
+    poses, estimates = rounds(0.7, mask(0), mask(30), mask(31))
+    assert poses.parallax == "full" and estimates == 2
+
+
+def test_restless_masks_of_a_clip_that_rotations_explain_mean_a_turn(rounds, capsys):
+    poses, estimates = rounds(0.7, mask(0), mask(30), mask(90))
+    assert poses.parallax == "rotation" and estimates == 3
+    assert not poses.c2w[:, :, 3].any() and poses.registered.all()
+    assert "rotations explain 70% of the matches" in capsys.readouterr().err
+    assert "did not come to rest" in poses.notes[0]
+
+
+@pytest.mark.parametrize("share", [0.3, None])
+def test_restless_masks_alone_do_not(rounds, share):
+    poses, _ = rounds(share, mask(0), mask(30), mask(90))
+    assert poses.parallax == "full"
+
+
+def test_a_killed_run_remembers_what_rotations_explained(rounds):
+    rounds(0.7, mask(0), mask(30), mask(31))
+    poses, estimates = rounds(None, mask(9), mask(30), mask(90))  # after the first round
+    assert poses.parallax == "rotation" and estimates == 2
