@@ -116,7 +116,7 @@ def test_the_terms_are_those_of_weighted_least_squares(offset: float) -> None:
     pairs = [
         (terms.pose_blocks, np.einsum("nt,ntij,ntik->tjk", weight, by_pose, by_pose)),
         (terms.points, np.einsum("nt,ntij,ntik->njk", weight, by_point, by_point)),
-        (terms.poses_points, np.einsum("nt,ntij,ntik->ntjk", weight, by_pose, by_point)),
+        (terms.points_poses, np.einsum("nt,ntij,ntik->nktj", weight, by_pose, by_point)),
         (terms.pose_gradient, np.einsum("nt,ntij,nti->tj", weight, by_pose, error)),
         (terms.point_gradient, np.einsum("nt,ntij,nti->nj", weight, by_point, error)),
     ]

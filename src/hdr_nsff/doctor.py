@@ -47,6 +47,7 @@ REQUIRED = {
     "pydantic>=2.12": "pydantic",
     "opencv-python-headless>=4.10": "cv2",
     "scipy>=1.11": "scipy",
+    "threadpoolctl>=3.1": "threadpoolctl",
     "matplotlib>=3.8": "matplotlib",
     "pycolmap>=4.0.4,<5": "pycolmap",
     "jinja2>=3.1": "jinja2",

@@ -67,13 +67,13 @@ def accumulate(
     min_depth,
     pose_blocks,
     point_blocks,
-    poses_points,
+    points_poses,
     pose_gradient,
     point_gradient,
 ):
     """Add the Gauss-Newton terms of all reprojection errors, by Huber weights.
 
-    To `pose_blocks` (T, 6, 6), `point_blocks` (N, 3, 3), `poses_points` (N, T, 6, 3),
+    To `pose_blocks` (T, 6, 6), `point_blocks` (N, 3, 3), `points_poses` (N, 3, T, 6),
     `pose_gradient` (T, 6) and `point_gradient` (N, 3). A pose is a rotation vector,
     then a translation.
     """
@@ -116,7 +116,7 @@ def accumulate(
                 for k in range(6):
                     pose_blocks[t, j, k] += first * by_pose[0, k] + second * by_pose[1, k]
                 for k in range(3):
-                    poses_points[n, t, j, k] += first * by_point[0, k] + second * by_point[1, k]
+                    points_poses[n, k, t, j] += first * by_point[0, k] + second * by_point[1, k]
             for j in range(3):
                 first, second = weight * by_point[0, j], weight * by_point[1, j]
                 point_gradient[n, j] += first * dx + second * dy

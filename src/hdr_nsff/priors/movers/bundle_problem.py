@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry import pinhole
@@ -25,6 +26,7 @@ from hdr_nsff.priors.movers.tuning import BUNDLE_TUNING, BundleTuning
 
 # observations that a point needs; one leaves its depth open
 MIN_OBSERVATIONS = 2
+TRACKS_TOGETHER = 16  # in one product of the Schur complement
 
 
 @dataclass(frozen=True)
@@ -68,11 +70,17 @@ class PriorResiduals:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Blocks of the Gauss-Newton approximation, and gradients of the cost."""
+    """Blocks of the Gauss-Newton approximation, and gradients of the cost.
+
+    Point n and the poses share `points_poses[n]` and, since the size of a shape grows
+    with its distance, the product of `by_size[n]` and `by_distance`.
+    """
 
     poses: np.ndarray  # (6 T, 6 T); six unknowns a time: rotation vector, translation
     points: np.ndarray  # (N, 3, 3)
-    poses_points: np.ndarray  # (N, 6 T, 3)
+    points_poses: np.ndarray  # (N, 3, 6 T), 0 where not visible
+    by_size: np.ndarray  # (N, 3)
+    by_distance: np.ndarray  # (6 T,)
     pose_gradient: np.ndarray  # (6 T,)
     point_gradient: np.ndarray  # (N, 3)
 
@@ -83,7 +91,7 @@ class ReprojectionTerms:
 
     pose_blocks: np.ndarray  # (T, 6, 6)
     points: np.ndarray  # (N, 3, 3)
-    poses_points: np.ndarray  # (N, T, 6, 3)
+    points_poses: np.ndarray  # (N, 3, T, 6)
     pose_gradient: np.ndarray  # (T, 6)
     point_gradient: np.ndarray  # (N, 3)
 
@@ -184,8 +192,11 @@ class BundleProblem:
         cost = self.cost(state)
         damping = tuning.initial_damping
         for _ in range(iterations):
-            candidate = self.damped_step(state, damping)
-            candidate_cost = self.cost(candidate)
+            try:
+                candidate = self.damped_step(state, damping)
+                candidate_cost = self.cost(candidate)
+            except LinAlgError:  # more damping determines the step
+                candidate_cost = np.inf
             if candidate_cost < cost:
                 state, cost = candidate, candidate_cost
                 damping /= tuning.damping_decrease
@@ -308,7 +319,7 @@ class BundleProblem:
         terms = ReprojectionTerms(
             pose_blocks=np.zeros((num, 6, 6)),
             points=np.zeros((count, 3, 3)),
-            poses_points=np.zeros((count, num, 6, 3)),
+            points_poses=np.zeros((count, 3, num, 6)),
             pose_gradient=np.zeros((num, 6)),
             point_gradient=np.zeros((count, 3)),
         )
@@ -317,7 +328,7 @@ class BundleProblem:
             self.min_depth,
             terms.pose_blocks,
             terms.points,
-            terms.poses_points,
+            terms.points_poses,
             terms.pose_gradient,
             terms.point_gradient,
         )
@@ -325,12 +336,11 @@ class BundleProblem:
 
     def normal_equations(self, state: BundleState) -> NormalEquations:
         """The Gauss-Newton system of the reprojection errors and all priors."""
-        count, num = self.visible.shape
+        num = self.visible.shape[1]
         priors = self.prior_residuals(state, self.reproject(state).depth)
         terms = self.reprojection_terms(state)
         pose_blocks, pose_gradient = terms.pose_blocks, terms.pose_gradient
         points, point_gradient = terms.points, terms.point_gradient
-        poses_points = terms.poses_points
 
         # mean z-depth
         by_depth = np.concatenate([np.zeros((num, 3)), self.w2c[:, 2]], -1)
@@ -351,8 +361,6 @@ class BundleProblem:
         points = points + np.eye(3) / sigma**2
         point_gradient = point_gradient + priors.shape / sigma
         relative_gradient = self.distance_gradient / distance  # (T, 3)
-        by_shape = (priors.shape / sigma)[:, None, None]
-        poses_points[:, :, 3:] -= relative_gradient[None, :, :, None] * by_shape
         squared = (priors.shape**2).sum()
         pose_gradient[:, 3:] += path_gradient - squared * self.distance_gradient / distance
         by_distance = np.sqrt(squared) * self.distance_gradient.reshape(-1) / distance
@@ -367,7 +375,9 @@ class BundleProblem:
         return NormalEquations(
             poses=poses.reshape(6 * num, 6 * num),
             points=points,
-            poses_points=poses_points.reshape(count, 6 * num, 3),
+            points_poses=terms.points_poses.reshape(len(points), 3, 6 * num),
+            by_size=priors.shape / sigma,
+            by_distance=np.concatenate([np.zeros((num, 3)), -relative_gradient], 1).reshape(-1),
             pose_gradient=pose_gradient.reshape(-1),
             point_gradient=point_gradient,
         )
@@ -375,7 +385,7 @@ class BundleProblem:
     def damped_step(self, state: BundleState, damping: float) -> BundleState:
         """The state after one damped Gauss-Newton step."""
         equations = self.normal_equations(state)
-        pose_step, point_step = solve_damped(equations, damping)
+        pose_step, point_step = solve_damped(equations, self.visible, damping)
         pose_step = pose_step.reshape(-1, 6)
         rotations = Rotation.from_rotvec(pose_step[:, :3]).as_matrix() @ state.rotations
         return BundleState(
@@ -383,10 +393,13 @@ class BundleProblem:
         )
 
 
-def solve_damped(equations: NormalEquations, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def solve_damped(
+    equations: NormalEquations, visible: np.ndarray, damping: float
+) -> tuple[np.ndarray, np.ndarray]:
     """The steps (6 T,) of the poses and (N, 3) of the points, by the Schur complement.
 
-    The diagonals grow by the share `damping`.
+    The diagonals grow by the share `damping`; `visible` (N, T) of the tracks.
+    LinAlgError where the poses stay undetermined.
     """
     poses, points = equations.poses.copy(), equations.points.copy()
     size = len(poses)
@@ -395,10 +408,38 @@ def solve_damped(equations: NormalEquations, damping: float) -> tuple[np.ndarray
     points[:, np.arange(3), np.arange(3)] *= 1 + damping
 
     inverse = np.linalg.inv(points)
-    poses_points = equations.poses_points
-    eliminated = poses_points @ inverse  # (N, 6 T, 3)
-    reduced = poses - np.tensordot(eliminated, poses_points, ((0, 2), (0, 2)))
-    carried = np.einsum("nij,nj->i", eliminated, equations.point_gradient)
-    pose_step = np.linalg.solve(reduced, -equations.pose_gradient + carried)
-    remaining = equations.point_gradient + np.einsum("nij,i->nj", poses_points, pose_step)
-    return pose_step, -np.einsum("nij,nj->ni", inverse, remaining)
+    subtract_carried(poses, equations.points_poses, inverse, visible)
+    couplings = equations.points_poses.reshape(-1, size)  # (3 N, 6 T)
+    sizes, distance = equations.by_size, equations.by_distance
+    solved_sizes = (inverse @ sizes[..., None])[..., 0]  # (N, 3)
+    carried_sizes = solved_sizes.reshape(-1) @ couplings
+    half = np.outer(carried_sizes + 0.5 * (sizes * solved_sizes).sum() * distance, distance)
+    poses -= half + half.T
+    solved = (inverse @ equations.point_gradient[..., None])[..., 0]  # (N, 3)
+    carried = solved.reshape(-1) @ couplings + distance * (sizes * solved).sum()
+    factor = cho_factor(poses, lower=True, overwrite_a=True, check_finite=False)
+    pose_step = cho_solve(factor, carried - equations.pose_gradient, check_finite=False)
+    remaining = equations.point_gradient + (couplings @ pose_step).reshape(-1, 3)
+    remaining += sizes * (distance @ pose_step)
+    return pose_step, -(inverse @ remaining[..., None])[..., 0]
+
+
+def subtract_carried(
+    poses: np.ndarray, points_poses: np.ndarray, inverse: np.ndarray, visible: np.ndarray
+) -> None:
+    """Subtract from `poses` (6 T, 6 T) what points carry from pose to pose: the sum of
+    W_n^T P_n W_n, W_n of `points_poses` (N, 3, 6 T) and P_n of `inverse` (N, 3, 3).
+
+    Tracks that start at about the same time go together, so that short ones cost only
+    the times at which they are `visible` (N, T).
+    """
+    order = np.argsort(visible.argmax(1), kind="stable")
+    for first in range(0, len(order), TRACKS_TOGETHER):
+        chosen = order[first : first + TRACKS_TOGETHER]
+        times = np.nonzero(visible[chosen].any(0))[0]
+        if len(times):
+            span = slice(6 * times[0], 6 * times[-1] + 6)
+            block = points_poses[chosen, :, span]
+            width = block.shape[2]
+            solved = (inverse[chosen] @ block).reshape(-1, width)
+            poses[span, span] -= block.reshape(-1, width).T @ solved
