@@ -1,6 +1,5 @@
 """Rounds of poses and masks: when they end, and what they end with."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -23,8 +22,8 @@ PLACED = Poses(
 
 @pytest.fixture
 def rounds(tmp_path, monkeypatch):
-    """Runs the rounds on a pan whose structure from motion is said to find parallax;
-    the masks of every round are those given.
+    """Runs the rounds on a pan whose structure from motion is said to find parallax,
+    and of which rotations explain a `share`; the masks of every round are given.
     """
 
     def run(share: float | None, *masks: np.ndarray) -> tuple[Poses, int]:
@@ -32,12 +31,13 @@ def rounds(tmp_path, monkeypatch):
 
         def estimate(work, moving, earlier):
             estimates.append(moving)
-            return replace(PLACED, rotation_share=share)
+            return PLACED
 
         after = iter(masks[1:])
         monkeypatch.setattr(step, "estimate", estimate)
         monkeypatch.setattr(step, "rough_mask", lambda *_: masks[0])
         monkeypatch.setattr(step, "geometric_mask", lambda *_: next(after))
+        monkeypatch.setattr(step, "parallax_free_share", lambda *_: share)
         frames = [SimpleNamespace(index=t, track=0, camera_id=0) for t in range(T)]
         work = SimpleNamespace(
             folder=tmp_path,
@@ -57,13 +57,18 @@ def mask(column: int) -> np.ndarray:
     return moving
 
 
-def test_masks_that_come_to_rest_keep_the_parallax(rounds):
-    poses, estimates = rounds(0.7, mask(0), mask(30), mask(31))
-    assert poses.parallax == "full" and estimates == 2
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_masks_that_come_to_rest_keep_the_parallax(rounds, number):
+    masks = [mask(30 * k) for k in range(number)]
+    poses, estimates = rounds(0.7, *masks, masks[-1])
+    assert poses.parallax == "full" and estimates == number
+
+
+RESTLESS = [mask(0), mask(30), mask(60), mask(90)]
 
 
 def test_restless_masks_of_a_clip_that_rotations_explain_mean_a_turn(rounds, capsys):
-    poses, estimates = rounds(0.7, mask(0), mask(30), mask(90))
+    poses, estimates = rounds(0.7, *RESTLESS)
     assert poses.parallax == "rotation" and estimates == 3
     assert not poses.c2w[:, :, 3].any() and poses.registered.all()
     assert "rotations explain 70% of the matches" in capsys.readouterr().err
@@ -72,11 +77,11 @@ def test_restless_masks_of_a_clip_that_rotations_explain_mean_a_turn(rounds, cap
 
 @pytest.mark.parametrize("share", [0.3, None])
 def test_restless_masks_alone_do_not(rounds, share):
-    poses, _ = rounds(share, mask(0), mask(30), mask(90))
-    assert poses.parallax == "full"
+    poses, estimates = rounds(share, *RESTLESS)
+    assert poses.parallax == "full" and estimates == 3
 
 
-def test_a_killed_run_remembers_what_rotations_explained(rounds):
-    rounds(0.7, mask(0), mask(30), mask(31))
-    poses, estimates = rounds(None, mask(9), mask(30), mask(90))  # after the first round
+def test_a_killed_run_goes_on_with_its_first_round(rounds):
+    rounds(0.7, mask(0), mask(0))
+    poses, estimates = rounds(0.7, mask(9), *RESTLESS[1:])
     assert poses.parallax == "rotation" and estimates == 2

@@ -43,8 +43,6 @@ class Poses:
     near: float | None = None  # z-depth, scene units
     far: float | None = None
     notes: tuple[str, ...] = ()  # sentences for the user
-    # of the static matches, that rotations alone explain; None: not measured
-    rotation_share: float | None = None
     # {camera_id: lens} where the frames turned out to be distorted: these poses are
     # then only the start
     lenses: dict[int, Lens] = field(default_factory=dict)

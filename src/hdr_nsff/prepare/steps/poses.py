@@ -24,6 +24,7 @@ from hdr_nsff.priors.poses.estimate import (
     PosesTuning,
     estimate_poses,
     panorama_poses,
+    parallax_free_share,
     rig_views,
     rotation_poses,
     still_panorama,
@@ -37,7 +38,7 @@ MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the sam
 SPHERE_NEAR = 0.5
 SPHERE_FAR = 2.0
 SIGHTINGS = "poses/sightings.npy"  # (O, 2) int32: a frame, and a point that it sees
-FIRST_ROUND = "poses/round.npz"  # lets a killed run go on with the second round
+FIRST_ROUND = "poses/first_round.npz"  # lets a killed run go on with the second round
 
 
 def find_poses(work: Work) -> StepResult:
@@ -131,41 +132,42 @@ def poses_and_masks(work: Work) -> Poses:
         before = share_masks(work, rough_mask(*work.raw_flows, work.equalized[0]))
         poses = estimate(work, before, earlier)
         write_round(cache, poses, before)
-    first, rough = poses, before
-    for _ in range(MAX_ROUNDS if poses.parallax == "full" else 0):
+    if poses.parallax != "full":
+        return poses
+    for rounds_left in reversed(range(MAX_ROUNDS + 1)):
         found = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
         moving = share_masks(work, found)
         agreement = (before & moving).sum() / max((before | moving).sum(), 1)
-        again = agreement < MIN_MASK_IOU
-        outcome = ": once more" if again else ""
+        settled = agreement >= MIN_MASK_IOU
+        outcome = ": once more" if rounds_left and not settled else ""
         say(f"poses: masks from these poses agree to {agreement:.0%} with those before{outcome}")
-        if not again:
+        if settled:
             return poses
-        poses, before = estimate(work, moving, earlier), moving
-    return turning_poses(work, first, rough) or poses
+        if rounds_left:
+            poses, before = estimate(work, moving, earlier), moving
+    return turning_poses(work, moving) or poses
 
 
-def turning_poses(work: Work, poses: Poses, moving: np.ndarray) -> Poses | None:
-    """Poses of a camera that turns in place, if rotations explain enough of what is not
-    `moving` (T, H, W) bool; None otherwise, and where `poses` have no parallax anyway.
+def turning_poses(work: Work, moving: np.ndarray) -> Poses | None:
+    """Poses of a camera that turns in place; None where rotations explain too little of
+    what is not `moving` (T, H, W) bool.
     """
-    share = poses.rotation_share
-    if poses.parallax != "full" or share is None:
-        return None
-    if share < PosesTuning().min_rotation_share_fallback:
-        return None
-    video, clipped = work.equalized
     track = best_track(work)
     own = track_frames(work.manifest, track)
-    turning = rotation_poses(video[own], moving[own] | np.array(clipped[own]))
-    if turning is None:
+    video, clipped = work.equalized
+    video, ignore = video[own], moving[own] | np.array(clipped[own])
+    share = parallax_free_share(video, ignore)
+    if share is None or share < PosesTuning().min_rotation_share_fallback:
+        return None
+    poses = rotation_poses(video, ignore)
+    if poses is None:
         return None
     note = (
         "treated as a camera that turns in place, since masks did not come to rest and "
         f"rotations explain {share:.0%} of the matches"
     )
     say(f"poses: {note}")
-    return share_poses(work, replace(turning, notes=(note, *turning.notes)), track)
+    return share_poses(work, replace(poses, notes=(note, *poses.notes)), track)
 
 
 def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = None) -> Poses:
@@ -233,8 +235,7 @@ ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_e
 def write_round(path: Path, poses: Poses, moving: np.ndarray) -> None:
     """Keep poses and the masks (T, H, W) they were estimated with."""
     arrays = {name: np.asarray(getattr(poses, name)) for name in ARRAYS}
-    known = (poses.near, poses.far, poses.rotation_share)
-    arrays["known"] = np.array([np.nan if v is None else v for v in known])
+    arrays["range"] = np.array([poses.near or np.nan, poses.far or np.nan])
     arrays["words"] = np.array([poses.parallax, *poses.notes])
     arrays["moving"] = np.packbits(moving, axis=-1)
     arrays["width"] = np.array(moving.shape[-1])
@@ -245,12 +246,10 @@ def write_round(path: Path, poses: Poses, moving: np.ndarray) -> None:
 def read_round(path: Path) -> tuple[Poses, np.ndarray]:
     """What `write_round` wrote."""
     with np.load(path, allow_pickle=False) as arrays:
-        near, far, share = (None if np.isnan(v) else float(v) for v in arrays["known"])
+        near, far = (None if np.isnan(v) else float(v) for v in arrays["range"])
         parallax, *notes = arrays["words"].tolist()
         packed, width = arrays["moving"], int(arrays["width"])
         moving = np.unpackbits(packed, axis=-1, count=width).astype(bool)
         values = {name: arrays[name] for name in ARRAYS}
-    poses = Poses(
-        **values, parallax=parallax, near=near, far=far, notes=tuple(notes), rotation_share=share
-    )
+    poses = Poses(**values, parallax=parallax, near=near, far=far, notes=tuple(notes))
     return poses, moving

@@ -145,7 +145,6 @@ def estimate_poses(
                 raise
             note = f"treated as a camera that turns in place, since {error}"
             poses = replace(poses, notes=(note, *poses.notes))
-    poses = replace(poses, rotation_share=share)
     if poses.lenses:
         return replace(poses, lenses={cameras[groups[k][0]]: v for k, v in poses.lenses.items()})
     for note in poses.notes:
