@@ -75,6 +75,17 @@ def test_restless_masks_of_a_clip_that_rotations_explain_mean_a_turn(rounds, cap
     assert "did not come to rest" in poses.notes[0]
 
 
+def test_small_movers_that_flicker_do_not(rounds):
+    dots = [m & (np.arange(H) == 50)[:, None] for m in RESTLESS]
+    poses, estimates = rounds(0.7, *dots)
+    assert poses.parallax == "full" and estimates == 3
+
+
+def test_where_nothing_moves_one_round_is_enough(rounds):
+    poses, estimates = rounds(0.7, *[np.zeros((T, H, W), bool)] * 2)
+    assert poses.parallax == "full" and estimates == 1
+
+
 @pytest.mark.parametrize("share", [0.3, None])
 def test_restless_masks_alone_do_not(rounds, share):
     poses, estimates = rounds(share, *RESTLESS)

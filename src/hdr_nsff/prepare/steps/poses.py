@@ -34,6 +34,9 @@ from hdr_nsff.priors.poses.visit_matches import choose_visits
 
 MAX_ROUNDS = 2  # of structure from motion after the first
 MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the same
+# share of all pixels whose masks change in the last round, from which poses have not
+# settled (hand-chosen; 0.02 or more on two clips that do not)
+MIN_RESTLESS_SHARE = 0.01
 # z-depth around distance 1, where everything lies when there is no parallax:
 SPHERE_NEAR = 0.5
 SPHERE_FAR = 2.0
@@ -137,7 +140,8 @@ def poses_and_masks(work: Work) -> Poses:
     for rounds_left in reversed(range(MAX_ROUNDS + 1)):
         found = geometric_mask(*work.raw_flows, work.equalized[0], poses.K, poses.c2w)
         moving = share_masks(work, found)
-        agreement = (before & moving).sum() / max((before | moving).sum(), 1)
+        union = (before | moving).sum()
+        agreement = (before & moving).sum() / union if union else 1.0
         settled = agreement >= MIN_MASK_IOU
         outcome = ": once more" if rounds_left and not settled else ""
         say(f"poses: masks from these poses agree to {agreement:.0%} with those before{outcome}")
@@ -145,6 +149,8 @@ def poses_and_masks(work: Work) -> Poses:
             return poses
         if rounds_left:
             poses, before = estimate(work, moving, earlier), moving
+    if (before ^ moving).mean() < MIN_RESTLESS_SHARE:
+        return poses
     return turning_poses(work, moving) or poses
 
 
