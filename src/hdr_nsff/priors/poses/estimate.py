@@ -74,9 +74,12 @@ class PosesTuning:
     # 0.42 with parallax; 0.70 and 0.73 on two that have it before a background far
     # away, of which structure from motion succeeds on the first alone)
     min_rotation_share: float = 0.8
-    # the same where structure from motion fails, or its masks do not come to rest; it
-    # then tries no lens (hand-chosen)
+    # the same where structure from motion fails, or its masks do not come to rest
+    # (hand-chosen)
     min_rotation_share_fallback: float = 0.5
+    # share of which so little parallax is left that no lens is looked for (a painted
+    # clip of which rotations explain 0.68 shows its lens)
+    no_lens_share: float = 0.7
     reconstruction: ReconstructionTuning = field(default_factory=ReconstructionTuning)
     still: StillCameraTuning = field(default_factory=StillCameraTuning)
 
@@ -126,9 +129,8 @@ def estimate_poses(
             share = parallax_free_share(video, ignore, tuning)
     if share is not None and share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning, lens)
-    undecided = share is not None and share >= tuning.min_rotation_share_fallback
     if poses is None:
-        if undecided and lens == "auto":
+        if share is not None and share >= tuning.no_lens_share and lens == "auto":
             lens = "none"
         if views is None:
             views = sfm_views(video, ignore, groups, tuning.reconstruction)
@@ -139,7 +141,7 @@ def estimate_poses(
         try:
             poses = mapper.poses(lens)
         except InputError as error:
-            if undecided:
+            if share is not None and share >= tuning.min_rotation_share_fallback:
                 poses = rotation_poses(video, ignore, tuning, lens)
             if poses is None:
                 raise
