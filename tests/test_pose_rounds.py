@@ -58,7 +58,7 @@ def mask(column: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_masks_that_come_to_rest_keep_the_parallax(rounds, number):
+def test_masks_that_settle_keep_the_parallax(rounds, number):
     masks = [mask(30 * k) for k in range(number)]
     poses, estimates = rounds(0.7, *masks, masks[-1])
     assert poses.parallax == "full" and estimates == number
@@ -72,7 +72,7 @@ def test_restless_masks_of_a_clip_that_rotations_explain_mean_a_turn(rounds, cap
     assert poses.parallax == "rotation" and estimates == 3
     assert not poses.c2w[:, :, 3].any() and poses.registered.all()
     assert "rotations explain 70% of the matches" in capsys.readouterr().err
-    assert "did not come to rest" in poses.notes[0]
+    assert "masks keep changing" in poses.notes[0]
 
 
 def test_small_movers_that_flicker_do_not(rounds):

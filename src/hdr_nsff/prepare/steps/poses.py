@@ -121,7 +121,7 @@ def poses_and_masks(work: Work) -> Poses:
     """Structure from motion in up to three rounds.
 
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
-    change any more. Where they do not come to rest and rotations explain much of the
+    change any more. Where they keep changing and rotations explain much of the
     footage, the camera counts as one that turns in place. A rig needs one round: its
     masks need no poses.
     """
@@ -169,7 +169,7 @@ def turning_poses(work: Work, moving: np.ndarray) -> Poses | None:
     if poses is None:
         return None
     note = (
-        "treated as a camera that turns in place, since masks did not come to rest and "
+        "treated as a camera that turns in place, since its masks keep changing and "
         f"rotations explain {share:.0%} of the matches"
     )
     say(f"poses: {note}")

@@ -74,11 +74,11 @@ class PosesTuning:
     # 0.42 with parallax; 0.70 and 0.73 on two that have it before a background far
     # away, of which structure from motion succeeds on the first alone)
     min_rotation_share: float = 0.8
-    # the same where structure from motion fails, or its masks do not come to rest
+    # the same where structure from motion fails, or its masks keep changing
     # (hand-chosen)
     min_rotation_share_fallback: float = 0.5
-    # share of which so little parallax is left that no lens is looked for (a painted
-    # clip of which rotations explain 0.68 shows its lens)
+    # share from which too little parallax is left to look for a lens (a painted clip
+    # with a share of 0.68 shows its lens)
     no_lens_share: float = 0.7
     reconstruction: ReconstructionTuning = field(default_factory=ReconstructionTuning)
     still: StillCameraTuning = field(default_factory=StillCameraTuning)
@@ -122,15 +122,15 @@ def estimate_poses(
                 ignore[t] |= mask[t]
     cameras = camera_ids or [0] * count
     groups = camera_groups(cameras)
-    poses, share = None, None
+    poses, share = None, 0.0
     if len(groups) == 1 and views is None:
         poses = still_poses(video, clipped, tuning, lens)
         if poses is None:
-            share = parallax_free_share(video, ignore, tuning)
-    if share is not None and share >= tuning.min_rotation_share:
+            share = parallax_free_share(video, ignore, tuning) or 0.0
+    if share >= tuning.min_rotation_share:
         poses = rotation_poses(video, ignore, tuning, lens)
     if poses is None:
-        if share is not None and share >= tuning.no_lens_share and lens == "auto":
+        if share >= tuning.no_lens_share and lens == "auto":
             lens = "none"
         if views is None:
             views = sfm_views(video, ignore, groups, tuning.reconstruction)
@@ -141,7 +141,7 @@ def estimate_poses(
         try:
             poses = mapper.poses(lens)
         except InputError as error:
-            if share is not None and share >= tuning.min_rotation_share_fallback:
+            if share >= tuning.min_rotation_share_fallback:
                 poses = rotation_poses(video, ignore, tuning, lens)
             if poses is None:
                 raise
