@@ -60,8 +60,10 @@ def track(items: Iterable[T], description: str, total: int | None = None) -> Ite
 
 
 def progress_of(done: int, total: int | None, seconds: float) -> str:
-    """The rest of a progress line: the total and the time left, where known."""
-    if not total:
+    """The rest of a progress line: the total and the time left, where known. Mapping
+    may take an image twice, and then more than its total.
+    """
+    if not total or done > total:
         return ""
     seconds_left = seconds / done * (total - done)
     return f" of {total}, {seconds_left:.0f} s left"
