@@ -4,8 +4,10 @@ import numpy as np
 from posed_clips import H, W, panning
 
 from hdr_nsff.priors.poses.matching import (
+    MatchingTuning,
     detect_keypoints,
     keypoint_mask,
+    match_pairs,
     sift_image,
     spread_pairs,
     view_pairs,
@@ -33,6 +35,19 @@ def test_small_frames_are_doubled_with_their_masks():
     ignore[10, 10] = True
     assert sift_image(np.zeros((H, W, 3)), 2, True).shape == (2 * H, 2 * W)
     assert (keypoint_mask(ignore, 2, margin=0) == 0).sum() == 4
+
+
+def test_noise_hides_fewer_matches_of_frames_that_are_not_doubled():
+    clip = panning(np.array([0.0, 0.1]))
+    noisy = clip + np.random.default_rng(0).normal(0, 0.08, clip.shape)
+    ignore = np.zeros(clip.shape[:3], bool)
+
+    def num_matches(denoise_px):
+        tuning = MatchingTuning(small_width=0, denoise_px=denoise_px)
+        keypoints = detect_keypoints(noisy, ignore, tuning)
+        return len(match_pairs(keypoints, [(0, 1)], tuning)[0].p)
+
+    assert num_matches(0.7) > 1.3 * num_matches(0.0) > 10
 
 
 def test_pairs_include_frames_of_equal_exposure():
