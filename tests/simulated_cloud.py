@@ -3,22 +3,18 @@ against plain torch. `test_cuda_step.py` runs these tests in a process with
 NUMBA_ENABLE_CUDASIM=1, which numba reads when it is imported.
 """
 
-from dataclasses import replace
 from typing import Any
 
 import pytest
 import torch
-from test_splat import BESIDE, TIMES, batch_of, scattered
+from moments import MOMENTS, compare, field_of_times, random_field
+from test_splat import BESIDE, scattered
 from torch import Tensor
 
 from hdr_nsff.fields.splat import draw, local_gaussians, training_view
-from hdr_nsff.fields.splat.config import SplatConfig
+from hdr_nsff.fields.splat.fused_cloud import fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.rasterize import Maps
-from hdr_nsff.fields.splat.splat import Splat
-
-NAMES = ("means", "quaternions", "scales", "opacities", "features")
-ROUNDING = 2e-5  # of the largest number: plain torch computes in float32
 
 
 @pytest.fixture(autouse=True)
@@ -28,95 +24,15 @@ def gaussians_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "rasterize", lambda *arguments: arguments[:5])
 
 
-def random_field(seed: int = 0, **settings: Any) -> Splat:
-    """Random Gaussians, some of them with dark, long or steep numbers."""
-    field = scattered(seed)
-    if settings:
-        config = replace(field.config, **settings)
-        other = Splat(config, torch.arange(TIMES), 1.0, 6.0, 1200)
-        other.load_state_dict(
-            {k: v for k, v in field.state_dict().items() if v.shape == other.state_dict()[k].shape},
-            strict=False,
-        )
-        field = other
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        field.static.opacity_logits[::5] = -9.0
-        field.moving.log_radiance[::7] = 17.0
-        field.mixture_logits.add_(torch.randn(field.mixture_logits.shape, generator=generator))
-    field.find_neighbors()
-    return field
-
-
-def values_and_gradients(
-    field: Splat, knot: float, offset: int | None, rigidity: bool, fused: bool
-) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-    """Gaussians and terms by name, and gradients and marks by parameters."""
-    draw_view = training_view.draw_by_kernels if fused else training_view.draw_by_torch
-    offsets = [] if offset is None else [offset]
-    batch = batch_of(0, offset or 1)
-    view = training_view.TrainingView(batch, knot, field.alive(knot), offsets, rigidity)
-    made, _, terms = draw_view(field.model(), view)
-    values = {**dict(zip(NAMES, made, strict=True)), **terms}
-    generator = torch.Generator().manual_seed(3)
-    loss = sum((torch.randn(v.shape, generator=generator) * v).sum() for v in values.values())
-    field.zero_grad()
-    loss.backward()
-    found = {n: p.grad for n, p in field.named_parameters() if p.grad is not None}
-    marks = {n: b.clone() for n, b in field.named_buffers() if n.endswith("touched")}
-    for name, buffer in field.named_buffers():
-        if name.endswith("touched"):
-            buffer.zero_()
-    return {k: v.detach() for k, v in values.items()}, {**found, **marks}
-
-
-def compare(field: Splat, knot: float, offset: int | None, rigidity: bool) -> None:
-    """The same by kernels and by plain torch."""
-    expected = values_and_gradients(field, knot, offset, rigidity, fused=False)
-    found = values_and_gradients(field, knot, offset, rigidity, fused=True)
-    for ours, theirs in zip(found, expected, strict=True):
-        for name, b in theirs.items():
-            a = ours.get(name, torch.zeros_like(b))
-            largest = float(b.float().abs().max()) if b.numel() else 0.0
-            if b.numel():
-                off = float((a.float() - b.float()).abs().max())
-                assert off <= ROUNDING * largest + 1e-7, f"{name}: off by {off:.3g} of {largest}"
-
-
-@pytest.mark.parametrize(("knot", "offset"), [(4.0, 1), (4.3, -1), (0.0, 1), (9.0, 1), (9.0, -1)])
-def test_gaussians_with_flow_to_a_neighbor(knot: float, offset: int) -> None:
-    compare(random_field(), knot, offset, rigidity=False)
-
-
-@pytest.mark.parametrize("knot", [0.0, 2.0, 3.7, 9.0])
-def test_gaussians_and_their_rigidity(knot: float) -> None:
-    compare(random_field(1), knot, None, rigidity=True)
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {"local": 0},
-        {"moving": 0, "local": 0},
-        {"radiance": "sigmoid"},
-        {"brightness_knots": 1, "color_knots": 1, "opacity_knots": 1},
-        {"bases": 1},
-    ],
-)
-def test_settings(settings: dict[str, Any]) -> None:
-    field = random_field(2, **settings)
-    compare(field, 4.2, 1, rigidity=False)
-    compare(field, 4.2, None, rigidity=True)
+@pytest.mark.parametrize(("seed", "settings", "knot", "offset"), MOMENTS)
+def test_moments(seed: int, settings: dict[str, Any], knot: float, offset: int | None) -> None:
+    compare(fused_cloud, random_field(seed, **settings), knot, offset)
 
 
 @pytest.mark.parametrize("num_times", [1, 2, 3])
 def test_short_clips(num_times: int) -> None:
-    config = SplatConfig(static=8, moving=6, local=0, bases=2)
-    field = Splat(config, torch.arange(num_times), 1.0, 6.0, 1200)
-    for p in field.parameters():
-        p.data.add_(0.1)
-    compare(field, float(num_times - 1), -1, rigidity=False)
-    compare(field, 0.0, None, rigidity=True)
+    compare(fused_cloud, field_of_times(num_times), float(num_times - 1), -1)
+    compare(fused_cloud, field_of_times(num_times), 0.0, None)
 
 
 def drawn_maps(channels: int) -> list[Tensor]:
@@ -155,7 +71,7 @@ def test_maps_over_the_background(radiance: str, channels: int) -> None:
 def test_more_gaussians_than_a_block() -> None:
     field = scattered(5, static=130, moving=150)
     field.find_neighbors()
-    compare(field, 5.0, 1, rigidity=False)
+    compare(fused_cloud, field, 5.0, 1)
 
 
 def test_flow_is_limited_near_the_camera() -> None:
@@ -164,7 +80,7 @@ def test_flow_is_limited_near_the_camera() -> None:
         field.static.means[:5, 2] = 1e-5
         field.static.means[5:8, 2] = -1.0
     assert float(BESIDE.project(field.static.means.detach())[0].abs().max()) > 100
-    compare(field, 4.0, 1, rigidity=False)
+    compare(fused_cloud, field, 4.0, 1)
 
 
 @pytest.mark.parametrize("knot", [0.0, 2.4, 4.0])

@@ -37,7 +37,7 @@ MIN_LENGTH = 1e-12  # added to a quaternion's length, which may be 0
 FAST = {"contract", "reassoc", "nsz", "arcp"}
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def rotation(q):
     """The unit quaternion (w, x, y, z) of `q`, its rotation matrix, and q's length.
 
@@ -53,7 +53,7 @@ def rotation(q):
     return (w, x, y, z), r, n
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def clamp_ratio(x, z, low, high):
     """x, moved so that x / z lies within [low, high], and whether it was moved."""
     ratio = x / z
@@ -64,13 +64,13 @@ def clamp_ratio(x, z, low, high):
     return x, False
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def dot(a, b):
     """Dot product of two triples."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def jacobian(k, held):
     """Entries 00, 02, 11 and 12 of J (2, 3), the linearized projection.
 
@@ -81,7 +81,7 @@ def jacobian(k, held):
     return k[0] / z, -k[0] * x / (z * z), k[1] / z, -k[1] * y / (z * z)
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def footprint(m, q, s, v, k, width, height):
     """A Gaussian of mean m, quaternion q and scales s in a camera's picture.
 
@@ -123,13 +123,13 @@ def footprint(m, q, s, v, k, width, height):
     return t, held, (t0, t1), (unit, r, n), (v0, v1), covariance
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def reach_of(o):
     """Standard deviations at which the alpha of an opacity o falls below ALPHA_MIN."""
     return math.sqrt(2 * math.log(o * 255.0 + 1e-6)) if o * 255.0 > 1 else 0.0
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def outline(covariance, o):
     """The ellipse in pixels outside of which a Gaussian of opacity o shows nothing.
 
@@ -142,7 +142,7 @@ def outline(covariance, o):
     return half_width, xy / xx, ratio, half_width * xy / math.sqrt(xx * yy)
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def ellipse(t, covariance, o, k, width, height):
     """What a Gaussian of camera point t (3,) and opacity o covers of the picture.
 
@@ -169,7 +169,7 @@ def ellipse(t, covariance, o, k, width, height):
     return True, (x, y), conic, (left, top, right, bottom)
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def picture_gradient(covariance, u):
     """dL / d pixel center (2,) and dL / d covariance (xx, xy, yy), of the moments `u`.
 
@@ -188,7 +188,7 @@ def picture_gradient(covariance, u):
     return d_center, d_covariance
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def shape_gradient(g, projection, spread, r, s):
     """From dL / d covariance to dL / dS (3,), dL / dR (3, 3) and dL / dT (2, 3).
 
@@ -242,7 +242,7 @@ def shape_gradient(g, projection, spread, r, s):
     return d_scales, d_rotation, d_projection
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def point_gradient(center, d_projection, t, held, w2c, k):
     """dL / d camera point t (3,), through the pixel center and through J in T = J W.
 
@@ -265,7 +265,7 @@ def point_gradient(center, d_projection, t, held, w2c, k):
     return dx, dy, dz
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def quaternion_gradient(unit, n, dr):
     """dL / d quaternion (4,) before it was normalized, from dL / dR (3, 3).
 
@@ -300,7 +300,7 @@ def quaternion_gradient(unit, n, dr):
     )
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def pose_gradient(point, d_projection, m, j):
     """dL / d world-to-camera matrix, three rows of 4 numbers.
 
@@ -321,7 +321,7 @@ def pose_gradient(point, d_projection, m, j):
     )
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def world_gradients(m, q, s, v, k, width, height, sums, d_depth):
     """Gradients of mean (3,), quaternion (4,) and scales (3,) of a Gaussian, and of v.
 

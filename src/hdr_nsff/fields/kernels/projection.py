@@ -24,7 +24,7 @@ TILE_X, TILE_Y = 8, 32  # pixels
 ZERO = np.float32(0)
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def gaussian(means, quaternions, scales, g):
     """Mean (3,), quaternion (4,) and scales (3,) of Gaussian `g` in float64."""
     mean = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
@@ -34,7 +34,7 @@ def gaussian(means, quaternions, scales, g):
     return mean, (w, x, y, z), scale
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def view_rows(w2c):
     """The three rows of a world-to-camera matrix (3, 4) as tuples."""
     return (
@@ -136,7 +136,7 @@ def project_backward(
                 grad_pose[g, 8 + j] = d_view[2][j]
 
 
-@jit(fastmath=FAST, error_model="numpy")
+@jit(fastmath=FAST, error_model="numpy", forceinline=True)
 def sum_moments(pairs, first, last):
     """The MOMENTS of a Gaussian's pairs from `first` to `last`, added up in float64."""
     u0 = u1 = u2 = u3 = u4 = u5 = 0.0

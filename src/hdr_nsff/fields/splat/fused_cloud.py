@@ -2,13 +2,12 @@
 neighbor and the field's own terms in one launch, their gradients in four.
 
 Plain torch takes about 300 launches for this (`cloud.py:cloud_at`, flow and terms),
-each of them shorter than a launch takes. It stays what the CPU does, and what view
-dependence, shutters and corrected cameras need.
+each of them shorter than a launch takes. It stays what view dependence, shutters and
+corrected cameras need. `numba_cloud.py` is the twin on the CPU.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -16,81 +15,10 @@ from torch import Tensor
 
 from hdr_nsff.core.tensors import constant
 from hdr_nsff.fields.kernels.cuda.launch import blocks_for, few_zeros, launch
-from hdr_nsff.fields.kernels.cuda.layout import NUMBERS, POSE, TERMS, THREADS
-from hdr_nsff.fields.knots import catmull_rom_weights, linear_position
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
+from hdr_nsff.fields.kernels.moment import POSE, TERMS
 from hdr_nsff.fields.splat.model import Model
-from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY
-from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.geometry.pinhole import MIN_DEPTH
-
-TERM_NAMES = (
-    "opacity",
-    "scale",
-    "trajectory",
-    "brightness_drift",
-    "opacity_offsets",
-    "color_change",
-    "rigidity",
-    "evenness",
-)
-MAX_FLOW = 2.0  # picture widths: keeps the flow of Gaussians near the camera finite
-EVERY_STEP = 6  # of the terms: rigidity and evenness take turns with flow
-
-
-@dataclass(frozen=True)
-class Moment:
-    """When and from where Gaussians are seen, and the frame that their flow goes to."""
-
-    knot: float
-    time: float  # in frames
-    share: float  # of the clip, in [0, 1]
-    camera: Camera
-    # knot, time and camera of the neighbor; without one there is no flow
-    neighbor: tuple[float, float, Camera] | None
-    rigidity: bool  # whether rigidity and evenness are due
-
-    def numbers(self, model: Model) -> tuple[float, ...]:
-        """What the kernels take of the time, in the order of `cloud_kernels.py`."""
-        t, share = model.trajectories, self.share
-        knot, time, _ = self.neighbor or (self.knot, self.time, None)
-        static, moving = model.static, model.moving
-        tables = static.log_radiance_offsets, moving.log_radiance_offsets, model.opacity_offsets
-        places = [linear_position(len(v), share * (len(v) - 1)) for v in tables]
-        numbers = (
-            *knot_weights(t.num_knots, self.knot),
-            *knot_weights(t.num_knots, knot),
-            self.time,
-            time,
-            *(number for place in places for number in place),
-            model.unit,
-            MIN_DEPTH,
-            MAX_FLOW * self.camera.width,
-            float(static.bounded),
-            float(self.rigidity),
-            MIN_OPACITY,
-            *t.window(self.knot),
-            COLOR_OFFSET_SHARE,
-        )
-        assert len(numbers) == NUMBERS, len(numbers)
-        return numbers
-
-
-def knot_weights(num_knots: int, knot: float) -> list[float]:
-    """The first of four rows that a knot is interpolated from, and their weights."""
-    first, weights = catmull_rom_weights(num_knots, knot)
-    return [first, *weights, *[0.0] * (4 - len(weights))]
-
-
-@dataclass(frozen=True)
-class Cloud:
-    """The Gaussians of a moment, as `rasterize` takes them."""
-
-    means: Tensor  # (G, 3) scene units
-    quaternions: Tensor  # (G, 4)
-    scales: Tensor  # (G, 3)
-    opacities: Tensor  # (G,)
-    features: Tensor  # (G, 4 or 6): radiance, motion, flow in pixels to the neighbor
-    terms: dict[str, Tensor]  # the field's own, by the names of their weights
+from hdr_nsff.fields.splat.moment import EVERY_STEP, TERM_NAMES, Cloud, Moment, split_parameters
 
 
 def fused_cloud(model: Model, moment: Moment, alive: Tensor) -> Cloud:
@@ -165,13 +93,6 @@ class MakeCloud(torch.autograd.Function):
             local.neighbors, before, *ctx.sight, *given, *g_rows[2:], *marks,
         )  # fmt: skip
         return None, None, None, *g_static, *g_moving, *g_rows
-
-
-def split_parameters(
-    learned: list[Tensor],
-) -> tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]:
-    """Those of static and moving Gaussians, of the shared motions, and local tables."""
-    return learned[:6], learned[6:14], learned[14:16], learned[16:]
 
 
 def zeros(like: Tensor, sizes: list[torch.Size]) -> list[Tensor]:

@@ -1,5 +1,5 @@
 """What a training step sees of its frame, and the field's own terms: by plain torch, or
-by CUDA kernels where they can do all that is asked for.
+by kernels where they can do all that is asked for.
 
 A frame is seen through its shutter, with optical flow to one of its neighbors, and with
 what is recorded of the Gaussians one by one, each where it is due.
@@ -7,6 +7,7 @@ what is recorded of the Gaussians one by one, each where it is due.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -24,15 +25,19 @@ from hdr_nsff.fields.splat.draw import (
     record_parts,
     seen_radiance,
 )
-from hdr_nsff.fields.splat.fused_cloud import MAX_FLOW, Moment, fused_cloud
+from hdr_nsff.fields.splat.fused_cloud import fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.late_mixing import Parts, split_late
 from hdr_nsff.fields.splat.local_gaussians import Living
 from hdr_nsff.fields.splat.model import Model
+from hdr_nsff.fields.splat.moment import MAX_FLOW, Cloud, Moment
+from hdr_nsff.fields.splat.numba_cloud import numba_cloud
 from hdr_nsff.fields.splat.rasterize import Maps, rasterize
 from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
 from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
 from hdr_nsff.scene.batch import PixelBatch, Recorder
+
+CloudMaker = Callable[[Model, Moment, Tensor], Cloud]
 
 
 @dataclass(frozen=True)
@@ -61,29 +66,38 @@ class Seen:
 
 def see(model: Model, view: TrainingView) -> Seen:
     """What a training step sees, differentiable in everything."""
-    if can_fuse(model, view):
-        maps, parts, terms = draw_by_kernels(model, view)
-        maps, late = split_late(maps, parts)
+    make_cloud = cloud_maker(model, view)
+    if make_cloud is None:
+        maps, parts, terms = draw_by_torch(model, view)
+    else:
+        maps, parts, terms = draw_by_kernels(model, view, make_cloud)
+    maps, late = split_late(maps, parts)
+    if make_cloud is fused_cloud:
         least = MIN_DEPTH_SHARE * model.unit
         numbers = model.bounded, model.far, least, MIN_ALPHA
         render, flow = fused_composite(maps, model.background, *numbers)
     else:
-        maps, parts, terms = draw_by_torch(model, view)
-        maps, late = split_late(maps, parts)
         render, drawn = composite(model, maps)
         # features are premultiplied by opacity
         flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
     return Seen(render, flow, terms, parts, late)
 
 
-def can_fuse(model: Model, view: TrainingView) -> bool:
-    """Whether kernels make the Gaussians of the view: on a GPU, without view
-    dependence, shutter or learned cameras.
+def cloud_maker(model: Model, view: TrainingView) -> CloudMaker | None:
+    """What makes the Gaussians of the view by kernels: `fused_cloud` or `numba_cloud`.
+
+    None with view dependence, a shutter or learned cameras, and where there are no
+    kernels.
     """
     cameras = view.batch.camera, *view.batch.neighbors.values()
     learned = any(c.c2w.requires_grad or c.K.requires_grad for c in cameras)
-    special = learned or view.shutter is not None or model.view_dependence
-    return not special and kernels_on(model.background.device)
+    if learned or view.shutter is not None or model.view_dependence:
+        return None
+    background = model.background
+    if kernels_on(background.device):
+        return fused_cloud
+    on_cpu = background.device.type == "cpu" and background.dtype == torch.float32
+    return numba_cloud if on_cpu else None
 
 
 def draw_by_torch(model: Model, view: TrainingView) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
@@ -110,9 +124,9 @@ def draw_by_torch(model: Model, view: TrainingView) -> tuple[Maps, Parts | None,
 
 
 def draw_by_kernels(
-    model: Model, view: TrainingView
+    model: Model, view: TrainingView, make_cloud: CloudMaker
 ) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
-    """The same by CUDA kernels, with flow to one neighbor at most."""
+    """The same by kernels, with flow to one neighbor at most."""
     batch, knot = view.batch, view.knot
     neighbor = None
     for offset in view.offsets:
@@ -120,7 +134,7 @@ def draw_by_kernels(
         neighbor = there, model.time(there), batch.neighbors[offset]
     when = knot, model.time(knot), model.share(knot)
     moment = Moment(*when, batch.camera, neighbor, view.rigidity)
-    cloud = fused_cloud(model, moment, view.alive)
+    cloud = make_cloud(model, moment, view.alive)
     gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
     features, parts = cloud.features, None
     if view.recorder is not None:

@@ -59,17 +59,27 @@ class Trajectories(nn.Module):
         shifts = catmull_rom(self.translations.view(self.num_knots, self.num_bases, 4), knot)
         return nn.functional.normalize(turns, dim=-1), shifts[:, :3]
 
+    def motions(self, pose: Pose) -> Tensor:
+        """Matrices (B, 3, 4) that move a canonical point as the bases in `pose` do."""
+        quaternions, shifts = pose
+        rotations = rotation_matrices(quaternions)  # (B, 3, 3)
+        turned_centers = (rotations @ self.centers[..., None])[..., 0]
+        offsets = self.centers + shifts - turned_centers
+        return torch.cat([rotations, offsets[..., None]], 2)
+
+    def pose_numbers(self, knot: float) -> Tensor:
+        """The bases at a knot as kernels take them: (B, 16) of `motions`, row by row,
+        and unit quaternions.
+        """
+        pose = self.pose(knot)
+        return torch.cat([self.motions(pose).flatten(1), pose[0]], 1)
+
     def move(self, points: Tensor, mixture: Tensor, pose: Pose) -> Tensor:
         """Where canonical `points` (G, 3) are when the bases are in `pose`: (G, 3).
 
         `mixture` (B, G) are each point's weights of the bases.
         """
-        quaternions, shifts = pose
-        rotations = rotation_matrices(quaternions)  # (B, 3, 3)
-        turned_centers = (rotations @ self.centers[..., None])[..., 0]
-        offsets = self.centers + shifts - turned_centers
-        bases = torch.cat([rotations, offsets[..., None]], 2)  # (B, 3, 4)
-        motions = (mixture.T @ bases.flatten(1)).unflatten(1, (3, 4))  # each point's own
+        motions = (mixture.T @ self.motions(pose).flatten(1)).unflatten(1, (3, 4))
         return torch.baddbmm(motions[..., 3:], motions[..., :3], points[..., None])[..., 0]
 
     def turn(self, quaternions: Tensor, mixture: Tensor, pose: Pose) -> Tensor:

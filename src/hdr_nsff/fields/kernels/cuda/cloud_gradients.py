@@ -1,8 +1,9 @@
 """CUDA kernels that carry gradients of `cloud_kernels.cloud` to the learned numbers.
 
-A thread per Gaussian of one kind. Gradients of the shared motions come in two steps:
-blocks of moving Gaussians add up what each basis gets (`moving_backward`), and a thread
-per basis carries that to the rows near the knot (`trajectory_backward`).
+A thread per Gaussian of one kind; what it does stands in `kernels/moment_gradients.py`.
+Gradients of the shared motions come in two steps: blocks of moving Gaussians add up
+what each basis gets (`moving_backward`), and a thread per basis carries that to the
+rows near the knot (`trajectory_backward`).
 
 Names, shapes and `numbers` are those of `cloud_kernels.py`. A `d_` is a gradient of
 what `cloud` filled, a `g_` one that is made here. Gradients of tables of which only
@@ -11,96 +12,40 @@ some rows are touched, and of the mixtures, must be 0 before.
 
 from __future__ import annotations
 
-import math
-
 from numba import cuda, float32
 
+from hdr_nsff.fields.kernels import footprint, moment_gradients
 from hdr_nsff.fields.kernels.cuda.cloud_kernels import (
-    BOUNDED,
-    COLOR_CHANGE,
-    DRIFT,
-    EVENNESS,
+    ROW,
+    column_sum,
+    mixed_pose,
+    move_point,
+    pose_of,
+    quaternion_at,
+    rotation,
+    share_of,
+    softmax_sum,
+    third_difference,
+)
+from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
+from hdr_nsff.fields.kernels.cuda.layout import THREADS
+from hdr_nsff.fields.kernels.moment import (
     FIRST_ROW,
     KNOT,
     LAST_ROW,
-    MEAN_OPACITY,
-    MEAN_SCALE,
-    MIN_OPACITY,
-    MOVING_COLOR,
-    NEAR_FLOW,
     NEIGHBOR,
-    OFFSET_SHARE,
-    OPACITY,
-    OPACITY_CHANGE,
+    POSE,
     RIGIDITY,
     RIGIDITY_DUE,
-    ROW,
-    STATIC_COLOR,
-    TIME,
     TRAJECTORY,
     UNIT,
-    between,
-    change_gradient,
-    column_sum,
-    flow_of,
-    local_at,
-    mixed_pose,
-    move_point,
-    point_gradient,
-    pose_of,
-    product,
-    quaternion_at,
-    quaternion_gradient,
-    radiance_of,
-    rotation,
-    share_of,
-    sigmoid,
-    softmax_sum,
-    third_difference,
-    unevenness_of,
 )
-from hdr_nsff.fields.kernels.cuda.device import exact_device
-from hdr_nsff.fields.kernels.cuda.layout import POSE, THREADS
 
+quaternion_gradient = device_functions(footprint, fastmath=False)["quaternion_gradient"]
+MOMENT = device_functions(moment_gradients, fastmath=False, arrays=True)
+static_gradients, motion_gradients = MOMENT["static_gradients"], MOMENT["motion_gradients"]
+moving_gradients, local_gradients = MOMENT["moving_gradients"], MOMENT["local_gradients"]
 SIGNS = (-1.0, 3.0, -3.0, 1.0)  # of poses in their third difference
-
-
-@exact_device
-def mean_gradients(g, x, there, sight, d_means, d_features):
-    """Gradients (3,) of a Gaussian's mean, and of its mean at the neighbor's time."""
-    d = (d_means[g, 0], d_means[g, 1], d_means[g, 2])
-    if d_features.shape[1] <= 4:
-        return (d[0] + 0.0, d[1] + 0.0, d[2] + 0.0), (0.0, 0.0, 0.0)
-    numbers, K, c2w, neighbor_K, neighbor_c2w = sight
-    _, free = flow_of(x, there, numbers, K, c2w, neighbor_K, neighbor_c2w)
-    fx, fy = d_features[g, 4] * free[0], d_features[g, 5] * free[1]
-    nearest = numbers[NEAR_FLOW]
-    here = point_gradient(x, K, c2w, nearest, (-fx, -fy))
-    later = point_gradient(there, neighbor_K, neighbor_c2w, nearest, (fx, fy))
-    return (d[0] + here[0], d[1] + here[1], d[2] + here[2]), later
-
-
-@exact_device
-def shape_gradients(g, i, opacity, log_scales, numbers, d_scales, d_opacities, d_terms, g_scales):
-    """Fill the gradient of the log scales; returns that of the opacity."""
-    count = d_scales.shape[0]
-    visible = 1.0 if float32(opacity) > float32(numbers[MIN_OPACITY]) else 0.0
-    of_scale = d_terms[MEAN_SCALE] * visible / (3 * count * numbers[UNIT])
-    for n in range(3):
-        g_scales[i, n] = math.exp(log_scales[i, n]) * (d_scales[g, n] + of_scale)
-    return d_opacities[g] + d_terms[MEAN_OPACITY] * visible / count
-
-
-@exact_device
-def offset_gradient(k, start, numbers, num_knots):
-    """d `between` / d the value at knot k."""
-    low = int(numbers[start])
-    g = 0.0
-    if k == low:
-        g += 1 - numbers[start + 1]
-    if k == min(low + 1, num_knots - 1):
-        g += numbers[start + 1]
-    return g
 
 
 def static_backward(
@@ -112,58 +57,11 @@ def static_backward(
     g = cuda.grid(1)
     if g >= means.shape[0]:
         return
-    x = (means[g, 0], means[g, 1], means[g, 2])
+    learned = means, log_scales, logits, colors, offsets
     sight = numbers, K, c2w, neighbor_K, neighbor_c2w
-    here, later = mean_gradients(g, x, x, sight, d_means, d_features)
-    for n in range(3):
-        g_means[g, n] = here[n] + later[n]
-    for n in range(4):
-        g_quaternions[g, n] = d_quaternions[g, n]
-    opacity = sigmoid(logits[g])
-    d = shape_gradients(
-        g, g, opacity, log_scales, numbers, d_scales, d_opacities, d_terms, g_log_scales
-    )
-    g_logits[g] = d * opacity * (1 - opacity)
-    offset = between(offsets, g, 0, STATIC_COLOR, numbers)
-    total = 0.0
-    for c in range(3):
-        _, slope = radiance_of(colors[g, c] + offset, numbers[BOUNDED])
-        g_colors[g, c] = d_features[g, c] * slope
-        total += d_features[g, c] * slope
-    for k in range(offsets.shape[0]):
-        drift = 2 * d_terms[DRIFT] * offsets[k, g, 0] / offsets.size
-        g_offsets[k, g, 0] = (
-            total * offset_gradient(k, STATIC_COLOR, numbers, offsets.shape[0]) + drift
-        )
-
-
-@exact_device
-def color_gradients(g, m, colors, offsets, numbers, d_features, d_terms, g_colors, g_offsets):
-    """Fill the gradients of a moving Gaussian's color and its changes in time."""
-    num_knots = offsets.shape[0]
-    for c in range(3):
-        stored = colors[m, c] + between(offsets, m, c, MOVING_COLOR, numbers)
-        _, slope = radiance_of(stored, numbers[BOUNDED])
-        d = d_features[g, c] * slope
-        g_colors[m, c] = d
-        for k in range(num_knots):
-            change = change_gradient(offsets, k, m, c)
-            change += numbers[OFFSET_SHARE] * 2 * offsets[k, m, c] / offsets.size
-            share = offset_gradient(k, MOVING_COLOR, numbers, num_knots)
-            g_offsets[k, m, c] = d * share + d_terms[COLOR_CHANGE] * change
-
-
-@exact_device
-def rest_gradients(m, pose, next_pose, d_here, d_there, d_q, g_means, g_quaternions):
-    """Fill the gradients of a moving Gaussian's mean and quaternion."""
-    for n in range(3):
-        d = 0.0
-        for axis in range(3):
-            d += pose[4 * axis + n] * d_here[axis] + next_pose[4 * axis + n] * d_there[axis]
-        g_means[m, n] = d
-    back = product((pose[12], -pose[13], -pose[14], -pose[15]), d_q)
-    for n in range(4):
-        g_quaternions[m, n] = back[n]
+    d = d_means, d_quaternions, d_scales, d_opacities, d_features, d_terms
+    made = g_means, g_quaternions, g_log_scales, g_logits, g_colors, g_offsets
+    static_gradients(g, learned, sight, d, made)
 
 
 @exact_device
@@ -276,34 +174,22 @@ def moving_backward(
     exists, with_flow = m < means.shape[0], d_features.shape[1] > 4
     num_bases, i = mixture.shape[0], min(m, means.shape[0] - 1)
     g = num_static + i
+    learned = means, quaternions, log_scales, logits, colors, offsets, presence
     sight = numbers, K, c2w, neighbor_K, neighbor_c2w
-    motion = rotations, translations, centers
+    d = d_means, d_quaternions, d_scales, d_opacities, d_features, d_terms
     rest = (means[i, 0], means[i, 1], means[i, 2])
-    own = (quaternions[i, 0], quaternions[i, 1], quaternions[i, 2], quaternions[i, 3])
-    d_q = (d_quaternions[g, 0], d_quaternions[g, 1], d_quaternions[g, 2], d_quaternions[g, 3])
     pose = mixed_pose(i, KNOT, numbers, mixture, rotations, translations, centers)
     next_pose = pose
     if with_flow:
         next_pose = mixed_pose(i, NEIGHBOR, numbers, mixture, rotations, translations, centers)
-    x, there = move_point(pose, rest), move_point(next_pose, rest)
-    d_here, d_there = mean_gradients(g, x, there, sight, d_means, d_features)
-    d_turn = product(d_q, (own[0], -own[1], -own[2], -own[3]))
+    motion = motion_gradients(g, i, pose, next_pose, learned, sight, d)
+    d_here, d_there, d_turn = motion
     if exists:
-        rest_gradients(i, pose, next_pose, d_here, d_there, d_q, g_means, g_quaternions)
-        opacity = sigmoid(logits[i] + between(presence, i, 0, OPACITY, numbers))
-        d = shape_gradients(
-            g, i, opacity, log_scales, numbers, d_scales, d_opacities, d_terms, g_log_scales
-        )
-        d_logit = d * opacity * (1 - opacity)
-        g_logits[i] = d_logit
-        for k in range(presence.shape[0]):
-            share = offset_gradient(k, OPACITY, numbers, presence.shape[0])
-            change = d_terms[OPACITY_CHANGE] * change_gradient(presence, k, i, 0)
-            g_presence[k, i, 0] = d_logit * share + change
-        color_gradients(g, i, colors, offsets, numbers, d_features, d_terms, g_colors, g_offsets)
-        d = (d_here, d_there, d_turn)
+        made = g_means, g_quaternions, g_log_scales, g_logits, g_colors, g_offsets, g_presence
+        moving_gradients(g, i, pose, next_pose, d_here, d_there, learned, sight, d, made)
+        bases = rotations, translations, centers
         mixture_gradients(
-            i, rest, motion, d, mixture, neighbors, numbers, d_terms, with_flow, g_mixture
+            i, rest, bases, motion, mixture, neighbors, numbers, d_terms, with_flow, g_mixture
         )
     top, total = softmax_sum(mixture, i)
     no_turn = (0.0, 0.0, 0.0, 0.0)
@@ -401,27 +287,12 @@ def local_backward(
     i = cuda.grid(1)
     if i >= alive.shape[0]:
         return
-    g, r = before + i, alive[i]
-    means_touched[r] = velocities_touched[r] = quaternions_touched[r] = 1
-    log_scales_touched[r] = colors_touched[r] = 1
-    x, there, _, opacity = local_at(r, means, velocities, quaternions, log_scales, colors, numbers)
+    learned = means, velocities, quaternions, log_scales, colors
     sight = numbers, K, c2w, neighbor_K, neighbor_c2w
-    here, later = mean_gradients(g, x, there, sight, d_means, d_features)
-    age, its_later = numbers[TIME] - means[r, 3], numbers[TIME + 1] - means[r, 3]
-    for c in range(3):
-        g_means[r, c] = here[c] + later[c]
-        d = here[c] * age + later[c] * its_later
-        if numbers[RIGIDITY_DUE] != 0:
-            total, _ = unevenness_of(r, velocities, neighbors, numbers, alive.shape[0], c)
-            d += d_terms[EVENNESS] * 2 * total / numbers[UNIT]
-        g_velocities[r, c] = d
-        _, slope = radiance_of(colors[r, c], numbers[BOUNDED])
-        g_colors[r, c] = d_features[g, c] * slope
-    for n in range(4):
-        g_quaternions[r, n] = d_quaternions[g, n]
-    d = shape_gradients(
-        g, r, opacity, log_scales, numbers, d_scales, d_opacities, d_terms, g_log_scales
-    )
-    duration = math.exp(log_scales[r, 3])
-    g_log_scales[r, 3] = d * opacity * age * age / (duration * duration)
-    g_colors[r, 3] = d * opacity * (1 - sigmoid(colors[r, 3]))
+    d = d_means, d_quaternions, d_scales, d_opacities, d_features, d_terms
+    made = g_means, g_velocities, g_quaternions, g_log_scales, g_colors
+    marks = means_touched, velocities_touched, quaternions_touched, log_scales_touched
+    local_gradients(
+        before + i, alive[i], alive.shape[0], learned, neighbors, sight, d, made,
+        (*marks, colors_touched),
+    )  # fmt: skip

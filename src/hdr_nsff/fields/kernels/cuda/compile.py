@@ -19,7 +19,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hdr_nsff.fields.kernels import compositing, footprint, grid
+from hdr_nsff.fields.kernels import compositing, footprint, grid, moment, moment_gradients
 from hdr_nsff.fields.kernels.cuda import layout
 
 # groups of arguments of the kernels that make the Gaussians of a moment: what was
@@ -176,7 +176,9 @@ def fingerprint() -> str:
     here = Path(__file__)
     sources = [here, here.with_name("device.py"), Path(layout.__file__)]
     sources += [here.with_name(f"{module}.py") for module in MODULES]
-    sources += [Path(str(m.__file__)) for m in (compositing, footprint, grid)]
+    sources += [
+        Path(str(m.__file__)) for m in (compositing, footprint, grid, moment, moment_gradients)
+    ]
     digest = hashlib.sha256()
     for path in sources:
         digest.update(path.read_bytes())

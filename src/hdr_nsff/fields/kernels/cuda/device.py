@@ -6,7 +6,9 @@ Nothing imports this module unless kernels are compiled.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
+from functools import cache
 from types import FunctionType, ModuleType
 from typing import Any
 
@@ -15,19 +17,28 @@ from numba.core import config
 from numba.core.dispatcher import Dispatcher
 
 
-def device_functions(module: ModuleType, fastmath: bool) -> dict[str, Callable[..., Any]]:
+@cache
+def device_functions(
+    module: ModuleType, fastmath: bool, arrays: bool = False
+) -> dict[str, Callable[..., Any]]:
     """The functions of a module that numba compiles for the CPU, as device functions.
 
     With `fastmath`, the compiler assumes that no number is NaN. The simulator calls the
-    CPU's compiled functions.
+    CPU's compiled functions or, where they take its `arrays`, Python.
     """
     compiled: dict[str, Any] = {k: v for k, v in vars(module).items() if isinstance(v, Dispatcher)}
-    if config.ENABLE_CUDASIM:
+    if config.ENABLE_CUDASIM and not arrays:
         return compiled
     names = dict(vars(module))
     for name, function in compiled.items():
+        home = sys.modules[function.py_func.__module__]
+        if home is not module:
+            names[name] = device_functions(home, fastmath, arrays)[function.__name__]
+            continue
         again = FunctionType(function.py_func.__code__, names, name)
-        names[name] = cuda.jit(device=True, fastmath=fastmath)(again)
+        if not config.ENABLE_CUDASIM:
+            again = cuda.jit(device=True, fastmath=fastmath)(again)
+        names[name] = again
     return {name: names[name] for name in compiled}
 
 

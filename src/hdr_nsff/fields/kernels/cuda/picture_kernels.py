@@ -13,10 +13,11 @@ import math
 
 from numba import cuda, float32
 
-from hdr_nsff.fields.kernels.cuda.cloud_kernels import radiance_of
-from hdr_nsff.fields.kernels.cuda.device import exact_device
+from hdr_nsff.fields.kernels import moment
+from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
 from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS, PICTURE_SUMS, THREADS
 
+radiance_of = device_functions(moment, fastmath=False, arrays=True)["radiance_of"]
 CURVES = 3 * MAX_KNOTS
 # positions in `sums` of `losses`: the terms, valid pixels of flow, blocks that are done
 PHOTOMETRIC, DEPTH, MASK, FLOW, VALID, DONE = 0, 1, 2, 3, 4, 5
