@@ -63,9 +63,10 @@ def values_and_gradients(
     view = training_view.TrainingView(batch, knot, field.alive(knot), offsets, rigidity)
     if make_cloud is None:
         made, _, terms = training_view.draw_by_torch(field.model(), view)
+        values = {**dict(zip(NAMES, made, strict=True)), **terms}
     else:
-        made, _, terms = training_view.draw_by_kernels(field.model(), view, make_cloud)
-    values = {**dict(zip(NAMES, made, strict=True)), **terms}
+        cloud = training_view.cloud_by_kernels(field.model(), view, make_cloud)
+        values = {**{name: getattr(cloud, name) for name in NAMES}, **cloud.terms}
     generator = torch.Generator().manual_seed(3)
     loss = sum((torch.randn(v.shape, generator=generator) * v).sum() for v in values.values())
     field.zero_grad()

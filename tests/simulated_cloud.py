@@ -8,20 +8,22 @@ from typing import Any
 import pytest
 import torch
 from moments import MOMENTS, compare, field_of_times, random_field
+from pictures import compare_composites
 from test_splat import BESIDE, scattered
 from torch import Tensor
 
-from hdr_nsff.fields.splat import draw, local_gaussians, training_view
+from hdr_nsff.fields.base import Render
+from hdr_nsff.fields.splat import draw, local_gaussians
 from hdr_nsff.fields.splat.fused_cloud import fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.rasterize import Maps
+from hdr_nsff.fields.splat.splat import Splat
 
 
 @pytest.fixture(autouse=True)
 def gaussians_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would be rasterized is the picture."""
-    for module in (draw, training_view):
-        monkeypatch.setattr(module, "rasterize", lambda *arguments: arguments[:5])
+    monkeypatch.setattr(draw, "rasterize", lambda *arguments: arguments[:5])
 
 
 @pytest.mark.parametrize(("seed", "settings", "knot", "offset"), MOMENTS)
@@ -35,37 +37,15 @@ def test_short_clips(num_times: int) -> None:
     compare(fused_cloud, field_of_times(num_times), 0.0, None)
 
 
-def drawn_maps(channels: int) -> list[Tensor]:
-    """Planes, depth and alpha of a picture, alpha near its limit here and there."""
-    generator = torch.Generator().manual_seed(0)
-    alpha = torch.rand(9, 15, generator=generator)
-    alpha[0], alpha[1], alpha[2] = 0.0, 1e-3, 0.9e-3
-    depth = 3 * torch.rand(9, 15, generator=generator) * alpha
-    return [torch.rand(channels, 9, 15, generator=generator), depth, alpha]
-
-
 @pytest.mark.parametrize("radiance", ["exp", "sigmoid"])
 @pytest.mark.parametrize("channels", [4, 6])
 def test_maps_over_the_background(radiance: str, channels: int) -> None:
-    field = random_field(radiance=radiance)
-    found = []
-    for fused in (True, False):
-        leaves = [m.clone().requires_grad_() for m in drawn_maps(channels)]
-        maps = Maps(leaves[0].permute(1, 2, 0), leaves[1], leaves[2])
-        if fused:
-            numbers = field.bounded, field.far, draw.MIN_DEPTH_SHARE, draw.MIN_ALPHA
-            render, flow = fused_composite(maps, field.background, *numbers)
-        else:
-            render, drawn = draw.composite(field.model(), maps)
-            flow = drawn / render.opacity.clamp_min(draw.MIN_ALPHA)[:, None]
-        values = [render.radiance, render.depth, render.motion, flow]
-        values = [v for v in values if v.numel()]
-        generator = torch.Generator().manual_seed(1)
-        loss = sum((torch.randn(v.shape, generator=generator) * v).sum() for v in values)
-        gradients = torch.autograd.grad(loss, [*leaves, field.background])
-        found.append([*(v.detach() for v in values), *gradients])
-    for a, b in zip(*found, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-5 * float(b.abs().max()))
+    def ours(field: Splat, drawn: list[Tensor]) -> tuple[Render, Tensor]:
+        maps = Maps(drawn[0].permute(1, 2, 0), drawn[1], drawn[2])
+        numbers = field.bounded, field.far, draw.MIN_DEPTH_SHARE, draw.MIN_ALPHA
+        return fused_composite(maps, field.background, *numbers)
+
+    compare_composites(ours, random_field(radiance=radiance), channels)
 
 
 def test_more_gaussians_than_a_block() -> None:

@@ -26,11 +26,11 @@ from hdr_nsff.fields.splat import (
     rasterize_cuda,
     training_view,
 )
-from hdr_nsff.fields.splat.rasterize import Maps, composite_view
+from hdr_nsff.fields.splat.rasterize import Maps, Planes, composite_view
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import bracketed, curve, fused_tone, kernel_cuda, vignetting
-from hdr_nsff.training import fused_losses, objective, weighted_terms
+from hdr_nsff.training import fused_losses, weighted_terms
 from hdr_nsff.training.run_folder import open_folder
 from hdr_nsff.training.train import Trainer
 
@@ -95,6 +95,11 @@ def draw_nothing(*arguments: Any) -> Maps:
     return Maps(*NothingDrawn.apply(camera, *gaussians))
 
 
+def draw_no_planes(*arguments: Any) -> Planes:
+    maps = draw_nothing(*arguments)
+    return Planes(torch.cat([maps.features.permute(2, 0, 1), maps.depth[None]]), maps.alpha)
+
+
 def launch_by(monkeypatch: pytest.MonkeyPatch, launched: Callable[..., None]) -> None:
     for module in WITH_LAUNCHES:
         monkeypatch.setattr(module, "launch", launched)
@@ -108,7 +113,8 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
         monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     for module in (draw, training_view):
         monkeypatch.setattr(module, "rasterize", draw_nothing)
-    objectives = (objective, weighted_terms)
+    monkeypatch.setattr(training_view, "rasterize_planes", draw_no_planes)
+    objectives = (fused_losses, weighted_terms)
     fields = training_view, local_gaussians, encodings
     for module in (*fields, curve, vignetting, bracketed, *objectives):
         monkeypatch.setattr(module, "kernels_on", lambda device: device.type == "pretend")

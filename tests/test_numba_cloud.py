@@ -6,15 +6,14 @@ import pytest
 from moments import MOMENTS, compare, field_of_times, random_field
 from test_splat import scattered
 
-from hdr_nsff.fields.splat import draw, training_view
+from hdr_nsff.fields.splat import draw
 from hdr_nsff.fields.splat.numba_cloud import numba_cloud
 
 
 @pytest.fixture(autouse=True)
 def gaussians_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would be rasterized is the picture."""
-    for module in (draw, training_view):
-        monkeypatch.setattr(module, "rasterize", lambda *arguments: arguments[:5])
+    monkeypatch.setattr(draw, "rasterize", lambda *arguments: arguments[:5])
 
 
 @pytest.mark.parametrize(("seed", "settings", "knot", "offset"), MOMENTS)

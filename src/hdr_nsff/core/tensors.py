@@ -10,6 +10,7 @@ from collections.abc import Callable
 from functools import cache, lru_cache
 from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -60,6 +61,15 @@ def table_on(table: Tensor, device: torch.device, dtype: torch.dtype) -> Tensor:
     """A constant `table` on a device, copied there once: not to be changed."""
     with torch.inference_mode(False):
         return table.to(device, dtype)
+
+
+def by_channel(values: Tensor) -> np.ndarray:
+    """Values (N, C) or (N,) of the CPU as an array that lies in memory channel by
+    channel; copied where they do not.
+    """
+    if values.ndim == 1:
+        return values.detach().contiguous().numpy()
+    return values.detach().T.contiguous().numpy().T
 
 
 def generator_for(device: torch.device, seed: int) -> torch.Generator:

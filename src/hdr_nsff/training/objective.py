@@ -15,11 +15,10 @@ from torch import Tensor
 
 from hdr_nsff.core.settings import Weight
 from hdr_nsff.fields.base import Render, Warp
-from hdr_nsff.fields.splat.cuda_backends import kernels_on
 from hdr_nsff.maths import losses
 from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.tonemap.base import ToneMapper
-from hdr_nsff.training.fused_losses import can_fuse, fused_terms
+from hdr_nsff.training.fused_losses import can_fuse, fused_terms, losses_by_kernels
 
 FLOW_LIMIT_PX = 20.0  # an outlier of the flow prior costs no more (hand-chosen)
 
@@ -59,9 +58,10 @@ class Objective:
         rgb = tonemap.record_render(render, batch, leaky=True)
         relative = self.published or self.depth_kind == "relative"
         plain = relative or self.squared or not can_fuse(render, batch)
-        if not plain and kernels_on(rgb.device):
+        kernels = None if plain else losses_by_kernels(rgb)
+        if kernels is not None:
             fade = self.fade ** int(phase)
-            return fused_terms(render, rgb, batch, self.near, fade, FLOW_LIMIT_PX)
+            return fused_terms(kernels, render, rgb, batch, self.near, fade, FLOW_LIMIT_PX)
         uniform = None if batch.all_uniform() else batch.uniform[:, None].to(rgb)
         terms = {"photometric": losses.photometric(rgb, batch.rgb, uniform, self.squared)}
         terms |= self.dynamic(render, rgb, batch, tonemap, phase)

@@ -32,6 +32,13 @@ class Maps(NamedTuple):
     alpha: Tensor  # (H, W) in [0, 1]: sum of weights
 
 
+class Planes(NamedTuple):
+    """The same plane by plane."""
+
+    planes: Tensor  # (D + 1, H, W) features and z-depth, premultiplied by opacity
+    alpha: Tensor  # (H, W)
+
+
 def rasterize(
     means: Tensor,
     quaternions: Tensor,
@@ -51,11 +58,9 @@ def rasterize(
     device = means.device.type if means.dtype == torch.float32 else None
     match device:
         case "cpu":
-            maps, alpha = RasterizeNumba.apply(
-                *gaussians, world_to_camera_and_focal(camera), camera
-            )
+            planes, alpha = rasterize_planes(*gaussians, camera)
             # `split` joins the two gradients, where slices' would be added up
-            seen, depth = maps.split([len(maps) - 1, 1])
+            seen, depth = planes.split([len(planes) - 1, 1])
             return Maps(seen.permute(1, 2, 0), depth[0], alpha)
         case "cuda":
             composite = composite_on(means.device)
@@ -66,6 +71,19 @@ def rasterize(
             return composite_view(composite, gaussians, camera)
         case _:
             return dense(*gaussians, camera)
+
+
+def rasterize_planes(
+    means: Tensor,
+    quaternions: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    features: Tensor,
+    camera: Camera,
+) -> Planes:
+    """`rasterize` by the numba kernels of the CPU, as these draw: plane by plane."""
+    gaussians = means, quaternions, scales, opacities, features
+    return Planes(*RasterizeNumba.apply(*gaussians, world_to_camera_and_focal(camera), camera))
 
 
 def composite_view(composite: Composite, gaussians: tuple[Tensor, ...], camera: Camera) -> Maps:

@@ -32,7 +32,8 @@ from hdr_nsff.fields.splat.local_gaussians import Living
 from hdr_nsff.fields.splat.model import Model
 from hdr_nsff.fields.splat.moment import MAX_FLOW, Cloud, Moment
 from hdr_nsff.fields.splat.numba_cloud import numba_cloud
-from hdr_nsff.fields.splat.rasterize import Maps, rasterize
+from hdr_nsff.fields.splat.numba_picture import numba_composite
+from hdr_nsff.fields.splat.rasterize import Maps, rasterize, rasterize_planes
 from hdr_nsff.fields.splat.shutter import Shutter, apparent_motion
 from hdr_nsff.fields.splat.terms import mixture_difference, regularizers
 from hdr_nsff.scene.batch import PixelBatch, Recorder
@@ -68,18 +69,33 @@ def see(model: Model, view: TrainingView) -> Seen:
     """What a training step sees, differentiable in everything."""
     make_cloud = cloud_maker(model, view)
     if make_cloud is None:
-        maps, parts, terms = draw_by_torch(model, view)
+        return see_by_torch(model, view)
+    cloud = cloud_by_kernels(model, view, make_cloud)
+    features, parts = cloud.features, None
+    if view.recorder is not None:
+        radiance = features[:, :3]
+        parts = record_parts(model, view.recorder, view.batch.camera, radiance, cloud.means)
+        features = torch.cat([features, parts.gaussians], 1)
+    gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities, features
+    numbers = model.bounded, model.far, MIN_DEPTH_SHARE * model.unit, MIN_ALPHA
+    late: Tensor | None
+    if make_cloud is numba_cloud:
+        planes = rasterize_planes(*gaussians, view.batch.camera)
+        kinds = bool(view.offsets), parts is not None
+        render, flow, late = numba_composite(planes, model.background, *kinds, numbers)
     else:
-        maps, parts, terms = draw_by_kernels(model, view, make_cloud)
-    maps, late = split_late(maps, parts)
-    if make_cloud is fused_cloud:
-        least = MIN_DEPTH_SHARE * model.unit
-        numbers = model.bounded, model.far, least, MIN_ALPHA
+        maps, late = split_late(rasterize(*gaussians, view.batch.camera), parts)
         render, flow = fused_composite(maps, model.background, *numbers)
-    else:
-        render, drawn = composite(model, maps)
-        # features are premultiplied by opacity
-        flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
+    return Seen(render, flow, cloud.terms, parts, None if parts is None else late)
+
+
+def see_by_torch(model: Model, view: TrainingView) -> Seen:
+    """The same by plain torch."""
+    maps, parts, terms = draw_by_torch(model, view)
+    maps, late = split_late(maps, parts)
+    render, drawn = composite(model, maps)
+    # features are premultiplied by opacity
+    flow = drawn / render.opacity.clamp_min(MIN_ALPHA)[:, None]
     return Seen(render, flow, terms, parts, late)
 
 
@@ -123,10 +139,8 @@ def draw_by_torch(model: Model, view: TrainingView) -> tuple[Maps, Parts | None,
     return maps, parts, terms
 
 
-def draw_by_kernels(
-    model: Model, view: TrainingView, make_cloud: CloudMaker
-) -> tuple[Maps, Parts | None, dict[str, Tensor]]:
-    """The same by kernels, with flow to one neighbor at most."""
+def cloud_by_kernels(model: Model, view: TrainingView, make_cloud: CloudMaker) -> Cloud:
+    """The Gaussians of the view by kernels, with flow to one neighbor at most."""
     batch, knot = view.batch, view.knot
     neighbor = None
     for offset in view.offsets:
@@ -134,14 +148,7 @@ def draw_by_kernels(
         neighbor = there, model.time(there), batch.neighbors[offset]
     when = knot, model.time(knot), model.share(knot)
     moment = Moment(*when, batch.camera, neighbor, view.rigidity)
-    cloud = make_cloud(model, moment, view.alive)
-    gaussians = cloud.means, cloud.quaternions, cloud.scales, cloud.opacities
-    features, parts = cloud.features, None
-    if view.recorder is not None:
-        radiance = features[:, :3]
-        parts = record_parts(model, view.recorder, batch.camera, radiance, cloud.means)
-        features = torch.cat([features, parts.gaussians], 1)
-    return rasterize(*gaussians, features, batch.camera), parts, cloud.terms
+    return make_cloud(model, moment, view.alive)
 
 
 def expose(

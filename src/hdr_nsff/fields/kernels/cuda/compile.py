@@ -19,7 +19,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from hdr_nsff.fields.kernels import compositing, footprint, grid, moment, moment_gradients
+from hdr_nsff.fields.kernels import compositing, footprint, grid, moment, moment_gradients, pixel
 from hdr_nsff.fields.kernels.cuda import layout
 
 # groups of arguments of the kernels that make the Gaussians of a moment: what was
@@ -176,9 +176,8 @@ def fingerprint() -> str:
     here = Path(__file__)
     sources = [here, here.with_name("device.py"), Path(layout.__file__)]
     sources += [here.with_name(f"{module}.py") for module in MODULES]
-    sources += [
-        Path(str(m.__file__)) for m in (compositing, footprint, grid, moment, moment_gradients)
-    ]
+    shared = compositing, footprint, grid, moment, moment_gradients, pixel
+    sources += [Path(str(m.__file__)) for m in shared]
     digest = hashlib.sha256()
     for path in sources:
         digest.update(path.read_bytes())

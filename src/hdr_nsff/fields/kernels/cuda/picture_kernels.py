@@ -13,14 +13,18 @@ import math
 
 from numba import cuda, float32
 
-from hdr_nsff.fields.kernels import moment
+from hdr_nsff.fields.kernels import pixel
 from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
 from hdr_nsff.fields.kernels.cuda.layout import MAX_KNOTS, PICTURE_SUMS, THREADS
+from hdr_nsff.fields.kernels.pixel import DEPTH, FLOW, MASK, PHOTOMETRIC, VALID
 
-radiance_of = device_functions(moment, fastmath=False, arrays=True)["radiance_of"]
+PIXEL = device_functions(pixel, fastmath=False, arrays=True)
+background_radiance = PIXEL["background_radiance"]
+pixel_losses, pixel_loss_gradients = PIXEL["pixel_losses"], PIXEL["pixel_loss_gradients"]
+compose_pixel = PIXEL["compose_pixel"]
+compose_pixel_gradients = PIXEL["compose_pixel_gradients"]
 CURVES = 3 * MAX_KNOTS
-# positions in `sums` of `losses`: the terms, valid pixels of flow, blocks that are done
-PHOTOMETRIC, DEPTH, MASK, FLOW, VALID, DONE = 0, 1, 2, 3, 4, 5
+DONE = 5  # position in `sums` of `losses`, after those of `pixel.py`: blocks that are done
 
 
 @exact_device
@@ -168,12 +172,6 @@ def shade_backward(
         cuda.atomic.add(g, (camera_id, thread), sums[thread])
 
 
-@exact_device
-def flow_error(i, flow, flow_target):
-    """Absolute difference of flow at pixel i, both axes added up."""
-    return abs(flow[i, 0] - flow_target[i, 0]) + abs(flow[i, 1] - flow_target[i, 1])
-
-
 def losses(
     rgb, recorded, depth, disparity, confidence, motion, moving, outline, flow, flow_target,
     flow_valid, near, fade, margin, limit, sums,
@@ -187,19 +185,16 @@ def losses(
     if thread < PICTURE_SUMS:
         shared[thread] = 0.0
     cuda.syncthreads()
+    rendered = rgb, depth, motion, flow
+    known = recorded, disparity, confidence, moving, outline, flow_target, flow_valid
     picture = far = mask = moved = valid = 0.0
     for i in range(cuda.grid(1), count, cuda.gridDim.x * THREADS):
-        for c in range(3):
-            picture += abs(rgb[i, c] - recorded[i, c])
-        if disparity.shape[0] > 0:
-            trust = confidence[i] if confidence.shape[0] > 0 else float32(1.0)
-            far += trust * abs(1 / depth[i] - disparity[i])
-        if moving.shape[0] > 0 and (outline.shape[0] == 0 or outline[i] == 0):
-            inside = motion[i] * (1 - 2 * margin) + margin
-            mask -= math.log(inside if moving[i] != 0 else 1 - inside)
-        if flow_valid.shape[0] > 0 and flow_valid[i] != 0:
-            moved += min(flow_error(i, flow, flow_target), limit)
-            valid += 1
+        own = pixel_losses(i, rendered, known, margin, limit)
+        picture += own[0]
+        far += own[1]
+        mask += own[2]
+        moved += own[3]
+        valid += own[4]
     cuda.atomic.add(shared, PHOTOMETRIC, float32(picture))
     cuda.atomic.add(shared, DEPTH, float32(far))
     cuda.atomic.add(shared, MASK, float32(mask))
@@ -218,38 +213,18 @@ def losses(
             sums[FLOW] = total / max(pixels, float32(1))
 
 
-@exact_device
-def sign(x):
-    """-1, 0 or 1."""
-    return (1.0 if x > 0 else 0.0) - (1.0 if x < 0 else 0.0)
-
-
 def losses_backward(
     rgb, recorded, depth, disparity, confidence, motion, moving, outline, flow, flow_target,
     flow_valid, near, fade, margin, limit, sums, d_terms, g_rgb, g_depth, g_motion, g_flow,
 ):  # fmt: skip
     """Fill the gradients of what was rendered, a thread per pixel."""
-    i, count = cuda.grid(1), rgb.shape[0]
-    if i >= count:
+    i = cuda.grid(1)
+    if i >= rgb.shape[0]:
         return
-    for c in range(3):
-        g_rgb[i, c] = d_terms[PHOTOMETRIC] / (3 * count) * sign(rgb[i, c] - recorded[i, c])
-    g_depth[i] = g_motion[i] = 0.0
-    if disparity.shape[0] > 0:
-        trust = confidence[i] if confidence.shape[0] > 0 else float32(1.0)
-        inverse = 1 / depth[i]
-        d = trust * sign(inverse - disparity[i]) * near * fade / count
-        g_depth[i] = -d_terms[DEPTH] * d * inverse * inverse
-    if moving.shape[0] > 0 and (outline.shape[0] == 0 or outline[i] == 0):
-        inside = motion[i] * (1 - 2 * margin) + margin
-        d = -1 / inside if moving[i] != 0 else 1 / (1 - inside)
-        g_motion[i] = d_terms[MASK] * d * (1 - 2 * margin) / count
-    if flow.shape[0] > 0:
-        weight = 0.0
-        if flow_valid[i] != 0 and flow_error(i, flow, flow_target) <= limit:
-            weight = d_terms[FLOW] * fade / max(sums[VALID], float32(1))
-        for axis in range(2):
-            g_flow[i, axis] = weight * sign(flow[i, axis] - flow_target[i, axis])
+    rendered = rgb, depth, motion, flow
+    known = recorded, disparity, confidence, moving, outline, flow_target, flow_valid
+    numbers, made = (near, fade, margin, limit), (g_rgb, g_depth, g_motion, g_flow)
+    pixel_loss_gradients(i, rendered, known, numbers, sums[VALID], d_terms, made)
 
 
 def compose(
@@ -262,18 +237,9 @@ def compose(
     i = cuda.grid(1)
     if i >= alphas.shape[0]:
         return
-    alpha = float(alphas[i])
-    for c in range(3):
-        behind, _ = radiance_of(background[c], bounded)
-        radiance[i, c] = planes[c, i] + (1 - alpha) * behind
-    z = far
-    if alphas[i] > float32(least_alpha):
-        z = depths[i] / alpha
-    depth[i] = max(z, least)
-    motion[i] = planes[3, i]
-    if flow.shape[0] > 0:
-        for axis in range(2):
-            flow[i, axis] = planes[4 + axis, i] / max(alpha, least_alpha)
+    behind, _ = background_radiance(background, bounded)
+    made = radiance, depth, motion, flow
+    compose_pixel(i, (planes, depths, alphas), behind, far, least, least_alpha, made)
 
 
 def compose_backward(
@@ -286,24 +252,13 @@ def compose_backward(
     if thread < 3:
         sums[thread] = 0.0
     cuda.syncthreads()
+    behind, slope = background_radiance(background, bounded)
+    drawn, made = (planes, depths, alphas), (g_planes, g_depths, g_alphas)
+    d = d_radiance, d_depth, d_motion, d_flow
     for i in range(cuda.grid(1), alphas.shape[0], cuda.gridDim.x * THREADS):
-        alpha = float(alphas[i])
-        g_alpha = g_depth = 0.0
+        g = compose_pixel_gradients(i, drawn, behind, least, least_alpha, d, made)
         for c in range(3):
-            behind, slope = radiance_of(background[c], bounded)
-            g_planes[c, i] = d_radiance[i, c]
-            g_alpha -= d_radiance[i, c] * behind
-            cuda.atomic.add(sums, c, float32(d_radiance[i, c] * (1 - alpha) * slope))
-        if alphas[i] > float32(least_alpha) and depths[i] / alpha >= least:
-            g_depth = d_depth[i] / alpha
-            g_alpha -= g_depth * depths[i] / alpha
-        g_planes[3, i] = d_motion[i]
-        for axis in range(planes.shape[0] - 4):
-            d = d_flow[i, axis] / max(alpha, least_alpha)
-            g_planes[4 + axis, i] = d
-            if alphas[i] >= float32(least_alpha):
-                g_alpha -= d * planes[4 + axis, i] / alpha
-        g_depths[i], g_alphas[i] = g_depth, g_alpha
+            cuda.atomic.add(sums, c, float32(g[c] * slope[c]))
     cuda.syncthreads()
     if thread < 3:
         cuda.atomic.add(g_background, thread, sums[thread])
