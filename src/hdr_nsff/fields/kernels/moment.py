@@ -32,6 +32,8 @@ MEAN_OPACITY, MEAN_SCALE, TRAJECTORY, DRIFT, OPACITY_CHANGE, COLOR_CHANGE = 0, 1
 RIGIDITY, EVENNESS = 6, 7
 MAX_LOG_RADIANCE = 16.0  # of a Gaussian, as in `splat/gaussians.py`
 
+# Inlined, without reference counts: calls, which pass every table as several numbers,
+# make kernels take four times as long.
 scalar = jit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
 
 
@@ -143,7 +145,7 @@ def unevenness_of(row, velocities, neighbors, numbers, num_alive, c):
 
 
 @scalar
-def finish(g, pose_term, x, there, q, log_scales, i, opacity, sight, made, sums):
+def finish(g, motion, x, there, q, log_scales, i, opacity, sight, made, sums):
     """Write a Gaussian's mean, shape, opacity and flow, of row i of its own tables, and
     add its opacity and scale terms.
     """
@@ -159,7 +161,7 @@ def finish(g, pose_term, x, there, q, log_scales, i, opacity, sight, made, sums)
     for n in range(4):
         quaternions[g, n] = q[n]
     opacities[g] = opacity
-    features[g, 3] = pose_term
+    features[g, 3] = motion
     if features.shape[1] > 4:
         flow, _ = flow_of(x, there, numbers, K, c2w, neighbor_K, neighbor_c2w)
         features[g, 4], features[g, 5] = flow[0], flow[1]
