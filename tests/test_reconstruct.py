@@ -6,12 +6,14 @@ import numpy as np
 from posed_clips import panning
 
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapImage, ColmapModel
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.priors.poses.reconstruct import (
     SfmViews,
     failure_message,
     has_plausible_lens,
     model_rank,
     sfm_views,
+    tuning_for_lenses,
 )
 
 
@@ -47,6 +49,19 @@ def test_a_plausible_lens_counts_more_than_images():
     assert not has_plausible_lens(model(89, 36))
     assert model_rank(model(250, 20), 36) > model_rank(model(89, 36), 36)
     assert model_rank(model(250, 34), 36) > model_rank(model(250, 20), 36)
+
+
+def test_a_lens_that_bends_strongly_may_be_wider():
+    def bent(k1: float) -> Lens:
+        return Lens(np.array([[120, 0, 120], [0, 120, 68], [0, 0, 1.0]]), (k1, 0, 0, 0), 240, 136)
+
+    wide = model(94, 36)  # 104 degrees
+    assert not has_plausible_lens(wide, tuning_for_lenses([]))
+    assert not has_plausible_lens(wide, tuning_for_lenses([bent(-0.005)]))
+    assert has_plausible_lens(wide, tuning_for_lenses([bent(-0.1)]))
+    assert not has_plausible_lens(model(60, 36), tuning_for_lenses([bent(-0.1)]))  # 127 degrees
+    # two cameras, one of which is no wide one
+    assert not has_plausible_lens(wide, tuning_for_lenses([bent(-0.1), bent(-0.005)]))
 
 
 def views_of(count: int) -> SfmViews:

@@ -29,6 +29,7 @@ from hdr_nsff.priors.poses.estimate import (
     rotation_poses,
     still_panorama,
 )
+from hdr_nsff.priors.poses.reconstruct import tuning_for_lenses
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import choose_visits
 
@@ -207,10 +208,17 @@ def estimate(work: Work, moving: np.ndarray, earlier: EarlierRounds | None = Non
         earlier=earlier,
         lens=lens,
         views=views,
+        tuning=tuning_of(work),
     )
     if poses.lenses:
         raise DistortedFramesError(poses.lenses)
     return poses
+
+
+def tuning_of(work: Work) -> PosesTuning:
+    """The tuning for frames that were undistorted by a clip's lenses."""
+    lenses = [entry.lens() for entry in work.manifest.lens.values()]
+    return PosesTuning(reconstruction=tuning_for_lenses(lenses))
 
 
 def estimate_of_track(work: Work, moving: np.ndarray, earlier: EarlierRounds | None) -> Poses:
@@ -229,6 +237,7 @@ def estimate_of_track(work: Work, moving: np.ndarray, earlier: EarlierRounds | N
         device=pick_device(work.config.device),
         earlier=earlier,
         lens=lens_to_find(work),
+        tuning=tuning_of(work),
     )
     if poses.lenses:
         raise DistortedFramesError(poses.lenses)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -24,6 +25,7 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, Stack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
+from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
     ADVICE,
@@ -64,6 +66,10 @@ class ReconstructionTuning:
     # across the image: what undistorted video cameras plausibly see
     min_fov_degrees: float = 25.0
     max_fov_degrees: float = 100.0
+    # the same of a lens that was found to bend strongly, as wide ones do: a GoPro's, once
+    # undistorted, sees 104 degrees
+    max_fov_degrees_bent: float = 120.0
+    strong_bend: float = 0.02  # of the width, at the corners (that clip: 0.1)
     enough_registered: float = 0.9  # share of the views that ends the search for a model
     min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
     min_track_views: int = 3  # of a point that is kept
@@ -302,6 +308,16 @@ def write_job(
     static = found.outside(masks)
     sfm.write_matches(folder, names, static.keypoints, named_pairs, static.matches)
     return job
+
+
+def tuning_for_lenses(
+    lenses: Sequence[Lens], tuning: ReconstructionTuning = ReconstructionTuning()
+) -> ReconstructionTuning:
+    """The tuning for frames that were undistorted by `lenses`; none: a pinhole's."""
+    bends = [lens.max_displacement_px() / lens.width for lens in lenses]
+    if not bends or min(bends) < tuning.strong_bend:
+        return tuning
+    return replace(tuning, max_fov_degrees=tuning.max_fov_degrees_bent)
 
 
 def has_plausible_lens(
