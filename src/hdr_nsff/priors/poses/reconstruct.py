@@ -66,8 +66,7 @@ class ReconstructionTuning:
     # across the image: what undistorted video cameras plausibly see
     min_fov_degrees: float = 25.0
     max_fov_degrees: float = 100.0
-    # the same of a lens that was found to bend strongly, as wide ones do: a GoPro's, once
-    # undistorted, sees 104 degrees
+    # of a lens that was found to bend strongly, as wide ones do (a GoPro's: 104)
     max_fov_degrees_bent: float = 120.0
     strong_bend: float = 0.02  # of the width, at the corners (that clip: 0.1)
     enough_registered: float = 0.9  # share of the views that ends the search for a model
