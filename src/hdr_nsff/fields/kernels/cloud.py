@@ -17,7 +17,15 @@ import numba
 
 from hdr_nsff.core.jit import jit
 from hdr_nsff.fields.kernels.footprint import FAST
-from hdr_nsff.fields.kernels.moment import make_local, make_moving, make_static, move_point, scalar
+from hdr_nsff.fields.kernels.moment import (
+    NO_POSE,
+    add_pose,
+    make_local,
+    make_moving,
+    make_static,
+    move_point,
+    scalar,
+)
 from hdr_nsff.fields.kernels.moment_gradients import (
     local_gradients,
     motion_gradients,
@@ -36,21 +44,9 @@ def num_chunks(count: int) -> int:
 @scalar
 def mean_pose(pose, mixture, m):
     """The mean of the bases' `pose` (B, POSE), by column m of the weights (B, M)."""
-    w = mixture[0, m]
-    a = (
-        w * pose[0, 0], w * pose[0, 1], w * pose[0, 2], w * pose[0, 3],
-        w * pose[0, 4], w * pose[0, 5], w * pose[0, 6], w * pose[0, 7],
-        w * pose[0, 8], w * pose[0, 9], w * pose[0, 10], w * pose[0, 11],
-        w * pose[0, 12], w * pose[0, 13], w * pose[0, 14], w * pose[0, 15],
-    )  # fmt: skip
-    for b in range(1, len(mixture)):
-        w, p = mixture[b, m], pose[b]
-        a = (
-            a[0] + w * p[0], a[1] + w * p[1], a[2] + w * p[2], a[3] + w * p[3],
-            a[4] + w * p[4], a[5] + w * p[5], a[6] + w * p[6], a[7] + w * p[7],
-            a[8] + w * p[8], a[9] + w * p[9], a[10] + w * p[10], a[11] + w * p[11],
-            a[12] + w * p[12], a[13] + w * p[13], a[14] + w * p[14], a[15] + w * p[15],
-        )  # fmt: skip
+    a = NO_POSE
+    for b in range(len(mixture)):
+        a = add_pose(a, mixture[b, m], pose[b])
     return a
 
 

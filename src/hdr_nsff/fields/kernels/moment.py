@@ -21,6 +21,7 @@ from hdr_nsff.core.jit import jit
 from hdr_nsff.fields.kernels.footprint import FAST
 
 POSE = 16  # numbers of a basis at a time: a 3x4 matrix by rows and a unit quaternion
+NO_POSE = (0.0,) * POSE
 NUMBERS = 27  # that depend on the time alone
 # positions in `numbers`
 KNOT, NEIGHBOR, TIME, STATIC_COLOR = 0, 5, 10, 12
@@ -35,6 +36,17 @@ MAX_LOG_RADIANCE = 16.0  # of a Gaussian, as in `splat/gaussians.py`
 # Inlined, without reference counts: calls, which pass every table as several numbers,
 # make kernels take four times as long.
 scalar = jit(fastmath=FAST, error_model="numpy", _nrt=False, forceinline=True)
+
+
+@scalar
+def add_pose(a, w, p):
+    """The pose `a` (POSE,) plus w times another one p."""
+    return (
+        a[0] + w * p[0], a[1] + w * p[1], a[2] + w * p[2], a[3] + w * p[3],
+        a[4] + w * p[4], a[5] + w * p[5], a[6] + w * p[6], a[7] + w * p[7],
+        a[8] + w * p[8], a[9] + w * p[9], a[10] + w * p[10], a[11] + w * p[11],
+        a[12] + w * p[12], a[13] + w * p[13], a[14] + w * p[14], a[15] + w * p[15],
+    )  # fmt: skip
 
 
 @scalar

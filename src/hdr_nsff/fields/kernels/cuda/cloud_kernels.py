@@ -28,6 +28,7 @@ from hdr_nsff.fields.kernels.moment import (
     KNOT,
     LAST_ROW,
     NEIGHBOR,
+    NO_POSE,
     POSE,
     RIGIDITY,
     RIGIDITY_DUE,
@@ -39,7 +40,7 @@ rotation = device_functions(footprint, fastmath=False)["rotation"]
 MOMENT = device_functions(moment, fastmath=False, arrays=True)
 make_static, make_moving = MOMENT["make_static"], MOMENT["make_moving"]
 make_local, move_point = MOMENT["make_local"], MOMENT["move_point"]
-NO_POSE = (0.0,) * POSE
+add_pose = MOMENT["add_pose"]
 ROW = POSE + 1  # floats from one thread's numbers to the next one's: odd, for the banks
 
 
@@ -94,13 +95,7 @@ def mixed_pose(m, start, numbers, mixture, rotations, translations, centers):
     a = NO_POSE
     for b in range(mixture.shape[0]):
         w = math.exp(mixture[b, m] - top) / total
-        p = pose_of(b, start, numbers, rotations, translations, centers)
-        a = (
-            a[0] + w * p[0], a[1] + w * p[1], a[2] + w * p[2], a[3] + w * p[3],
-            a[4] + w * p[4], a[5] + w * p[5], a[6] + w * p[6], a[7] + w * p[7],
-            a[8] + w * p[8], a[9] + w * p[9], a[10] + w * p[10], a[11] + w * p[11],
-            a[12] + w * p[12], a[13] + w * p[13], a[14] + w * p[14], a[15] + w * p[15],
-        )  # fmt: skip
+        a = add_pose(a, w, pose_of(b, start, numbers, rotations, translations, centers))
     return a
 
 
