@@ -7,6 +7,7 @@ import torch
 from test_splat import BESIDE, CAMERA, STEP, batch_of, card_field
 from torch import Tensor
 
+from hdr_nsff.fields.splat import training_view
 from hdr_nsff.fields.splat.shutter import (
     MAX_RENDERS,
     Shutter,
@@ -47,8 +48,12 @@ def test_blur_is_the_mean_over_the_time_of_the_open_shutter() -> None:
     assert (blurred - exact).abs().mean() < 0.25 * (picture(TIME) - exact).abs().mean()
 
 
-def test_no_shutter_and_a_moment_are_the_same() -> None:
-    assert torch.equal(trained_picture(None), trained_picture(Shutter(0.0, (0.0,))))
+def test_no_shutter_and_a_moment_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    by_kernels = trained_picture(None)  # which have no shutter
+    monkeypatch.setattr(training_view, "cloud_maker", lambda model, view: None)
+    moment = trained_picture(Shutter(0.0, (0.0,)))
+    assert torch.equal(trained_picture(None), moment)
+    torch.testing.assert_close(by_kernels, moment)
 
 
 def test_the_cameras_motion_counts_as_that_of_points() -> None:
