@@ -10,8 +10,8 @@ near the knot (`trajectory_backward`). The twins are `kernels/cloud.py` and plai
 (`training_view.py:draw_by_torch`, of the fields' folder `splat`); tests compare them.
 
 Shapes: those of `moment.py`, A living time-local Gaussians; B bases at T knots.
-`fused_cloud.py` lists the `numbers`. The simulator of numba-cuda replaces the name
-`cuda` in this module.
+`Moment.numbers` of `splat/moment.py` lists the `numbers`. The simulator of numba-cuda
+replaces the name `cuda` in this module.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 and the differences to the recording and the priors; with their gradients.
 
 A thread takes every so many pixels. Sums over pixels are added up in shared memory
-first. The plain-torch twins are `Vignetting`, `curve.record` and `maths/losses.py`.
+first. Composites and losses of a pixel stand in `kernels/pixel.py`. The
+plain-torch twins are `Vignetting`, `curve.record` and `maths/losses.py`.
 Shapes: N pixels, K <= MAX_KNOTS points of a response curve. The simulator of numba-cuda
 replaces the name `cuda` in this module.
 """
