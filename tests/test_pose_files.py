@@ -178,6 +178,31 @@ def test_frames_of_a_video_are_matched_in_order(tmp_path):
     assert np.allclose(pixels(poses), expected())
 
 
+@pytest.mark.parametrize("names", [["left", "right.mp4", "shot/up.png"], ["0", "1", "2"]])
+def test_still_cameras_have_one_pose_for_all_of_their_frames(tmp_path, names):
+    document = transforms()
+    for frame, name in zip(document["frames"], names, strict=True):
+        frame["file_path"] = name
+    write(tmp_path / "transforms.json", document)
+    folders = [f"{camera}/{k}.png" for camera in ("left", "right", "up") for k in range(4)]
+    videos = [f"{camera}.mp4#{k}" for camera in ("left", "right", "up") for k in range(4)]
+    for sources in (folders, videos):
+        poses = import_poses(tmp_path, sources, (H, W))
+        assert np.allclose(poses.c2w, C2W[[0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2]])
+        assert poses.parallax == "full"
+    if names[0] == "left":  # by name, not by order
+        poses = import_poses(tmp_path, [folders[8], folders[0], folders[4]], (H, W))
+        assert np.allclose(poses.c2w, C2W[[2, 0, 1]])
+
+
+def test_a_frame_of_a_video_without_a_pose_lies_between_those_of_its_camera(tmp_path):
+    colmap_text(tmp_path, ["left.mp4#0", "left.mp4#2", "right.mp4#0"])
+    sources = ["left.mp4#0", "left.mp4#1", "left.mp4#2", "right.mp4#0"]
+    poses = import_poses(tmp_path, sources, (H, W))
+    assert poses.registered.tolist() == [True, False, True, True]
+    assert np.allclose(poses.c2w[1, :, 3], C2W[:2, :, 3].mean(0))
+
+
 def test_a_frame_that_colmap_left_out_lies_between_its_neighbors(tmp_path):
     colmap_text(tmp_path)
     text = (tmp_path / "images.txt").read_text().splitlines()

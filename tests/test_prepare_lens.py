@@ -59,6 +59,32 @@ def test_frames_of_given_poses_are_undistorted_and_poses_are_of_a_pinhole(tmp_pa
     assert focal == pytest.approx(LENS.pinhole()[0, 0])
 
 
+def test_each_camera_of_a_rig_has_the_lens_of_its_pose(tmp_path):
+    bends = {"left": 0.15, "middle": 0.0, "right": -0.1}
+    frames = []
+    for camera, k1 in bends.items():
+        for t, picture in enumerate(sliding(PLACES[:3])):
+            write_png(tmp_path / "rig" / camera / f"{t}.png", picture)
+        pose = np.eye(4)
+        pose[0, 3] = k1
+        size = {"w": W, "h": H, "fl_x": K[0, 0], "cx": W / 2, "cy": H / 2, "k1": k1}
+        frames.append({"file_path": camera, "transform_matrix": pose.tolist(), **size})
+    (tmp_path / "poses.json").write_text(json.dumps({"frames": frames}))
+    work = begin(PrepareConfig(tmp_path / "rig", tmp_path / "scene", poses=tmp_path / "poses.json"))
+    assert {c: e.distortion[0] for c, e in work.manifest.lens.items()} == {0: 0.15, 2: -0.1}
+    run_step(work, "frames", STEPS["frames"])
+    found = find_poses(work).frames
+    lenses = [Lens(K, (k1, 0.0, 0.0, 0.0), W, H) for k1 in bends.values()]
+    focals = [lenses[0].pinhole()[0, 0], K[0, 0], lenses[2].pinhole()[0, 0]]
+    assert [found["K"][t][0][0] for t in (0, 4, 8)] == pytest.approx(focals)
+    assert [found["c2w"][t][0][3] for t in (0, 4, 8)] == pytest.approx(list(bends.values()))
+    for camera, lens in enumerate(lenses):
+        recorded = read_image(tmp_path / "rig" / list(bends)[camera] / "1.png")
+        straight = undistorted_picture(recorded, lens) if lens.distortion[0] else recorded
+        seen = read_image(tmp_path / "scene" / "images" / f"{3 * camera + 1:05d}.png")
+        assert np.abs(seen - straight).max() < 3e-3
+
+
 def test_the_lens_of_a_scene_stays_while_the_settings_ask_for_it(tmp_path):
     found, given = LensEntry.of(LENS, given=False), LensEntry.of(LENS, given=True)
     for entry, choice, stays in (

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 import numpy as np
@@ -17,12 +17,13 @@ import numpy as np
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapModel, read_model
 from hdr_nsff.footage.pose_formats import (
+    MAX_DISTORTION_PX,
     GivenPoses,
-    common_lens,
     distorted,
     from_colmap,
     from_json,
     from_llff,
+    max_displacement_px,
 )
 from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.geometry.lens import Lens
@@ -46,29 +47,32 @@ NAMES = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "precom
 
 
 def import_poses(
-    path: Path | str, sources: list[str], size: tuple[int, int], lens: Lens | None = None
+    path: Path | str,
+    sources: list[str],
+    size: tuple[int, int],
+    lenses: Sequence[Lens | None] = (),
 ) -> Poses:
     """Poses of the frames named `sources` (T) from `path`, for `size` (height, width).
 
-    Frames are matched by file name, or in order where no name fits and the numbers do.
-    `path` is a file, or a folder that holds one of the known ones. Where frames were
-    undistorted, `lens` is what distorted them. InputError where it cannot be read, does
-    not fit, or has fewer poses than six frames in ten.
+    Frames are matched by file name, else still cameras by theirs, else either in order
+    where the numbers fit. `path` is a file, or a folder that holds one of the known
+    ones. `lenses` (T), or none, distorted the frames before these were undistorted.
+    InputError where it cannot be read, does not fit, or has fewer poses than six frames
+    in ten.
     """
     path = locate(Path(path))
     given, model = read_given(path)
     rows = match_frames(path, given.names, len(given.c2w), sources)
-    poses = fit_poses(path, given, rows, size, lens)
+    poses = fit_poses(path, given, rows, size, lenses)
     if model is not None:
-        poses = with_points(poses, model, rows, lens)
+        poses = with_points(poses, model, rows, lenses)
     if all(row is not None for row in rows):
         return poses
-    folders = [str(Path(source).parent) for source in sources]
-    cameras = [
-        [t for t, folder in enumerate(folders) if folder == camera]
-        for camera in sorted(set(folders))
-    ]
-    return interpolate(poses, cameras)
+    cameras = [camera_of(source) for source in sources]
+    frames_of: dict[str, list[int]] = {camera: [] for camera in cameras}
+    for t, camera in enumerate(cameras):
+        frames_of[camera].append(t)
+    return interpolate(poses, list(frames_of.values()))
 
 
 def read_given(path: Path) -> tuple[GivenPoses, ColmapModel | None]:
@@ -112,7 +116,8 @@ def match_frames(
 ) -> list[int | None]:
     """Which of `count` given poses belongs to each of the frames `sources`.
 
-    By the longest ending of the path that distinguishes pictures, else in order.
+    By the longest ending of the path that distinguishes pictures, else the one pose
+    that a camera has for all of its frames, else in order.
     """
     for parts in (3, 2, 1) if names is not None else ():
         assert names is not None
@@ -126,12 +131,38 @@ def match_frames(
                 f"(frames {format_ranges(missing)}); give poses for all of them"
             )
         return rows
+    cameras = list(dict.fromkeys(map(camera_of, sources)))
+    rows_of = rows_of_cameras(names, count, cameras)
+    if rows_of is not None and all(len(rows) == 1 for rows in rows_of):
+        row_of = {camera: row for camera, (row,) in zip(cameras, rows_of, strict=True)}
+        return [row_of[camera_of(source)] for source in sources]
     if count != len(sources):
         raise InputError(
             f"{path}: {count} poses for {len(sources)} frames, and no file name fits; "
-            "give one pose per used frame"
+            "give one pose per used frame, or one per still camera by the camera's name"
         )
     return list(range(count))
+
+
+def rows_of_cameras(
+    names: list[str] | None, count: int, cameras: Sequence[str]
+) -> list[list[int]] | None:
+    """The rows, of `count` poses with these `names`, that belong to each of `cameras`.
+
+    A pose is a camera's if its file or its folder has the camera's name; one pose per
+    camera may also come in the cameras' order. None where neither fits.
+    """
+    ends = [(camera_of(f"{name}#"), camera_of(name)) for name in names or ()]
+    rows_of = [[row for row, end in enumerate(ends) if camera in end] for camera in cameras]
+    if rows_of and all(rows_of):
+        return rows_of
+    return [[row] for row in range(count)] if count == len(cameras) else None
+
+
+def camera_of(source: str) -> str:
+    """The name of a frame's camera: its video's, or its folder's."""
+    file, is_video, _ = source.replace("\\", "/").partition("#")
+    return PurePosixPath(file).stem if is_video else PurePosixPath(file).parent.name
 
 
 def match_names(names: list[str], sources: list[str], parts: int) -> list[int | None] | None:
@@ -162,10 +193,10 @@ def fit_poses(
     given: GivenPoses,
     rows: Sequence[int | None],
     size: tuple[int, int],
-    lens: Lens | None = None,
+    lenses: Sequence[Lens | None] = (),
 ) -> Poses:
     """The poses `rows` (T) of `given`, for frames of `size` (height, width) that were
-    freed of the distortion of `lens`.
+    freed of the distortion of `lenses` (T), or of none.
 
     A row of None is a frame without a pose. InputError, which names `path`, for poses
     that make no sense or are for frames of another shape.
@@ -173,11 +204,12 @@ def fit_poses(
     check_given(path, given)
     first = next(row for row in rows if row is not None)
     K = np.stack([scaled_intrinsics(path, given, first if r is None else r, size) for r in rows])
-    if lens is not None:
-        height, width = size
-        K[:] = lens.resized(width, height).pinhole()
-    elif (found := common_lens(path, given)) is not None:
-        raise distorted(path, found.max_displacement_px())
+    height, width = size
+    pinholes = {id(lens): lens.resized(width, height).pinhole() for lens in lenses if lens}
+    for t, lens in enumerate(lenses):
+        K[t] = pinholes.get(id(lens), K[t])
+    if not pinholes and (displacement := max_displacement_px(given)) > MAX_DISTORTION_PX:
+        raise distorted(path, displacement)
     c2w = np.tile(np.eye(4)[:3], (len(rows), 1, 1))
     for t, row in enumerate(rows):
         if row is not None:
@@ -240,14 +272,17 @@ def parallax_of(c2w: np.ndarray, near: float) -> Parallax:
 
 
 def with_points(
-    poses: Poses, model: ColmapModel, rows: Sequence[int | None], lens: Lens | None = None
+    poses: Poses,
+    model: ColmapModel,
+    rows: Sequence[int | None],
+    lenses: Sequence[Lens | None] = (),
 ) -> Poses:
     """`poses` with the static points of a COLMAP model, and near and far from those.
 
-    `rows` (T) are the images of the frames in the order of their names; `lens` what
-    distorted their keypoints.
+    `rows` (T) are the images of the frames in the order of their names; `lenses` (T),
+    or none, distorted their keypoints.
     """
-    tracks = tracks_of(poses, model, rows, lens)
+    tracks = tracks_of(poses, model, rows, lenses)
     shrink = poses.K[0, 0, 0] / next(iter(model.cameras.values())).K[0, 0]
     errors = model.errors * shrink  # in pixels of the frames
     poses = trusted_points(replace(poses, points=model.points, point_errors=errors, tracks=tracks))
@@ -262,7 +297,10 @@ def with_points(
 
 
 def tracks_of(
-    poses: Poses, model: ColmapModel, rows: Sequence[int | None], lens: Lens | None
+    poses: Poses,
+    model: ColmapModel,
+    rows: Sequence[int | None],
+    lenses: Sequence[Lens | None],
 ) -> np.ndarray:
     """Every view of a point (O, 4): frame, point, x, y in pixels of the frames."""
     images = sorted(model.images.values(), key=lambda i: i.name)
@@ -274,6 +312,7 @@ def tracks_of(
         image = images[row]
         camera = model.cameras[image.camera_id]
         pixels = image.xy * (poses.K[t, (0, 1), (0, 1)] / camera.K[(0, 1), (0, 1)])
+        lens = lenses[t] if lenses else None
         if lens is not None:
             pixels = lens.resized(camera.width, camera.height).undistort(image.xy, poses.K[t])
         for (x, y), key in zip(pixels, image.point_ids, strict=True):

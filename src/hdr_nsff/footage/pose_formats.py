@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +48,17 @@ class GivenPoses:
     # (N, 4) k1, k2, p1, p2 of OpenCV's model; None: no pose has any
     distortion: np.ndarray | None = None
 
+    def of(self, rows: list[int]) -> GivenPoses:
+        """These poses of it."""
+        return replace(
+            self,
+            names=None if self.names is None else [self.names[row] for row in rows],
+            K=self.K[rows],
+            c2w=self.c2w[rows],
+            size=self.size[rows],
+            distortion=None if self.distortion is None else self.distortion[rows],
+        )
+
 
 # COLMAP
 
@@ -83,25 +94,37 @@ def colmap_distortion(path: Path, camera: ColmapCamera) -> np.ndarray:
     )
 
 
-def common_lens(path: Path, given: GivenPoses) -> Lens | None:
-    """The lens of all poses; None where a pinhole misplaces no corner by more than
-    `MAX_DISTORTION_PX`. InputError where they have several lenses, or no size.
+def lenses_of(given: GivenPoses) -> list[Lens]:
+    """The lens of every pose; none where no pose has distortion, or numbers that no
+    lens has, which are refused later.
     """
     if given.distortion is None or not given.distortion.any():
-        return None
-    numbers = (given.K, given.distortion, given.size)
-    if not all(np.isfinite(each).all() for each in numbers):
-        return None  # refused later
-    lenses = [
+        return []
+    if not all(np.isfinite(each).all() for each in (given.K, given.distortion, given.size)):
+        return []
+    return [
         Lens(K, (k1, k2, p1, p2), round(width), round(height))
         for K, (k1, k2, p1, p2), (width, height) in zip(
             given.K, given.distortion.tolist(), given.size, strict=True
         )
     ]
-    worst = max(lens.max_displacement_px() for lens in lenses)
+
+
+def max_displacement_px(given: GivenPoses) -> float:
+    """By how many pixels pinholes in place of the lenses misplace a corner at most."""
+    return max((lens.max_displacement_px() for lens in lenses_of(given)), default=0.0)
+
+
+def common_lens(path: Path, given: GivenPoses) -> Lens | None:
+    """The lens of all poses; None where a pinhole misplaces no corner by more than
+    `MAX_DISTORTION_PX`. InputError where they have several lenses, or no size.
+    """
+    lenses = lenses_of(given)
+    worst = max_displacement_px(given)
     if not worst > MAX_DISTORTION_PX:
         return None
-    several = any(not np.allclose(each, each[0]) for each in numbers)
+    numbers = [[*each.K.ravel(), *each.distortion, each.width, each.height] for each in lenses]
+    several = not np.allclose(numbers, numbers[0])
     if several or lenses[0].height <= 0 or not lenses[0].is_one_to_one():
         raise distorted(path, worst)
     return lenses[0]

@@ -7,6 +7,7 @@ finds is known only later, see `undistort.py`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.footage.lens_files import read_lens
-from hdr_nsff.footage.pose_files import MAX_ASPECT_ERROR, locate, read_given
+from hdr_nsff.footage.pose_files import MAX_ASPECT_ERROR, locate, read_given, rows_of_cameras
 from hdr_nsff.footage.pose_formats import common_lens, distorted
 from hdr_nsff.geometry.lens import Lens, undistorted_picture
 from hdr_nsff.prepare.work import Part, PrepareConfig, Work
@@ -77,7 +78,8 @@ def given_lenses(work: Work) -> dict[int, LensEntry]:
     """
     choice = parse_lens(work.config.lens_distortion)
     if isinstance(choice, Path):
-        return entries_of(work, choice, calibrated_lens(work, choice))
+        lens = calibrated_lens(work, choice)
+        return entries_of(work, choice, [lens] * len(camera_names(work)))
     capture, path = work.capture_with("poses"), work.config.poses
     if capture is not None and capture.poses is not None:
         path, given = capture.root, capture.poses
@@ -90,10 +92,19 @@ def given_lenses(work: Work) -> dict[int, LensEntry]:
         return {}
     if choice != "auto":
         given = replace(given, distortion=np.tile([*choice, 0.0, 0.0], (len(given.K), 1)))
-    lens = common_lens(path, given)
-    if lens is None:
-        return {}
-    return entries_of(work, path, lens)
+    cameras = camera_names(work)
+    rows_of = rows_of_cameras(given.names, len(given.c2w), cameras) if len(cameras) > 1 else None
+    if rows_of is None:
+        return entries_of(work, path, [common_lens(path, given)] * len(cameras))
+    return entries_of(work, path, [common_lens(path, given.of(rows)) for rows in rows_of])
+
+
+def camera_names(work: Work) -> list[str]:
+    """The names of the cameras that have lenses: those of their folders or videos."""
+    footage = work.footage
+    if footage.same_camera:
+        return [footage.path.name]
+    return [f[0].stem if footage.video else f[0].parent.name for f in footage.cameras]
 
 
 def calibrated_lens(work: Work, path: Path) -> Lens:
@@ -108,17 +119,16 @@ def calibrated_lens(work: Work, path: Path) -> Lens:
     return lens
 
 
-def entries_of(work: Work, path: Path, lens: Lens) -> dict[int, LensEntry]:
-    """A lens, given by the file `path`, for every camera; InputError where maps that
-    are given would have to be undistorted too.
+def entries_of(work: Work, path: Path, lenses: Sequence[Lens | None]) -> dict[int, LensEntry]:
+    """The lens of every camera, or None, given by the file `path`; InputError where
+    maps that are given would have to be undistorted too.
     """
+    bent = {camera_id: lens for camera_id, lens in enumerate(lenses) if lens is not None}
     other_parts: tuple[Part, ...] = ("flow", "masks", "depth")
     with_maps = any(work.capture_with(part) for part in other_parts)
-    if with_maps or (work.capture is not None and work.capture.has_held_out):
-        raise distorted(path, lens.max_displacement_px())
-    entry = LensEntry.of(lens, given=True)
-    cameras = 1 if work.footage.same_camera else len(work.footage.cameras)
-    return {camera_id: entry for camera_id in range(cameras)}
+    if bent and (with_maps or (work.capture is not None and work.capture.has_held_out)):
+        raise distorted(path, max(lens.max_displacement_px() for lens in bent.values()))
+    return {camera_id: LensEntry.of(lens, given=True) for camera_id, lens in bent.items()}
 
 
 def lens_to_find(work: Work) -> LensChoice:

@@ -54,7 +54,7 @@ def find_poses(work: Work) -> StepResult:
         poses = data_set_poses(work)
     elif c.poses is not None:
         size, sources = (m.height, m.width), [f.source for f in m.frames if not f.track]
-        poses = import_poses(c.poses, sources, size, lens_of_clip(work))
+        poses = import_poses(c.poses, sources, size, lenses_of_frames(work))
         poses = share_poses(work, poses, track=0)
     elif c.tripod:
         poses = tripod_poses(work)
@@ -94,7 +94,7 @@ def data_set_poses(work: Work) -> Poses:
     assert capture is not None and capture.poses is not None
     rows: list[int | None] = [capture.row[f.source] for f in m.frames]
     size = (m.height, m.width)
-    poses = fit_poses(capture.root, capture.poses, rows, size, lens_of_clip(work))
+    poses = fit_poses(capture.root, capture.poses, rows, size, lenses_of_frames(work))
     return poses if capture.points is None else replace(poses, points=capture.points)
 
 
@@ -112,10 +112,11 @@ def tripod_poses(work: Work) -> Poses:
     return poses
 
 
-def lens_of_clip(work: Work) -> Lens | None:
-    """The lens of given poses, which is that of all cameras; None for a pinhole."""
-    entries = list(work.manifest.lens.values())
-    return entries[0].lens() if entries else None
+def lenses_of_frames(work: Work) -> list[Lens | None]:
+    """The given lens of each frame of the first track; None for a pinhole."""
+    m = work.manifest
+    lenses = {camera_id: entry.lens() for camera_id, entry in m.lens.items()}
+    return [lenses.get(f.camera_id) for f in m.frames if not f.track]
 
 
 def poses_and_masks(work: Work) -> Poses:
