@@ -41,11 +41,11 @@ from hdr_nsff.priors.poses.matching import (
     match_pairs,
     view_pairs,
 )
+from hdr_nsff.priors.poses.model_poses import poses_from_model
 from hdr_nsff.priors.poses.reconstruct import (
     ReconstructionTuning,
     SfmViews,
     best_model,
-    poses_from_model,
     sfm_views,
     spread_frames,
     views_of_images,
