@@ -1,7 +1,9 @@
 """Fixtures that several test files share."""
 
 import json
+import os
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -18,6 +20,8 @@ from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
 
 prepare_process()  # as the command line does, before a test imports numba
+if os.environ.get("NUMBA_ENABLE_CUDASIM") == "1":
+    sys.setswitchinterval(5e-4)  # seconds: a block's threads wait in loops for each other
 
 
 @pytest.fixture(scope="session")

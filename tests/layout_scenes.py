@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import miniatures as mini
 import numpy as np
-from toy_scene import ToyScene
 
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import write_png
@@ -22,13 +22,13 @@ LAYOUTS = ("hdr-gopro", "nerfstudio")
 EXPOSURES = [2.0, 0.0, -1.0]  # of the toy scene's brackets 0 to 2
 
 
-def exported_scene(folder: Path) -> Path:
-    """The toy scene with the detail of a real one.
+def exported_scene(toy_folder: Path, folder: Path) -> Path:
+    """A copy of the toy scene in `folder` with the detail of a real one.
 
     Its poses are no round numbers; it has static points, confidences, and a bracket
     whose exposure is unknown.
     """
-    ToyScene().write(folder)
+    shutil.copytree(toy_folder, folder)
     m = Manifest.load(folder)
     rng = np.random.default_rng(0)
     size = (m.height, m.width)

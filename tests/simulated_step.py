@@ -13,6 +13,7 @@ import pytest
 import torch
 from presets import small
 from pretend_device import COUNTING, PretendTensor, counted, pretend_device, unwrap
+from simulated_tone import use_few_knots
 from torch import Tensor
 
 from hdr_nsff.core import distributed
@@ -109,6 +110,7 @@ def launch_by(monkeypatch: pytest.MonkeyPatch, launched: Callable[..., None]) ->
 def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[torch.device]:
     """The pretend device, on which our kernels run."""
     launch_by(monkeypatch, launch_there)
+    use_few_knots(monkeypatch)
     for module in (fused_picture, kernel_cuda, fused_losses):
         monkeypatch.setattr(module, "MAX_BLOCKS", 2)
     for module in (draw, training_view):

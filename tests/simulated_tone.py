@@ -17,12 +17,16 @@ from hdr_nsff.tonemap.fused_tone import Recording, fused_recording
 FEW = 32  # knots; the simulator has a thread of the CPU for each
 
 
-@pytest.fixture
-def few_knots(monkeypatch: pytest.MonkeyPatch) -> None:
+def use_few_knots(monkeypatch: pytest.MonkeyPatch) -> None:
     """As many knots and threads as one launch takes, but of blocks that are smaller."""
     for module in (fused_tone, tone_kernels):
         monkeypatch.setattr(module, "MAX_KNOTS", FEW)
     monkeypatch.setattr(base, "knot_positions", lambda spacing: knot_positions(spacing, FEW))
+
+
+@pytest.fixture
+def few_knots(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_few_knots(monkeypatch)
 
 
 def random_tone_mapper(num_cameras: int, anchored: bool, **settings: bool) -> SharedToneMapper:

@@ -12,7 +12,6 @@ from fakes import fake_run
 from test_export_gaussians import make_run
 from test_hdr_shots import large_shot
 from test_hdr_video import decoded, luma
-from toy_scene import ToyScene
 from viewer_scenes import render, scene_file, trained, trained_local
 
 from hdr_nsff.core.exr import read_exr
@@ -74,9 +73,10 @@ def test_a_view_of_a_run_is_rendered(
     assert seen["Z"].shape == (34, 60) and (tmp_path / "view.png").is_file()
 
 
-def test_a_path_made_from_the_scene_is_one_that_render_takes(toy: Scene, tmp_path: Path) -> None:
-    scene = ToyScene().write(tmp_path / "scene")
-    count = camera_path.dolly(scene, tmp_path / "dolly.json")
+def test_a_path_made_from_the_scene_is_one_that_render_takes(
+    toy: Scene, toy_folder: Path, tmp_path: Path
+) -> None:
+    count = camera_path.dolly(toy_folder, tmp_path / "dolly.json")
     views = read_path(tmp_path / "dolly.json", toy.train[0].camera)
     assert len(views) == count == 11
     assert [view.time for view in views] == pytest.approx(np.arange(11) / 2)

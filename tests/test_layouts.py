@@ -33,8 +33,8 @@ KEPT = (
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    return exported_scene(tmp_path / "scene")
+def scene(toy_folder: Path, tmp_path: Path) -> Path:
+    return exported_scene(toy_folder, tmp_path / "scene")
 
 
 def assert_same_frame(one: Path, f: FrameEntry, other: Path, g: FrameEntry) -> None:

@@ -25,8 +25,8 @@ from hdr_nsff.scene.truth import Truth, true_pictures
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    return exported_scene(tmp_path / "scene")
+def scene(toy_folder: Path, tmp_path: Path) -> Path:
+    return exported_scene(toy_folder, tmp_path / "scene")
 
 
 @pytest.fixture

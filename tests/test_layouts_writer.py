@@ -18,8 +18,8 @@ from hdr_nsff.scene.manifest import Manifest
 
 
 @pytest.fixture
-def scene(tmp_path: Path) -> Path:
-    return exported_scene(tmp_path / "scene")
+def scene(toy_folder: Path, tmp_path: Path) -> Path:
+    return exported_scene(toy_folder, tmp_path / "scene")
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
