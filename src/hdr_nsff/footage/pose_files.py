@@ -286,6 +286,11 @@ def with_points(
     shrink = poses.K[0, 0, 0] / next(iter(model.cameras.values())).K[0, 0]
     errors = model.errors * shrink  # in pixels of the frames
     poses = trusted_points(replace(poses, points=model.points, point_errors=errors, tracks=tracks))
+    return with_depth_range(poses)
+
+
+def with_depth_range(poses: Poses) -> Poses:
+    """`poses` with near and far from their points, where these are enough."""
     if len(poses.tracks) < MIN_TRACKED_POINTS:
         return poses
     frames = poses.tracks[:, 0].astype(int)

@@ -13,6 +13,7 @@ from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.frame_files import RECORDED, natural_key, sorted_folders
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import sam2_masks
+from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.tracks import share_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.background import correct_by_background
@@ -42,8 +43,8 @@ def find_masks(work: Work) -> StepResult:
 
 
 def estimated_masks(work: Work) -> np.ndarray:
-    """Moving masks (T, H, W) from flow and poses; of a rig, also from the visits of its
-    cameras.
+    """Moving masks (T, H, W) from flow and poses; also from the visits of a rig's
+    cameras, or from the background, where a camera shows it at other times.
     """
     evidence = work.visits.distance if work.manifest.rig > 1 else None
     found, valid, pairs = work.raw_flows
@@ -56,7 +57,9 @@ def estimated_masks(work: Work) -> np.ndarray:
     if not train.all():
         by_all = geometric_mask(found, valid, pairs, video, K, c2w, evidence=evidence)
         moving[~train] = by_all[~train]
-    if work.manifest.parallax == "full":
+    in_turn = work.manifest.rig > 1  # what their visits show is in the masks already
+    shows_background = not in_turn and still_cameras(work) is not None
+    if work.manifest.parallax == "full" and not shows_background:
         return share_masks(work, moving)
     frames = work.manifest.frames
     recorded_alike = np.unique(

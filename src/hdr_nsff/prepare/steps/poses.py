@@ -11,7 +11,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic, write_npy
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.footage.pose_files import fit_poses, import_poses
+from hdr_nsff.footage.pose_files import fit_poses, import_poses, with_depth_range
 from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.lens import DistortedFramesError, lens_to_find
@@ -29,6 +29,7 @@ from hdr_nsff.priors.poses.estimate import (
     rotation_poses,
     still_panorama,
 )
+from hdr_nsff.priors.poses.guided_points import points_between_cameras
 from hdr_nsff.priors.poses.reconstruct import tuning_for_lenses
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import choose_visits
@@ -51,11 +52,11 @@ def find_poses(work: Work) -> StepResult:
     given = True
     capture = work.capture_with("poses")
     if capture is not None and capture.poses is not None:
-        poses = data_set_poses(work)
+        poses = with_common_points(work, data_set_poses(work))
     elif c.poses is not None:
         size, sources = (m.height, m.width), [f.source for f in m.frames if not f.track]
         poses = import_poses(c.poses, sources, size, lenses_of_frames(work))
-        poses = share_poses(work, poses, track=0)
+        poses = with_common_points(work, share_poses(work, poses, track=0))
     elif c.tripod:
         poses = tripod_poses(work)
     elif isinstance(c.masks, Path) or work.capture_with("masks") is not None:
@@ -96,6 +97,20 @@ def data_set_poses(work: Work) -> Poses:
     size = (m.height, m.width)
     poses = fit_poses(capture.root, capture.poses, rows, size, lenses_of_frames(work))
     return poses if capture.points is None else replace(poses, points=capture.points)
+
+
+def with_common_points(work: Work, poses: Poses) -> Poses:
+    """Given `poses` with the static points that several cameras see at once, where no
+    points come with them.
+    """
+    if len(poses.points) or not work.manifest.synchronized:
+        return poses
+    times = np.array([f.time for f in work.manifest.frames])
+    video, clipped = work.equalized
+    ignore = rough_mask(*work.raw_flows, video) | np.array(clipped)
+    found = points_between_cameras(poses, video, ignore, times)
+    say(f"poses: {len(found.points)} static points matched between the cameras")
+    return found if found.near else with_depth_range(found)
 
 
 def tripod_poses(work: Work) -> Poses:

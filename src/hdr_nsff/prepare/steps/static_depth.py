@@ -12,17 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from hdr_nsff.core.stack import ArrayStack, by_key
+from hdr_nsff.core.stack import ArrayStack, Stack, by_key
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_files
 from hdr_nsff.prepare.steps.neural import network_depth
+from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
 from hdr_nsff.priors.masks.visits import without_movers
+from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.scene.posed_video import PosedVideo
 
+MAX_STILL_FRAMES = 60  # of a camera that stands still, that its static picture is made of
 DEPTH_FILES = {".npy", ".exr", ".png"}
 
 
@@ -74,8 +77,10 @@ def geometric_depth(work: Work) -> Depth:
     """Depth from the parallax of the static scene."""
     m = work.manifest
     points = work.static_points()
-    if m.rig > 1:
-        disparity, confidence, still = rig_depth(work, points)
+    cameras = still_cameras(work)
+    if cameras is not None:
+        of_train = cameras[[f.index for f in work.train]]
+        disparity, confidence, still = depth_of_cameras(work, of_train, points)
     else:
         flow = work.training_flows(work.raw_flows)
         disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
@@ -86,24 +91,30 @@ def geometric_depth(work: Work) -> Depth:
     return Depth(disparity, confidence, note, "geometric", still=still)
 
 
-def rig_depth(work: Work, points: np.ndarray) -> tuple[ArrayStack, ArrayStack, ArrayStack]:
-    """Depth from the static pictures of a rig's cameras, the same for all frames of a
+def depth_of_cameras(
+    work: Work, camera_of: np.ndarray, points: np.ndarray
+) -> tuple[ArrayStack, ArrayStack, ArrayStack]:
+    """Depth from the static pictures of still cameras, the same for all frames of a
     camera: disparity, confidence, and that no pixel of the masks is static, (T, H, W).
+    `camera_of` (T,): the camera of every training frame.
     """
-    m = work.manifest
-    own = np.array([m.places[f.index] for f in work.train])
-    cameras, first, of_frame = np.unique(own, return_index=True, return_inverse=True)
+    cameras, first, of_frame = np.unique(camera_of, return_index=True, return_inverse=True)
     frames = work.training_clip()
-    pictures = without_movers(
-        frames.video, frames.clipped, frames.moving, of_frame.tolist(), len(cameras)
-    )
+    of_camera = [np.flatnonzero(of_frame == k) for k in range(len(cameras))]
+    some = np.concatenate([own[spread_frames(len(own), MAX_STILL_FRAMES)] for own in of_camera])
+    kept = frames.video[some], frames.clipped[some], frames.moving[some]
+    pictures = without_movers(*kept, of_frame[some].tolist(), len(cameras))
     # each at a time of its own: what is unknown in one may move in another
     times = np.arange(len(cameras), dtype=np.float64)
     clip = PosedVideo(frames.K[first], frames.c2w[first], times, *pictures)
     no_flow = np.zeros((0, *clip.size, 2)), np.zeros((0, *clip.size), bool), np.zeros((0, 2), int)
     disparity, confidence, _ = static_geometric_depth(clip, *no_flow, points)
-    still = np.zeros((len(own), *clip.size), bool)
-    return np.array(disparity)[of_frame], np.array(confidence)[of_frame], still
+    shape = (len(camera_of), *clip.size)
+
+    def of_frames(maps: ArrayStack) -> Stack:
+        return Stack(lambda t: maps[of_frame[t]], shape)
+
+    return of_frames(disparity), of_frames(confidence), np.zeros(shape, bool)
 
 
 def data_set_depth(work: Work) -> Depth:

@@ -83,7 +83,7 @@ def correct_by_background(
     `video` (T, H, W, 3) is rgb in [0, 1]; frames of one of the `groups` (T,) were
     recorded alike. `sources` (T,) bool: frames that may show others their background;
     the others see all frames. `K` (T, 3, 3) px and `c2w` (T, 3, 4) are of cameras
-    without parallax.
+    without parallax in each group.
     """
     count, height, width = moving.shape
     coarseness = int(np.ceil(np.sqrt(height * width / tuning.working_pixels)))
