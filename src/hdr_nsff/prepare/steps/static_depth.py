@@ -11,7 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
+from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, Stack, by_key
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
@@ -26,6 +28,10 @@ from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.scene.posed_video import PosedVideo
 
 MAX_STILL_FRAMES = 60  # of a camera that stands still, that its static picture is made of
+KNOWN = 0.5  # confidence of depth from which on a pixel counts as well known
+# of synchronized still cameras, below which depth is mere chance (hand-chosen: 3 % of
+# cameras a quarter of a circle apart, where a picture before each was 4 dB better)
+MIN_KNOWN_SHARE = 0.1
 DEPTH_FILES = {".npy", ".exr", ".png"}
 
 
@@ -86,7 +92,7 @@ def geometric_depth(work: Work) -> Depth:
         disparity, confidence, still = static_geometric_depth(work.training_clip(), *flow, points)
         if m.synchronized:  # views of one instant fit moving pixels too
             still = np.zeros(still.shape, bool)
-    known = np.mean([(map > 0.5).mean() for map in confidence])
+    known = np.mean([(map > KNOWN).mean() for map in confidence])
     note = f"{known:.0%} of the pixels well known"
     return Depth(disparity, confidence, note, "geometric", still=still)
 
@@ -109,12 +115,29 @@ def depth_of_cameras(
     clip = PosedVideo(frames.K[first], frames.c2w[first], times, *pictures)
     no_flow = np.zeros((0, *clip.size, 2)), np.zeros((0, *clip.size), bool), np.zeros((0, 2), int)
     disparity, confidence, _ = static_geometric_depth(clip, *no_flow, points)
+    known = np.mean([(map > KNOWN).mean() for map in confidence])
+    if work.manifest.rig == 1 and 0 < known < MIN_KNOWN_SHARE:
+        distance = np.float32(least_spacing(clip.c2w) / 2)
+        say(
+            f"depth: the cameras agree about {known:.0%} of the pixels: each becomes a picture "
+            f"before its camera, at distance {distance:.3g}; views between them are not to be had"
+        )
+        disparity = np.full(confidence.shape, 1 / distance)
+        confidence = np.zeros(confidence.shape, np.float32)
     shape = (len(camera_of), *clip.size)
 
     def of_frames(maps: ArrayStack) -> Stack:
         return Stack(lambda t: maps[of_frame[t]], shape)
 
     return of_frames(disparity), of_frames(confidence), np.zeros(shape, bool)
+
+
+def least_spacing(c2w: np.ndarray) -> float:
+    """The smallest distance between two of the cameras `c2w` (N, 3, 4) at different
+    places.
+    """
+    spacings = pdist(c2w[:, :, 3])
+    return float(spacings[spacings > 0].min())
 
 
 def data_set_depth(work: Work) -> Depth:

@@ -34,7 +34,7 @@ from hdr_nsff.priors.depth.parallax import (
 from hdr_nsff.priors.depth.plane_sweep import PlaneSweepTuning, sweep
 from hdr_nsff.scene.posed_video import PosedVideo
 
-NO_PARALLAX_RANGE = (0.5, 2.0)  # near and far around distance 1, scene units
+NO_PARALLAX_RANGE = (0.5, 2.0)  # near and far, of the one distance of everything
 
 
 @dataclass(frozen=True)
@@ -228,8 +228,9 @@ def depth_range(
     """Near and far z-depth that hold the confident pixels, with room: movers and other
     pixels are somewhere in between. `disparity`, `confidence` (T, H, W).
     """
-    if not confidence.any():  # no parallax: everything is at distance 1
-        return NO_PARALLAX_RANGE
+    if not confidence.any():  # no parallax: everything is at one distance
+        near, far = NO_PARALLAX_RANGE
+        return near / float(np.median(disparity)), far / float(np.median(disparity))
     least = np.quantile(confidence, tuning.min_range_quantile)
     depth = 1 / disparity[confidence >= least]
     near, far = np.percentile(depth, tuning.range_percentiles)

@@ -1,0 +1,47 @@
+"""The static depth of still cameras: once for each, and none that is mere chance."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from posed_planes import H, W, cameras_at, plane, posed_video
+
+from hdr_nsff.prepare.steps import static_depth
+from hdr_nsff.prepare.steps.static_depth import MIN_KNOWN_SHARE, depth_of_cameras, least_spacing
+
+EYES = [(0.0, 0, 0), (0.4, 0, 0), (0.4, 0.3, 0)]
+CAMERA_OF = np.array([0, 0, 1, 1, 2, 2])
+
+
+def work_of(c2w: np.ndarray, rig: int) -> Any:
+    """Two frames of each camera."""
+    frames = c2w[CAMERA_OF]
+    clip = posed_video(frames, video=plane(frames, 3.0, 0.2)[0])
+    return SimpleNamespace(manifest=SimpleNamespace(rig=rig), training_clip=lambda: clip)
+
+
+def test_the_least_spacing_is_of_cameras_at_different_places() -> None:
+    assert least_spacing(cameras_at(*EYES, EYES[0])) == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize("rig", [1, 3])
+@pytest.mark.parametrize("share", [0.0, MIN_KNOWN_SHARE / 2, 2 * MIN_KNOWN_SHARE])
+def test_depth_that_cameras_hardly_agree_about_is_a_picture_before_each(
+    share: float, rig: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def found(clip: Any, *arguments: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        assert len(clip.video) == 3  # one picture of each camera
+        confidence = np.zeros((3, H, W), np.float32)
+        confidence[:, :, : round(share * W)] = 1
+        depth = np.broadcast_to(np.float32([[[2]], [[3]], [[4]]]), confidence.shape)
+        return 1 / depth, confidence, np.zeros(confidence.shape, bool)
+
+    monkeypatch.setattr(static_depth, "static_geometric_depth", found)
+    work = work_of(cameras_at(*EYES), rig)
+    disparity, confidence, still = depth_of_cameras(work, CAMERA_OF, np.zeros((0, 3)))
+    assert not still.any() and still.shape == (6, H, W)
+    by_chance = rig == 1 and 0 < share < MIN_KNOWN_SHARE
+    for t, camera in enumerate(CAMERA_OF):
+        assert disparity[t] == pytest.approx(1 / (0.15 if by_chance else 2 + camera))
+        assert confidence[t].any() == (share > 0 and not by_chance)
