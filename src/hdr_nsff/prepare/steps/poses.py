@@ -107,8 +107,8 @@ def with_common_points(work: Work, poses: Poses) -> Poses:
         return poses
     times = np.array([f.time for f in work.manifest.frames])
     video, clipped = work.equalized
-    ignore = rough_mask(*work.raw_flows, video) | np.array(clipped)
-    found = points_between_cameras(poses, video, ignore, times)
+    moving = geometric_mask(*work.raw_flows, video, poses.K, poses.c2w)
+    found = points_between_cameras(poses, video, moving | np.array(clipped), times)
     say(f"poses: {len(found.points)} static points matched between the cameras")
     return found if found.near else with_depth_range(found)
 
