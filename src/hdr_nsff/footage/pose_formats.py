@@ -49,7 +49,7 @@ class GivenPoses:
     distortion: np.ndarray | None = None
 
     def of(self, rows: list[int]) -> GivenPoses:
-        """These poses of it."""
+        """The poses of these rows."""
         return replace(
             self,
             names=None if self.names is None else [self.names[row] for row in rows],

@@ -49,7 +49,8 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         clip = replace(clip, moving=masks & ~still)
         moving = clip.moving
         found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
-        if work.manifest.synchronized and any(np.any(c) for c in confidence):
+        agree = any(np.any(c) for c in confidence)  # about the depth of something
+        if work.manifest.synchronized and agree:
             seen = same_time_depth(clip, work.static_points())
             if seen is not None:
                 found, trust = take_same_time_depth(

@@ -119,8 +119,8 @@ def depth_of_cameras(
     if work.manifest.rig == 1 and 0 < known < MIN_KNOWN_SHARE:
         distance = np.float32(least_spacing(clip.c2w) / 2)
         say(
-            f"depth: the cameras agree about {known:.0%} of the pixels: each becomes a picture "
-            f"before its camera, at distance {distance:.3g}; views between them are not to be had"
+            f"depth: the cameras agree about {known:.0%} of the pixels only; what each sees is put "
+            f"at distance {distance:.3g}, so views between the cameras will not work"
         )
         disparity = np.full(confidence.shape, 1 / distance)
         confidence = np.zeros(confidence.shape, np.float32)
