@@ -59,8 +59,8 @@ def read_frames(
             name, height, width = first
             if (h, w) != (height, width):
                 raise InputError(
-                    f"{source}: {w}x{h} pixels, but {name} has {width}x{height}; "
-                    "all frames must have one size"
+                    f"{source}: {w}x{h} pixels, but {name} has {width}x{height}; all frames "
+                    f"must have one size: crop them to {min(w, width)}x{min(h, height)}"
                 )
             rgb = shrink(footage.bars.cut(image), max_size)
             if footage.linear:
