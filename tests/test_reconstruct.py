@@ -84,3 +84,6 @@ def test_failure_names_the_lens_or_the_frames():
     assert "focal length of 45 px is impossible" in message  # doubled frames: 90 / 2
     message = failure_message(long_lens, views_of(10), [])
     assert "6 of 10 frames could not be registered (frames 3-5, 7-9)" in message
+    rig = replace(views_of(10), groups=[[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]])
+    assert "one each is enough" in failure_message(None, rig, [])
+    assert "--tripod" in failure_message(None, views_of(10), [])

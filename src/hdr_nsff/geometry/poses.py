@@ -19,6 +19,10 @@ ADVICE = (
     "it stood still, give masks of the moving objects (--mask FOLDER), or import poses "
     "(--poses FOLDER or FILE)"
 )
+RIG_ADVICE = (
+    "place the cameras nearer to each other, or give the poses of a calibration (--poses FILE); "
+    "for still cameras one each is enough"
+)
 # share of frames with poses of their own below which poses have failed (hand-chosen)
 MIN_REGISTERED_SHARE = 0.6
 MAX_LISTED_RANGES = 8  # in a message

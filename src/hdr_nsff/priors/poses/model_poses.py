@@ -16,6 +16,7 @@ from hdr_nsff.footage.colmap import ColmapModel
 from hdr_nsff.geometry.pinhole import intrinsics
 from hdr_nsff.geometry.poses import (
     ADVICE,
+    RIG_ADVICE,
     Poses,
     format_ranges,
     interpolate,
@@ -47,7 +48,7 @@ def poses_from_model(
         if not images:
             raise InputError(
                 "poses failed: none of the frames of one camera could be registered "
-                f"(views {format_ranges(group)}); {ADVICE}"
+                f"(views {format_ranges(group)}); {RIG_ADVICE}"
             )
         focal = model.cameras[images[0].camera_id].K[0, 0] / scale  # one for the group
         K[np.isin(views.of_frame, group)] = intrinsics(focal, width, height)

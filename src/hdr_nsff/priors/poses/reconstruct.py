@@ -24,7 +24,7 @@ from hdr_nsff.core.stack import ArrayStack, Stack
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.geometry.lens import Lens
-from hdr_nsff.geometry.poses import ADVICE, MIN_REGISTERED_SHARE, format_ranges
+from hdr_nsff.geometry.poses import ADVICE, MIN_REGISTERED_SHARE, RIG_ADVICE, format_ranges
 from hdr_nsff.priors.poses import sfm
 from hdr_nsff.priors.poses.lens import PINHOLE, LensTuning, Mapping
 from hdr_nsff.priors.poses.lightglue import LightGlueTuning, Matcher, match_images, upsample
@@ -336,11 +336,12 @@ def failure_message(
 ) -> str:
     """Why there are no poses, for which frames, and what to do."""
     count, width = len(views.of_frame), views.images.shape[2]
+    advice = ADVICE if len(views.groups) == 1 else RIG_ADVICE
     if model is None:
         last_error = f"; the last error was: {failures[-1]}" if failures else ""
         return (
             "poses failed: no two frames could be matched "
-            f"(no common texture seen from two places){last_error}; {ADVICE}"
+            f"(no common texture seen from two places){last_error}; {advice}"
         )
     registered = views_of_images(model)
     missing = [t for t in range(count) if int(views.of_frame[t]) not in registered]
@@ -349,11 +350,11 @@ def failure_message(
         focal = next(iter(model.cameras.values())).K[0, 0] / scale
         return (
             f"poses failed: the estimated focal length of {focal:.0f} px is impossible "
-            f"for {width} px wide frames; {ADVICE}"
+            f"for {width} px wide frames; {advice}"
         )
     return (
         f"poses failed: {len(missing)} of {count} frames could not be registered "
-        f"(frames {format_ranges(missing)}); {ADVICE}"
+        f"(frames {format_ranges(missing)}); {advice}"
     )
 
 
