@@ -58,7 +58,7 @@ def compare_both(
 
 @pytest.mark.parametrize(
     ("seed", "channels", "size", "count"),
-    [(0, 4, (24, 16), 15), (1, 1, (16, 8), 30), (2, 17, (16, 16), 12), (3, 7, (1, 1), 9),
+    [(0, 4, (24, 20), 15), (1, 1, (16, 8), 30), (2, 17, (16, 16), 12), (3, 7, (1, 1), 9),
      (4, 7, (32, 32), 9)],
 )  # fmt: skip
 def test_random_scenes(seed: int, channels: int, size: tuple[int, int], count: int) -> None:
@@ -91,7 +91,7 @@ def test_no_gaussians() -> None:
 
 @pytest.mark.parametrize("size", [1e-6, 1000.0])
 def test_dust_and_giants(size: float) -> None:
-    view = camera(16, 16)
+    view = camera(20, 16)
     gaussians = scene(5, view, count=20)
     gaussians[2] = (gaussians[2] * size).float().double()
     gaussians[3] = (gaussians[3] * 0.3).float().double()  # light gets through all of them
@@ -99,7 +99,7 @@ def test_dust_and_giants(size: float) -> None:
 
 
 def test_needles() -> None:
-    view = camera(16, 16)
+    view = camera(20, 16)
     gaussians = scene(5, view, count=20)
     gaussians[2] = torch.tensor([3.0, 1e-5, 1e-5]).double().expand(20, 3)
     compare_both(gaussians, view)

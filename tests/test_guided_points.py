@@ -3,6 +3,7 @@ known.
 """
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,63 +11,64 @@ from posed_clips import BOARDS, H, K, W, sliding
 
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import read_npy
-from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.prepare import prepare
 from hdr_nsff.prepare.work import PrepareConfig
-from hdr_nsff.priors.poses.guided_points import (
-    GuidedTuning,
-    line_distances,
-    points_between_cameras,
-    triangulate_pair,
-)
+from hdr_nsff.priors.depth.guided_points import line_distances, points_between_cameras
+from hdr_nsff.scene.posed_video import PosedVideo
 from hdr_nsff.scene.scene import Scene
 
 EYES = np.array([(-0.5, 0, 0), (0, 0.2, 0.1), (0.5, -0.1, 0)])
 
 
-def poses_at(eyes: np.ndarray) -> Poses:
-    """Cameras at `eyes` (T, 3) that look along +z."""
-    c2w = np.concatenate([np.tile(np.eye(3), (len(eyes), 1, 1)), eyes[:, :, None]], 2)
-    return Poses(np.tile(K, (len(eyes), 1, 1)), c2w, np.ones(len(eyes), bool), "full")
+def boards_from(eyes: np.ndarray) -> PosedVideo:
+    """The boards at one instant, by cameras at EYES that are said to be at `eyes`."""
+    c2w = np.concatenate([np.tile(np.eye(3), (3, 1, 1)), eyes[:, :, None]], 2)
+    nowhere = np.zeros((3, H, W), bool)
+    video = sliding(EYES).astype(np.float32)
+    return PosedVideo(np.tile(K, (3, 1, 1)), c2w, np.zeros(3), video, nowhere, nowhere)
 
 
 def test_points_lie_on_the_boards():
-    video, hidden = sliding(EYES).astype(np.float32), np.zeros((3, H, W), bool)
-    found = points_between_cameras(poses_at(EYES), video, hidden, np.zeros(3))
+    clip = boards_from(EYES)
+    points, tracks = points_between_cameras(clip)
     depths = np.array([depth for depth, _, _ in BOARDS])
-    off = np.abs(found.points[:, 2:] / depths - 1).min(1)
-    assert len(found.points) > 100 and np.mean(off < 0.03) > 0.97
-    assert np.bincount(found.tracks[:, 1].astype(int)).tolist() == [2] * len(found.points)
-    assert found.point_errors.max() < GuidedTuning().max_error_px
+    off = np.abs(points[:, 2:] / depths - 1).min(1)
+    assert len(points) > 100 and np.mean(off < 0.03) > 0.97
+    frames, rows = tracks[:, :2].T.astype(int)
+    assert np.bincount(rows).tolist() == [2] * len(points)
+    for i in range(3):
+        seen = frames == i
+        pixels, _, inside = clip.project(i, points[rows[seen]])
+        assert inside.all() and np.abs(pixels - tracks[seen, 2:]).max() < 2
 
 
 def test_nothing_is_found_in_pixels_that_are_ignored_or_at_different_times():
-    video, hidden = sliding(EYES).astype(np.float32), np.zeros((3, H, W), bool)
-    hidden[:, :, : W // 2] = True
-    found = points_between_cameras(poses_at(EYES), video, hidden, np.zeros(3))
-    assert len(found.points) and found.tracks[:, 2].min() > W // 2
-    for ignore, times in ((np.ones_like(hidden), np.zeros(3)), (hidden, np.arange(3.0))):
-        poses = poses_at(EYES)
-        assert points_between_cameras(poses, video, ignore, times) is poses
+    clip = boards_from(EYES)
+    left = np.zeros((3, H, W), bool)
+    left[:, :, : W // 2] = True
+    for hidden in (replace(clip, moving=left), replace(clip, clipped=left)):
+        points, tracks = points_between_cameras(hidden)
+        assert len(points) and tracks[:, 2].min() > W // 2
+    everywhere = np.ones_like(left)
+    for empty in (replace(clip, moving=everywhere), replace(clip, times=np.arange(3.0))):
+        points, tracks = points_between_cameras(empty)
+        assert (points.shape, tracks.shape) == ((0, 3), (0, 4))
 
 
 def test_wrong_poses_find_no_points():
-    video, hidden = sliding(EYES).astype(np.float32), np.zeros((3, H, W), bool)
-    wrong = poses_at(EYES[:, [1, 0, 2]] * (3, -1, 1))
-    assert len(points_between_cameras(wrong, video, hidden, np.zeros(3)).points) == 0
+    points, _ = points_between_cameras(boards_from(EYES[:, [1, 0, 2]] * (3, -1, 1)))
+    assert len(points) == 0
 
 
-def test_a_point_is_found_on_its_line_and_where_it_is():
-    point, poses = np.array([[0.3, -0.2, 4.0]]), poses_at(EYES)
-    local = point - EYES[:2]
-    p, q = local[:, None, :2] / local[:, None, 2:] * K[0, 0] + (W / 2, H / 2)
-    assert line_distances(poses, 0, 1, p, q) == pytest.approx(0, abs=1e-9)
-    along = EYES[1] - EYES[0]
-    across = np.array([[-along[1], along[0]]]) / np.hypot(*along[:2])
-    assert 1.5 < line_distances(poses, 0, 1, p, q + 2 * across)[0, 0] <= 2
-    found, error = triangulate_pair(poses, 0, 1, p, q)
-    assert found == pytest.approx(point) and error == pytest.approx(0, abs=1e-9)
-    assert np.isinf(triangulate_pair(poses, 0, 1, q, p)[1]).all()  # rays meet behind
+def test_a_pixel_is_as_far_from_the_line_as_it_was_moved():
+    point, clip = np.array([[0.3, -0.2, 4.0]]), boards_from(EYES)
+    p, q = (clip.project(i, point)[0] for i in (0, 1))
+    assert line_distances(clip, 0, 1, p, q) == pytest.approx(0, abs=1e-9)
+    far, _, _ = clip.project(1, EYES[0] + 2 * (point - EYES[0]))  # on the line too
+    along = (far - q) / np.linalg.norm(far - q)
+    across = along[:, ::-1] * (1, -1)
+    moved = np.concatenate([q + 2 * across, q + 5 * along])
+    assert line_distances(clip, 0, 1, p, moved)[0] == pytest.approx([2, 0], abs=1e-9)
 
 
 def test_still_cameras_with_given_poses_have_depth_and_whole_masks(tmp_path):

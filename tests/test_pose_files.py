@@ -195,6 +195,18 @@ def test_still_cameras_have_one_pose_for_all_of_their_frames(tmp_path, names):
         assert np.allclose(poses.c2w, C2W[[2, 0, 1]])
 
 
+def test_one_pose_is_not_that_of_all_frames_of_a_clip(tmp_path):
+    document = transforms()
+    document["frames"] = document["frames"][:1]
+    write(tmp_path / "transforms.json", document)
+    with pytest.raises(InputError, match="1 poses for 3 frames"):
+        import_poses(tmp_path, [f"clip.mp4#{k}" for k in range(3)], (H, W))
+    document["frames"][0]["file_path"] = "clip.mp4"  # it stood still
+    write(tmp_path / "transforms.json", document)
+    poses = import_poses(tmp_path, [f"clip.mp4#{k}" for k in range(3)], (H, W))
+    assert np.allclose(poses.c2w, C2W[[0, 0, 0]]) and poses.parallax == "none"
+
+
 def test_a_frame_of_a_video_without_a_pose_lies_between_those_of_its_camera(tmp_path):
     colmap_text(tmp_path, ["left.mp4#0", "left.mp4#2", "right.mp4#0"])
     sources = ["left.mp4#0", "left.mp4#1", "left.mp4#2", "right.mp4#0"]

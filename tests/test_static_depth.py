@@ -27,12 +27,13 @@ def test_the_least_spacing_is_of_cameras_at_different_places() -> None:
 
 @pytest.mark.parametrize("rig", [1, 3])
 @pytest.mark.parametrize("share", [0.0, MIN_KNOWN_SHARE / 2, 2 * MIN_KNOWN_SHARE])
+@pytest.mark.parametrize("least", [0.0, 0.3])  # confidence of the other pixels
 def test_depth_that_cameras_hardly_agree_about_is_a_picture_before_each(
-    share: float, rig: int, monkeypatch: pytest.MonkeyPatch
+    least: float, share: float, rig: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def found(clip: Any, *arguments: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert len(clip.video) == 3  # one picture of each camera
-        confidence = np.zeros((3, H, W), np.float32)
+        confidence = np.full((3, H, W), least, np.float32)
         confidence[:, :, : round(share * W)] = 1
         depth = np.broadcast_to(np.float32([[[2]], [[3]], [[4]]]), confidence.shape)
         return 1 / depth, confidence, np.zeros(confidence.shape, bool)
@@ -41,7 +42,8 @@ def test_depth_that_cameras_hardly_agree_about_is_a_picture_before_each(
     work = work_of(cameras_at(*EYES), rig)
     disparity, confidence, still = depth_of_cameras(work, CAMERA_OF, np.zeros((0, 3)))
     assert not still.any() and still.shape == (6, H, W)
-    by_chance = rig == 1 and 0 < share < MIN_KNOWN_SHARE
+    hints = share > 0 or least > 0
+    by_chance = rig == 1 and hints and share < MIN_KNOWN_SHARE
     for t, camera in enumerate(CAMERA_OF):
         assert disparity[t] == pytest.approx(1 / (0.15 if by_chance else 2 + camera))
-        assert confidence[t].any() == (share > 0 and not by_chance)
+        assert confidence[t].any() == (hints and not by_chance)

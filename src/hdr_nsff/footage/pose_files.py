@@ -150,13 +150,13 @@ def rows_of_cameras(
     """The rows, of `count` poses with these `names`, that belong to each of `cameras`.
 
     A pose is a camera's if its file or its folder has the camera's name; one pose per
-    camera may also come in the cameras' order. None where neither fits.
+    camera of several may also come in the cameras' order. None where neither fits.
     """
     ends = [(camera_of(f"{name}#"), camera_of(name)) for name in names or ()]
     rows_of = [[row for row, end in enumerate(ends) if camera in end] for camera in cameras]
     if rows_of and all(rows_of):
         return rows_of
-    return [[row] for row in range(count)] if count == len(cameras) else None
+    return [[row] for row in range(count)] if count == len(cameras) > 1 else None
 
 
 def camera_of(source: str) -> str:

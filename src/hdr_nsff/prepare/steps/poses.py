@@ -19,6 +19,7 @@ from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.masks import given_masks
 from hdr_nsff.prepare.tracks import best_track, share_masks, share_poses, track_frames
 from hdr_nsff.prepare.work import Work
+from hdr_nsff.priors.depth.guided_points import points_between_cameras
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import (
     PosesTuning,
@@ -29,10 +30,10 @@ from hdr_nsff.priors.poses.estimate import (
     rotation_poses,
     still_panorama,
 )
-from hdr_nsff.priors.poses.guided_points import points_between_cameras
 from hdr_nsff.priors.poses.reconstruct import tuning_for_lenses
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import choose_visits
+from hdr_nsff.scene.posed_video import PosedVideo
 
 MAX_ROUNDS = 2  # of structure from motion after the first
 MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the same
@@ -108,8 +109,10 @@ def with_common_points(work: Work, poses: Poses) -> Poses:
     times = np.array([f.time for f in work.manifest.frames])
     video, clipped = work.equalized
     moving = geometric_mask(*work.raw_flows, video, poses.K, poses.c2w)
-    found = points_between_cameras(poses, video, moving | np.array(clipped), times)
-    say(f"poses: {len(found.points)} static points matched between the cameras")
+    clip = PosedVideo(poses.K, poses.c2w, times, video, clipped, moving)
+    points, tracks = points_between_cameras(clip)
+    say(f"poses: {len(points)} static points matched between the cameras")
+    found = replace(poses, points=points, tracks=tracks)
     return found if found.near else with_depth_range(found)
 
 

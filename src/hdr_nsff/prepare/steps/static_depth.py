@@ -116,7 +116,7 @@ def depth_of_cameras(
     no_flow = np.zeros((0, *clip.size, 2)), np.zeros((0, *clip.size), bool), np.zeros((0, 2), int)
     disparity, confidence, _ = static_geometric_depth(clip, *no_flow, points)
     known = np.mean([(map > KNOWN).mean() for map in confidence])
-    if work.manifest.rig == 1 and 0 < known < MIN_KNOWN_SHARE:
+    if work.manifest.rig == 1 and np.any(confidence) and known < MIN_KNOWN_SHARE:
         distance = np.float32(least_spacing(clip.c2w) / 2)
         say(
             f"depth: the cameras agree about {known:.0%} of the pixels only; what each sees is put "

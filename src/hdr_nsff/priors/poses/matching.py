@@ -126,9 +126,18 @@ def match_keypoints(
     a: Keypoints, b: Keypoints, tuning: MatchingTuning = MatchingTuning()
 ) -> tuple[np.ndarray, np.ndarray]:
     """Positions (M, 2), (M, 2) of mutual nearest neighbors that pass the ratio test."""
-    if len(a.xy) < 2 or len(b.xy) < 2:
-        return np.zeros((0, 2)), np.zeros((0, 2))
-    cosine = a.descriptors @ b.descriptors.T
+    rows, columns = mutual_neighbors(a.descriptors @ b.descriptors.T, tuning.max_ratio)
+    return a.xy[rows], b.xy[columns]
+
+
+def mutual_neighbors(
+    cosine: np.ndarray, max_ratio: float, min_cosine: float = -1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (M,) and columns (M,) of the `cosine` (A, B) of descriptors that are each
+    other's best, above `min_cosine`, and pass the ratio test; `cosine` is changed.
+    """
+    if min(cosine.shape) < 2:
+        return np.zeros(0, int), np.zeros(0, int)
     best = np.argmax(cosine, 1)
     rows = np.arange(len(best))
     best_cosine = cosine[rows, best]
@@ -136,9 +145,9 @@ def match_keypoints(
     cosine[rows, best] = -1
     second_cosine = cosine.max(1)
     # squared distances of unit vectors are 2 (1 - cosine)
-    distinct = 1 - best_cosine < tuning.max_ratio**2 * (1 - second_cosine)
-    kept = mutual & distinct
-    return a.xy[kept], b.xy[best[kept]]
+    distinct = 1 - best_cosine < max_ratio**2 * (1 - second_cosine)
+    kept = mutual & distinct & (best_cosine > min_cosine)
+    return rows[kept], best[kept]
 
 
 def match_pairs(
