@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.rendering.chan import write_chan
 from hdr_nsff.rendering.export_scene import export_chan
+from hdr_nsff.rendering.shot_views import plan_shot
 from hdr_nsff.scene.scene import Scene
 
 
@@ -60,3 +62,13 @@ def test_only_camera_files_are_replaced(tmp_path: Path) -> None:
     path.write_text("my notes")
     with pytest.raises(InputError, match="was not made by export"):
         export_chan(run, path)
+
+
+def test_two_tracks_of_one_camera_have_one_line_for_every_picture(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    second = [replace(f, index=f.index + len(run.scene.train)) for f in run.scene.train]
+    both = replace(run, scene=replace(run.scene, train=run.scene.train + second))
+    assert len(plan_shot(both, "training").views) == len(run.scene.train)
+    export_chan(both, tmp_path / "both.chan")
+    export_chan(run, tmp_path / "one.chan")
+    assert (tmp_path / "both.chan").read_text() == (tmp_path / "one.chan").read_text()

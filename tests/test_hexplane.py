@@ -13,13 +13,15 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image
 from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate
-from hdr_nsff.fields.baselines.hexplane import NUM_GROWTHS, HexPlane
+from hdr_nsff.fields.baselines.hexplane import NUM_GROWTHS, HexPlane, HexPlaneConfig
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.rendering.export import ExportConfig, export
 from hdr_nsff.rendering.output import Output
 from hdr_nsff.rendering.render import RenderConfig, render
 from hdr_nsff.scene.batch import PixelBatch, Recorder, draw_pixels
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training.config import check_config
+from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
 
@@ -156,3 +158,10 @@ def test_a_run_is_evaluated_at_every_exposure_and_has_no_gaussians_to_export(
     assert psnr == pytest.approx(-10 * math.log10(mse), abs=0.05)
     with pytest.raises(InputError, match="Gaussian"):
         export(ExportConfig(run_of, tmp_path / "a.ply", ply=True))
+
+
+def test_planes_that_would_have_to_shrink_are_refused(tmp_path: Path) -> None:
+    field = HexPlaneConfig(coarsest=64, finest=40)
+    config = replace(PRESETS["hdr-hexplane"], scene=tmp_path, field=field)
+    with pytest.raises(InputError, match=r"--field.finest 40: .*--field.coarsest 64"):
+        check_config(config)

@@ -165,3 +165,10 @@ def test_a_velocity_is_the_median_of_the_nearest_believed_ones() -> None:
     found = velocities_around(torch.tensor([[0.0, 0.0], [29.0, 29.0]]), pixels, velocities)
     assert found[:, 0].tolist() == [1.0, 0.0]
     assert float(velocities_around(torch.zeros(2, 2), pixels[:0], velocities[:0]).abs().max()) == 0
+
+
+def test_fewer_gaussians_than_frames_are_spread_over_the_clip(soft: Scene) -> None:
+    field = Splat(SplatConfig(static=400, moving=0, local=3), soft.times, 1.0, 6.0, 60 * 34)
+    with torch.no_grad():
+        assert place_local(field.local, soft, recorded, soft.near) == 3
+    assert field.local.means.detach()[:, 3].tolist() == [0, 2, 5]

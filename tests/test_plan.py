@@ -4,16 +4,23 @@ settings and folders.
 
 from __future__ import annotations
 
+import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pytest
 from bad_input import Capture, call, refused
 from test_bench_scenes import made
 
+from hdr_nsff.bench.bench import MEASURING_SHARE, share_done
 from hdr_nsff.bench.config import BenchConfig, BenchRun
-from hdr_nsff.bench.plan import make_plan
+from hdr_nsff.bench.plan import check_run, make_plan
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene.scene import Manifest
+from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.presets import PRESETS
+from hdr_nsff.training.run_folder import open_folder, stored_config
 
 
 def runs_of(
@@ -126,3 +133,19 @@ def test_a_folder_of_other_files_is_left_alone(
     command = bench_words(tmp_path / "mine", toy_folder)
     assert "holds other files" in refused(capsys, *command)
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["results.csv"]
+
+
+def test_an_open_budget_is_that_of_the_run(toy_folder: Path, tmp_path: Path) -> None:
+    (run,) = runs_of(tmp_path, toy_folder, "splat")
+    assert run.config.budget == Budget()
+    assert share_done(run) == 0  # nothing is there yet
+    started = replace(run.config, budget=Budget(minutes=2.0))  # as `train` completes it
+    open_folder(started)
+    line = {"step": 5, "seconds": 60.0, "psnr": 20.0, "rays_per_second": 1.0, "losses": {}}
+    (run.folder / "log.jsonl").write_text(json.dumps(line) + "\n", encoding="utf-8")
+    assert share_done(run) == pytest.approx((1 - MEASURING_SHARE) / 2)
+    check_run(run)  # the same command continues
+    assert stored_config(run.folder)[0] == started
+    other = replace(run, config=replace(run.config, budget=Budget(minutes=3.0)))
+    with pytest.raises(InputError, match="other settings"):
+        check_run(other)

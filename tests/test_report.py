@@ -6,20 +6,28 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from estimates import tone_mapper
 from fakes import fake_run
 from test_scores import truth_of, with_flow
+from torch import Tensor
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.evaluation.evaluate import evaluate_run
 from hdr_nsff.evaluation.report import ReportConfig, find_viewer, report, write_report
+from hdr_nsff.evaluation.report.pictures import recorded_frame, side_by_side
 from hdr_nsff.evaluation.report.plots import moving_average
+from hdr_nsff.geometry.paths import PathView
+from hdr_nsff.rendering.output import Output
+from hdr_nsff.rendering.shot_views import plan_shot
+from hdr_nsff.rendering.shots import describe_view
 from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.training.run_folder import Run
 
@@ -208,3 +216,33 @@ def test_learned_exposures_are_called_learned(tmp_path: Path) -> None:
     run = replace(run, scene=replace(run.scene, manifest=manifest))
     text, _ = read(write_report(run, tmp_path / "r.html", tmp_path / "render"))
     assert "learned" in text and "none given" in text
+
+
+def test_pictures_of_other_views_are_left_out(finished: tuple[Run, Path], tmp_path: Path) -> None:
+    run, folder = finished
+    renders = tmp_path / "render"
+    shutil.copytree(folder / "render", renders)
+    assert side_by_side(run, renders) is not None
+    note = json.loads((renders / "training/sequence.json").read_text())
+    note["views"] += note["views"][:2]  # as if `render --path training` had made more
+    (renders / "training/sequence.json").write_text(json.dumps(note))
+    assert side_by_side(run, renders) is None
+
+
+def test_the_recorded_frame_is_of_the_camera_of_the_view(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    beside = [
+        replace(f, index=f.index + 6, camera_id=1, camera=f.camera.moved(shifted(f.camera.c2w)))
+        for f in run.scene.train
+    ]
+    rig = replace(run, scene=replace(run.scene, train=run.scene.train + beside))
+    views = [describe_view(rig, v, Output()) for v in plan_shot(rig, "training").views]
+    assert [recorded_frame(rig, view).index for view in views] == [v.frame for v in views]
+    assert sorted(view.frame or 0 for view in views) == list(range(12))
+    between = describe_view(rig, PathView(run.scene.train[0].camera, 2.2), Output())
+    assert between.frame is None and recorded_frame(rig, between).time == 2
+
+
+def shifted(c2w: Tensor) -> Tensor:
+    """A pose (3, 4) a little to the right."""
+    return c2w + torch.eye(3, 4).roll(3, 1) * 0.3

@@ -14,7 +14,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene import scene as scene_module
 from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
 from hdr_nsff.scene.movers import write_movers
-from hdr_nsff.scene.scene import Scene, neighbors, outline
+from hdr_nsff.scene.scene import Frame, Scene, StoredFrame, neighbors, outline
 
 
 def entry(index: int, time: float, camera: int = 0) -> FrameEntry:
@@ -118,3 +118,13 @@ def test_frames_are_forgotten_and_read_again(
     assert scene.train[0].image is not first and torch.equal(scene.train[0].image, first)
     moved = replace(scene.train[0], time=9.0)
     assert moved.time == 9.0 and torch.equal(moved.image, first)
+
+
+def test_a_frame_of_another_camera_stays_in_the_folder(toy_folder: Path) -> None:
+    frame = Scene.open(toy_folder).train[1]
+    turned = frame.with_camera(frame.camera.resized(7, 5))
+    assert (turned.camera.width, turned.index, turned.flow.keys()) == (7, 1, frame.flow.keys())
+    assert torch.equal(turned.image, frame.image)
+    assert isinstance(turned, StoredFrame) and turned.load is frame.load
+    held = Frame(0, 0.0, frame.camera, 0, 0, frame.image)
+    assert held.with_camera(turned.camera).camera is turned.camera

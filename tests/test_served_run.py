@@ -125,6 +125,10 @@ def test_videos_of_render_and_of_run_are_served(
         (renders / name).write_bytes(b"")
     videos = {f"/video/{name}": renders / name for name in ("training.mp4", "training_hlg.mp4")}
     assert served.videos() == videos
+    again = tmp_path / "run/render"  # where `render` puts them
+    again.mkdir()
+    (again / "training.mp4").write_bytes(b"")
+    assert served.videos() == videos | {"/video/training.mp4": again / "training.mp4"}
     assert '{"href": "video/training_hlg.mp4", "text": "HDR clip"}' in served.page()
 
 

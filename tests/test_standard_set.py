@@ -77,6 +77,12 @@ def test_thinned_shots_drop_views_evenly_and_keep_eight() -> None:
     assert cut([1.0] * 20, 1, 1.0, thin=True)[1][::7] == [0, 19]
 
 
-def test_the_set_needs_its_exr_sequence(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="--exr none"):
-        render_all(fake_run(tmp_path), tmp_path, output=Output(exr="none"))
+@pytest.mark.parametrize(
+    ("output", "option"), [(Output(exr="none"), "--exr none"), (Output(png=False), "--no-png")]
+)
+def test_the_set_needs_its_exr_sequence_and_pictures(
+    tmp_path: Path, output: Output, option: str
+) -> None:
+    with pytest.raises(InputError, match=option):
+        render_all(fake_run(tmp_path), tmp_path / "out", output=output)
+    assert not (tmp_path / "out").exists()

@@ -11,6 +11,7 @@ import torch
 from test_export_gaussians import SH_0, make_run, splat
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.fields.kernels.footprint import NEAREST
 from hdr_nsff.rendering import usd
 from hdr_nsff.rendering.export_scene import export_usd, keep_sign
 from hdr_nsff.scene.scene import Scene
@@ -99,3 +100,8 @@ def test_quaternions_never_jump_to_their_negative() -> None:
     one = np.array([0.5, 0.5, 0.5, 0.5])
     seen = keep_sign(np.stack([one, -one, -one, one])[:, None])
     assert np.array_equal(seen, np.tile(one, (4, 1, 1)))
+
+
+def test_the_camera_clips_nothing_that_is_drawn(stage: Any) -> None:
+    near, far = UsdGeom.Camera.Get(stage, "/Scene/Camera").GetClippingRangeAttr().Get()
+    assert near == pytest.approx(NEAREST) and far > 1e5

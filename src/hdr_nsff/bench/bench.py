@@ -23,8 +23,8 @@ from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import bar, say
 from hdr_nsff.core.tensors import pick_device
-from hdr_nsff.maths.metrics import Lpips
-from hdr_nsff.training.run_folder import last_logged
+from hdr_nsff.evaluation.evaluate import load_lpips
+from hdr_nsff.training.run_folder import last_logged, stored_config
 
 __all__ = ["BenchConfig", "bench"]
 
@@ -41,7 +41,7 @@ def bench(config: BenchConfig) -> None:
             print(shell_line(arguments(config, run.name)))
         return
     if config.lpips is not None:
-        Lpips(config.lpips)  # refuses unreadable weights before anything is trained
+        load_lpips(config.lpips)  # refuses unreadable weights before anything is trained
     if config.devices is None:
         pick_device(config.device)
     # A part of a benchmark (`--only`) leaves the folder's lock to the benchmark itself.
@@ -148,7 +148,8 @@ def share_done(run: BenchRun) -> float:
     line = last_logged(run.folder)
     if line is None:
         return 0.0
-    share = run.config.budget.progress(line.step, line.seconds)
+    budget = stored_config(run.folder)[0].budget  # an open one follows the clip there
+    share = budget.progress(line.step, line.seconds)
     return (1 - MEASURING_SHARE) * min(share, 1.0)
 
 

@@ -55,6 +55,7 @@ class SequenceView(Note):
 
     time: float  # in frames
     ev: float | None
+    frame: int | None = None  # the training frame filmed there, by its index in the clip
 
 
 class Sequence(Note):

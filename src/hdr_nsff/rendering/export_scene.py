@@ -19,6 +19,7 @@ from hdr_nsff.rendering import usd
 from hdr_nsff.rendering.chan import is_chan, write_chan
 from hdr_nsff.rendering.export_gaussians import NOT_OURS
 from hdr_nsff.rendering.exr_header import neutral_gains
+from hdr_nsff.rendering.shot_views import plan_shot
 from hdr_nsff.training.run_folder import Run
 
 CHAN = ".chan"
@@ -127,7 +128,7 @@ def export_chan(run: Run, path: Path) -> Path:
     """Write the cameras of `render --path training`, by the numbers of its pictures."""
     if path.exists() and not is_chan(path):
         raise InputError(f"{path}: {NOT_OURS}; choose another name")
-    frames = sorted(run.scene.train, key=lambda f: f.time)
-    write_chan(path, [frame.camera for frame in frames])
-    say(f"{path}: {len(frames)} cameras, numbered as the pictures of the training path")
+    views = plan_shot(run, "training").views
+    write_chan(path, [view.camera for view in views])
+    say(f"{path}: {len(views)} cameras, numbered as the pictures of the training path")
     return path

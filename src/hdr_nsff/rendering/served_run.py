@@ -55,21 +55,25 @@ class ServedRun:
             for name, text in VIDEOS.items()
             if f"{name}.mp4" in names
         ]
-        clip = find_hdr_clip(self.run, self.renders().parent)
+        clip = self.hdr_clip()
         link = None if clip is None else Link(names[clip.name], HDR_CLIP)
         return make_page(self.title, None, PageSettings(videos, link, server=True))
 
-    def renders(self) -> Path:
-        """The folder of the run's videos: that of `render`, else that of `run`."""
-        own = self.folder / "render"
-        beside = self.folder.resolve().parent / "render"
-        return beside if self.folder.resolve().name == "run" and not own.is_dir() else own
+    def places(self) -> list[Path]:
+        """Folders where the run's videos may be: those of `render`, then of `run`."""
+        own, beside = self.folder, self.folder.resolve().parent
+        return [
+            p / "render" for p in ((own, beside) if beside / "run" == own.resolve() else (own,))
+        ]
+
+    def hdr_clip(self) -> Path | None:
+        return find_hdr_clip(self.run, self.places()[-1].parent)
 
     def videos(self) -> dict[str, Path]:
-        files = [self.renders() / f"{name}.mp4" for name in VIDEOS]
-        clip = find_hdr_clip(self.run, self.renders().parent)
-        files += [] if clip is None else [clip]
-        return {f"/video/{file.name}": file for file in files if file.is_file()}
+        found = [place / f"{name}.mp4" for name in VIDEOS for place in reversed(self.places())]
+        clip = self.hdr_clip()
+        found += [] if clip is None else [clip]
+        return {f"/video/{file.name}": file for file in found if file.is_file()}
 
     def scene(self) -> bytes:
         with self.lock:

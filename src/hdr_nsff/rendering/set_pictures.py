@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.exr import read_exr
@@ -22,7 +21,7 @@ from hdr_nsff.rendering.develop import develop_view
 from hdr_nsff.rendering.exr_header import unbalance
 from hdr_nsff.rendering.fingerprint import fingerprint
 from hdr_nsff.rendering.output import Output, Shot
-from hdr_nsff.scene.scene import Frame
+from hdr_nsff.rendering.shots import filmed_frame
 from hdr_nsff.training.run_folder import Run
 
 MIN_EV_RANGE = 0.5  # stops: a clip of less has one exposure (hand-chosen)
@@ -153,14 +152,8 @@ def write_overview(run: Run, out: Path, shot: Shot, evs: Sequence[float], moves:
     positions = np.linspace(0, len(shot.views) - 1, OVERVIEW_ROWS).tolist()
     rows = []
     for i in sorted({round(position) for position in positions}):
-        recorded = frame_of(run, shot.views[i]).image.cpu().numpy()
+        frame = filmed_frame(run, shot.views[i])
+        assert frame is not None, "a view of the training path"
+        recorded = frame.image.cpu().numpy()
         rows.append([recorded, *(read_image(folder / f"{i:05d}.png") for folder in folders)])
     write_png(out / "overview.png", contact_sheet(rows))
-
-
-def frame_of(run: Run, view: PathView) -> Frame:
-    """The training frame that a view of the training path was filmed as."""
-    for frame in run.scene.train:
-        if frame.time == view.time and torch.equal(frame.camera.c2w, view.camera.c2w):
-            return frame
-    raise AssertionError(f"no training frame at time {view.time} and this pose")

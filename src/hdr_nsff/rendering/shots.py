@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
@@ -21,6 +22,7 @@ from hdr_nsff.core.hdr_video import check_side
 from hdr_nsff.core.images import contact_sheet, read_image, write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.core.video import write_video
+from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.radiometry.hdr_stills import still_path, still_paths
 from hdr_nsff.rendering.develop import display_exposure
 from hdr_nsff.rendering.fingerprint import fingerprint
@@ -28,6 +30,7 @@ from hdr_nsff.rendering.hdr_shots import hdr_files, hdr_paths, write_hdr_stills,
 from hdr_nsff.rendering.mattes import ObjectMattes
 from hdr_nsff.rendering.output import Output, Shot, ev_of, picture_settings
 from hdr_nsff.rendering.write_view import open_look, write_view
+from hdr_nsff.scene.scene import Frame
 from hdr_nsff.training.run_folder import Run
 
 SHEET_VIEWS = 12  # on a contact sheet
@@ -76,6 +79,21 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     return result
 
 
+def filmed_frame(run: Run, view: PathView) -> Frame | None:
+    """The training frame that was filmed from a view at its time, if any."""
+    for frame in run.scene.train:
+        if frame.time == view.time and torch.equal(frame.camera.c2w, view.camera.c2w):
+            return frame
+    return None
+
+
+def describe_view(run: Run, view: PathView, output: Output) -> notes.SequenceView:
+    """A view of a shot in its note."""
+    frame = filmed_frame(run, view)
+    index = None if frame is None else frame.index
+    return notes.SequenceView(time=view.time, ev=ev_of(view, output), frame=index)
+
+
 def open_sequence(
     run: Run, shot: Shot, folder: Path, output: Output, products: Sequence[Path]
 ) -> notes.Sequence:
@@ -102,7 +120,7 @@ def open_sequence(
         step=run.step,
         fps=shot.fps,
         display_exposure=display_exposure(run, shot.views),
-        views=[notes.SequenceView(time=v.time, ev=ev_of(v, output)) for v in shot.views],
+        views=[describe_view(run, v, output) for v in shot.views],
         seconds=0.0,
     )
     notes.write(path, note)

@@ -63,6 +63,9 @@ def render_all(
 ) -> dict[str, Path]:
     """Render the standard set within about `budget` seconds; its files by name."""
     output = output or Output()
+    if not output.png:
+        problem = "the overview and the report are made from the standard set's pictures"
+        raise InputError(f"--no-png: {problem}; leave it out, or choose one --path")
     if output.exr == "none":
         problem = "the standard set is made from its EXR sequence"
         raise InputError(f"--exr none: {problem}; choose --exr half or float")
@@ -127,7 +130,7 @@ def fit_to_budget(
         scale, chosen = plan[shot.name].scale, plan[shot.name].views
         if scale < 1 or len(chosen) < len(shot.views):
             made = f"{len(chosen)} of {len(shot.views)} views at {scale:.0%} size"
-            command = f"hdr-nsff render {run.folder} --path {shot.name}"
+            command = f"hdr-nsff render {run.folder} --path {shot.name} --out {out}"
             say(f"{shot.name}: {made}, to keep to {budget:.0f} s; `{command}` makes them all")
         fps = shot.fps
         if shot.name in THINNED:  # skipped views do not make it faster

@@ -17,6 +17,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import atomic
+from hdr_nsff.fields.kernels.footprint import NEAREST
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.rendering.ply import SH_0
 
@@ -24,6 +25,7 @@ ENDINGS = (".usdc", ".usda", ".usd")
 LAYER_KEY = "hdrNsff"  # of customLayerData: by it, files are recognized as ours
 ROOT = "/Scene"
 FLIP = np.diag([1.0, -1.0, -1.0])  # OpenCV axes to +y up, -z forward, and back
+FARTHEST = 1e6  # z-depth of the camera's far plane, scene units: USD's default
 APERTURE = 36.0  # width of the film, tenths of a scene unit: any; focal lengths follow
 
 
@@ -135,6 +137,7 @@ def write_camera(stage: Any, cameras: Sequence[Camera], times: Sequence[float]) 
 
     prim = UsdGeom.Camera.Define(stage, f"{ROOT}/Camera")
     transform = prim.AddTransformOp()
+    prim.GetClippingRangeAttr().Set(Gf.Vec2f(NEAREST, FARTHEST))
     for camera, time in zip(cameras, times, strict=True):
         code = Usd.TimeCode(time)
         fx, fy, cx, cy = (float(camera.K[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))

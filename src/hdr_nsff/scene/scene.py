@@ -59,12 +59,18 @@ class Frame:
     flow: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W, 2)} px
     flow_valid: dict[int, Tensor] = field(default_factory=dict)  # {+-1: (H, W) bool}
 
+    def with_camera(self, camera: Camera) -> Frame:
+        """The same frame, of another camera."""
+        return dataclasses.replace(self, camera=camera)
+
 
 class StoredFrame(Frame):
     """A frame whose image and maps are read from the scene folder when they are asked
     for, and forgotten when others need the memory. Replacing a field makes a frame that
     holds all of them.
     """
+
+    load: Callable[[], Frame]
 
     def __init__(self, load: Callable[[], Frame] | None = None, **fields: Any) -> None:
         """`load` reads the whole frame; `fields` are those of `Frame` without its image
@@ -78,6 +84,11 @@ class StoredFrame(Frame):
             object.__setattr__(self, name, value)
         object.__setattr__(self, "load", load)
 
+    def with_camera(self, camera: Camera) -> Frame:
+        """The same frame, of another camera: image and maps stay in the folder."""
+        fields = {name: getattr(self, name) for name in LIGHT}
+        return StoredFrame(self.load, **fields | {"camera": camera})
+
 
 STORED = (
     "image",
@@ -88,6 +99,7 @@ STORED = (
     "flow",
     "flow_valid",
 )
+LIGHT = tuple(f.name for f in dataclasses.fields(Frame) if f.name not in STORED)
 
 
 def stored_value(name: str) -> property:
@@ -120,8 +132,7 @@ class FrameStore:
         """A frame, read once to check it; arguments as of `load_frame`."""
         self.arguments[entry.index] = (entry, neighbor_index, positions)
         whole = self.read(entry.index)
-        names = [f.name for f in dataclasses.fields(Frame) if f.name not in STORED]
-        light = {name: getattr(whole, name) for name in names}
+        light = {name: getattr(whole, name) for name in LIGHT}
         return StoredFrame(partial(self.read, entry.index), **light)
 
 

@@ -132,4 +132,8 @@ def check_config(config: TrainConfig) -> TrainConfig:
             f"--loss.dynamic {config.loss.dynamic:g}: this preset has no such term; "
             "give --rays and --moving-rays too, or leave it out"
         )
+    f = config.field
+    if isinstance(f, HexPlaneConfig) and f.finest < f.coarsest:
+        problem = f"fewer cells than --field.coarsest {f.coarsest}, which it starts with"
+        raise InputError(f"--field.finest {f.finest}: {problem}; raise it, or lower the other")
     return replace(config, scene=config.scene.resolve())

@@ -124,7 +124,7 @@ class PoseCorrections(GivenPoses):
     def frame(self, scene: Scene, position: int) -> Frame:
         """A training frame with its camera as corrected so far."""
         frame = scene.train[position]
-        return replace(frame, camera=self.camera(frame.camera, *self.frames[position]))
+        return frame.with_camera(self.camera(frame.camera, *self.frames[position]))
 
     def regularizers(self, frame: int) -> dict[str, Tensor]:
         """The penalty `pose` of the corrections of a training frame's camera.
@@ -182,7 +182,7 @@ class PoseCorrections(GivenPoses):
             if lens is None:
                 return f
             correction = self.cameras.get(pose_key(f))
-            return replace(f, camera=self.camera(f.camera, correction, lens))
+            return f.with_camera(self.camera(f.camera, correction, lens))
 
         train = [corrected(f) for f in scene.train]
         test = [corrected(f) for f in scene.test]

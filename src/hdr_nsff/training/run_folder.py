@@ -27,7 +27,7 @@ from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.scene.scene import Frame, Scene
 from hdr_nsff.tonemap.base import ToneMapper
 from hdr_nsff.tonemap.build import tone_mapper_for
-from hdr_nsff.training.budget import Clock
+from hdr_nsff.training.budget import Budget, Clock
 from hdr_nsff.training.config import TrainConfig
 from hdr_nsff.training.pose_corrections import poses_for
 
@@ -100,13 +100,15 @@ class Run:
 def open_folder(config: TrainConfig) -> None:
     """Start a run folder, or check that an existing one has these settings and scene.
 
-    The path of a scene that has moved is updated.
+    The path of a scene that has moved is updated. An open budget is that of the run.
     """
     out = config.out
     if (out / SCENE_FILE).exists():
         raise InputError(f"{out}: holds a scene; choose another --out for the run")
     if (out / CONFIG).exists():
         before, places = stored_config(out)
+        if config.budget == Budget():
+            config = replace(config, budget=before.budget)
         if replace(before, scene=config.scene, out=out, device=config.device) != config:
             raise InputError(
                 f"{out}: holds a run with other settings; "

@@ -104,16 +104,18 @@ def why_absent(renders: Path) -> str:
 def side_by_side(run: Run, renders: Path) -> SideBySide | None:
     """Rows of recorded frame, tone-mapped HDR, depth, scene flow and three exposures.
 
-    None where `render` has not made them.
+    None where `render` has not made them, or not of the views of `training`/.
     """
     ranges = notes.read(renders / "views.json", notes.PictureRanges)
     sequence = notes.read(renders / "training" / "sequence.json", notes.Sequence)
     if ranges is None or sequence is None:
         return None
     columns = picture_captions(ranges)
+    if not all(holds_pictures(renders / folder, len(sequence.views)) for folder in columns):
+        return None
     rows = []
     for i in spread(len(sequence.views), NUM_ROWS):
-        frame = nearest_frame(run, sequence.views[i].time)
+        frame = recorded_frame(run, sequence.views[i])
         ev = run.tonemapper.exposures()[frame.bracket].item()
         recorded = frame.image.cpu().numpy()
         row = [figure(recorded, f"recorded, frame {frame.index}, EV {ev:+.1f}")]
@@ -121,6 +123,12 @@ def side_by_side(run: Run, renders: Path) -> SideBySide | None:
             row.append(figure(read_image(renders / folder / f"{i:05d}.png"), caption))
         rows.append(row)
     return SideBySide(rows, ranges.moves)
+
+
+def holds_pictures(folder: Path, count: int) -> bool:
+    """Whether a folder holds the numbered pictures of `count` views, and of no more."""
+    there = [(folder / f"{i:05d}.png").is_file() for i in range(count + 1)]
+    return all(there[:count]) and not there[count]
 
 
 def picture_captions(ranges: notes.PictureRanges) -> dict[str, str]:
@@ -143,9 +151,9 @@ def spread(count: int, number: int) -> list[int]:
     return sorted({round(position) for position in positions})
 
 
-def nearest_frame(run: Run, time: float) -> Frame:
-    """The training frame nearest in time."""
-    return min(run.scene.train, key=lambda frame: abs(frame.time - time))
+def recorded_frame(run: Run, view: notes.SequenceView) -> Frame:
+    """The training frame filmed at a view, else the one nearest in time."""
+    return min(run.scene.train, key=lambda f: (f.index != view.frame, abs(f.time - view.time)))
 
 
 def held_out_views(folder: Path, metrics: dict[str, Any] | None) -> HeldOutViews | None:

@@ -9,6 +9,7 @@ from another exposure.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,6 +106,7 @@ def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, un
     num_pixels = sum(int(mask.sum()) for mask in masks)
     if not num_pixels or not len(local):
         return 0
+    masks = thinned(masks, len(local))
     side = math.sqrt(max(num_pixels / len(local), 1.0))
     while sum(count_cells(mask, side) for mask in masks) > len(local):
         side *= 1.01
@@ -125,6 +127,15 @@ def place_local(local: LocalGaussians, scene: Scene, to_radiance: ToRadiance, un
     local.colors[:n, 3] = math.log(OPACITY / (1 - OPACITY))
     local.find_neighbors(unit)
     return n
+
+
+def thinned(masks: Sequence[Tensor], most: int) -> list[Tensor]:
+    """`masks` (H, W), of which at most `most` mark anything: those spread evenly."""
+    marked = [i for i, mask in enumerate(masks) if mask.any()]
+    if len(marked) <= most:
+        return list(masks)
+    kept = {marked[int(i)] for i in np.linspace(0, len(marked) - 1, most)}
+    return [m if i in kept else torch.zeros_like(m) for i, m in enumerate(masks)]
 
 
 def start_duration(scene: Scene) -> float:
