@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,8 +139,12 @@ def gopro_held_out(dense: Path, t: int) -> None:
             write_png(dense / f"mv_images_time/{t:05d}/{k + 1:05d}.png", see(gopro_pose(k), EV[k]))
 
 
-def colmap(dense: Path, points: np.ndarray) -> None:
-    """`sparse/` of the tree: every picture sees every point of `points` (P, 3)."""
+def colmap(dense: Path, points: np.ndarray, names: Sequence[str] = ()) -> None:
+    """`sparse/` of the tree: every picture sees every point of `points` (P, 3).
+
+    Picture i is `names[i]`, else 00000.png, 00001.png, ...
+    """
+    names = names or [f"{i:05d}.png" for i in range(COUNT)]
     folder = dense / "sparse"
     folder.mkdir()
     (folder / "cameras.bin").write_bytes(
@@ -153,7 +158,7 @@ def colmap(dense: Path, points: np.ndarray) -> None:
         xy = local[:, :2] / local[:, 2:] * FOCAL + [W / 2, H / 2]
         images += (
             struct.pack("<i7di", i + 1, *q, *(-c2w[:, :3].T @ c2w[:, 3]), 1)
-            + f"{i:05d}.png".encode()
+            + names[i].encode()
             + b"\0"
         )
         images += struct.pack("<Q", len(points)) + b"".join(

@@ -89,6 +89,14 @@ def claim_size(path: Path) -> None:
     path.write_bytes(data[:12] + header + struct.pack(">I", zlib.crc32(header)) + data[33:])
 
 
+def clip_of_codes(folder: Path, white: int) -> Path:
+    """Frames in 16-bit files whose white is the code `white`."""
+    for t, picture in enumerate(recorded()):
+        codes = np.rint(np.clip(1.2 * picture, 0, 1) * white).astype(np.uint16)
+        encode(folder / f"{t:03d}.png", codes)
+    return folder
+
+
 def text_video(folder: Path) -> Path:
     folder.mkdir()
     (folder / "notes.mp4").write_text("not a film\n" * 100)
@@ -142,6 +150,10 @@ FOOTAGE: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a PNG of a thousand megapixels": (
         lambda p: one_bad(p, claim_size),
         "004.png: 40000x30000 pixels, more than the 200 megapixels",
+    ),
+    "12 bits in files of 16": (
+        lambda p: clip_of_codes(p, 4095),
+        "looks like 12-bit values in 16-bit files",
     ),
     "all black": (lambda p: clip(p, [np.zeros((34, 60, 3))] * FRAMES), "all frames are black"),
     "all white": (lambda p: clip(p, [np.ones((34, 60, 3))] * FRAMES), "all frames are white"),

@@ -112,6 +112,12 @@ def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
     assert facts.exposure.given == "exposures.csv" and brackets == list(range(8))
     assert facts.exposure.ev == (7, 6, 5, 4, 3, 2, 1, 0)
     assert facts.exposure.white_share[7] == 0 and outlook(facts)["HDR"] == "yes"
+    # rows in any order, but all of them
+    (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows[::-1]]))
+    assert measure_clip(clip)[0].exposure == facts.exposure
+    (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows[:-1]]))
+    with pytest.raises(InputError, match="no row for frame"):
+        measure_clip(clip)
 
 
 def good_facts() -> ClipFacts:

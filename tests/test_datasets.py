@@ -16,7 +16,7 @@ from mutations import check_json_reader, check_reader
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.video import write_video
-from hdr_nsff.footage.datasets import held_out_views, layout_of, recognize
+from hdr_nsff.footage.datasets import held_out_views, layout_of, maps, recognize
 from hdr_nsff.footage.datasets.capture import Capture, Clock, number_cameras
 from hdr_nsff.footage.pose_files import fit_poses
 from hdr_nsff.footage.pose_formats import GivenPoses
@@ -127,6 +127,91 @@ def test_a_wrong_convention_would_be_noticed(tmp_path: Path) -> None:
         None, capture.poses.K, capture.poses.c2w * [[[1, -1, -1, 1]]], capture.poses.size
     )
     assert misses(tmp_path, [tmp_path / p.source for p in capture.pictures], flipped, 1.0) > 3
+
+
+def unpadded_gopro(root: Path) -> tuple[Path, list[str]]:
+    """The HDR-GoPro layout with pictures img_5.png to img_13.png in time, and their
+    names. Rows are as LLFF writes them: img_10.png first.
+    """
+    names = [f"img_{number + 5}.png" for number in range(mini.COUNT)]
+    dense = mini.gopro(root) / "dense"
+    for number, name in enumerate(names):
+        for folder in ("images", f"images_{mini.W}x{mini.H}"):
+            (dense / folder / f"{number:05d}.png").rename(dense / folder / name)
+    table = np.load(dense / "poses_bounds.npy")
+    table[:, 15] += 0.01 * np.arange(mini.COUNT)  # near, of this picture alone
+    np.save(dense / "poses_bounds.npy", table[np.argsort(names)])
+    return root, names
+
+
+def test_rows_of_pictures_that_are_not_zero_padded_are_as_llff_sorts_names(
+    tmp_path: Path,
+) -> None:
+    root, names = unpadded_gopro(tmp_path)
+    points = np.random.default_rng(0).uniform([-1, -0.5, 3], [1, 0.5, 5], (30, 3))
+    mini.colmap(root / "dense", points, names)
+    capture = read(root)
+    assert [Path(p.source).name for p in capture.pictures] == names
+    assert [p.time for p in capture.pictures] == [*range(mini.COUNT)]
+    assert capture.poses is not None
+    files = [root / p.source for p in capture.pictures]
+    assert misses(root, files, capture.poses, None) < 0.6
+    for number, picture in enumerate(capture.pictures):
+        sparse = capture.sparse_depth[picture.source]
+        c2w = mini.gopro_pose(number % mini.CAMERAS)
+        local = (points - c2w[:, 3]) @ c2w[:, :3]
+        pixels = (local / local[:, 2:]) @ mini.K.T
+        assert np.allclose(sparse.depth, local[:, 2])
+        assert np.allclose(sparse.xy * [mini.W, mini.H], pixels[:, :2])
+        assert sparse.bounds == pytest.approx((3 + 0.01 * number, 5))
+    assert any("row 0 (from 0) is that of" in note and "img_10" in note for note in capture.notes)
+    views, given = held_out_views.read_views(capture)
+    assert misses(root, [v.recorded[0][0] for v in views], given, None) < 0.6
+
+
+def test_rows_of_real_hdr_nerf_scenes_are_as_llff_sorts_names(tmp_path: Path) -> None:
+    padded = read(mini.hdr_nerf_real(tmp_path / "padded"))
+    assert padded.notes == () and padded.poses is not None
+    root = mini.hdr_nerf_real(tmp_path / "set")
+    files = sorted((root / "input_images").iterdir())
+    names = [f"{number}.png" for number in range(len(files))]
+    for file, name in zip(files, names, strict=True):
+        file.rename(file.with_name(name))
+    path = root / "poses_bounds_exps.npy"
+    np.save(path, np.load(path)[np.argsort(names)])
+    capture = read(root)
+    assert capture.poses is not None and "of 10.png" in capture.notes[0]
+    assert [p.source for p in capture.pictures[:2]] == ["input_images/0.png", "input_images/12.png"]
+    assert [p.ev for p in capture.pictures] == [p.ev for p in padded.pictures]
+    assert np.array_equal(capture.poses.c2w, padded.poses.c2w)
+    views, given = held_out_views.read_views(capture)
+    evs = [exposure for _, exposure in views[0].recorded]
+    assert evs == pytest.approx([-4, -2, 0, 2, 4])
+    assert misses(root, [v.recorded[0][0] for v in views], given, None) < 0.6
+
+
+@pytest.mark.parametrize("per_frame", [False, True])
+@pytest.mark.parametrize("model", ["OPENCV_FISHEYE", "EQUIRECTANGULAR"])
+def test_a_data_set_of_another_camera_model_is_refused(
+    model: str, per_frame: bool, tmp_path: Path
+) -> None:
+    root = mini.nerfstudio(tmp_path, **({} if per_frame else {"camera_model": model}))
+    document = json.loads((root / "transforms.json").read_text())
+    if per_frame:
+        document["frames"][2]["camera_model"] = model
+    mini.write_json(root / "transforms.json", document)
+    with pytest.raises(InputError, match=f"the model {model} is not that of a lens"):
+        recognize(root)
+
+
+def test_depth_of_a_data_set_in_8_bits_is_refused(tmp_path: Path) -> None:
+    root = mini.nerfstudio(tmp_path)
+    write_png(root / "depth/3.png", np.full((mini.H, mini.W), 0.5))
+    path = root / "transforms.json"
+    path.write_text(path.read_text().replace("depth/3.npy", "depth/3.png"))
+    capture = read(root)
+    with pytest.raises(InputError, match=r"3\.png: 8 bits hold no metric depth"):
+        maps.disparities(capture, capture.pictures, (mini.H, mini.W))
 
 
 def test_times_in_any_unit_become_frames() -> None:

@@ -168,3 +168,11 @@ def test_a_gain_that_is_not_above_zero_is_refused(column, tmp_path):
     (tmp_path / "exposures.csv").write_text(f"file,exposure,{column}\nf1.png,1/4,0\n")
     with pytest.raises(InputError, match=f"{column} 0 is not above 0"):
         read_exposure_csv(open_footage(tmp_path))
+
+
+def test_lists_in_the_folders_of_cameras_are_not_passed_over(tmp_path):
+    for camera in ("a", "b"):
+        write_frames(tmp_path / camera, 2)
+    (tmp_path / "b/exposures.csv").write_text("file,ev\nf1.png,0\nf2.png,1\n")
+    with pytest.raises(InputError, match=r"b/exposures.csv: .* one list for all cameras; join"):
+        read_exposure_csv(open_footage(tmp_path))

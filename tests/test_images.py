@@ -80,6 +80,32 @@ def test_images_that_are_missing_cut_short_or_damaged_are_refused(tmp_path: Path
         read_image(tmp_path / "a.tif")
 
 
+@pytest.mark.parametrize("progressive", [False, True])
+def test_what_follows_the_end_of_a_jpeg_is_no_damage(progressive: bool, tmp_path: Path) -> None:
+    """Phones append data of their own, and motion photos a video."""
+    image = Image.fromarray((255 * RGB).astype(np.uint8))
+    image.save(tmp_path / "a.jpg", progressive=progressive)
+    picture = (tmp_path / "a.jpg").read_bytes()
+    for trailer in (b"\0" * 100, b"\0\0\0\x18ftypmp42" + b"\xff\xda\xff\x12" * 5000, picture[:-9]):
+        (tmp_path / "b.jpg").write_bytes(picture + trailer)
+        assert np.array_equal(read_image(tmp_path / "b.jpg"), read_image(tmp_path / "a.jpg"))
+
+
+@pytest.mark.parametrize("progressive", [False, True])
+def test_a_jpeg_cut_after_its_thumbnail_is_refused(progressive: bool, tmp_path: Path) -> None:
+    """The thumbnail, in a segment before the picture, is a whole JPEG itself."""
+    image = Image.fromarray(np.random.default_rng(0).integers(0, 256, (64, 96, 3), np.uint8))
+    image.resize((16, 12)).save(tmp_path / "small.jpg")
+    exif = b"Exif\0\0" + (tmp_path / "small.jpg").read_bytes()
+    image.save(tmp_path / "a.jpg", exif=exif, progressive=progressive)
+    assert read_image(tmp_path / "a.jpg").shape == (64, 96, 3)
+    whole = (tmp_path / "a.jpg").read_bytes()
+    for end in range(len(exif) + 20, len(whole) - 1, 50):
+        (tmp_path / "a.jpg").write_bytes(whole[:end])
+        with pytest.raises(InputError, match="cut short"):
+            read_image(tmp_path / "a.jpg")
+
+
 def test_a_contact_sheet_places_its_cells(tmp_path: Path) -> None:
     sheet = contact_sheet([[np.ones((2, 3)), np.zeros((1, 1, 3))], [np.ones((2, 3, 3))]], gap=1)
     assert sheet.shape == (7, 9, 3)  # two rows of 2 and two columns of 3, with gaps of 1

@@ -2,9 +2,12 @@
 written down.
 """
 
+import weakref
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from hdr_nsff.core.exr import REC709, write_exr
 from hdr_nsff.core.hdr_video import write_hdr_video
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.video import write_video
+from hdr_nsff.footage import linear_light
 from hdr_nsff.footage.exposure_lists import read_exif_ev
 from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.footage.ingest import read_frames, shrink
@@ -141,6 +145,54 @@ def test_sixteen_bit_tiff_and_jpeg_keep_their_values(tmp_path):
     assert np.allclose(frames[1].rgb, 99 / 255, atol=1 / 255)
 
 
+def codes(largest: int, clipped: int, dtype: type = np.uint16) -> np.ndarray:
+    """Noise (24, 32, 3) below the code `largest`, which so many pixels have."""
+    picture = np.random.default_rng(0).integers(0, largest, (24, 32, 3)).astype(dtype)
+    picture.reshape(-1, 3)[:clipped] = largest
+    return picture
+
+
+@pytest.mark.parametrize(("bits", "factor"), [(10, 64), (12, 16), (14, 4)])
+@pytest.mark.parametrize("suffix", [".png", ".tif"])
+def test_narrow_codes_in_16_bit_files_are_refused(tmp_path, bits, factor, suffix):
+    folder = tmp_path / "clip"
+    folder.mkdir()
+    for t, clipped in enumerate((0, 100, 0)):
+        cv2.imwrite(str(folder / f"{t}{suffix}"), codes(2**bits - 1, clipped))
+    assert len(all_frames(folder, end=1)) == 1  # nothing is clipped there
+    words = rf"clip: looks like {bits}-bit values in 16-bit files.*multiply all values by {factor},"
+    with pytest.raises(InputError, match=words):
+        all_frames(folder)
+    for file in folder.iterdir():  # as the message advises
+        cv2.imwrite(str(file), factor * cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+    frames = all_frames(folder)
+    assert max(f.rgb.max() for f in frames) == pytest.approx(1, abs=1e-3)
+
+
+def test_narrow_codes_of_one_camera_are_refused_before_the_next_one(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "0.png"), codes(4095, 100))
+    frames = read_frames(open_footage(tmp_path), 0, None, 1, 640)
+    assert next(frames).camera_id == 0
+    with pytest.raises(InputError, match=r"a: looks like 12-bit values"):
+        next(frames)
+
+
+def test_dark_pictures_of_full_range_are_read(tmp_path):
+    for name, frames in {
+        "a single pixel is the brightest": [codes(4095, 1), codes(2000, 0)],
+        "another code": [codes(4094, 100), codes(4094, 100)],
+        "brighter in another frame": [codes(4095, 100), codes(4097, 1)],
+        "8 bits": [codes(15, 100, np.uint8), codes(15, 100, np.uint8)],
+        "8 bits scaled up": [257 * codes(15, 100), 256 * codes(16, 100)],
+    }.items():
+        (tmp_path / name).mkdir()
+        for t, frame in enumerate(frames):
+            cv2.imwrite(str(tmp_path / name / f"{t}.png"), frame)
+        assert len(all_frames(tmp_path / name)) == 2, name
+
+
 def test_linear_frames_share_one_scale_and_are_encoded(tmp_path):
     for i, level in enumerate((0.5, 2.0, 8.0)):
         write_exr(tmp_path / f"{i}.exr", {"RGB": np.full((16, 16, 3), level, np.float32)})
@@ -151,6 +203,29 @@ def test_linear_frames_share_one_scale_and_are_encoded(tmp_path):
 def test_linear_frames_within_one_are_not_scaled(tmp_path):
     write_exr(tmp_path / "0.exr", {"RGB": np.full((16, 16, 3), 0.25, np.float32)})
     assert np.allclose(all_frames(tmp_path)[0].rgb, 0.25 ** (1 / 2.2), atol=1e-3)
+
+
+def test_the_scale_of_linear_frames_is_found_with_one_of_them_in_memory(monkeypatch):
+    rng = np.random.default_rng(0)
+    stored = {f"{t}.exr": (2.0**t * rng.random((37, 50, 3))).astype(np.float32) for t in range(6)}
+    given: list[weakref.ref] = []
+
+    def read(path: Path) -> np.ndarray:
+        assert not any(ref() is not None for ref in given), f"a frame is left before {path}"
+        frame = stored[path.name].copy()
+        given.append(weakref.ref(frame))
+        return frame
+
+    monkeypatch.setattr(linear_light, "read_frame", read)
+    scale = linear_light.linear_scale([Path(name) for name in stored])
+    sampled = np.concatenate([frame[::4, ::4].ravel() for frame in stored.values()])
+    assert len(given) == 6 and scale == 1 / float(np.percentile(sampled, 99.9))
+
+
+def test_raw_frames_are_not_read_for_a_scale(monkeypatch):
+    """They are never brighter than 1; reading one takes seconds."""
+    monkeypatch.setattr(linear_light, "read_frame", lambda path: pytest.fail(f"{path} is read"))
+    assert linear_light.linear_scale([Path("a.dng"), Path("b.DNG")]) == 1
 
 
 def test_shrinking_averages_and_keeps_the_shape():
@@ -175,6 +250,40 @@ def test_damaged_videos_are_read_or_refused(tmp_path):
     path = tmp_path / "a.mp4"
     write_video(path, [picture(0.1 * k) for k in range(6)])
     check_reader(path, lambda: all_frames(path), 60)
+
+
+def write_held_video(path: Path) -> Path:
+    """30 frames of noise, 30 a second, and the last of them is shown for a second."""
+    noise = np.random.default_rng(0)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        packets = []
+        for number in range(30):
+            picture = noise.integers(0, 256, (48, 64, 3), np.uint8)
+            frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            packets += stream.encode(frame)
+        packets += stream.encode(None)
+        max(packets, key=lambda p: p.pts).duration = 30
+        for packet in packets:
+            container.mux(packet)
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov"])
+def test_a_video_whose_last_frame_is_held_long_is_whole(tmp_path, suffix):
+    frames = all_frames(write_held_video(tmp_path / f"a{suffix}"))
+    assert len(frames) == 30 and frames[-1].seconds == pytest.approx(29 / 30, abs=1e-3)
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov"])
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
+def test_a_video_is_cut_short_before_a_frame_that_is_held_long(tmp_path, suffix, share):
+    path = write_held_video(tmp_path / f"a{suffix}")
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+    with pytest.raises(InputError, match="cut short"):
+        all_frames(path)
 
 
 def write_dng(
@@ -225,6 +334,15 @@ def test_raw_photographs_are_linear_and_share_a_white_balance(tmp_path):
     assert np.allclose(bright / dark, 4, rtol=0.01)
     half = all_frames(tmp_path)[1].rgb[16, 48] ** 2.2
     assert np.allclose(bright / half, 2, rtol=0.01)
+
+
+def test_raw_photographs_are_scaled_by_white_and_not_by_their_brightest_pixel(tmp_path):
+    pytest.importorskip("rawpy")
+    light = []
+    for level in (0.5, 0.76, 0.9):
+        write_dng(tmp_path / f"{level}.dng", level)
+        light.append(read_frame(tmp_path / f"{level}.dng")[16, 48] / level)
+    assert np.allclose(light, light[0], rtol=0.01)
 
 
 def test_the_tags_of_a_raw_photograph_are_its_exposure(tmp_path):

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from posed_clips import texture
 
-from hdr_nsff.priors.masks.visits import separate_movers, without_movers
+from hdr_nsff.priors.masks.visits import VisitTuning, separate_movers, without_movers
 
 H, W, VISITS = 60, 90, 4
 BACKGROUND = texture(0, W, H)
@@ -75,3 +75,13 @@ def test_clipped_visits_count_only_where_nothing_else_was_recorded():
     picture, lost, _ = without_movers(video, clipped, still, [0, 0], count=1)
     assert np.allclose(picture[0, 0, :, 0], [3.0, 2.0])
     assert lost.tolist() == [[[False, True]]]
+
+
+def test_of_many_visits_those_spread_evenly_are_compared():
+    few = VisitTuning(max_compared=5)
+    frames = [visits()[0][k % VISITS] for k in range(3 * VISITS)]
+    video, truth = np.stack(frames), np.tile(visits()[1], (3, 1, 1))
+    found = separate_movers(video, np.zeros_like(truth), [0] * len(video), tuning=few)
+    assert found.moving.shape == truth.shape
+    assert (found.moving & truth).sum() > 0.95 * truth.sum()
+    assert np.abs(found.video[0] - BACKGROUND).mean() < 0.01

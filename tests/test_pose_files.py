@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import read_model
-from hdr_nsff.footage.pose_files import import_poses
+from hdr_nsff.footage.lens_files import read_lens
+from hdr_nsff.footage.pose_files import import_poses, rows_of_cameras
+from hdr_nsff.footage.pose_formats import from_json, from_transforms
 from hdr_nsff.geometry.poses import project
 
 W, H, FOCAL = 64, 48, 50.0
@@ -152,6 +154,48 @@ def test_json_of_llff_poses_has_columns_right_up_back(tmp_path):
     assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H, W))), expected())
 
 
+# row by row in the files below
+SORTED_BY_LLFF = ["img_1.png", "img_10.png", "img_2.png"]
+
+
+@pytest.mark.parametrize("name", ["poses_bounds.npy", "precomputed.json"])
+def test_rows_of_llff_are_in_plain_string_order_of_the_names(tmp_path, capsys, name):
+    if name == "poses_bounds.npy":
+        np.save(tmp_path / name, llff_table())
+    else:
+        matrices = [np.column_stack([np.array(opengl(c))[:3], [H, W, FOCAL]]) for c in C2W]
+        poses = [matrix.tolist() for matrix in matrices]
+        write(tmp_path / name, {"poses": poses, "bds": [[2.0, 10.0]] * 3})
+    in_time = ["img_1.png", "img_2.png", "img_10.png"]
+    poses = import_poses(tmp_path, in_time, (H, W))
+    assert np.allclose(poses.c2w, C2W[[SORTED_BY_LLFF.index(n) for n in in_time]])
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"{name}: poses are taken in plain string order of the names" in said
+    assert "row 1 (from 0) is that of img_10.png" in said
+
+
+@pytest.mark.parametrize(
+    "sources", [[f"clip.mp4#{k}" for k in (1, 2, 10)], NAMES, ["8.png", "9.png", "a.png"]]
+)
+def test_rows_in_the_order_of_time_stay_so_without_a_word(tmp_path, capsys, sources):
+    np.save(tmp_path / "poses_bounds.npy", llff_table())
+    assert np.allclose(import_poses(tmp_path, sources, (H, W)).c2w, C2W)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("ending", ["/{}.png", ".mp4#{}"])
+def test_rows_of_still_cameras_are_in_plain_string_order_of_their_names(tmp_path, capsys, ending):
+    np.save(tmp_path / "poses_bounds.npy", llff_table())
+    cameras = ["cam1", "cam2", "cam10"]
+    sources = [camera + ending.format(k) for camera in cameras for k in range(2)]
+    poses = import_poses(tmp_path, sources, (H, W))
+    assert np.allclose(poses.c2w, C2W[[0, 0, 2, 2, 1, 1]])
+    assert f"row 1 (from 0) is that of {sources[4]}" in " ".join(capsys.readouterr().err.split())
+    assert rows_of_cameras(None, 3, cameras) == [[0], [2], [1]]  # of their lenses too
+    names = ["x.png", "y.png", "z.png"]  # that fit no camera: the file's own order
+    assert rows_of_cameras(names, 3, cameras) == [[0], [1], [2]]
+
+
 def test_smaller_frames_have_smaller_pixels(tmp_path):
     write(tmp_path / "transforms.json", transforms())
     assert np.allclose(pixels(import_poses(tmp_path, NAMES, (H // 2, W // 2))), expected() / 2)
@@ -253,6 +297,30 @@ def bad_distortion(folder):
     write(folder / "transforms.json", transforms(k1=0.3))
 
 
+def bad_model(folder):
+    # distortion too small to matter in a pinhole camera
+    small = {"k1": 1e-4, "k2": 1e-5, "k3": 0.0, "k4": 0.0}
+    write(folder / "transforms.json", transforms(camera_model="OPENCV_FISHEYE", **small))
+
+
+def bad_model_of_a_frame(folder):
+    document = transforms(camera_model="PINHOLE")
+    document["frames"][1]["camera_model"] = "EQUIRECTANGULAR"
+    write(folder / "transforms.json", document)
+
+
+def bad_fisheye(folder):
+    write(folder / "transforms.json", transforms(is_fisheye=True))
+
+
+def bad_terms(folder):
+    write(folder / "transforms.json", transforms(camera_model="OPENCV", k4=1e-3))
+
+
+def bad_colmap_fisheye(folder):
+    colmap_text(folder, camera="1 OPENCV_FISHEYE 64 48 50 50 32 24 0 0 0 0")
+
+
 def bad_shape(folder):
     write(folder / "transforms.json", transforms(w=64, h=64))
 
@@ -289,6 +357,11 @@ def bad_empty(folder):
         (bad_npy, "17"),
         (bad_count, "6 poses for 3 frames"),
         (bad_distortion, "distortion"),
+        (bad_model, "the model OPENCV_FISHEYE is not that of a lens with k1"),
+        (bad_model_of_a_frame, "the model EQUIRECTANGULAR is not"),
+        (bad_fisheye, "the fisheye model .* is not"),
+        (bad_terms, "distortion with k4, k5 or k6 is not"),
+        (bad_colmap_fisheye, "OPENCV_FISHEYE is not a pinhole"),
         (bad_shape, "another shape"),
         (bad_nan, "NaN"),
         (bad_json, "export them again"),
@@ -309,6 +382,10 @@ def test_poses_that_do_not_fit_are_refused_in_a_sentence(tmp_path, make, words):
         {"fl_x": 10**400},
         {"w": 10**400},
         {"k1": 10**400},
+        {"k3": 10**400},
+        {"k3": 1e308},
+        {"k3": float("nan")},
+        {"k4": float("nan")},
         {"near": 10**400},
         {"camera_angle_x": 0, "fl_x": None},
         {"near": -1.0},
@@ -334,6 +411,26 @@ def test_poses_with_nan_and_inf_are_one_sentence_without_warnings(tmp_path):
             import_poses(tmp_path, NAMES, (H, W))
 
 
+def test_k3_of_a_transforms_file_becomes_part_of_k1_and_k2(tmp_path):
+    path = tmp_path / "transforms.json"
+    write(path, transforms(camera_model="OPENCV", k1=-0.2, k2=0.05, k3=-0.01, p1=1e-4))
+    given = from_json(path)
+    assert given.distortion is not None
+    assert np.allclose(given.distortion, read_lens(path).distortion)
+    assert given.distortion[0, 2] == 1e-4
+    assert (np.abs(given.distortion[:, :2] - [-0.2, 0.05]) > 1e-4).all()
+    write(path, transforms(k1=-0.2, k2=0.05, k3=0, k4=0, is_fisheye=False))
+    assert np.array_equal(from_json(path).distortion, [[-0.2, 0.05, 0, 0]] * 3)
+
+
+def test_k3_needs_the_size_of_the_pictures(tmp_path):
+    document = transforms(camera_angle_x=0.9, k3=0.01)
+    for key in ("fl_x", "w", "h"):
+        del document[key]
+    with pytest.raises(InputError, match="`k3` without `w` and `h`"):
+        from_transforms(tmp_path / "transforms.json", document)
+
+
 def test_damaged_poses_are_read_or_refused(tmp_path):
     def read(folder):
         return lambda: import_poses(folder, NAMES, (H, W))
@@ -342,7 +439,7 @@ def test_damaged_poses_are_read_or_refused(tmp_path):
     np.save(tmp_path / "llff/poses_bounds.npy", llff_table())
     check_reader(tmp_path / "llff/poses_bounds.npy", read(tmp_path / "llff"), 150)
     path = tmp_path / "transforms.json"
-    write(path, transforms(near=1.0, far=9.0, k1=0.0))
+    write(path, transforms(near=1.0, far=9.0, k1=0.0, k3=1e-3, camera_model="OPENCV"))
     check_reader(path, read(tmp_path), 150)
     check_json_reader(path, read(tmp_path), 300)
 

@@ -21,7 +21,13 @@ PLACED = Poses(
 
 
 @pytest.fixture
-def rounds(tmp_path, monkeypatch):
+def models() -> list[dict[str, bytes]]:
+    """The models that the rounds start from, one after another."""
+    return []
+
+
+@pytest.fixture
+def rounds(tmp_path, monkeypatch, models):
     """Runs the rounds on a pan whose structure from motion is said to find parallax,
     and of which rotations explain a `share`; the masks of every round are given.
     """
@@ -31,6 +37,8 @@ def rounds(tmp_path, monkeypatch):
 
         def estimate(work, moving, earlier):
             estimates.append(moving)
+            models.append(dict(earlier.model))
+            earlier.model = {"images.bin": bytes([len(models), 0, 255])}
             return PLACED
 
         after = iter(masks[1:])
@@ -96,3 +104,9 @@ def test_a_killed_run_goes_on_with_its_first_round(rounds):
     rounds(0.7, mask(0), mask(0))
     poses, estimates = rounds(0.7, mask(9), *RESTLESS[1:])
     assert poses.parallax == "rotation" and estimates == 2
+
+
+def test_a_killed_run_starts_its_second_round_from_the_model_of_the_first(rounds, models):
+    rounds(0.7, mask(0), mask(0))
+    rounds(0.7, mask(9), mask(30), mask(30))
+    assert models == [{}, {"images.bin": bytes([1, 0, 255])}]

@@ -9,15 +9,18 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, read_mask, write_png
 from hdr_nsff.core.io import write_npy
 from hdr_nsff.geometry.round_trip import round_trip
 from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, prepare
+from hdr_nsff.prepare.steps.sheet import NO_FLOW, flow_cell
 from hdr_nsff.priors.flow.dense import average_with_reverse
 from hdr_nsff.priors.flow.local_motion import LOCAL_MOTION_TUNING
 from hdr_nsff.scene.manifest import Manifest
@@ -392,3 +395,59 @@ def test_steps_depend_only_on_steps_before_them():
     order = list(STEPS)
     for name, kind in STEPS.items():
         assert all(order.index(n) < order.index(name) for n in kind.needs)
+
+
+def test_depth_in_a_folder_tells_near_and_far_where_poses_do_not(config, tmp_path):
+    bounds = np.load(config.poses)
+    known = Manifest.load(prepare(config))
+    assert (known.near, known.far) == (0.8, 5)  # of the poses, with room
+    transforms = {"w": W, "h": H, "fl_x": FOCAL, "fl_y": FOCAL, "cx": W / 2, "cy": H / 2}
+    transforms["frames"] = []
+    for t in range(COUNT):
+        pose = np.eye(4)
+        pose[0, 3] = bounds[t, 3]
+        frame = {"file_path": f"{t:03d}.png", "transform_matrix": pose.tolist()}
+        transforms["frames"].append(frame)
+        write_npy(tmp_path / f"far/{t:03d}.npy", np.full((H, W), 8.0, np.float32))
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms))
+    poses = tmp_path / "transforms.json"
+    far = replace(config, poses=poses, depth=tmp_path / "far", out=tmp_path / "other")
+    m = Manifest.load(prepare(far))
+    assert 4 < m.near < 8 < m.far < 16
+
+
+def test_a_list_that_is_added_or_changed_is_read(config):
+    prepare(config)
+    rows = "".join(f"{t:03d}.png,{EVS[t % 3]}\n" for t in range(COUNT))
+    written = config.clip / "exposures.csv"
+    written.write_text("file,ev\n" + rows)
+    assert Manifest.load(prepare(config)).steps["exposure"].details["source"] == written.name
+    before = stamps(prepare(config))
+    assert stamps(prepare(config)) == before  # and not again
+    written.write_text("file,ev\n" + rows.replace("-2.0", "-1.0"))
+    m = Manifest.load(prepare(config))
+    assert sorted(m.bracket_ev)[1] - sorted(m.bracket_ev)[0] == pytest.approx(1)
+
+
+@pytest.mark.parametrize("codes", [np.uint8(1), np.array([0, 0, 128], np.uint8)])
+def test_masks_without_white_are_refused(config, codes):
+    for path in sorted(config.masks.glob("*.png")):
+        moving = read_mask(path)
+        cv2.imwrite(str(path), moving[..., None] * codes)
+    with pytest.raises(InputError, match="no mask is white anywhere"):
+        prepare(config)
+
+
+def test_masks_that_mark_nothing_are_taken(config):
+    for path in sorted(config.masks.glob("*.png")):
+        write_png(path, np.zeros((H, W)))
+    assert not any(f.moving.any() for f in Scene.open(prepare(config)).train)
+
+
+def test_a_frame_without_flow_is_gray_in_the_sheet(config):
+    prepare(config)
+    m = Manifest.load(config.out)
+    cell = flow_cell(SimpleNamespace(folder=config.out, manifest=m), m.frames[0])
+    assert cell.shape == (H, W, 3) and cell.std() > 0
+    alone = m.frames[0].model_copy(update={"flow": {}})
+    assert (flow_cell(SimpleNamespace(folder=config.out, manifest=m), alone) == NO_FLOW).all()

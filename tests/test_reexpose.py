@@ -69,7 +69,7 @@ def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbors(tmp
     assert truth.views[0].c2w == [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert [pose[0][3] for pose in truth.clip_c2w] == [t for t in range(20) if t not in (4, 12)]
     assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
-    names = [f"{k}.png" for k in range(18)]
+    names = [f"{k:05d}.png" for k in range(18)]
     again = import_poses(out / "poses_bounds.npy", names, (24, 40))  # as `prepare --poses` does
     assert np.allclose(again.c2w, truth.clip_c2w) and np.allclose(again.K, truth.K)
 

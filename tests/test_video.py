@@ -13,6 +13,7 @@ import pytest
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.video import (
+    frame_spans,
     frame_times,
     is_mirrored,
     read_video,
@@ -37,6 +38,13 @@ def test_the_header_names_frames_rate_and_length(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", FRAMES, fps=12)
     info = video_info(tmp_path / "a.mp4")
     assert (info.frames, info.fps) == (3, 12) and info.seconds == pytest.approx(0.25)
+
+
+def test_frames_are_shown_until_the_next_ones(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mp4", FRAMES, fps=12)
+    spans = frame_spans(tmp_path / "a.mp4")
+    assert 12 * spans == pytest.approx(np.array([[0, 1], [1, 2], [2, 3]]))
+    assert np.array_equal(frame_times(tmp_path / "a.mp4"), spans[:, 0])
 
 
 def test_no_frames_are_no_video(tmp_path: Path) -> None:

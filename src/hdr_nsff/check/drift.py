@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.priors.poses.matching import Keypoints, match_pairs
-from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.radiometry import exposure_cycle as exposure
 
 

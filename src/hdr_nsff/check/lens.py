@@ -11,8 +11,8 @@ import numpy as np
 
 from hdr_nsff.check.facts import LensFacts
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.priors.poses.estimate import estimate_poses
-from hdr_nsff.priors.poses.reconstruct import spread_frames
 
 # frames that are mapped (hand-chosen: seconds, and enough for one lens)
 MAX_FRAMES = 16

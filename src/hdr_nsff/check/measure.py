@@ -16,10 +16,11 @@ from hdr_nsff.check.lens import measure_lens
 from hdr_nsff.check.shutter import measure_readout
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import track
+from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.core.video import frame_times, video_info
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.exposure_lists import read_exif_ev, read_exposure_csv
+from hdr_nsff.footage.exposure_lists import ev_in_list, read_exif_ev, read_exposure_csv
 from hdr_nsff.footage.footage import Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.ingest import MAX_FRAMES, read_frames
@@ -32,7 +33,6 @@ from hdr_nsff.priors.poses.matching import (
     match_pairs,
     view_pairs,
 )
-from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.priors.poses.rotation import fit_panorama, rotation_share
 from hdr_nsff.priors.poses.still_camera import still_camera_shifts
 from hdr_nsff.radiometry import exposure_cycle as exposure
@@ -170,8 +170,11 @@ def given_exposures(footage: Footage, count: int) -> tuple[str | None, list[floa
     """Where exposures are written down, and those of the first `count` frames."""
     table = read_exposure_csv(footage)
     if table is not None:
-        given = list(table[1].values())[:count]
-        return (table[0].name, given) if len(given) == count else (None, [])
+        path, rows = table
+        names = list(footage.files)
+        sources = [f"{names[0]}#{i}" if footage.video else names[i] for i in range(count)]
+        given = [ev_in_list(path, rows, source, i) for i, source in enumerate(sources)]
+        return path.name, given
     if footage.video:
         return None, []
     known = [read_exif_ev(path) for path in footage.cameras[0][:count]]

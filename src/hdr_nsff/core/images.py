@@ -6,6 +6,7 @@ An image is float32 rgb (H, W, 3) in [0, 1]. Reading checks and refuses in one s
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import cv2
@@ -16,8 +17,10 @@ from hdr_nsff.core.io import atomic, how_to_restore
 from hdr_nsff.core.picture_size import check_size, encoded_size
 
 PNG_END = b"IEND\xaeB`\x82"
-JPEG_END = b"\xff\xd9"
-JPEG_TAIL_BYTES = 64  # some cameras write a few bytes after the end marker
+JPEG_START = b"\xff\xd8"
+# of a JPEG: markers, but for those that stand alone before its end (RST, SOI, TEM)
+JPEG_MARKER = re.compile(rb"\xff[^\x00\x01\xd0-\xd8\xff]")
+JPEG_END = 0xD9
 TURBO_PERCENTILES = (2, 98)  # of a map: the ends of its colors (hand-chosen on depth maps)
 FLOW_PERCENTILE = 98  # of the lengths: full saturation (hand-chosen on rendered scenes)
 
@@ -90,7 +93,7 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
     suffix = path.suffix.lower()
     if suffix == ".png" and not data.rstrip(b"\0").endswith(PNG_END):
         raise InputError(f"{path}: the PNG is cut short; {how_to_restore(path)}")
-    if suffix in {".jpg", ".jpeg"} and JPEG_END not in data[-JPEG_TAIL_BYTES:]:
+    if suffix in {".jpg", ".jpeg"} and not has_jpeg_end(data):
         raise InputError(f"{path}: the JPEG is cut short; {how_to_restore(path)}")
     size = encoded_size(data)
     if size is not None:
@@ -111,13 +114,35 @@ def decode(path: Path, transparency: bool) -> np.ndarray:
     return image
 
 
+def has_jpeg_end(data: bytes) -> bool:
+    """Whether a JPEG holds its picture to the end marker. Anything may follow: phones
+    append data of their own, further pictures, and videos.
+
+    Segments are passed over by their lengths, since thumbnails in them end like this.
+    """
+    if not data.startswith(JPEG_START):
+        return False
+    place = len(JPEG_START)
+    while (found := JPEG_MARKER.search(data, place)) is not None:
+        place = found.end()
+        if data[place - 1] == JPEG_END:
+            return True
+        place += int.from_bytes(data[place : place + 2], "big")
+    return False
+
+
 def read_mask(path: Path | str) -> np.ndarray:
     """A mask image as bool (H, W): true above half of white, in the mean of rgb;
     transparency is ignored.
     """
+    return mask_gray(path) > 0.5
+
+
+def mask_gray(path: Path | str) -> np.ndarray:
+    """The mean of rgb (H, W) of a mask image in [0, 1]; transparency is ignored."""
     codes = decode(Path(path), transparency=False)
     gray = codes if codes.ndim == 2 else codes.mean(-1)
-    return np.asarray(gray > np.iinfo(codes.dtype).max / 2)
+    return np.asarray(gray / np.iinfo(codes.dtype).max)
 
 
 def contact_sheet(

@@ -145,3 +145,8 @@ class RecentArrays:
                 _, oldest = self.arrays.popitem(last=False)
                 self.bytes -= oldest.nbytes
         return array
+
+
+def spread_frames(count: int, limit: int) -> np.ndarray:
+    """Up to `limit` of `count` frames, spread evenly over the clip."""
+    return np.unique(np.linspace(0, count - 1, min(limit, count)).astype(int))

@@ -200,10 +200,16 @@ def unreadable(path: Path, error: Exception) -> InputError:
 
 
 def frame_times(path: Path | str) -> np.ndarray:
-    """Seconds at which the frames of a video are shown, in order; nothing is decoded.
+    """Seconds (T,) at which the frames of a video are shown, in order; nothing is
+    decoded.
 
     Frames that an edit list hides count too. InputError where the file is no video.
     """
+    return frame_spans(path)[:, 0]
+
+
+def frame_spans(path: Path | str) -> np.ndarray:
+    """Seconds (T, 2) from which and until which the frames are shown, as above."""
     import av
 
     path = Path(path)
@@ -211,8 +217,12 @@ def frame_times(path: Path | str) -> np.ndarray:
         with open_video(path) as container:
             if not container.streams.video:
                 raise InputError(f"{path}: no video stream in this file")
-            packets = container.demux(video=0)
-            found = [float(p.pts * p.time_base) for p in packets if p.pts is not None]
+            found = [
+                (float(p.pts * p.time_base), float((p.duration or 0) * p.time_base))
+                for p in container.demux(video=0)
+                if p.pts is not None
+            ]
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
-    return np.sort(np.array(found))
+    starts, lengths = np.array(sorted(found)).reshape(-1, 2).T
+    return np.stack([starts, starts + lengths], -1)

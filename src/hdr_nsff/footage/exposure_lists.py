@@ -19,6 +19,7 @@ from hdr_nsff.core.errors import InputError, check_number, shorten
 from hdr_nsff.footage.footage import Footage
 from hdr_nsff.scene.manifest import MAX_EV
 
+LIST = "exposures.csv"  # in a folder of frames
 # columns of a CSV: times, and the seconds of their unit
 TIMES = {"exposure": 1.0, "exposure_s": 1.0, "exposure_us": 1e-6, "exposure_ns": 1e-9}
 GAINS = ("iso", "gain_db", "aperture")  # count where a time is given
@@ -86,6 +87,7 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     """
     path = csv_path(footage)
     if not path.is_file():
+        refuse_scattered(footage)
         return None
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
     try:
@@ -114,8 +116,35 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
 def csv_path(footage: Footage) -> Path:
     """Where the CSV of a clip is."""
     if footage.path.is_dir():
-        return footage.path / "exposures.csv"
+        return footage.path / LIST
     return footage.path.with_suffix(".csv")
+
+
+def refuse_scattered(footage: Footage) -> None:
+    """InputError for lists in the folders of cameras, which nobody would read."""
+    for folder in {files[0].parent: None for files in footage.cameras if files}:
+        scattered = folder / LIST
+        if folder != footage.root and scattered.is_file():
+            advice = f"{footage.path} takes one list for all cameras"
+            raise InputError(
+                f"{scattered}: {advice}; join them to {footage.root / LIST}, with files like "
+                f"{folder.name}/0001.png"
+            )
+
+
+def ev_in_list(
+    path: Path, rows: dict[str, float], source: str, number: int, whole_name: bool = False
+) -> float:
+    """The EV of a frame in the `rows` of a CSV, by its name `source` or `number`; by
+    its `whole_name`, with the folder, only, where several tracks have the others.
+    """
+    keys = [source]
+    if not whole_name:
+        keys += [Path(source).name, f"#{number}"]
+    for key in keys:
+        if key in rows:
+            return rows[key]
+    raise InputError(f"{path}: no row for frame {source}; add it, or give `--exposures auto`")
 
 
 def read_utf8(path: Path) -> str:

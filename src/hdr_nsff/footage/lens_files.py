@@ -20,13 +20,15 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.io import read_json
 from hdr_nsff.footage.colmap import ColmapCamera, cameras_bin, cameras_txt, read_part
 from hdr_nsff.footage.pose_formats import (
-    DISTORTION_KEYS,
     OPENCV_MODELS,
     UNREADABLE,
+    beyond,
+    check_model,
+    coefficients_of,
+    lens_of_opencv,
     parse_intrinsics,
 )
 from hdr_nsff.geometry.lens import Lens
-from hdr_nsff.geometry.pinhole import camera_rays
 
 ACCEPTED = (
     "COLMAP's cameras.txt or .bin, nerfstudio's transforms.json, or a calibration by OpenCV, ROS "
@@ -46,11 +48,6 @@ DISTORTION_NAMES = (
 SIZE_NAMES = ("imagesize", "resolution", "size")
 WIDTH_NAMES, HEIGHT_NAMES = ("imagewidth", "width", "w"), ("imageheight", "height", "h")
 MODEL_NAMES = ("distortionmodel", "cameramodel", "model")
-OTHER_MODELS = ("fish", "equi", "kannala", "omni", "fov", "eucm", "division", "prism")
-MAX_SIDE = 10**6  # pixels of a picture
-# of the picture's width: how well k1 and k2 have to stand for more radial terms
-MAX_FIT_ERROR = 1e-3
-NUM_RADII = 200
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 TOP_LEVEL = re.compile(r"^(\w+)[ \t]*:", re.MULTILINE)
 
@@ -114,13 +111,11 @@ def transforms_lens(path: Path, document: dict[str, Any]) -> Lens:
     """The lens of a `transforms.json`: that of all frames, or of the first one."""
     frames = document.get("frames") or [{}]
     values = {**document, **frames[0]}
-    check_model(path, str(values.get("camera_model", "")))
+    coefficients = coefficients_of(path, values)
     K, (width, height) = parse_intrinsics(path, values)
     if height <= 0:
         raise no_size(path)
-    k1, k2, p1, p2 = (float(values.get(key, 0)) for key in DISTORTION_KEYS)
-    k3 = float(values.get("k3", 0))
-    return lens_of_opencv(path, K, np.array([k1, k2, p1, p2, k3]), round(width), round(height))
+    return lens_of_opencv(path, K, np.array(coefficients), round(width), round(height))
 
 
 # OpenCV, ROS, Kalibr
@@ -206,73 +201,9 @@ def numbers_of(values: Values, names: Iterable[str]) -> list[float]:
     return []
 
 
-def check_model(path: Path, model: str) -> None:
-    """InputError for a model of distortion that is not OpenCV's radial one."""
-    if any(word in model.lower() for word in OTHER_MODELS):
-        raise beyond(path, f"the model {shorten(model)}")
-
-
 def no_size(path: Path) -> InputError:
     """The error for a calibration without the size of its pictures."""
     return InputError(
         f"{path}: the size of the pictures that it is for is missing; add image_width and "
         "image_height"
     )
-
-
-def beyond(path: Path, what: str) -> InputError:
-    """The error for a lens that k1, k2, p1, p2 do not describe."""
-    return InputError(
-        f"{path}: {what} is not that of a lens with k1, k2, p1, p2; undistort the frames first"
-    )
-
-
-# OpenCV's model
-
-
-def lens_of_opencv(
-    path: Path, K: np.ndarray, distortion: np.ndarray, width: int, height: int
-) -> Lens:
-    """A lens from OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, or the first of
-    them; further radial terms become part of k1 and k2.
-    """
-    coefficients = np.pad(np.asarray(distortion, np.float64), (0, 14))[:14]
-    numbers = (K, coefficients)
-    possible = all(np.isfinite(n).all() for n in numbers) and min(K[0, 0], K[1, 1]) > 0
-    possible = possible and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE
-    if not possible or abs(K[0, 1]) > 1e-6 * K[0, 0]:
-        raise InputError(f"{path}: impossible numbers in the calibration; calibrate again")
-    if coefficients[8:].any():
-        raise beyond(path, "a thin prism or a tilted sensor")
-    k1, k2, p1, p2 = coefficients[:4].tolist()
-    if coefficients[4:8].any():
-        k1, k2 = fit_two_terms(path, K, coefficients, width)
-    lens = Lens(K, (k1, k2, p1, p2), width, height)
-    if not lens.is_one_to_one():
-        raise beyond(path, "distortion that folds the picture over")
-    return lens
-
-
-def fit_two_terms(
-    path: Path, K: np.ndarray, coefficients: np.ndarray, width: int
-) -> tuple[float, float]:
-    """k1 and k2 that stand for all radial terms over the picture, by least squares."""
-    k1, k2, _, _, k3, k4, k5, k6 = coefficients[:8]
-    corners = np.array([(0.0, 0.0), (2 * K[0, 2], 2 * K[1, 2])])
-    recorded = float(np.linalg.norm(camera_rays(corners, K)[..., :2], axis=-1).max())
-    radius = np.linspace(0, 3 * recorded, 20 * NUM_RADII)
-    r2 = radius**2
-    factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
-    bent = radius * factor
-    folds = np.flatnonzero(np.diff(bent) <= 0)
-    inside = bent <= recorded
-    inside[int(np.argmin(inside)) or len(inside) :] = False
-    if folds.size and folds[0] < inside.sum():
-        raise beyond(path, "distortion that folds the picture over")
-    radius, r2, bent = radius[inside], r2[inside], bent[inside]
-    design = np.stack([radius * r2, radius * r2**2], 1)
-    found = np.linalg.lstsq(design, bent - radius, rcond=None)[0]
-    error_px = K[0, 0] * float(np.abs(design @ found - bent + radius).max())
-    if error_px > MAX_FIT_ERROR * width:
-        raise beyond(path, f"radial distortion of high order ({error_px:.1f} px off)")
-    return float(found[0]), float(found[1])

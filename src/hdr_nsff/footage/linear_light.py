@@ -57,13 +57,23 @@ def light_table(transfer: Transfer) -> np.ndarray:
 def linear_scale(files: list[Path]) -> float:
     """The constant that brings linear frames into [0, 1].
 
-    1 where nothing is brighter than 1, else 1 / the 99.9th percentile. The same for all
-    frames, so that their exposures keep their ratios; what is brighter is saturated, as
-    on a sensor.
+    1 where nothing is brighter than 1, as in DNG, else 1 / the 99.9th percentile. The
+    same for all frames, so that their exposures keep their ratios; what is brighter is
+    saturated, as on a sensor.
     """
-    images = [read_frame(f) for f in files]
-    if not images or max(float(i.max()) for i in images) <= 1:
+    if all(f.suffix.lower() == ".dng" for f in files):
         return 1.0
-    sampled = np.concatenate([i[::4, ::4].ravel() for i in images])
-    white = float(np.percentile(sampled, WHITE_PERCENTILE))
+    maxima, samples = zip(*(maximum_and_sample(f) for f in files), strict=True)
+    if max(maxima) <= 1:
+        return 1.0
+    sampled = np.concatenate(samples)
+    white = float(np.percentile(sampled, WHITE_PERCENTILE, overwrite_input=True))
     return 1 / max(white, 1e-12)
+
+
+def maximum_and_sample(path: Path) -> tuple[float, np.ndarray]:
+    """The largest value of a frame, and the values (N,) of every fourth pixel of every
+    fourth row. The frame itself is let go, since all of a clip would fill the memory.
+    """
+    image = read_frame(path)
+    return float(image.max()), image[::4, ::4].flatten()

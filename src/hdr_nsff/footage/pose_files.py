@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.progress import say
 from hdr_nsff.footage.colmap import ColmapModel, read_model
 from hdr_nsff.footage.pose_formats import (
     MAX_DISTORTION_PX,
@@ -23,7 +24,9 @@ from hdr_nsff.footage.pose_formats import (
     from_colmap,
     from_json,
     from_llff,
+    llff_places,
     max_displacement_px,
+    order_note,
 )
 from hdr_nsff.geometry.alignment import nearest_rotation
 from hdr_nsff.geometry.lens import Lens
@@ -43,6 +46,7 @@ MAX_ASPECT_ERROR = 0.02  # by which the shape of the poses' frames may differ fr
 MIN_TURN = 1e-6  # entries of rotations, and centers over `near`: less is no motion
 MIN_TRACKED_POINTS = 10  # from which near and far are taken from the points
 Parallax = Literal["full", "rotation", "none"]
+FRAME_OF_VIDEO = re.compile(r"#\d+$")  # ends its name
 NAMES = ("transforms.json", "transforms_train.json", "poses_bounds.npy", "precomputed.json")
 
 
@@ -63,6 +67,9 @@ def import_poses(
     path = locate(Path(path))
     given, model = read_given(path)
     rows = match_frames(path, given.names, len(given.c2w), sources)
+    note = order_note(sources, rows) if given.names is None else None
+    if note is not None:
+        say(f"{path.name}: {note}")
     poses = fit_poses(path, given, rows, size, lenses)
     if model is not None:
         poses = with_points(poses, model, rows, lenses)
@@ -141,7 +148,18 @@ def match_frames(
             f"{path}: {count} poses for {len(sources)} frames, and no file name fits; "
             "give one pose per used frame, or one per still camera by the camera's name"
         )
-    return list(range(count))
+    return [*rows_in_order(names, sources)]
+
+
+def rows_in_order(names: list[str] | None, wanted: Sequence[str]) -> list[int]:
+    """The row of each of the frames, or cameras, `wanted` (N), of as many poses.
+
+    Poses without `names` are as LLFF writes them, in the order of sorted file names;
+    those of a video's frames are in time, and poses with `names` in their own order.
+    """
+    if names is None and not all(FRAME_OF_VIDEO.search(name) for name in wanted):
+        return llff_places(wanted)
+    return list(range(len(wanted)))
 
 
 def rows_of_cameras(
@@ -150,13 +168,15 @@ def rows_of_cameras(
     """The rows, of `count` poses with these `names`, that belong to each of `cameras`.
 
     A pose is a camera's if its file or its folder has the camera's name; one pose per
-    camera of several may also come in the cameras' order. None where neither fits.
+    camera of several may also come in order. None where neither fits.
     """
     ends = [(camera_of(f"{name}#"), camera_of(name)) for name in names or ()]
     rows_of = [[row for row, end in enumerate(ends) if camera in end] for camera in cameras]
     if rows_of and all(rows_of):
         return rows_of
-    return [[row] for row in range(count)] if count == len(cameras) > 1 else None
+    if not count == len(cameras) > 1:
+        return None
+    return [[row] for row in rows_in_order(names, cameras)]
 
 
 def camera_of(source: str) -> str:

@@ -2,15 +2,16 @@
 `poses_bounds.npy` (LLFF), and the JSON of LLFF poses that non-rigid NeRF publishes.
 
 Every convention is converted here: c2w OpenCV (+x right, +y down, +z forward), pixels
-with centers at +0.5. The world and its units stay as they are.
+with centers at +0.5, and distortion with k1, k2, p1, p2 (`geometry/lens.py`). The world
+and its units stay as they are.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from hdr_nsff.core.io import read_json
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapModel
 from hdr_nsff.geometry.lens import Lens
+from hdr_nsff.geometry.pinhole import camera_rays
 from hdr_nsff.scene.manifest import MAX_NUMBER
 
 # columns right, up, back -> right, down, forward
@@ -30,7 +32,18 @@ FROM_LLFF = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1.0]])
 MAX_DISTORTION_PX = 2.0
 # models whose distortion is that of OpenCV: k1, k2, p1, p2, or the first of these
 OPENCV_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-DISTORTION_KEYS = ("k1", "k2", "p1", "p2")  # of `transforms.json`
+# words in the names of models that are not OpenCV's radial one
+OTHER_MODELS = (
+    *("fish", "equi", "kannala", "omni", "fov", "eucm", "division", "prism"),
+    *("vr180", "ortho"),
+)
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")  # of `transforms.json`
+# not read: nerfstudio multiplies by what OpenCV divides by
+FURTHER_KEYS = ("k4", "k5", "k6")
+MAX_SIDE = 10**6  # pixels of a picture
+# of the picture's width: how well k1 and k2 have to stand for more radial terms
+MAX_FIT_ERROR = 1e-3
+NUM_RADII = 200
 # what Python and numpy raise for JSON values of another shape or size than expected
 UNREADABLE = (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError)
 
@@ -83,10 +96,11 @@ def from_colmap(path: Path, model: ColmapModel) -> GivenPoses:
 def colmap_distortion(path: Path, camera: ColmapCamera) -> np.ndarray:
     """k1, k2, p1, p2 of OpenCV's model.
 
-    InputError for models beyond it, unless nothing is distorted.
+    InputError for models beyond it, unless nothing is distorted: a fisheye always is.
     """
     values = camera.distortion
-    if camera.model in OPENCV_MODELS or not np.any(values):
+    undistorted = not np.any(values) and "FISHEYE" not in camera.model
+    if camera.model in OPENCV_MODELS or undistorted:
         return np.pad(values, (0, 4))[:4]
     raise InputError(
         f"{path}: camera model {camera.model} is not a pinhole camera; undistort the frames "
@@ -163,6 +177,35 @@ def llff_rows(table: np.ndarray) -> GivenPoses:
     focal length), and then near and far.
     """
     return llff_poses(table[:, :15].reshape(-1, 3, 5), table[:, 15:], FROM_LLFF)
+
+
+def llff_places(names: Sequence[str]) -> list[int]:
+    """The row of each of the pictures, or cameras, `names` (N) in what LLFF writes.
+
+    It sorts names as plain strings: img_10 stands before img_2.
+    """
+    parts = [PurePosixPath(name).parts for name in names]
+    order = sorted(range(len(names)), key=lambda k: parts[k])
+    rows = [0] * len(names)
+    for row, k in enumerate(order):
+        rows[k] = row
+    return rows
+
+
+def order_note(names: Sequence[str], rows: Sequence[int | None]) -> str | None:
+    """A sentence where pictures `names` (N) do not take their `rows` (N) one after the
+    other; None where they do.
+    """
+    distinct = dict.fromkeys(row for row in rows if row is not None)
+    moved = [row for place, row in enumerate(distinct) if row != place]
+    if not moved:
+        return None
+    first = min(moved)
+    name = shorten(names[rows.index(first)])
+    return (
+        "poses are taken in plain string order of the names, as LLFF writes them: "
+        f"row {first} (from 0) is that of {name}"
+    )
 
 
 def llff_poses(matrices: np.ndarray, bounds: np.ndarray, columns: np.ndarray) -> GivenPoses:
@@ -242,7 +285,9 @@ def parse_transforms(path: Path, document: dict[str, Any]) -> GivenPoses:
         raise InputError(f"{path}: no frames in it; export the poses again")
     values = [{**document, **frame} for frame in frames]
     lenses = [parse_intrinsics(path, each) for each in values]
-    distortion = [[float(each.get(key, 0)) for key in DISTORTION_KEYS] for each in values]
+    distortion = [
+        distortion_of(path, each, K, size) for each, (K, size) in zip(values, lenses, strict=True)
+    ]
     matrices = np.array([frame["transform_matrix"] for frame in frames], np.float64)[:, :3]
     with np.errstate(invalid="ignore"):  # NaN and Inf are refused afterwards
         c2w = np.concatenate([matrices[:, :, :3] @ FROM_OPENGL, matrices[:, :, 3:4]], 2)
@@ -304,3 +349,97 @@ def parse_intrinsics(
     cy = float(values.get("cy", height / 2))
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     return K, (width, height)
+
+
+def distortion_of(
+    path: Path, values: Mapping[str, Any], K: np.ndarray, size: tuple[float, float]
+) -> tuple[float, ...]:
+    """k1, k2, p1, p2 from the keys of a frame; k3 becomes part of k1 and k2.
+
+    `K` (3, 3) is for `size` (width, height).
+    """
+    *four, k3 = coefficients_of(path, values)
+    if k3 == 0:
+        return tuple(four)
+    width, height = size
+    if height <= 0:
+        raise InputError(f"{path}: `k3` without `w` and `h`, the size of the pictures; add them")
+    return lens_of_opencv(path, K, np.array([*four, k3]), round(width), round(height)).distortion
+
+
+def coefficients_of(path: Path, values: Mapping[str, Any]) -> list[float]:
+    """k1, k2, p1, p2, k3 of OpenCV's model from the keys of a frame.
+
+    InputError for another model, and for terms beyond these.
+    """
+    check_model(path, str(values.get("camera_model", "")))
+    if values.get("is_fisheye"):
+        raise beyond(path, "the fisheye model (`is_fisheye`)")
+    if any(float(values.get(key, 0)) for key in FURTHER_KEYS):
+        raise beyond(path, "distortion with k4, k5 or k6")
+    return [float(values.get(key, 0)) for key in DISTORTION_KEYS]
+
+
+# OpenCV's model
+
+
+def check_model(path: Path, model: str) -> None:
+    """InputError for a model of distortion that is not OpenCV's radial one."""
+    if any(word in model.lower() for word in OTHER_MODELS):
+        raise beyond(path, f"the model {shorten(model)}")
+
+
+def beyond(path: Path, what: str) -> InputError:
+    """The error for a lens that k1, k2, p1, p2 do not describe."""
+    return InputError(
+        f"{path}: {what} is not that of a lens with k1, k2, p1, p2; undistort the frames first"
+    )
+
+
+def lens_of_opencv(
+    path: Path, K: np.ndarray, distortion: np.ndarray, width: int, height: int
+) -> Lens:
+    """A lens from OpenCV's coefficients k1, k2, p1, p2, k3, k4, k5, k6, or the first of
+    them; further radial terms become part of k1 and k2.
+    """
+    coefficients = np.pad(np.asarray(distortion, np.float64), (0, 14))[:14]
+    numbers = (K, coefficients)
+    possible = all(np.abs(n).max() <= MAX_NUMBER for n in numbers) and min(K[0, 0], K[1, 1]) > 0
+    possible = possible and 0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE
+    if not possible or abs(K[0, 1]) > 1e-6 * K[0, 0]:
+        raise InputError(f"{path}: impossible numbers in the calibration; calibrate again")
+    if coefficients[8:].any():
+        raise beyond(path, "a thin prism or a tilted sensor")
+    k1, k2, p1, p2 = coefficients[:4].tolist()
+    if coefficients[4:8].any():
+        with np.errstate(all="ignore"):  # numbers that no lens has fit nothing
+            k1, k2 = fit_two_terms(path, K, coefficients, width)
+    lens = Lens(K, (k1, k2, p1, p2), width, height)
+    if not lens.is_one_to_one():
+        raise beyond(path, "distortion that folds the picture over")
+    return lens
+
+
+def fit_two_terms(
+    path: Path, K: np.ndarray, coefficients: np.ndarray, width: int
+) -> tuple[float, float]:
+    """k1 and k2 that stand for all radial terms over the picture, by least squares."""
+    k1, k2, _, _, k3, k4, k5, k6 = coefficients[:8]
+    corners = np.array([(0.0, 0.0), (2 * K[0, 2], 2 * K[1, 2])])
+    recorded = float(np.linalg.norm(camera_rays(corners, K)[..., :2], axis=-1).max())
+    radius = np.linspace(0, 3 * recorded, 20 * NUM_RADII)
+    r2 = radius**2
+    factor = (1 + k1 * r2 + k2 * r2**2 + k3 * r2**3) / (1 + k4 * r2 + k5 * r2**2 + k6 * r2**3)
+    bent = radius * factor
+    folds = np.flatnonzero(np.diff(bent) <= 0)
+    inside = bent <= recorded
+    inside[int(np.argmin(inside)) or len(inside) :] = False
+    if folds.size and folds[0] < inside.sum():
+        raise beyond(path, "distortion that folds the picture over")
+    radius, r2, bent = radius[inside], r2[inside], bent[inside]
+    design = np.stack([radius * r2, radius * r2**2], 1)
+    found = np.linalg.lstsq(design, bent - radius, rcond=None)[0]
+    error_px = K[0, 0] * float(np.abs(design @ found - bent + radius).max())
+    if not error_px <= MAX_FIT_ERROR * width:
+        raise beyond(path, f"radial distortion of high order ({error_px:.1f} px off)")
+    return float(found[0]), float(found[1])

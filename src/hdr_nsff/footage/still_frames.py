@@ -63,6 +63,7 @@ def read_dng(path: Path) -> np.ndarray:
                 gamma=(1, 1),
                 no_auto_bright=True,
                 output_bps=16,
+                adjust_maximum_thr=0.0,  # white is the sensor's, not the frame's brightest
                 user_wb=[float(v) or 1.0 for v in raw.daylight_whitebalance],
             )
     except rawpy.LibRawError as error:

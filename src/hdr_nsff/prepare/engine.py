@@ -23,6 +23,7 @@ from hdr_nsff.core.io import is_leftover
 from hdr_nsff.core.process import cpu_seconds, peak_memory
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.datasets.capture import Picture
+from hdr_nsff.footage.exposure_lists import csv_path
 from hdr_nsff.prepare.result import StepResult, store
 from hdr_nsff.prepare.steps.neural import weights_of
 from hdr_nsff.prepare.work import PrepareConfig, StepName, Work
@@ -100,13 +101,20 @@ def step_key(work: Work, name: StepName, step: Step) -> str:
         settings[setting] = value
     records = work.manifest.steps
     before = [(n, records[n].key, records[n].details.get("attempt")) for n in step.needs]
-    inputs = work.manifest.inputs if name == "frames" else {}
+    inputs = list_part(work) if name == "frames" else {}
     from_capture = [capture_part(work, name)] if work.capture is not None else []
     cut = [asdict(work.footage.bars)] if name == "frames" and work.footage.bars else []
     lens = lens_part(work, name)
     parts = [settings, before, inputs, *from_capture, *cut, *lens, *weights_of(work.config, name)]
     parts += step.depends
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()
+
+
+def list_part(work: Work) -> dict[str, Any]:
+    """The footage, with the list of exposures and times beside it, if any."""
+    written = csv_path(work.footage)
+    inputs: dict[str, Any] = dict(work.manifest.inputs)
+    return inputs | {"list": hash_of(written)} if written.is_file() else inputs
 
 
 def lens_part(work: Work, name: StepName) -> list[Any]:

@@ -8,13 +8,13 @@ training learns the exposures.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
 from hdr_nsff.footage.exposure_lists import (
+    ev_in_list,
     parse_exposures,
     read_exif_ev,
     read_exposure_csv,
@@ -25,7 +25,6 @@ from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.camera_brackets import common_brackets, exposure_groups
 from hdr_nsff.radiometry.dropped_frames import GappedCycle, find_cycle
-from hdr_nsff.scene.manifest import FrameEntry
 
 # confidence of a cycle by brightness from which it refutes a list (hand-chosen)
 MIN_CONFIDENCE = 0.8
@@ -209,7 +208,8 @@ def given_exposures(work: Work) -> tuple[str, list[float] | None]:
     if table is not None:
         path, rows = table
         return path.name, [
-            csv_exposure(path, rows, f, n, tracks > 1) for f, n in zip(frames, numbers, strict=True)
+            ev_in_list(path, rows, f.source, n, tracks > 1)
+            for f, n in zip(frames, numbers, strict=True)
         ]
     if work.footage.video:
         source, known, least_change = GOPRO, gopro_exposures(work), MIN_DRIFT_EV
@@ -240,21 +240,6 @@ def track_cycle(work: Work, evs: list[float]) -> list[float]:
             "in the order of --same-camera"
         )
     return [evs[f.track] for f in work.manifest.frames]
-
-
-def csv_exposure(
-    path: Path, rows: dict[str, float], frame: FrameEntry, number: int, whole_name: bool = False
-) -> float:
-    """The EV of a frame in the `rows` of a CSV, by its name or `number`; by its
-    `whole_name`, with the folder, only, where several tracks have the others.
-    """
-    keys = [frame.source]
-    if not whole_name:
-        keys += [Path(frame.source).name, f"#{number}"]
-    for key in keys:
-        if key in rows:
-            return rows[key]
-    raise InputError(f"{path}: no row for frame {frame.source}; add it, or give `--exposures auto`")
 
 
 def exif_exposures(work: Work) -> list[float]:

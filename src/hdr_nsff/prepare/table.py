@@ -8,7 +8,7 @@ from hdr_nsff.prepare.engine import Step, all_have, run_step
 from hdr_nsff.prepare.lens import DistortedFramesError
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.depth import find_depth
-from hdr_nsff.prepare.steps.flow import find_flow, has_flow
+from hdr_nsff.prepare.steps.flow import find_flow, has_flow, has_refined_flow
 from hdr_nsff.prepare.steps.masks import find_masks
 from hdr_nsff.prepare.steps.movers import find_movers
 from hdr_nsff.prepare.steps.poses import find_poses
@@ -88,7 +88,7 @@ STEPS: dict[StepName, Step] = {
         refine_flow,
         needs=("response",),
         outputs=("refined_flow",),
-        complete=all_have("flow"),
+        complete=has_refined_flow,
         forgets=("refined_flows",),
     ),
     "movers": Step(

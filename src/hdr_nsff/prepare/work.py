@@ -160,8 +160,9 @@ class PrepareConfig:
     OWNER/MODEL of the Hugging Face hub, or a model's folder.
     """
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
-    """What the given depth maps hold: z-depth in the units of the poses, 1 / z-depth,
-    or disparity up to scale and shift.
+    """What the given depth maps hold: z-depth in the units of the poses (a PNG: 16
+    bits, millimeters), 1 / z-depth (below 0: unknown), or disparity up to scale and
+    shift.
     """
     estimate: tuple[Part, ...] = ()
     """Parts of a public data set to estimate although it gives them. Its depth is

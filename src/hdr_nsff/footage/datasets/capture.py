@@ -79,7 +79,7 @@ class Capture:
     depth_kind: Literal["metric", "disparity", "relative"] = "metric"
     # own: of the depth network, brought to scene units by `sparse_depth`
     depth_units: Literal["scene", "own"] = "scene"
-    depth_scale: float = 1.0  # scene units per unit of a metric depth file
+    depth_scale: float = 1.0  # scene units per unit of a metric array (pictures hold millimeters)
     sparse_depth: Mapping[str, SparseDepth] = field(default_factory=dict)  # by source
     points: np.ndarray | None = None  # (P, 3) static, scene units
     exposures: Exposures | None = None

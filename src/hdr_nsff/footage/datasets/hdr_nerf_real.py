@@ -1,6 +1,7 @@
 """HDR-NeRF's real scenes: still, five exposures of every pose, one after the other in
 `input_images/`, and a row for every picture in `poses_bounds_exps.npy` (N, 18): LLFF's
-3x5 matrix (columns down, right, back), near and far, exposure time in seconds.
+3x5 matrix (columns down, right, back), near and far, exposure time in seconds. Rows
+are in plain string order of the names, as LLFF sorts them.
 
 Every second pose is trained on, the first one too, the others are held out with all
 five exposures: their protocol. As in the synthetic scenes, one picture per training
@@ -18,7 +19,13 @@ from hdr_nsff.footage.datasets.capture import Capture, Picture, select_poses
 from hdr_nsff.footage.datasets.hdr_nerf import NUM_EXPOSURES, TRAINED
 from hdr_nsff.footage.datasets.set_files import source_of
 from hdr_nsff.footage.frame_files import frame_files
-from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
+from hdr_nsff.footage.pose_formats import (
+    GivenPoses,
+    llff_places,
+    llff_rows,
+    llff_table,
+    order_note,
+)
 
 NAME = "poses_bounds_exps.npy"
 PICTURES = "input_images"
@@ -34,8 +41,9 @@ def read(folder: Path) -> Capture:
 
     InputError where something is missing or short.
     """
-    given, ev = read_cameras(folder)
-    files = picture_files(folder, len(ev))
+    files, given, ev = read_cameras(folder)
+    names = [file.name for file in files]
+    note = order_note(names, llff_places(names))
     rows = []
     for number, pose in enumerate(range(0, len(ev) // NUM_EXPOSURES, 2)):
         rows.append(NUM_EXPOSURES * pose + TRAINED[number % len(TRAINED)])
@@ -50,6 +58,7 @@ def read(folder: Path) -> Capture:
         poses=select_poses(given, rows),
         has_held_out=len(ev) > NUM_EXPOSURES,
         is_static=True,
+        notes=() if note is None else (note,),
     )
 
 
@@ -59,8 +68,8 @@ def held_out_rows(count: int) -> list[range]:
     return [range(start, start + NUM_EXPOSURES) for start in starts]
 
 
-def read_cameras(folder: Path) -> tuple[GivenPoses, list[float]]:
-    """The camera and the EV of every picture."""
+def read_cameras(folder: Path) -> tuple[list[Path], GivenPoses, list[float]]:
+    """All pictures in order, and the camera and the EV of each."""
     path = folder / NAME
     table = llff_table(path, 18)
     seconds = table[:, 17]
@@ -73,7 +82,9 @@ def read_cameras(folder: Path) -> tuple[GivenPoses, list[float]]:
         raise InputError(
             f"{path}: an exposure time in its last column is not above 0; copy the file again"
         )
-    return llff_rows(table[:, :17]), np.log2(seconds).tolist()
+    files = picture_files(folder, len(table))
+    table = table[llff_places([file.name for file in files])]
+    return files, llff_rows(table[:, :17]), np.log2(table[:, 17]).tolist()
 
 
 def picture_files(folder: Path, count: int) -> list[Path]:

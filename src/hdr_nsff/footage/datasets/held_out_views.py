@@ -118,8 +118,7 @@ def hdr_nerf_views(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
 
 def hdr_nerf_real_views(capture: Capture) -> tuple[list[HeldOut], GivenPoses]:
     """All five exposures of every second pose."""
-    given, ev = hdr_nerf_real.read_cameras(capture.root)
-    files = hdr_nerf_real.picture_files(capture.root, len(ev))
+    files, given, ev = hdr_nerf_real.read_cameras(capture.root)
     views = []
     first_rows = []
     for number, rows in enumerate(hdr_nerf_real.held_out_rows(len(ev))):

@@ -1,7 +1,8 @@
 """HDR-GoPro / NSFF layout (LLFF poses): under `<scene>/dense/` the pictures,
-`poses_bounds.npy` (c2w columns down, right, back), and where they are there moving
-masks, depth and optical flow. Cameras take turns: training picture i is of camera i mod
-C, and stands at time i. Held out (opened by `held_out.py` alone):
+`poses_bounds.npy` (c2w columns down, right, back; a row for every picture, in plain
+string order of the names), and where they are there moving masks, depth and optical
+flow. Cameras take turns: training picture i, in the order of the numbers in the names,
+is of camera i mod C, and stands at time i. Held out (opened by `held_out.py` alone):
 `mv_images/<time>/<camera>.png`, `mv_images_time/`, `mv_masks/`; of sets that `export`
 wrote only the ones that `hdr_nsff.json` lists.
 
@@ -27,7 +28,13 @@ from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
 from hdr_nsff.footage.datasets.extra import Extra, parse_extra
 from hdr_nsff.footage.datasets.set_files import check_count, source_of
 from hdr_nsff.footage.frame_files import frame_files, natural_key
-from hdr_nsff.footage.pose_formats import GivenPoses, llff_rows, llff_table
+from hdr_nsff.footage.pose_formats import (
+    GivenPoses,
+    llff_places,
+    llff_rows,
+    llff_table,
+    order_note,
+)
 
 FLOWS = ("semantic_flow_i1", "flow_i1")
 MULTI_VIEW = ("mv_images", "mv_images_time")
@@ -88,6 +95,7 @@ def read(folder: Path) -> Capture:
     given, bounds = read_poses(dense)
     files = read_pictures(dense, len(bounds))
     sources = [source_of(folder, file) for file in files]
+    rows = llff_places([file.name for file in files])
     extra = read_extra(dense, [file.name for file in files])
     masks, white_moves = moving_masks(folder, dense, len(files))
     depth, is_metric = depth_maps(dense, len(files), extra)
@@ -97,6 +105,7 @@ def read(folder: Path) -> Capture:
         confidence = map_files(dense / "disp_confidence", ".npy", len(files), purpose)
     flow, flow_notes = flow_files(dense, sources)
     model = sparse_model(dense)
+    sparse = sparse_depths(model, bounds)
     pictures = [
         Picture(
             source,
@@ -109,6 +118,9 @@ def read(folder: Path) -> Capture:
         for number, source in enumerate(sources)
     ]
     notes = [f"pictures of {files[0].parent.name}/", *flow_notes]
+    reordered = order_note(sources, rows)
+    if reordered is not None:
+        notes.append(reordered)
     if depth:
         notes.append(f"depth of {depth[0].parent.name}/")
     has_views = any(multi_view(folder, name) is not None for name in MULTI_VIEW)
@@ -116,12 +128,12 @@ def read(folder: Path) -> Capture:
         layout="HDR-GoPro / NSFF (LLFF)",
         root=folder,
         pictures=pictures,
-        poses=replace(given, names=sources),
+        poses=replace(given.of(rows), names=sources),
         has_held_out=has_views,
         white_moves=white_moves,
         depth_kind="metric" if is_metric else "disparity",
         depth_units="own",
-        sparse_depth=dict(zip(sources, sparse_depths(model, bounds), strict=True)),
+        sparse_depth={source: sparse[row] for source, row in zip(sources, rows, strict=True)},
         points=trusted_points(model),
         notes=tuple(notes),
     )
@@ -158,7 +170,7 @@ def with_extra(capture: Capture, extra: Extra, names: list[str]) -> Capture:
 
 
 def read_poses(dense: Path) -> tuple[GivenPoses, np.ndarray]:
-    """The poses, and the near and far bounds (N, 2) of every picture."""
+    """The poses, and the near and far bounds (N, 2), row by row."""
     path = dense / "poses_bounds.npy"
     if not path.is_file():
         raise InputError(f"{path}: missing; it holds the camera poses, copy it again")
@@ -269,7 +281,8 @@ def trusted_points(model: ColmapModel | None) -> np.ndarray | None:
 
 
 def sparse_depths(model: ColmapModel | None, bounds: np.ndarray) -> list[SparseDepth]:
-    """The static points that every picture sees; `bounds` (N, 2) are near and far.
+    """The static points that every picture sees, in the order of the rows; `bounds`
+    (N, 2) are near and far.
 
     No points where there is no model of just these pictures.
     """

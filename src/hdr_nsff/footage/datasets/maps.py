@@ -19,14 +19,13 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask
 from hdr_nsff.footage.arrays import read_array
 from hdr_nsff.footage.datasets.capture import Capture, Picture, SparseDepth
-from hdr_nsff.footage.depth_files import read_map
+from hdr_nsff.footage.depth_files import ARRAYS, read_map
 from hdr_nsff.footage.flow_files import check_flow, read_npz
 from hdr_nsff.geometry.fill import fill
 
 MAX_ASPECT_ERROR = 0.02  # by which the shape of a map may differ from the frames'
 MIN_POINTS = 20  # from which a scale and shift are fitted (hand-chosen)
 MAX_FAR = 3.0  # times the far bound: fitted disparity is clamped there (hand-chosen)
-PNG_WHITE = 65535.0  # the value of white in a PNG of 16 bits
 FIT_ROUNDS = 5  # fits of a line, each without the worst of the last
 FIT_SHARE = 0.75  # of the points, that the next round keeps (hand-chosen)
 
@@ -83,9 +82,9 @@ def flow_map(path: Path, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]
     return fit_size(path, flow, size, cv2.INTER_AREA) * scale, valid
 
 
-def depth_map(path: Path, size: tuple[int, int]) -> np.ndarray:
-    """A depth or disparity map (H, W) float32 as stored."""
-    values = read_map(path)
+def depth_map(path: Path, size: tuple[int, int], is_metric: bool) -> np.ndarray:
+    """A map (H, W) float32 of metric depth, or of disparity or its confidence."""
+    values = read_map(path, is_metric)
     if values.ndim != 2:
         raise InputError(
             f"{path}: a depth map of shape {values.shape}; it must be (H, W), copy it again"
@@ -106,12 +105,13 @@ def disparities(
     The note is a sentence on how they were brought to scene units.
     """
     paths = [p.depth for p in chosen if p.depth is not None]
-    maps = np.stack([depth_map(path, size) for path in paths])
+    is_metric = capture.depth_kind == "metric"
+    maps = np.stack([depth_map(path, size, is_metric) for path in paths])
     sparse = [capture.sparse_depth.get(p.source) for p in chosen]
     for path, values in zip(paths, maps, strict=True):
         if capture.depth_kind != "relative" and not (values > 0).any():
             raise InputError(f"{path}: nothing above 0 in this depth map; copy it again")
-    if capture.depth_kind == "metric":
+    if is_metric:
         maps *= unit_scales(paths, capture.depth_scale)[:, None, None]
         return disparity_of_metric(maps, sparse, capture.depth_units == "own")
     note = ""
@@ -121,12 +121,12 @@ def disparities(
 
 
 def unit_scales(paths: Sequence[Path], depth_scale: float) -> np.ndarray:
-    """Scene units per unit of each map (T,) as read.
+    """Scene units per unit of each metric map (T,) as read.
 
-    Pictures are read as shares of white, arrays as they are.
+    Pictures are read in scene units, arrays in those of the set.
     """
-    white = [PNG_WHITE if path.suffix.lower() == ".png" else 1.0 for path in paths]
-    return np.array(white, np.float32) * np.float32(depth_scale)
+    scales = [depth_scale if path.suffix.lower() in ARRAYS else 1.0 for path in paths]
+    return np.array(scales, np.float32)
 
 
 def disparity_of_metric(
@@ -150,7 +150,7 @@ def read_confidence(chosen: Sequence[Picture], size: tuple[int, int]) -> np.ndar
     confidence = np.ones((len(chosen), *size), np.float32)
     for k, picture in enumerate(chosen):
         if picture.confidence is not None:
-            confidence[k] = depth_map(picture.confidence, size)
+            confidence[k] = depth_map(picture.confidence, size, is_metric=False)
     return confidence
 
 

@@ -34,6 +34,7 @@ from hdr_nsff.footage.datasets.set_files import (
     read_document,
     source_of,
 )
+from hdr_nsff.footage.depth_files import MILLIMETERS
 from hdr_nsff.footage.frame_files import natural_key
 from hdr_nsff.footage.pose_formats import GivenPoses, from_transforms
 
@@ -41,7 +42,6 @@ NAME = "transforms.json"
 HELD_OUT = ("val_filenames", "test_filenames")
 EXTRA = "hdr_nsff"
 VIEWS = "held_out/"  # where `export` puts the views of a truth folder
-MILLIMETERS = 1000.0  # a unit of the poses in what depth files hold
 
 
 def recognized(folder: Path) -> bool:

@@ -98,6 +98,12 @@ def has_flow(m: Manifest) -> bool:
     return bool(pairs) and all(j in m.frames[i].raw_flow for i, j in pairs)
 
 
+def has_refined_flow(m: Manifest) -> bool:
+    """Whether the manifest names the refined flow of every pair."""
+    pairs = flow_pairs(m.frames)
+    return bool(pairs) and all(j in m.frames[i].flow for i, j in pairs)
+
+
 def learning_pairs(frames: list[FrameEntry]) -> tuple[list[Pair], list[Pair]]:
     """Of the training frames of each camera and track: neighbors, and consecutive ones
     of equal exposure.

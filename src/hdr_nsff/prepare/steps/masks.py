@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.images import read_mask
+from hdr_nsff.core.images import mask_gray
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.frame_files import RECORDED, natural_key, sorted_folders
 from hdr_nsff.prepare.result import StepResult
@@ -85,14 +85,21 @@ def given_masks(work: Work) -> np.ndarray:
             masks.append(mask)
         return np.stack(masks)
     assert isinstance(folder, Path)
+    brightest = 0.0
     for f, path in zip(m.frames, given_files(work, folder, RECORDED), strict=True):
-        mask = read_mask(path)
+        gray = mask_gray(path)
+        mask, brightest = gray > 0.5, max(brightest, float(gray.max()))
         if mask.shape != size:
             raise InputError(
                 f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
                 f"frame {f.index} is {m.width}x{m.height}; make it that size"
             )
         masks.append(mask)
+    if 0 < brightest <= 0.5:
+        raise InputError(
+            f"{folder}: no mask is white anywhere, the brightest pixel is {255 * brightest:.3g} of "
+            "255; what moves must be white, above half of it"
+        )
     return np.stack(masks)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -75,7 +76,11 @@ def find_poses(work: Work) -> StepResult:
     return StepResult(
         provenance="given" if given else "estimated",
         note=f"{sum(registered)} of {len(m.frames)} frames placed, parallax: {poses.parallax}",
-        details={"registered": registered, "notes": list(poses.notes)},
+        details={
+            "registered": registered,
+            "notes": list(poses.notes),
+            "known_range": known_range,
+        },
         manifest={
             "parallax": poses.parallax,
             "near": poses.near if known_range else SPHERE_NEAR,
@@ -150,11 +155,11 @@ def poses_and_masks(work: Work) -> Poses:
     earlier = EarlierRounds()
     cache = work.folder / FIRST_ROUND
     if cache.is_file():
-        poses, before = read_round(cache)
+        poses, before, earlier.model = read_round(cache)
     else:
         before = share_masks(work, rough_mask(*work.raw_flows, work.equalized[0]))
         poses = estimate(work, before, earlier)
-        write_round(cache, poses, before)
+        write_round(cache, poses, before, earlier.model)
     if poses.parallax != "full":
         return poses
     for rounds_left in reversed(range(MAX_ROUNDS + 1)):
@@ -264,20 +269,24 @@ def estimate_of_track(work: Work, moving: np.ndarray, earlier: EarlierRounds | N
 
 
 ARRAYS = ("K", "c2w", "registered", "points", "point_errors", "tracks", "frame_errors")
+MODEL = "model/"  # before the names of its files
 
 
-def write_round(path: Path, poses: Poses, moving: np.ndarray) -> None:
-    """Keep poses and the masks (T, H, W) they were estimated with."""
+def write_round(path: Path, poses: Poses, moving: np.ndarray, model: Mapping[str, bytes]) -> None:
+    """Keep poses, the masks (T, H, W) they were estimated with, and the files of the
+    `model` that the next round starts from.
+    """
     arrays = {name: np.asarray(getattr(poses, name)) for name in ARRAYS}
     arrays["range"] = np.array([poses.near or np.nan, poses.far or np.nan])
     arrays["words"] = np.array([poses.parallax, *poses.notes])
     arrays["moving"] = np.packbits(moving, axis=-1)
     arrays["width"] = np.array(moving.shape[-1])
+    arrays |= {MODEL + name: np.frombuffer(content, np.uint8) for name, content in model.items()}
     with atomic(path) as temporary, open(temporary, "wb") as file:
         np.savez(file, **arrays)  # type: ignore[arg-type]
 
 
-def read_round(path: Path) -> tuple[Poses, np.ndarray]:
+def read_round(path: Path) -> tuple[Poses, np.ndarray, dict[str, bytes]]:
     """What `write_round` wrote."""
     with np.load(path, allow_pickle=False) as arrays:
         near, far = (None if np.isnan(v) else float(v) for v in arrays["range"])
@@ -285,5 +294,7 @@ def read_round(path: Path) -> tuple[Poses, np.ndarray]:
         packed, width = arrays["moving"], int(arrays["width"])
         moving = np.unpackbits(packed, axis=-1, count=width).astype(bool)
         values = {name: arrays[name] for name in ARRAYS}
+        stored = [name for name in arrays.files if name.startswith(MODEL)]
+        model = {Path(name).name: arrays[name].tobytes() for name in stored}
     poses = Poses(**values, parallax=parallax, near=near, far=far, notes=tuple(notes))
-    return poses, moving
+    return poses, moving, model

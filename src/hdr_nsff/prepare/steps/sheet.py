@@ -16,6 +16,7 @@ from hdr_nsff.scene.movers import Mover, nearest_mover, read_movers
 
 NUM_COLUMNS = 6  # frames shown
 STRIPE_PX = 3  # width of the stripes on movers that are not rigid
+NO_FLOW = 0.25  # gray where there is none
 SHEET = "contact_sheet.png"
 
 
@@ -92,11 +93,13 @@ def mover_colors(movers: Sequence[Mover]) -> np.ndarray:
 
 def flow_cell(work: Work, f: FrameEntry) -> np.ndarray:
     """Flow (H, W, 3) to the next frame, from the last one to the one before; gray where
-    it is not believed.
+    it is not believed, or where the frame has none.
     """
+    if not f.flow:
+        return np.full((work.manifest.height, work.manifest.width, 3), NO_FLOW)
     files = f.flow[max(f.flow)]
     flow = colorize_flow(read_npy(work.folder / files.flow).astype(np.float32))
-    return np.where(read_mask(work.folder / files.valid)[..., None], flow, 0.25)
+    return np.where(read_mask(work.folder / files.valid)[..., None], flow, NO_FLOW)
 
 
 def disparity_cells(work: Work, frames: Sequence[FrameEntry]) -> list[np.ndarray]:

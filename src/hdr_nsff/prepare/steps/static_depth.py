@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial.distance import pdist
 
 from hdr_nsff.core.progress import say
-from hdr_nsff.core.stack import ArrayStack, Stack, by_key
+from hdr_nsff.core.stack import ArrayStack, Stack, by_key, spread_frames
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
 from hdr_nsff.prepare.result import StepResult
@@ -24,7 +24,6 @@ from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
 from hdr_nsff.priors.masks.visits import without_movers
-from hdr_nsff.priors.poses.reconstruct import spread_frames
 from hdr_nsff.scene.posed_video import PosedVideo
 
 MAX_STILL_FRAMES = 60  # of a camera that stands still, that its static picture is made of
@@ -161,10 +160,15 @@ def user_depth(work: Work, folder: Path) -> Depth:
     files = given_files(work, folder, DEPTH_FILES)
     disparity, confidence = read_depth_files(files, kind, (m.height, m.width))
     index = [f.index for f in work.train]
-    changes = {"depth_kind": "relative"} if kind == "relative" else {}
+    disparity, confidence = disparity[index], confidence[index]
+    changes: dict[str, Any] = {}
+    if kind == "relative":
+        changes["depth_kind"] = "relative"
+    elif not m.steps["poses"].details.get("known_range", True):
+        changes["near"], changes["far"] = depth_range(disparity, confidence)
     return Depth(
-        disparity[index],
-        confidence[index],
+        disparity,
+        confidence,
         f"given ({kind})",
         "given",
         given=True,

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 
-from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.core.stack import ArrayStack, spread_frames
 from hdr_nsff.priors.masks.geometric import extract_objects
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING, GeometricMaskTuning
 from hdr_nsff.radiometry.common_range import recorded_range
@@ -45,6 +46,10 @@ class VisitTuning:
     """Standard deviations that distances are limited to beside other evidence."""
     smoothing_px: float = 1.0
     """Standard deviation of the blur of the squared distances."""
+    max_compared: int = 24
+    """Visits of a camera that are compared with each other; of more, those spread
+    evenly.
+    """
     objects: GeometricMaskTuning = GEOMETRIC_MASK_TUNING
     """How scores become objects."""
 
@@ -93,18 +98,17 @@ def separate_movers(
         own = np.flatnonzero(learned[times])
         if not len(own):
             continue
-        distances = visit_distances(visits, tuning)
-        agreeing = distances < tuning.same_distance
-        among = np.ix_(own, own)
-        chosen = own[most_supported(distances[among], agreeing[among])]
-        supporters = np.take_along_axis(agreeing, chosen[None, None], 0)[0]  # (V, H, W)
+        noise = noise_of_visits(visits, tuning)
+        compared = own[spread_frames(len(own), tuning.max_compared)]
+        chosen = most_supported(visits, noise, compared, tuning)
+        from_static = distances_from(visits, noise, chosen, compared, tuning)
+        supporters = from_static < tuning.same_distance
         supporters[~learned[times]] = False
         recorded = supporters & ~visits.clipped
         unrecorded[camera] = ~recorded.any(0)
         used = np.where(unrecorded[camera], supporters, recorded)
         pictures[camera] = weighted_mean(visits.frames, used)
         unknown[camera] = supporters.sum(0) < 2
-        from_static = np.take_along_axis(distances, chosen[None, None], 0)[0]
         for t, distance in zip(times, from_static, strict=True):
             difference[t] = np.minimum(distance, tuning.max_score)
             moving[t] = extract_objects(tuning.score_scale * distance, tuning.objects)
@@ -138,22 +142,17 @@ def read_visits(
     return Visits(frames, blurred, without, ranges)
 
 
-def visit_distances(visits: Visits, tuning: VisitTuning = VISIT_TUNING) -> np.ndarray:
-    """Distances (V, V, H, W) between the visits of one camera at every pixel, in
-    standard deviations of the noise.
+def visit_distance(
+    visits: Visits, noise: np.ndarray, a: int, b: int, tuning: VisitTuning
+) -> np.ndarray:
+    """The distance (H, W) between two visits in standard deviations of the `noise`
+    (V, H, W, 3).
     """
-    count = len(visits.frames)
-    noise = noise_of_visits(visits, tuning)
-    distances = np.zeros((count, count, *visits.frames.shape[1:3]), np.float32)
-    for a in range(count):
-        for b in range(a + 1, count):
-            first, second = visits.in_common(a, b)
-            variance = noise[a] ** 2 + noise[b] ** 2
-            squared = ((first - second) ** 2 / variance).mean(-1)
-            squared = np.minimum(squared, tuning.max_distance**2)
-            distance = np.sqrt(cv2.GaussianBlur(squared, (0, 0), tuning.smoothing_px))
-            distances[a, b] = distances[b, a] = distance
-    return distances
+    first, second = visits.in_common(a, b)
+    variance = noise[a] ** 2 + noise[b] ** 2
+    squared = ((first - second) ** 2 / variance).mean(-1)
+    squared = np.minimum(squared, tuning.max_distance**2)
+    return np.asarray(np.sqrt(cv2.GaussianBlur(squared, (0, 0), tuning.smoothing_px)), np.float32)
 
 
 def noise_of_visits(visits: Visits, tuning: VisitTuning = VISIT_TUNING) -> np.ndarray:
@@ -181,13 +180,38 @@ def noise_of_visits(visits: Visits, tuning: VisitTuning = VISIT_TUNING) -> np.nd
     return np.hypot(noise[level(visits.blurred)], tuning.relative_noise * visits.blurred)
 
 
-def most_supported(distances: np.ndarray, agreeing: np.ndarray) -> np.ndarray:
-    """The visit (H, W) that most visits agree with at each pixel, the nearest to them
-    among equals; `distances` and `agreeing` are (V, V, H, W).
+def most_supported(
+    visits: Visits, noise: np.ndarray, compared: np.ndarray, tuning: VisitTuning
+) -> np.ndarray:
+    """The visit (H, W) that most of those `compared` (C,) agree with at each pixel, the
+    nearest to them among equals.
     """
-    support = agreeing.sum(0)
-    spread = np.where(agreeing, distances, 0).sum(0)
-    return np.argmax(support - spread / (1 + spread), 0)
+    size = visits.frames.shape[1:3]
+    support = np.ones((len(compared), *size), np.int32)  # each agrees with itself
+    spread = np.zeros((len(compared), *size), np.float32)
+    for i, j in combinations(range(len(compared)), 2):
+        distance = visit_distance(visits, noise, compared[i], compared[j], tuning)
+        agreeing = distance < tuning.same_distance
+        for k in (i, j):
+            support[k] += agreeing
+            spread[k] += np.where(agreeing, distance, 0)
+    return compared[np.argmax(support - spread / (1 + spread), 0)]
+
+
+def distances_from(
+    visits: Visits, noise: np.ndarray, chosen: np.ndarray, compared: np.ndarray, tuning: VisitTuning
+) -> np.ndarray:
+    """Distances (V, H, W) of all visits from the visit `chosen` (H, W) at each pixel,
+    one of those `compared` (C,).
+    """
+    distances = np.zeros((len(visits.frames), *chosen.shape), np.float32)
+    for b in compared:
+        there = chosen == b
+        for a in range(len(distances) if there.any() else 0):
+            if a != b:
+                distance = visit_distance(visits, noise, min(a, b), max(a, b), tuning)
+                distances[a][there] = distance[there]
+    return distances
 
 
 def weighted_mean(values: np.ndarray, weights: np.ndarray) -> np.ndarray:

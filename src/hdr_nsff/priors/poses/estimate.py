@@ -19,7 +19,7 @@ import torch
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.progress import say
-from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.core.stack import ArrayStack, spread_frames
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.colmap import ColmapModel
 from hdr_nsff.geometry.lens import Lens
@@ -47,7 +47,6 @@ from hdr_nsff.priors.poses.reconstruct import (
     SfmViews,
     best_model,
     sfm_views,
-    spread_frames,
     views_of_images,
 )
 from hdr_nsff.priors.poses.rotation import (

@@ -20,7 +20,7 @@ import torch
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import encode
 from hdr_nsff.core.progress import say
-from hdr_nsff.core.stack import ArrayStack, Stack
+from hdr_nsff.core.stack import ArrayStack, Stack, spread_frames
 from hdr_nsff.core.tensors import CPU
 from hdr_nsff.footage.colmap import ColmapImage, ColmapModel, read_model
 from hdr_nsff.geometry.lens import Lens
@@ -90,11 +90,6 @@ class SfmViews:
     groups: list[list[int]]  # views of each physical camera
     of_frame: np.ndarray  # (T,) the view of each frame
     visits: VisitImages | None = None  # of a rig: what is matched instead of the images
-
-
-def spread_frames(count: int, limit: int) -> np.ndarray:
-    """Up to `limit` of `count` frames, spread evenly over the clip."""
-    return np.unique(np.linspace(0, count - 1, min(limit, count)).astype(int))
 
 
 def sfm_views(

@@ -12,8 +12,7 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from hdr_nsff.core.stack import ArrayStack
-from hdr_nsff.priors.poses.reconstruct import spread_frames
+from hdr_nsff.core.stack import ArrayStack, spread_frames
 from hdr_nsff.priors.poses.rotation import MAD_TO_SIGMA
 from hdr_nsff.radiometry.local_detail import LocalDetailTuning, local_detail
 
