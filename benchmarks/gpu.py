@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from record import ROOT, Record, code_version, make_parser, restart_prepared
+from record import ROOT, Record, code_version, gpu_name, make_parser, restart_prepared
 from torch import Tensor
 
 from hdr_nsff.core import distributed
@@ -60,7 +60,7 @@ def main() -> None:
         print("benchmarks/gpu.py: this torch sees no CUDA device", file=sys.stderr)
         raise SystemExit(2)
     restart_prepared()
-    record = Record("gpu", args, seed=0)
+    record = Record("gpu", args, seed=0, device=device)
     record.results = earlier_results(args.out, device)
     done = {result["name"] for result in record.results}
     measurements = all_measurements(args, device)
@@ -104,8 +104,8 @@ def earlier_results(path: Path, device: torch.device) -> list[dict[str, Any]]:
         document = json.loads(path.read_text())
     except (OSError, ValueError):
         return []
-    gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
-    same = document["commit"] == code_version()[0] and document["machine"]["gpu"] == gpu
+    gpu = document["machine"]["gpu"]
+    same = document["commit"] == code_version()[0] and gpu == gpu_name(device)
     return [r for r in document["results"] if "error" not in r] if same else []
 
 
@@ -176,7 +176,7 @@ def measure_training(
     """Steps per second and peak memory of a preset, and frames per second after it."""
     if device.type == "cuda":
         torch.cuda.empty_cache()
-        torch.cuda.reset_peak_memory_stats()
+        torch.cuda.reset_peak_memory_stats(device)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         scene = toy_scene(size, folder)
@@ -193,7 +193,7 @@ def measure_training(
         "frames_per_second": round(frames_per_second(trainer, device), 2),
     }
     if device.type == "cuda":
-        result["peak_gpu_gb"] = round(torch.cuda.max_memory_allocated() / 2**30, 2)
+        result["peak_gpu_gb"] = round(torch.cuda.max_memory_allocated(device) / 2**30, 2)
     if preset == "splat":
         counts = len(trainer.field.static), len(trainer.field.moving), len(trainer.field.local)
         result["gaussians"] = sum(counts)
@@ -231,7 +231,7 @@ def frames_per_second(trainer: Trainer, device: torch.device) -> float:
 def synchronize(device: torch.device) -> None:
     """Wait for the device."""
     if device.type == "cuda":
-        torch.cuda.synchronize()
+        torch.cuda.synchronize(device)
 
 
 def run_demo(device: torch.device) -> dict[str, Any]:

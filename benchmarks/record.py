@@ -36,6 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 # What the numbers of a benchmark depend on; its results are no part of it.
 CODE = ("src", "benchmarks", ":(exclude)benchmarks/results")
+ANY_GPU = torch.device("cuda")  # the current one
 # Names that many folders share: their parent's name is recorded as well.
 COMMON_NAMES = {"scene", "oracle", "truth", "clip", "run", "out", "images", ""}
 
@@ -71,8 +72,15 @@ def restart_prepared() -> None:
 class Record:
     """The results of one benchmark, and the file that they are written to."""
 
-    def __init__(self, benchmark: str, args: argparse.Namespace, seed: int | None = None) -> None:
+    def __init__(
+        self,
+        benchmark: str,
+        args: argparse.Namespace,
+        seed: int | None = None,
+        device: torch.device = ANY_GPU,
+    ) -> None:
         self.benchmark = benchmark
+        self.device = device  # whose name is recorded
         self.seed = seed  # of the random numbers; None where none are drawn
         self.out: Path = args.out
         self.settings = {name: value for name, value in vars(args).items() if name != "out"}
@@ -87,7 +95,7 @@ class Record:
     def save(self, show: bool = True) -> Path:
         """Write the file, atomically; `show` prints where it is."""
         machine = this_machine().model_dump(exclude={"commit"})
-        machine["gpu"] = torch.cuda.get_device_name() if torch.cuda.is_available() else None
+        machine["gpu"] = gpu_name(self.device)
         commit, dirty = code_version()
         document = {
             "benchmark": self.benchmark,
@@ -103,6 +111,13 @@ class Record:
         if show:
             print(f"results: {self.out}")
         return self.out
+
+
+def gpu_name(device: torch.device) -> str | None:
+    """The name of a CUDA device; None for the CPU, and where there is no GPU."""
+    if device.type != "cuda" or not torch.cuda.is_available():
+        return None
+    return torch.cuda.get_device_name(device)
 
 
 def code_version() -> tuple[str | None, bool | None]:

@@ -5,7 +5,8 @@ process with NUMBA_ENABLE_CUDASIM=1, which numba reads when it is imported.
 
 import ctypes
 import math
-from typing import Any
+import threading
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -150,10 +151,35 @@ def test_no_gradient_is_made_for_a_pose_that_wants_none() -> None:
     assert view.c2w.grad is None and float(leaves[0].grad.abs().max()) > 0
 
 
-class SimulatedDriver:
+class Contexts:
+    """A libcuda with a context for each device."""
+
+    def __init__(self) -> None:
+        self.retained: list[int] = []
+        self.current = threading.local()
+
+    def cuInit(self, flags: int) -> int:  # noqa: N802
+        return flags
+
+    def cuDeviceGet(self, handle: Any, device: int) -> int:  # noqa: N802
+        handle._obj.value = 10 + device
+        return 0
+
+    def cuDevicePrimaryCtxRetain(self, context: Any, handle: Any) -> int:  # noqa: N802
+        self.retained.append(handle.value)
+        context._obj.value = 100 + handle.value
+        return 0
+
+    def cuCtxSetCurrent(self, context: Any) -> int:  # noqa: N802
+        self.current.context = context.value
+        return 0
+
+
+class SimulatedDriver(Contexts):
     """A libcuda that finds a kernel's arguments as a GPU would, and simulates it."""
 
     def __init__(self, name: str) -> None:
+        super().__init__()
         self.name = name
 
     def cuLaunchKernel(self, function: Any, *values: Any) -> int:  # noqa: N802
@@ -189,7 +215,7 @@ def test_the_driver_gets_the_arguments_as_a_kernel_reads_them(
 
     def by_driver(name: str, grid: tuple[int, int], threads: int, *arguments: Any) -> None:
         driver = Driver(SimulatedDriver(name))
-        driver.launch(ctypes.c_void_p(1), grid, threads, 0, pack(*arguments))
+        driver.launch(0, ctypes.c_void_p(1), grid, threads, 0, pack(*arguments))
 
     monkeypatch.setattr(rasterize_cuda, "launch", by_driver)
     found = drawn(simulated, scene(0, view, count=6), view, weight)
@@ -198,7 +224,7 @@ def test_the_driver_gets_the_arguments_as_a_kernel_reads_them(
 
 
 def test_a_failure_of_the_driver_is_named() -> None:
-    class Broken:
+    class Broken(Contexts):
         def cuLaunchKernel(self, *values: Any) -> int:  # noqa: N802
             return 700
 
@@ -207,7 +233,53 @@ def test_a_failure_of_the_driver_is_named() -> None:
             return 0
 
     with pytest.raises(RuntimeError, match="cuLaunchKernel failed: an illegal memory"):
-        Driver(Broken()).launch(ctypes.c_void_p(1), (1, 1), 1, 0, b"")
+        Driver(Broken()).launch(0, ctypes.c_void_p(1), (1, 1), 1, 0, b"")
+
+
+def test_a_kernel_is_launched_in_the_context_of_its_device_from_any_thread() -> None:
+    class WithContext(Contexts):
+        launches: ClassVar[list[int | None]] = []
+
+        def cuLaunchKernel(self, *values: Any) -> int:  # noqa: N802
+            self.launches.append(getattr(self.current, "context", None))
+            return 0
+
+    library = WithContext()
+    driver = Driver(library)
+
+    def start(device: int) -> None:
+        arguments = device, ctypes.c_void_p(1), (1, 1), 1, 0, b""
+        thread = threading.Thread(target=driver.launch, args=arguments)
+        thread.start()
+        thread.join()
+
+    for device in (0, 1, 0, 1):
+        start(device)
+    assert library.launches == [110, 111, 110, 111] and library.retained == [10, 11]
+
+
+ROWS = (torch.zeros(3, 4), torch.zeros(3, 4), 0.5, 0.1, torch.zeros(3, dtype=torch.uint8))
+
+
+@pytest.mark.parametrize(
+    ("position", "wrong", "found"),
+    [
+        (1, torch.zeros(3, 4, device="meta"), r"float32 \(3, 4\) on meta"),
+        (1, torch.zeros(3, 4, dtype=torch.float64), r"float64 \(3, 4\) on cpu"),
+        (1, torch.zeros(12), r"float32 \(12,\) on cpu"),
+        (1, 2.0, "2.0"),
+        (2, 1, "1"),
+        (2, torch.zeros(()), r"float32 \(\) on cpu"),
+    ],
+)
+def test_an_argument_that_a_kernel_does_not_take_is_refused(
+    position: int, wrong: Tensor | float, found: str
+) -> None:
+    given = list(ROWS)
+    launch("living", (1, 1), 3, *given)
+    given[position] = wrong
+    with pytest.raises(TypeError, match=f"living: argument {position} is .*{found}, and has to"):
+        launch("living", (1, 1), 3, *given)
 
 
 def test_tensors_of_the_cpu_are_refused_without_the_simulator(

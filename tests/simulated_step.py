@@ -17,7 +17,7 @@ from simulated_tone import use_few_knots
 from torch import Tensor
 
 from hdr_nsff.core import distributed
-from hdr_nsff.fields.kernels.cuda.launch import launch
+from hdr_nsff.fields.kernels.cuda.launch import check_arguments, launch
 from hdr_nsff.fields.nsff import encodings, fused_grid
 from hdr_nsff.fields.splat import (
     draw,
@@ -48,23 +48,31 @@ WITH_LAUNCHES = (
 )
 
 
-def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
-    """A kernel on tensors of the pretend device."""
-    if 0 in grid:
-        return
+def arrive(name: str, values: tuple[Tensor | float, ...]) -> list[Tensor | float]:
+    """Count a launch; its arguments, once all of them are known to be there."""
     for counts in COUNTING:
         counts.launches[name] += 1
-    launch(name, grid, threads, *(unwrap(v) for v in values))
+    for i, value in enumerate(values):
+        there = not isinstance(value, Tensor) or isinstance(value, PretendTensor)
+        assert there, f"{name}: argument {i} {tuple(value.shape)} is on the CPU"
+    arguments = [unwrap(v) for v in values]
+    check_arguments(name, arguments)
+    return arguments
 
 
-def count_launch(name: str, grid: tuple[int, int], threads: int, *values: Tensor | int) -> None:
+def launch_there(name: str, grid: tuple[int, int], threads: int, *values: Tensor | float) -> None:
+    """A kernel on tensors of the pretend device."""
+    if 0 not in grid:
+        launch(name, grid, threads, *arrive(name, values))
+
+
+def count_launch(name: str, grid: tuple[int, int], threads: int, *values: Tensor | float) -> None:
     """A kernel that does nothing but fill its last result with one number."""
     if 0 in grid:
         return
-    for counts in COUNTING:
-        counts.launches[name] += 1
-    if isinstance(values[-1], Tensor):  # every time-local Gaussian is alive
-        unwrap(values[-1]).fill_(name == "living")
+    *_, last = arrive(name, values)
+    if isinstance(last, Tensor):  # every time-local Gaussian is alive
+        last.fill_(name == "living")
 
 
 class NothingDrawn(torch.autograd.Function):
@@ -200,6 +208,22 @@ def test_a_step_has_the_terms_and_gradients_of_the_cpu(
         largest = float(expected.abs().max()) if expected.numel() else 0.0
         off = float((gradient - expected).abs().max()) if expected.numel() else 0.0
         assert off <= 1e-3 * largest + 1e-7, (name, off, largest)
+
+
+def test_a_step_moves_the_poses_near_the_knot_as_on_the_cpu(
+    toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    moved = []
+    for where in (torch.device("cpu"), device):
+        trainer = trainer_on(where, toy, toy_folder, tmp_path / where.type)
+        poses = trainer.field.trajectories
+        before = [unwrap(p.detach()).clone() for p in (poses.rotations, poses.translations)]
+        trainer.step()
+        after = [unwrap(p.detach()) for p in (poses.rotations, poses.translations)]
+        moved.append([(a != b).any(1) for a, b in zip(after, before, strict=True)])
+        assert not any(unwrap(marks).any() for marks in trainer.optimizers.row_marks)
+    for ours, theirs in zip(*moved, strict=True):
+        assert torch.equal(ours, theirs) and 0 < int(ours.sum()) < len(ours)
 
 
 def test_launches_of_a_step_with_time_local_gaussians(

@@ -9,20 +9,24 @@ from typing import Any
 
 import pytest
 import torch
-from presets import random_field, small
+from presets import interrupted_at, random_field, small
 from pretend_device import PretendTensor, counted, pretend_device
 from torch import nn
 
 from hdr_nsff.core import distributed
+from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.evaluation.evaluate import evaluate_run
+from hdr_nsff.fields.nsff.encodings import TouchedAdam
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.rasterize import Maps
+from hdr_nsff.priors.flow.networks import build
 from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.shot_views import plan_shot
 from hdr_nsff.rendering.shots import render_shot
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.training import run_folder
 from hdr_nsff.training.presets import METHODS
 from hdr_nsff.training.run_folder import Run, open_folder
 from hdr_nsff.training.train import Trainer, train
@@ -77,6 +81,41 @@ def test_a_preset_trains_renders_and_evaluates(
 
 
 @pytest.mark.parametrize("preset", ["splat", "grid"])
+def test_optimizers_clear_the_marks_that_the_field_makes(
+    preset: str, toy: Scene, toy_folder: Path, tmp_path: Path, device: torch.device
+) -> None:
+    config = small(preset, toy_folder, tmp_path / "run")
+    open_folder(config)
+    trainer = Trainer(config, toy, device, distributed.Ranks())
+    made = {id(b) for name, b in trainer.field.named_buffers() if name.endswith("touched")}
+    touched = trainer.optimizers.by_name["touched"]
+    assert isinstance(touched, TouchedAdam) and made
+    for held in (trainer.optimizers.row_marks, list(touched.marks.values())):
+        assert {id(marks) for marks in held} == made
+        assert all(isinstance(marks, PretendTensor) for marks in held)
+
+
+@pytest.mark.parametrize("preset", ["splat", "grid"])
+def test_a_stopped_run_resumes_on_the_device(
+    preset: str,
+    toy_folder: Path,
+    tmp_path: Path,
+    device: torch.device,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(run_folder, "write_preview", lambda *_: None)
+    settings = small(preset, toy_folder, tmp_path / "run", STEPS)
+    settings = replace(settings, checkpoint_seconds=0.0)
+    interrupted_at(3, settings, monkeypatch)
+    straight = replace(settings, out=tmp_path / "straight")
+    learned = [latest_checkpoint(train(each)) for each in (settings, straight)]
+    resumed, expected = (found.tensors for found in learned if found)
+    assert resumed.keys() == expected.keys()
+    for name, tensor in resumed.items():
+        torch.testing.assert_close(tensor, expected[name], rtol=0, atol=0, msg=name)
+
+
+@pytest.mark.parametrize("preset", ["splat", "grid"])
 def test_poses_are_corrected_on_the_device(
     preset: str, toy_folder: Path, tmp_path: Path, device: torch.device
 ) -> None:
@@ -101,6 +140,34 @@ def test_a_step_has_the_losses_of_the_cpu(
     with pretend_device() as device:
         found = first_step(tmp_path / "pretend", device)
     assert found == pytest.approx(expected, rel=2e-3, abs=1e-5)
+
+
+def test_autocast_may_make_other_types_of_raw_numbers(
+    toy: Scene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On CUDA, exponentials of bfloat16 are float32; on the CPU, they are not."""
+    field = random_field("paper", toy).eval()  # without noise
+    to_density, to_radiance = field.to_density, field.to_radiance
+    monkeypatch.setattr(field, "to_density", lambda raw, bias: to_density(raw.float(), bias))
+    monkeypatch.setattr(field, "to_radiance", lambda raw: to_radiance(raw.float()))
+    raw, index = torch.randn(3, 5).bfloat16(), torch.tensor([1, 2, 5])
+    found = field.scatter(raw, index, torch.Size((2, 3)), 0.5)
+    kept = torch.zeros(6, dtype=torch.bool)
+    kept[index] = True
+    expected = to_density(raw[:, 3].float(), 0.5)
+    torch.testing.assert_close(found.density.view(-1)[kept], expected)
+    torch.testing.assert_close(found.radiance.view(-1, 3)[kept], to_radiance(raw[:, :3].float()))
+    torch.testing.assert_close(found.blend.view(-1)[kept], raw[:, 4].sigmoid())
+    assert not found.density.view(-1)[~kept].any() and not found.radiance.view(-1, 3)[~kept].any()
+
+
+@pytest.mark.parametrize(("capability", "fast"), [((7, 5), False), ((8, 0), True), ((12, 0), True)])
+def test_flow_is_computed_in_bfloat16_where_a_gpu_has_units_for_it(
+    capability: tuple[int, int], fast: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda device: capability)
+    monkeypatch.setattr("hdr_nsff.priors.flow.networks.GMFlow", lambda bf16: bf16)
+    assert build("gmflow", torch.device("cuda", 1)) is fast
 
 
 # operations that a step launches at most, forward and backward and Adam, and for which

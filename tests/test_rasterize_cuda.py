@@ -42,6 +42,16 @@ def test_a_kernel_becomes_machine_code(name: str, capability: tuple[int, int]) -
 
 
 @needs_compiler
+@pytest.mark.parametrize("name", ["project", "project_backward"])
+def test_a_gaussian_is_projected_in_float64(name: str) -> None:
+    ptx = ptx_of(name, (8, 0))
+    assert len(re.findall(r"\bfma\.rn\.f64", ptx)) >= 9  # of the camera point alone
+    single = re.findall(r"\b(?:fma|mul|add|sub|div|sqrt)[\w.]*\.f32", ptx)
+    # the opacity's gradient is a quotient of two stored numbers
+    assert single == ["div.rn.f32"] * (name == "project_backward")
+
+
+@needs_compiler
 @pytest.mark.parametrize("name", list(SIGNATURES))
 def test_a_kernel_takes_eight_byte_numbers_as_many_as_are_packed(name: str) -> None:
     ptx = ptx_of(name, (8, 0))
@@ -65,19 +75,59 @@ def test_a_gpu_that_the_linker_does_not_know_gets_ptx(monkeypatch: pytest.Monkey
 
 def test_a_kernel_is_compiled_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     compiled: list[str] = []
+    image = b"\x7fELF machine code"
 
     def compile_kernel(name: str, capability: tuple[int, int]) -> bytes:
         compiled.append(name)
-        return b"machine code"
+        return image
 
     monkeypatch.setattr(compiling, "compile_kernel", compile_kernel)
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     for capability in ((8, 0), (8, 0), (9, 0)):
-        assert load_kernel("forward", capability) == b"machine code"
+        assert load_kernel("forward", capability) == image
     assert compiled == ["forward", "forward"]
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "hdr-nsff-cuda" / "file"))
     next((tmp_path / "hdr-nsff-cuda").iterdir()).rename(tmp_path / "hdr-nsff-cuda" / "file")
-    assert load_kernel("forward", (8, 0)) == b"machine code"  # where nothing can be written
+    assert load_kernel("forward", (8, 0)) == image  # where nothing can be written
+
+
+def test_ptx_is_linked_by_a_linker_that_is_there_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiled: list[str] = []
+
+    def compile_ptx(name: str, capability: tuple[int, int]) -> str:
+        compiled.append(name)
+        return "PTX"
+
+    def missing(ptx: str, capability: tuple[int, int]) -> bytes:
+        raise ImportError("no nvJitLink")
+
+    monkeypatch.setattr(compiling, "compile_ptx", compile_ptx)
+    monkeypatch.setattr(compiling, "link", missing)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    assert [load_kernel("forward", (8, 0)) for _ in range(2)] == 2 * [b"PTX\0"]
+    linked = []
+
+    def link(ptx: str, capability: tuple[int, int]) -> bytes:
+        linked.append((ptx, capability))
+        return b"\x7fELF"
+
+    monkeypatch.setattr(compiling, "link", link)
+    assert [load_kernel("forward", (8, 0)) for _ in range(2)] == 2 * [b"\x7fELF"]
+    assert compiled == ["forward"] and linked == [("PTX", (8, 0))]
+
+
+@pytest.mark.parametrize("package", ["nvidia-nvjitlink", "nvidia-nvjitlink-cu12"])
+def test_another_linker_compiles_anew(package: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = set()
+    for version in ("", "12.8", "12.9"):
+        installed = {package: version}
+        monkeypatch.setattr(
+            compiling, "versions", lambda names, of=installed: [of.get(n, "1.0") for n in names]
+        )
+        found.add(compiling.fingerprint.__wrapped__())
+    assert len(found) == 3
 
 
 @pytest.mark.parametrize(("cuda", "extra"), [("12.8", "gpu12"), ("13.0", "gpu"), (None, "gpu")])

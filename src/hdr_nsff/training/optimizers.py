@@ -15,7 +15,10 @@ from hdr_nsff.fields.nsff.encodings import TouchedAdam
 
 
 class Optimizers:
-    """Optimizers over parameter groups, by name: "dense" and "touched"."""
+    """Optimizers over parameter groups, by name: "dense" and "touched".
+
+    The parameters and their marks stay on the device where they are.
+    """
 
     def __init__(self, groups: Sequence[ParamGroup]) -> None:
         dense = [group for group in groups if group.row_marks is None]
@@ -34,11 +37,6 @@ class Optimizers:
         for optimizer in self.by_name.values():
             for group in optimizer.param_groups:
                 yield from group["params"]
-
-    def follow_parameters(self) -> None:
-        """Move the moments to the devices of their parameters."""
-        for optimizer in self.by_name.values():
-            optimizer.load_state_dict(optimizer.state_dict())
 
     def step(self, lr_share: float, progress: float) -> None:
         """One step at rates of `lr_share` of their start; gradients are cleared."""

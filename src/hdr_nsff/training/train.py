@@ -14,6 +14,7 @@ from pathlib import Path
 import torch
 
 from hdr_nsff.core import distributed
+from hdr_nsff.core.checkpoints import checkpoint_files
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
@@ -95,25 +96,24 @@ class Trainer:
             published=config.published,
         )
         modules = {"field": self.field, "tonemapper": self.tonemapper, "poses": self.poses}
+        note = None
+        if not checkpoint_files(config.out):
+            with_flow = config.loss.flow > 0
+            note = start_run(self.field, self.tonemapper, scene, config.from_priors, with_flow)
+        # before there are optimizers: a move replaces the marks that these hold
+        for module in modules.values():
+            module.to(device)
         groups = self.field.param_groups()
         groups += self.tonemapper.param_groups(config.tonemap_lr)
         groups += self.poses.param_groups(config.pose_lr)
         self.optimizers = Optimizers(groups)
         num_rays = rays_per_step(config, scene)
         self.writer = RunWriter(config, modules, self.optimizers, num_rays, ranks.main)
-        resumed = self.writer.resume(self.clock)
-        if resumed is None:
-            with_flow = config.loss.flow > 0
-            note = start_run(self.field, self.tonemapper, scene, config.from_priors, with_flow)
-            self.writer.say(note)
-        else:
-            self.clock = resumed
+        self.writer.say(note)
+        self.clock = self.writer.resume(self.clock) or self.clock
         # frames on the CPU stay where they are: read when they are drawn
         self.scene = scene if device.type == "cpu" else to_device(scene, device)
         self.read_ahead = ReadAhead(self.scene.train)
-        for module in modules.values():
-            module.to(device)
-        self.optimizers.follow_parameters()
 
     def loop(self, keep_at: Sequence[float] = (), previews: bool = True) -> None:
         """Train until the clock runs out; it counts neither compiling nor writing."""

@@ -220,13 +220,18 @@ class TwoBranches(nn.Module):
 
     def scatter(self, raw: Tensor, index: Tensor, shape: torch.Size, bias: float) -> BranchOutput:
         """Raw numbers (M, 4 or 5) of samples `index`, as rays of `shape` (N, S)."""
-        total = shape[0] * shape[1]
-        density = raw.new_zeros(total).index_copy(0, index, self.to_density(raw[:, 3], bias))
-        radiance = raw.new_zeros(total, 3).index_copy(0, index, self.to_radiance(raw[:, :3]))
+
+        def everywhere(values: Tensor) -> Tensor:
+            # autocast may have made other types of the raw numbers, by device
+            found = values.new_zeros(shape[0] * shape[1], *values.shape[1:])
+            return found.index_copy(0, index, values).view(*shape, *values.shape[1:])
+
+        density = everywhere(self.to_density(raw[:, 3], bias))
+        radiance = everywhere(self.to_radiance(raw[:, :3]))
         blend = density  # unused where densities add up, and of the dynamic branch
         if self.config.compositing == "blend" and raw.shape[1] > 4:
-            blend = raw.new_zeros(total).index_copy(0, index, raw[:, 4].sigmoid())
-        return BranchOutput(density.view(shape), radiance.view(*shape, 3), blend.view(shape))
+            blend = everywhere(raw[:, 4].sigmoid())
+        return BranchOutput(density, radiance, blend)
 
     def view_directions(self, samples: RaySamples, index: Tensor) -> Tensor:
         """View directions (M, 3) of samples `index`; none for grids."""

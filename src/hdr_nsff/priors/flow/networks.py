@@ -191,11 +191,17 @@ def build(name: str | None, device: torch.device) -> FlowNetwork:
     """An untrained network; in bfloat16 only where `device` computes it fast."""
     match name:
         case "gmflow":
-            fast_bf16 = device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
-            return GMFlow(bf16=fast_bf16)
+            return GMFlow(bf16=computes_bf16_fast(device))
         case "raft":
             return Raft()
     raise InputError(f"weights of {name!r}: no such flow network; use those of gmflow or raft")
+
+
+def computes_bf16_fast(device: torch.device) -> bool:
+    """Whether a device has units for bfloat16; GPUs have them since Ampere."""
+    if device.type == "cuda":
+        return torch.cuda.get_device_capability(device) >= (8, 0)
+    return torch.cpu._is_avx512_bf16_supported()
 
 
 def finetuned_file(given: Path) -> Path | None:

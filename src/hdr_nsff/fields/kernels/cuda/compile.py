@@ -3,8 +3,9 @@ brings as wheels: no CUDA toolkit, no C compiler, no driver.
 
 numba-cuda makes PTX, and nvJitLink makes of it what one kind of GPU runs. PTX alone
 would need a driver as new as the compiler. It is what is left where nvJitLink does not
-know the GPU. Machine code is kept in the user's cache folder, under a name that changes
-with the sources and the compiler.
+know the GPU, or is not there. Both are kept in the user's cache folder, under names
+that change with the sources and the compiler. PTX is linked at a later start, if that
+works by then.
 """
 
 from __future__ import annotations
@@ -73,18 +74,33 @@ MODULES = (
 )  # that hold the kernels
 # these may take every number for a finite one: `project` has thrown out the others
 FAST = ("forward", "backward")
-PACKAGES = ("numba", "numba-cuda", "cuda-bindings", "nvidia-nvvm", "nvidia-cuda-nvcc-cu12")
+MACHINE_CODE = b"\x7fELF"  # its first bytes
+PACKAGES = (
+    "numba",
+    "numba-cuda",
+    "cuda-bindings",
+    "nvidia-nvvm",
+    "nvidia-cuda-nvcc-cu12",
+    "nvidia-nvjitlink",
+    "nvidia-nvjitlink-cu12",
+)  # that make the machine code
 
 
 def compile_kernel(name: str, capability: tuple[int, int]) -> bytes:
-    """What a GPU of this compute capability runs of a kernel, or PTX where the linker
-    does not know the GPU. The entry has the kernel's name.
+    """What a GPU of this compute capability runs of a kernel, or PTX where it cannot be
+    linked. The entry has the kernel's name.
     """
-    ptx = compile_ptx(name, capability)
+    return link_if_possible(compile_ptx(name, capability).encode() + b"\0", capability)
+
+
+def link_if_possible(ptx: bytes, capability: tuple[int, int]) -> bytes:
+    """Machine code of PTX, or the PTX where the linker is missing or does not know the
+    GPU. PTX ends with 0.
+    """
     try:
-        return link(ptx, capability)
+        return link(ptx.rstrip(b"\0").decode(), capability)
     except Exception:  # of its own type, whose module is not there without nvJitLink
-        return ptx.encode() + b"\0"
+        return ptx
 
 
 def kernel_function(name: str) -> Callable[..., None]:
@@ -144,21 +160,40 @@ def link(ptx: str, capability: tuple[int, int]) -> bytes:
 
 
 def load_kernel(name: str, capability: tuple[int, int]) -> bytes:
-    """`compile_kernel`, once for each user, kind of GPU, and state of the sources."""
-    folder = cache_folder()
-    path = folder / "{}-sm_{}{}-{}".format(name, *capability, fingerprint())
+    """`compile_kernel`, once for each user, kind of GPU, and state of the sources.
+
+    PTX that could not be linked is compiled once as well, but another try is made to
+    link it.
+    """
+    stem = "{}-sm_{}{}-{}".format(name, *capability, fingerprint())
+    image = read_kept(f"{stem}.cubin")
+    if image is not None:
+        return image
+    ptx = read_kept(f"{stem}.ptx")
+    image = compile_kernel(name, capability) if ptx is None else link_if_possible(ptx, capability)
+    kind = "cubin" if image.startswith(MACHINE_CODE) else "ptx"
+    keep(f"{stem}.{kind}", image)
+    return image
+
+
+def read_kept(file_name: str) -> bytes | None:
+    """A file of the cache folder; None where there is none."""
     try:
-        return path.read_bytes()
+        return (cache_folder() / file_name).read_bytes()
     except OSError:
-        image = compile_kernel(name, capability)
-    temporary = path.with_name(f"{path.name}.{os.getpid()}")
+        return None
+
+
+def keep(file_name: str, content: bytes) -> None:
+    """Write a file of the cache folder, if it can be written."""
+    path = cache_folder() / file_name
+    temporary = path.with_name(f"{file_name}.{os.getpid()}")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        temporary.write_bytes(image)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(content)
         temporary.replace(path)
     except OSError:  # no home to write to: they are compiled at every start
         pass
-    return image
 
 
 def cache_folder() -> Path:

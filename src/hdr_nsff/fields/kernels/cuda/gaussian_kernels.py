@@ -1,14 +1,14 @@
 """CUDA kernels with a thread per Gaussian: into the picture, its tiles, and backwards.
 
-They call the CPU's functions for everything about one Gaussian (`footprint.py`).
-Shapes: G Gaussians, P (Gaussian, tile) pairs. The simulator of numba-cuda replaces the
-name `cuda` in this module.
+They call the CPU's functions for everything about one Gaussian (`footprint.py`), in
+float64: compiled, `float` of a float32 is a float32. Shapes: G Gaussians, P (Gaussian,
+tile) pairs. The simulator of numba-cuda replaces the name `cuda` in this module.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import cuda
+from numba import cuda, float64
 
 from hdr_nsff.fields.kernels import footprint
 from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
@@ -24,25 +24,25 @@ world_gradients = FOOTPRINT["world_gradients"]
 @exact_device
 def read_gaussian(g, means, quaternions, scales):
     """Mean, quaternion and scales of a Gaussian in float64."""
-    m = (float(means[g, 0]), float(means[g, 1]), float(means[g, 2]))
+    m = (float64(means[g, 0]), float64(means[g, 1]), float64(means[g, 2]))
     q = (
-        float(quaternions[g, 0]),
-        float(quaternions[g, 1]),
-        float(quaternions[g, 2]),
-        float(quaternions[g, 3]),
+        float64(quaternions[g, 0]),
+        float64(quaternions[g, 1]),
+        float64(quaternions[g, 2]),
+        float64(quaternions[g, 3]),
     )
-    return m, q, (float(scales[g, 0]), float(scales[g, 1]), float(scales[g, 2]))
+    return m, q, (float64(scales[g, 0]), float64(scales[g, 1]), float64(scales[g, 2]))
 
 
 @exact_device
 def read_camera(w2c, K):
     """World-to-camera matrix (3, 4), row by row, and (fx, fy, cx, cy), in float64."""
     view = (
-        (float(w2c[0, 0]), float(w2c[0, 1]), float(w2c[0, 2]), float(w2c[0, 3])),
-        (float(w2c[1, 0]), float(w2c[1, 1]), float(w2c[1, 2]), float(w2c[1, 3])),
-        (float(w2c[2, 0]), float(w2c[2, 1]), float(w2c[2, 2]), float(w2c[2, 3])),
+        (float64(w2c[0, 0]), float64(w2c[0, 1]), float64(w2c[0, 2]), float64(w2c[0, 3])),
+        (float64(w2c[1, 0]), float64(w2c[1, 1]), float64(w2c[1, 2]), float64(w2c[1, 3])),
+        (float64(w2c[2, 0]), float64(w2c[2, 1]), float64(w2c[2, 2]), float64(w2c[2, 3])),
     )
-    return view, (float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+    return view, (float64(K[0, 0]), float64(K[1, 1]), float64(K[0, 2]), float64(K[1, 2]))
 
 
 def project(
@@ -61,7 +61,8 @@ def project(
     m, q, s = read_gaussian(g, means, quaternions, scales)
     view, k = read_camera(w2c, K)
     t, _, _, _, _, covariance = footprint_of(m, q, s, view, k, width, height)
-    shows, center, conic, bounds = ellipse_of(t, covariance, float(opacities[g]), k, width, height)
+    opacity = float64(opacities[g])
+    shows, center, conic, bounds = ellipse_of(t, covariance, opacity, k, width, height)
     depths[g] = t[2]
     num_features = features.shape[1]
     for n in range(num_features):
@@ -148,15 +149,15 @@ def project_backward(
     m, q, s = read_gaussian(g, means, quaternions, scales)
     view, k = read_camera(w2c, K)
     u = (
-        float(sums[g, 0]),
-        float(sums[g, 1]),
-        float(sums[g, 2]),
-        float(sums[g, 3]),
-        float(sums[g, 4]),
-        float(sums[g, 5]),
+        float64(sums[g, 0]),
+        float64(sums[g, 1]),
+        float64(sums[g, 2]),
+        float64(sums[g, 3]),
+        float64(sums[g, 4]),
+        float64(sums[g, 5]),
     )
     grad_opacities[g] = -sums[g, 0] / opacities[g]  # dL / do = dL / dalpha * alpha / o
-    d_depth = float(sums[g, MOMENTS + depth_channel])
+    d_depth = float64(sums[g, MOMENTS + depth_channel])
     d_mean, d_quaternion, d_scales, d_view = world_gradients(
         m, q, s, view, k, width, height, u, d_depth
     )

@@ -13,6 +13,7 @@ from __future__ import annotations
 import ctypes
 import math
 import struct
+from collections.abc import Sequence
 from functools import cache
 from threading import Lock
 from typing import Any
@@ -25,6 +26,9 @@ from hdr_nsff.fields.kernels.cuda.layout import THREADS
 
 # the driver's keys of a launch's extra values (CU_LAUNCH_PARAM_...)
 BUFFER_END, BUFFER_POINTER, BUFFER_SIZE = 0, 1, 2
+# the types in `compile.SIGNATURES`
+DTYPES = {"f": torch.float32, "d": torch.float64, "s": torch.int32, "i": torch.int64}
+DTYPES["b"] = torch.uint8
 
 
 def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | float) -> None:
@@ -34,14 +38,40 @@ def launch(name: str, grid: tuple[int, int], threads: int, *arguments: Tensor | 
     """
     if 0 in grid:
         return
-    device = next(a.device for a in arguments if isinstance(a, Tensor))
+    device = check_arguments(name, arguments)
     if device.type == "cpu":
         simulate(name, grid, threads, *arguments)
         return
     with torch.cuda.device(device):
+        index = torch.cuda.current_device()
         stream = torch.cuda.current_stream().cuda_stream
-        function = loaded_kernel(name, torch.cuda.current_device())
-        driver().launch(function, grid, threads, stream, pack(*arguments))
+        function = loaded_kernel(name, index)
+        driver().launch(index, function, grid, threads, stream, pack(*arguments))
+
+
+def check_arguments(name: str, arguments: Sequence[Tensor | float]) -> torch.device:
+    """The device on which all tensors among a kernel's arguments are.
+
+    TypeError where one is elsewhere, or an argument is not what the kernel takes: it
+    would read and write anywhere.
+    """
+    device = next(a.device for a in arguments if isinstance(a, Tensor))
+    for i, (a, (dtype, ndim)) in enumerate(zip(arguments, kinds_of(name), strict=True)):
+        if isinstance(a, Tensor):
+            fits = a.dtype == dtype and a.ndim == ndim and a.device == device
+        else:
+            fits = ndim == 0 and isinstance(a, float) == dtype.is_floating_point
+        if not fits:
+            found = f"{a.dtype} {tuple(a.shape)} on {a.device}" if isinstance(a, Tensor) else a
+            wanted = f"{dtype} of {ndim} dimensions, tensors on {device}"
+            raise TypeError(f"{name}: argument {i} is {found}, and has to be {wanted}")
+    return device
+
+
+@cache
+def kinds_of(name: str) -> list[tuple[torch.dtype, int]]:
+    """The type of each argument of a kernel, and its dimensions, 0 for a number."""
+    return [(DTYPES[code[0]], int(code[1])) for code in SIGNATURES[name].split()]
 
 
 def blocks_for(count: int) -> tuple[int, int]:
@@ -112,6 +142,7 @@ class Driver:
 
     def __init__(self, library: Any) -> None:
         self.library = library
+        self.contexts: dict[int, ctypes.c_void_p] = {}  # by device
 
     def call(self, function: str, *arguments: Any) -> None:
         """Call a function of the driver; RuntimeError where it fails."""
@@ -131,22 +162,29 @@ class Driver:
         return function
 
     def make_current(self, device: int) -> None:
-        """Make the context of a device, the one that torch uses, this thread's."""
-        context, handle = ctypes.c_void_p(), ctypes.c_int()
-        self.call("cuInit", 0)
-        self.call("cuDeviceGet", ctypes.byref(handle), device)
-        self.call("cuDevicePrimaryCtxRetain", ctypes.byref(context), handle)
-        self.call("cuCtxSetCurrent", context)
+        """Make the context of a device, the one that torch uses, this thread's.
+
+        A thread has none before torch's first kernel in it.
+        """
+        if device not in self.contexts:
+            context, handle = ctypes.c_void_p(), ctypes.c_int()
+            self.call("cuInit", 0)
+            self.call("cuDeviceGet", ctypes.byref(handle), device)
+            self.call("cuDevicePrimaryCtxRetain", ctypes.byref(context), handle)
+            self.contexts[device] = context
+        self.call("cuCtxSetCurrent", self.contexts[device])
 
     def launch(
         self,
+        device: int,
         function: ctypes.c_void_p,
         grid: tuple[int, int],
         threads: int,
         stream: int,
         parameters: bytes,
     ) -> None:
-        """Put a kernel with packed `parameters` on a stream."""
+        """Put a kernel with packed `parameters` on a stream of a device."""
+        self.make_current(device)
         buffer = ctypes.create_string_buffer(parameters, len(parameters))
         size = ctypes.c_size_t(len(parameters))
         extra = (ctypes.c_void_p * 5)(

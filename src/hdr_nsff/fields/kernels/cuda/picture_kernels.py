@@ -210,7 +210,9 @@ def losses(
         cuda.atomic.add(sums, VALID, shared[VALID])
         cuda.threadfence()
         if cuda.atomic.add(sums, DONE, float32(1)) == cuda.gridDim.x - 1:
-            total, pixels = cuda.atomic.add(sums, FLOW, float32(0)), sums[VALID]
+            # what other blocks added is only sure to be seen by atomic reads
+            total = cuda.atomic.add(sums, FLOW, float32(0))
+            pixels = cuda.atomic.add(sums, VALID, float32(0))
             sums[FLOW] = total / max(pixels, float32(1))
 
 
