@@ -2,7 +2,8 @@
 
     python examples/hdr_video.py OUT/render/training video.mp4 24 1.5
 
-24 frames a second, 1.5 stops brighter: then radiance 1 is diffuse white, 203 nits.
+24 frames a second, 1.5 stops brighter: then radiance 1 is diffuse white, 203 nits. Gray
+becomes neutral by the gains in the headers of files that `render` wrote.
 """
 
 from __future__ import annotations
@@ -11,23 +12,29 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
+
 from hdr_nsff.core.exr import read_exr
-from hdr_nsff.core.hdr_video import Planes, write_hdr_video
-from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
+from hdr_nsff.radiometry.hdr_footage import write_radiance_video
 
 
 def hdr_video(folder: Path, out: Path, fps: float, stops: float) -> int:
     """Write `out`; the number of its frames."""
-    return write_hdr_video(out, planes(sorted(folder.glob("*.exr")), stops), fps, "pq")
+    files = sorted(folder.glob("*.exr"))
+
+    def radiance() -> Iterator[np.ndarray]:
+        return (read_exr(file)["RGB"] * neutral_gains(file) for file in files)
+
+    write_radiance_video(out, radiance, "pq", "hevc", fps, 2.0**stops)
+    return len(files)
 
 
-def planes(files: list[Path], stops: float) -> Iterator[Planes]:
-    """10-bit codes of every picture, cut to even sizes."""
-    for file in files:
-        light = read_exr(file)["RGB"]
-        height, width = light.shape[0] // 2 * 2, light.shape[1] // 2 * 2
-        nits = display_light(light[:height, :width], 2.0**stops, "pq")
-        yield ycbcr_planes(encode(nits, "pq"))
+def neutral_gains(file: Path) -> np.ndarray:
+    """Gains (3,) that make gray neutral, by the header; 1 where it has none."""
+    with OpenEXR.File(str(file), header_only=True) as exr:
+        text = exr.header().get("neutralWhiteBalance", "1 1 1")
+    return np.array(text.split(), np.float32)
 
 
 if __name__ == "__main__":

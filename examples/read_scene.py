@@ -91,7 +91,7 @@ def gaussians(document, arrays, time, eye):
             means = np.einsum("nb,nbi->ni", g["mixture"], moved + centers + shifts)
             quaternions = product(g["mixture"] @ turns, quaternions)
         if "velocities" in g:  # around a time of their own
-            since = time - g["centers"]
+            since = np.clip(time, times[0], times[-1]) - g["centers"]
             means = means + g["velocities"] * since[:, None]
             window = np.exp(-0.5 * (since / np.exp(g["log_durations"])) ** 2)
             window = np.where(window > 0.02, window, 0)

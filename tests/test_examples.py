@@ -62,6 +62,14 @@ def test_the_reader_draws_time_local_gaussians(toy: Scene, tmp_path: Path) -> No
     assert mu_law_psnr(found, expected, float(expected.max())) > 50
 
 
+def test_beyond_the_clip_the_reader_keeps_its_last_moment(toy: Scene, tmp_path: Path) -> None:
+    field, tonemapper = trained_local(toy)
+    path = tmp_path / "local.hdr4d"
+    path.write_bytes(to_bytes(scene_of(field, tonemapper, toy, "Toy", 1.0)))
+    last = float(toy.times[-1])
+    np.testing.assert_array_equal(draw(path, toy, last + 3), draw(path, toy, last))
+
+
 def test_a_view_of_a_run_is_rendered(
     toy: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -84,12 +92,18 @@ def test_a_path_made_from_the_scene_is_one_that_render_takes(
     assert not torch.equal(views[2].camera.c2w, views[0].camera.c2w)
 
 
-def test_exr_files_become_an_hdr_video(tmp_path: Path) -> None:
-    render_shot(fake_run(tmp_path), large_shot(), tmp_path, Output(exr="float"))
+def test_exr_files_become_an_hdr_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run = fake_run(tmp_path)
+    gains = np.array([1.5, 1.0, 0.6], np.float32)
+    monkeypatch.setattr(run.tonemapper, "neutral", lambda _: torch.from_numpy(gains))
+    render_shot(run, large_shot(), tmp_path, Output(exr="float"))
     video = tmp_path / "hdr.mp4"
     assert hdr_video.hdr_video(tmp_path / "some", video, 24, -1.0) == 2
     stream, frames = decoded(video)
     assert stream.codec_context.color_trc == 16 and len(frames) == 2
-    light = display_light(read_exr(tmp_path / "some/00001.exr")["RGB"], 0.5, "pq")
+    neutral = read_exr(tmp_path / "some/00001.exr")["RGB"] * gains
+    light = display_light(neutral, 0.5, "pq")
     expected = ycbcr_planes(encode(light, "pq"))[0].astype(int)
     assert np.abs(luma(frames[1]) - expected).mean() < 2
+    names = {data.type.name for data in frames[0].side_data}
+    assert {"CONTENT_LIGHT_LEVEL", "MASTERING_DISPLAY_METADATA"} <= names

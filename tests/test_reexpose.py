@@ -15,6 +15,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, write_png
 from hdr_nsff.core.io import write_npy
+from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.maths.hdr_signal import display_light, encode, pq_decode, ycbcr_planes
 from hdr_nsff.radiometry.exposure_cycle import detect_cycle
@@ -203,6 +204,15 @@ def test_auto_exposure_drifts_and_is_kept_as_truth(tmp_path):
 def test_without_auto_exposure_no_drift_is_kept(tmp_path):
     out = reexpose(ReexposeConfig(ordinary_clip(tmp_path / "in"), tmp_path / "out"))
     assert Truth.open(out / "truth").clip_drift is None
+
+
+def test_the_lost_rate_of_a_video_is_said(tmp_path, capsys):
+    frames = [np.full((24, 40, 3), 0.1 + 0.03 * t) for t in range(20)]
+    for fps in (24, 30):
+        write_video(tmp_path / "in.mp4", frames, fps)
+        reexpose(ReexposeConfig(tmp_path / "in.mp4", tmp_path / f"{fps}"))
+        printed = " ".join(capsys.readouterr().err.split())
+        assert ("30 frames a second are now 24" in printed) == (fps == 30)
 
 
 def test_hdr_references_hold_the_linearized_clip(tmp_path):

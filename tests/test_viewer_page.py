@@ -27,10 +27,12 @@ from hdr_nsff.geometry import paths
 from hdr_nsff.maths.metrics import mu_law_psnr
 from hdr_nsff.rendering.served_run import ServedRun
 from hdr_nsff.scene.scene import Scene
+from hdr_nsff.tonemap.base import ToneMapConfig
+from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.viewer.field_scene import scene_of
 from hdr_nsff.viewer.page_file import PageSettings, make_page
 from hdr_nsff.viewer.scene_file import SceneFile, to_bytes
-from hdr_nsff.viewer.server import ViewerServer
+from hdr_nsff.viewer.server import MAX_PIXELS, ViewerServer
 
 SIZE = (160, 90)
 TO_BASE64 = """a => {
@@ -157,6 +159,19 @@ def test_the_camera_curve_records_as_the_tone_mapper_does(viewer: Page, toy: Sce
     radiance = torch.from_numpy(exposed[..., :3] * 2**-0.5)
     expected = tonemapper.develop(radiance, 0.5).numpy()
     np.testing.assert_allclose(found, expected, atol=0.004)
+
+
+def test_a_response_that_rises_beyond_1_is_shown_whole(
+    tab: Page, toy: Scene, tmp_path: Path
+) -> None:
+    field, _ = trained(toy)
+    tonemapper = tone_mapper_for(ToneMapConfig(kind="sigmoid"), toy)
+    open_page(tab, tmp_path / "scene.html", scene_of(field, tonemapper, toy, "Toy", 1.0))
+    tab.run("viewer.set({curve: 'camera', ev: 3})")
+    found = read_png(base64.b64decode(tab.run(png_text(16))))
+    exposed = read_linear(tab, tab.run("viewer.view(viewer.fullSize)"))[..., :3].numpy()
+    assert found.max() > 0.8
+    np.testing.assert_allclose(found, exposed / (1 + exposed), atol=0.004)
 
 
 def png_text(bits: int) -> str:
@@ -318,6 +333,44 @@ def test_the_copied_path_is_one_that_render_reads(viewer: Page, toy: Scene, tmp_
     torch.testing.assert_close(views[0].camera.c2w, toy.train[0].camera.c2w, atol=1e-5, rtol=0)
 
 
+def test_the_path_of_a_clip_has_held_out_frames_too(viewer: Page) -> None:
+    viewer.run("viewer.scene.times = [0, 1, 2, 4, 5, 6, 7.5]")
+    times = [view["time"] for view in viewer.run("viewer.cameraPath()")]
+    assert times == [0, 1, 2, 3, 4, 5, 6, 7, 7.5]
+    viewer.run("viewer.scene.times = [3]")
+    assert [view["time"] for view in viewer.run("viewer.cameraPath()")] == [3]
+
+
+def test_the_path_of_another_camera_names_it(viewer: Page) -> None:
+    for holder in ("viewer.scene", "viewer.renderer"):
+        viewer.run(f"{holder}.responses.push({holder}.responses[0])")
+    viewer.run("viewer.set({curve: 'camera', camera: 1})")
+    viewer.click("#copy-path")
+    text = "document.getElementById('note').textContent"
+    viewer.wait(f"{text}.endsWith('--path path.json --camera-id 1')")
+
+
+def test_a_right_click_drags_nothing(viewer: Page) -> None:
+    mouse = {"x": 120, "y": 100, "clickCount": 1}
+    right = {"button": "right", "buttons": 2}
+    viewer.call("Input.dispatchMouseEvent", type="mousePressed", **mouse, **right)
+    viewer.call("Input.dispatchMouseEvent", type="mouseMoved", x=160, y=110)
+    assert state(viewer, "mode") == "filmed"
+    left = {"button": "left", "buttons": 1}
+    viewer.call("Input.dispatchMouseEvent", type="mousePressed", **mouse, **left)
+    viewer.call("Input.dispatchMouseEvent", type="mouseMoved", x=160, y=110)  # released elsewhere
+    assert state(viewer, "mode") == "filmed"
+
+
+def test_recorded_frames_say_their_own_exposure(tab: Page, toy: Scene, tmp_path: Path) -> None:
+    drifting = replace(toy, train=[replace(frame, drift=0.3) for frame in toy.train])
+    open_page(tab, tmp_path / "scene.html", scene_file(drifting))
+    tab.run("viewer.set({split: true, time: viewer.first})")
+    ev = tab.run("viewer.scene.exposures[viewer.scene.views[0].bracket]") + 0.3
+    label = tab.run("document.getElementById('recorded-label').textContent")
+    assert label == f"Recorded, {ev:+.1f} EV".replace("-", "−")
+
+
 def test_without_parallax_the_camera_stays_where_it_filmed(
     tab: Page, toy: Scene, tmp_path: Path
 ) -> None:
@@ -342,6 +395,41 @@ def test_the_picture_and_the_controls_fit_the_window(
         left, top, right, bottom = tab.run(f"(r => [r.left, r.top, r.right, r.bottom])({rect})")
         assert left >= 0 and top >= 0 and right <= width + 1 and bottom <= height + 1
         assert right - left > 20 and bottom - top > 20
+
+
+# Over time
+
+
+def test_a_new_state_of_the_scene_is_sorted_again(viewer: Page) -> None:
+    viewer.run("viewer.set({playing: true})")
+    started = "const old = viewer.renderer, done = viewer.replace(viewer.scene);"
+    left = "viewer.sortedFor = ''; viewer.sorting = false; viewer.drawIfNeeded(0);"
+    slow = "old.sorter.worker.onmessage = () => {};"  # not answered when it ends
+    viewer.run(f"(async () => {{ {started} {slow} {left} await done; }})()")
+    assert viewer.run("viewer.sorting && viewer.renderer.sorter.pending.size === 0") is False
+    viewer.run("globalThis.sorts = viewer.renderer.sorter.next")
+    viewer.wait("viewer.renderer.sorter.next > sorts + 3")
+    viewer.run("viewer.set({playing: false})")
+    viewer.wait("!viewer.sorting")
+
+
+def test_a_picture_is_saved_while_the_scene_is_replaced(viewer: Page) -> None:
+    file = viewer.run(png_text(8))
+    viewer.run("viewer.renderer.sorter.worker.onmessage = () => {}")  # not answered when it ends
+    both = f"Promise.all([{png_text(8)}, viewer.replace(viewer.scene)])"
+    assert viewer.run(f"{both}.then(answers => answers[0])") == file
+
+
+def test_another_tab_says_nothing_about_the_speed(viewer: Page) -> None:
+    viewer.run("globalThis.requestAnimationFrame = () => 0")  # the turns below are the only ones
+    viewer.run("viewer.set({playing: true})")
+    turns = "for (let i = 0; i < {}; i++) viewer.tick(now += {});"
+    run = "(() => {{ globalThis.now ??= performance.now() + 1e5; {} return viewer.isSlow(); }})()"
+    assert viewer.run(run.format(turns.format(20, 16))) is False
+    assert viewer.run("viewer.framesPerSecond()") == pytest.approx(62.5)
+    assert viewer.run(run.format(turns.format(1, 5000) + turns.format(4, 16))) is False
+    assert viewer.run("viewer.frameTimes.length") == 5
+    assert viewer.run(run.format(turns.format(8, 700))) is True  # a slow GPU always pauses
 
 
 # With a server
@@ -372,6 +460,23 @@ def test_a_browser_without_a_gpu_shows_frames_of_the_server(tab: Page, address: 
     assert tab.run("document.querySelector('#curve [value^=agx]').disabled") is True
     assert all(asked.startswith(address) for asked in tab.requests())
     assert tab.problems() == []
+
+
+def test_frames_of_the_server_are_never_too_large(tab: Page, address: str) -> None:
+    tab.goto(address, 500, 300)
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+    tab.run(
+        "(() => { const { frames } = viewer; frames.maxPixels = 700; frames.shown = 0;"
+        "frames.request(viewer.view(), viewer.state); })()"
+    )
+    tab.wait("!viewer.frames.busy && viewer.frames.shown > 0")
+    width, height = tab.run(
+        "(image => [image.naturalWidth, image.naturalHeight])(document.getElementById('frame'))"
+    )
+    assert 600 < width * height <= 700
+    assert tab.run("JSON.parse(document.getElementById('settings').textContent).max_pixels") == (
+        MAX_PIXELS
+    )
 
 
 def test_a_browser_that_draws_too_slowly_asks_the_server(tab: Page, address: str) -> None:

@@ -32,7 +32,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.exposure_lists import parse_exposures
-from hdr_nsff.footage.footage import Footage, open_footage
+from hdr_nsff.footage.footage import FOLDER_FPS, MAX_RATE_DIFFERENCE, Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_choice, check_frame_size
 from hdr_nsff.footage.frame_files import frame_files
 from hdr_nsff.footage.hold_out import HOLD_OUT, hold_out_every
@@ -178,8 +178,19 @@ def reexpose(config: ReexposeConfig) -> Path:
         f"{len(plan.kept)} frames in {config.out / 'clip'}, "
         f"{len(plan.test)} true views in {config.out / 'truth'}"
     )
+    say_rate(footage.fps / config.stride)
     say(f"next: hdr-nsff prepare {config.out / 'clip'} SCENE --ev={config.ev} {given}")
     return config.out
+
+
+def say_rate(fps: float) -> None:
+    """One sentence where the new footage, a folder of frames, has lost its rate."""
+    if abs(fps - FOLDER_FPS) > MAX_RATE_DIFFERENCE * fps:
+        say(
+            f"{fps:.4g} frames a second are now {FOLDER_FPS:g}, as in any folder of frames: "
+            f"`render --fps {fps:.4g}` plays as fast as the clip, and `--segment` and "
+            "`--readout` count seconds at the new rate"
+        )
 
 
 def check(config: ReexposeConfig) -> list[float]:

@@ -34,6 +34,8 @@ from hdr_nsff.viewer.scene_file import (
 MAX_RECORDED_PIXELS = 24e6  # of all recorded pictures in a file: about 4 MB of JPEG
 PICTURE_QUALITY = 85  # of its JPEG
 MIN_LENGTH = 1e-12  # of a quaternion
+STOPS_BEYOND, STEPS_BEYOND = 8, 128  # of a response that is not white at 1
+LEAST_RISE = 1 / 512  # of one that goes on rising there
 Array = np.ndarray
 
 
@@ -50,7 +52,8 @@ def scene_of(
     responses and recorded pictures.
     """
     frames = sorted(scene.train, key=lambda f: f.time)
-    views, recorded = filmed_views(frames)
+    exposures = tonemapper.exposures().tolist()
+    views, recorded = filmed_views(frames, exposures)
     first = frames[0].camera
     shell = SceneFile(
         title=title,
@@ -62,7 +65,7 @@ def scene_of(
         far=scene.far,
         parallax=scene.manifest.parallax,
         background=[0.0, 0.0, 0.0],
-        exposures=tonemapper.exposures().tolist(),
+        exposures=exposures,
         display_exposure=display_exposure,
         views=views,
         responses=camera_responses(tonemapper),
@@ -151,10 +154,13 @@ def drop_invisible(group: GaussianGroup) -> GaussianGroup:
     return replace(group, **chosen)
 
 
-def filmed_views(frames: Sequence[Frame]) -> tuple[list[FilmedView], bytes]:
+def filmed_views(
+    frames: Sequence[Frame], exposures: Sequence[float]
+) -> tuple[list[FilmedView], bytes]:
     """The recorded frames in order of time, and their pictures as JPEG files.
 
-    The pictures of long and large clips are made smaller.
+    `exposures` is the EV of every bracket. The pictures of long and large clips are
+    made smaller.
     """
     num_pixels = sum(frame.camera.width * frame.camera.height for frame in frames)
     scale = min(1.0, math.sqrt(MAX_RECORDED_PIXELS / num_pixels))
@@ -168,6 +174,7 @@ def filmed_views(frames: Sequence[Frame]) -> tuple[list[FilmedView], bytes]:
             bracket=frame.bracket,
             camera_id=frame.camera_id,
             picture=[length, length + len(picture)],
+            ev=exposures[frame.bracket] + frame.drift,
         )
         views.append(view)
         pictures.append(picture)
@@ -197,12 +204,28 @@ def camera_responses(tonemapper: ToneMapper) -> list[CameraResponse]:
     """The learned response of every physical camera."""
     responses = []
     for camera_id in range(tonemapper.num_cameras):
-        x, y = tonemapper.curve(camera_id)
+        x, y = whole_curve(tonemapper, camera_id)
         with torch.no_grad():
             white_balance = tonemapper.log_white_balance(camera_id).exp()
             neutral = tonemapper.neutral(camera_id)
         responses.append(CameraResponse(rows(x), rows(y), rows(white_balance), rows(neutral)))
     return responses
+
+
+@torch.no_grad()
+def whole_curve(tonemapper: ToneMapper, camera_id: int) -> tuple[Tensor, Tensor]:
+    """The response of a camera: exposure x (M,) and recorded y (3, M).
+
+    Most are white at 1; those that go on rising there are followed further.
+    """
+    x, y = tonemapper.curve(camera_id)
+    stops = torch.linspace(0, STOPS_BEYOND, STEPS_BEYOND + 1, device=x.device)[1:]
+    beyond = stops.exp2()
+    exposed, gain = beyond[:, None].repeat(1, 3), torch.ones(3, device=x.device)
+    values = tonemapper.respond(exposed, gain, camera_id, tonemapper.reference_frame, False).T
+    if (values[:, -1] - y[:, -1]).max() < LEAST_RISE:
+        return x, y
+    return torch.cat([x, beyond]), torch.cat([y, values], 1)
 
 
 def rows(values: Tensor) -> list:

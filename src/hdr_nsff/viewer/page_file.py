@@ -20,6 +20,7 @@ from pathlib import Path
 FOLDER = Path(__file__).parent / "page"
 SHADERS = ("splat.vert", "splat.frag", "picture.vert", "develop.frag")
 ENTRY, WORKER = "main.js", "sorter.js"
+MAX_PIXELS = 4_000_000  # of a frame that the server renders
 MARK = '<meta name="generator" content="hdr-nsff">'  # of a page that was made here
 IMPORT = re.compile(r'^import\s*\{[^}]*\}\s*from\s*"\./([\w.]+)";\n', re.MULTILINE)
 EXPORT = re.compile(r"^export\s+(?=(async\s+)?(function|class|const|let)\b)", re.MULTILINE)
@@ -48,6 +49,7 @@ class PageSettings:
     """An HDR video, for screens whose browser draws no light above white."""
     server: bool = False
     """The page comes from a server, which has the scene and renders frames."""
+    max_pixels: int = MAX_PIXELS
 
 
 def make_page(

@@ -93,13 +93,14 @@ class FilmedView:
     bracket: int
     camera_id: int
     picture: list[int] | None = None  # first and last + 1 byte in `recorded`
+    ev: float | None = None  # of its own exposure; None in older files
 
 
 @dataclass(frozen=True)
 class CameraResponse:
     """How one physical camera records: rgb = curve(white_balance * 2^EV * radiance)."""
 
-    x: list[float]  # (M,) exposures in [0, 1], rising
+    x: list[float]  # (M,) exposures from 0 to where the curve ends, rising
     y: list[list[float]]  # (3, M) recorded values in [0, 1]
     white_balance: list[float]  # (3,) gains relative to camera 0
     neutral: list[float]  # (3,) gains that make the camera's mid gray neutral

@@ -18,9 +18,9 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.paths import parse_intrinsics, parse_numbers, parse_pose
+from hdr_nsff.viewer.page_file import MAX_PIXELS
 
 HOST = "127.0.0.1"
-MAX_PIXELS = 4_000_000  # of a frame
 MAX_REQUEST_BYTES = 10_000
 NUM_PORTS = 2**16
 MAX_EV = 60.0  # stops: beyond this float32 radiance is 0 or Inf

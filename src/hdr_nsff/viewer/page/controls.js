@@ -160,10 +160,12 @@ function connectPointer(player) {
   const canvas = find("canvas");
   const fingers = new Map();
   canvas.onpointerdown = (event) => {
+    if (event.button !== 0) return; // the menu of a right click takes its release
     canvas.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
   };
   canvas.onpointermove = (event) => {
+    if (!event.buttons) fingers.delete(event.pointerId);
     const before = fingers.get(event.pointerId);
     if (!before) return;
     const width = canvas.clientWidth;
@@ -192,9 +194,10 @@ function fingerSpread(fingers) {
 
 function connectDivider(player) {
   const divider = find("divider");
-  divider.onpointerdown = (event) => divider.setPointerCapture(event.pointerId);
+  divider.onpointerdown = (event) =>
+    event.button === 0 && divider.setPointerCapture(event.pointerId);
   divider.onpointermove = (event) => {
-    if (!divider.hasPointerCapture(event.pointerId)) return;
+    if (!event.buttons || !divider.hasPointerCapture(event.pointerId)) return;
     const { left, width } = find("picture").getBoundingClientRect();
     player.set({ splitAt: Math.min(Math.max((event.clientX - left) / width, 0), 1) });
   };
@@ -293,7 +296,10 @@ async function copyPath(player) {
     copyBySelection(text); // where a page may not use the clipboard
   }
   const views = path.length === 1 ? "one view" : `${path.length} views`;
-  note(`Copied ${views}. Save it as path.json, then: hdr-nsff render RUN --path path.json`, 8);
+  const { camera } = player.state;
+  const whose = camera > 0 ? ` --camera-id ${camera}` : "";
+  const command = `hdr-nsff render RUN --path path.json${whose}`;
+  note(`Copied ${views}. Save it as path.json, then: ${command}`, 8);
 }
 
 function copyBySelection(text) {
@@ -306,9 +312,10 @@ function copyBySelection(text) {
 }
 
 async function savePng(player, bits) {
-  if (!player.renderer) return note("Pictures can be saved where the browser draws them.");
+  const picture = await player.png(bits);
+  if (!picture) return note("Pictures can be saved where the browser draws them.");
   const link = document.createElement("a");
-  link.href = URL.createObjectURL(await player.png(bits));
+  link.href = URL.createObjectURL(picture);
   const signal = bits === 16 && player.isBeyondWhite() ? "_pq" : "";
   link.download = `${player.scene.title}_${player.state.time.toFixed(2)}${signal}.png`;
   link.click();
@@ -359,7 +366,7 @@ function showSplit(player, scene, state) {
   find("recorded").style.clipPath = `inset(0 ${100 - percent}% 0 0)`;
   find("divider").style.left = `${percent}%`;
   find("divider").ariaValueNow = String(Math.round(percent));
-  const ev = Math.round(10 * scene.exposures[nearest.bracket]) / 10;
+  const ev = Math.round(10 * nearest.ev) / 10;
   find("recorded-label").textContent = `Recorded, ${stops(ev)} EV`;
 }
 

@@ -12,12 +12,13 @@ export const CURVES = [
 const SIZE = 1024; // entries, as in develop.frag
 const GAMMA = 2.2;
 
-/** A learned response resampled evenly in x^(1/2.2): RGBA, four numbers an entry. */
+/** A learned response evenly in x^(1/2.2) up to its last x: RGBA, four numbers an entry. */
 export function curveTable({ x, y }) {
   const table = new Float32Array(4 * SIZE);
+  const end = x[x.length - 1];
   let right = 1;
   for (let i = 0; i < SIZE; i++) {
-    const exposed = (i / (SIZE - 1)) ** GAMMA;
+    const exposed = end * (i / (SIZE - 1)) ** GAMMA;
     while (right < x.length - 1 && x[right] < exposed) right++;
     const share = Math.min(Math.max((exposed - x[right - 1]) / (x[right] - x[right - 1]), 0), 1);
     for (let c = 0; c < 3; c++)

@@ -18,6 +18,7 @@ uniform sampler2D u_response;
 uniform bool u_flipped; // rows from the top
 uniform int u_view, u_curve;
 uniform vec3 u_gain; // exposure times white balance
+uniform float u_responseEnd; // exposure at the last entry of the learned curve
 uniform bool u_clipping, u_falseColor;
 uniform vec2 u_depthRange; // near, far
 uniform float u_maxFlow; // pixels
@@ -40,7 +41,8 @@ vec3 encode(vec3 linear) { // sRGB
 }
 
 float response(float exposed, int channel) {
-  float place = pow(clamp(exposed, 0.0, 1.0), 1.0 / 2.2) * (CURVE_SIZE - 1.0);
+  float share = clamp(exposed / u_responseEnd, 0.0, 1.0);
+  float place = pow(share, 1.0 / 2.2) * (CURVE_SIZE - 1.0);
   int low = min(int(place), int(CURVE_SIZE) - 2);
   float a = texelFetch(u_response, ivec2(low, 0), 0)[channel];
   float b = texelFetch(u_response, ivec2(low + 1, 0), 0)[channel];

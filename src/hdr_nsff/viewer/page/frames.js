@@ -8,16 +8,18 @@ export const SERVER_VIEWS = ["radiance", "depth", "motion"];
 const FIRST_SECONDS = 0.12; // that a first, coarse frame may take
 const START_RATE = 3e5; // pixels per second, before any was measured
 const SMALLEST_WIDTH = 32; // pixels
+const ROUNDING = 0.99; // of the most pixels: sides are rounded
 
 export class Frames {
   /**
    * Shows frames in `image`, at most `maxWidth` pixels wide: those of the clip, as finer
-   * ones would take longer and show nothing more. Calls `failed` with a sentence where
-   * none come.
+   * ones would take longer and show nothing more. They have `maxPixels` at most. Calls
+   * `failed` with a sentence where none come.
    */
-  constructor(image, maxWidth, failed) {
+  constructor(image, maxWidth, maxPixels, failed) {
     this.image = image;
     this.maxWidth = maxWidth;
+    this.maxPixels = maxPixels;
     this.failed = failed;
     this.rate = START_RATE;
     this.wanted = null; // the newest request that is not answered yet
@@ -36,8 +38,10 @@ export class Frames {
     while (this.wanted) {
       const wanted = this.wanted;
       this.wanted = null;
-      const affordable = Math.sqrt((this.rate * FIRST_SECONDS) / (wanted.width * wanted.height));
-      const finest = Math.min(this.maxWidth / wanted.width, 1);
+      const scaleTo = (pixels) => Math.sqrt(pixels / (wanted.width * wanted.height));
+      const affordable = scaleTo(this.rate * FIRST_SECONDS);
+      const largest = scaleTo(ROUNDING * this.maxPixels);
+      const finest = Math.min(this.maxWidth / wanted.width, largest, 1);
       let scale = Math.min(Math.max(affordable, SMALLEST_WIDTH / wanted.width), finest);
       while (!this.wanted) {
         if (!(await this.show(wanted, scale))) break;

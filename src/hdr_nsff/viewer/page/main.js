@@ -33,14 +33,14 @@ async function start() {
   connectControls(player);
   showVideos(settings);
   if (scene.groups.length) await draw(player, settings);
-  else showFrames(player);
+  else showFrames(player, settings);
   if (player.renderer) await player.renderer.sort(player.view());
   if (hasHighRange() && !player.hdr) explainRange(settings);
   find("loading").hidden = true;
   const loop = (now) => {
     player.tick(now);
     if (player.state.stats) showStats(player);
-    if (player.renderer && settings.server && player.isSlow()) showFrames(player);
+    if (player.renderer && settings.server && player.isSlow()) showFrames(player, settings);
     else if (player.renderer) player.easeOff();
     requestAnimationFrame(loop);
   };
@@ -56,7 +56,7 @@ async function draw(player, settings) {
     const gl = openContext(player.canvas);
     player.driver = driverName(gl);
     const software = SOFTWARE.test(player.driver);
-    if (software && settings.server && !gpuWanted) return showFrames(player);
+    if (software && settings.server && !gpuWanted) return showFrames(player, settings);
     player.renderer = new Renderer(gl, player.scene, shaderSources(), held(WORKER));
     player.canvas.addEventListener("webglcontextlost", () =>
       note("The graphics driver was reset. Reload the page.", 0),
@@ -68,7 +68,7 @@ async function draw(player, settings) {
     note(`This browser draws without a GPU, so playback is slow.${videos}`, 8);
   } catch (error) {
     if (!settings.server) throw error;
-    showFrames(player);
+    showFrames(player, settings);
   }
 }
 
@@ -78,12 +78,13 @@ function shaderSources() {
 }
 
 /** From now on, frames that the server renders. */
-function showFrames(player) {
+function showFrames(player, { max_pixels: maxPixels }) {
   player.renderer?.dispose();
   player.renderer = null;
   player.hdr?.hide();
   player.hdr = null;
-  player.frames = new Frames(find("frame"), player.scene.width, (problem) => note(problem, 0));
+  const failed = (problem) => note(problem, 0);
+  player.frames = new Frames(find("frame"), player.scene.width, maxPixels, failed);
   const { curve, show } = player.state;
   player.set({
     curve: SERVER_CURVES.includes(curve) ? curve : "reinhard",

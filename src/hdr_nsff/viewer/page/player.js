@@ -22,6 +22,8 @@ const MAX_EV = 8;
 const MEASURED_FRAMES = 20; // in a row, at most, that tell the frame rate
 const LEAST_FRAMES = 6;
 const LEAST_MILLISECONDS = 1000; // that a frame rate is measured over before it has effects
+const PAUSE_MILLISECONDS = 500; // between two frames: another tab was looked at
+const PAUSE_FRAMES = 3; // as long at least, as a slow GPU pauses at every frame
 const SLOW_FRAMES_PER_SECOND = 10;
 const SMOOTH_FRAMES_PER_SECOND = 24;
 
@@ -60,6 +62,7 @@ export class Player {
     this.state.ev = clamp(this.state.ev, -MAX_EV, MAX_EV);
     this.maxRatio = MAX_PIXEL_RATIO; // less where drawing is slow
     this.frameTimes = [];
+    this.gap = 0; // milliseconds between the last two turns of the loop
     this.dirty = true;
     this.sorting = false;
     this.sortedFor = "";
@@ -135,14 +138,20 @@ export class Player {
   /** Show another state of the same scene: a run that is training. */
   async replace(scene) {
     this.scene = scene;
-    if (this.renderer) {
-      const old = this.renderer;
-      const renderer = new Renderer(old.gl, scene, ...old.sources);
-      await renderer.sort(this.view());
-      this.renderer = renderer;
-      old.dispose();
-    }
+    if (this.renderer) await this.renew(this.renderer, scene);
     this.set({});
+  }
+
+  /** Draw another scene in place of a renderer, unless the server has taken over. */
+  async renew(old, scene) {
+    const renderer = new Renderer(old.gl, scene, ...old.sources);
+    await renderer.sort(this.view());
+    if (this.renderer !== old) return renderer.dispose();
+    this.renderer = renderer;
+    this.sorting = false;
+    this.sortedFor = "";
+    this.frameTimes = []; // making it took long
+    old.dispose();
   }
 
   /** Draw again. */
@@ -180,8 +189,11 @@ export class Player {
 
   /** One turn of the loop, at `now` in milliseconds. */
   tick(now) {
-    const seconds = Math.min((now - (this.before ?? now)) / 1000, 0.25);
+    const gap = now - (this.before ?? now);
+    if (gap > Math.max(PAUSE_MILLISECONDS, PAUSE_FRAMES * this.gap)) this.frameTimes = [];
+    this.gap = gap;
     this.before = now;
+    const seconds = Math.min(gap / 1000, 0.25);
     this.advance(seconds);
     this.fly(seconds);
     if (this.renderer) this.drawIfNeeded(now);
@@ -215,7 +227,9 @@ export class Player {
     if (place !== this.sortedFor && !this.sorting) {
       this.sorting = true;
       this.sortedFor = place;
-      this.renderer.sort(view).then(() => {
+      const { renderer } = this;
+      renderer.sort(view).then(() => {
+        if (renderer !== this.renderer) return;
         this.sorting = false;
         this.dirty = true;
       });
@@ -267,8 +281,8 @@ export class Player {
    */
   async readLinear(view = this.view()) {
     const whole = { show: "radiance", ...view };
-    await this.renderer.sort(whole);
-    const values = this.renderer.read(this.renderer.composite(whole, "read"));
+    const renderer = await this.sorted(whole);
+    const values = renderer.read(renderer.composite(whole, "read"));
     this.sortedFor = ""; // what is shown is sorted again
     const gain = whole.show === "radiance" ? 2 ** this.state.ev : 1;
     for (let i = 0; i < values.length; i++) if (i % 4 !== 3) values[i] *= gain;
@@ -277,12 +291,12 @@ export class Player {
 
   /**
    * What is shown as a PNG file of 8 or 16 bits, as fine as the screen. Light above white
-   * is kept with 16 bits, as PQ.
+   * is kept with 16 bits, as PQ. Null where the server has taken over.
    */
   async png(bits) {
-    const { renderer } = this;
     const view = this.view(this.fullSize);
-    await renderer.sort(view);
+    const renderer = await this.sorted(view);
+    if (!renderer) return null;
     const maps = renderer.composite(view, "read");
     const picture = renderer.target("png", view.width, view.height, renderer.deepFormat());
     renderer.develop(maps, this.state, picture);
@@ -292,6 +306,15 @@ export class Player {
     if (bits === 16 && this.isBeyondWhite())
       return encodePng(encodePq(values), ...size, bits, PQ_TAGS);
     return encodePng(values, ...size, bits);
+  }
+
+  /** The renderer once it has sorted for a view; another one may take its place. */
+  async sorted(view) {
+    for (;;) {
+      const { renderer } = this;
+      await renderer?.sort(view);
+      if (renderer === this.renderer) return renderer;
+    }
   }
 
   /** Remember the camera and time of now for a path. */
@@ -312,7 +335,7 @@ export class Player {
   cameraPath() {
     const { curve, ev, mode } = this.state;
     let views = this.keys.length ? pathThrough(this.keys) : null;
-    views ??= this.scene.times.map((time) => ({
+    views ??= evenTimes(this.scene.times).map((time) => ({
       time,
       ...(mode === "filmed" ? filmedCamera(this.scene.views, time) : this.pose),
     }));
@@ -324,6 +347,15 @@ export class Player {
       ...exposed,
     }));
   }
+}
+
+/** From the first to the last of `times` by their usual gap: also held-out frames. */
+function evenTimes(times) {
+  const [first, last] = [times[0], times[times.length - 1]];
+  const gaps = times.slice(1).map((time, i) => time - times[i]);
+  const usual = gaps.sort((a, b) => a - b)[Math.floor(gaps.length / 2)];
+  const count = usual ? Math.ceil((last - first) / usual - 1e-6) : 0;
+  return [...Array.from({ length: count }, (_, k) => first + k * usual), last];
 }
 
 /** Views through `keys`, about a frame of the clip apart. */

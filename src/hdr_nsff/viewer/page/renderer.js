@@ -69,16 +69,14 @@ export class Renderer {
     }
     for (const texture of [...textures, this.poseTable]) gl.deleteTexture(texture ?? null);
     gl.deleteBuffer(this.orderBuffer);
-    this.sorter.worker.terminate();
+    this.sorter.dispose();
   }
 
-  /** Sort for a view; resolves once its order is on the GPU. */
+  /** Sort for a view; resolves once its order is on the GPU, or after `dispose`. */
   async sort(view) {
-    const { order, milliseconds } = await this.sorter.sort(
-      view.time,
-      this.poses(view.time),
-      depthRow(view.c2w),
-    );
+    const sorted = await this.sorter.sort(view.time, this.poses(view.time), depthRow(view.c2w));
+    if (!sorted) return;
+    const { order, milliseconds } = sorted;
     const { gl } = this;
     gl.bindBuffer(gl.ARRAY_BUFFER, this.orderBuffer);
     gl.bufferData(gl.ARRAY_BUFFER, order, gl.DYNAMIC_DRAW);
@@ -192,6 +190,7 @@ export class Renderer {
       CURVES.findIndex((curve) => curve.id === look.curve),
     );
     screen.set("u_gain", gains(scene.responses[look.camera], look));
+    screen.set("u_responseEnd", scene.responses[look.camera].x.at(-1));
     screen.set("u_clipping", look.clipping ? 1 : 0);
     screen.set("u_falseColor", look.falseColor ? 1 : 0);
     screen.set("u_depthRange", [scene.near, scene.far]);
@@ -306,5 +305,12 @@ class Sorter {
       this.pending.set(id, resolve);
       this.worker.postMessage({ id, time, poses, row });
     });
+  }
+
+  /** End the worker; who still waits gets nothing. */
+  dispose() {
+    this.worker.terminate();
+    for (const resolve of this.pending.values()) resolve(null);
+    this.pending.clear();
   }
 }
