@@ -1,5 +1,6 @@
 """Random Gaussians of a training moment, made by kernels and by plain torch."""
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -47,6 +48,7 @@ def random_field(seed: int = 0, **settings: Any) -> Splat:
     with torch.no_grad():
         field.static.opacity_logits[::5] = -9.0
         field.moving.log_radiance[::7] = 17.0
+        field.local.log_scales[::2, 3] = math.log(0.8)  # shorter than lives become
         field.mixture_logits.add_(torch.randn(field.mixture_logits.shape, generator=generator))
     field.find_neighbors()
     return field

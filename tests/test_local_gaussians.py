@@ -11,7 +11,12 @@ from torch import Tensor
 
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.fields.splat.local_gaussians import MIN_WINDOW, LocalGaussians, TakeRows
+from hdr_nsff.fields.splat.local_gaussians import (
+    MIN_WINDOW,
+    LocalGaussians,
+    TakeRows,
+    least_duration,
+)
 from hdr_nsff.fields.splat.relocate import relocate_unseen
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.fields.splat.training_view import TrainingView, flow_to_neighbor
@@ -72,13 +77,13 @@ def test_lives_move_straight_and_fade_around_their_center(time: float) -> None:
     expected = torch.tensor([0.0, 0, 2.0]) + ages[:, None] * VELOCITY
     torch.testing.assert_close(local.living(alive).positions(time).detach(), expected)
     opacities = 0.5 * torch.exp(-0.5 * (ages / DURATION) ** 2)
-    torch.testing.assert_close(local.living(alive).opacities(time).detach(), opacities)
+    torch.testing.assert_close(local.living(alive).opacities(time, 1.2).detach(), opacities)
 
 
 def test_the_center_time_has_no_gradient_and_all_else_has() -> None:
     local, alive = three(), torch.tensor([0, 1])
     living = local.living(alive)
-    drawn = [living.positions(4.0), living.opacities(4.0), living.radiance()]
+    drawn = [living.positions(4.0), living.opacities(4.0, 1.2), living.radiance()]
     sum(values.square().sum() for values in drawn).backward()  # type: ignore[union-attr]
     assert local.means.grad is not None and local.velocities.grad is not None
     assert float(local.means.grad[:, 3].abs().max()) == 0
@@ -204,3 +209,25 @@ def test_gradients_of_rows_add_up_in_their_table() -> None:
     expected = torch.zeros(3, 4)
     expected[2, 1], expected[0, 1] = 55.0, 77.0
     assert table.grad is not None and torch.equal(table.grad, expected)
+
+
+def test_a_life_shorter_than_a_step_does_not_learn_to_be_shorter() -> None:
+    """Between frames nothing is supervised: lives that end before would leave holes."""
+    local, alive = three(), torch.tensor([0, 1])
+
+    def gradient(sign: float, least: float) -> torch.Tensor:
+        local.log_scales.grad = None
+        (sign * local.living(alive).opacities(4.0, least).sum()).backward()
+        assert local.log_scales.grad is not None
+        return local.log_scales.grad[:2, 3].clone()
+
+    longer = gradient(-1.0, 0.5)  # more opacity away from the center: a longer life
+    assert (longer < 0).all() and torch.equal(gradient(-1.0, 2.0), longer)
+    assert torch.equal(gradient(1.0, 0.5), -longer)  # longer than the least of 0.5 frames
+    assert not gradient(1.0, 2.0).any()  # shorter than the least of 2 frames
+
+
+def test_the_least_life_follows_the_gaps_between_frames() -> None:
+    assert least_duration(torch.tensor([0.0, 1, 2, 4])) == pytest.approx(1.2)
+    assert least_duration(torch.tensor([0.0, 2, 4])) == pytest.approx(2.4)
+    assert least_duration(torch.tensor([3.0])) == pytest.approx(1.2)

@@ -15,6 +15,7 @@ from hdr_nsff.fields.kernels.moment import (
     COLOR_CHANGE,
     DRIFT,
     EVENNESS,
+    LEAST_DURATION,
     MEAN_OPACITY,
     MEAN_SCALE,
     MIN_OPACITY,
@@ -231,5 +232,7 @@ def local_gradients(g, r, num_alive, learned, neighbors, sight, d, made, marks):
     for n in range(3):
         g_log_scales[r, n] += of_scales[n]
     duration = math.exp(log_scales[r, 3])
-    g_log_scales[r, 3] += d_opacity * opacity * age * age / (duration * duration)
+    d_duration = d_opacity * opacity * age * age / (duration * duration)
+    if d_duration < 0 or duration > numbers[LEAST_DURATION]:  # what is short gets no shorter
+        g_log_scales[r, 3] += d_duration
     g_colors[r, 3] += d_opacity * opacity * (1 - sigmoid(colors[r, 3]))

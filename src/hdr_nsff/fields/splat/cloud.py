@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.knots import interpolate_linear
 from hdr_nsff.fields.outputs import GaussianCloud
-from hdr_nsff.fields.splat.local_gaussians import Living
+from hdr_nsff.fields.splat.local_gaussians import Living, least_duration
 from hdr_nsff.fields.splat.model import Model
 
 
@@ -28,6 +28,7 @@ def cloud_at(model: Model, knot: float, living: Living) -> GaussianCloud:
     pose = model.trajectories.pose(knot)
     moved = model.trajectories.move(moving.means, mixture, pose)
     turned = model.trajectories.turn(moving.quaternions, mixture, pose)
+    least = least_duration(model.times)
     at_rest = static.means.new_zeros(len(static))
     num_moving = len(moving) + len(living.means)
     log_scales = [static.log_scales, moving.log_scales, living.log_scales[:, :3]]
@@ -36,7 +37,7 @@ def cloud_at(model: Model, knot: float, living: Living) -> GaussianCloud:
         means=torch.cat([static.means, moved, living.positions(time)]),
         quaternions=torch.cat([static.quaternions, turned, living.quaternions]),
         scales=torch.cat(log_scales).exp(),
-        opacities=torch.cat([opacities_at(model, share), living.opacities(time)]),
+        opacities=torch.cat([opacities_at(model, share), living.opacities(time, least)]),
         radiance=torch.cat(radiance),
         motion=torch.cat([at_rest, static.means.new_ones(num_moving)]),
     )

@@ -28,7 +28,7 @@ from hdr_nsff.fields.point_cloud import (
     unproject_frame,
 )
 from hdr_nsff.fields.splat.gaussians import from_log_radiance
-from hdr_nsff.fields.splat.local_gaussians import MAX_AGE, LocalGaussians
+from hdr_nsff.fields.splat.local_gaussians import MAX_AGE, LocalGaussians, frame_step
 from hdr_nsff.scene.movers import nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
@@ -140,15 +140,9 @@ def thinned(masks: Sequence[Tensor], most: int) -> list[Tensor]:
 
 def start_duration(scene: Scene) -> float:
     """The standard deviation of the life of what is slow, in frames."""
-    step = frame_step(scene)
+    step = frame_step(scene.times)
     cycle = scene.manifest.num_brackets * step
     return max(DURATION_CYCLES * cycle, MIN_DURATION * step)
-
-
-def frame_step(scene: Scene) -> float:
-    """The typical time between two captured times, in frames."""
-    times = scene.times
-    return float(times.diff().median()) if len(times) > 1 else 1.0
 
 
 def start_durations(scene: Scene, f: Frame, points: PointCloud, velocities: Tensor) -> Tensor:

@@ -30,6 +30,12 @@ from hdr_nsff.fields.splat.gaussians import START_LOG_SCALE, START_LOGIT, to_rad
 MIN_WINDOW = 0.02  # below this share of its opacity, a Gaussian is not alive ...
 MAX_AGE = math.sqrt(-2 * math.log(MIN_WINDOW))  # ... which are 2.8 durations
 VELOCITY_SHARE = 0.1  # learning rate of velocities per frame relative to positions
+# learning rates of shapes, lives and colors relative to those of the other Gaussians:
+# alive around a few frames, they take part in few steps (hand-chosen on real clips)
+RATE = 4.0
+# steps between frames that a life has at least: shorter ones leave holes between
+# frames, where nothing is supervised
+LEAST_STEPS = 1.2
 NUM_NEIGHBORS = 4  # whose velocities are compared
 # scene lengths (in units of the near depth) that count as far as one frame, for
 # neighbors in space and time
@@ -58,6 +64,34 @@ class TakeRows(torch.autograd.Function):
         return None, None
 
 
+class KeepAbove(torch.autograd.Function):
+    """Learned values, which do not learn to become smaller where they are `least` or
+    less.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, least: float) -> Tensor:
+        """The values as they are."""
+        ctx.save_for_backward(values > least)
+        return values.clone()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        """Gradients that make small values smaller, removed."""
+        (above,) = ctx.saved_tensors
+        return gradient.where(above | (gradient < 0), 0.0), None
+
+
+def frame_step(times: Tensor) -> float:
+    """The typical gap between captured `times` (T,), in frames."""
+    return float(times.diff().median()) if len(times) > 1 else 1.0
+
+
+def least_duration(times: Tensor) -> float:
+    """The standard deviation of the shortest life that is learned, in frames."""
+    return LEAST_STEPS * frame_step(times)
+
+
 @dataclass(frozen=True)
 class Living:
     """Time-local Gaussians that are alive, as rows (A, 4) of the tables."""
@@ -74,9 +108,12 @@ class Living:
         ages = (time - self.means[:, 3:]).detach()
         return self.means[:, :3] + ages * self.velocities[:, :3]
 
-    def opacities(self, time: float) -> Tensor:
-        """Opacities (A,) in [0, 1] at a time."""
-        ages = (time - self.means[:, 3].detach()) / self.log_scales[:, 3].exp()
+    def opacities(self, time: float, least: float) -> Tensor:
+        """Opacities (A,) in [0, 1] at a time. Lives shorter than `least` frames do not
+        learn to be shorter still.
+        """
+        durations = KeepAbove.apply(self.log_scales[:, 3], math.log(least)).exp()
+        ages = (time - self.means[:, 3].detach()) / durations
         return (-0.5 * ages.square()).exp() * self.colors[:, 3].sigmoid()
 
     def radiance(self) -> Tensor:
@@ -133,9 +170,9 @@ class LocalGaussians(nn.Module):
         rates = {
             "means": config.position_lr * unit,
             "velocities": VELOCITY_SHARE * config.position_lr * unit,
-            "quaternions": config.shape_lr,
-            "log_scales": config.shape_lr,
-            "colors": config.color_lr,
+            "quaternions": RATE * config.shape_lr,
+            "log_scales": RATE * config.shape_lr,
+            "colors": RATE * config.color_lr,
         }
         return [
             ParamGroup(

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hdr_nsff.fields.kernels.moment import NUMBERS
 from hdr_nsff.fields.knots import catmull_rom_weights, linear_position
+from hdr_nsff.fields.splat.local_gaussians import least_duration
 from hdr_nsff.fields.splat.model import Model
 from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY
 from hdr_nsff.geometry.cameras import Camera
@@ -62,6 +63,7 @@ class Moment:
             MIN_OPACITY,
             *t.window(self.knot),
             COLOR_OFFSET_SHARE,
+            least_duration(model.times),
         )
         assert len(numbers) == NUMBERS, len(numbers)
         return numbers
