@@ -79,3 +79,27 @@ def test_the_folder_that_the_message_names_is_used(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     assert run_kernels(tmp_path, HOME=home, NUMBA_CACHE_DIR=str(cache)) == ("True 8 5\n", "")
     assert list(cache.rglob("*.nbi"))
+
+
+def test_a_changed_function_is_changed_in_its_callers_in_other_files(tmp_path: Path) -> None:
+    parts = (
+        "from hdr_nsff.core.jit import jit\n\n@jit(forceinline=True)\ndef half(x):\n    return x"
+    )
+    (tmp_path / "parts.py").write_text(f"{parts} / 2\n")
+    run_kernels(tmp_path)
+    caller = "from hdr_nsff.core.jit import jit\nfrom parts import half\n\n"
+    caller += "@jit()\ndef twice(x):\n    return half(x) + half(x)\n\nprint(twice(6.0))\n"
+    (tmp_path / "kernels.py").write_text(caller)
+
+    def run() -> str:
+        environment = os.environ | {"PYTHONPATH": str(tmp_path), "PYTHONDONTWRITEBYTECODE": "1"}
+        command = [sys.executable, tmp_path / "kernels.py"]
+        return subprocess.run(
+            command, env=environment, capture_output=True, check=True
+        ).stdout.decode()
+
+    assert [run(), run()] == ["6.0\n"] * 2
+    kept = sorted((tmp_path / "__pycache__").glob("kernels.twice*.nbc"))
+    (tmp_path / "parts.py").write_text(f"{parts} / 3\n")
+    assert run() == "4.0\n"
+    assert kept and run() == "4.0\n"

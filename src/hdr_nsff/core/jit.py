@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -29,7 +30,7 @@ def jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         if options.get("inline") == "always":
             return numba.njit(**options)(function)
         try:
-            return numba.njit(cache=True, **options)(function)
+            return watching_folder(numba.njit(cache=True, **options)(function), function)
         except RuntimeError as error:
             if "cannot cache function" not in str(error):
                 raise
@@ -37,6 +38,25 @@ def jit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return numba.njit(**options)(function)
 
     return decorate
+
+
+def watching_folder(compiled: Any, function: Callable[..., Any]) -> Any:
+    """The `compiled` function, compiled anew once any source in its folder has changed.
+
+    numba looks at the function's own file only, but machine code holds the functions
+    that it calls, too.
+    """
+    index = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if index is not None:  # a numba that keeps it so; none where it compiles nothing
+        index._source_stamp = stamp_of(Path(function.__code__.co_filename).parent)
+    return compiled
+
+
+@cache
+def stamp_of(folder: Path) -> tuple[tuple[str, int, int], ...]:
+    """Names, times and sizes of the Python sources in a folder."""
+    found = [(path.name, path.stat()) for path in sorted(folder.glob("*.py"))]
+    return tuple((name, stat.st_mtime_ns, stat.st_size) for name, stat in found)
 
 
 @cache
