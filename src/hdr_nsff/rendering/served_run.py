@@ -61,10 +61,8 @@ class ServedRun:
 
     def places(self) -> list[Path]:
         """Folders where the run's videos may be: those of `render`, then of `run`."""
-        own, beside = self.folder, self.folder.resolve().parent
-        return [
-            p / "render" for p in ((own, beside) if beside / "run" == own.resolve() else (own,))
-        ]
+        own, whole = self.folder / "render", self.folder.resolve()
+        return [own, whole.parent / "render"] if whole.name == "run" else [own]
 
     def hdr_clip(self) -> Path | None:
         return find_hdr_clip(self.run, self.places()[-1].parent)

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
+from hdr_nsff.core.stack import spread_frames
 from hdr_nsff.fields.point_cloud import (
     MIN_RADIANCE,
     PointCloud,
@@ -134,7 +135,7 @@ def thinned(masks: Sequence[Tensor], most: int) -> list[Tensor]:
     marked = [i for i, mask in enumerate(masks) if mask.any()]
     if len(marked) <= most:
         return list(masks)
-    kept = {marked[int(i)] for i in np.linspace(0, len(marked) - 1, most)}
+    kept = {marked[k] for k in spread_frames(len(marked), most)}
     return [m if i in kept else torch.zeros_like(m) for i, m in enumerate(masks)]
 
 

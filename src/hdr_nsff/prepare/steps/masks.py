@@ -98,7 +98,7 @@ def given_masks(work: Work) -> np.ndarray:
     if 0 < brightest <= 0.5:
         raise InputError(
             f"{folder}: no mask is white anywhere, the brightest pixel is {255 * brightest:.3g} of "
-            "255; what moves must be white, above half of it"
+            "255; paint moving pixels white (255)"
         )
     return np.stack(masks)
 
