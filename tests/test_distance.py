@@ -3,7 +3,7 @@
 import numpy as np
 from posed_planes import F, H, W, X, Y, cameras_at, neighbors, posed_video
 
-from hdr_nsff.priors.movers.distance import mover_depth, smoothest_path, third_differences
+from hdr_nsff.priors.movers.distance import mover_depth, smoothest_path
 from hdr_nsff.priors.movers.regions import FlowStep, region_growth
 
 FORWARD = np.tile([0.0, 0, 1], (24, 1))
@@ -21,16 +21,6 @@ def path(shake: float, count: int = 24) -> tuple[np.ndarray, np.ndarray, np.ndar
     )
     local = point - eyes
     return point[:, 2] - eyes[:, 2], eyes, local / local[:, 2:]
-
-
-def test_third_differences_vanish_on_parabolas_whatever_the_spacing() -> None:
-    t = np.array([0, 1, 3, 4, 5, 7.0])
-    differences = third_differences(t, np.ones(5, bool))
-    assert differences.shape == (3, 6)
-    assert np.allclose(differences @ (2 - t + 0.3 * t**2), 0, atol=1e-9)
-    assert np.allclose(third_differences(np.arange(4.0), np.ones(3, bool)), [[-1, 3, -3, 1]])
-    # a step is unknown in every run of four
-    assert len(third_differences(t, np.array([1, 1, 0, 1, 1], bool))) == 0
 
 
 def test_a_shaking_camera_determines_the_distance_of_a_moving_point() -> None:

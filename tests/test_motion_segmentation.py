@@ -27,7 +27,8 @@ T = np.arange(TIMES)
 K = np.tile([[FOCAL, 0, 120], [0, FOCAL, 70], [0, 0, 1.0]], (TIMES, 1, 1))
 # a camera in a shaking hand
 EYES = np.stack([0.05 * np.sin(2.1 * T), 0.04 * np.sin(2.9 * T + 1), 0.02 * np.sin(1.7 * T)], -1)
-CAMERAS = Cameras(K, np.concatenate([np.tile(np.eye(3), (TIMES, 1, 1)), EYES[..., None]], 2))
+C2W = np.concatenate([np.tile(np.eye(3), (TIMES, 1, 1)), EYES[..., None]], 2)
+CAMERAS = Cameras(K, C2W, T.astype(float))
 
 
 def body(

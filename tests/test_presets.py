@@ -1,7 +1,8 @@
-"""Ablations of `splat` and `grid`: each changes the one part that its name states."""
+"""Presets: each changes the parts that its name states, and no setting is in vain."""
 
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -17,7 +18,10 @@ from hdr_nsff.scene.batch import whole_frame
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.base import ToneMapConfig
 from hdr_nsff.tonemap.build import tone_mapper_for
+from hdr_nsff.training.budget import Clock
+from hdr_nsff.training.config import check_config
 from hdr_nsff.training.presets import ABLATIONS, METHODS, PRESETS, ablated
+from hdr_nsff.training.sampling import moving_rays
 from hdr_nsff.training.start import start_field
 
 NAMES = [name for name in PRESETS if name not in METHODS]
@@ -58,11 +62,57 @@ def test_the_small_published_presets_change_sizes_alone() -> None:
     for name in ("paper", "nsff-paper", "nerf-wt-paper"):
         published, tiny = asdict(PRESETS[name]), asdict(PRESETS[f"{name}-small"])
         resized = {k for k in published if published[k] != tiny[k]}
-        sizes = {"field", "budget", "schedule", "rays", "moving_rays"}
+        sizes = {"field", "budget", "schedule", "rays", "moving_rays", "moving_until"}
         assert resized - sizes == {"tonemap_lr", "bf16", "checkpoint_seconds"}
         fields = published["field"], tiny["field"]
         changed = {k for k in fields[0] if fields[0][k] != fields[1][k]}
         assert changed == {"encoding", "samples", "render_samples"}
+
+
+@pytest.mark.parametrize("name", ["paper", "paper-small", "nsff-paper-small"])
+def test_rays_of_moving_pixels_end_with_the_first_phase(name: str) -> None:
+    config = PRESETS[name]
+
+    def drawn(phase: float) -> int:
+        clock = Clock(config.budget, config.schedule, num_frames=36)
+        assert config.budget.steps is not None
+        step = round(phase * 36 / 250 * config.budget.steps)  # K is 1000 times the frames
+        clock = replace(clock, step=step)
+        assert clock.phase == pytest.approx(phase, abs=1e-3)
+        return moving_rays(config, clock)
+
+    assert drawn(0.99) == config.moving_rays > 0
+    assert drawn(1.01) == drawn(6.9) == 0
+
+
+def test_a_setting_that_would_change_nothing_is_refused() -> None:
+    def problem(name: str, **changes: Any) -> str:
+        config = PRESETS[name]
+        loss = replace(config.loss, **{k: v for k, v in changes.items() if hasattr(config.loss, k)})
+        rays = {k: v for k, v in changes.items() if not hasattr(config.loss, k)}
+        with pytest.raises(InputError) as error:
+            check_config(replace(config, loss=loss, **rays))
+        return str(error.value)
+
+    assert "--moving-rays 512: whole frames are drawn" in problem("splat", moving_rays=512)
+    assert "--loss.dynamic 1: this preset has no such term" in problem("splat", dynamic=1.0)
+    for name in ("nerf-wt", "hdr-hexplane"):
+        assert "--loss.flow 0.1: this method has no scene flow" in problem(name, flow=0.1)
+    assert "--loss.mask 0.2: this method does not tell" in problem("hdr-hexplane", mask=0.2)
+    for config in PRESETS.values():
+        check_config(config)
+
+
+def test_a_grid_does_not_start_from_depth_without_units(toy: Scene) -> None:
+    manifest = toy.manifest.model_copy(update={"depth_kind": "relative"})
+    relative = replace(toy, manifest=manifest)
+    said = [
+        initialize_field(
+            build_field(small("grid").field, scene), scene, lambda rgb, i: rgb, 0.0, True
+        )
+        for scene in (toy, relative)
+    ]
+    assert said == ["field: initialized from the depth prior", None]
 
 
 def test_without_a_split_everything_is_dynamic(
@@ -122,7 +172,7 @@ def test_gaussians_with_a_sigmoid_stay_below_one_in_every_part_and_learn_in_ever
     field = build_field(replace(config, view_dependence=True), toy)
     assert isinstance(field, Splat)
     initialize_field(
-        field, toy, lambda rgb, i: 3 * rgb, 0.5, True
+        field, toy, lambda rgb, *frame: 3 * rgb, 0.5, True
     )  # brighter than 1, the background too
     for g in (field.static, field.moving):
         for p in (g.log_radiance_offsets, g.sh1):  # shades, colors in time, colors by direction
@@ -148,7 +198,7 @@ def test_gaussians_with_a_sigmoid_start_in_the_colors_that_are_below_it(
 ) -> None:
     fields = [build_field(small(name).field, toy) for name in ("splat-sigmoid", "splat")]
     for field in fields:
-        initialize_field(field, toy, lambda rgb, i: 3 * rgb, -1.3, from_priors)
+        initialize_field(field, toy, lambda rgb, *frame: 3 * rgb, -1.3, from_priors)
     bounded, free = fields
     assert isinstance(bounded, Splat) and isinstance(free, Splat)
     for share in (0.0, 0.3):

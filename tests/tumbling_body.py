@@ -25,7 +25,8 @@ TRUE = np.einsum("tij,nj->nti", ROTATIONS, LOCAL) + POSITIONS  # (COUNT, TIMES, 
 
 def cameras_at(eyes: np.ndarray) -> Cameras:
     """Cameras at `eyes` (TIMES, 3) that look along +z."""
-    return Cameras(K, np.concatenate([np.tile(np.eye(3), (TIMES, 1, 1)), eyes[..., None]], 2))
+    c2w = np.concatenate([np.tile(np.eye(3), (TIMES, 1, 1)), eyes[..., None]], 2)
+    return Cameras(K, c2w, np.arange(float(TIMES)))
 
 
 CAMERAS = cameras_at(EYES)

@@ -89,7 +89,9 @@ def initialize_field(
     match field:
         case NSFF() | NerfWT():
             field.bias.fill_(typical)
-            initialized = from_priors and initialize_grid(field, scene.train, to_radiance)
+            in_scene_units = scene.manifest.depth_kind == "scene"
+            usable = from_priors and in_scene_units
+            initialized = usable and initialize_grid(field, scene.train, to_radiance)
             return "field: initialized from the depth prior" if initialized else None
         case HexPlane():
             field.bias.fill_(typical)

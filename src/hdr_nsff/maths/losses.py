@@ -17,16 +17,22 @@ MASK_MARGIN = 1e-4  # a motion share is read as lying in [MASK_MARGIN, 1 - MASK_
 
 
 def photometric(
-    predicted: Tensor, recorded: Tensor, weight: Tensor | None = None, squared: bool = False
+    predicted: Tensor,
+    recorded: Tensor,
+    weight: Tensor | None = None,
+    squared: bool = False,
+    trust: Tensor | None = None,
 ) -> Tensor:
     """Mean difference of predicted and recorded rgb (N, 3), eq. 12-13.
 
     The paper prints squared differences, its published code takes absolute ones: see
     `squared`. `weight` is (N,), (N, 1) or (N, 3); the weighted mean divides by the sum
-    of the weights.
+    of the weights. `trust` (N, 3) weighs errors without entering that sum.
     """
     difference = predicted - recorded
     error = difference.square() if squared else difference.abs()
+    if trust is not None:
+        error = error * trust
     if weight is None:
         return error.mean()
     per_pixel = weight if weight.dim() == 2 else weight[:, None]

@@ -5,6 +5,7 @@ config.json; enough to rebuild it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,6 +24,7 @@ from hdr_nsff.core.settings import (
     with_changes,
 )
 from hdr_nsff.fields.baselines.hexplane import HexPlaneConfig
+from hdr_nsff.fields.baselines.nerf_wt import NerfWTConfig
 from hdr_nsff.fields.build import FieldConfig
 from hdr_nsff.fields.nsff.nsff import NSFFConfig
 from hdr_nsff.fields.splat.config import SplatConfig
@@ -125,15 +127,25 @@ def check_config(config: TrainConfig) -> TrainConfig:
     Its scene folder is absolute, so that the run can be opened from anywhere.
     """
     config = with_changes(replace(config, set=()), config.set, HELP)
-    two_branches = not isinstance(config.field, SplatConfig | HexPlaneConfig)
-    extra_pixels = config.rays > 0 and config.moving_rays > 0
-    if config.loss.dynamic and not (two_branches or extra_pixels):
-        raise InputError(
-            f"--loss.dynamic {config.loss.dynamic:g}: this preset has no such term; "
-            "give --rays and --moving-rays too, or leave it out"
-        )
+    for setting, problem in settings_without_effect(config):
+        raise InputError(f"{setting}: {problem}, or leave it out")
     f = config.field
     if isinstance(f, HexPlaneConfig) and f.finest < f.coarsest:
         problem = f"fewer cells than --field.coarsest {f.coarsest}, which it starts with"
         raise InputError(f"--field.finest {f.finest}: {problem}; raise it, or lower the other")
     return replace(config, scene=config.scene.resolve())
+
+
+def settings_without_effect(config: TrainConfig) -> Iterator[tuple[str, str]]:
+    """Settings that would change nothing, as a user writes them, and what to do."""
+    loss, field = config.loss, config.field
+    if config.moving_rays and not config.rays:
+        yield f"--moving-rays {config.moving_rays}", "whole frames are drawn; give --rays too"
+    if loss.dynamic and isinstance(field, SplatConfig | HexPlaneConfig) and not config.moving_rays:
+        problem = "this preset has no such term; give --rays and --moving-rays too"
+        yield f"--loss.dynamic {loss.dynamic:g}", problem
+    if loss.flow and isinstance(field, NerfWTConfig | HexPlaneConfig):
+        yield f"--loss.flow {loss.flow:g}", "this method has no scene flow; choose another"
+    if loss.mask and isinstance(field, HexPlaneConfig):
+        problem = "this method does not tell moving content from static; choose another"
+        yield f"--loss.mask {loss.mask:g}", problem

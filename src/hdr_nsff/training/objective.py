@@ -92,6 +92,17 @@ class Objective:
             return losses.saturation_weight(batch.rgb)
         return torch.ones_like(batch.rgb)
 
+    def trusted(self, rgb: Tensor, batch: PixelBatch, share: Tensor) -> Tensor:
+        """Errors of `rgb` (N, 3), weighed by trust and by the pixels' shares (N,).
+
+        The reference divides by the sum of the shares alone, so that frames of mostly
+        clipped values count less. Ours divides by that of trust times share.
+        """
+        trust, share = self.trust(batch), share[:, None]
+        if self.published:
+            return losses.photometric(rgb, batch.rgb, share, self.squared, trust)
+        return losses.photometric(rgb, batch.rgb, trust * share, self.squared)
+
     def dynamic(
         self, render: Render, rgb: Tensor, batch: PixelBatch, tonemap: ToneMapper, phase: float
     ) -> dict[str, Tensor]:
@@ -102,14 +113,13 @@ class Objective:
         """
         if render.dynamic_radiance is not None:
             rgb = tonemap.record(render.dynamic_radiance, batch, leaky=True)
-            weight = self.trust(batch)
-            if phase >= 1:
-                weight = weight * render.motion.detach()[:, None]
+            motion = render.motion.detach()
+            share = motion if phase >= 1 else torch.ones_like(motion)
         elif batch.all_uniform():
             return {}
         else:
-            weight = self.trust(batch) * (~batch.uniform)[:, None]
-        return {"dynamic": losses.photometric(rgb, batch.rgb, weight, self.squared)}
+            share = (~batch.uniform).to(rgb)
+        return {"dynamic": self.trusted(rgb, batch, share)}
 
     def warped(
         self, render: Render, batch: PixelBatch, tonemap: ToneMapper, phase: float
@@ -125,8 +135,7 @@ class Objective:
             share = warp.confidence
             if phase >= 1:
                 share = share * render.motion.detach()
-            weight = self.trust(batch) * share[:, None]
-            return losses.photometric(rgb, batch.rgb, weight, self.squared)
+            return self.trusted(rgb, batch, share)
 
         warps = [warp for warp in render.warps if warp.radiance is not None]
         single = [term(warp) for warp in warps if abs(warp.offset) == 1]

@@ -11,7 +11,7 @@ from typing import Literal
 from hdr_nsff.fields.baselines.hexplane import HexPlaneConfig
 from hdr_nsff.fields.baselines.nerf_wt import NerfWTConfig
 from hdr_nsff.fields.nsff.branches import GridConfig, MlpConfig
-from hdr_nsff.fields.nsff.nsff import NSFFConfig, SceneFlowLosses
+from hdr_nsff.fields.nsff.nsff import NDC_TO_CUBE, NSFFConfig, SceneFlowLosses
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.tonemap.base import ToneMapConfig, ToneMapLosses
 from hdr_nsff.training.budget import Budget, Schedule
@@ -24,8 +24,11 @@ PUBLISHED_SCHEDULE = Schedule(period=0.0, prior_fade=0.1, lr_final=0.0)
 PUBLISHED_STEPS = Budget(steps=250_000, minutes=None)
 # the published fields: networks, no culling, ReLU densities with noise
 PUBLISHED_SAMPLES = 128
+# published terms are means over axes, ours add the axes up
+AXES, IMAGE_AXES = 3, 2
 # the same on a CPU, see `small`
 SMALL_STEPS = 12_000
+SMALL_PERIOD = 0.144  # of the run, as the published K is for 36 frames
 SMALL_SAMPLES = 32
 # NeRF-W weighs mean transient density by 0.01 and squared errors by 1 / (2 beta^2).
 # This is the ratio of the two at beta's minimum, 0.03: beta itself is left out.
@@ -52,10 +55,10 @@ def paper() -> TrainConfig:
         loss=SceneFlowLosses(
             temporal=1.0,
             chain=1.0,
-            cycle=1.0,
+            cycle=1.0 / NDC_TO_CUBE / AXES,  # published in NDC, here in cube units
             flow_magnitude=0.1,
-            smoothness=0.1,
-            kinetic=0.1,
+            smoothness=0.1 / AXES,
+            kinetic=0.1 / AXES,
             disocclusion=0.1,
             blend_entropy=1e-3,
             distortion=1e-3,
@@ -78,7 +81,7 @@ def paper() -> TrainConfig:
     return TrainConfig(
         field=field,
         tonemap=tonemap,
-        loss=LossWeights(depth=0.04, flow=0.02, mask=0.0),
+        loss=LossWeights(depth=0.04, flow=0.02 / IMAGE_AXES, mask=0.0),
         budget=PUBLISHED_STEPS,
         schedule=PUBLISHED_SCHEDULE,
         rays=1024,
@@ -107,9 +110,10 @@ def small(published: TrainConfig) -> TrainConfig:
             render_samples=SMALL_SAMPLES,
         ),
         budget=Budget(steps=SMALL_STEPS, minutes=None),
-        schedule=replace(published.schedule, period=0.144, lr_final=0.1),
+        schedule=replace(published.schedule, period=SMALL_PERIOD, lr_final=0.1),
         rays=224,
         moving_rays=min(64, published.moving_rays),
+        moving_until=SMALL_PERIOD,
         bf16=True,
         tonemap_lr=1e-2,
         checkpoint_seconds=60.0,
@@ -191,7 +195,7 @@ def hexplane_paper() -> TrainConfig:
         schedule=Schedule(lr_final=0.1),
         rays=4096,
         moving_rays=0,
-        tonemap_lr=1e-3,
+        tonemap_lr=0.02,
         anchor_at=1.0,
         from_priors=False,
         squared=True,
@@ -222,6 +226,7 @@ def hexplane() -> TrainConfig:
         field=field,
         budget=Budget(minutes=5.0),
         rays=512,
+        tonemap_lr=1e-3,
         torch_threads=1,
         checkpoint_seconds=120.0,
     )

@@ -48,9 +48,9 @@ class SurfaceSamples:
 
 
 def initialize_grid(field: TwoBranches, frames: list[Frame], to_radiance: ToRadiance) -> bool:
-    """Initialize `field` from the frames' depth priors; whether it could.
+    """Initialize `field` from the frames' depths in scene units; whether it could.
 
-    It cannot where it has no grids, or a frame no depth in scene units.
+    It cannot where it has no grids, or a frame no depth.
     `to_radiance(rgb (P, 3), i)` inverts the recording of frame `i`.
     """
     if not isinstance(field.branches, GridBranches):

@@ -238,17 +238,21 @@ class SceneFlowPass:
         return result
 
     def kinetic(self) -> list[Tensor]:
-        """Kinetic energy twice here and once at each neighbor along the chain.
+        """Kinetic energy twice here and once at the neighbor along the chain.
 
-        The publication counts it so; without a chain both neighbors count.
+        The publication counts it so, from the first step on. Where densities add up,
+        both neighbors count as long as there is no chain.
         """
         near = self.near_samples(KINETIC_SHARE)
         terms = []
         if len(self.offsets) == 2:
             here = losses.kinetic(self.displacement[1][near], self.displacement[-1][near])
             terms += [here, here]
+        direction = self.batch.chain
+        if self.alone is not None and not direction:  # before the chain: by chance
+            direction = 1 if self.batch.seed % 2 else -1
         for o in self.offsets:
-            if self.batch.chain in (0, o):
+            if direction in (0, o):
                 flow = self.to_flow(self.neighbor_motion[o])[near]  # (M, 2, 3) cube
                 start = self.moved[o][near]
                 onward = self.displace(start, flow[:, side_of(o)])

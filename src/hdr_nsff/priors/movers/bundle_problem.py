@@ -19,6 +19,7 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry import pinhole
+from hdr_nsff.maths.differences import differences
 from hdr_nsff.priors.movers import bundle_kernels as kernels
 from hdr_nsff.priors.movers.rigid_motion import RigidGroup, canonical_points
 from hdr_nsff.priors.movers.tracks import Tracks
@@ -35,10 +36,11 @@ class Cameras:
 
     K: np.ndarray  # (T, 3, 3) pixels
     c2w: np.ndarray  # (T, 3, 4) OpenCV, scene units
+    when: np.ndarray  # (T,) the times themselves, ascending, in frames of the footage
 
     def at(self, times: np.ndarray) -> Cameras:
         """The cameras at the `times` (S,)."""
-        return Cameras(self.K[times], self.c2w[times])
+        return Cameras(self.K[times], self.c2w[times], self.when[times])
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,8 @@ class BundleProblem:
     """Residuals of a state, their derivatives, and the minimization.
 
     `usable` (members,) bool marks the tracks that have a point; all other arrays of N
-    points are of those. `times` (T,) are positions in the clip, by default one after
-    the other: motion is smooth only between consecutive ones.
+    points are of those. `times` (T,) are positions among the clip's, by default one
+    after the other: motion is smooth only between consecutive ones.
     """
 
     def __init__(
@@ -131,19 +133,21 @@ class BundleProblem:
         if len(members):
             self.middle = np.median(self.start, 0)
             self.size = np.median(np.linalg.norm(self.start - self.middle, axis=-1)) + 1e-9
-        self.init_differences(np.arange(len(self.K)) if times is None else times)
+        positions = np.arange(len(self.K)) if times is None else times
+        self.init_differences(positions, cameras.when)
         self.init_depth_prior(prior_points[self.usable], tracks.trust[members])
 
-    def init_differences(self, times: np.ndarray) -> None:
-        """Difference operators over the `times` (T,), one row for every three or four
+    def init_differences(self, positions: np.ndarray, when: np.ndarray) -> None:
+        """Difference operators over the times, one row for every three or four
         consecutive ones, and which rows of the path are supported.
+
+        `positions` (T,) tell which are consecutive; `when` (T,) they are is uneven
+        where frames are missing or held out.
         """
-        num = len(self.K)
-        self.three_in_a_row = times[2:] - times[:-2] == 2  # (T - 2,)
-        four_in_a_row = times[3:] - times[:-3] == 3
-        second, third = (np.diff(np.eye(num), n=order, axis=0) for order in (2, 3))
-        self.second_differences = second[self.three_in_a_row]  # (R, T)
-        self.third_differences = third[four_in_a_row]  # (P, T)
+        known = np.diff(positions) == 1  # (T - 1,)
+        self.second_differences = differences(when, known, 2)  # (R, T)
+        self.third_differences = differences(when, known, 3)  # (P, T)
+        self.turn_differences = turn_differences(when, known)  # (R, T - 1)
         # makes third differences, as shares of z-depth, standard deviations
         self.path_whitening = np.eye(3) / self.tuning.initial_path_sigma  # (3, 3)
         min_tracks = self.tuning.min_tracks
@@ -151,6 +155,7 @@ class BundleProblem:
         linked = (self.visible[:, 1:] & self.visible[:, :-1]).sum(0) >= min_tracks
         # (T,) the run of linked times, within which depth has one unknown factor
         self.run = np.concatenate([[0], np.cumsum(~linked)])
+        four_in_a_row = known[2:] & known[1:-1] & known[:-2]
         in_one_run = (self.run[3:] == self.run[:-3])[four_in_a_row]
         num_unknown = (np.abs(self.third_differences) > 0) @ ~self.depth_known
         self.path_rows = (num_unknown == 0) & in_one_run  # (P,)
@@ -259,7 +264,7 @@ class BundleProblem:
         return PriorResiduals(
             depth=np.where(self.depth_known, change, 0),
             path=path @ self.path_whitening,
-            rotation=np.diff(steps, axis=0)[self.three_in_a_row] / self.tuning.rotation_sigma_rad,
+            rotation=self.turn_differences @ steps / self.tuning.rotation_sigma_rad,
             shape=(state.points - self.middle) / self.shape_sigma(state),
         )
 
@@ -391,6 +396,21 @@ class BundleProblem:
         return BundleState(
             state.points + point_step, rotations, state.translations + pose_step[:, 3:]
         )
+
+
+def turn_differences(when: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Matrix (R, T - 1) that makes second differences of the rotation from the turns
+    between one time and the next.
+
+    As `differences` of order 2 has it: the difference of two angular velocities, times
+    the mean of their steps.
+    """
+    steps = np.diff(when)  # (T - 1,)
+    firsts = np.nonzero(known[1:] & known[:-1])[0]  # (R,)
+    rows = np.zeros((len(firsts), len(steps)))
+    for row, k in zip(rows, firsts, strict=True):
+        row[k : k + 2] = np.array([-1, 1]) / steps[k : k + 2] * steps[k : k + 2].mean()
+    return rows
 
 
 def solve_damped(

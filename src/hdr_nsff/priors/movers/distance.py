@@ -17,6 +17,7 @@ import numpy as np
 
 from hdr_nsff.core.stack import ArrayStack, Stack, with_pixels
 from hdr_nsff.geometry import pinhole
+from hdr_nsff.maths.differences import differences
 from hdr_nsff.priors.movers.regions import (
     RegionTrack,
     flow_steps,
@@ -149,24 +150,6 @@ def region_centers(
     return path
 
 
-def third_differences(times: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Matrix (rows, n) of third differences over every run of four frames whose steps
-    are `known` (n - 1,).
-
-    Divided differences at `times` (n,), scaled so that even steps give (-1, 3, -3, 1).
-    """
-    rows = []
-    for start in range(len(times) - ORDER):
-        if known[start : start + ORDER].all():
-            t = times[start : start + ORDER + 1]
-            gaps = t[:, None] - t[None] + np.eye(ORDER + 1)
-            mean_step = (t[-1] - t[0]) / ORDER
-            row = np.zeros(len(times))
-            row[start : start + ORDER + 1] = 6 * mean_step**ORDER / gaps.prod(1)
-            rows.append(row)
-    return np.array(rows).reshape(-1, len(times))
-
-
 def smoothest_path(
     eyes: np.ndarray,
     axes: np.ndarray,
@@ -188,8 +171,8 @@ def smoothest_path(
     own shake, the path determines nothing and the priors remain.
     """
     num = len(times)
-    differences = third_differences(times, known)
-    degree = max(len(differences), num // 2) // tuning.rows_per_depth_degree
+    third = differences(times, known, ORDER)
+    degree = max(len(third), num // 2) // tuning.rows_per_depth_degree
     count = 1 + min(tuning.max_depth_degree, degree)
     scaled_times = 2 * (times - times[0]) / max(times[-1] - times[0], 1e-9) - 1
     basis = np.polynomial.legendre.legvander(scaled_times, count - 1)  # (n, count)
@@ -200,10 +183,10 @@ def smoothest_path(
     change_rows = np.eye(count)[1:] / (tuning.change_sigma * np.median(prior))
     rows = [prior_rows, change_rows]
     targets = [prior_target, np.zeros(count - 1)]
-    if len(differences) >= tuning.min_path_rows:
-        path_rows = np.einsum("rn,nk,nc->rck", differences, basis, rays).reshape(-1, count)
+    if len(third) >= tuning.min_path_rows:
+        path_rows = np.einsum("rn,nk,nc->rck", third, basis, rays).reshape(-1, count)
         fixed_points = eyes + camera_depth[:, None] * rays
-        path_target = -(differences @ fixed_points).reshape(-1)
+        path_target = -(third @ fixed_points).reshape(-1)
         weight, noise = huber_weights(path_rows, path_target, tuning)
         signal = max(float((path_target**2).mean()), 1e-30)
         reliability = max(0.0, 1 - tuning.signal_to_noise * noise**2 / signal)

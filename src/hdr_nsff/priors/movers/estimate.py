@@ -48,7 +48,7 @@ def estimate_movers(
     tracks = follow_moving_pixels(views, tuning.tracks)
     segments: list[Segment] = []
     if len(tracks.trust):
-        cameras = Cameras(clip.K[frames], clip.c2w[frames])
+        cameras = Cameras(clip.K[frames], clip.c2w[frames], clip.times[frames])
         segments = segment_tracks(tracks, cameras, tuning)
     if not segments:
         return (mover_without_tracks(np.array(frames), views, tuning),)
