@@ -9,7 +9,7 @@ import pytest
 import torch
 from moments import MOMENTS, compare, field_of_times, random_field
 from pictures import compare_composites
-from test_splat import BESIDE, scattered
+from test_splat import BESIDE, TIMES, scattered
 from torch import Tensor
 
 from hdr_nsff.fields.base import Render
@@ -18,6 +18,7 @@ from hdr_nsff.fields.splat.fused_cloud import fused_cloud
 from hdr_nsff.fields.splat.fused_picture import fused_composite
 from hdr_nsff.fields.splat.rasterize import Maps
 from hdr_nsff.fields.splat.splat import Splat
+from hdr_nsff.fields.splat.trajectories import weights_of_differences
 
 
 @pytest.fixture(autouse=True)
@@ -29,6 +30,14 @@ def gaussians_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(("seed", "settings", "knot", "offset"), MOMENTS)
 def test_moments(seed: int, settings: dict[str, Any], knot: float, offset: int | None) -> None:
     compare(fused_cloud, random_field(seed, **settings), knot, offset)
+
+
+def test_poses_are_smooth_in_time_where_frames_are_missing() -> None:
+    times = torch.arange(float(TIMES))
+    times[4:] += 1.5
+    field = random_field()
+    field.trajectories.differences = weights_of_differences(times)
+    compare(fused_cloud, field, 4.2, None)
 
 
 @pytest.mark.parametrize("num_times", [1, 2, 3])

@@ -22,12 +22,13 @@ from hdr_nsff.fields.kernels.footprint import FAST
 
 POSE = 16  # numbers of a basis at a time: a 3x4 matrix by rows and a unit quaternion
 NO_POSE = (0.0,) * POSE
-NUMBERS = 28  # that depend on the time alone
+NUMBERS = 44  # that depend on the time alone
 # positions in `numbers`
 KNOT, NEIGHBOR, TIME, STATIC_COLOR = 0, 5, 10, 12
 MOVING_COLOR, OPACITY, UNIT, NEAR_FLOW, MAX_FLOW, BOUNDED = 14, 16, 18, 19, 20, 21
 RIGIDITY_DUE, MIN_OPACITY, FIRST_ROW, LAST_ROW, OFFSET_SHARE = 22, 23, 24, 25, 26
 LEAST_DURATION = 27
+DIFFERENCES = 28  # four weights for each third difference of the poses near the knot
 TERMS = 8  # of the field's own
 # positions in `terms`
 MEAN_OPACITY, MEAN_SCALE, TRAJECTORY, DRIFT, OPACITY_CHANGE, COLOR_CHANGE = 0, 1, 2, 3, 4, 5

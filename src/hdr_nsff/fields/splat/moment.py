@@ -64,7 +64,9 @@ class Moment:
             *t.window(self.knot),
             COLOR_OFFSET_SHARE,
             least_duration(model.times),
+            *t.window_differences(self.knot),
         )
+        numbers += (0.0,) * (NUMBERS - len(numbers))  # near the ends there are fewer
         assert len(numbers) == NUMBERS, len(numbers)
         return numbers
 

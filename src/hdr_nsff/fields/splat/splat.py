@@ -77,7 +77,7 @@ class Splat(nn.Module):
         # added to the moving ones' opacity logits
         self.opacity_offsets = nn.Parameter(torch.zeros(config.opacity_knots, moving))
         self.mixture_logits = nn.Parameter(torch.zeros(config.bases, moving))
-        self.trajectories = Trajectories(config.bases, len(times))
+        self.trajectories = Trajectories(config.bases, self.host_times)
         itself = torch.arange(moving, dtype=torch.int32)[:, None]
         self.register_buffer("neighbors", itself.repeat(1, NUM_NEIGHBORS))  # of moving ones
         # log radiance (or log odds) where no Gaussian is

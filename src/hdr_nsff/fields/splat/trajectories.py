@@ -9,17 +9,19 @@ interpolated by a cubic with continuous velocity, so any time between can be ren
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
-from hdr_nsff.core.tensors import table_on
+from hdr_nsff.core.tensors import constant, table_on
 from hdr_nsff.fields.knots import catmull_rom
 from hdr_nsff.fields.splat.rasterize import rotation_matrices, sum_products
+from hdr_nsff.maths.differences import differences
 
 # knots on either side whose poses a step may change: the reach of `roughness` and of
 # the cubic
 WINDOW = 3
-THIRD_DIFFERENCE = torch.tensor([-1.0, 3.0, -3.0, 1.0])  # 0 for constant acceleration
+ORDER = 3  # of the differences in `roughness`: constant acceleration costs nothing
 POSE_NUMBERS = 8  # of a basis at a knot: a quaternion, and a shift with an unused column
 # w, x, y, z of the Hamilton product of two quaternions
 HAMILTON_PRODUCT = sum_products(
@@ -33,16 +35,17 @@ Pose = tuple[Tensor, Tensor]  # unit quaternions (B, 4) w x y z, shifts (B, 3) s
 
 
 class Trajectories(nn.Module):
-    """`num_bases` (B) rigid motions over `num_knots` (T) training times."""
+    """`num_bases` (B) rigid motions over the training `times` (T,), in frames."""
 
     centers: Tensor
     rotations_touched: Tensor
     translations_touched: Tensor
 
-    def __init__(self, num_bases: int, num_knots: int) -> None:
+    def __init__(self, num_bases: int, times: Tensor) -> None:
         super().__init__()
-        self.num_bases, self.num_knots = num_bases, num_knots
-        rows = num_knots * num_bases
+        self.num_bases, self.num_knots = num_bases, len(times)
+        self.differences = weights_of_differences(times)
+        rows = self.num_knots * num_bases
         unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1)
         self.rotations = nn.Parameter(unturned)  # (T * B, 4) quaternions w x y z of any length
         # (T * B, 3) scene units, and a column that is not used: optimizer rows have
@@ -99,22 +102,38 @@ class Trajectories(nn.Module):
         """First and last + 1 of the knots within `WINDOW` of a knot."""
         return max(int(knot) - WINDOW, 0), min(int(knot) + 1 + WINDOW, self.num_knots)
 
+    def window_differences(self, knot: float) -> tuple[float, ...]:
+        """The weights of the poses near a knot in their third differences, four for
+        each difference.
+        """
+        first, last = self.window(knot)
+        return tuple(w for row in self.differences[first : last - ORDER] for w in row)
+
     def roughness(self, knot: float, unit: float) -> Tensor:
         """Mean square third difference of the poses near a knot, 0 for smooth motion.
 
         Of quaternions, and of shifts in `unit` (scene units); the sum over the 4 + 4
-        numbers of a pose. Constant acceleration costs nothing.
+        numbers of a pose. Constant acceleration costs nothing, also where frames are
+        missing or held out.
         """
         first, last = self.window(knot)
         turns = self.rotations.view(self.num_knots, -1, 4)[first:last]
         turns = nn.functional.normalize(turns, dim=-1)
-        if last - first < len(THIRD_DIFFERENCE):
+        if last - first <= ORDER:
             return turns.sum() * 0
         shifts = self.translations.view(self.num_knots, -1, 4)[first:last] / unit
         poses = torch.cat([turns, shifts], -1)
-        third_difference = table_on(THIRD_DIFFERENCE, poses.device, poses.dtype)
-        third_differences = poses.unfold(0, 4, 1) @ third_difference
+        weights = constant(self.window_differences(knot), poses.device, poses.dtype)
+        runs = poses.unfold(0, ORDER + 1, 1)  # (rows, B, 8, 4)
+        third_differences = (runs @ weights.view(-1, 1, ORDER + 1, 1))[..., 0]
         return POSE_NUMBERS * third_differences.square().mean()
+
+
+def weights_of_differences(times: Tensor) -> list[list[float]]:
+    """The weights of four knots in a row in their third difference: (T - 3, 4)."""
+    known = np.ones(max(len(times) - 1, 0), bool)
+    rows = differences(times.numpy().astype(float), known, ORDER)
+    return [row[k : k + ORDER + 1].tolist() for k, row in enumerate(rows)]
 
 
 def quaternion_product(a: Tensor, b: Tensor) -> Tensor:

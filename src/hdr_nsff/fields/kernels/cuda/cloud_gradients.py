@@ -30,6 +30,7 @@ from hdr_nsff.fields.kernels.cuda.cloud_kernels import (
 from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
 from hdr_nsff.fields.kernels.cuda.layout import THREADS
 from hdr_nsff.fields.kernels.moment import (
+    DIFFERENCES,
     FIRST_ROW,
     KNOT,
     LAST_ROW,
@@ -45,7 +46,6 @@ quaternion_gradient = device_functions(footprint, fastmath=False)["quaternion_gr
 MOMENT = device_functions(moment_gradients, fastmath=False, arrays=True)
 static_gradients, motion_gradients = MOMENT["static_gradients"], MOMENT["motion_gradients"]
 moving_gradients, local_gradients = MOMENT["moving_gradients"], MOMENT["local_gradients"]
-SIGNS = (-1.0, 3.0, -3.0, 1.0)  # of poses in their third difference
 
 
 def static_backward(
@@ -244,16 +244,17 @@ def roughness_gradient(b, numbers, motion, weight, g_rotations, g_translations):
     num_bases = centers.shape[0]
     first, last = int(numbers[FIRST_ROW]), int(numbers[LAST_ROW])
     factor = 2 * weight / max((last - first - 3) * num_bases, 1)
-    for start in range(first, last - 3):
-        d = third_difference(start, b, num_bases, numbers, rotations, translations)
+    for row in range(last - first - 3):
+        d = third_difference(row, b, num_bases, numbers, rotations, translations)
         for i in range(4):
-            r = (start + i) * num_bases + b
+            w = factor * numbers[DIFFERENCES + 4 * row + i]
+            r = (first + row + i) * num_bases + b
             q = (rotations[r, 0], rotations[r, 1], rotations[r, 2], rotations[r, 3])
             unit, _, length = rotation(q)
             along = d[0] * unit[0] + d[1] * unit[1] + d[2] * unit[2] + d[3] * unit[3]
             for n in range(4):
-                g_rotations[r, n] += factor * SIGNS[i] * (d[n] - along * unit[n]) / length
-                g_translations[r, n] += factor * SIGNS[i] * d[4 + n] / numbers[UNIT]
+                g_rotations[r, n] += w * (d[n] - along * unit[n]) / length
+                g_translations[r, n] += w * d[4 + n] / numbers[UNIT]
 
 
 def trajectory_backward(

@@ -24,6 +24,7 @@ from hdr_nsff.fields.kernels import footprint, moment
 from hdr_nsff.fields.kernels.cuda.device import device_functions, exact_device
 from hdr_nsff.fields.kernels.cuda.layout import THREADS
 from hdr_nsff.fields.kernels.moment import (
+    DIFFERENCES,
     FIRST_ROW,
     KNOT,
     LAST_ROW,
@@ -142,18 +143,24 @@ def normalized_pose(r, numbers, rotations, translations):
 
 
 @exact_device
-def third_difference(first, b, num_bases, numbers, rotations, translations):
-    """Third difference (8,) of basis b's poses at `first` and three knots after it."""
-    x0 = normalized_pose(first * num_bases + b, numbers, rotations, translations)
-    x1 = normalized_pose((first + 1) * num_bases + b, numbers, rotations, translations)
-    x2 = normalized_pose((first + 2) * num_bases + b, numbers, rotations, translations)
-    x3 = normalized_pose((first + 3) * num_bases + b, numbers, rotations, translations)
+def third_difference(row, b, num_bases, numbers, rotations, translations):
+    """The row-th third difference (8,) of the poses of basis b near the knot."""
+    start, at = int(numbers[FIRST_ROW]) + row, DIFFERENCES + 4 * row
+    x0 = normalized_pose(start * num_bases + b, numbers, rotations, translations)
+    x1 = normalized_pose((start + 1) * num_bases + b, numbers, rotations, translations)
+    x2 = normalized_pose((start + 2) * num_bases + b, numbers, rotations, translations)
+    x3 = normalized_pose((start + 3) * num_bases + b, numbers, rotations, translations)
+    w0, w1, w2, w3 = numbers[at], numbers[at + 1], numbers[at + 2], numbers[at + 3]
     return (
-        x3[0] - x0[0] + 3 * (x1[0] - x2[0]), x3[1] - x0[1] + 3 * (x1[1] - x2[1]),
-        x3[2] - x0[2] + 3 * (x1[2] - x2[2]), x3[3] - x0[3] + 3 * (x1[3] - x2[3]),
-        x3[4] - x0[4] + 3 * (x1[4] - x2[4]), x3[5] - x0[5] + 3 * (x1[5] - x2[5]),
-        x3[6] - x0[6] + 3 * (x1[6] - x2[6]), x3[7] - x0[7] + 3 * (x1[7] - x2[7]),
-    )  # fmt: skip
+        w0 * x0[0] + w1 * x1[0] + w2 * x2[0] + w3 * x3[0],
+        w0 * x0[1] + w1 * x1[1] + w2 * x2[1] + w3 * x3[1],
+        w0 * x0[2] + w1 * x1[2] + w2 * x2[2] + w3 * x3[2],
+        w0 * x0[3] + w1 * x1[3] + w2 * x2[3] + w3 * x3[3],
+        w0 * x0[4] + w1 * x1[4] + w2 * x2[4] + w3 * x3[4],
+        w0 * x0[5] + w1 * x1[5] + w2 * x2[5] + w3 * x3[5],
+        w0 * x0[6] + w1 * x1[6] + w2 * x2[6] + w3 * x3[6],
+        w0 * x0[7] + w1 * x1[7] + w2 * x2[7] + w3 * x3[7],
+    )
 
 
 @exact_device
@@ -161,8 +168,8 @@ def roughness_of(b, num_bases, numbers, rotations, translations):
     """Share of basis b in the roughness of the poses near the knot."""
     first, last = int(numbers[FIRST_ROW]), int(numbers[LAST_ROW])
     total = 0.0
-    for start in range(first, last - 3):
-        d = third_difference(start, b, num_bases, numbers, rotations, translations)
+    for row in range(last - first - 3):
+        d = third_difference(row, b, num_bases, numbers, rotations, translations)
         for n in range(8):
             total += d[n] * d[n]
     return total / max((last - first - 3) * num_bases, 1)
