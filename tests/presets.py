@@ -81,7 +81,7 @@ def random_field(preset: str, scene: Scene, seed: int = 0) -> AnyField:
     torch.manual_seed(seed)
     field = build_field(small(preset).field, scene)
     if isinstance(field, Splat):
-        initialize_field(field, scene, lambda rgb, i: rgb + 0.1, 0.0, True)
+        initialize_field(field, scene, lambda rgb, *frame: rgb + 0.1, 0.0, True)
         for p in field.trajectories.parameters():
             p.data.add_(0.02 * torch.randn_like(p))
         for p in (

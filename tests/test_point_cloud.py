@@ -34,7 +34,7 @@ def frame(
     return Frame(0, 0.0, CAMERA, 0, 0, image, disparity=disparity, disparity_confidence=confidence)
 
 
-def double(rgb: Tensor, frame: int) -> Tensor:
+def double(rgb: Tensor, frame: int, pixels: Tensor | None = None) -> Tensor:
     """The inverse of a recording: half the radiance in frame 0, a third in frame 1."""
     return rgb * (2 + frame)
 

@@ -9,10 +9,12 @@ from test_exposure_cycle import clip
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.prepare import exposures
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.prepare.steps.footage import exposure_step, frames_step
+from hdr_nsff.prepare.steps.response import drift_of_frames
 from hdr_nsff.prepare.work import Work
-from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.scene.manifest import Manifest, StepRecord
 
 
 def work_on(folder: Path, video: np.ndarray, **settings: object) -> Work:
@@ -83,6 +85,28 @@ def test_a_listed_alternation_with_drift_on_top_keeps_its_brackets(tmp_path: Pat
     assert [f.bracket for f in frames] == [0, 1] * 10
     found = [work.manifest.bracket_ev[f.bracket] + f.drift for f in frames]
     np.testing.assert_allclose(np.diff(found), np.diff(ev), atol=1e-9)
+
+
+def test_the_exposures_of_synchronized_cameras_drift_from_brackets_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As two GoPros write them, the second two stops darker."""
+    for camera in "ab":
+        for t, frame in enumerate(clip([0], frames=20)):
+            write_png(tmp_path / f"clip/{camera}/{t:03d}.png", frame)
+    config = PrepareConfig(tmp_path / "clip", tmp_path / "scene")
+    manifest = Manifest(source="clip", width=1, height=1)
+    work = Work(config, open_footage(config.clip), manifest)
+    frames_step(work)
+    drift = np.linspace(-0.5, 0.5, 20)
+    ev = [*(-8 + drift).tolist(), *(-10 - drift).tolist()]
+    monkeypatch.setattr(exposures, "given_exposures", lambda work: (exposures.GOPRO, ev))
+    result = exposure_step(work)
+    frames = manifest.frames
+    assert [f.bracket for f in frames] == [0] * 20 + [1] * 20
+    np.testing.assert_allclose([f.drift for f in frames], [*drift, *-drift], atol=1e-9)
+    manifest.steps["exposure"] = StepRecord(details=result.details)
+    assert drift_of_frames(work, None) == {f.index: f.drift for f in frames}
 
 
 def test_a_mask_of_another_size_is_named_with_the_way_out(tmp_path: Path) -> None:

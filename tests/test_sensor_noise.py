@@ -5,7 +5,7 @@ import pytest
 
 from hdr_nsff.radiometry.bracketing import FACTORS
 from hdr_nsff.radiometry.recording import Curve, Noise, record, response_curve
-from hdr_nsff.radiometry.sensor_noise import measure_noise, noise_log_likelihood
+from hdr_nsff.radiometry.sensor_noise import code_step, measure_noise, noise_log_likelihood
 
 EV = np.array([-2.0, 0.0, 2.0])
 
@@ -54,6 +54,25 @@ def test_without_flat_places_nothing_is_measured() -> None:
     images = [np.ones((20, 20, 3), np.float32)] * 3
     assert log_likelihood(images, curve, 1.0) is None
     assert not measure_noise(images, [0, 1, 2], curve.x, curve.y, EV).count.size
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_rounding_is_to_the_codes_that_occur(bits: int) -> None:
+    top = 2**bits - 1
+    exact = np.random.default_rng(0).random((80, 90, 3))
+    image = (np.rint(exact * top) / top).astype(np.float32)
+    assert code_step(image) == pytest.approx(1 / top, rel=0.01)
+    assert code_step(np.zeros((2, 2, 3), np.float32)) == pytest.approx(1 / 255)
+
+
+def test_rounding_to_16_bits_counts_as_that() -> None:
+    curve, rng = response_curve("gamma"), np.random.default_rng(0)
+    coarse = recordings(curve)
+    fine = [np.clip(i + rng.uniform(-0.5, 0.5, i.shape) / 255, 0, 1) for i in coarse]
+    fine = [(np.rint(i * 65535) / 65535).astype(np.float32) for i in fine]
+    of_8, of_16 = (measure_noise(i, [0, 1, 2], curve.x, curve.y, EV) for i in (coarse, fine))
+    ratio = np.median(of_8.rounding) / np.median(of_16.rounding)
+    assert ratio == pytest.approx((65535 / 255) ** 2, rel=0.2)
 
 
 def test_measured_noise_is_that_of_the_sensor() -> None:

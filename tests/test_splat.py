@@ -379,7 +379,7 @@ def test_colors_change_over_the_clip_and_static_ones_in_brightness_only() -> Non
 def test_an_initialized_field_has_the_cards_flow(toy: Scene) -> None:
     config = SplatConfig(static=1500, moving=400, bases=2)
     field = Splat(config, toy.times, toy.near, toy.far, 60 * 34)
-    initialize_field(field, toy, lambda rgb, i: rgb + 0.1, 0.0, True)
+    initialize_field(field, toy, lambda rgb, *frame: rgb + 0.1, 0.0, True)
     f = toy.train[2]
     offset = card_offset(2.0)
     pixel = f.camera.project(torch.tensor([*offset, CARD], dtype=torch.float32))[0]

@@ -84,6 +84,19 @@ def test_the_white_balance_of_single_frames_is_a_known_offset():
     torch.testing.assert_close(t.log_gain(1, 0, None), torch.zeros(3))
 
 
+@pytest.mark.parametrize("kind", ["per_image", "sigmoid"])
+def test_free_gains_start_at_the_drift_of_their_images(kind):
+    """Relative to the reference image, frame 1; one gain takes the mean of colors."""
+    drift, balance = (0.5, 0.25, -0.5, 0.0), ((0.3, 0.0, 0.0), *[(0.0,) * 3] * 3)
+    recordings = Recordings((0, 1, 0, 1), (0,) * 4, (-2.0, 0.0), 1, 1, drift, balance)
+    t = build_tone_mapper(ToneMapConfig(kind=kind), recordings)
+    t.start(measured([-2.0, 0.0]))
+    stops = torch.tensor([[-1.45, -1.75, -1.75], [0.0] * 3, [-2.75] * 3, [-0.25] * 3])
+    if kind == "sigmoid":
+        stops = stops.mean(1, keepdim=True).expand(-1, 3)
+    torch.testing.assert_close(t.gains(), stops, atol=1e-6, rtol=0)
+
+
 def test_known_exposures_are_exact_and_not_learned():
     t = mapper([-4.0, None, 0.0])
     t.set_exposures([-9.0, -1.5, 7.0])

@@ -138,15 +138,15 @@ def geometry_of(path: Path, view: PathView) -> Geometry:
 def recordings(run: Run, target: Target, radiance: Tensor) -> dict[int, Tensor]:
     """Recordings {bracket: (H, W, 3)} in [0, 1] of predicted `radiance` (H, W, 3).
 
-    By the learned camera, at every bracket that the target has.
+    By the learned camera, at every bracket that the target has, with the target's own
+    drift of exposure and white balance.
     """
-    brackets = list(target.rgb)
-    radiance = radiance * 2.0 ** torch.tensor(target.white_balance)
-    if target.drift:
-        exposures = run.tonemapper.exposures()
-        evs = [float(exposures[b]) + target.drift for b in brackets]
-        return dict(zip(brackets, recordings_at(run, target, radiance, evs), strict=True))
-    recorders = [run.tonemapper.recorder(b, target.camera_id) for b in brackets]
+    drift = target.drift + torch.tensor(target.white_balance)
+    camera, brackets = target.camera_id, list(target.rgb)
+    if drift.any():
+        recorders = [run.tonemapper.drifted_recorder(b, camera, drift) for b in brackets]
+    else:
+        recorders = [run.tonemapper.recorder(b, camera) for b in brackets]
     return dict(zip(brackets, record(run, target, radiance, recorders), strict=True))
 
 

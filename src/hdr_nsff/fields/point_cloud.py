@@ -5,8 +5,8 @@ reduction of many points to one per cell.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -27,8 +27,15 @@ UNCLIPPED = (0.01, 0.97)
 CLIPPED_TRUST = 1e-3  # of a pixel with a clipped channel, where a good one has up to 1
 MIN_BRIGHTNESS_TRUST = 0.05  # of a black pixel: its relative noise is largest
 
-# recorded rgb (P, 3) and the position of its training frame -> radiance (P, 3)
-ToRadiance = Callable[[Tensor, int], Tensor]
+
+class ToRadiance(Protocol):
+    """The inverse of a recording."""
+
+    def __call__(self, rgb: Tensor, frame: int, pixels: Tensor | None = None, /) -> Tensor:
+        """Radiance (P, 3) that training frame `frame` recorded as `rgb` (P, 3) at
+        `pixels` (P, 2), by default all of its picture, row by row.
+        """
+        ...
 
 
 @dataclass(frozen=True)
@@ -62,9 +69,10 @@ def unproject_frame(
     between z-depths `near` and `far`.
     """
     disparity = prior_disparity(frame, near, far)[chosen]
-    rays = frame.camera.rays(frame.camera.pixel_grid()[chosen])
+    pixels = frame.camera.pixel_grid()[chosen]
+    rays = frame.camera.rays(pixels)
     rgb = frame.image.reshape(-1, 3)[chosen]
-    radiance = to_radiance(rgb, position)
+    radiance = to_radiance(rgb, position, pixels)
     focal = frame.camera.K[0, 0]
     return PointCloud(
         positions=rays.origins + rays.directions / disparity[:, None],

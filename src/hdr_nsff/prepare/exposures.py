@@ -89,7 +89,8 @@ def exposures_by(
         return FrameExposures(source, brackets, unknown, False, True, notes=tuple(notes))
     many = len(exposure.brackets_by_ev(given)[1]) > exposure.MAX_CYCLE
     if source == GOPRO or (many and len(cameras) == 1):
-        return drifting_exposures(source, given, gapped)
+        own = own_brackets(work, given) if gapped is None else gapped.cycle.brackets
+        return drifting_exposures(source, given, own)
     brackets, known = exposure.brackets_by_ev(given)
     doubts = []
     for own in cameras:
@@ -135,6 +136,21 @@ def track_exposures(work: Work, source: str, given: list[float] | None) -> Frame
     """Exposures of tracks that one camera records at the same times: each has brackets
     of its own, one unless it alternates; `given` EVs may drift from it.
     """
+    brackets = own_brackets(work, given)
+    if given is None:
+        unknown: list[float | None] = [None] * (max(brackets) + 1)
+        return FrameExposures(source, brackets, unknown, False, True)
+    known, drift = levels_and_drift(given, brackets)
+    drifts = np.ptp(drift) > MIN_DRIFT_EV
+    return FrameExposures(
+        source, brackets, [*known], True, False, drift=tuple(drift.tolist()) if drifts else ()
+    )
+
+
+def own_brackets(work: Work, given: list[float] | None) -> list[int]:
+    """The bracket of every frame where each camera, and track of it, has brackets of
+    its own: one unless it alternates, by the `given` EVs of frames, else by brightness.
+    """
     brackets = [0] * len(work.manifest.frames)
     count = 0
     for own in work.camera_frames():
@@ -145,13 +161,7 @@ def track_exposures(work: Work, source: str, given: list[float] | None) -> Frame
         for index, bracket in zip(own, cycle.brackets, strict=True):
             brackets[index] = count + bracket
         count += len(cycle.order)
-    if given is None:
-        return FrameExposures(source, brackets, [None] * count, False, True)
-    known, drift = levels_and_drift(given, brackets)
-    drifts = np.ptp(drift) > MIN_DRIFT_EV
-    return FrameExposures(
-        source, brackets, [*known], True, False, drift=tuple(drift.tolist()) if drifts else ()
-    )
+    return brackets
 
 
 def levels_and_drift(given: list[float], brackets: list[int]) -> tuple[list[float], np.ndarray]:
@@ -165,14 +175,10 @@ def levels_and_drift(given: list[float], brackets: list[int]) -> tuple[list[floa
     return levels, drift
 
 
-def drifting_exposures(
-    source: str, given: list[float], gapped: GappedCycle | None = None
-) -> FrameExposures:
-    """Given EVs of frames that are too many for a cycle: brackets of one where they
-    alternate, and the drift of every frame from its bracket.
+def drifting_exposures(source: str, given: list[float], brackets: list[int]) -> FrameExposures:
+    """Given EVs of frames that are too many for a cycle: the level of their `brackets`,
+    and the drift of every frame from its bracket.
     """
-    cycle = exposure.cycle_of_steps(np.diff(given)) if gapped is None else gapped.cycle
-    brackets = cycle.brackets
     known, drift = levels_and_drift(given, brackets)
     note = f"given exposures drift by {drift.min():+.2f} to {drift.max():+.2f} EV"
     return FrameExposures(

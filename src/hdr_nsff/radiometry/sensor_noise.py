@@ -29,7 +29,7 @@ from hdr_nsff.radiometry.debevec import HIGH, LOW
 KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 SLOPE = np.array([[-1, 0, 1]] * 3, np.float32) / 6
 MEDIAN_SQUARE = 0.4549  # of a standard normal variable
-CODES = 255.0
+STEP_8_BIT = 1 / 255  # between codes, as values in [0, 1]
 MIN_EXPOSURE = 1e-7
 
 
@@ -69,7 +69,7 @@ class NoiseBins:
     log_exposure: np.ndarray  # (N,) natural, measured, 0 at saturation
     log_radiance: np.ndarray  # (N,) the same at the reference bracket
     variance: np.ndarray  # (N,) of the log exposure
-    rounding: np.ndarray  # (N,) variance of rounding to 8 bits
+    rounding: np.ndarray  # (N,) variance of rounding to the codes of the images
     count: np.ndarray  # (N,) pixels
 
 
@@ -125,6 +125,7 @@ def measure_noise(
         of_bracket = [k for k, b in enumerate(brackets) if b == bracket]
         step = max(1, min(stride, len(of_bracket) // 3))
         own = [images[k] for k in of_bracket[::step]]
+        code = min(code_step(image) for image in own)
         for channel in range(3):
             pixels = [channel_noise(image[..., channel], x, y[channel]) for image in own]
             g, noise, slope, z, gain = np.concatenate(pixels, axis=1)
@@ -143,11 +144,18 @@ def measure_noise(
                 if is_clipped or not is_measured:
                     continue
                 log_exposure = np.median(g[members])
-                rounding = np.median(gain[members]) ** 2 / CODES**2 / 12
+                rounding = (np.median(gain[members]) * code) ** 2 / 12
                 log_radiance = log_exposure - ev[bracket] * np.log(2)
                 count = len(members)
                 rows.append((channel, log_exposure, log_radiance, deviation**2, rounding, count))
     return NoiseBins(*np.array(rows).reshape(-1, 6).T)
+
+
+def code_step(image: np.ndarray) -> float:
+    """The step between neighboring codes of an `image` (H, W, 3): the smallest between
+    values that occur, at most that of 8 bits.
+    """
+    return float(np.diff(np.unique(image)).min(initial=STEP_8_BIT))
 
 
 def channel_noise(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -254,6 +254,19 @@ class ToneMapper(nn.Module, ABC):
             self.shading(camera_id),
         )
 
+    def drifted_recorder(self, bracket: int, camera_id: int, drift: Tensor) -> Recorder:
+        """The same of a view that is no training frame, whose exposure and white
+        balance differ from those of its bracket by `drift` (3,) stops.
+        """
+        images = self.images_of(bracket)
+
+        def record(radiance: Tensor) -> Tensor:
+            gain = self.log_gain(bracket, camera_id, None)
+            gain = (gain + drift.to(gain) * LN2).exp()
+            return self.respond(radiance.float(), gain, camera_id, images, leaky=False)
+
+        return Recorder(record, tuple(images.tolist()), self.shading(camera_id))
+
     def recorder_at(self, ev: float, camera_id: int = 0, lens: bool = False) -> Recorder:
         """The same of a picture developed at `ev`; it looks like the training images of
         the nearest exposure. With `lens` it is as dark towards the corners as these.
@@ -332,6 +345,14 @@ class ToneMapper(nn.Module, ABC):
         """Everything that is learned here, at one rate."""
         params = [p for p in self.parameters() if p.numel()]
         return [ParamGroup(params, lr)] if params else []
+
+
+def drift_of(recordings: Recordings) -> Tensor:
+    """Stops (frames, 3) by which every training frame differs from its bracket."""
+    count = len(recordings.brackets)
+    exposure = torch.tensor(recordings.drift or [0.0] * count, dtype=torch.float32)
+    balance = torch.tensor(recordings.balance or [[0.0] * 3] * count, dtype=torch.float32)
+    return exposure[:, None] + balance.view(count, 3)
 
 
 def informative(rgb: Tensor, low: float = 3 / 255, high: float = 250 / 255) -> Tensor:

@@ -15,7 +15,7 @@ from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap import curve
-from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper, drift_of
 from hdr_nsff.tonemap.curve import GAMMA
 from hdr_nsff.tonemap.fused_tone import Held, Learned, Recording, fused_recording
 from hdr_nsff.tonemap.kernel import bin_table
@@ -73,14 +73,6 @@ class BracketGain(nn.Module):
             # Their mean is 0: the residuals cannot carry scale.
             log_gain = log_gain + self.residual[frame] - self.residual.mean(0)
         return log_gain
-
-
-def drift_of(recordings: Recordings) -> Tensor:
-    """Stops (frames, 3) by which every training frame differs from its bracket."""
-    count = len(recordings.brackets)
-    exposure = torch.tensor(recordings.drift or [0.0] * count, dtype=torch.float32)
-    balance = torch.tensor(recordings.balance or [[0.0] * 3] * count, dtype=torch.float32)
-    return exposure[:, None] + balance.view(count, 3)
 
 
 class BracketedToneMapper(ToneMapper):

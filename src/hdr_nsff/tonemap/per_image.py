@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from hdr_nsff.radiometry.response import Response
 from hdr_nsff.tonemap import curve
-from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper
+from hdr_nsff.tonemap.base import LN2, Recordings, ToneMapConfig, ToneMapper, drift_of
 from hdr_nsff.tonemap.curve import GAMMA
 from hdr_nsff.tonemap.kernel import bin_table
 from hdr_nsff.tonemap.responses import ImageResponse
@@ -38,9 +38,14 @@ class ImageGainToneMapper(ToneMapper):
 
     @torch.no_grad()
     def set_exposures(self, ev: list[float]) -> None:
-        """Start every image's gain from `ev` (B,) of its bracket."""
-        gains = torch.tensor([[ev[b] * LN2] for b in self.frame_brackets])
-        self.image_gain.copy_(gains.expand_as(self.image_gain))
+        """Start every image's gain from `ev` (B,) of its bracket and its own drift,
+        relative to the reference image.
+        """
+        levels = torch.tensor([[ev[b]] for b in self.frame_brackets])
+        gains = (levels + drift_of(self.recordings)) * LN2
+        if self.image_gain.shape[1] == 1:
+            gains = gains.mean(1, keepdim=True)
+        self.image_gain.copy_(gains - gains[self.reference_frame])
 
 
 class ImageToneMapper(ImageGainToneMapper):

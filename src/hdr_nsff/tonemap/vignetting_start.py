@@ -34,7 +34,13 @@ DEGREES = (1, 2, 3)  # of r^2
 
 @torch.no_grad()
 def start_vignetting(lens: Vignetting, tonemapper: ToneMapper, scene: Scene) -> None:
-    """Start the coefficients of every camera where static points show them."""
+    """Start the coefficients of every camera where static points show them.
+
+    Depth that is known up to scale and shift does not lead from frame to frame: they
+    stay at none then, and training alone learns them.
+    """
+    if scene.manifest.depth_kind != "scene":
+        return
     generator = np.random.default_rng(0)
     for camera_id in range(len(lens.coefficients)):
         frames = [(k, f) for k, f in enumerate(scene.train) if f.camera_id == camera_id]

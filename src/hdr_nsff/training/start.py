@@ -38,17 +38,24 @@ def start_field(
         still = [replace(f, flow={}, flow_valid={}) for f in scene.train]
         scene = replace(scene, train=still)
 
-    def to_radiance(rgb: Tensor, frame: int) -> Tensor:
-        return recorded_radiance(tonemapper, scene, rgb, frame)
+    def to_radiance(rgb: Tensor, frame: int, pixels: Tensor | None = None) -> Tensor:
+        return recorded_radiance(tonemapper, scene, rgb, frame, pixels)
 
     typical = typical_log_radiance(tonemapper, scene)
     return initialize_field(field, scene, to_radiance, typical, from_priors)
 
 
-def recorded_radiance(tonemapper: ToneMapper, scene: Scene, rgb: Tensor, frame: int) -> Tensor:
-    """Radiance (N, 3) that training frame `frame` recorded as `rgb` (N, 3)."""
+@torch.no_grad()
+def recorded_radiance(
+    tonemapper: ToneMapper, scene: Scene, rgb: Tensor, frame: int, pixels: Tensor | None = None
+) -> Tensor:
+    """Radiance (N, 3) that training frame `frame` recorded as `rgb` (N, 3) at `pixels`
+    (N, 2), by default all of its picture. What the lens kept back is given back.
+    """
     f = scene.train[frame]
-    return tonemapper.inverse(rgb, f.bracket, f.camera_id, frame)
+    radiance = tonemapper.inverse(rgb, f.bracket, f.camera_id, frame)
+    share = tonemapper.shade(torch.ones_like(radiance), f.camera, f.camera_id, pixels)
+    return radiance / share
 
 
 @torch.no_grad()
@@ -56,8 +63,11 @@ def typical_log_radiance(tonemapper: ToneMapper, scene: Scene) -> float:
     """Median log radiance of what the frames recorded without clipping."""
     logs = []
     for i, f in enumerate(scene.train):
-        rgb = f.image[::SUBSAMPLING, ::SUBSAMPLING].reshape(-1, 3)
-        radiance = recorded_radiance(tonemapper, scene, rgb[informative(rgb)], i)
+        step, size = SUBSAMPLING, f.image.shape[:2]
+        rgb = f.image[::step, ::step].reshape(-1, 3)
+        pixels = f.camera.pixel_grid().view(*size, 2)[::step, ::step].reshape(-1, 2)
+        kept = informative(rgb)
+        radiance = recorded_radiance(tonemapper, scene, rgb[kept], i, pixels[kept])
         logs.append(radiance.clamp_min(MIN_RADIANCE).log().flatten())
     values = torch.cat(logs)
     return float(values.median()) if len(values) else 0.0

@@ -248,7 +248,7 @@ def colors_along_flow(
     j = f.neighbors[offset]
     _, cell, inside = landing(f, mask, offset)
     rgb = scene.train[j].image[cell[:, 1], cell[:, 0]]
-    log = to_radiance(rgb, j).clamp_min(MIN_RADIANCE).log()
+    log = to_radiance(rgb, j, cell + 0.5).clamp_min(MIN_RADIANCE).log()
     return log, exposure_trust(rgb) * (inside & f.flow_valid[offset][mask])
 
 

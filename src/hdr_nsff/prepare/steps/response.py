@@ -104,12 +104,13 @@ def given_drift(work: Work) -> np.ndarray | None:
 def drift_of_frames(work: Work, drift: np.ndarray | None) -> dict[int, float]:
     """The drift of every frame by its index, from that of the training frames (V,).
 
-    Frames that are held out lie between their neighbors of the same bracket.
+    Given drift stays, whatever was estimated. Frames that are held out lie between
+    their neighbors of the same bracket.
     """
-    if drift is None:
-        return {}
     if given_drift(work) is not None:
         return {f.index: f.drift for f in work.manifest.frames if f.drift is not None}
+    if drift is None:
+        return {}
     found = {}
     for f in work.manifest.frames:
         same = [k for k, other in enumerate(work.train) if other.bracket == f.bracket]
