@@ -133,8 +133,9 @@ def test_the_table_of_the_method_has_the_weights_of_a_preset(preset: str, column
     for row in re.findall(r"^\| `\w+` \|.*$", table, re.MULTILINE):
         cells = [cell.strip() for cell in row.split("|")]
         name = cells[1].strip("`")
-        number = re.match(r"\**([\d.]+)", cells[column])
-        assert (float(number[1]) if number else None) == weights.get(name), row
+        number = re.match(r"\**([\d.]+)(?: / (\d))?", cells[column])
+        weight = float(number[1]) / float(number[2] or 1) if number else None
+        assert weight == weights.get(name), row
 
 
 # Files and functions

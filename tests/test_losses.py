@@ -19,6 +19,14 @@ def test_photometric_ignores_pixels_of_weight_zero() -> None:
     assert math.isclose(float(losses.photometric(a, b, torch.tensor([1.0, 0.0]))), 1.0)
 
 
+def test_trust_weighs_errors_and_not_the_sum_that_they_are_divided_by() -> None:
+    a, b = torch.ones(2, 3), torch.zeros(2, 3)
+    trust = torch.tensor([[0.5] * 3, [0.1] * 3])
+    share = torch.tensor([1.0, 3.0])
+    found = losses.photometric(a, b, share, trust=trust)
+    assert math.isclose(float(found), (0.5 + 3 * 0.1) / 4, rel_tol=1e-6)
+
+
 def test_saturation_weight_is_one_inside_and_a_quarter_at_the_ends() -> None:
     w = losses.saturation_weight(torch.tensor([0.0, 0.15, 0.5, 0.9, 1.0]))
     torch.testing.assert_close(w, torch.tensor([0.25, 1.0, 1.0, 1.0, 0.25]))

@@ -103,6 +103,20 @@ def test_a_setting_that_would_change_nothing_is_refused() -> None:
         check_config(config)
 
 
+@pytest.mark.parametrize("fast", [True, False])
+def test_layers_are_in_bfloat16_where_the_device_computes_in_it(
+    toy: Scene, toy_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fast: bool
+) -> None:
+    monkeypatch.setattr("hdr_nsff.training.train.computes_bf16_fast", lambda device: fast)
+    t = trainer(small("paper-small", toy_folder, tmp_path / "run"), toy)
+    types = set()
+    layers = [m for m in t.field.modules() if isinstance(m, torch.nn.Linear)]
+    for layer in layers:
+        layer.register_forward_hook(lambda module, given, made: types.add(made.dtype))
+    t.step()
+    assert layers and types == {torch.bfloat16 if fast else torch.float32}
+
+
 def test_a_grid_does_not_start_from_depth_without_units(toy: Scene) -> None:
     manifest = toy.manifest.model_copy(update={"depth_kind": "relative"})
     relative = replace(toy, manifest=manifest)

@@ -3,108 +3,43 @@ loops and float64, on a random field of the published kind.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import pytest
 import torch
 from presets import random_field, small
+from published import (
+    RAYS,
+    Case,
+    add,
+    decode,
+    flow_of,
+    in_float64,
+    paper_case,
+    paper_field,
+    raw_at,
+    samples_of,
+    sigmoid,
+)
 from torch import Tensor
 
+from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.nsff.nsff import NSFF
 from hdr_nsff.fields.nsff.scene_flow import SceneFlowPass
-from hdr_nsff.fields.nsff.two_branches import BranchPass
-from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.maths import losses, volume
 from hdr_nsff.scene.batch import PixelBatch, draw_pixels
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.tonemap.curve import smoothness
-from hdr_nsff.training.objective import LossWeights, Objective
+from hdr_nsff.training.objective import Objective
 from hdr_nsff.training.presets import PRESETS
 
-RAYS = 5
-
-
-@dataclass
-class Case:
-    """A random field of the preset `paper` in float64, a batch and its pass."""
-
-    field: NSFF
-    batch: PixelBatch
-    base: BranchPass
-    scene_flow: SceneFlowPass
-    terms: dict[str, Tensor]
-
-    @property
-    def num_samples(self) -> int:
-        return self.base.samples.depths.shape[1]
-
-    def flow(self, i: int, k: int, side: int) -> list[float]:
-        """Scene flow in cube units of sample k of ray i; side 0 forward, 1 backward."""
-        return self.scene_flow.flow[i * self.num_samples + k, side].tolist()
+BRIGHT = 3  # a frame of the longest exposure: much of it clips
 
 
 @pytest.fixture(scope="module")
 def case(toy: Scene) -> Case:
-    field = random_field("paper", toy)
-    assert isinstance(field, NSFF)
-    field.config = replace(field.config, density_noise=0.0)
-    field.double()
-    batch = draw_pixels(toy, 2, RAYS, 0, torch.Generator().manual_seed(1))
-    batch = replace(in_float64(batch), chain=1)
-    base = field.query(batch, motion=True)
-    scene_flow = SceneFlowPass(field, field.to_flow, batch, base)
-    return Case(field, batch, base, scene_flow, field(batch)[1])
-
-
-def in_float64(batch: PixelBatch) -> PixelBatch:
-    """The batch with pixels, recorded values and cameras in float64."""
-
-    def double(c: Camera) -> Camera:
-        return replace(c, K=c.K.double(), c2w=c.c2w.double())
-
-    return replace(
-        batch,
-        pixels=batch.pixels.double(),
-        rgb=batch.rgb.double(),
-        camera=double(batch.camera),
-        neighbors={offset: double(c) for offset, c in batch.neighbors.items()},
-    )
-
-
-def decode(case: Case, coords: list[float]) -> Tensor:
-    """A point of the cube in scene units."""
-    return case.field.space.decode(torch.tensor([coords], dtype=torch.float64))[0]
-
-
-def add(a: list[float], b: list[float]) -> list[float]:
-    return [x + y for x, y in zip(a, b, strict=True)]
-
-
-def raw_at(case: Case, coords: list[float], knot: float, ray: int) -> list[float]:
-    """What the dynamic network answers at one point of the cube."""
-    where = torch.tensor([coords], dtype=torch.float64)
-    direction = case.base.samples.directions[ray : ray + 1]
-    raw, motion = case.field.branches.dynamic(where, knot, direction, True)
-    assert motion is not None
-    return [*raw[0].tolist(), *motion[0].tolist()]
-
-
-def samples_of(case: Case) -> list[tuple[int, int, list[float]]]:
-    """Every sample: its ray, its place along it, its cube coordinates."""
-    coords = case.base.samples.coords
-    places = [(i, k) for i in range(RAYS) for k in range(case.num_samples)]
-    return [(i, k, coords[i, k].tolist()) for i, k in places]
-
-
-def sigmoid(x: float) -> float:
-    return 1 / (1 + math.exp(-x))
-
-
-def flow_of(raw: list[float], side: int) -> list[float]:
-    """tanh in NDC of [-1, 1], in units of the cube."""
-    start = 4 + 4 * side
-    return [0.5 * math.tanh(x) for x in raw[start : start + 3]]
+    return paper_case(toy)
 
 
 # Compositing
@@ -233,6 +168,22 @@ def test_kinetic_energy_counts_twice_and_once_along_the_chain(case: Case) -> Non
     assert summed(case, "kinetic") == pytest.approx((2 * here + along) / count)
 
 
+def test_before_the_chain_one_neighbor_drawn_by_chance_counts_too(case: Case, toy: Scene) -> None:
+    def kinetic(field: NSFF, **changes: int) -> list[float]:
+        batch = replace(case.batch, **changes)
+        base = field.query(batch, motion=True)
+        values = SceneFlowPass(field, field.to_flow, batch, base).kinetic()
+        return [float(v) for v in values]
+
+    for seed, direction in ((4, -1), (5, 1)):
+        before = kinetic(case.field, seed=seed, chain=0)
+        assert len(before) == 3
+        assert before == pytest.approx(kinetic(case.field, seed=seed, chain=direction))
+    grid = random_field("grid", toy)
+    assert isinstance(grid, NSFF)
+    assert len(kinetic(grid.double(), chain=0)) == 4  # ours: both neighbors
+
+
 def test_blend_entropy_is_the_mean_of_minus_v_log_v(case: Case) -> None:
     v = case.base.static.blend.reshape(-1).tolist()
     entropy = -sum(x * math.log(x) for x in v) / len(v)
@@ -286,6 +237,17 @@ def test_eq_15_is_a_sum_over_images_channels_and_points(toy: Scene) -> None:
     assert found == pytest.approx(float(smoothness(curves)) * len(toy.train) * 3, rel=1e-4)
 
 
+def test_free_curves_end_at_0_and_1_and_may_leave_them_between(toy: Scene) -> None:
+    tonemap = tone_mapper_for(small("paper").tonemap, toy)
+    for p in tonemap.parameters():
+        p.data.add_(3 * torch.randn_like(p))
+    curves = tonemap.response.values(slice(None))  # type: ignore[union-attr]
+    assert curves.shape == (len(toy.train), 3, 256)
+    assert (curves[..., 0] == 0).all() and (curves[..., -1] == 1).all()
+    assert float(curves.min()) < 0 and float(curves.max()) > 1
+    assert torch.allclose(tonemap.knots, torch.linspace(0, 1, 256))
+
+
 @pytest.mark.parametrize("kind", ["scene", "relative"])
 def test_depth_is_compared_up_to_scale_and_shift_whatever_the_prior(
     case: Case, toy: Scene, kind: str
@@ -308,31 +270,98 @@ def normalized(values: list[float]) -> list[float]:
     return [(v - median) / deviation for v in values]
 
 
-def test_flow_and_temporal_terms_are_sums_over_both_neighbors(case: Case, toy: Scene) -> None:
-    tonemap = tone_mapper_for(small("paper").tonemap, toy).double()
+def test_flow_terms_are_sums_over_both_neighbors(case: Case, toy: Scene) -> None:
     render = case.scene_flow.render()
-    weights = LossWeights()
-    published = Objective({}, "scene", toy.near, published=True)
-    terms = published.terms(render, case.batch, tonemap, phase=0.0)
-    assert weights.flow and {"flow", "temporal", "flow_magnitude"} <= set(terms)
-    flow = temporal = magnitude = 0.0
-    trust = losses.saturation_weight(case.batch.rgb)
+    terms = pictured(render, case.batch, toy, phase=0.0)
+    flow = magnitude = 0.0
     for warp in render.warps:
         if abs(warp.offset) != 1:
             continue
         target, valid = case.batch.flow[warp.offset], case.batch.flow_valid[warp.offset]
         error = (warp.flow - target).abs().sum(-1)
         flow += float(error[valid].sum() / max(int(valid.sum()), 1))
-        assert warp.radiance is not None
-        which = case.batch.bracket, case.batch.camera_id, case.batch.frame
-        rgb = tonemap(warp.radiance, *which, leaky=True)
-        weight = trust * warp.confidence[:, None]
-        temporal += float(((rgb - case.batch.rgb).abs() * weight).sum() / weight.sum())
         rendered = render.scene_flow[warp.offset].tolist()
         magnitude += sum(abs(x) for flow in rendered for x in flow) / RAYS
     assert float(terms["flow"]) == pytest.approx(flow, rel=1e-4)
-    assert float(terms["temporal"]) == pytest.approx(temporal, rel=1e-4)
     assert float(terms["flow_magnitude"]) == pytest.approx(magnitude, rel=1e-4)
+
+
+@pytest.fixture(scope="module")
+def clipped(toy: Scene) -> tuple[NSFF, PixelBatch]:
+    """A field and pixels of a bright frame, with a chain backward."""
+    batch = draw_pixels(toy, BRIGHT, 6, 3, torch.Generator().manual_seed(2))
+    return paper_field(toy), replace(in_float64(batch), chain=-1)
+
+
+@pytest.mark.parametrize("phase", [0.0, 1.0, 2.0])
+def test_trust_weighs_errors_of_dynamic_terms_and_not_their_normalizer(
+    clipped: tuple[NSFF, PixelBatch], toy: Scene, phase: float
+) -> None:
+    field, batch = clipped
+    render, _ = field(batch)
+    terms = pictured(render, batch, toy, phase)
+    tonemap = tone_mapper_for(small("paper").tonemap, toy).double()
+    trust = losses.saturation_weight(batch.rgb)
+    assert float(trust.min()) < 0.6 and float(trust.max()) == 1
+    which = batch.bracket, batch.camera_id, batch.frame
+
+    def error(radiance: Tensor) -> Tensor:
+        return (tonemap(radiance, *which, leaky=True) - batch.rgb).abs()
+
+    def weighted(radiance: Tensor, share: Tensor) -> float:
+        if phase >= 1:
+            share = share * render.motion
+        return float((error(radiance) * trust * share[:, None]).sum() / (3 * share.sum()))
+
+    plain = error(render.radiance)[batch.uniform].mean()
+    assert float(terms["photometric"]) == pytest.approx(float(plain), rel=1e-4)
+    assert render.dynamic_radiance is not None
+    dynamic = weighted(render.dynamic_radiance, torch.ones_like(render.motion))
+    assert float(terms["dynamic"]) == pytest.approx(dynamic, rel=1e-4)
+    sums = {1: 0.0, 2: 0.0}  # over both neighbors; over the chain
+    for warp in render.warps:
+        assert warp.radiance is not None
+        sums[abs(warp.offset)] += weighted(warp.radiance, warp.confidence)
+    assert float(terms["temporal"]) == pytest.approx(sums[1], rel=1e-4)
+    assert ("chain" in terms) == (phase >= 2)
+    if phase >= 2:
+        assert float(terms["chain"]) == pytest.approx(sums[2], rel=1e-4)
+
+
+def pictured(render: Render, batch: PixelBatch, scene: Scene, phase: float) -> dict[str, Tensor]:
+    """The terms of a render, as the preset forms them."""
+    tonemap = tone_mapper_for(small("paper").tonemap, scene).double()
+    objective = Objective({}, "scene", scene.near, published=PRESETS["paper"].published)
+    return objective.terms(render, batch, tonemap, phase)
+
+
+# Weights
+
+
+def test_weighted_terms_are_the_published_means_over_axes(case: Case, toy: Scene) -> None:
+    """Cycles are published in NDC of [-1, 1], which are twice the cube's units."""
+    scene_flow, near = case.scene_flow, round(0.95 * case.num_samples)
+    cycle = smoothness = flow = 0.0
+    for side, offset in ((0, 1), (1, -1)):
+        back = case.field.to_flow(scene_flow.neighbor_motion[offset])[:, 1 - side]
+        seen = (1 - scene_flow.disocclusion[:, side])[:, None].expand(-1, 3)
+        error = 2 * (scene_flow.flow[:, side] + back).abs()
+        cycle += float((seen * error).sum() / seen.sum())
+        moves = scene_flow.displacement[offset].view(RAYS, -1, 3)[:, :near]
+        smoothness += float(moves.diff(dim=1).abs().mean())
+        target, valid = case.batch.flow[offset], case.batch.flow_valid[offset]
+        (warp,) = (w for w in scene_flow.render().warps if w.offset == offset)
+        flow += float((warp.flow - target).abs()[valid].mean())
+    both = (scene_flow.displacement[1] + scene_flow.displacement[-1]).view(RAYS, -1, 3)
+    here = 0.5 * both[:, : round(0.9 * case.num_samples)].square().mean()
+    config = PRESETS["paper"]
+    weights = config.field.loss  # type: ignore[union-attr]
+    assert weights.cycle * summed(case, "cycle") == pytest.approx(1.0 * cycle)
+    assert weights.smoothness * summed(case, "smoothness") == pytest.approx(0.1 * smoothness)
+    kinetic = weights.kinetic * float(case.terms["kinetic"][0])
+    assert kinetic == pytest.approx(0.1 * float(here))
+    terms = pictured(scene_flow.render(), case.batch, toy, phase=0.0)
+    assert config.loss.flow * float(terms["flow"]) == pytest.approx(0.02 * flow, rel=1e-4)
 
 
 @pytest.mark.parametrize("preset", ["paper", "nsff-paper"])

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import pytest
 import torch
 from presets import random_field, small
-from test_published import in_float64
-from torch import Tensor, nn
+from published import affine, encoded, in_float64, last_hidden, relu
+from torch import Tensor
 
 from hdr_nsff.fields.base import Render
 from hdr_nsff.fields.baselines.nerf_wt import CodedMlp, NerfWT, NerfWTConfig
@@ -59,28 +59,6 @@ def case(toy: Scene) -> Case:
     return Case(field, batch, field.query(batch, motion=False), render, terms)
 
 
-def encoded(values: list[float], octaves: int) -> list[float]:
-    """The values, then sine and cosine of every octave (NeRF, eq. 4)."""
-    result = list(values)
-    for octave in range(octaves):
-        result += [math.sin(2**octave * x) for x in values]
-        result += [math.cos(2**octave * x) for x in values]
-    return result
-
-
-def affine(layer: nn.Module, inputs: list[float]) -> list[float]:
-    assert isinstance(layer, nn.Linear)
-    rows, bias = layer.weight.tolist(), layer.bias.tolist()
-    return [
-        sum(w * x for w, x in zip(r, inputs, strict=True)) + b
-        for r, b in zip(rows, bias, strict=True)
-    ]
-
-
-def relu(values: list[float]) -> list[float]:
-    return [max(x, 0.0) for x in values]
-
-
 def sigmoid(values: list[float]) -> list[float]:
     return [1 / (1 + math.exp(-x)) for x in values]
 
@@ -91,14 +69,7 @@ def softplus(x: float) -> float:
 
 def trunk_output(case: Case, coords: list[float]) -> list[float]:
     """The last layer of the network that both contents share."""
-    trunk = case.branches.static_trunk
-    position = encoded([2 * x - 1 for x in coords], trunk.config.octaves)
-    h = position
-    for i, layer in enumerate(trunk.hidden):
-        if i == trunk.config.skip_after:
-            h = position + h
-        h = relu(affine(layer, h))
-    return h
+    return last_hidden(case.branches.static_trunk, [2 * x - 1 for x in coords])
 
 
 def some_samples(case: Case) -> list[tuple[int, int, list[float]]]:

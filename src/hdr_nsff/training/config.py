@@ -82,11 +82,14 @@ class TrainConfig:
     saturation: Advanced[bool] = True
     """Trust recorded values near 0 and 1 less in the dynamic terms."""
     published: Advanced[bool] = False
-    """Form the terms as the reference does: both neighbors add up, depth is compared up
-    to scale and shift whatever the prior, and errors of flow have no upper limit.
+    """Form the terms as the reference does: both neighbors add up, trust in recorded
+    values does not count in means, depth is compared up to scale and shift whatever the
+    prior, and errors of flow have no upper limit.
     """
     bf16: Advanced[bool] = False
-    """Network layers in bfloat16 (matters for `paper` only)."""
+    """Network layers in bfloat16 where the device has units for it (matters for `paper`
+    only).
+    """
     seed: Annotated[int, Ge(0), Le(MAX_SEED)] = 0
     device: str = "auto"
     """auto, cpu or cuda."""

@@ -19,7 +19,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.process import limit_torch_threads
-from hdr_nsff.core.tensors import to_device
+from hdr_nsff.core.tensors import computes_bf16_fast, to_device
 from hdr_nsff.fields.base import FrameError
 from hdr_nsff.fields.build import build_field, device_for
 from hdr_nsff.scene.batch import PixelBatch
@@ -110,6 +110,9 @@ class Trainer:
         num_rays = rays_per_step(config, scene)
         self.writer = RunWriter(config, modules, self.optimizers, num_rays, ranks.main)
         self.writer.say(note)
+        self.bf16 = config.bf16 and computes_bf16_fast(device)
+        if config.bf16 and not self.bf16:
+            self.writer.say("layers in float32: this device would take longer in bfloat16")
         self.clock = self.writer.resume(self.clock) or self.clock
         # frames on the CPU stay where they are: read when they are drawn
         self.scene = scene if device.type == "cpu" else to_device(scene, device)
@@ -155,7 +158,7 @@ class Trainer:
         for slot in slots:
             batch = self.poses(self.draw(slot))
             self.read_ahead(draw_frame(config, self.scene, clock.step + 1, slot)[0])
-            with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=config.bf16):
+            with torch.autocast(batch.rgb.device.type, torch.bfloat16, enabled=self.bf16):
                 render, field_terms = self.field(batch)
             terms = self.objective.terms(render, batch, self.tonemapper, clock.phase)
             terms |= self.objective.reduce(field_terms) | self.tonemapper.regularizers()

@@ -220,7 +220,7 @@ class SceneFlowPass:
         """Regularizers by the names of `SceneFlowLosses`, means over dynamic samples.
 
         Cycle, smoothness and disocclusion have one value per neighbor, kinetic energy
-        up to three (`kinetic`): the objective adds them up or averages them.
+        up to four (`kinetic`): the objective adds them up or averages them.
         """
         if not len(self.base.index):
             return {}

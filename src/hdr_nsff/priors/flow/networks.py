@@ -22,6 +22,7 @@ from torch.nn import functional
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.core.tensors import computes_bf16_fast
 from hdr_nsff.priors.flow.dense import (
     DENSE_FLOW_TUNING,
     DenseFlowTuning,
@@ -195,13 +196,6 @@ def build(name: str | None, device: torch.device) -> FlowNetwork:
         case "raft":
             return Raft()
     raise InputError(f"weights of {name!r}: no such flow network; use those of gmflow or raft")
-
-
-def computes_bf16_fast(device: torch.device) -> bool:
-    """Whether a device has units for bfloat16; GPUs have them since Ampere."""
-    if device.type == "cuda":
-        return torch.cuda.get_device_capability(device) >= (8, 0)
-    return torch.cpu._is_avx512_bf16_supported()
 
 
 def finetuned_file(given: Path) -> Path | None:
