@@ -17,8 +17,9 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.datasets.capture import SparseDepth
-from hdr_nsff.prepare.prepare import PrepareConfig, held_out_truth, prepare
-from hdr_nsff.scene.manifest import Manifest
+from hdr_nsff.prepare.engine import step_key
+from hdr_nsff.prepare.prepare import STEPS, PrepareConfig, begin, held_out_truth, prepare
+from hdr_nsff.scene.manifest import Manifest, StepRecord
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 
@@ -200,6 +201,19 @@ def test_a_second_run_does_nothing_and_a_changed_map_redoes_its_step(gopro: Prep
     repeated = {name for name, attempt in attempts.items() if attempt == 2}
     assert {"frames", "exposure", "flow", "poses"} == attempts.keys() - repeated
     assert max(attempts.values()) == 2
+
+
+def test_poses_are_estimated_again_where_their_masks_change(gopro: PrepareConfig) -> None:
+    def key(config: PrepareConfig) -> str:
+        work = begin(config)
+        work.manifest.steps["flow"] = StepRecord(done=True)
+        return step_key(work, "poses", STEPS["poses"])
+
+    estimate, with_masks = replace(gopro, estimate=("poses",)), ("poses", "masks")
+    assert key(estimate) != key(replace(gopro, estimate=with_masks))
+    given, before = key(gopro), key(estimate)
+    write_png(gopro.clip / "dense/motion_masks/00003.png", mini.left(9))
+    assert key(gopro) == given and key(estimate) != before
 
 
 # What training must not see

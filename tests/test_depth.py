@@ -159,3 +159,14 @@ def test_a_bad_depth_map_is_one_sentence(tmp_path, values, words):
     write_npy(tmp_path / "0.npy", values)
     with pytest.raises(InputError, match=words):
         read_depth_files([tmp_path / "0.npy"], "metric", (H, W))
+
+
+def test_sky_has_no_part_in_near_and_far():
+    disparity = np.full((2, 8, 8), 0.5, np.float32)
+    disparity[:, :3] = 0
+    ones = np.ones_like(disparity)
+    near, far = depth_module.depth_range(disparity, ones)
+    assert (near, far) == pytest.approx((1.6, 2.4))
+    assert depth_module.depth_range(disparity, 0 * ones) == pytest.approx((1.0, 4.0))
+    with pytest.raises(InputError, match="endlessly far away"):
+        depth_module.depth_range(0 * ones, ones)

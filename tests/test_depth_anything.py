@@ -2,6 +2,8 @@
 come back, in spite of outliers and gaps; a tiny network runs.
 """
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -13,6 +15,7 @@ from hdr_nsff.priors.depth.depth_anything import (
     anchored_depth,
     network_disparity,
     network_input,
+    ransac_line,
 )
 from hdr_nsff.priors.pretrained import pretrained
 from hdr_nsff.scene.posed_video import PosedVideo
@@ -59,6 +62,16 @@ def test_a_metric_network_needs_one_scale_per_frame_and_gets_no_shift():
     lines, _ = align(frames_of(scales, outliers=0.3, noise=0.003), with_shift=False)
     assert (lines[:, 1] == 0).all()
     np.testing.assert_allclose(lines[:, 0], scales[:, 0], rtol=0.01)
+
+
+def test_memory_does_not_grow_with_the_points_of_a_clip():
+    (samples,) = frames_of(CHANGING[:1], number=100_000, outliers=0.3)
+    tracemalloc.start()
+    line = ransac_line(samples, with_shift=True)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    np.testing.assert_allclose(line, CHANGING[0], rtol=1e-6)
+    assert peak < 100e6  # bytes
 
 
 def test_a_frame_without_points_takes_the_mean_fit_of_its_neighbors():

@@ -1,6 +1,7 @@
 """Gaps in maps: filled from around, and what is known stays."""
 
 import numpy as np
+import pytest
 
 from hdr_nsff.geometry.fill import fill
 
@@ -21,3 +22,15 @@ def test_known_values_stay_and_a_map_without_any_is_left_as_it_is():
     assert np.array_equal(filled[known], values[known])
     assert filled.min() >= values[known].min() and filled.max() <= values[known].max()
     assert fill(values, np.zeros((H, W), bool)) is values
+
+
+@pytest.mark.parametrize("count", [1, 20])  # of 3072 pixels
+def test_few_known_pixels_reach_everywhere(count):
+    rng = np.random.default_rng(0)
+    known = np.zeros((H, W), bool)
+    known.flat[rng.choice(H * W, count, replace=False)] = True
+    values = rng.uniform(1, 2, (H, W)).astype(np.float32)
+    filled = fill(np.where(known, values, 0), known)
+    assert np.array_equal(filled[known], values[known])
+    least, most = values[known].min(), values[known].max()
+    assert filled.min() > 0.999 * least and filled.max() < 1.001 * most

@@ -4,6 +4,7 @@ known.
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +12,12 @@ from posed_clips import BOARDS, H, K, W, sliding
 
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import read_npy
+from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.prepare.prepare import prepare
-from hdr_nsff.prepare.work import PrepareConfig
+from hdr_nsff.prepare.steps.poses import with_common_points
+from hdr_nsff.prepare.work import PrepareConfig, Work
 from hdr_nsff.priors.depth.guided_points import line_distances, points_between_cameras
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
 from hdr_nsff.scene.posed_video import PosedVideo
 from hdr_nsff.scene.scene import Scene
 
@@ -58,6 +62,27 @@ def test_nothing_is_found_in_pixels_that_are_ignored_or_at_different_times():
 def test_wrong_poses_find_no_points():
     points, _ = points_between_cameras(boards_from(EYES[:, [1, 0, 2]] * (3, -1, 1)))
     assert len(points) == 0
+
+
+def test_frames_that_are_held_out_give_no_points():
+    clip = boards_from(EYES)
+    poses = Poses(np.tile(K, (6, 1, 1)), np.tile(clip.c2w, (2, 1, 1)), np.ones(6, bool), "full")
+    manifest = Manifest(source="rig", width=W, height=H)
+    for index in range(6):  # three cameras at two times, of which one is held out
+        entry = FrameEntry(index=index, image="", source="", time=index // 3, bracket=0)
+        entry.camera_id, entry.split = index % 3, "test" if index < 3 else "train"
+        manifest.frames.append(entry)
+    found = []
+    for held_out in (clip.video, np.random.default_rng(0).random(clip.video.shape)):
+        work = Work(PrepareConfig(Path("rig"), Path("scene")), None, manifest)
+        video = np.concatenate([held_out, clip.video]).astype(np.float32)
+        work.equalized = video, np.zeros((6, H, W), bool)
+        no_pairs = np.zeros((0, 2), int)
+        work.raw_flows = np.zeros((0, H, W, 2)), np.zeros((0, H, W), bool), no_pairs
+        found.append(with_common_points(work, poses))
+    assert len(found[0].points) > 100 and set(found[0].tracks[:, 0]) == {3, 4, 5}
+    assert np.array_equal(found[0].points, found[1].points)
+    assert (found[0].near, found[0].far) == (found[1].near, found[1].far)
 
 
 def test_a_pixel_is_as_far_from_the_line_as_it_was_moved():

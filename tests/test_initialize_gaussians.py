@@ -33,7 +33,7 @@ pytestmark = pytest.mark.filterwarnings("error")
 CONFIG = SplatConfig(static=400, moving=150, bases=3)
 
 
-def recorded(rgb: Tensor, frame: int) -> Tensor:
+def recorded(rgb: Tensor, frame: int, pixels: Tensor | None = None) -> Tensor:
     """Radiance of what the toy's frames recorded: their exposures repeat, their
     response is a gamma of 2.2.
     """
@@ -212,7 +212,7 @@ def test_without_a_depth_prior_gaussians_are_scattered_in_view(toy: Scene, given
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_few_training_frames(toy: Scene, frames: int) -> None:
     started, note = seeded(changed(toy, lambda f: f, frames))
-    assert started.trajectories.num_knots == frames and " 0 movers" not in note
+    assert started.trajectories.num_knots == frames and " 0 rigid movers" not in note
     assert moving_at(started, 0.0)[:, :2].mean(0).numpy() == pytest.approx(
         card_offset(0.0), abs=0.05
     )

@@ -1,9 +1,14 @@
 """Moving masks, corrected by difference from the background of other frames."""
 
+from pathlib import Path
+
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from hdr_nsff.prepare.steps import masks
+from hdr_nsff.prepare.work import PrepareConfig, Work
 from hdr_nsff.priors.masks.background import BackgroundTuning, correct_by_background
+from hdr_nsff.scene.manifest import FrameEntry, Manifest
 
 T, H, W = 12, 40, 60
 BODY = np.s_[10:34, 20:34]
@@ -104,6 +109,27 @@ def test_held_out_frames_show_training_frames_nothing():
     train = np.arange(T) == 5
     before = mask_with_hole()
     assert (correct_by_background(before, clip(), ONE_GROUP, train, K, STILL) == before).all()
+
+
+def test_the_last_frame_of_a_camera_is_no_neighbor_of_the_first_of_the_next(monkeypatch):
+    video, moving = np.concatenate([clip(), clip(1)]), np.zeros((2 * T, H, W), bool)
+    video[5] = video[4]
+    video[T - 1][BODY], moving[T - 1][BODY] = 0.05, True
+    video[T + 5] = video[T + 4]
+    video[T][BODY] -= 0.08  # a leaf, which needs a mark
+    frames = [
+        FrameEntry(index=i, image="", source="", time=i % T, bracket=0, camera_id=i // T)
+        for i in range(2 * T)
+    ]
+    for f in frames:
+        f.K, f.c2w = K.tolist(), STILL[0].tolist()
+    manifest = Manifest(source="rig", width=W, height=H, parallax="none", frames=frames)
+    work = Work(PrepareConfig(Path("rig"), Path("scene")), None, manifest)
+    work.equalized = video, np.zeros(moving.shape, bool)
+    work.raw_flows = np.zeros((0, H, W, 2)), np.zeros((0, H, W), bool), np.zeros((0, 2), int)
+    monkeypatch.setattr(masks, "geometric_mask", lambda *given, **more: moving.copy())
+    found = masks.estimated_masks(work)
+    assert found[T - 1][BODY].mean() > 0.95 and not found[T].any()
 
 
 def test_the_background_of_a_turning_camera_is_aligned():

@@ -9,6 +9,7 @@ from painted_clips import H, K, W, cameras, painted_clip
 from hdr_nsff.priors.masks import geometric
 from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask, texture_confidence
 from hdr_nsff.priors.masks.geometric_tuning import GEOMETRIC_MASK_TUNING
+from hdr_nsff.priors.masks.static_residuals import working_clip
 
 
 def iou(a: np.ndarray, b: np.ndarray) -> float:
@@ -69,6 +70,21 @@ def test_large_frames_are_judged_on_a_coarser_grid():
     found = geometric_mask(*given, K, cameras(), tuning)
     assert found.shape == truth.shape
     assert iou(found, truth) > 0.6
+
+
+def test_the_coarser_grid_of_an_odd_size_shifts_nothing(monkeypatch):
+    height, width = 361, 641  # twice 181 and 321, less 1
+    video = np.zeros((2, height, width, 3), np.float32)
+    video[:, 319:351, 599:631] = 1
+    bright = lambda clip, frame, *given: 4.5 * clip.gray[frame]  # noqa: E731
+    monkeypatch.setattr(geometric, "motion_score", bright)
+    flow, pairs = np.zeros((2, height, width, 2), np.float32), np.array([[0, 1], [1, 0]])
+    valid = np.ones((2, height, width), bool)
+    mask = rough_mask(flow, valid, pairs, video)[0]
+    y, x = (np.nonzero(mask)[k].mean() + 0.5 for k in (0, 1))
+    assert (x, y) == pytest.approx((615, 335), abs=0.3)
+    clip = working_clip(flow + 1, valid, pairs, video)
+    assert np.allclose(clip.flow, (321 / width, 181 / height))
 
 
 def test_texture_beside_black_has_a_confidence_in_large_frames():

@@ -416,6 +416,26 @@ def test_depth_in_a_folder_tells_near_and_far_where_poses_do_not(config, tmp_pat
     assert 4 < m.near < 8 < m.far < 16
 
 
+@pytest.mark.parametrize("tripod", [False, True])
+def test_near_and_far_of_earlier_depth_do_not_stay(config, tmp_path, tripod):
+    config = replace(config, tripod=tripod, poses=None if tripod else config.poses)
+    disparity = np.full((H, W), 0.1, np.float32)
+    disparity[:8] = 0  # sky
+    for t in range(COUNT):
+        write_npy(tmp_path / f"far/{t:03d}.npy", disparity)
+    far = replace(config, depth=tmp_path / "far", depth_kind="disparity")
+    geometric = replace(config, depth=None)
+
+    def depths(config):
+        m = Manifest.load(prepare(config))
+        return m.near, m.far
+
+    fresh = {c: depths(replace(c, out=tmp_path / f"fresh_{c is far}")) for c in (far, geometric)}
+    assert fresh[far] != fresh[geometric]
+    for again in (geometric, far, geometric):
+        assert depths(again) == fresh[again]
+
+
 def test_a_list_that_is_added_or_changed_is_read(config):
     prepare(config)
     rows = "".join(f"{t:03d}.png,{EVS[t % 3]}\n" for t in range(COUNT))

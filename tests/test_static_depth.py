@@ -9,6 +9,7 @@ from posed_planes import H, W, cameras_at, plane, posed_video
 
 from hdr_nsff.prepare.steps import static_depth
 from hdr_nsff.prepare.steps.static_depth import MIN_KNOWN_SHARE, depth_of_cameras, least_spacing
+from hdr_nsff.scene.manifest import FrameEntry, Manifest, StepRecord
 
 EYES = [(0.0, 0, 0), (0.4, 0, 0), (0.4, 0.3, 0)]
 CAMERA_OF = np.array([0, 0, 1, 1, 2, 2])
@@ -47,3 +48,14 @@ def test_depth_that_cameras_hardly_agree_about_is_a_picture_before_each(
     for t, camera in enumerate(CAMERA_OF):
         assert disparity[t] == pytest.approx(1 / (0.15 if by_chance else 2 + camera))
         assert confidence[t].any() == (hints and not by_chance)
+
+
+def test_a_network_that_never_ran_is_not_the_source_of_depth() -> None:
+    entry = FrameEntry(index=0, image="", source="", time=0, bracket=0)
+    m = Manifest(source="clip", width=W, height=H, parallax="none", frames=[entry])
+    m.steps["poses"] = StepRecord(details={"range": [0.5, 2.0]})
+    config = SimpleNamespace(depth="depth-anything")
+    work: Any = SimpleNamespace(manifest=m, config=config, train=[entry])
+    work.capture_with = lambda part: None
+    found = static_depth.find_static_depth(work)
+    assert found.details["source"] == "geometric"

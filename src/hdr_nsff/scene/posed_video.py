@@ -13,6 +13,8 @@ from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.radiometry.common_range import recorded_range
 
+MIN_DISPARITY = 1e-9  # 1 / scene units; less is endlessly far away
+
 
 @dataclass(frozen=True)
 class PosedVideo:
@@ -49,7 +51,8 @@ class PosedVideo:
 
     def unproject(self, i: int, pixels: np.ndarray, disparity: np.ndarray) -> np.ndarray:
         """World points (P, 3) of `pixels` (P, 2) of frame `i` at `disparity` (P,)."""
-        return pinhole.unproject(pixels, 1 / disparity, self.K[i], self.c2w[i])
+        depth = 1 / np.maximum(disparity, MIN_DISPARITY)
+        return pinhole.unproject(pixels, depth, self.K[i], self.c2w[i])
 
     def transfer(self, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
         """`A` (3, 3) and `b` (3,) float32: pixel (x, y) of frame `i` at disparity d

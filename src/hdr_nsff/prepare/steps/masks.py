@@ -66,7 +66,11 @@ def estimated_masks(work: Work) -> np.ndarray:
         [(f.camera_id, f.bracket) for f in frames], axis=0, return_inverse=True
     )
     groups = recorded_alike[1].ravel()
-    return share_masks(work, correct_by_background(moving, video, groups, train, K, c2w))
+    for own in work.camera_frames():  # frames of two cameras are no neighbors
+        moving[own] = correct_by_background(
+            moving[own], video[own], groups[own], train[own], K[own], c2w[own]
+        )
+    return share_masks(work, moving)
 
 
 def given_masks(work: Work) -> np.ndarray:

@@ -66,6 +66,7 @@ def find_poses(work: Work) -> StepResult:
     else:
         poses, given = poses_and_masks(work), False
     known_range = bool(poses.near and poses.far)
+    near, far = (poses.near, poses.far) if known_range else (SPHERE_NEAR, SPHERE_FAR)
     files = {}
     if len(poses.points):
         points = poses.points.astype(np.float32)
@@ -80,11 +81,12 @@ def find_poses(work: Work) -> StepResult:
             "registered": registered,
             "notes": list(poses.notes),
             "known_range": known_range,
+            "range": [near, far],  # from which `static_depth` starts, also a second time
         },
         manifest={
             "parallax": poses.parallax,
-            "near": poses.near if known_range else SPHERE_NEAR,
-            "far": poses.far if known_range else SPHERE_FAR,
+            "near": near,
+            "far": far,
             "points": "points.npy" if len(poses.points) else None,
         },
         frames={
@@ -107,15 +109,18 @@ def data_set_poses(work: Work) -> Poses:
 
 def with_common_points(work: Work, poses: Poses) -> Poses:
     """Given `poses` with the static points that several cameras see at once, where no
-    points come with them.
+    points come with them: outside of held-out frames, since these points bound depth.
     """
     if len(poses.points) or not work.manifest.synchronized:
         return poses
-    times = np.array([f.time for f in work.manifest.frames])
-    video, clipped = work.equalized
-    moving = geometric_mask(*work.raw_flows, video, poses.K, poses.c2w)
-    clip = PosedVideo(poses.K, poses.c2w, times, video, clipped, moving)
+    index = np.array([f.index for f in work.train])
+    times = np.array([f.time for f in work.train])
+    video, clipped = (stack[index] for stack in work.equalized)
+    K, c2w = poses.K[index], poses.c2w[index]
+    moving = geometric_mask(*work.training_flows(work.raw_flows), video, K, c2w)
+    clip = PosedVideo(K, c2w, times, video, clipped, moving)
     points, tracks = points_between_cameras(clip)
+    tracks[:, 0] = index[tracks[:, 0].astype(int)]
     say(f"poses: {len(points)} static points matched between the cameras")
     found = replace(poses, points=points, tracks=tracks)
     return found if found.near else with_depth_range(found)

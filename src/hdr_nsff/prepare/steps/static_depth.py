@@ -24,6 +24,7 @@ from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.depth.geometric import depth_range, static_geometric_depth
 from hdr_nsff.priors.masks.visits import without_movers
+from hdr_nsff.scene.manifest import Manifest
 from hdr_nsff.scene.posed_video import PosedVideo
 
 MAX_STILL_FRAMES = 60  # of a camera that stands still, that its static picture is made of
@@ -58,7 +59,7 @@ def find_static_depth(work: Work) -> StepResult:
     elif m.parallax != "full":
         ones = np.ones((len(work.train), m.height, m.width), np.float32)
         note = "everything at distance 1: without parallax there is no depth to find"
-        depth = Depth(ones, ones, note, c.depth or "geometric")
+        depth = Depth(ones, ones, note, "geometric")  # no network had a part in it
     elif c.depth == "depth-anything":
         depth = depth_anything(work)
     else:
@@ -72,10 +73,16 @@ def find_static_depth(work: Work) -> StepResult:
         provenance="given" if depth.given else "estimated",
         note=depth.note,
         details={"source": depth.source, **depth.details},
-        manifest={"depth_kind": "scene", **depth.manifest},
+        manifest={"depth_kind": "scene", **range_of_poses(m), **depth.manifest},
         frames=cleared,
         maps={name: by_key(indices, values) for name, values in result_maps.items()},
     )
+
+
+def range_of_poses(m: Manifest) -> dict[str, float | None]:
+    """Near and far as the step `poses` left them, whatever depth has made of them."""
+    near, far = m.steps["poses"].details.get("range", (m.near, m.far))
+    return {"near": near, "far": far}
 
 
 def geometric_depth(work: Work) -> Depth:

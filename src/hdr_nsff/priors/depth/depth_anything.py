@@ -41,6 +41,7 @@ class DepthAnythingTuning:
 
     min_points: int = 30  # a frame with fewer is drawn to its neighbors in time
     num_hypotheses: int = 200  # pairs of points tried for a first scale and shift (RANSAC)
+    max_judges: int = 10_000  # points, drawn at random, that these are compared at
     num_iterations: int = 10  # of reweighting
     # standard deviations from which on points have little weight (Geman-McClure)
     outlier_scale: float = 2.4
@@ -211,8 +212,9 @@ def ransac_line(
     with_shift: bool,
     tuning: DepthAnythingTuning = DepthAnythingTuning(),
 ) -> np.ndarray | None:
-    """The scale and shift (2,) with the least median distance to `samples` (N, 2), of
-    many through two of them (through one of them and zero without `with_shift`).
+    """The scale and shift (2,) with the least median distance to `samples` (N, 2), or
+    some of them, of many through two of them (through one of them and zero without
+    `with_shift`).
 
     None for fewer than `min_points`, or where no scale is above 0: what is nearer for
     the network is nearer.
@@ -228,8 +230,11 @@ def ransac_line(
     run, rise = (first - second).T
     scale = rise / np.where(np.abs(run) < 1e-12, np.inf, run)
     shift = first[:, 1] - scale * first[:, 0] if with_shift else np.zeros_like(scale)
-    lines = scale[:, None] * samples[:, 0] + shift[:, None]
-    distance = np.median(np.abs(samples[:, 1] - lines), 1)
+    judges = samples
+    if count > tuning.max_judges:
+        judges = samples[rng.choice(count, tuning.max_judges, replace=False)]
+    lines = scale[:, None] * judges[:, 0] + shift[:, None]
+    distance = np.median(np.abs(judges[:, 1] - lines), 1)
     best = int(np.argmin(np.where(scale > 0, distance, np.inf)))
     return np.array([scale[best], shift[best]]) if scale[best] > 0 else None
 

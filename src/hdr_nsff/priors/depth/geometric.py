@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 import cv2
 import numpy as np
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.parallel import map_in_threads
 from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack
@@ -32,7 +33,7 @@ from hdr_nsff.priors.depth.parallax import (
     triangulate,
 )
 from hdr_nsff.priors.depth.plane_sweep import PlaneSweepTuning, sweep
-from hdr_nsff.scene.posed_video import PosedVideo
+from hdr_nsff.scene.posed_video import MIN_DISPARITY, PosedVideo
 
 NO_PARALLAX_RANGE = (0.5, 2.0)  # near and far, of the one distance of everything
 
@@ -227,7 +228,13 @@ def depth_range(
 ) -> tuple[float, float]:
     """Near and far z-depth that hold the confident pixels, with room: movers and other
     pixels are somewhere in between. `disparity`, `confidence` (T, H, W).
+
+    What is endlessly far away, such as sky, does not count; InputError where all is.
     """
+    finite = disparity > MIN_DISPARITY
+    disparity, confidence = disparity[finite], confidence[finite]
+    if not len(disparity):
+        raise InputError("depth: everything is endlessly far away; check the depth maps")
     if not confidence.any():  # no parallax: everything is at one distance
         near, far = NO_PARALLAX_RANGE
         return near / float(np.median(disparity)), far / float(np.median(disparity))

@@ -77,8 +77,8 @@ def correct_by_background(
     c2w: np.ndarray,
     tuning: BackgroundTuning = BackgroundTuning(),
 ) -> np.ndarray:
-    """The moving masks (T, H, W) bool, with regions that differ from the background and
-    without those that equal it.
+    """The moving masks (T, H, W) bool of one camera, with regions that differ from the
+    background and without those that equal it.
 
     `video` (T, H, W, 3) is rgb in [0, 1]; frames of one of the `groups` (T,) were
     recorded alike. `sources` (T,) bool: frames that may show others their background;
@@ -144,7 +144,7 @@ def grow_masks(
 
     ordered = np.flatnonzero(sources).tolist()
     for order in (ordered, ordered[::-1]):
-        for neighbor, t in zip([order[0], *order], order, strict=False):
+        for neighbor, t in zip([*order[:1], *order], order, strict=False):
             grow(t, neighbor)
     for t in np.flatnonzero(~sources).tolist():
         for neighbor in (max(t - 1, 0), min(t + 1, len(masks) - 1)):

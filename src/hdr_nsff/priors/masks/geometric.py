@@ -79,7 +79,7 @@ def geometric_mask(
     added to that of flow.
     """
     clip = working_clip(flow, valid, pairs, video, tuning)
-    scale = np.array([1 / clip.coarseness, 1 / clip.coarseness, 1])[:, None]
+    scale = np.append(clip.scale, 1)[:, None]
     small_K = np.broadcast_to(K, (len(c2w), 3, 3)) * scale
 
     def residuals(frame: int, chains: list[ChainedFlow]) -> np.ndarray:
@@ -114,9 +114,9 @@ def segment_motion(
     height, width = clip.size
     moving = np.zeros((len(scores), height, width), bool)
     for frame, score in enumerate(scores):
-        objects = extract_objects(score, tuning)
-        enlarged = objects.repeat(clip.coarseness, 0).repeat(clip.coarseness, 1)
-        moving[frame] = enlarged[:height, :width]
+        objects = extract_objects(score, tuning).astype(np.uint8)
+        nearest = cv2.INTER_NEAREST_EXACT
+        moving[frame] = cv2.resize(objects, (width, height), interpolation=nearest) > 0
     warn_of_large_masks(moving, report, tuning)
     return moving
 

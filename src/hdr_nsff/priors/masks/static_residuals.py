@@ -55,9 +55,17 @@ class FlowClip:
     backward: Links
     """To the nearest earlier frame."""
     coarseness: int
-    """Pixels of the frames per pixel of the working grid, in x and in y."""
+    """Pixels of the frames per pixel of the working grid, in x and in y; a little less
+    where the grid's size was rounded up.
+    """
     size: tuple[int, int]
     """Height and width of the frames."""
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Pixels of the working grid per pixel of the frames, (2,) float64: x, y."""
+        height, width = self.gray.shape[1:]
+        return np.array([width / self.size[1], height / self.size[0]])
 
 
 def working_clip(
@@ -89,7 +97,8 @@ def working_clip(
         return cv2.resize(image, (small_width, small_height), interpolation=cv2.INTER_AREA)
 
     gray = [shrink(cv2.GaussianBlur(frame @ LUMA, (0, 0), tuning.blur_px)) for frame in video]
-    small_flow = np.array([shrink(f) / coarseness for f in flow], np.float32)
+    step = np.array([width / small_width, height / small_height], np.float32)
+    small_flow = np.array([shrink(f) / step for f in flow], np.float32)
     small_valid = np.array([shrink(v) > 0.5 for v in valid], bool)
     return FlowClip(
         gray=np.stack(gray),

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
@@ -98,7 +98,7 @@ def separate_movers(
         own = np.flatnonzero(learned[times])
         if not len(own):
             continue
-        noise = noise_of_visits(visits, tuning)
+        noise = noise_of_visits(visits, own, tuning)
         compared = own[spread_frames(len(own), tuning.max_compared)]
         chosen = most_supported(visits, noise, compared, tuning)
         from_static = distances_from(visits, noise, chosen, compared, tuning)
@@ -155,20 +155,21 @@ def visit_distance(
     return np.asarray(np.sqrt(cv2.GaussianBlur(squared, (0, 0), tuning.smoothing_px)), np.float32)
 
 
-def noise_of_visits(visits: Visits, tuning: VisitTuning = VISIT_TUNING) -> np.ndarray:
+def noise_of_visits(
+    visits: Visits, learned: np.ndarray, tuning: VisitTuning = VISIT_TUNING
+) -> np.ndarray:
     """The standard deviation (V, H, W, 3) of the noise of every visit.
 
     It is that of the median difference of two visits, at pixels of one brightness: less
-    than half of them move.
+    than half of them move. `learned` (L,): the visits that it is estimated from.
     """
-    middle = np.median(visits.blurred, 0)
+    middle = np.median(visits.blurred[learned], 0)
     edges = np.quantile(middle, np.linspace(0, 1, tuning.noise_levels + 1))
 
     def level(values: np.ndarray) -> np.ndarray:
         return np.clip(np.searchsorted(edges, values) - 1, 0, tuning.noise_levels - 1)
 
-    pairs = range(len(visits.frames) - 1)
-    common = [visits.in_common(k, k + 1) for k in pairs]
+    common = [visits.in_common(a, b) for a, b in pairwise(learned)]
     differences = np.array([np.abs(a - b) for a, b in common])
     noise = np.full(tuning.noise_levels, tuning.min_noise)
     level_of_middle = level(middle)

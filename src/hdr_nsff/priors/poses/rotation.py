@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
@@ -344,7 +345,7 @@ def refine(
     damping, lowest = 1e-4, robust_cost(rotations, focal, matches)
     normal, right = normal_equations(rotations, focal, matches, free_focal)
     for _ in range(tuning.max_iterations):
-        step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
+        step = solve_damped(normal, damping, right)
         turns = Rotation.from_rotvec(step[:-1].reshape(-1, 3)).as_matrix()
         new_rotations = rotations @ turns
         new_focal = float(focal * np.exp(np.clip(step[-1], -0.3, 0.3)))
@@ -362,8 +363,19 @@ def refine(
         lowest = cost
     predicted, _ = rotate_pixels(rotations, focal, matches.frames, matches.p)
     error = MAD_TO_SIGMA * np.median(np.linalg.norm(predicted - matches.q, axis=1))
-    log_focal_variance = np.linalg.inv(normal)[-1, -1] * tuning.matches_per_point
+    of_focal = np.append(np.zeros(len(right) - 1), 1.0)  # the last column of the inverse
+    log_focal_variance = solve_damped(normal, 0.0, of_focal)[-1] * tuning.matches_per_point
     return RefinedRotations(rotations, focal, float(error * np.sqrt(log_focal_variance)))
+
+
+def solve_damped(normal: np.ndarray, damping: float, right: np.ndarray) -> np.ndarray:
+    """The solution (N,) for `normal` (N, N), symmetric and positive definite, with its
+    diagonal raised by the share `damping`, and `right` (N,).
+    """
+    damped = normal.copy()
+    np.einsum("ii->i", damped)[:] *= 1 + damping  # a view of the diagonal
+    factor = cho_factor(damped.T, overwrite_a=True)  # in the order of LAPACK, so no copy
+    return np.asarray(cho_solve(factor, right))
 
 
 def robust_cost(rotations: np.ndarray, focal: float, matches: RotationMatches) -> float:
