@@ -66,8 +66,14 @@ def test_footage_of_synth_is_to_be_prepared(tmp_path: Path) -> None:
     assert scene.footage is not None and scene.footage.clip == folder / "clip"
     assert scene.footage.poses == folder / "poses_bounds.npy"
     assert scene.footage.hold_out == 2  # the toy's truth is of frames 1 and 3
+    with pytest.raises(InputError, match="leave --protocol out"):
+        parse(folder, protocol="novel-view")  # which would train on them
+    edit(folder / "truth/truth.json", lambda t: [v.update(time=1.5) for v in t["views"]])
     novel = parse(folder, protocol="novel-view").footage
     assert novel is not None and novel.protocol == "novel-view"
+    (folder / "transforms.json").write_text("{}")
+    of_now = parse(folder).footage
+    assert of_now is not None and of_now.poses == folder / "transforms.json"
 
 
 def test_an_oracle_scene_is_named_so_however_it_is_given(tmp_path: Path) -> None:

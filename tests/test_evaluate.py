@@ -23,7 +23,7 @@ from hdr_nsff.evaluation.evaluate import EvaluateConfig, evaluate, evaluate_run
 from hdr_nsff.fields.base import Render
 from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.truth import Truth, TruthView, match_brackets
+from hdr_nsff.scene.truth import Truth, TruthView, as_exposed, match_brackets
 from hdr_nsff.training.run_folder import Run
 
 # The truth's world is turned, three times as large, and elsewhere.
@@ -174,6 +174,44 @@ def test_tripod_views_off_the_path_are_left_out_by_name(tmp_path: Path) -> None:
 def test_brackets_are_matched_by_rank_of_exposure() -> None:
     assert match_brackets([-2, 0, 2], [0.1, -2.2, 2.1]) == {0: 1, 1: 0, 2: 2}
     assert match_brackets([-4, -2, 0], [0.0, -2.1]) == {0: 1, 1: 1, 2: 0}
+
+
+def test_brackets_of_a_drifting_clip_have_the_mean_exposure_of_their_training_frames(
+    tmp_path: Path,
+) -> None:
+    """The scene knows the drift of frame 0. Frame 6, held out, does not count."""
+    run = fake_run(tmp_path / "run", num_frames=7, held_out=1)
+    mean = np.array([0.5, -0.25, 0.25])  # of the training frames of every bracket
+    drift = [*(mean + 0.1), *(mean - 0.1), 3.0]
+    frames = run.scene.manifest.frames
+    frames[0].drift = 0.2
+    drift[0] += 0.2
+    changes = {"bracket_ev": (EV - mean).tolist(), "clip_drift": drift, "clip_c2w": None}
+    truth = write_truth(tmp_path / "truth", run, field_of(run), **changes)
+    found = as_exposed(Truth.open(truth), frames, EV)
+    assert found.bracket_ev == pytest.approx(EV)
+    views = Truth.open(truth).views
+    write_truth(truth, run, field_of(run), **changes, views=[v for v in views if v.c2w is None])
+    result = evaluate_run(run, truth)
+    view = next(v for v in result["views"] if v["name"] == "a")
+    assert view["psnr"] > 55 and result["camera"]["largest_ev_error"] < 1e-6
+
+
+def test_a_scene_that_counts_other_frames_than_the_truth_is_refused(tmp_path: Path) -> None:
+    """Of `prepare --start 2` or `--stride 2`; of a video, and of a folder of frames."""
+    run = fake_run(tmp_path / "run")
+    truth = write_truth(tmp_path / "truth", run, field_of(run))
+    manifest = run.scene.manifest
+    for start, stride in ((0, 1), (2, 1), (0, 2)):
+        for names in ("clip.mp4#{}", "img_{}.png"):
+            manifest.inputs = {names.format(n): "" for n in range(20) if "#" not in names}
+            for frame in manifest.frames:
+                frame.source = names.format(start + stride * frame.index)
+            if (start, stride) == (0, 1):
+                evaluate_run(run, truth)
+                continue
+            with pytest.raises(InputError, match="without --start, --stride"):
+                evaluate_run(run, truth)
 
 
 def test_learned_exposures_are_compared_up_to_a_power(tmp_path: Path) -> None:

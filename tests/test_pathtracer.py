@@ -4,6 +4,7 @@ installed.
 
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.geometry.pinhole import pixel_centers, project
 from hdr_nsff.synth import pathtracer
 from hdr_nsff.synth.pathtracer import Tracer, smooth
+from hdr_nsff.synth.scenes.cloth import CLOTH
 from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import BACK, CORD, FLOOR, ball_pose, camera_pose
 
@@ -39,6 +41,21 @@ def test_smoothing_does_not_cross_a_mover_or_a_corner() -> None:
     assert 0.2 < smooth(light, surface, 0.05)[6, 7, 0] < 0.8
 
 
+def test_seeds_of_paths_have_32_bits_and_small_ones_stay() -> None:
+    """The largest is that of `synth --seed 999`'s last picture and moment."""
+    seeds: list[int] = []
+
+    def render(scene: object, seed: int, **_: object) -> np.ndarray:
+        seeds.append(seed)
+        return np.zeros((1, 1, 3))
+
+    mi = SimpleNamespace(load_dict=lambda kind: kind, render=render)
+    for seed in (5, 999_999 + 7 * 100_003):
+        Tracer.average(SimpleNamespace(mi=mi), None, None, {}, 128, seed)  # type: ignore[arg-type]
+    assert seeds[:2] == [5 * 4096, 5 * 4096 + 1]
+    assert all(seed < 2**32 for seed in seeds) and len(set(seeds)) == 4
+
+
 def test_unusable_variants_are_refused_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
     monkeypatch.setattr(pathtracer, "newest_llvm", lambda: None)
@@ -62,6 +79,21 @@ def test_a_tiny_picture_holds_the_range_it_promises(tracer: Tracer) -> None:
         assert picture.shape == (18, 32, 3) and np.isfinite(picture).all() and picture.min() >= 0
         assert picture.max() > 20 and np.percentile(picture, 5) < 0.05
     assert np.abs(pictures[0] - pictures[1]).max() > 0.1  # the room moves
+
+
+def test_a_ray_that_leaves_the_scene_sees_a_static_sky_of_depth_0() -> None:
+    """A tall picture looks over the walls of the courtyard."""
+    pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
+    size, c2w = (9, 16), CLOTH.camera_pose(0)
+    tracer = Tracer(CLOTH, 0, "scalar_rgb")
+    surface = tracer.surface(0, intrinsics(*size), c2w, size)
+    sky = surface.depth == 0
+    assert sky[0].all() and not sky[8:].any()
+    assert (surface.bodies[sky] == ROOM).all()
+    away = surface.points - c2w[:, 3]
+    assert (np.linalg.norm(away, axis=-1)[sky] > 1000).all()  # no parallax
+    picture = tracer.radiance(0, intrinsics(*size), c2w, size, 2, 0)
+    assert np.isfinite(picture).all() and picture[sky].min() > 0.05
 
 
 def test_surfaces_lie_on_the_rays_through_pixel_centers(tracer: Tracer) -> None:

@@ -103,7 +103,15 @@ def test_settings_of_the_user_take_precedence_over_the_truth(tmp_path: Path) -> 
     assert held_out_every(config) == 8
     assert held_out_every(replace(config, hold_out=3)) == 3
     assert held_out_every(replace(config, hold_out=0)) == 0
-    assert held_out_every(replace(config, protocol="novel-view-time")) is None
+    other = truth_of(tmp_path / "other", (2.5, 2))
+    assert held_out_every(replace(config, truth=other, protocol="novel-view-time")) is None
+
+
+def test_a_protocol_that_trains_on_frames_of_the_truth_is_refused(tmp_path: Path) -> None:
+    config = RunConfig(tmp_path, tmp_path, truth=truth_of(tmp_path / "truth", (4.0, 4), (12.0, 12)))
+    for protocol in ("novel-view", "novel-view-time"):
+        with pytest.raises(InputError, match="leave --protocol out"):
+            held_out_every(replace(config, protocol=protocol))
 
 
 def test_unevenly_spaced_truth_frames_are_refused_in_a_sentence(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from test_hdr_video import decoded, luma
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, write_png
-from hdr_nsff.core.io import write_npy
+from hdr_nsff.core.io import write_json, write_npy
 from hdr_nsff.core.video import write_video
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.maths.hdr_signal import display_light, encode, pq_decode, ycbcr_planes
@@ -69,10 +69,29 @@ def test_with_poses_truth_frames_are_missing_and_lie_between_their_neighbors(tmp
     ]
     assert truth.views[0].c2w == [[1, 0, 0, 4], [0, 1, 0, 0], [0, 0, 1, 0]]
     assert [pose[0][3] for pose in truth.clip_c2w] == [t for t in range(20) if t not in (4, 12)]
-    assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]]
+    assert truth.K == [[50, 0, 20], [0, 50, 12], [0, 0, 1]] and truth.views[0].K is None
+
+
+def test_given_cameras_are_handed_on_as_they_are(tmp_path):
+    """Off-center, of two focal lengths and a zoom, with their near and far."""
+    frames = []
+    for t in range(20):
+        matrix = np.eye(4)
+        matrix[0, 3] = 0.1 * t
+        lens = {"fl_x": 50.0 + t, "fl_y": 47.0 + t, "cx": 17.0, "cy": 14.0}
+        frames.append({"file_path": f"{t:03d}.png", "transform_matrix": matrix.tolist(), **lens})
+    path = tmp_path / "transforms.json"
+    write_json(path, {"w": 40, "h": 24, "near": 0.5, "far": 9.0, "frames": frames})
+    clip = ordinary_clip(tmp_path / "in")
+    given = import_poses(path, [f"{t:03d}.png" for t in range(20)], (24, 40))
+    out = reexpose(ReexposeConfig(clip, tmp_path / "out", poses=path))
     names = [f"{k:05d}.png" for k in range(18)]
-    again = import_poses(out / "poses_bounds.npy", names, (24, 40))  # as `prepare --poses` does
-    assert np.allclose(again.c2w, truth.clip_c2w) and np.allclose(again.K, truth.K)
+    again = import_poses(out / "transforms.json", names, (24, 40))  # as `prepare --poses` does
+    kept = [t for t in range(20) if t not in (4, 12)]
+    assert np.allclose(again.K, given.K[kept]) and np.allclose(again.c2w, given.c2w[kept])
+    assert (again.near, again.far) == (given.near, given.far) == (0.5, 9.0)
+    views = Truth.open(out / "truth").views
+    assert np.allclose([view.K for view in views], given.K[[4, 12]])
 
 
 def test_recordings_follow_the_response_and_truth_is_the_clip(tmp_path):

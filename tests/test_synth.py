@@ -12,7 +12,7 @@ from test_ultra_hdr import decode
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.core.images import read_image, read_mask
-from hdr_nsff.core.io import read_npy
+from hdr_nsff.core.io import read_npy, write_text
 from hdr_nsff.core.video import read_video
 from hdr_nsff.footage.exposure_lists import read_exposure_csv
 from hdr_nsff.footage.footage import open_footage
@@ -23,6 +23,7 @@ from hdr_nsff.maths.hdr_signal import display_light, encode, ycbcr_planes
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, true_pictures
 from hdr_nsff.synth import synth as verb
+from hdr_nsff.synth.pathtracer import Surface
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 from hdr_nsff.synth.scenes.interior import INTERIOR
@@ -173,6 +174,44 @@ def test_the_poses_of_a_rig_are_in_its_truth_and_its_oracle(flat: SynthConfig) -
     np.testing.assert_allclose(np.array(Truth.open(flat.out / "truth").clip_c2w), poses)
     entries = Scene.open(flat.out / "oracle").manifest.frames
     np.testing.assert_allclose([entry.c2w for entry in entries], poses)
+
+
+def test_an_oracle_of_other_settings_is_removed_and_one_of_the_same_is_kept(
+    flat: SynthConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    synth(flat)
+    plain = replace(flat, oracle=False)
+    synth(plain)
+    assert (flat.out / "oracle/scene.json").is_file()
+    synth(replace(plain, ev="0,-3"))
+    assert not (flat.out / "oracle").exists()
+    assert "add --oracle to write it again" in " ".join(capsys.readouterr().err.split())
+    write_text(flat.out / "oracle/notes.txt", "of somebody else")
+    synth(plain)
+    assert (flat.out / "oracle/notes.txt").is_file()
+
+
+def test_an_oracle_knows_that_the_sky_is_far_away(
+    flat: SynthConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a picture has a depth of 0: a disparity of 0, and no point."""
+
+    class Open(Flat):
+        def surface(
+            self, t: float, K: np.ndarray, c2w: np.ndarray, size: tuple[int, int]
+        ) -> Surface:
+            wall = super().surface(t, K, c2w, size)
+            sky = np.arange(size[1])[:, None] < 3
+            return replace(wall, depth=np.where(sky, 0, wall.depth))
+
+    monkeypatch.setattr(verb, "Tracer", Open)
+    synth(flat)
+    scene = Scene.open(flat.out / "oracle")
+    assert (scene.near, scene.far) == pytest.approx((0.95 * 3, 1.05 * 3))
+    disparity = scene.train[5].disparity
+    assert disparity is not None
+    assert (disparity[:3] == 0).all() and (disparity[3:] > 0.2).all()
+    assert scene.points[:, 2].min() > 2
 
 
 def test_a_killed_rig_continues_and_does_not_mix_with_one_camera(flat: SynthConfig) -> None:

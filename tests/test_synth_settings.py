@@ -6,6 +6,7 @@ import pytest
 from synth_scene import Flat
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.synth.scenes.walk import RIGHT, WALK
 from hdr_nsff.synth.settings import SynthConfig, parse_ev, parse_size, parse_white_balance
 from hdr_nsff.synth.synth import synth
 
@@ -50,3 +51,12 @@ def test_bad_numbers_are_refused_before_anything_is_rendered(
     with pytest.raises(InputError):
         synth(replace(flat, **change))
     assert Flat.rendered == 0 and not flat.out.exists()
+
+
+def test_a_clip_ends_before_a_mover_leaves_the_scene(flat: SynthConfig) -> None:
+    """The walker, moved on by a frame for flow, is still before the wall."""
+    longest = WALK.max_frames
+    ahead = [WALK.vertices(p, longest)[:, 0].max() for p in WALK.build(0) if "walker" in p.body]
+    assert 0 < RIGHT - max(ahead) < 0.3
+    with pytest.raises(InputError, match=f"from 12 to {longest} for walk"):
+        synth(replace(flat, name="walk", frames=longest + 1))

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.shutter import BANDS, Exposure, exposures, trace_exposure
-from hdr_nsff.synth.views import TracedView
+from hdr_nsff.synth.views import TracedView, clip_views
 
 SIZE = (4, 24)
 VIEW = TracedView("clip_00003", 3.0, np.eye(3, 4), 64, 5, anchor=3)
@@ -32,6 +33,18 @@ def test_every_row_is_traced_at_its_time() -> None:
 
 def test_an_open_shutter_sees_the_mean_over_its_time() -> None:
     assert seen(Exposure(0.0, 0.9)) == pytest.approx(9 + 0.9**2 / 12, abs=2e-3)
+
+
+def test_a_camera_of_a_rig_stays_in_its_place_while_its_rows_are_read() -> None:
+    """Over more than a frame's time, where other cameras of the rig record."""
+    view = clip_views(INTERIOR, 12, 64, 0, "rig")[3]
+
+    def distance(time, K, pose, size, spp, seed):
+        return np.full((size[1], size[0], 3), np.abs(pose - view.c2w).max(), np.float32)
+
+    tracer = SimpleNamespace(radiance=distance)
+    exposure = Exposure(1.44, 0.5)
+    assert not trace_exposure(tracer, INTERIOR, view, np.eye(3), SIZE, "rig", exposure).any()
 
 
 def test_no_shutter_is_none_and_darker_exposures_are_shorter() -> None:

@@ -174,9 +174,14 @@ def held_out_every(config: RunConfig) -> int | None:
     """`--hold-out` for `prepare`, so that no frame is trained on that the truth is made
     of. Beside a truth of other places or times nothing is held out; beside a truth of
     the clip's own frames these are. None leaves the choice to `prepare`. InputError
-    where no `--hold-out` keeps out those frames.
+    where no `--hold-out`, or a protocol, keeps out those frames.
     """
     frames = views_of_clip(config.truth) if config.truth is not None else []
+    if frames and config.protocol is not None:
+        raise InputError(
+            f"--protocol {config.protocol}: would train on frames of the clip that are the views "
+            f"of {config.truth}; leave --protocol out, and these frames are kept out of training"
+        )
     if config.hold_out is not None or config.protocol is not None or config.truth is None:
         return config.hold_out
     if not frames:

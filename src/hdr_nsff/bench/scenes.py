@@ -126,13 +126,18 @@ def footage_scene(name: str, clip: Path, truth: Path | None, config: BenchConfig
     """A scene that `prepare` makes of a clip, with the poses that were given for it."""
     out = config.out / "scenes" / name
     hold_out = held_out_every(RunConfig(clip, out, truth=truth, protocol=config.protocol))
-    poses = clip.parent / "poses_bounds.npy"
     footage = PrepareConfig(
         clip,
         out,
         max_size=config.max_size,
         hold_out=hold_out,
         protocol=config.protocol,
-        poses=poses if truth is not None and poses.is_file() else None,
+        poses=poses_beside(clip) if truth is not None else None,
     )
     return BenchScene(name, out, truth, footage, False)
+
+
+def poses_beside(clip: Path) -> Path | None:
+    """The poses that `reexpose` wrote beside a clip, LLFF's in folders of old."""
+    candidates = (clip.parent / name for name in ("transforms.json", "poses_bounds.npy"))
+    return next((path for path in candidates if path.is_file()), None)

@@ -21,9 +21,9 @@ from hdr_nsff.geometry import alignment
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.lens import undistorted_picture
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.scene.manifest import FrameEntry, Protocol, inside
+from hdr_nsff.scene.manifest import FrameEntry, Manifest, Protocol, inside
 from hdr_nsff.scene.scene import Frame
-from hdr_nsff.scene.truth import Truth, TruthView, scene_brackets, true_pictures
+from hdr_nsff.scene.truth import Truth, TruthView, as_exposed, scene_brackets, true_pictures
 from hdr_nsff.tonemap.base import informative
 from hdr_nsff.training.run_folder import Run
 
@@ -147,11 +147,9 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
 
     And sentences about views that were left out.
     """
-    num_frames = len(run.scene.manifest.frames)
-    if truth.clip_c2w is not None and len(truth.clip_c2w) != num_frames:
-        problem = f"the truth is of a clip of {len(truth.clip_c2w)} frames"
-        advice = "prepare the whole clip"
-        raise InputError(f"{folder}: {problem}, the scene has {num_frames}; {advice}")
+    check_frames(run.scene.manifest, truth, folder)
+    learned_ev = run.tonemapper.exposures().tolist()
+    truth = as_exposed(truth, run.scene.manifest.frames, learned_ev)
     scale = world_scale(run, truth)
     times = run.scene.times.tolist()
     targets, notes = [], []
@@ -179,6 +177,35 @@ def truth_targets(run: Run, truth: Truth, folder: Path) -> tuple[list[Target], l
     if exact and not any(radiance.any() for radiance in exact):
         raise InputError(f"{folder}: the radiance of every view is 0; make the truth again")
     return targets, notes
+
+
+def check_frames(manifest: Manifest, truth: Truth, folder: Path) -> None:
+    """InputError where the frames of a scene are not those that the truth counts."""
+    num_frames = len(manifest.frames)
+    for of_clip in (truth.clip_c2w, truth.clip_drift):
+        if of_clip is not None and len(of_clip) != num_frames:
+            problem = f"the truth is of a clip of {len(of_clip)} frames"
+            advice = "prepare the whole clip"
+            raise InputError(f"{folder}: {problem}, the scene has {num_frames}; {advice}")
+    if truth.bracket_frame is not None or manifest.num_cameras * manifest.num_tracks > 1:
+        return  # `prepare` wrote the truth for this scene, or the numbers are of a camera
+    places = {name: place for place, name in enumerate(manifest.inputs)}
+    for frame in manifest.frames:
+        number = number_in_clip(frame, places)
+        if number is not None and number != frame.index:
+            problem = f"counts all frames of the clip, but frame {frame.index} of the scene is"
+            advice = "prepare it without --start, --stride and --segment"
+            raise InputError(f"{folder}: {problem} frame {number} there; {advice}")
+
+
+def number_in_clip(frame: FrameEntry, places: dict[str, int]) -> int | None:
+    """The number of a frame in the footage of one camera, whose files have these
+    `places`; None where it is unknown.
+    """
+    _, mark, number = frame.source.rpartition("#")
+    if mark and number.isdecimal():
+        return int(number)
+    return places.get(frame.source)
 
 
 def truth_target(run: Run, truth: Truth, view: TruthView, folder: Path, scale: float) -> Target:

@@ -280,6 +280,28 @@ def record(
     return response.apply(exposed).astype(np.float32)
 
 
+def as_exposed(truth: Truth, frames: Sequence[FrameEntry], learned_ev: Sequence[float]) -> Truth:
+    """The truth with the exposures that the brackets of a scene stand for.
+
+    That is the mean over its training frames, as far as the scene has no drift for
+    them. `frames` are those of the clip, `learned_ev` the exposures of the scene's
+    brackets.
+    """
+    if truth.clip_drift is None:
+        return truth
+    evs = list(truth.bracket_ev)
+    for bracket, own in scene_brackets(truth, frames, learned_ev).items():
+        moved = [
+            true - (frame.drift or 0.0)
+            for frame, true in zip(frames, truth.clip_drift, strict=True)
+            if frame.split == "train" and frame.bracket == own
+        ]
+        ev = evs[bracket]
+        if ev is not None and moved:
+            evs[bracket] = ev + float(np.mean(moved))
+    return truth.model_copy(update={"bracket_ev": evs})
+
+
 def match_brackets(true_ev: Sequence[float], learned_ev: Sequence[float]) -> dict[int, int]:
     """{bracket of the truth: bracket of the scene}, by rank of exposure.
 

@@ -56,7 +56,7 @@ def view_geometry(
 ) -> dict[str, np.ndarray]:
     """The channels of `truth.GEOMETRY` for a rendered view at `time`: z-depth; flow
     over one frame in the view's own camera, held still; scene flow over one frame in
-    the world.
+    the world. The sky, of depth 0, stands still.
     """
     points = back_project(channels["Z"].astype(np.float64), K, c2w)
     bodies, uv = surface_points(channels)

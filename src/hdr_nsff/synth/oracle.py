@@ -10,15 +10,18 @@ that take turns share id 0.
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import MOTION_DIRECTIONS
-from hdr_nsff.core.images import read_mask, write_png
+from hdr_nsff.core.images import read_image, read_mask, write_png
 from hdr_nsff.core.io import read_npy, write_npy
+from hdr_nsff.core.progress import say
 from hdr_nsff.priors.movers.estimate import estimate_movers
 from hdr_nsff.priors.movers.rigidity import judge_rigidity
 from hdr_nsff.radiometry.estimate_response import estimate_response
@@ -65,6 +68,9 @@ def write_oracle(
     rng = np.random.default_rng(noise.seed)
     count, height, width = video.shape[:3]
     depths = np.stack([channels["Z"] for channels in exact])
+    surfaces = depths > 0
+    nearest, farthest = float(depths[surfaces].min()), float(depths[surfaces].max())
+    depths[~surfaces] = np.inf  # the sky
     entries = [frame_entry(i, count, K, c2w[i], ev) for i in range(count)]
     certain = np.ones((height, width), np.float16)
     for i, (channels, entry) in enumerate(zip(exact, entries, strict=True)):
@@ -90,8 +96,8 @@ def write_oracle(
         reference_bracket=reference,
         bracket_ev=list(ev),
         exposure_given=True,
-        near=(1 - DEPTH_MARGIN) * float(depths.min()),
-        far=(1 + DEPTH_MARGIN) * float(depths.max()),
+        near=(1 - DEPTH_MARGIN) * nearest,
+        far=(1 + DEPTH_MARGIN) * farthest,
         points="points.npy",
         response="response.json",
         movers="movers.npz",
@@ -100,6 +106,24 @@ def write_oracle(
     )
     write_estimates(folder, manifest, video)
     manifest.save(folder)
+
+
+def remove_stale(out: Path) -> None:
+    """Remove `out`/oracle where its frames are not those of `out`/clip, because it was
+    made with other settings. A folder that is no readable oracle stays.
+    """
+    folder = out / "oracle"
+    try:
+        manifest = Manifest.load(folder)
+        if not any(step.note == ORACLE_NOTE for step in manifest.steps.values()):
+            return
+        pairs = [(folder / f.image, out / f.source) for f in manifest.frames]
+        if all(np.array_equal(read_image(a), read_image(b)) for a, b in pairs):
+            return
+    except InputError:
+        return
+    shutil.rmtree(folder)
+    say(f"{folder}: removed, it was of other settings; add --oracle to write it again")
 
 
 def write_estimates(folder: Path, manifest: Manifest, video: np.ndarray) -> None:
@@ -202,7 +226,7 @@ def static_points(
     """
     points = []
     for channels, pose in zip(exact, c2w, strict=True):
-        y, x = np.nonzero(channels["body"] == 0)
+        y, x = np.nonzero((channels["body"] == 0) & (channels["Z"] > 0))
         chosen = rng.choice(len(x), min(POINTS_PER_FRAME, len(x)), replace=False)
         points.append(back_project(channels["Z"], K, pose)[y[chosen], x[chosen]])
     return np.concatenate(points).astype(np.float32)

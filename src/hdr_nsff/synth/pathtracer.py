@@ -38,6 +38,7 @@ BLUR_RADIUS_PX = 9  # the average of bounced light reaches no further (hand-chos
 FACING_POWER = 16  # of the cosine between normals: how sharply edges cut the average
 MIN_ALBEDO = 0.01  # that bounced light is divided by
 MIN_LLVM = 16  # version
+SKY_DISTANCE = 1e4  # meters, where points of the sky are taken to be
 OPENCV_TO_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])  # camera axes
 LLVM_FOLDERS = (
     "/usr/lib",
@@ -50,11 +51,13 @@ LLVM_FOLDERS = (
 
 @dataclass(frozen=True)
 class Surface:
-    """The surface that the ray through each pixel center hits."""
+    """The surface that the ray through each pixel center hits. Where it hits none it
+    sees the sky: far away, static, and turned to the camera.
+    """
 
     points: np.ndarray  # (H, W, 3) world
     normals: np.ndarray  # (H, W, 3) world
-    depth: np.ndarray  # (H, W) z-depth
+    depth: np.ndarray  # (H, W) z-depth, 0 of the sky
     bodies: np.ndarray  # (H, W) int: 0 static, k the scene's k-th body
     uv: np.ndarray  # (H, W, 2) texture coordinates
 
@@ -259,8 +262,9 @@ class Tracer:
         kind = self.mi.load_dict(integrator)
         images = []
         for k in range(passes):
+            own_seed = (seed * 4096 + k) % 2**32  # Mitsuba takes 32 bits
             image = self.mi.render(
-                scene, sensor=sensor, integrator=kind, spp=min(spp, PASS_SPP), seed=seed * 4096 + k
+                scene, sensor=sensor, integrator=kind, spp=min(spp, PASS_SPP), seed=own_seed
             )
             images.append(np.array(image, np.float64))
         return np.sum(images, 0) / passes
@@ -272,9 +276,13 @@ class Tracer:
         pixels = pinhole.pixel_centers(height, width).reshape(-1, 2)
         directions = pinhole.world_rays(pixels, K, c2w)
         depth, normals, uv, names = self.trace(self.scene_at(self.scene, t), origin, directions)
-        assert np.isfinite(depth).all(), "the geometry of a scene fills every picture of it"
-        points = origin + depth[:, None] * directions
+        sky = ~np.isfinite(depth)
+        points = origin + np.where(sky, SKY_DISTANCE, depth)[:, None] * directions
+        unit = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        normals, uv = np.where(sky[:, None], -unit, normals), np.where(sky[:, None], 0, uv)
+        depth = np.where(sky, 0, depth)
         index = {name: self.content.index(part.body) for name, part in self.parts.items()}
+        index[""] = self.content.index(STATIC_BODY)  # the sky
         bodies = np.array([index[name] for name in names])
         return Surface(
             points.reshape(height, width, 3),
@@ -287,8 +295,9 @@ class Tracer:
     def trace(
         self, scene: Any, origin: np.ndarray, directions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[str]]:
-        """For rays from one point: distances (S,) in units of each direction's length,
-        normals (S, 3), texture coordinates (S, 2), names of the parts hit.
+        """For rays from one point: distances (S,) in units of each direction's length
+        (infinite where nothing is hit), normals (S, 3), texture coordinates (S, 2),
+        names of the parts hit.
         """
         import drjit as dr
 
@@ -322,7 +331,8 @@ class Tracer:
         distances = np.array([hit.t for hit in hits])
         normals = np.array([np.ravel(hit.n) for hit in hits])
         uv = np.array([np.ravel(hit.uv) for hit in hits])
-        return distances, normals, uv, [hit.shape.id() for hit in hits]
+        names = [hit.shape.id() if hit.is_valid() else "" for hit in hits]
+        return distances, normals, uv, names
 
 
 def circuit(part: Part) -> str:

@@ -4,7 +4,7 @@ truth is the clip itself.
 The clip is linearized (gamma 2.2) and taken for the scene's radiance. A camera with
 another response records it again with alternating exposures, noise and 8 bits. The
 output folder holds `clip/` (the footage), `truth/` (radiance of the held-out frames,
-for `evaluate`), `poses_bounds.npy` (where poses are given: those of the footage, for
+for `evaluate`), `transforms.json` (where poses are given: those of the footage, for
 `prepare --poses`) and `reexpose.json` (the settings).
 
 With poses, held-out frames are missing from the footage, and their time lies between
@@ -27,7 +27,7 @@ from hdr_nsff.core.errors import InputError, check_number
 from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.hashes import hash_file
 from hdr_nsff.core.images import read_mask, write_png
-from hdr_nsff.core.io import is_leftover, read_json, write_json, write_npy, writing_to
+from hdr_nsff.core.io import is_leftover, read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.bars import with_bars
@@ -37,6 +37,7 @@ from hdr_nsff.footage.frame_choice import check_choice, check_frame_size
 from hdr_nsff.footage.frame_files import frame_files
 from hdr_nsff.footage.hold_out import HOLD_OUT, hold_out_every
 from hdr_nsff.footage.ingest import FootageFrame, read_frames
+from hdr_nsff.footage.layouts.nerfstudio import pose_entry
 from hdr_nsff.footage.pose_files import import_poses
 from hdr_nsff.geometry.poses import Poses
 from hdr_nsff.maths.hdr_signal import Transfer
@@ -171,8 +172,8 @@ def reexpose(config: ReexposeConfig) -> Path:
         write_linearized(config, footage, len(numbers))
         given = f"--hold-out {config.hold_out}"
         if poses is not None:
-            path = config.out / "poses_bounds.npy"
-            write_npy(path, llff_rows(poses, size)[plan.kept])
+            path = config.out / "transforms.json"
+            write_poses(path, poses, size, plan.kept)
             given = f"--poses {path} --hold-out 0"
     say(
         f"{len(plan.kept)} frames in {config.out / 'clip'}, "
@@ -366,6 +367,7 @@ def write_truth(
             bracket=plan.bracket[k],
             anchor=plan.anchor(k),
             c2w=c2w[k] if c2w else None,
+            K=own_intrinsics(poses, k, plan.kept[plan.anchor(k)]),
             radiance=f"radiance/{k:05d}.exr",
             mask=f"masks/{k:05d}.png" if k in masks else None,
         )
@@ -382,6 +384,13 @@ def write_truth(
         views=views,
     )
     write_json(out / "truth/truth.json", truth.model_dump())
+
+
+def own_intrinsics(poses: Poses | None, frame: int, anchor: int) -> list[list[float]] | None:
+    """K (3, 3) of a frame; None where it is that of its anchor, or unknown."""
+    if poses is None or np.allclose(poses.K[frame], poses.K[anchor]):
+        return None
+    return poses.K[frame].tolist()
 
 
 def frame_masks(
@@ -424,14 +433,14 @@ def read_poses(path: Path, footage: Footage, numbers: list[int], size: tuple[int
     )
 
 
-def llff_rows(poses: Poses, size: tuple[int, int]) -> np.ndarray:
-    """(N, 17) as in poses_bounds.npy: 3x5 (columns down, right, back, center, (height,
-    width, focal)), then near and far (0: unknown).
+def write_poses(path: Path, poses: Poses, size: tuple[int, int], kept: list[int]) -> None:
+    """Write the poses of the `kept` frames, of `size` (H, W), as a `transforms.json` of
+    the new footage.
     """
-    c2w = poses.c2w  # (N, 3, 4), columns right, down, forward, center
-    count = len(c2w)
-    camera = np.stack([np.full(count, size[0]), np.full(count, size[1]), poses.K[:, 0, 0]], -1)
-    columns = [c2w[..., 1], c2w[..., 0], -c2w[..., 2], c2w[..., 3], camera]
-    matrices = np.stack(columns, -1)  # (N, 3, 5)
-    bounds = np.tile([poses.near or 0.0, poses.far or 0.0], (count, 1))
-    return np.concatenate([matrices.reshape(-1, 15), bounds], 1)
+    frames = [
+        pose_entry(f"clip/{place:05d}.png", poses.K[k], poses.c2w[k], place / max(len(kept) - 1, 1))
+        for place, k in enumerate(kept)
+    ]
+    height, width = size
+    bounds = {"near": poses.near, "far": poses.far}
+    write_json(path, {"w": width, "h": height, **bounds, "frames": frames})

@@ -17,7 +17,7 @@ from hdr_nsff.radiometry.recording import Noise, response_curve
 from hdr_nsff.synth.scenes.base import Views
 from hdr_nsff.synth.scenes.geometry import intrinsics
 
-MIN_FRAMES, MAX_FRAMES = 12, 400  # fewer leave no view far from the frames of its time
+MIN_FRAMES = 12  # fewer leave no view far from the frames of its time
 MIN_SIDE = 16  # pixels of a picture
 # pictures that a lens distorts are traced this much wider than the clip, and finer
 LENS_MARGIN, LENS_FINENESS = 1.25, 1.5
@@ -98,9 +98,10 @@ class SynthConfig:
     """Of the oracle's flow, in pixels."""
 
 
-def check(config: SynthConfig, min_paths: int) -> None:
+def check(config: SynthConfig, min_paths: int, max_frames: int) -> None:
     """InputError for numbers out of range, before anything is rendered. `min_paths` is
-    the smaller number of paths per pixel, of the clip or of the held-out views.
+    the smaller number of paths per pixel, of the clip or of the held-out views;
+    `max_frames` is that of the scene.
     """
     response_curve(config.response)
     parse_white_balance(config.white_balance)
@@ -117,10 +118,11 @@ def check(config: SynthConfig, min_paths: int) -> None:
         raise InputError("--lens, --oracle: exact flow is that of a pinhole; leave one out")
     if parse_lens(c.lens, intrinsics(*size), size) is not None and (c.readout or c.shutter):
         raise InputError("--lens and --readout or --shutter: record one of them")
-    if not MIN_FRAMES <= c.frames <= MAX_FRAMES:
+    if not MIN_FRAMES <= c.frames <= max_frames:
         raise InputError(
-            f"--frames {c.frames}: choose from {MIN_FRAMES} to {MAX_FRAMES}; "
-            "fewer leave no views far from the frames of their time"
+            f"--frames {c.frames}: choose from {MIN_FRAMES} to {max_frames} for {c.name}; fewer "
+            "leave no views far from the frames of their time, and in more, movers may leave "
+            "the scene"
         )
     if not 0 <= c.seed <= MAX_SEED:
         raise InputError(f"--seed {c.seed}: choose from 0 to {MAX_SEED}")

@@ -46,7 +46,9 @@ def trace_exposure(
     views: Views,
     exposure: Exposure,
 ) -> np.ndarray:
-    """Linear radiance (H, W, 3), averaged over what the shutter lets each row see."""
+    """Linear radiance (H, W, 3), averaged over what the shutter lets each row see. The
+    cameras of a rig stand still meanwhile.
+    """
     height = size[1]
     bands = BANDS if exposure.readout else 1
     moments = MOMENTS if exposure.open else 1
@@ -57,7 +59,7 @@ def trace_exposure(
         row_time = exposure.readout * ((band + 0.5) / bands - 0.5)
         for moment in range(moments):
             time = view.time + row_time + exposure.open * ((moment + 0.5) / moments - 0.5)
-            pose = scene.pose(views, time)
+            pose = view.c2w if views == "rig" else scene.pose(views, time)
             seed = view.seed + moment * 100_003
             traced = tracer.radiance(time, K, pose, size, spp, seed)
             picture[rows] += traced[rows] / moments

@@ -47,7 +47,7 @@ from hdr_nsff.radiometry.hdr_references import check_references, write_reference
 from hdr_nsff.radiometry.recording import record, response_curve, vignette
 from hdr_nsff.scene.truth import Truth, TruthView
 from hdr_nsff.synth.motion import UV, exact_flow, view_geometry
-from hdr_nsff.synth.oracle import OracleNoise, write_oracle
+from hdr_nsff.synth.oracle import OracleNoise, remove_stale, write_oracle
 from hdr_nsff.synth.pathtracer import PASS_SPP, Surface, Tracer
 from hdr_nsff.synth.scenes import SCENES
 from hdr_nsff.synth.scenes.base import SynthScene, Views
@@ -87,7 +87,7 @@ def synth(config: SynthConfig) -> None:
     config = replace(config, ev=ev, spp=spp, truth_spp=truth_spp)
     size = parse_size(config.size)
     evs = parse_ev(ev)
-    check(config, min(spp, truth_spp))
+    check(config, min(spp, truth_spp), scene.max_frames)
     check_references(config.out, size, config.hdr_video, config.hdr_still)
     clip = clip_views(scene, config.frames, spp, config.seed, config.views)
     held_out = held_out_views(scene, config.frames, truth_spp, config.seed, config.views)
@@ -113,6 +113,8 @@ def synth(config: SynthConfig) -> None:
             frames = [exact(config.out, view) for view in clip]
             poses = [view.c2w for view in clip]
             write_oracle(config.out, scene, frames, video, K, poses, relative, reference, noise)
+        else:
+            remove_stale(config.out)
     say(
         f"{config.out}/clip.mp4: {len(clip)} frames of {size[0]}x{size[1]}, "
         f"exposures {config.ev}; {len(held_out)} held-out views in truth/"

@@ -10,7 +10,7 @@ import numpy as np
 from hdr_nsff.evaluation.targets import Target, trajectories
 from hdr_nsff.geometry import alignment
 from hdr_nsff.radiometry.recording import Curve
-from hdr_nsff.scene.truth import Truth, scene_brackets
+from hdr_nsff.scene.truth import Truth, as_exposed, scene_brackets
 from hdr_nsff.training.run_folder import Run
 
 POWERS = np.geomspace(0.25, 4, 385)  # candidates for the response, 0.7 % apart
@@ -108,7 +108,9 @@ def exposure_pairs(run: Run, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     Relative to the reference bracket of the truth.
     """
     ev = run.tonemapper.exposures().cpu().double().numpy()
-    match = scene_brackets(truth, run.scene.manifest.frames, ev.tolist())
+    frames = run.scene.manifest.frames
+    truth = as_exposed(truth, frames, ev.tolist())
+    match = scene_brackets(truth, frames, ev.tolist())
     reference = truth.reference_bracket
     true_ev = np.array(truth.bracket_ev, np.float64)
     brackets = sorted(match)

@@ -140,6 +140,7 @@ class SynthScene:
     ev: str = "-4,-2,0"  # exposures that suit it
     spp: int = 128  # paths per pixel that suit it
     truth_spp: int = 384  # paths per pixel of the held-out views
+    max_frames: int = 400  # of a clip: later, a mover would leave the scene
     blur: float = 0.05  # meters of a surface over which bounced light is averaged
     sky: Callable[[], np.ndarray] | None = None
     """Radiance (H, W, 3) from all around: latitude down, longitude across."""

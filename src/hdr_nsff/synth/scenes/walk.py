@@ -216,6 +216,7 @@ WALK = SynthScene(
     ),
     rig_target=(0.0, 0.1, 3.5),
     ev="-5,-3,-1",
+    max_frames=88,  # then she has reached the wall
     blur=0.08,
     sky=sky,
 )
