@@ -230,4 +230,7 @@ def test_a_life_shorter_than_a_step_does_not_learn_to_be_shorter() -> None:
 def test_the_least_life_follows_the_gaps_between_frames() -> None:
     assert least_duration(torch.tensor([0.0, 1, 2, 4])) == pytest.approx(1.2)
     assert least_duration(torch.tensor([0.0, 2, 4])) == pytest.approx(2.4)
+    for count in range(6, 12):  # pairs of frames, the next two held out
+        pairs = torch.tensor([4.0 * (k // 2) + k % 2 for k in range(count)])
+        assert least_duration(pairs) == pytest.approx(3.6)
     assert least_duration(torch.tensor([3.0])) == pytest.approx(1.2)
