@@ -42,15 +42,22 @@ def at_knots(values, share):
     return values[low] + (position - low) * (values[high] - values[low])
 
 
-def catmull_rom(values, knot):
-    """Values (T, ...) at a knot, cubic between, continued in a straight line beyond."""
-    if len(values) == 1:
+def cubic(values, times, knot):
+    """Values (T, ...) of `times` (T) at a knot: a cubic with continuous velocity."""
+    if len(times) == 1:
         return values[0]
-    ends = 2 * values[:1] - values[1:2], 2 * values[-1:] - values[-2:-1]
-    low = min(int(knot), len(values) - 2)
-    a, b, c, d = np.concatenate([ends[0], values, ends[1]])[low : low + 4]
-    u = knot - low
-    return b + 0.5 * u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * (b - c) + d - a)))
+    gaps, low = np.diff(times), min(int(knot), len(times) - 2)
+    slopes = np.diff(values, axis=0) / gaps.reshape(-1, *[1] * (values.ndim - 1))
+
+    def velocity(k):
+        """That of the parabola through three values; at the ends, that of a line."""
+        if k in (0, len(gaps)):
+            return slopes[max(k - 1, 0)]
+        return (slopes[k - 1] * gaps[k] + slopes[k] * gaps[k - 1]) / (gaps[k - 1] + gaps[k])
+
+    u, start, end = knot - low, velocity(low), velocity(low + 1)
+    bend = (1 - u) * start - u * end + (2 * u - 1) * slopes[low]
+    return values[low] + u * gaps[low] * (slopes[low] + (1 - u) * bend)
 
 
 def rotations(q):
@@ -84,9 +91,9 @@ def gaussians(document, arrays, time, eye):
         if "opacity_offsets" in g:
             logits = logits + at_knots(g["opacity_offsets"], share)
         if "mixture" in g:  # shared rigid motions
-            turns = catmull_rom(arrays["bases.quaternions"], knot)
+            turns = cubic(arrays["bases.quaternions"], times, knot)
             turns = turns / np.linalg.norm(turns, axis=-1, keepdims=True)
-            centers, shifts = arrays["bases.centers"], catmull_rom(arrays["bases.shifts"], knot)
+            centers, shifts = arrays["bases.centers"], cubic(arrays["bases.shifts"], times, knot)
             moved = np.einsum("bij,nbj->nbi", rotations(turns), means[:, None] - centers)
             means = np.einsum("nb,nbi->ni", g["mixture"], moved + centers + shifts)
             quaternions = product(g["mixture"] @ turns, quaternions)

@@ -36,6 +36,7 @@ def test_poses_are_smooth_in_time_where_frames_are_missing() -> None:
     times = torch.arange(float(TIMES))
     times[4:] += 1.5
     field = random_field()
+    field.trajectories.times = times.tolist()
     field.trajectories.differences = weights_of_differences(times)
     compare(fused_cloud, field, 4.2, None)
 

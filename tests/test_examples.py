@@ -12,7 +12,7 @@ from fakes import fake_run
 from test_export_gaussians import make_run
 from test_hdr_shots import large_shot
 from test_hdr_video import decoded, luma
-from viewer_scenes import render, scene_file, trained, trained_local
+from viewer_scenes import render, scene_file, trained, trained_local, with_gap
 
 from hdr_nsff.core.exr import read_exr
 from hdr_nsff.geometry.paths import read_path
@@ -51,6 +51,17 @@ def test_the_reader_draws_what_render_does(toy: Scene, tmp_path: Path, preset: s
         expected = render(field, toy, 1, time, SIZE)
         found = torch.from_numpy(draw(tmp_path / "scene.html", toy, time))
         assert mu_law_psnr(found, expected, float(expected.max())) > 50
+
+
+def test_the_reader_moves_as_render_does_where_frames_are_missing(
+    toy: Scene, tmp_path: Path
+) -> None:
+    scene = with_gap(toy)
+    field, _ = trained(scene)
+    (tmp_path / "gap.hdr4d").write_bytes(to_bytes(scene_file(scene)))
+    expected = render(field, scene, 1, 5.0, SIZE)
+    found = torch.from_numpy(draw(tmp_path / "gap.hdr4d", scene, 5.0))
+    assert mu_law_psnr(found, expected, float(expected.max())) > 50
 
 
 def test_the_reader_draws_time_local_gaussians(toy: Scene, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from test_export_gaussians import make_run
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.rendering.export import ExportConfig, check_settings
-from hdr_nsff.rendering.export_page import export_page, find_videos, run_title
+from hdr_nsff.rendering.export_page import export_page, find_videos, link_below, run_title
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.viewer.scene_file import from_bytes
 
@@ -44,6 +44,14 @@ def test_videos_below_the_page_are_linked(toy: Scene, tmp_path: Path) -> None:
     (tmp_path / "render" / "training.mp4").write_bytes(b"")
     assert [link.href for link in find_videos(run, tmp_path)] == ["render/training.mp4"]
     assert find_videos(run, tmp_path / "elsewhere") == []
+
+
+def test_links_to_videos_are_quoted(tmp_path: Path) -> None:
+    video = tmp_path / "take#2 50%" / "slowmo.mp4"
+    video.parent.mkdir()
+    video.write_bytes(b"")
+    link = link_below(video, tmp_path, "Video")
+    assert link is not None and link.href == "take%232%2050%25/slowmo.mp4"
 
 
 def test_an_hdr_video_is_inside_the_page_if_it_is_small(

@@ -9,6 +9,7 @@ from estimates import with_movers
 from test_initialize_gaussians import recorded
 from toy_scene import CARD, card_offset
 
+from hdr_nsff.fields.build import build_field
 from hdr_nsff.fields.point_cloud import PointCloud
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
@@ -110,6 +111,18 @@ def test_two_movers_share_the_mask_by_their_tracks(soft: Scene) -> None:
     east = replace(mover, pixels=mover.pixels + np.array([1000.0, 0.0]))
     near = replace(mover, rigid=True)
     assert not local_mask(replace(soft, movers=(east, near)), 2).any()
+
+
+def test_rigid_movers_beyond_the_bases_become_time_local(soft: Scene) -> None:
+    (mover,) = soft.movers
+    card = replace(mover, rigid=True)
+    elsewhere = replace(card, pixels=card.pixels + np.array([1000.0, 0.0]))
+    scene = replace(soft, movers=(elsewhere, card))
+    for bases, text in ((1, " 0 moving ones on 1 of 2 rigid movers"), (2, " on 2 rigid movers")):
+        field = build_field(SplatConfig(static=400, moving=100, bases=bases), scene)
+        note = initialize_gaussians(field, scene, recorded, -1.0)
+        assert text in note and note.endswith("; 0 time-local ones") == (bases == 2)
+        assert bool((field.local.colors.detach()[:, 3] > 0).any()) == (bases == 1)
 
 
 def test_velocities_need_no_believed_flow(soft: Scene) -> None:

@@ -8,10 +8,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from hdr_nsff.fields.knots import catmull_rom, interpolate_linear, knot_of
+from hdr_nsff.fields.knots import cubic, interpolate_linear, knot_of
 
-every_curve = pytest.mark.parametrize("curve", [interpolate_linear, catmull_rom])
 Curve = Callable[[Tensor, float], Tensor]
+EVEN, UNEVEN = [0.0, 1, 2, 3, 4, 5], [0.0, 1, 2, 4, 4.5, 9]
+
+
+def even_cubic(values: Tensor, position: float) -> Tensor:
+    return cubic(values, EVEN[: len(values)], position)
+
+
+every_curve = pytest.mark.parametrize("curve", [interpolate_linear, even_cubic])
+any_times = pytest.mark.parametrize("times", [EVEN, UNEVEN])
 
 
 def values(count: int = 6) -> Tensor:
@@ -56,24 +64,36 @@ def test_linear_interpolation_half_way_is_the_mean() -> None:
     torch.testing.assert_close(interpolate_linear(v, 3.5), (v[3] + v[4]) / 2)
 
 
-def test_a_parabola_is_reproduced_by_the_cubic_away_from_the_ends() -> None:
-    v = torch.arange(6, dtype=torch.float64)[:, None] ** 2
+@any_times
+def test_a_parabola_is_reproduced_by_the_cubic_away_from_the_ends(times: list[float]) -> None:
+    t = torch.tensor(times, dtype=torch.float64)[:, None]
     for position in (1.2, 2.5, 3.9):
-        expected = torch.tensor([position**2], dtype=torch.float64)
-        torch.testing.assert_close(catmull_rom(v, position), expected)
+        expected = interpolate_linear(t, position) ** 2
+        torch.testing.assert_close(cubic(t**2, times, position), expected)
 
 
-def test_the_cubics_velocity_is_continuous_and_that_of_the_neighbors() -> None:
+@pytest.mark.parametrize("count", [2, 3, 6])
+def test_linear_motion_is_reproduced_by_the_cubic_at_uneven_times(count: int) -> None:
+    t = torch.tensor(UNEVEN[:count], dtype=torch.float64)[:, None]
+    for position in torch.linspace(0, count - 1, 41).tolist():
+        found = cubic(t, UNEVEN[:count], position)
+        torch.testing.assert_close(found, interpolate_linear(t, position), rtol=0, atol=1e-12)
+
+
+@any_times
+def test_the_cubics_velocity_is_continuous(times: list[float]) -> None:
     v, e = values(), 1e-6
     for k in range(1, 5):
-        before = (catmull_rom(v, float(k)) - catmull_rom(v, k - e)) / e
-        after = (catmull_rom(v, k + e) - catmull_rom(v, float(k))) / e
+        before = (cubic(v, times, float(k)) - cubic(v, times, k - e)) / e
+        after = (cubic(v, times, k + e) - cubic(v, times, float(k))) / e
+        before, after = before / (times[k] - times[k - 1]), after / (times[k + 1] - times[k])
         torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
-        torch.testing.assert_close(after, (v[k + 1] - v[k - 1]) / 2, atol=1e-4, rtol=0)
+        if times is EVEN:
+            torch.testing.assert_close(after, (v[k + 1] - v[k - 1]) / 2, atol=1e-4, rtol=0)
 
 
 def test_the_cubics_gradient_reaches_four_knots_and_no_more() -> None:
     v = values().requires_grad_()
-    catmull_rom(v, 2.5).sum().backward()
+    even_cubic(v, 2.5).sum().backward()
     share = v.grad[:, 0, 0]
     torch.testing.assert_close(share, torch.tensor([0, -1, 9, 9, -1, 0], dtype=torch.float64) / 16)

@@ -63,7 +63,7 @@ def test_slow_motion_divides_uneven_intervals_and_glides_the_camera() -> None:
     views = paths.slow_motion(
         [camera(), camera(30.0, 1.0), camera(30.0, 1.0)], [0.0, 1.0, 3.0], factor=2
     )
-    assert [v.time for v in views] == [0.0, 0.5, 1.0, 2.0, 3.0]
+    assert [v.time for v in views] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
     assert torch.allclose(
         views[1].camera.c2w, pose(15.0, 0.5), atol=1e-6
     )  # half the angle, half the way
@@ -76,6 +76,17 @@ def test_training_path_and_fixed_camera_pair_cameras_with_times() -> None:
         (b, 0.0, None),
         (b, 2.0, None),
     ]
+
+
+def test_videos_pass_held_out_frames_at_the_same_speed() -> None:
+    times = [t for t in range(20) if t % 8 != 4]
+    fixed = [v.time for v in paths.fixed_path(camera(), times)]
+    assert fixed == list(range(20))
+    slow = [v.time for v in paths.slow_motion([camera()] * len(times), times, 2)]
+    assert slow == [t / 2 for t in range(39)]
+    # the last step is shorter where the clip does not end on an even one
+    assert [v.time for v in paths.fixed_path(camera(), [1, 3, 5, 8])] == [1, 3, 5, 7, 8]
+    assert [v.time for v in paths.fixed_path(camera(), [3])] == [3]
 
 
 def test_resizing_a_view_keeps_what_it_sees() -> None:

@@ -12,7 +12,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import ENCODERS
 from hdr_nsff.core.images import read_image
 from hdr_nsff.rendering.output import Output
-from hdr_nsff.rendering.render import RenderConfig, check_size, render
+from hdr_nsff.rendering.render import RenderConfig, check_settings, check_size, render
 from hdr_nsff.training.run_folder import Run
 
 
@@ -44,6 +44,36 @@ def test_settings_that_make_no_sense_are_refused_in_a_sentence(tmp_path: Path) -
     for sentence, config in requests.items():
         with pytest.raises(InputError, match=sentence):
             render(config)
+
+
+@pytest.mark.parametrize(
+    ("path", "option", "value"),
+    [
+        ("all", "scale", 0.5),
+        ("all", "frame", 3),
+        ("all", "factor", 8),
+        ("all", "fps", 60.0),
+        ("training", "frame", 5),
+        ("fixed", "budget", 5.0),
+        ("fixed", "views", 9),
+        ("bullet", "factor", 9),
+        ("ride.json", "factor", 9),
+    ],
+)
+def test_options_without_effect_are_refused(
+    path: str, option: str, value: float, tmp_path: Path
+) -> None:
+    sentence = rf"--{option}: has no effect with --path .*use it with --path"
+    with pytest.raises(InputError, match=sentence):
+        check_settings(RenderConfig(tmp_path, path, **{option: value}))
+
+
+def test_options_with_an_effect_are_accepted(tmp_path: Path) -> None:
+    for path in ("fixed", "bullet", "slowmo", "my/ride.json"):
+        check_settings(RenderConfig(tmp_path, path, frame=0, scale=0.5, fps=60))
+    check_settings(RenderConfig(tmp_path, "slowmo", factor=8))
+    check_settings(RenderConfig(tmp_path, "bullet", views=96))
+    check_settings(RenderConfig(tmp_path, budget=5))
 
 
 @pytest.mark.usefixtures("opened")

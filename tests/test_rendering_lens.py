@@ -12,6 +12,7 @@ from hdr_nsff.geometry.lens import Lens
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.geometry.pinhole import camera_rays, intrinsics, pixel_centers
 from hdr_nsff.rendering.lens import LensView, original_lens
+from hdr_nsff.rendering.stills import Still
 from hdr_nsff.scene.manifest import LensEntry, Manifest
 
 W, H = 64, 48
@@ -39,6 +40,19 @@ def test_motion_is_that_between_recorded_pixels():
     motion = SEEN.distort_motion(right)
     middle, edge = motion[H // 2, W // 2, 0], motion[H // 2, 0, 0]
     assert middle == pytest.approx(1, abs=0.01) and edge < 0.9  # a barrel lens shrinks the edge
+
+
+def test_a_lamp_has_no_dark_ring_and_no_depth_between_it_and_the_wall():
+    x, y = np.moveaxis(pixel_centers(WIDE.height, WIDE.width), -1, 0)
+    lamp = np.hypot(x - 40, y - 20) < 6
+    bright = np.where(lamp, 50, 0.2).astype(np.float32)
+    bright[0, 0] = 0  # elsewhere it is darker
+    depth = np.where(lamp, 2, 50).astype(np.float32)
+    flat = np.zeros_like(depth)
+    rgb = np.stack([bright] * 3, -1)
+    recorded = SEEN.distort_still(Still(rgb, flat, depth, flat, {}))
+    assert recorded.radiance[2:-2, 2:-2].min() >= 0.2 - 1e-6 and recorded.radiance.max() == 50
+    assert set(np.unique(recorded.depth)) == {2, 50}
 
 
 def test_a_scene_without_distortion_has_no_original_lens():

@@ -70,3 +70,12 @@ def test_slow_motion_of_too_many_views_is_refused_before_it_is_planned(tmp_path:
         plan_shot(run, "slowmo", factor=2000)
     with pytest.raises(InputError, match=r"--factor 10\^400.* use 1999"):
         plan_shot(run, "slowmo", factor=10**400)
+
+
+@pytest.mark.parametrize("path", ["fixed", "slowmo"])
+def test_a_pause_longer_than_a_shot_is_refused(tmp_path: Path, path: str) -> None:
+    run = fake_run(tmp_path)
+    late = replace(run.scene.train[-1], time=1e9)
+    paused = replace(run, scene=replace(run.scene, train=[*run.scene.train[:-1], late]))
+    with pytest.raises(InputError, match=r"lasts 1,000,000,001 frames.*use --path training"):
+        plan_shot(paused, path, factor=1)

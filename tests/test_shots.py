@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
-from fakes import H, W, camera, fake_run
+import torch
+from fakes import DiscBeforeWall, H, W, camera, fake_run
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.exr import read_exr
@@ -20,6 +21,7 @@ from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.fingerprint import fingerprint
 from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.shots import render_shot
+from hdr_nsff.rendering.stills import screen_motion
 
 
 def shot_of(*times: float) -> Shot:
@@ -68,6 +70,22 @@ def test_motion_on_the_screen_has_the_cameras_part_and_y_up(tmp_path: Path) -> N
     assert np.allclose(seen["forward.v"][~disc], 0, atol=1e-3)
     # the first view of a shot: motion continues in a straight line
     assert np.allclose(seen["backward.u"], -seen["forward.u"])
+
+
+def test_motion_on_the_screen_is_by_real_time_beside_a_gap() -> None:
+    times = [0.0, 1.0, 2.0, 3.0, 5.0, 6.0]  # 4 was held out
+    for time, forward, backward in ((2.5, 1.5, 1.0), (3.0, 2.0, 1.0), (5.5, 1.5, 1.5)):
+        seen = DiscBeforeWall().render(camera(), time)
+        disc = seen.motion > 0.5
+        durations = {1: forward, -1: backward}  # to one training interval away
+        flow = {o: durations[o] * seen.scene_flow[o] for o in durations}
+        neighbors = {o: PathView(camera(), time + 0.5 * o) for o in durations}
+        view = PathView(camera(), time)
+        scene = replace(seen, scene_flow=flow)
+        moved = screen_motion(scene, view, neighbors, times, torch.device("cpu"))
+        for side in (1, -1):  # half a frame of 8 and 2 pixels
+            expected = side * torch.tensor([4.0, 1.0])
+            assert torch.allclose(moved[side][disc], expected, atol=1e-3)
 
 
 def test_vectors_for_blender_are_to_the_previous_and_from_the_next_picture(

@@ -2,9 +2,11 @@
 
 import math
 
+import pytest
 import torch
 from torch import Tensor
 
+from hdr_nsff.fields.knots import time_at
 from hdr_nsff.fields.splat.rasterize import rotation_matrices
 from hdr_nsff.fields.splat.trajectories import WINDOW, Trajectories, quaternion_product
 
@@ -72,6 +74,15 @@ def test_a_mixture_of_two_shifts_is_their_weighted_mean() -> None:
     mixture = torch.tensor([[1.0, 0.0, 0.25], [0.0, 1.0, 0.75]])
     expected = torch.tensor([[3.5, 0, 0], [0, 7, 0], [0.25 * 3.5, 0.75 * 7, 0]])
     torch.testing.assert_close(t.move(points, mixture, t.pose(3.5)) - points, expected)
+
+
+def test_a_steady_shift_is_steady_where_a_frame_is_missing() -> None:
+    times = torch.tensor([0.0, 1, 2, 4, 5, 6])
+    t = Trajectories(1, times)
+    t.translations.data[:, 0] = times
+    for knot in torch.linspace(0, 5, 21).tolist():
+        x = t.move(torch.zeros(1, 3), torch.ones(1, 1), t.pose(knot))[0, 0]
+        assert float(x.detach()) == pytest.approx(time_at(times, knot), abs=1e-6)
 
 
 def test_quaternions_multiply_as_rotation_matrices_do() -> None:

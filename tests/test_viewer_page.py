@@ -20,7 +20,7 @@ import pytest
 import torch
 from browser import Page, browser, find_browser
 from test_served_run import save_run
-from viewer_scenes import render, scene_file, trained, trained_local
+from viewer_scenes import render, scene_file, trained, trained_local, with_gap
 
 from hdr_nsff.fields.splat.rasterize import rasterize
 from hdr_nsff.geometry import paths
@@ -99,6 +99,19 @@ def test_the_page_sees_what_render_sees(tab: Page, toy: Scene, tmp_path: Path, p
             expected = render(field, toy, frame, time, SIZE)
             found = read_linear(tab, view_of(toy, frame, time))[..., :3]
             assert mu_law_psnr(found, expected, float(expected.max())) > 45
+
+
+def test_the_page_moves_as_render_does_where_frames_are_missing(
+    tab: Page, toy: Scene, tmp_path: Path
+) -> None:
+    scene = with_gap(toy)
+    field, _ = trained(scene)
+    open_page(tab, tmp_path / "scene.html", scene_file(scene))
+    tab.run("viewer.set({ev: 0})")
+    for time in (1.37, 5.0, 12.5):
+        expected = render(field, scene, 2, time, SIZE)
+        found = read_linear(tab, view_of(scene, 2, time))[..., :3]
+        assert mu_law_psnr(found, expected, float(expected.max())) > 55
 
 
 def test_the_page_draws_time_local_gaussians(tab: Page, toy: Scene, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from presets import random_field
 
@@ -52,6 +54,12 @@ def trained_local(scene: Scene, count: int = 60, seed: int = 4) -> tuple[Splat, 
 def local_gaussians(scene: Scene) -> GaussianGroup:
     """The time-local Gaussians of that field."""
     return local_of(trained_local(scene)[0].local)
+
+
+def with_gap(scene: Scene) -> Scene:
+    """The scene with nine frames missing after the time 2."""
+    later = [replace(f, time=f.time + 9 * (f.time > 2)) for f in scene.train]
+    return replace(scene, train=later)
 
 
 def render(

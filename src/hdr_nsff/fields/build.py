@@ -20,7 +20,7 @@ from hdr_nsff.fields.space import build_space
 from hdr_nsff.fields.splat import cuda_backends
 from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.fields.splat.initialize_gaussians import initialize_gaussians
-from hdr_nsff.fields.splat.initialize_local import count_local_pixels
+from hdr_nsff.fields.splat.initialize_local import count_local_pixels, limit_rigid_movers
 from hdr_nsff.fields.splat.shutter import shutter_for
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.scene import Scene
@@ -52,7 +52,7 @@ def build_field(config: FieldConfig, scene: Scene) -> AnyField:
     """An untrained field for a scene."""
     m, near, far = scene.manifest, scene.near, scene.far
     if isinstance(config, SplatConfig):
-        local_pixels = count_local_pixels(scene)
+        local_pixels = count_local_pixels(limit_rigid_movers(scene, config.bases))
         if config.moving is None and not any(mover.rigid for mover in scene.movers):
             config = replace(config, moving=0)  # there is nothing for them to draw
         shutter = shutter_for(config.readout, config.shutter, m.fps, scene.response.ev.tolist())

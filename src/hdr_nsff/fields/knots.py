@@ -4,6 +4,8 @@ first and T - 1 at the last. What varies in time is kept at knots and interpolat
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -48,39 +50,38 @@ def linear_position(count: int, position: float) -> tuple[int, float]:
     return low, position - low
 
 
-def catmull_rom(values: Tensor, position: float) -> Tensor:
-    """`values` (K, ...) at `position` in [0, K - 1], by a cubic through them: (...).
+def cubic(values: Tensor, times: Sequence[float], position: float) -> Tensor:
+    """`values` (K, ...) of K rising `times` at `position` in [0, K - 1], by a cubic
+    through them: (...).
 
-    The cubic has continuous velocity (Catmull and Rom 1974). Both ends are extended in
-    a straight line, so that linear motion is reproduced everywhere.
+    A cubic of Hermite with continuous velocity: at a time, that of the parabola through
+    its value and the two beside it; at both ends, that of the line to the neighbor. So
+    linear motion is reproduced everywhere, at any times. At even times it is the cubic
+    of Catmull and Rom 1974.
     """
-    if len(values) == 1:
-        return values[0]
-    first_row, weights = catmull_rom_weights(len(values), position)
+    first_row, weights = cubic_weights(times, position)
     return weighted_rows(values[first_row : first_row + len(weights)], weights)
 
 
-def catmull_rom_weights(count: int, position: float) -> tuple[int, list[float]]:
-    """The first of `count` rows that `catmull_rom` adds up, and their weights."""
-    last = count - 1
+def cubic_weights(times: Sequence[float], position: float) -> tuple[int, list[float]]:
+    """The first of the rows that `cubic` adds up, and their weights (1 to 4)."""
+    last = len(times) - 1
     if last == 0:
         return 0, [1.0]
     low = min(max(int(position), 0), last - 1)
     u = position - low
-    # weights of the rows low - 1, low, low + 1, low + 2
-    before = 0.5 * u * (u * (2 - u) - 1)
-    start = 1 + 0.5 * u * u * (3 * u - 5)
-    end = 0.5 * u * (u * (4 - 3 * u) + 1)
-    after = 0.5 * u * u * (u - 1)
-    if low == 0:  # row -1 is 2 * row 0 - row 1
-        start, end = start + 2 * before, end - before
-        before = 0.0
-    if low + 2 > last:  # row K is 2 * row K - 1 - row K - 2
-        start, end = start - after, end + 2 * after
-        after = 0.0
+    gap = times[low + 1] - times[low]
+    # this gap over those before and after, which are endless at the ends
+    before = gap / (times[low] - times[low - 1]) if low > 0 else 0.0
+    after = gap / (times[low + 2] - times[low + 1]) if low + 1 < last else 0.0
+    start, end = u * (1 - u) ** 2, -u * u * (1 - u)  # of the velocities at both times
+    # of the steps from row low - 1 to low, to low + 1, to low + 2
+    step_before = start * before**2 / (1 + before)
+    step = u * u * (3 - 2 * u) + start / (1 + before) + end / (1 + after)
+    step_after = end * after**2 / (1 + after)
+    weights = [-step_before, 1 + step_before - step, step - step_after, step_after]
     first_row, end_row = max(low - 1, 0), min(low + 3, last + 1)
-    weights = [before, start, end, after][first_row - low + 1 : end_row - low + 1]
-    return first_row, weights
+    return first_row, weights[first_row - low + 1 : end_row - low + 1]
 
 
 def weighted_rows(values: Tensor, weights: list[float]) -> Tensor:

@@ -161,10 +161,19 @@ def sample(picture: np.ndarray, pixels: np.ndarray, linear: bool = False) -> np.
     x, y = places[..., 0], places[..., 1]
     edge = cv2.BORDER_REPLICATE
     if picture.dtype == bool:
-        marks = picture.astype(np.uint8)
-        return np.asarray(cv2.remap(marks, x, y, cv2.INTER_NEAREST, borderMode=edge)) > 0
+        return sample_nearest(picture.astype(np.uint8), pixels) > 0
     values = np.ascontiguousarray(picture, np.float32)
     if linear:
         return np.asarray(cv2.remap(values, x, y, cv2.INTER_LINEAR, borderMode=edge))
     read = np.asarray(cv2.remap(values, x, y, cv2.INTER_CUBIC, borderMode=edge))
     return read.clip(values.min(), values.max())
+
+
+def sample_nearest(picture: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """A picture (H, W) read at the pixels nearest to `pixels` (h, w, 2), and beyond its
+    border as there: for numbers that have no meaning in between.
+    """
+    places = np.ascontiguousarray(pixels - 0.5, np.float32)
+    x, y = places[..., 0], places[..., 1]
+    values = np.ascontiguousarray(picture)
+    return np.asarray(cv2.remap(values, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE))

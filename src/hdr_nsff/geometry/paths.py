@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import itertools
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ REQUIRED_KEYS = {"time", "c2w"}
 KNOWN_KEYS = REQUIRED_KEYS | {"K", "ev"}
 MAX_NUMBER = 1e9  # of a path file: beyond it single precision has nothing to render
 REACH_QUANTILES = (0.1, 0.9)  # hand-chosen: single outliers among the poses do not count
+TIME_TOLERANCE = 1e-6  # of the usual gap: even times this close to the last one are it
 ROTATION_TOLERANCE = 1e-3  # per entry of R R^T: poses may be written with few digits
 
 
@@ -57,9 +60,21 @@ def training_path(cameras: Sequence[Camera], times: Sequence[float]) -> list[Pat
     return [PathView(c, float(t)) for c, t in zip(cameras, times, strict=True)]
 
 
+def usual_gap(times: Sequence[float]) -> float:
+    """From a time to the next one, where none is missing: the (lower) median gap."""
+    gaps = [b - a for a, b in itertools.pairwise(times)]
+    return float(statistics.median_low(gaps)) if gaps else 1.0
+
+
 def fixed_path(camera: Camera, times: Sequence[float]) -> list[PathView]:
-    """One camera that stands still while time goes on."""
-    return [PathView(camera, float(t)) for t in times]
+    """One camera that stands still while time goes on evenly, by the usual gap.
+
+    Where `times` are further apart, frames are held out or missing; there are views at
+    these, too.
+    """
+    first, last, step = float(times[0]), float(times[-1]), usual_gap(times)
+    count = math.ceil((last - first) / step - TIME_TOLERANCE)
+    return [PathView(camera, t) for t in [*(first + k * step for k in range(count)), last]]
 
 
 def center_spread(cameras: Sequence[Camera], camera: Camera) -> Tensor:
@@ -114,20 +129,30 @@ def bullet_time(
 def slow_motion(cameras: Sequence[Camera], times: Sequence[float], factor: int) -> list[PathView]:
     """`factor` views per recorded frame, the camera interpolated between its neighbors.
 
-    `times` rise strictly and need not be evenly spaced. Centers are interpolated
-    linearly, rotations along the shortest arc.
+    `times` rise strictly; where frames are held out or missing, there are as many more
+    views. Centers are interpolated linearly, rotations along the shortest arc.
     """
     assert factor >= 1, factor
     assert len(cameras) == len(times), (len(cameras), len(times))
     assert all(a < b for a, b in itertools.pairwise(times)), list(times)
     views = []
-    for i in range(len(times) - 1):
+    for i, count in enumerate(views_per_interval(times, factor)):
         interval = times[i + 1] - times[i]
-        for k in range(factor):
-            fraction = k / factor
+        for k in range(count):
+            fraction = k / count
             camera = interpolate_camera(cameras[i], cameras[i + 1], fraction)
             views.append(PathView(camera, times[i] + fraction * interval))
     return [*views, PathView(cameras[-1], float(times[-1]))]
+
+
+def views_per_interval(times: Sequence[float], factor: int) -> list[int]:
+    """How many views of slow motion there are from each time until before the next:
+    `factor` where they are one usual gap apart.
+    """
+    usual = usual_gap(times)
+    # exact, because a factor may be larger than any float
+    gaps = [Fraction((b - a) / usual) for a, b in itertools.pairwise(times)]
+    return [max(1, round(factor * gap)) for gap in gaps]
 
 
 def interpolate_camera(a: Camera, b: Camera, fraction: float) -> Camera:

@@ -371,6 +371,7 @@ class Work:
         """Flows between training frames; pairs are positions among training frames."""
         index = np.array([f.index for f in self.train])
         flow, valid, pairs = flows
+        pairs = pairs.reshape(-1, 2)  # also where there are none
         kept = np.isin(pairs, index).all(1)
         return flow[kept], valid[kept], np.searchsorted(index, pairs[kept])
 

@@ -7,6 +7,7 @@ specifies what it holds.
 from __future__ import annotations
 
 from pathlib import Path
+from urllib.parse import quote
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import Codec
@@ -93,7 +94,7 @@ def link_below(video: Path, folder: Path, text: str) -> Link | None:
     target, base = video.resolve(), folder.resolve()
     if not (target.is_file() and target.is_relative_to(base)):
         return None
-    return Link(target.relative_to(base).as_posix(), text)
+    return Link(quote(target.relative_to(base).as_posix()), text)
 
 
 def find_hdr_clip(run: Run, folder: Path) -> Path | None:

@@ -16,7 +16,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.lens import original_lens
 from hdr_nsff.rendering.output import Output, Shot
-from hdr_nsff.rendering.shot_views import MAX_VIEWS, plan_shot, short_count
+from hdr_nsff.rendering.shot_views import MAX_VIEWS, SHOTS, plan_shot, short_count
 from hdr_nsff.rendering.shots import name_results, render_shot
 from hdr_nsff.rendering.standard_set import render_all
 from hdr_nsff.rendering.write_view import open_look
@@ -28,6 +28,16 @@ MAX_PIXELS = 64_000_000  # of one picture: twice those of an 8K frame
 MIN_SIDE_PX = 2  # H.264 with 4:2:0 color takes even sizes
 MAX_FPS = 1000  # no player shows more
 MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
+FILE = "FILE.json"
+# which paths use an option; those that are not here are used by all
+USED_BY = {
+    "frame": ("fixed", "bullet", "slowmo", FILE),  # slowmo where several cameras filmed
+    "scale": (*SHOTS, FILE),
+    "factor": ("slowmo",),
+    "views": ("bullet",),
+    "fps": (*SHOTS, FILE),
+    "budget": ("all",),
+}
 
 
 @dataclass(frozen=True)
@@ -119,6 +129,7 @@ def check_settings(config: RenderConfig) -> None:
         if config.fps > MAX_FPS:
             limit = f"no player shows that many; use {MAX_FPS} at most"
             raise InputError(f"--fps {config.fps:g}: {limit}")
+    check_used(config)
     output = config.output
     if output.ev is not None and not abs(output.ev) < MAX_EV:
         meaning = "an exposure in stops relative to the reference, like -2 or 1.5"
@@ -134,6 +145,18 @@ def check_settings(config: RenderConfig) -> None:
     if output.exr == "none" and not (output.png or output.video or hdr):
         options = "--exr none --no-png --no-video"
         raise InputError(f"{options}: nothing left to write; leave one of them out")
+
+
+def check_used(config: RenderConfig) -> None:
+    """InputError for an option without effect on the path."""
+    path = FILE if config.path.endswith(".json") else config.path
+    if path not in ("all", *SHOTS, FILE):
+        return  # refused with the run
+    for option, paths in USED_BY.items():
+        given = getattr(config, option) != getattr(RenderConfig, option)
+        if given and path not in paths:
+            advice = f"leave it out, or use it with --path {' or '.join(paths)}"
+            raise InputError(f"--{option}: has no effect with --path {path}; {advice}")
 
 
 def check_positive(option: str, value: float) -> None:

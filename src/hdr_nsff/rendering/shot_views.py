@@ -47,11 +47,13 @@ def plan_shot(
         case "training":
             return Shot(path, paths.training_path(cameras, [f.time for f in frames]), fps)
         case "fixed":
+            check_length(path, times)
             return Shot(path, paths.fixed_path(start.camera, times), fps)
         case "bullet":
             return Shot(path, bullet_views(run, start, num_views), min(fps, BULLET_FPS))
         case "slowmo":
-            check_slow_motion(len(times), factor)
+            check_length(path, times)
+            check_slow_motion(times, factor)
             if len({f.camera_id for f in frames}) > 1:
                 # Gliding from one camera to the next would be a ride around the scene.
                 cameras = [start.camera] * len(times)
@@ -67,13 +69,21 @@ def plan_shot(
     return Shot(Path(path).stem, views, fps)
 
 
-def check_slow_motion(num_times: int, factor: int) -> None:
-    """InputError where slow motion would take more views than a shot may have."""
-    steps = num_times - 1
-    count = steps * factor + 1
+def check_length(path: str, times: Sequence[float]) -> None:
+    """InputError where the clip, with the gaps in it, lasts longer than a shot may."""
+    count = round((times[-1] - times[0]) / paths.usual_gap(times)) + 1
     if count > MAX_VIEWS:
-        largest = max(1, (MAX_VIEWS - 1) // steps)
-        problem = f"slow motion of {num_times} frames would take {short_count(count)} views"
+        problem = f"the clip lasts {count:,} frames, those that are missing included"
+        limit = f"a shot has at most {MAX_VIEWS:,} views; use --path training or a .json file"
+        raise InputError(f"--path {path}: {problem}; {limit}")
+
+
+def check_slow_motion(times: Sequence[float], factor: int) -> None:
+    """InputError where slow motion would take more views than a shot may have."""
+    count = sum(paths.views_per_interval(times, factor)) + 1
+    if count > MAX_VIEWS:
+        largest = max(1, factor * (MAX_VIEWS - 1) // count)
+        problem = f"slow motion of {len(times)} frames would take {short_count(count)} views"
         limit = f"a shot has at most {MAX_VIEWS:,}"
         raise InputError(f"--factor {short_count(factor)}: {problem}; {limit}, use {largest}")
 

@@ -1,7 +1,7 @@
 """One rendered view, and its EXR file.
 
 Motion is stored twice. `content.*` is what the content moves in a camera at rest, until
-the next and the previous training time. The other vectors are motion on the screen from
+one training interval later and earlier. The other vectors are motion on the screen from
 this picture of a shot to its neighbors, the camera's motion included: what motion blur
 and retiming take.
 """
@@ -9,6 +9,7 @@ and retiming take.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,8 +42,8 @@ class Still:
     opacity: np.ndarray  # (H, W) in [0, 1]; the field's background fills the rest
     depth: np.ndarray  # (H, W) z-depth, scene units
     motion: np.ndarray  # (H, W) in [0, 1]: share of dynamic content
-    # {+-1: (H, W, 2)} pixels: motion of the content until the next / previous frame, in
-    # a camera at rest; y down
+    # {+-1: (H, W, 2)} pixels: motion of the content until one training interval later /
+    # earlier, in a camera at rest; y down
     flow: dict[int, np.ndarray]
     # the same from this picture of a shot to its neighbors, seen by their cameras
     screen_motion: dict[int, np.ndarray] = field(default_factory=dict)
@@ -113,10 +114,10 @@ def screen_motion(
 ) -> dict[int, torch.Tensor]:
     """Motion (S, 2) in pixels, y down, to the next (1) and previous (-1) picture.
 
-    Content moves along its scene flow, which is to one training interval later or
-    earlier, by the share of it that the pictures are apart. Where a picture has one
-    neighbor, motion continues in a straight line; without any, the camera rests and
-    the neighbors are one training interval away. Empty for fields without scene flow.
+    Content moves along its scene flow by the share of its time that the pictures are
+    apart. Where a picture has one neighbor, motion continues in a straight line;
+    without any, the camera rests and the neighbors are one training interval away.
+    Empty for fields without scene flow.
     """
     if not seen.scene_flow:
         return {}
@@ -128,17 +129,32 @@ def screen_motion(
     limit = MAX_MOTION * max(camera.width, camera.height)
     steps = {}
     for side, neighbor in neighbors.items():
-        knots = np.interp([view.time, neighbor.time], times, np.arange(len(times)))
-        intervals = float(knots[1] - knots[0])
+        apart = neighbor.time - view.time
         moved = points
-        if intervals:
-            moved = points + abs(intervals) * seen.scene_flow[1 if intervals > 0 else -1]
+        if apart:
+            direction = 1 if apart > 0 else -1
+            share = abs(apart) / flow_duration(view.time, direction, times)
+            moved = points + share * seen.scene_flow[direction]
         landing = to_device(neighbor.camera, device).project(moved)[0]
         steps[side] = (landing - pixels).clamp(-limit, limit)
     for side in (1, -1):
         if side not in steps:
             steps[side] = -steps[-side]
     return steps
+
+
+def flow_duration(time: float, direction: int, times: list[float]) -> float:
+    """Over how many frames the scene flow at a time goes later (1) or earlier (-1).
+
+    That is one training interval of the `times`. Beyond their ends it continues the
+    flow of the other direction. Infinite where neither is within the clip: no flow.
+    """
+    knots = np.arange(len(times))
+    knot = float(np.interp(time, times, knots))
+    for side in (direction, -direction):
+        if knots[0] <= knot + side <= knots[-1]:
+            return abs(float(np.interp(knot + side, knots, times)) - time)
+    return math.inf
 
 
 def write_still(

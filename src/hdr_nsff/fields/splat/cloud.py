@@ -64,8 +64,8 @@ def displacement(model: Model, means: Tensor, living: Living, knot: float, offse
     """From `means` (G, 3) at a knot to the means one training interval away.
 
     `living` (A) are the time-local ones among them. `offset` is +1 (later) or -1
-    (earlier). Beyond the clip's ends, the displacement of the other direction is
-    continued.
+    (earlier): between two training times, to as far between the next two. Beyond the
+    clip's ends, the displacement of the other direction is continued.
     """
     if model.has_knot(knot + offset):
         return positions_at(model, knot + offset, living) - means

@@ -32,7 +32,12 @@ from hdr_nsff.fields.space import FrustumSpace, build_space
 from hdr_nsff.fields.splat.detail import cell_sizes, detail_density, scale_by_size
 from hdr_nsff.fields.splat.free_space import remove_fog
 from hdr_nsff.fields.splat.gaussians import START_LOGIT, Gaussians, from_log_radiance
-from hdr_nsff.fields.splat.initialize_local import local_mask, other_camera, place_local
+from hdr_nsff.fields.splat.initialize_local import (
+    limit_rigid_movers,
+    local_mask,
+    other_camera,
+    place_local,
+)
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
@@ -69,12 +74,15 @@ def initialize_gaussians(
                 "static Gaussians start at random places and moving ones not at all, "
                 "without a depth prior in scene units"
             )
+        found = sum(mover.rigid for mover in scene.movers)
+        scene = limit_rigid_movers(scene, field.config.bases)
         num_movers, moving = place_movers(field, scene, to_radiance)
         local = place_local(field.local, scene, to_radiance, field.unit)
         count = place_static(field, scene, to_radiance)
+        of_all = f" of {found}" if found > num_movers else ""
         return (
             f"{count} static Gaussians from the depth prior; "
-            f"{moving} moving ones on {num_movers} rigid movers; {local} time-local ones"
+            f"{moving} moving ones on {num_movers}{of_all} rigid movers; {local} time-local ones"
         )
 
 
@@ -198,11 +206,12 @@ def scatter(field: Splat, scene: Scene, typical: float) -> None:
 
 
 def place_movers(field: Splat, scene: Scene, to_radiance: ToRadiance) -> tuple[int, int]:
-    """Place moving Gaussians on rigid movers and give these the shared motions.
+    """Place moving Gaussians on rigid movers, at most as many as there are shared
+    motions, and give them these.
 
     Returns the number of movers and of Gaussians.
     """
-    movers = [mover for mover in scene.movers if mover.rigid][: field.config.bases]
+    movers = [mover for mover in scene.movers if mover.rigid]
     if not movers:
         return 0, 0
     position = {f.index: i for i, f in enumerate(scene.train)}

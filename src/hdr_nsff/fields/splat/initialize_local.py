@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -58,6 +58,17 @@ class LocalSeeds:
     velocities: Tensor  # (P, 3) scene units a frame
     durations: Tensor  # (P,) standard deviations of their lives, in frames
     time: float  # in frames
+
+
+def limit_rigid_movers(scene: Scene, most: int) -> Scene:
+    """The scene with at most `most` rigid movers, the largest: others would have no
+    motion of their own to share, and count as not rigid.
+    """
+    rigid = [k for k, mover in enumerate(scene.movers) if mover.rigid]
+    movers = list(scene.movers)
+    for k in rigid[most:]:
+        movers[k] = replace(movers[k], rigid=False)
+    return replace(scene, movers=tuple(movers))
 
 
 def local_mask(scene: Scene, i: int) -> Tensor:

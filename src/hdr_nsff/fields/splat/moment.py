@@ -4,12 +4,13 @@ and the field's own terms.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import Tensor
 
 from hdr_nsff.fields.kernels.moment import NUMBERS
-from hdr_nsff.fields.knots import catmull_rom_weights, linear_position
+from hdr_nsff.fields.knots import cubic_weights, linear_position
 from hdr_nsff.fields.splat.local_gaussians import least_duration
 from hdr_nsff.fields.splat.model import Model
 from hdr_nsff.fields.splat.terms import COLOR_OFFSET_SHARE, MIN_OPACITY
@@ -50,8 +51,8 @@ class Moment:
         tables = static.log_radiance_offsets, moving.log_radiance_offsets, model.opacity_offsets
         places = [linear_position(len(v), share * (len(v) - 1)) for v in tables]
         numbers = (
-            *knot_weights(t.num_knots, self.knot),
-            *knot_weights(t.num_knots, knot),
+            *knot_weights(t.times, self.knot),
+            *knot_weights(t.times, knot),
             self.time,
             time,
             *(number for place in places for number in place),
@@ -71,9 +72,9 @@ class Moment:
         return numbers
 
 
-def knot_weights(num_knots: int, knot: float) -> list[float]:
+def knot_weights(times: Sequence[float], knot: float) -> list[float]:
     """The first of four rows that a knot is interpolated from, and their weights."""
-    first, weights = catmull_rom_weights(num_knots, knot)
+    first, weights = cubic_weights(times, knot)
     return [first, *weights, *[0.0] * (4 - len(weights))]
 
 

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from hdr_nsff.core.tensors import constant, table_on
-from hdr_nsff.fields.knots import catmull_rom
+from hdr_nsff.fields.knots import cubic
 from hdr_nsff.fields.splat.rasterize import rotation_matrices, sum_products
 from hdr_nsff.maths.differences import differences
 
@@ -44,6 +44,7 @@ class Trajectories(nn.Module):
     def __init__(self, num_bases: int, times: Tensor) -> None:
         super().__init__()
         self.num_bases, self.num_knots = num_bases, len(times)
+        self.times: list[float] = times.tolist()  # on the host
         self.differences = weights_of_differences(times)
         rows = self.num_knots * num_bases
         unturned = torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(rows, 1)
@@ -58,8 +59,9 @@ class Trajectories(nn.Module):
 
     def pose(self, knot: float) -> Pose:
         """The bases' poses at a knot."""
-        turns = catmull_rom(self.rotations.view(self.num_knots, self.num_bases, 4), knot)
-        shifts = catmull_rom(self.translations.view(self.num_knots, self.num_bases, 4), knot)
+        shape = self.num_knots, self.num_bases, 4
+        turns = cubic(self.rotations.view(shape), self.times, knot)
+        shifts = cubic(self.translations.view(shape), self.times, knot)
         return nn.functional.normalize(turns, dim=-1), shifts[:, :3]
 
     def motions(self, pose: Pose) -> Tensor:

@@ -14,7 +14,8 @@ export function offerClip(link, data) {
   button.onclick = () => {
     if (!video.src) {
       video.src = data ? toAddress(data) : link.href;
-      Object.assign(find("clip-file"), { href: video.src, download: link.href.split("/").pop() });
+      const name = decodeURIComponent(link.href.split("/").pop());
+      Object.assign(find("clip-file"), { href: video.src, download: name });
     }
     dialog.showModal();
     if (problem.hidden) video.play().catch(() => {}); // `onerror` says why

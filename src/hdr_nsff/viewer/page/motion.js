@@ -14,33 +14,30 @@ export function knotOf(times, time) {
 }
 
 /**
- * Weights of the rows low - 1 ... low + 2 of a cubic through K values at a position in
- * [0, K - 1] (Catmull and Rom 1974). Both ends are extended in a straight line.
+ * Weights of the rows low - 1 ... low + 2 of a cubic through values at the rising times,
+ * at a position in [0, K - 1]. Its velocity at a time is that of the parabola through
+ * the value and the two beside it; at both ends, that of the line to the neighbor.
  */
-export function catmullRom(count, position) {
-  if (count === 1) return [[0, 1]];
-  const last = count - 1;
+export function cubic(times, position) {
+  const last = times.length - 1;
+  if (last === 0) return [[0, 1]];
   const low = Math.min(Math.max(Math.floor(position), 0), last - 1);
   const u = position - low;
-  let before = 0.5 * u * (u * (2 - u) - 1);
-  let start = 1 + 0.5 * u * u * (3 * u - 5);
-  let end = 0.5 * u * (u * (4 - 3 * u) + 1);
-  let after = 0.5 * u * u * (u - 1);
-  if (low === 0) {
-    start += 2 * before;
-    end -= before;
-    before = 0;
-  }
-  if (low + 2 > last) {
-    start -= after;
-    end += 2 * after;
-    after = 0;
-  }
+  const gap = times[low + 1] - times[low];
+  // this gap over those before and after, which are endless at the ends
+  const before = low > 0 ? gap / (times[low] - times[low - 1]) : 0;
+  const after = low + 1 < last ? gap / (times[low + 2] - times[low + 1]) : 0;
+  // of the velocities at both times, then of the steps from row to row
+  const start = u * (1 - u) * (1 - u);
+  const end = -u * u * (1 - u);
+  const stepBefore = (start * before * before) / (1 + before);
+  const step = u * u * (3 - 2 * u) + start / (1 + before) + end / (1 + after);
+  const stepAfter = (end * after * after) / (1 + after);
   const rows = [
-    [low - 1, before],
-    [low, start],
-    [low + 1, end],
-    [low + 2, after],
+    [low - 1, -stepBefore],
+    [low, 1 + stepBefore - step],
+    [low + 1, step - stepAfter],
+    [low + 2, stepAfter],
   ];
   return rows.filter(([row]) => row >= 0 && row <= last);
 }
@@ -61,13 +58,13 @@ export function rotationMatrix([w, x, y, z]) {
 }
 
 /**
- * The motion of every basis at a knot, POSE_FLOATS numbers each: a point x goes to
+ * The motion of every basis at a knot of the times, POSE_FLOATS numbers each: a point x goes to
  * R (x - c) + c + s, as the rows of a 3 x 4 matrix; then the unit quaternion of R.
  */
-export function posesAt(bases, numTimes, knot) {
+export function posesAt(bases, times, knot) {
   const poses = new Float32Array(Math.max(bases?.count ?? 0, 1) * POSE_FLOATS);
   if (!bases) return poses;
-  const rows = catmullRom(numTimes, knot);
+  const rows = cubic(times, knot);
   for (let b = 0; b < bases.count; b++) {
     const turn = [0, 0, 0, 0];
     const shift = [0, 0, 0];

@@ -86,7 +86,7 @@ export class Renderer {
 
   poses(time) {
     const { bases, times } = this.scene;
-    return posesAt(bases, times.length, knotOf(times, time));
+    return posesAt(bases, times, knotOf(times, time));
   }
 
   /**
@@ -144,7 +144,7 @@ export class Renderer {
     const poses = this.poses(time);
     const both = new Float32Array(2 * poses.length);
     both.set(poses);
-    both.set(posesAt(scene.bases, times.length, flowKnot), poses.length);
+    both.set(posesAt(scene.bases, times, flowKnot), poses.length);
     this.poseTable ??= gl.createTexture();
     gl.activeTexture(gl.TEXTURE5);
     gl.bindTexture(gl.TEXTURE_2D, this.poseTable);
