@@ -13,6 +13,7 @@ from fakes import SPEED, DiscBeforeWall, W, camera, fake_run
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.rendering.shot_views import plan_shot
+from hdr_nsff.rendering.shots import filmed_frame
 from hdr_nsff.rendering.stills import render_still
 
 
@@ -61,6 +62,21 @@ def test_paths_that_the_footage_cannot_show_are_refused(tmp_path: Path) -> None:
         plan_shot(run, path_file(tmp_path, 0.0, 7.5))
     with pytest.raises(InputError, match="leaves the clip's viewpoint"):
         plan_shot(still, path_file(tmp_path, 0.5, 1.0))
+
+
+def test_held_out_frames_have_their_pictures_too(tmp_path: Path) -> None:
+    run = fake_run(tmp_path)
+    frames = run.scene.train
+    kept, held_out = [f for f in frames if f.index != 3], [frames[3]]
+    other = replace(frames[2], camera_id=1, time=2.5)  # filmed by a camera of no training frame
+    scene = replace(run.scene, train=kept, test=[*held_out, other])
+    gapped = replace(run, scene=scene)
+    for path in ("training", "fixed", "slowmo"):
+        whole, found = plan_shot(run, path), plan_shot(gapped, path)
+        assert [v.time for v in found.views] == [v.time for v in whole.views]
+    cameras = [v.camera.c2w for v in plan_shot(gapped, "training").views]
+    assert all(torch.equal(c, f.camera.c2w) for c, f in zip(cameras, frames, strict=True))
+    assert filmed_frame(gapped, plan_shot(gapped, "training").views[3]) is held_out[0]
 
 
 def test_slow_motion_of_too_many_views_is_refused_before_it_is_planned(tmp_path: Path) -> None:

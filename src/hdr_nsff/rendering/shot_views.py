@@ -37,10 +37,9 @@ def plan_shot(
 
     InputError where the footage cannot show them.
     """
-    frames = sorted(run.scene.train, key=lambda f: f.time)
-    frames = list({(f.camera_id, f.time): f for f in reversed(frames)}.values())[::-1]
+    frames = filmed_frames(run)
     cameras = [f.camera for f in frames]
-    times = run.scene.times.tolist()
+    times = sorted({f.time for f in frames})
     start = find_frame(run, frame)
     fps = run.scene.manifest.fps
     match path:
@@ -67,6 +66,20 @@ def plan_shot(
         raise InputError(f"{path}: {len(views):,} views; {limit}")
     check_views(run, path, views)
     return Shot(Path(path).stem, views, fps)
+
+
+def filmed_frames(run: Run) -> list[Frame]:
+    """The frames of the training cameras in order of time, one per camera and time:
+    those of training, and those between them that were held out.
+    """
+    train = run.scene.train
+    cameras, times = {f.camera_id for f in train}, [f.time for f in train]
+    first, last = min(times), max(times)
+    between = [f for f in run.scene.test if f.camera_id in cameras and first <= f.time <= last]
+    found: dict[tuple[int, float], Frame] = {}
+    for f in [*train, *between]:
+        found.setdefault((f.camera_id, f.time), f)
+    return sorted(found.values(), key=lambda f: (f.time, f.index))
 
 
 def check_length(path: str, times: Sequence[float]) -> None:

@@ -80,8 +80,8 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
 
 
 def filmed_frame(run: Run, view: PathView) -> Frame | None:
-    """The training frame that was filmed from a view at its time, if any."""
-    for frame in run.scene.train:
+    """The frame that was filmed from a view at its time, if any."""
+    for frame in [*run.scene.train, *run.scene.test]:
         if frame.time == view.time and torch.equal(frame.camera.c2w, view.camera.c2w):
             return frame
     return None

@@ -145,10 +145,11 @@ def read_plan(
 ) -> dict[str, notes.ShotShare]:
     """Per shot the scale and the positions of the views to render.
 
-    From `plan.json` where that is of this checkpoint, else planned and written.
+    From `plan.json` where that is of this checkpoint and of as many views, else planned
+    and written.
     """
     path = out / "plan.json"
-    key = fingerprint(run, budget)
+    key = fingerprint(run, budget, [len(shot.views) for shot in shots])
     found = notes.read(path, notes.RenderPlan)
     if found is not None and found.key == key:
         if plan_fits(found, shots):

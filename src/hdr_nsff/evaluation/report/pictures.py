@@ -152,7 +152,10 @@ def spread(count: int, number: int) -> list[int]:
 
 
 def recorded_frame(run: Run, view: notes.SequenceView) -> Frame:
-    """The training frame filmed at a view, else the one nearest in time."""
+    """The frame filmed at a view, else the training frame nearest in time."""
+    for frame in run.scene.test:
+        if frame.index == view.frame:
+            return frame
     return min(run.scene.train, key=lambda f: (f.index != view.frame, abs(f.time - view.time)))
 
 
