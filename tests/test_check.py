@@ -17,6 +17,7 @@ from hdr_nsff.check.findings import judge, outlook
 from hdr_nsff.check.measure import measure_clip
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_image, write_png
+from hdr_nsff.footage.frame_files import CHECK_PICTURE, frame_files
 
 WIDTH, HEIGHT, FRAMES = 240, 136, 12
 
@@ -118,6 +119,21 @@ def test_given_exposures_are_taken_as_they_are(tmp_path: Path) -> None:
     (clip / "exposures.csv").write_text("\n".join(["frame,ev", *rows[:-1]]))
     with pytest.raises(InputError, match="no row for frame"):
         measure_clip(clip)
+
+
+def test_given_exposures_that_do_not_change_are_no_alternation() -> None:
+    good = good_facts()
+    constant = replace(good.exposure, cycle=1, ev=(0.0,), given="exposures.csv", change_ev=0.0)
+    found = judge(replace(good, exposure=replace(constant, white_share=(0.0,), black_share=(0.0,))))
+    (exposure,) = (finding for finding in found if finding.subject == "exposure")
+    assert exposure.level == "problem" and exposure.advice
+
+
+def test_the_picture_of_check_is_no_frame(tmp_path: Path) -> None:
+    clip = clip_of(tmp_path, still_scene, [0.0, -2.0] * 4)
+    before = frame_files(clip)
+    (clip / f"frames{CHECK_PICTURE}").write_bytes(before[0].read_bytes())
+    assert frame_files(clip) == before
 
 
 def good_facts() -> ClipFacts:

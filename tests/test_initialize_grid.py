@@ -120,9 +120,8 @@ def fit_residual(sweeps: int, monkeypatch: pytest.MonkeyPatch) -> float:
         squares,
         trust=torch.ones(n),
         moving=torch.zeros(n, dtype=torch.bool),
-        crossed=torch.zeros(n, 1, 3),
-        lengths=torch.zeros(n),
         knot=0.0,
+        free_space=lambda: (torch.zeros(n, 1, 3), torch.zeros(n)),
     )
     grid = AdditiveGrid([(16, 16, 4, 1), (32, 32, 4, 1), (64, 64, 4, 1)])
     fit_radiance(grid, [wall], moving=False)

@@ -42,6 +42,7 @@ def test_opposite_flows_close_the_cycle_and_cost_no_kinetic_energy() -> None:
 def test_kinetic_energy_of_a_bend() -> None:
     forward, backward = torch.tensor([[1.0, 0, 0]]), torch.tensor([[0.0, 1.0, 0]])
     assert math.isclose(float(losses.kinetic(forward, backward)), 0.5 * 2)
+    assert float(losses.kinetic(forward[:0], backward[:0])) == 0  # as in `smoothness`
 
 
 def test_flow_magnitude_does_not_cancel_between_axes() -> None:

@@ -12,6 +12,7 @@ from presets import random_field
 from torch import Tensor, nn
 
 from hdr_nsff.fields.nsff.nsff import NSFF, NSFFConfig
+from hdr_nsff.fields.nsff.scene_flow import SceneFlowPass
 from hdr_nsff.fields.space import build_space
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.scene.batch import PixelBatch, draw_pixels
@@ -218,6 +219,17 @@ def test_steady_flow_costs_little_kinetic_energy_and_a_turn_costs_more() -> None
 
     bent.dynamic = turn_back  # type: ignore[method-assign]
     assert float(steady.max()) < 0.01 * float(blob_field(bent)(batch())[1]["kinetic"].max())
+
+
+def test_steady_flow_past_a_missing_frame_costs_no_kinetic_energy() -> None:
+    field = blob_field(Blob())
+    field.host_times = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64)
+    base = field.query(batch(), motion=True)
+    seen = SceneFlowPass(field, field.to_flow, batch(), base)
+    v = torch.tensor([[0.1, -0.2, 0.3]])
+    assert float(seen.acceleration(1, 2 * v, -v)) < 1e-12
+    assert float(seen.acceleration(1, v, -v)) > 1e-3
+    assert float(seen.acceleration(0, v, -v)) == float(seen.acceleration(2, v, -v)) == 0
 
 
 # Gradients, on grids

@@ -207,6 +207,13 @@ def test_other_settings_in_the_same_folder_are_refused(unbroken: Path, toy_folde
         train(replace(config(toy_folder, unbroken), rays=65))
 
 
+def test_a_run_goes_on_with_its_own_budget_where_none_is_given(
+    unbroken: Path, toy_folder: Path
+) -> None:
+    train(replace(config(toy_folder, unbroken), budget=Budget()))
+    assert Run.open(unbroken).step == STEPS
+
+
 def test_a_finished_run_stays_finished(unbroken: Path, toy_folder: Path) -> None:
     before = final(unbroken)
     train(config(toy_folder, unbroken))

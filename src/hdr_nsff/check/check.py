@@ -19,8 +19,8 @@ from hdr_nsff.check.picture import MARKS, draw
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.footage.footage import open_footage
+from hdr_nsff.footage.frame_files import CHECK_PICTURE
 
-ENDING = "_check.png"  # of the picture's name, by default
 PNG_START = b"\x89PNG"
 WIDTH = 100  # characters of a line
 
@@ -42,7 +42,7 @@ class CheckConfig:
 
 def check(config: CheckConfig) -> Path:
     """The verb: the picture that was written."""
-    picture = config.picture or Path(f"{config.clip.resolve().stem}{ENDING}")
+    picture = config.picture or Path(f"{config.clip.resolve().stem}{CHECK_PICTURE}")
     check_place(picture, config.clip)
     facts, video, brackets = measure_clip(config.clip)
     findings, works = judge(facts), outlook(facts)
@@ -73,7 +73,7 @@ def check_place(picture: Path, clip: Path) -> None:
         raise InputError(f"--picture {picture}: is a folder; name a file")
     if picture.is_file() and picture.read_bytes()[:4] != PNG_START:
         raise InputError(f"--picture {picture}: exists and is no picture; name another file")
-    if picture.is_file() and not picture.name.endswith(ENDING):
+    if picture.is_file() and not picture.name.endswith(CHECK_PICTURE):
         frames = [frame for files in open_footage(clip).cameras for frame in files]
         if picture.resolve() in [frame.resolve() for frame in frames]:
             raise InputError(f"--picture {picture}: is a frame of the clip; name another file")

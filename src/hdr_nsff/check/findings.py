@@ -89,7 +89,7 @@ def judge_exposure(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
     """The cycle, or what is there instead."""
     exposure = facts.exposure
     ordered = sorted(exposure.ev)
-    if exposure.given is not None:
+    if exposure.given is not None and ordered[-1] >= MIN_STEP:
         text = (
             f"{len(ordered)} exposures are given by {exposure.given}, {ordered[-1]:.1f} EV in all"
         )

@@ -9,6 +9,7 @@ RECORDED = {".png", ".jpg", ".jpeg", ".tif", ".tiff"}
 LINEAR = {".exr", ".dng"}
 FRAMES = RECORDED | LINEAR
 LOSSY = {".jpg", ".jpeg"}  # formats of frames
+CHECK_PICTURE = "_check.png"  # ends the name of what `check` writes, which is no frame
 VIDEOS = {".mp4", ".mov", ".mkv", ".m4v", ".avi", ".webm", ".mxf", ".mts"}
 
 
@@ -26,6 +27,7 @@ def natural_key(path: Path) -> list[tuple[int, int, str]]:
 def frame_files(folder: Path) -> list[Path]:
     """The frames directly in `folder`, in order."""
     shown = [p for p in folder.iterdir() if not p.name.startswith(".")]
+    shown = [p for p in shown if not p.name.endswith(CHECK_PICTURE)]
     found = [p for p in shown if p.suffix.lower() in FRAMES and p.is_file()]
     return sorted(found, key=natural_key)
 

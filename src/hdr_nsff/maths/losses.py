@@ -66,9 +66,12 @@ def cycle(there: Tensor, back: Tensor, confidence: Tensor) -> Tensor:
 def kinetic(forward: Tensor, backward: Tensor) -> Tensor:
     """Least kinetic energy: mean of `0.5 |f_(t->t+1) + f_(t->t-1)|^2` (Li et al. 2021).
 
-    It is 0 for constant velocity. Flows (N, 3) are in scene units.
+    It is 0 for constant velocity, and where there are none. Flows (N, 3) are in scene
+    units, over equal times.
     """
     acceleration = forward + backward
+    if not len(acceleration):
+        return acceleration.sum()
     return 0.5 * acceleration.square().sum(-1).mean()
 
 

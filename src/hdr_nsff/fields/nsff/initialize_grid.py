@@ -10,7 +10,9 @@ all of it; this only saves it the first minutes.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -42,9 +44,10 @@ class SurfaceSamples:
     raw_radiance: Tensor  # (P, 3) as the grids store it
     trust: Tensor  # (P,) > 0
     moving: Tensor  # (P,) bool
-    crossed: Tensor  # (P, FREE_SAMPLES, 3) cube points in front of the surface
-    lengths: Tensor  # (P,) cube length of ray that each of those represents
     knot: float  # of the frame's time
+    # cube points (P, FREE_SAMPLES, 3) in front of the surface, and the cube length (P,)
+    # of ray that each of them represents: too many to be kept for all frames
+    free_space: Callable[[], tuple[Tensor, Tensor]]
 
 
 def initialize_grid(field: TwoBranches, frames: list[Frame], to_radiance: ToRadiance) -> bool:
@@ -85,12 +88,6 @@ def sample_surface(
     disparity = prior_disparity(frame, field.near, field.far)
     rgb = frame.image.reshape(-1, 3)
     surface = rays.origins + rays.directions / disparity[:, None]  # (P, 3)
-    # samples in front of the surface, even in disparity
-    share = (torch.arange(FREE_SAMPLES) + 0.5) / FREE_SAMPLES
-    nearest = 1 / field.near
-    passing = nearest + share * (disparity[:, None] - nearest)  # (P, FREE_SAMPLES)
-    in_front = rays.origins[:, None] + rays.directions[:, None] / passing[..., None]
-    crossed = field.space.encode(in_front)
     if frame.moving is None:
         moving = torch.zeros_like(disparity, dtype=torch.bool)
     else:
@@ -100,10 +97,21 @@ def sample_surface(
         raw_radiance=field.from_radiance(to_radiance(rgb, position)),
         trust=point_trust(rgb, prior_confidence(frame)),
         moving=moving,
-        crossed=crossed,
-        lengths=(crossed[:, -1] - crossed[:, 0]).norm(dim=-1) / (FREE_SAMPLES - 1),
         knot=field.knot(frame.time),
+        free_space=partial(free_space, field, frame),
     )
+
+
+def free_space(field: TwoBranches, frame: Frame) -> tuple[Tensor, Tensor]:
+    """The `SurfaceSamples.free_space` of a frame: samples even in disparity."""
+    rays = frame.camera.rays(frame.camera.pixel_grid())
+    disparity = prior_disparity(frame, field.near, field.far)
+    share = (torch.arange(FREE_SAMPLES) + 0.5) / FREE_SAMPLES
+    nearest = 1 / field.near
+    passing = nearest + share * (disparity[:, None] - nearest)  # (P, FREE_SAMPLES)
+    in_front = rays.origins[:, None] + rays.directions[:, None] / passing[..., None]
+    crossed = field.space.encode(in_front)
+    return crossed, (crossed[:, -1] - crossed[:, 0]).norm(dim=-1) / (FREE_SAMPLES - 1)
 
 
 def fit_radiance(grid: AdditiveGrid, samples: list[SurfaceSamples], moving: bool) -> None:
@@ -142,9 +150,10 @@ def fit_density(
         stops = torch.zeros(int(chosen.sum()), 4)
         stops[:, 0] = 1
         total += grid.scatter_level(level, s.coords[chosen], stops, s.knot)
+        crossed, lengths = s.free_space()
         passes = torch.zeros(len(s.coords) * FREE_SAMPLES, 4)
-        passes[:, 1] = s.lengths[:, None].expand(-1, FREE_SAMPLES).reshape(-1)
-        total += grid.scatter_level(level, s.crossed.reshape(-1, 3), passes, s.knot)
+        passes[:, 1] = lengths[:, None].expand(-1, FREE_SAMPLES).reshape(-1)
+        total += grid.scatter_level(level, crossed.reshape(-1, 3), passes, s.knot)
     stopped, length = total[:, 0], total[:, 1]
     half_cell = 0.5 / float(grid.res[level, 2])  # a ray that stops has crossed half a cell
     density = stopped / (length + stopped * half_cell).clamp_min(1e-9)

@@ -244,10 +244,11 @@ class SceneFlowPass:
         both neighbors count as long as there is no chain.
         """
         near = self.near_samples(KINETIC_SHARE)
+        knot = round(self.base.knot)
         terms = []
         if len(self.offsets) == 2:
-            here = losses.kinetic(self.displacement[1][near], self.displacement[-1][near])
-            terms += [here, here]
+            forward, backward = self.displacement[1][near], self.displacement[-1][near]
+            terms += [self.acceleration(knot, forward, backward)] * 2
         direction = self.batch.chain
         if self.alone is not None and not direction:  # before the chain: by chance
             direction = 1 if self.batch.seed % 2 else -1
@@ -255,9 +256,17 @@ class SceneFlowPass:
             if direction in (0, o):
                 flow = self.to_flow(self.neighbor_motion[o])[near]  # (M, 2, 3) cube
                 start = self.moved[o][near]
-                onward = self.displace(start, flow[:, side_of(o)])
-                terms.append(losses.kinetic(onward, self.displace(start, flow[:, side_of(-o)])))
+                forward, backward = (self.displace(start, flow[:, side_of(s)]) for s in (1, -1))
+                terms.append(self.acceleration(knot + o, forward, backward))
         return terms
+
+    def acceleration(self, knot: int, forward: Tensor, backward: Tensor) -> Tensor:
+        """Kinetic energy of displacements (M, 3) from a knot to the times after and
+        before it, as if both were equally far.
+        """
+        after, before = self.field.gaps_at(knot)
+        mean = (after + before) / 2
+        return losses.kinetic(forward * (mean / after), backward * (mean / before))
 
     def near_samples(self, share: float) -> Tensor:
         """Which dynamic samples (M,) are among the first `share` of their ray's."""

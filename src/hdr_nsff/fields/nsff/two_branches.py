@@ -186,6 +186,15 @@ class TwoBranches(nn.Module):
         """Position of a time (in frames) on the list of training times."""
         return knot_of(self.host_times, time)
 
+    def gaps_at(self, knot: int) -> tuple[float, float]:
+        """Frames from the training time at a knot to the next one, and to it from the
+        one before; equal at both ends.
+        """
+        if not 0 < knot < len(self.host_times) - 1:
+            return 1.0, 1.0
+        before, here, after = self.host_times[knot - 1 : knot + 2].tolist()
+        return after - here, here - before
+
     def sample(
         self, camera: Camera, pixels: Tensor, num_samples: int, generator: torch.Generator | None
     ) -> RaySamples:
