@@ -152,7 +152,7 @@ def capture_part(work: Work, name: StepName) -> Any:
             cameras = [given.K.tolist(), given.c2w.tolist(), given.size.tolist()]
             return [*cameras, given.near, given.far, points]
         case "poses" if work.config.poses is None and not work.config.tripod:
-            return capture_part(work, "masks")  # what moves is left out of estimates
+            return capture_part(work, "masks")  # poses are estimated from static pixels
         case "masks" if work.capture_with("masks"):
             return [capture.is_static, capture.white_moves, files(lambda p: p.mask)]
         case "static_depth" if work.capture_with("depth"):

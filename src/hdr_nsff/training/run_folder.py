@@ -107,8 +107,7 @@ def open_folder(config: TrainConfig) -> None:
         raise InputError(f"{out}: holds a scene; choose another --out for the run")
     if (out / CONFIG).exists():
         before, places = stored_config(out)
-        if config.budget == Budget():
-            config = replace(config, budget=before.budget)
+        config = with_own_budget(config)
         if replace(before, scene=config.scene, out=out, device=config.device) != config:
             raise InputError(
                 f"{out}: holds a run with other settings; "
@@ -121,6 +120,13 @@ def open_folder(config: TrainConfig) -> None:
             "choose another --out, or delete it to start over"
         )
     write_config(out, config)
+
+
+def with_own_budget(config: TrainConfig) -> TrainConfig:
+    """The settings; an open budget becomes that of the run in the folder, if any."""
+    if config.budget == Budget() and (config.out / CONFIG).is_file():
+        return replace(config, budget=stored_config(config.out)[0].budget)
+    return config
 
 
 def refuse_another_scene(config: TrainConfig, places: Sequence[Path]) -> None:

@@ -26,7 +26,7 @@ from hdr_nsff.scene.batch import PixelBatch
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.tonemap.build import tone_mapper_for
 from hdr_nsff.training import run_folder
-from hdr_nsff.training.budget import Budget, Clock, Stopwatch
+from hdr_nsff.training.budget import Clock, Stopwatch
 from hdr_nsff.training.config import TrainConfig, check_config
 from hdr_nsff.training.measure import Monitor, averaged, frame_error, spread_frames
 from hdr_nsff.training.objective import Objective
@@ -59,8 +59,7 @@ def train(config: TrainConfig, keep_at: Sequence[float] = (), previews: bool = T
         device = device_for(config.field, config.device)
         scene = Scene.open(config.scene)
         camera = scene.train[0].camera
-        if config.budget == Budget() and (config.out / run_folder.CONFIG).is_file():
-            config = replace(config, budget=run_folder.stored_config(config.out)[0].budget)
+        config = run_folder.with_own_budget(config)
         budget = config.budget.for_clip(camera.width * camera.height, len(scene.train))
         config = replace(config, budget=budget)
         if ranks.main:
