@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from fakes import FOCAL, WALL, DiscBeforeWall, H, W, camera
+from fakes import FOCAL, SPEED, WALL, DiscBeforeWall, H, W, camera
 from torch import Tensor
 
 from hdr_nsff.fields.outputs import Layers
@@ -38,6 +38,33 @@ def test_a_disc_at_constant_velocity_lands_at_the_closed_form_place(
     # 100 x half of the disc's edge (31 of 1536 pixels)
     assert (seen.radiance - truth.radiance).abs().mean() < 2.0
     assert abs(seen.motion.sum() - truth.motion.sum()) < 9  # the disc keeps its 79 pixels
+
+
+@pytest.mark.parametrize(("time", "later", "earlier"), [(0.25, 1.75, 1.75), (2.5, 3.25, 2.125)])
+def test_scene_flow_between_times_is_that_of_a_straight_line(
+    time: float, later: float, earlier: float
+) -> None:
+    """Over one training interval, which ends between two times as well: 0.25 to 2.0,
+    2.5 to 5.75 and to 0.375. Before the clip there is none, so the later one counts.
+    """
+    times = [0.0, 1.0, 5.0, 7.0]
+    gap = 1.0 if time < 1 else 4.0
+
+    class Disc(DiscBeforeWall):
+        """A disc whose scene flow spans the interval that is splatted."""
+
+        def layers(self, camera: Camera, time: float, pixels: Tensor | None = None) -> Layers:
+            layers = super().layers(camera, time, pixels)
+            return replace(layers, scene_flow={o: gap * f for o, f in layers.scene_flow.items()})
+
+    speed = SPEED / 4
+    seen = render_at(Disc(speed=speed), CAMERA, time, times)
+    disc = seen.motion > 0.99
+    assert disc.sum() > 40
+    for side, frames in ((1, later), (-1, -earlier)):
+        assert torch.allclose(seen.scene_flow[side][disc], frames * speed, atol=1e-3)
+        assert not seen.scene_flow[side][seen.motion == 0].any()
+    assert not render_at(Disc(), CAMERA, time, times, scene_flow=False).scene_flow
 
 
 def test_a_wall_at_rest_is_exact_and_has_no_holes() -> None:

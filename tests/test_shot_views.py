@@ -64,14 +64,8 @@ def test_paths_that_the_footage_cannot_show_are_refused(tmp_path: Path) -> None:
         plan_shot(still, path_file(tmp_path, 0.5, 1.0))
 
 
-class Continuous(DiscBeforeWall):
-    """A field that is rendered at any time itself, as Gaussians are."""
-
-    layers = None  # type: ignore[assignment]
-
-
 def test_held_out_frames_have_their_pictures_too(tmp_path: Path) -> None:
-    run = replace(fake_run(tmp_path), field=Continuous(speed=SPEED / 4, red=3.0))
+    run = fake_run(tmp_path)
     frames = run.scene.train
     kept, held_out = [f for f in frames if f.index != 3], [frames[3]]
     other = replace(frames[2], camera_id=1, time=2.5)  # filmed by a camera of no training frame
@@ -83,8 +77,6 @@ def test_held_out_frames_have_their_pictures_too(tmp_path: Path) -> None:
     cameras = [v.camera.c2w for v in plan_shot(gapped, "training").views]
     assert all(torch.equal(c, f.camera.c2w) for c, f in zip(cameras, frames, strict=True))
     assert filmed_frame(gapped, plan_shot(gapped, "training").views[3]) is held_out[0]
-    interpolated = replace(gapped, field=DiscBeforeWall(speed=SPEED / 4, red=3.0))
-    assert len(plan_shot(interpolated, "training").views) == len(kept)
 
 
 def test_slow_motion_of_too_many_views_is_refused_before_it_is_planned(tmp_path: Path) -> None:

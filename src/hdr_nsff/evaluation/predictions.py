@@ -23,7 +23,7 @@ from hdr_nsff.evaluation.targets import Target
 from hdr_nsff.fields.outputs import record_pixels
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.fingerprint import fingerprint
-from hdr_nsff.rendering.interpolate import LayeredField, render_at
+from hdr_nsff.rendering.interpolate import render_at
 from hdr_nsff.rendering.stills import device_of
 from hdr_nsff.scene.batch import Recorder
 from hdr_nsff.training.run_folder import Run
@@ -70,26 +70,19 @@ def is_readable(path: Path) -> bool:
 
 
 def render_maps(run: Run, view: PathView, motion: bool) -> dict[str, np.ndarray]:
-    """The EXR channels of one view.
-
-    Where a time between frames is splatted, the scene flow is that of the field at
-    this time.
-    """
+    """The EXR channels of one view."""
     camera = to_device(view.camera, device_of(run))
     times = run.scene.times.tolist()
     with torch.no_grad():
         seen = render_at(run.field, camera, view.time, times, scene_flow=motion)
-        flows = seen.scene_flow
-        if motion and not flows and isinstance(run.field, LayeredField):
-            flows = run.field.render(camera, view.time).scene_flow
 
     def image(values: Tensor) -> np.ndarray:
         return values.reshape(camera.height, camera.width, *values.shape[1:]).float().cpu().numpy()
 
     channels = {"RGB": image(seen.radiance), "Z": image(seen.depth)}
     for side, frames in intervals(view.time, times).items():
-        if side in flows:
-            flow = image(flows[side]) / frames
+        if side in seen.scene_flow:
+            flow = image(seen.scene_flow[side]) / frames
             channels |= {
                 f"{MOTION_DIRECTIONS[side]}.{axis}": flow[..., k] for k, axis in enumerate("xyz")
             }

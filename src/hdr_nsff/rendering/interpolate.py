@@ -12,15 +12,18 @@ Splatting, layer by layer: bilinear weights w, alpha = sum(w * alpha) / clamp(su
 Where they pile up, like a mover over empty samples at rest, it is the sum, so a mover
 keeps its opacity. Where hardly anything lands, alpha fades. Where one time shows
 nothing, because the content moved away, the other fills in; where neither does, the
-nearer training time is shown unmoved, so there are no holes.
+nearer training time is shown unmoved, so there are no holes. The picture's scene flow
+is that of its layers, in a straight line over the interval.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol, runtime_checkable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -58,7 +61,8 @@ class Picture:
     """A composited view; every quantity is premultiplied by opacity."""
 
     opacity: Tensor  # (S, 1)
-    color: Tensor  # (S, C): radiance, disparity, motion
+    # (S, C): radiance, disparity, motion, displacement over the training interval
+    color: Tensor
 
 
 def neighbors(time: float, times: Sequence[float]) -> tuple[float, float, float]:
@@ -88,8 +92,7 @@ def render_at(
     """The whole picture (S = height * width, row by row) at any `time` in frames.
 
     `times` are the training times in order. `auto` splats where the field has layers
-    and renders directly where it has none; `splat` demands layers. A splatted `Render`
-    carries no scene flow, nor does one without `scene_flow`.
+    and renders directly where it has none; `splat` demands layers.
     """
     before, after, fraction = neighbors(time, times)
     layered = isinstance(field, LayeredField)
@@ -98,7 +101,26 @@ def render_at(
     assert isinstance(field, LayeredField), f"{type(field).__name__} has no layers to splat"
     forward, before_unmoved = splat(field.layers(camera, before), camera, 1, fraction)
     backward, after_unmoved = splat(field.layers(camera, after), camera, -1, 1 - fraction)
-    return blend((forward, backward), (before_unmoved, after_unmoved), fraction)
+    render = blend((forward, backward), (before_unmoved, after_unmoved), fraction)
+    if not scene_flow:
+        return replace(render, scene_flow={})
+    interval = after - before
+    spans = {side: flow_duration(time, side, times) / interval for side in render.scene_flow}
+    return replace(render, scene_flow={o: spans[o] * f for o, f in render.scene_flow.items()})
+
+
+def flow_duration(time: float, direction: int, times: Sequence[float]) -> float:
+    """Over how many frames the scene flow at a time goes later (1) or earlier (-1).
+
+    That is one training interval of the `times`. Beyond their ends it continues the
+    flow of the other direction. Infinite where neither is within the clip: no flow.
+    """
+    knots = np.arange(len(times))
+    knot = float(np.interp(time, times, knots))
+    for side in (direction, -direction):
+        if knots[0] <= knot + side <= knots[-1]:
+            return abs(float(np.interp(knot + side, knots, times)) - time)
+    return math.inf
 
 
 def splat(
@@ -113,11 +135,13 @@ def splat(
     """
     num_layers = layers.alpha.shape[1]
     disparity = inverse(camera.to_camera(layers.positions)[..., 2:])
-    values = torch.cat([layers.radiance, disparity, layers.motion[..., None]], -1)
+    flow = layers.scene_flow[direction]
+    displacement = direction * flow  # from the earlier time to the later one
+    values = torch.cat([layers.radiance, disparity, layers.motion[..., None], displacement], -1)
     alpha = layers.alpha.reshape(-1, 1)  # (S L, 1): sample = pixel * L + layer
-    value = values.reshape(-1, 5)  # (S L, 5)
+    value = values.reshape(-1, 8)  # (S L, 8)
     positions = layers.positions.reshape(-1, 3)  # (S L, 3)
-    flow = layers.scene_flow[direction].reshape(-1, 3)  # (S L, 3)
+    flow = flow.reshape(-1, 3)  # (S L, 3)
     moving = (alpha[:, 0] > MIN_ALPHA) & flow.any(-1)  # (S L,)
     unmoved = composite(alpha, value, num_layers)
     source = moving.nonzero()[:, 0]  # (M,)
@@ -205,7 +229,8 @@ def sum_of(parts: Iterable[Tensor]) -> Tensor:
 
 def blend(moved: Sequence[Picture], unmoved: Sequence[Picture], fraction: float) -> Render:
     """Two pictures blended by `fraction`, each weighted by the presence of its content:
-    its opacity relative to that of the unmoved picture.
+    its opacity relative to that of the unmoved picture. Scene flow is over the whole
+    interval between them.
     """
     shares = (1 - fraction, fraction)
     presence = sum_of(
@@ -219,13 +244,15 @@ def blend(moved: Sequence[Picture], unmoved: Sequence[Picture], fraction: float)
     nearer = unmoved[0] if fraction <= 0.5 else unmoved[1]
     scale = 1 / presence.clamp_min(MIN_PRESENCE)
     opacity = (opacity * scale + lack * nearer.opacity).clamp(0, 1)  # (S, 1)
-    color = color * scale + lack * nearer.color  # (S, 5)
-    rest = color[:, 3:] / opacity.clamp_min(1e-6)
+    color = color * scale + lack * nearer.color  # (S, 8)
+    rest = color[:, 3:5] / opacity.clamp_min(1e-6)
+    displacement = color[:, 5:]
     return Render(
         radiance=color[:, :3],
         depth=1 / rest[:, 0].clamp_min(1e-6),
         opacity=opacity[:, 0],
         motion=rest[:, 1].clamp(0, 1),
+        scene_flow={1: displacement, -1: -displacement},
     )
 
 

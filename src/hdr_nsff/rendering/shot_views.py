@@ -15,7 +15,6 @@ from hdr_nsff.core.errors import InputError, shorten
 from hdr_nsff.core.tensors import to_device
 from hdr_nsff.geometry import paths
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.output import Shot
 from hdr_nsff.rendering.stills import device_of
 from hdr_nsff.scene.scene import Frame
@@ -72,15 +71,11 @@ def plan_shot(
 def filmed_frames(run: Run) -> list[Frame]:
     """The frames of the training cameras in order of time, one per camera and time:
     those of training, and those between them that were held out.
-
-    A field that is interpolated between training times has no scene flow there: without
-    the latter.
     """
     train = run.scene.train
-    held_out = [] if isinstance(run.field, LayeredField) else run.scene.test
     cameras, times = {f.camera_id for f in train}, [f.time for f in train]
     first, last = min(times), max(times)
-    between = [f for f in held_out if f.camera_id in cameras and first <= f.time <= last]
+    between = [f for f in run.scene.test if f.camera_id in cameras and first <= f.time <= last]
     found: dict[tuple[int, float], Frame] = {}
     for f in [*train, *between]:
         found.setdefault((f.camera_id, f.time), f)

@@ -9,7 +9,6 @@ and retiming take.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,7 +24,7 @@ from hdr_nsff.core.tensors import to_device
 from hdr_nsff.fields.base import Render
 from hdr_nsff.geometry.cameras import Camera
 from hdr_nsff.geometry.paths import PathView
-from hdr_nsff.rendering.interpolate import Mode, render_at
+from hdr_nsff.rendering.interpolate import Mode, flow_duration, render_at
 from hdr_nsff.training.run_folder import Run
 
 Vectors = Literal["nuke", "blender"]
@@ -141,20 +140,6 @@ def screen_motion(
         if side not in steps:
             steps[side] = -steps[-side]
     return steps
-
-
-def flow_duration(time: float, direction: int, times: list[float]) -> float:
-    """Over how many frames the scene flow at a time goes later (1) or earlier (-1).
-
-    That is one training interval of the `times`. Beyond their ends it continues the
-    flow of the other direction. Infinite where neither is within the clip: no flow.
-    """
-    knots = np.arange(len(times))
-    knot = float(np.interp(time, times, knots))
-    for side in (direction, -direction):
-        if knots[0] <= knot + side <= knots[-1]:
-            return abs(float(np.interp(knot + side, knots, times)) - time)
-    return math.inf
 
 
 def write_still(
