@@ -64,6 +64,15 @@ def test_points_on_the_border_on_grid_points_and_outside() -> None:
     torch.testing.assert_close(ours[0], plain(grid(), points, 2.0).detach(), **CLOSE)
 
 
+def test_a_coordinate_that_is_not_a_number_gives_no_number() -> None:
+    points = torch.tensor([[0.3, torch.nan, 0.4], [0.2, 0.5, 0.9]])
+    ours = values_and_gradients(simulated, points, 1.3, 2**10)
+    theirs = values_and_gradients(by_cpu, points, 1.3, 2**10)
+    assert bool(ours[0][0].isnan().all()) and bool(ours[0][1].isfinite().all())
+    for a, b in zip(ours, theirs, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-4, equal_nan=True)
+
+
 def test_gradients_add_up_over_several_uses_of_one_grid_and_no_points_are_fine() -> None:
     g, points = grid(), coords(5)
     simulated(g, points, 0.0).sum().backward()

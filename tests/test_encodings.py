@@ -36,6 +36,16 @@ def test_kernels_equal_plain_torch_in_values_and_gradients_dense_and_hashed() ->
         torch.testing.assert_close(point, x.grad, atol=2e-3, rtol=1e-3)
 
 
+def test_a_coordinate_that_is_not_a_number_gives_no_number_and_harms_no_other_point() -> None:
+    g, x = grid(), coords(3)
+    x[1, 2] = torch.nan
+    for out in (g(x, 1.3), g.reference(x, *g.time_slices(1.3))):
+        assert bool(out[1].isnan().all())
+        torch.testing.assert_close(out[::2], g(x[::2], 1.3))
+    g(x.requires_grad_(), 1.3).sum().backward()
+    assert x.grad is not None and bool(x.grad[::2].isfinite().all())
+
+
 def test_twin_gradient_agrees_with_finite_differences() -> None:
     g = grid().double()
     x = torch.tensor(

@@ -37,9 +37,14 @@ CHANNELS = 4
 
 @jit(inline="always")
 def cell_of(u: Any, resolution: Any) -> Any:
-    """Lower grid point and fraction in [0, 1] of a coordinate, clamped to [0, 1]."""
+    """Lower grid point and fraction in [0, 1] of a coordinate, clamped to [0, 1].
+
+    NaN has the first cell, and the fraction NaN: as an integer it may be any row.
+    """
     position = min(max(u, ZERO), ONE) * np.float32(resolution - 1)
-    low = min(np.int32(position), np.int32(resolution - 2))
+    low = np.int32(0)
+    if position > ZERO:
+        low = min(np.int32(position), np.int32(resolution - 2))
     return low, position - np.float32(low)
 
 

@@ -128,7 +128,7 @@ class AdditiveGrid(nn.Module):
         for level, resolution in enumerate(self.res):
             top = constant(tuple(resolution.tolist()), coords.device, torch.int64) - 1
             position = coords.clamp(0, 1) * top
-            low = torch.minimum(position.floor().long(), top - 1)
+            low = torch.minimum(position.nan_to_num().floor().long(), top - 1)
             fraction = position - low
             for s, slice_weight in zip(slices[level], weights[level], strict=True):
                 if slice_weight == 0:
