@@ -119,12 +119,17 @@ def test_more_gaussians_than_a_batch_and_an_opaque_stack() -> None:
     assert float(seen[..., -1].min()) > 0.999
 
 
-@pytest.mark.parametrize("part", range(4))
-def test_a_gaussian_that_is_not_a_number_is_not_drawn_and_harms_no_other(part: int) -> None:
+@pytest.mark.parametrize(
+    ("part", "value"),
+    [*((part, math.nan) for part in range(4)), (2, math.inf), (3, math.inf)],
+)
+def test_a_gaussian_that_is_not_finite_is_not_drawn_and_harms_no_other(
+    part: int, value: float
+) -> None:
     view = camera(16, 16)
     gaussians = scene(0, view, count=8)
     rest = [torch.cat([t[:7], t[8:]]) for t in gaussians]
-    gaussians[part].view(8, -1)[7, -1] = math.nan
+    gaussians[part].view(8, -1)[7, -1] = value
     weight = torch.ones(16, 16, 6, dtype=torch.float64)
     seen, gradients = drawn(simulated, gaussians, view, weight)
     expected, theirs = drawn(simulated, rest, view, weight)

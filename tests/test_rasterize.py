@@ -307,7 +307,7 @@ def test_opacity_never_exceeds_1_however_many_gaussians_there_are() -> None:
 @both
 @pytest.mark.parametrize(
     ("part", "bad"),
-    [*((part, math.nan) for part in range(4)), (0, math.inf), (2, math.inf)],
+    [*((part, math.nan) for part in range(4)), (0, math.inf), (2, math.inf), (3, math.inf)],
 )
 def test_a_gaussian_that_is_not_finite_is_not_drawn_and_harms_no_other(
     twin: Callable[..., Maps], part: int, bad: float

@@ -152,8 +152,8 @@ def ellipse(t, covariance, o, k, width, height):
     """
     xx, xy, yy = covariance
     hidden = False, (0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0)
-    if not (t[2] > NEAREST and o >= ALPHA_MIN):
-        return hidden  # behind, too faint, or not a number
+    if not (t[2] > NEAREST and ALPHA_MIN <= o < math.inf):
+        return hidden  # behind, too faint, or not finite
     x, y = k[0] * t[0] / t[2] + k[2], k[1] * t[1] / t[2] + k[3]
     reach = reach_of(o)
     rx, ry = reach * math.sqrt(xx), reach * math.sqrt(yy)
