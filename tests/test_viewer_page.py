@@ -281,6 +281,37 @@ def test_keys_choose_view_curve_camera_and_split(viewer: Page) -> None:
     assert state(viewer, "split") is False
 
 
+def key(viewer: Page, kind: str, name: str, repeated: bool = False) -> None:
+    text = {"text": name} if kind == "keyDown" and len(name) == 1 else {}
+    viewer.call("Input.dispatchKeyEvent", type=kind, key=name, autoRepeat=repeated, **text)
+
+
+def test_of_keys_that_are_held_down_arrows_alone_act_again(viewer: Page) -> None:
+    viewer.run("viewer.set({speed: 0.01, time: 0})")
+    for name in ("k", " ", "ArrowRight"):
+        for repeated in (False, True):
+            key(viewer, "keyDown", name, repeated)
+        if name == " ":
+            assert state(viewer, "playing") is True
+        key(viewer, "keyUp", name)
+    assert viewer.run("viewer.keys.length") == 1
+    assert 2 <= state(viewer, "time") < 3
+
+
+def test_the_camera_flies_while_a_key_is_held_and_in_that_mode_alone(viewer: Page) -> None:
+    key(viewer, "keyDown", "w")
+    assert state(viewer, "mode") == "fly"
+    viewer.wait("viewer.camera().c2w.some((row, i) => row[3] !== viewer.scene.views[0].c2w[i][3])")
+    viewer.press("1")
+    viewer.run("viewer.tick(performance.now() + 50)")
+    assert state(viewer, "mode") == "filmed"
+    key(viewer, "keyUp", "w")
+    key(viewer, "keyDown", "w")
+    key(viewer, "keyDown", "Alt")
+    key(viewer, "keyUp", "∑")  # of w, on a Mac
+    assert viewer.run("viewer.held.size") == 0
+
+
 def test_a_drag_orbits_and_keeps_a_rotation(viewer: Page) -> None:
     before = viewer.run("viewer.camera().c2w")
     viewer.drag((120, 100), (160, 110))

@@ -216,6 +216,7 @@ function connectKeyboard(player) {
     const { state } = player;
     const key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     const ahead = event.shiftKey ? 10 : 1;
+    const repeated = event.repeat && !key.startsWith("Arrow"); // of a key that is held down
     const actions = {
       " ": () => togglePlay(player),
       ArrowLeft: () => player.set({ time: state.time - ahead, playing: false }),
@@ -236,11 +237,9 @@ function connectKeyboard(player) {
       h: () => document.body.classList.toggle("bare"),
     };
     MODES.forEach((mode, i) => (actions[i + 1] = () => player.set({ mode })));
-    if (FLY_KEYS.includes(key) && player.free) {
-      if (state.mode !== "fly") player.set({ mode: "fly" });
-      player.held.add(key);
-    } else if (actions[key]) actions[key]();
-    else return;
+    if (FLY_KEYS.includes(key) && player.free) actions[key] = () => fly(player, key);
+    if (!actions[key]) return;
+    if (!repeated) actions[key]();
     event.preventDefault();
   });
   // after a click, keys are for the player again
@@ -255,7 +254,16 @@ function connectKeyboard(player) {
     ({ target }) => byPointer && target.matches("select") && target.blur(),
   );
   addEventListener("keyup", (event) => player.held.delete(event.key.toLowerCase()));
+  // a Mac hides the release of a letter beside Command, and names it otherwise beside Option
+  addEventListener("keydown", ({ key }) => {
+    if (key === "Meta" || key === "Alt") player.held.clear();
+  });
   addEventListener("blur", () => player.held.clear());
+}
+
+function fly(player, key) {
+  if (player.state.mode !== "fly") player.set({ mode: "fly" });
+  player.held.add(key);
 }
 
 /** Whether an element does something with a key itself. */

@@ -83,6 +83,7 @@ export class Player {
       if (change.split) change.mode = "filmed";
       else change.split = false;
     }
+    if (change.mode && change.mode !== "fly") this.held.clear();
     Object.assign(this.state, change);
     this.dirty = true;
     this.changed();
