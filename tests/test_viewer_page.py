@@ -416,6 +416,18 @@ def test_recorded_frames_say_their_own_exposure(tab: Page, toy: Scene, tmp_path:
     assert label == f"Recorded, {ev:+.1f} EV".replace("-", "−")
 
 
+def test_the_recorded_frame_is_of_the_camera_that_the_page_follows(
+    tab: Page, toy: Scene, tmp_path: Path
+) -> None:
+    file = scene_file(toy)
+    views = [replace(view, camera_id=i % 2) for i, view in enumerate(file.views)]
+    two = replace(file, views=views, responses=2 * file.responses)
+    open_page(tab, tmp_path / "scene.html", two)
+    tab.run("viewer.set({split: true, time: viewer.scene.views[1].time})")
+    shown = tab.run("viewer.scene.views.filter(view => view.address).map(view => view.camera_id)")
+    assert shown == [0]
+
+
 def test_without_parallax_the_camera_stays_where_it_filmed(
     tab: Page, toy: Scene, tmp_path: Path
 ) -> None:

@@ -2,10 +2,14 @@
 
 export const MODES = ["filmed", "fixed", "orbit", "fly"];
 
+/** The views of the camera that the page follows: the first one of several. */
+export function followed(views) {
+  return views.filter((view) => view.camera_id === views[0].camera_id);
+}
+
 /** The filmed camera at a time: { c2w, K } between its two neighbors. */
 export function filmedCamera(views, time) {
-  const first = views[0].camera_id;
-  const own = views.filter((view) => view.camera_id === first);
+  const own = followed(views);
   let after = own.findIndex((view) => view.time >= time);
   if (after < 0) after = own.length - 1;
   const before = Math.max(after - 1, 0);

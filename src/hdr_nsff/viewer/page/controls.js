@@ -1,7 +1,7 @@
 // What people touch: buttons, sliders, keys, the pointer on the picture.
 
 import { CURVES, EXTENDED } from "./curves.js";
-import { MODES } from "./cameras.js";
+import { MODES, followed } from "./cameras.js";
 import { SERVER_CURVES, SERVER_VIEWS } from "./frames.js";
 import { VIEWS } from "./renderer.js";
 
@@ -363,7 +363,7 @@ function showSplit(player, scene, state) {
   for (const id of ["recorded", "divider", "recorded-label", "rendered-label"])
     find(id).hidden = !on;
   if (!on) return;
-  const nearest = scene.views.reduce((best, view) =>
+  const nearest = followed(scene.views).reduce((best, view) =>
     Math.abs(view.time - state.time) < Math.abs(best.time - state.time) ? view : best,
   );
   nearest.address ??= URL.createObjectURL(
