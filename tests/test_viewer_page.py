@@ -378,10 +378,16 @@ def test_the_copied_path_is_one_that_render_reads(viewer: Page, toy: Scene, tmp_
     torch.testing.assert_close(views[0].camera.c2w, toy.train[0].camera.c2w, atol=1e-5, rtol=0)
 
 
-def test_the_path_of_a_clip_has_held_out_frames_too(viewer: Page) -> None:
+def test_the_path_of_a_clip_has_held_out_frames_too(viewer: Page, toy: Scene) -> None:
     viewer.run("viewer.scene.times = [0, 1, 2, 4, 5, 6, 7.5]")
     times = [view["time"] for view in viewer.run("viewer.cameraPath()")]
     assert times == [0, 1, 2, 3, 4, 5, 6, 7, 7.5]
+    for clip in ([0, 1, 3, 4, 6], [1 / 3, 1 / 3 + 1, 1 / 3 + 1.6666666]):
+        viewer.run(f"viewer.scene.times = {clip}")
+        times = [view["time"] for view in viewer.run("viewer.cameraPath()")]
+        expected = [view.time for view in paths.fixed_path(toy.train[0].camera, clip)]
+        assert times == pytest.approx(expected, abs=1e-6)
+        assert (times[0], times[-1]) == (clip[0], clip[-1])  # not outside of the clip
     viewer.run("viewer.scene.times = [3]")
     assert [view["time"] for view in viewer.run("viewer.cameraPath()")] == [3]
 

@@ -341,8 +341,9 @@ export class Player {
       ...(mode === "filmed" ? filmedCamera(this.scene.views, time) : this.pose),
     }));
     const exposed = curve === "camera" ? { ev } : {}; // others have no learned camera
+    const { times } = this.scene;
     return views.map(({ time, c2w, K }) => ({
-      time: round(time),
+      time: clamp(round(time), times[0], times[times.length - 1]), // `render` takes no other
       c2w: rounded(c2w),
       K: rounded(K),
       ...exposed,
@@ -354,7 +355,7 @@ export class Player {
 function evenTimes(times) {
   const [first, last] = [times[0], times[times.length - 1]];
   const gaps = times.slice(1).map((time, i) => time - times[i]);
-  const usual = gaps.sort((a, b) => a - b)[Math.floor(gaps.length / 2)];
+  const usual = gaps.sort((a, b) => a - b)[(gaps.length - 1) >> 1]; // as `paths.usual_gap`
   const count = usual ? Math.ceil((last - first) / usual - 1e-6) : 0;
   return [...Array.from({ length: count }, (_, k) => first + k * usual), last];
 }
