@@ -351,6 +351,22 @@ def test_the_path_is_copied_with_a_hint(viewer: Page) -> None:
     assert "--path path.json" in viewer.run(note) and "path.json" not in before
 
 
+def test_a_path_that_the_browser_does_not_copy_is_not_called_copied(viewer: Page) -> None:
+    viewer.run("navigator.clipboard.writeText = () => Promise.reject(new Error('no')); 0")
+    viewer.run("document.execCommand = () => false; 0")
+    viewer.click("#copy-path")
+    viewer.wait("document.getElementById('note').textContent.includes('did not let')")
+
+
+def test_a_saved_picture_is_named_by_its_own_time(viewer: Page) -> None:
+    save = "HTMLAnchorElement.prototype.click = function () { globalThis.saved = this.download; }"
+    later = "viewer.png = () => { viewer.set({time: 3}); return new Blob(); }"
+    viewer.run(f"{save}; {later}; viewer.set({{time: 1}})")
+    viewer.press("p")
+    viewer.wait("globalThis.saved")
+    assert viewer.run("saved") == "Toy_1.00.png"
+
+
 def test_buttons_work_by_pointer(viewer: Page) -> None:
     viewer.click("#play")
     assert state(viewer, "playing") is True
@@ -411,6 +427,20 @@ def test_a_right_click_drags_nothing(viewer: Page) -> None:
     viewer.call("Input.dispatchMouseEvent", type="mousePressed", **mouse, **left)
     viewer.call("Input.dispatchMouseEvent", type="mouseMoved", x=160, y=110)  # released elsewhere
     assert state(viewer, "mode") == "filmed"
+
+
+def test_a_drag_ends_with_the_left_button(viewer: Page) -> None:
+    def mouse(kind: str, x: float, button: str, buttons: int) -> None:
+        place = {"x": x, "y": 100, "clickCount": 1}
+        viewer.call("Input.dispatchMouseEvent", type=kind, button=button, buttons=buttons, **place)
+
+    mouse("mousePressed", 120, "left", 1)
+    mouse("mousePressed", 120, "right", 3)
+    mouse("mouseReleased", 120, "left", 2)
+    before = viewer.run("viewer.camera().c2w")
+    mouse("mouseMoved", 160, "right", 2)
+    mouse("mouseReleased", 160, "right", 0)
+    assert viewer.run("viewer.camera().c2w") == before
 
 
 def test_recorded_frames_say_their_own_exposure(tab: Page, toy: Scene, tmp_path: Path) -> None:

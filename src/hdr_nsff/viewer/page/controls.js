@@ -165,7 +165,7 @@ function connectPointer(player) {
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
   };
   canvas.onpointermove = (event) => {
-    if (!event.buttons) fingers.delete(event.pointerId);
+    if (!(event.buttons & 1)) fingers.delete(event.pointerId); // also beside another button
     const before = fingers.get(event.pointerId);
     if (!before) return;
     const width = canvas.clientWidth;
@@ -301,7 +301,8 @@ async function copyPath(player) {
   try {
     await navigator.clipboard.writeText(text);
   } catch {
-    copyBySelection(text); // where a page may not use the clipboard
+    // where a page may not use the clipboard
+    if (!copyBySelection(text)) return note("This browser did not let the page copy the path.");
   }
   const views = path.length === 1 ? "one view" : `${path.length} views`;
   const { camera } = player.state;
@@ -310,22 +311,25 @@ async function copyPath(player) {
   note(`Copied ${views}. Save it as path.json, then: ${command}`, 8);
 }
 
+/** Copy a text as people do; false where the browser refuses. */
 function copyBySelection(text) {
   const area = document.createElement("textarea");
   area.value = text;
   document.body.append(area);
   area.select();
-  document.execCommand("copy");
+  const copied = document.execCommand("copy");
   area.remove();
+  return copied;
 }
 
 async function savePng(player, bits) {
+  const { time } = player.state; // playback goes on while the file is made
   const picture = await player.png(bits);
   if (!picture) return note("Pictures can be saved where the browser draws them.");
   const link = document.createElement("a");
   link.href = URL.createObjectURL(picture);
   const signal = bits === 16 && player.isBeyondWhite() ? "_pq" : "";
-  link.download = `${player.scene.title}_${player.state.time.toFixed(2)}${signal}.png`;
+  link.download = `${player.scene.title}_${time.toFixed(2)}${signal}.png`;
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
