@@ -6,6 +6,8 @@ import hashlib
 import subprocess
 import sys
 from dataclasses import replace
+from http.client import IncompleteRead
+from io import BytesIO
 
 import pytest
 import torch
@@ -101,6 +103,28 @@ def test_a_failed_download_is_one_sentence_and_leaves_no_files(tmp_path, monkeyp
     with pytest.raises(InputError, match="cannot be downloaded"):
         find("raft")
     assert not list((tmp_path / "cache/raft").iterdir())
+
+
+class ShortAnswer(BytesIO):
+    """A server's answer that ends before all of it has arrived."""
+
+    def read(self, size: int | None = -1) -> bytes:
+        raise IncompleteRead(b"fl", 2)
+
+
+@pytest.mark.parametrize("answer", [BytesIO(b"<html>log in</html>"), ShortAnswer()])
+def test_a_download_that_is_not_the_weights_is_not_kept(answer, tmp_path, monkeypatch):
+    monkeypatch.delenv("HF_HUB_OFFLINE")
+    monkeypatch.setattr("urllib.request.urlopen", lambda url, timeout: answer)
+    with pytest.raises(InputError, match=r"SHA-256|cannot be downloaded"):
+        find("raft")
+    assert not list((tmp_path / "cache/raft").iterdir())
+
+
+@pytest.mark.parametrize(("value", "forbidden"), [("1", True), ("on", True), ("false", False)])
+def test_the_network_is_forbidden_by_the_words_of_the_hub(value, forbidden, monkeypatch):
+    monkeypatch.setenv("HF_HUB_OFFLINE", value)
+    assert weights.is_offline() == forbidden
 
 
 def test_a_download_goes_into_the_cache(tmp_path, monkeypatch):

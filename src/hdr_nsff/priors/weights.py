@@ -17,6 +17,7 @@ import os
 import shutil
 import urllib.request
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError, shorten
@@ -50,8 +51,7 @@ def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     if given is not None:
         return given_path(weights, Path(given))
     found = locate(weights)
-    offline = os.environ.get("HF_HUB_OFFLINE", "0") not in ("", "0")
-    if found is None and download and not offline:
+    if found is None and download and not is_offline():
         found = Found(fetch(weights), "download")
     if found is None:
         raise InputError(f"{missing_message(weights)}; {how_to_get(weights)}")
@@ -59,6 +59,11 @@ def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     if fault is not None:
         raise InputError(f"{found.path}: {fault}; delete it, and {how_to_get(weights)}")
     return found.path
+
+
+def is_offline() -> bool:
+    """Whether the environment forbids the network, in the hub library's words."""
+    return os.environ.get("HF_HUB_OFFLINE", "").upper() in ("1", "ON", "YES", "TRUE")
 
 
 def entry(name: str) -> Weights:
@@ -195,15 +200,22 @@ def fetch(weights: Weights) -> Path:
         f"({size_and_license(weights)}) to {target}"
     )
     try:
-        with (
-            atomic(target) as partial,
-            urllib.request.urlopen(weights.url, timeout=DOWNLOAD_TIMEOUT) as response,
-            partial.open("wb") as file,
-        ):
-            shutil.copyfileobj(response, file)
-    except OSError as error:
+        with atomic(target) as partial:
+            with (
+                urllib.request.urlopen(weights.url, timeout=DOWNLOAD_TIMEOUT) as response,
+                partial.open("wb") as file,
+            ):
+                shutil.copyfileobj(response, file)
+            fault = check_hash(weights, partial)
+            if fault is not None:  # cut short, or a page of a network that asks for a login
+                raise InputError(
+                    f"{weights.url}: what was downloaded {fault}; "
+                    f"run the same command again, or {how_to_get(weights)}"
+                )
+    except (OSError, HTTPException) as error:
         raise InputError(
-            f"{missing_message(weights)}, and cannot be downloaded ({error}); {how_to_get(weights)}"
+            f"{missing_message(weights)}, and cannot be downloaded ({shorten(error)}); "
+            f"{how_to_get(weights)}"
         ) from error
     return target
 
