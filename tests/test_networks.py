@@ -99,6 +99,8 @@ def test_weights_name_their_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         load_network("raft", tmp_path)
     with pytest.raises(InputError, match="does not name its network"):
         load_network(None, tmp_path / "flownet.pkl")
+    with pytest.raises(InputError, match=r"holds no weights.safetensors"):
+        load_network(None, tmp_path / "unfinished")
 
 
 @pytest.mark.parametrize(
@@ -106,13 +108,18 @@ def test_weights_name_their_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     [
         ("other.pkl", "do not fit gmflow"),
         ("list.pkl", "not the weights of a network"),
+        ("numbered.pkl", "not the weights of a network"),
         ("broken.pkl", "no readable weights"),
+        ("cut.pkl", "no readable weights"),
         ("broken.safetensors", "no readable weights"),
     ],
 )
 def test_weights_that_do_not_fit_are_refused_in_one_sentence(tmp_path: Path, name: str, words: str):
     torch.save({"something": torch.zeros(2)}, tmp_path / "other.pkl")
     torch.save([1, 2], tmp_path / "list.pkl")
+    torch.save({0: torch.zeros(2)}, tmp_path / "numbered.pkl")
+    torch.save({"a": torch.zeros(9)}, tmp_path / "cut.pkl", _use_new_zipfile_serialization=False)
+    (tmp_path / "cut.pkl").write_bytes((tmp_path / "cut.pkl").read_bytes()[:18])
     (tmp_path / "broken.pkl").write_bytes(b"PK nothing")
     (tmp_path / "broken.safetensors").write_bytes(b"nothing")
     with pytest.raises(InputError, match=words):

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from pickle import UnpicklingError
 from typing import Literal
 
 import numpy as np
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import safe_open
 from torch import Tensor
 from torch.nn import functional
 
@@ -40,15 +39,6 @@ FlowNetwork = GMFlow | Raft
 FINETUNED = "weights.safetensors"  # the file that `finetune-flow` leaves in its folder
 MULTIPLE = 32  # pixels: sides of a network's images are multiples of this, ...
 MIN_SIDE_PX = 128  # ... and no shorter than this
-UNREADABLE = (
-    SafetensorError,
-    UnpicklingError,
-    RuntimeError,
-    EOFError,
-    OSError,
-    ValueError,
-    KeyError,
-)  # raised by torch.load and safetensors for broken files
 
 
 @dataclass(frozen=True)
@@ -185,6 +175,11 @@ def load_network(
 def weights_file(name: Network | None, given: Path | None) -> Path:
     """The file that `load_network` reads; InputError where there is none."""
     finetuned = None if given is None else finetuned_file(given)
+    if finetuned is None and name is None and given is not None and not given.is_file():
+        raise InputError(
+            f"{given}: holds no {FINETUNED}; name the folder of a `hdr-nsff finetune-flow` "
+            "that has ended"
+        )
     return finetuned or find(name or "gmflow", given)
 
 
@@ -216,12 +211,14 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], str | None]:
         if path.suffix == ".safetensors":
             return read_safetensors(path)
         state = torch.load(path, map_location="cpu", weights_only=True)
-    except UNREADABLE as error:
+    except Exception as error:  # torch and safetensors raise many unrelated types
         reason = one_line(error, 120)
         raise InputError(f"{path}: no readable weights ({reason}); copy the file again") from error
     if isinstance(state, dict) and "model" in state:  # a training checkpoint
         state = state["model"]
-    if not isinstance(state, dict) or not all(isinstance(v, Tensor) for v in state.values()):
+    if not isinstance(state, dict) or not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    ):
         raise InputError(f"{path}: not the weights of a network; name another file")
     # saved from nn.DataParallel, names have a prefix
     return {name.removeprefix("module."): tensor for name, tensor in state.items()}, None
