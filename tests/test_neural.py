@@ -156,6 +156,14 @@ def test_missing_weights_are_refused_before_anything_is_written(clip, tmp_path, 
     assert not (tmp_path / "scene").exists()
 
 
+def test_weights_of_another_network_are_refused_before_anything_is_written(clip, tmp_path):
+    other = str(tiny_depth_anything(tmp_path / "network", "metric"))
+    for weights, words in ((other, "weights of 'depth_anything'"), ("xfeat", "no Sam2VideoModel")):
+        with pytest.raises(InputError, match=words):
+            prepare(replace(clip, out=tmp_path / "scene", masks="sam2", mask_weights=weights))
+    assert not (tmp_path / "scene").exists()
+
+
 def changed(weights: Path) -> None:
     """Other numbers under the same name."""
     from safetensors.torch import load_file, save_file

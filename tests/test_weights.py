@@ -85,6 +85,17 @@ def test_a_hub_model_is_a_folder_with_its_config_and_its_tensors(tmp_path):
         find("dinov2-small", tmp_path)
 
 
+def test_a_named_path_must_be_a_model_folder(tmp_path):
+    """A pickled model, and a link to a file that is gone, count as none."""
+    put(tmp_path / "model/config.json", b"{}")
+    put(tmp_path / "model/pytorch_model.bin", b"")
+    (tmp_path / "model/model.safetensors").symlink_to(tmp_path / "gone")
+    with pytest.raises(InputError, match=r"no model folder .* name one"):
+        find(str(tmp_path / "model"))
+    put(tmp_path / "gone", b"")
+    assert find(str(tmp_path / "model")) == tmp_path / "model"
+
+
 def test_any_model_of_the_hub_has_a_place_in_the_cache(tmp_path):
     with pytest.raises(InputError, match="someone--model"):
         find("someone/model")
@@ -181,6 +192,11 @@ def test_a_hub_model_without_a_known_hash_must_be_readable(tmp_path, capsys):
     assert "readable" in capsys.readouterr().out
     whole = (folder / "model.safetensors").read_bytes()
     (folder / "model.safetensors").write_bytes(whole[:2000])  # a copy cut short
+    with pytest.raises(SystemExit):
+        cli.main(["weights", "dinov2-small"])
+    assert "cannot be read" in capsys.readouterr().err
+    (folder / "model.safetensors").write_bytes(whole)
+    put(folder / "config.json", b"{")
     with pytest.raises(SystemExit):
         cli.main(["weights", "dinov2-small"])
     assert "cannot be read" in capsys.readouterr().err

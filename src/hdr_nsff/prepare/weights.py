@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import read_json
 from hdr_nsff.priors.known_weights import KNOWN, Weights
 from hdr_nsff.priors.weights import (
     cache_folder,
@@ -100,7 +101,9 @@ def check_weights(known: Weights, path: Path) -> tuple[str | None, str]:
     """
     if known.sha256 is not None:
         return check_hash(known, path), "SHA-256 right"
-    files = sorted(path.glob("*.safetensors")) if path.is_dir() else [path]
+    files = [path]
+    if path.is_dir():
+        files = [path / "config.json", *sorted(path.glob("*.safetensors"))]
     try:
         for file in files:
             check_readable(file)
@@ -110,8 +113,10 @@ def check_weights(known: Weights, path: Path) -> tuple[str | None, str]:
 
 
 def check_readable(file: Path) -> None:
-    """Raise the library's error where a file of weights cannot be read."""
-    if file.suffix == ".safetensors":
+    """Raise the library's error where a file of weights or settings cannot be read."""
+    if file.suffix == ".json":
+        read_json(file)
+    elif file.suffix == ".safetensors":
         with safe_open(file, "pt") as tensors:  # compares the header with the file's length
             tensors.keys()
     else:

@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 
-from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.errors import InputError, shorten
+from hdr_nsff.core.io import read_json
 from hdr_nsff.priors.weights import find
 
 # of rgb in [0, 1], (3, 1, 1): what nearly all of the networks were trained with
@@ -37,6 +38,28 @@ def architecture(name: str) -> Any:
     return getattr(transformers, name)
 
 
+def find_model(network: str, name: str, given: Path | None = None) -> Path:
+    """The folder that `pretrained` loads; InputError where it is missing, or of another
+    network, as far as its config.json shows.
+    """
+    expected = architecture(network).config_class.model_type
+    folder = find(name, given)
+    try:
+        settings = dict(read_json(folder / "config.json"))
+    except (OSError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{folder}: holds no {network}, its config.json cannot be read ({shorten(error)}); "
+            "name a folder that holds one"
+        ) from error
+    kind = settings.get("model_type", expected)
+    if kind != expected:
+        raise InputError(
+            f"{folder}: holds no {network} but weights of {shorten(kind)!r}; "
+            "name a folder that holds one"
+        )
+    return folder
+
+
 def pretrained(network: str, name: str, given: Path | None = None) -> Any:
     """A network with its weights, in evaluation mode, without gradients, float32, on
     the CPU.
@@ -45,17 +68,25 @@ def pretrained(network: str, name: str, given: Path | None = None) -> Any:
     `known_weights.KNOWN`, OWNER/MODEL, or a folder; `given`: a folder to load them from
     instead. InputError where transformers or the weights are missing, or do not fit.
     """
-    network_class = architecture(network)
-    folder = find(name, given)
+    folder = find_model(network, name, given)
     try:
-        loaded, report = network_class.from_pretrained(
-            folder, local_files_only=True, output_loading_info=True
+        loaded, report = architecture(network).from_pretrained(
+            folder,
+            local_files_only=True,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,  # its own error does not name them
         )
-    except Exception as error:  # of many types: broken JSON, a cut-off file, sizes that do not fit
-        reason = " ".join(str(error).split())[:200]
+    except Exception as error:  # of many types: a cut-off file, settings that do not fit
         raise InputError(
-            f"{folder}: no {network} can be loaded ({reason}); name a folder that holds one"
+            f"{folder}: no {network} can be loaded ({shorten(error, 200)}); "
+            "name a folder that holds one"
         ) from error
+    mismatched = sorted(name for name, *_ in report["mismatched_keys"])
+    if mismatched:
+        raise InputError(
+            f"{folder}: the size of {mismatched[0]} is not that of its config.json; "
+            "copy both files again"
+        )
     missing = sorted(report["missing_keys"])
     if missing:
         raise InputError(

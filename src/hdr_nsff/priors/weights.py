@@ -46,7 +46,7 @@ def find(name: str, given: Path | None = None, download: bool = True) -> Path:
     weights cannot be found, or where their hash is wrong.
     """
     if given is None and name not in KNOWN and Path(name).exists():
-        return Path(name)
+        return model_folder(Path(name), "a name of `hdr-nsff weights`")
     weights = entry(name)
     if given is not None:
         return given_path(weights, Path(given))
@@ -92,10 +92,17 @@ def given_path(weights: Weights, given: Path) -> Path:
     path = given / weights.file if weights.file and given.is_dir() else given
     if not path.exists():
         raise InputError(f"{path}: no such weights; correct the path, or {how_to_get(weights)}")
-    if weights.hub and not is_model_folder(path):
+    return model_folder(path, how_to_get(weights)) if weights.hub else path
+
+
+def model_folder(path: Path, otherwise: str) -> Path:
+    """`path`, where it is a folder with a model; InputError, which ends with what to do
+    `otherwise`, where it is none.
+    """
+    if not is_model_folder(path):
         raise InputError(
             f"{path}: no model folder with config.json and model.safetensors; "
-            f"name one, or {how_to_get(weights)}"
+            f"name one, or {otherwise}"
         )
     return path
 
@@ -139,8 +146,11 @@ def package_folder(weights: Weights) -> Path | None:
 
 
 def is_model_folder(folder: Path) -> bool:
-    """Whether a folder holds a model as transformers saves it."""
-    return (folder / "config.json").is_file() and any(folder.glob("*.safetensors"))
+    """Whether a folder holds a model as transformers saves it. A link to a file that is
+    gone does not count.
+    """
+    tensors = folder.glob("*.safetensors")
+    return (folder / "config.json").is_file() and any(file.is_file() for file in tensors)
 
 
 def hub_folder(weights: Weights, local: bool) -> Path | None:

@@ -25,7 +25,7 @@ from hdr_nsff.priors.masks.points_file import (
 from hdr_nsff.priors.masks.prompts import find_objects
 from hdr_nsff.priors.masks.sam2 import sam2_mask
 from hdr_nsff.priors.poses.lightglue import check_matcher, matcher_weights
-from hdr_nsff.priors.pretrained import architecture, pretrained
+from hdr_nsff.priors.pretrained import find_model, pretrained
 from hdr_nsff.priors.weights import content_hash, find
 
 SAM2, DEPTH_ANYTHING = "Sam2VideoModel", "DepthAnythingForDepthEstimation"
@@ -39,16 +39,14 @@ def check_networks(config: PrepareConfig) -> None:
     """
     check_matcher(config.matcher)
     if config.masks == "sam2":
-        architecture(SAM2)
-        find(config.mask_weights)
+        find_model(SAM2, config.mask_weights)
     elif config.mask_points is not None:
         raise InputError(
             "--mask-points: only `--mask sam2` can be corrected by points; "
             "choose it, or paint over the files in masks/ and give them"
         )
     if config.depth == "depth-anything":
-        architecture(DEPTH_ANYTHING)
-        find(config.depth_weights)
+        find_model(DEPTH_ANYTHING, config.depth_weights)
 
 
 def weights_of(config: PrepareConfig, step: StepName) -> list[str]:
