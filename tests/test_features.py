@@ -134,7 +134,13 @@ def test_the_layer_is_the_papers_share_of_the_depth(dino):
 
 
 @pytest.mark.parametrize(
-    ("layer", "stride", "words"), [(9, None, "has 4 layers"), (None, 15, "14 pixels wide")]
+    ("layer", "stride", "words"),
+    [
+        (9, None, "has 4 layers"),
+        (0, None, "has 4 layers"),
+        (None, 15, "14 pixels wide"),
+        (None, 0, "14 pixels wide"),
+    ],
 )
 def test_a_layer_or_stride_that_is_not_there_is_refused(dino, layer, stride, words):
     source = feature_source("dinov2-small", dino, layer, stride)

@@ -164,6 +164,13 @@ def test_weights_of_another_network_are_refused_before_anything_is_written(clip,
     assert not (tmp_path / "scene").exists()
 
 
+def test_weights_that_no_chosen_network_reads_are_refused(clip, tmp_path):
+    for option in ("mask_weights", "depth_weights"):
+        with pytest.raises(InputError, match=option.replace("_", "-") + " sam2-large: read by"):
+            prepare(replace(clip, out=tmp_path / "scene", **{option: "sam2-large"}))
+    assert not (tmp_path / "scene").exists()
+
+
 def changed(weights: Path) -> None:
     """Other numbers under the same name."""
     from safetensors.torch import load_file, save_file

@@ -100,6 +100,31 @@ def test_semantic_flow_takes_the_weights_of_its_features(tmp_path: Path):
         flow_source("semantic", broken, SemanticConfig(steps=-1))
 
 
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        (SemanticConfig(features="dinov2-small", layer=0), "1 or more"),
+        (SemanticConfig(features="dinov2-small", stride=0), "1 or more"),
+        (SemanticConfig(layer=3), "DINOv2 only"),
+        (SemanticConfig(steps=-1), "0 or more"),
+        (SemanticConfig(seed=-1), "0 or more"),
+    ],
+)
+def test_settings_of_semantic_flow_are_checked_before_any_work(
+    settings: SemanticConfig, words: str
+):
+    for chosen in (None, "semantic"):
+        with pytest.raises(InputError, match=words):
+            check_flow(chosen, None, settings)
+
+
+def test_settings_of_semantic_flow_are_for_it_alone(tmp_path: Path):
+    check_flow(None, None, SemanticConfig(steps=10))
+    for chosen in ("dis", tmp_path):
+        with pytest.raises(InputError, match="leave one of them out"):
+            check_flow(chosen, None, SemanticConfig(steps=10))
+
+
 def test_features_learn_from_training_frames_of_one_camera_at_a_time():
     """Two cameras of 5 and 2 frames, exposures 0, 1, 0, ..., frame 1 held out."""
     frames = [

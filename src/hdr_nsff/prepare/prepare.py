@@ -178,7 +178,7 @@ def check_settings(config: PrepareConfig) -> None:
             "choose a place outside"
         )
     pick_device(config.device)
-    check_flow(config.flow, config.flow_weights)
+    check_flow(config.flow, config.flow_weights, config.semantic)
     given = {
         "poses": config.poses,
         "mask": config.masks,

@@ -38,6 +38,17 @@ def check_networks(config: PrepareConfig) -> None:
     Its weights are downloaded where that is allowed.
     """
     check_matcher(config.matcher)
+    needs = {
+        "mask_weights": ("--mask sam2", config.masks == "sam2"),
+        "depth_weights": ("--depth depth-anything", config.depth == "depth-anything"),
+    }
+    for setting, (option, chosen) in needs.items():
+        name = getattr(config, setting)
+        if not chosen and name != getattr(PrepareConfig, setting):
+            raise InputError(
+                f"--{setting.replace('_', '-')} {name}: read by `{option}` alone; "
+                "add that option, or leave this one out"
+            )
     if config.masks == "sam2":
         find_model(SAM2, config.mask_weights)
     elif config.mask_points is not None:

@@ -96,13 +96,18 @@ def feature_source(
     if name != "xfeat":
         network = pretrained("Dinov2Model", name, weights).to(device)
         return partial(dinov2_features, network, layer=layer, stride=stride, tuning=tuning)
+    check_xfeat(layer, stride)
+    xfeat = load_xfeat(find("xfeat", weights)).to(device)
+    return partial(xfeat_features, xfeat, tuning=tuning)
+
+
+def check_xfeat(layer: int | None, stride: int | None) -> None:
+    """InputError where XFeat is given one of the two."""
     if layer is not None or stride is not None:
         raise InputError(
             "--semantic.layer and --semantic.stride: apply to the features of DINOv2 only; "
             "leave them out with `xfeat`"
         )
-    xfeat = load_xfeat(find("xfeat", weights)).to(device)
-    return partial(xfeat_features, xfeat, tuning=tuning)
 
 
 def run_per_frame(
@@ -237,8 +242,8 @@ def dinov2_features(
     """
     depth = network.config.num_hidden_layers
     patch = network.config.patch_size
-    layer = layer or round(tuning.dino_depth * depth)
-    stride = stride or patch // 2
+    layer = round(tuning.dino_depth * depth) if layer is None else layer
+    stride = patch // 2 if stride is None else stride
     if not 1 <= layer <= depth:
         raise InputError(
             f"--semantic.layer {layer}: this network has {depth} layers; choose 1 to {depth}"

@@ -45,6 +45,7 @@ from hdr_nsff.priors.flow.features import (
     Features,
     FeatureSource,
     FeatureTuning,
+    check_xfeat,
     feature_source,
 )
 from hdr_nsff.radiometry.common_range import common_gray
@@ -111,6 +112,17 @@ class SemanticTuning:
 SEMANTIC_TUNING = SemanticTuning()
 
 
+def check_semantic(config: SemanticConfig) -> None:
+    """InputError for settings that are out of range for every network."""
+    least = {"layer": 1, "stride": 1, "steps": 0, "seed": 0}
+    for name, lowest in least.items():
+        value = getattr(config, name)
+        if value is not None and value < lowest:
+            raise InputError(f"--semantic.{name} {value}: must be {lowest} or more")
+    if config.features == "xfeat":
+        check_xfeat(config.layer, config.stride)
+
+
 def semantic_flow(
     config: SemanticConfig,
     weights: Path | None,
@@ -126,11 +138,10 @@ def semantic_flow(
     `SemanticFlow`. Features are computed, fitted and searched for on `device`.
     InputError for settings out of range.
     """
+    check_semantic(config)
     steps = config.steps
     if steps is None:
         steps = 0 if config.features == "xfeat" else DINOV2_STEPS
-    if steps < 0:
-        raise InputError(f"--semantic.steps {steps}: must be 0 or more")
     if config.refiner == "published":
         tuning = replace(tuning, adapt=with_published_network(tuning.adapt))
     source = feature_source(

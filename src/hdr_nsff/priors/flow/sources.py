@@ -25,7 +25,13 @@ from hdr_nsff.priors.flow.networks import (
     network_flow,
     weights_file,
 )
-from hdr_nsff.priors.flow.semantic import Pairs, SemanticConfig, SemanticTuning, semantic_flow
+from hdr_nsff.priors.flow.semantic import (
+    Pairs,
+    SemanticConfig,
+    SemanticTuning,
+    check_semantic,
+    semantic_flow,
+)
 from hdr_nsff.priors.weights import entry, find, locate
 
 FlowName = Literal["dis", "semantic", "gmflow", "raft", "raft-finetuned"]
@@ -66,8 +72,12 @@ def fallback_note(chosen: FlowName | Path | None, features: str) -> str:
     )
 
 
-def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
-    """InputError where the chosen source, or its weights, cannot be used.
+def check_flow(
+    chosen: FlowName | Path | None,
+    weights: Path | None,
+    semantic: SemanticConfig | None = None,
+) -> None:
+    """InputError where the chosen source, its weights or its settings cannot be used.
 
     A network is loaded, so that bad weights are reported before any work is done.
     """
@@ -79,6 +89,14 @@ def check_flow(chosen: FlowName | Path | None, weights: Path | None) -> None:
         )
     if weights is not None:
         check_weights(chosen, weights)
+    semantic = semantic or SemanticConfig()
+    if chosen in (None, "semantic"):
+        check_semantic(semantic)
+    elif semantic != SemanticConfig():
+        raise InputError(
+            f"--semantic.*: settings of `--flow semantic`, which `--flow {chosen}` replaces; "
+            "leave one of them out"
+        )
     if chosen == "raft-finetuned" and weights is None:
         raise InputError(
             "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; "
