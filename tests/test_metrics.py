@@ -394,3 +394,17 @@ def test_lpips_names_what_is_wrong_with_its_weights(tmp_path):
         metrics.Lpips(tmp_path / "text.pth")
     with pytest.raises(InputError, match="no such weights file"):
         metrics.Lpips(tmp_path / "nowhere.pth")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"holds no \.pth file"):
+        metrics.Lpips(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("channels", [(64, 128, 256, 512, 512), (64, 128, 256, 384, 384, 512, 512)])
+def test_lpips_refuses_the_layers_of_vgg_and_squeezenet(tmp_path, channels):
+    """Their files lie beside AlexNet's in the authors' package, with the same names."""
+    net, linear = alexnet_weights()
+    torch.save(net | linear, tmp_path / "alex.pth")
+    others = {f"lin{k}.model.1.weight": torch.ones(1, c, 1, 1) for k, c in enumerate(channels)}
+    torch.save(others, tmp_path / "other.pth")
+    with pytest.raises(InputError, match=r"importance\.1 has the size of another network"):
+        metrics.Lpips(tmp_path)

@@ -242,7 +242,7 @@ def absences(headline: dict[str, Any], gauge: Gauge | None, units: Units | None)
 
 def lpips_note(weights: str | None, views: Sequence[dict[str, Any]]) -> str:
     """The weights of LPIPS, or why it is absent."""
-    if weights is None:
+    if not weights:
         return "absent; give --lpips FILE (AlexNet weights) or --lpips hub"
     if "lpips" in views[0]:
         return f"AlexNet v0.1, {weights}"

@@ -273,7 +273,14 @@ class Lpips(nn.Module):
         layers = zip(inputs, self.CHANNELS, self.KERNELS, self.STRIDES, self.PADDINGS, strict=True)
         self.convolutions = nn.ModuleList(nn.Conv2d(*layer) for layer in layers)
         self.importance = nn.ParameterList(torch.zeros(c) for c in self.CHANNELS)
-        self.load_state_dict(lpips_state(weights))
+        state = lpips_state(weights)
+        for name, parameter in self.state_dict().items():
+            if state[name].shape != parameter.shape:
+                raise InputError(
+                    f"{weights}: {name} has the size of another network than LPIPS's AlexNet; "
+                    "name the files of AlexNet alone"
+                )
+        self.load_state_dict(state)
         self.requires_grad_(False).eval()
 
     def forward(self, a: Tensor, b: Tensor) -> float:
@@ -340,15 +347,21 @@ def lpips_state(weights: Path | str | Sequence[Path]) -> dict[str, Tensor]:
             f"{', '.join(map(str, files))}: no complete LPIPS weights (AlexNet and linear "
             f"layers), {missing[0]} is missing"
         )
-    return state
+    return {name: state[name] for name in wanted}
 
 
 def list_weights(weights: Path | str | Sequence[Path]) -> list[Path]:
-    """The files of a file, of a folder's `.pth` files, or of a list of files."""
+    """The files of a file, of a folder's `.pth` files, or of a list of files.
+
+    InputError for a folder without any.
+    """
     if not isinstance(weights, Path | str):
         return list(weights)
     path = Path(weights)
-    return sorted(path.glob("*.pth")) if path.is_dir() else [path]
+    files = sorted(path.glob("*.pth")) if path.is_dir() else [path]
+    if not files:
+        raise InputError(f"{path}: holds no .pth file; name a file or folder of LPIPS weights")
+    return files
 
 
 def lpips_name(key: str) -> str | None:
