@@ -157,6 +157,13 @@ def test_without_points_the_network_is_refused_in_a_sentence():
         anchored_depth(true, "relative", clip, np.zeros((0, 3)), *NONE)
 
 
+@pytest.mark.parametrize("scale", [0, -7, np.nan])
+def test_predictions_without_any_relation_to_the_points_are_refused_in_a_sentence(scale):
+    clip, true, points = slanted()
+    with pytest.raises(InputError, match="does not rise"):
+        anchored_depth(scale * true + 9, "relative", clip, points, *NONE)
+
+
 @pytest.fixture(scope="module", params=["relative", "metric"])
 def tiny(request, tmp_path_factory):
     """A tiny Depth Anything, and its kind."""

@@ -172,7 +172,8 @@ def align(
     median error (T,) as a share of the disparity.
 
     `samples`: per frame (N, 2) predictions and disparities; without `with_shift` the
-    shift is 0. Frames without points get the median error of all.
+    shift is 0. Frames without points get the median error of all. InputError where the
+    predictions of the whole clip do not rise with the disparities.
 
     Each frame's line starts from the best of many through two of its points (RANSAC)
     and is refined by reweighting. All frames are solved together: those that lack
@@ -181,6 +182,11 @@ def align(
     """
     every_sample = np.concatenate([s for s in samples if len(s)])
     common = ransac_line(every_sample, with_shift, tuning)
+    if common is None:
+        raise InputError(
+            "--depth depth-anything: what the network predicts does not rise where static points "
+            "are nearer; use other --depth-weights, or --depth geometric"
+        )
     lines = np.zeros((len(samples), 2))
     for t, s in enumerate(samples):
         own = ransac_line(s, with_shift, tuning)
