@@ -4,15 +4,18 @@ import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from masks_of_discs import HEIGHT, WIDTH, disc
 from tiny_networks import tiny_depth_anything, tiny_sam2
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import read_mask, write_png
 from hdr_nsff.core.io import read_npy, write_npy, write_text
 from hdr_nsff.prepare.prepare import PrepareConfig, prepare
+from hdr_nsff.prepare.steps import neural
 from hdr_nsff.prepare.steps.neural import weights_of
 from hdr_nsff.priors.flow.semantic import SemanticConfig
 from hdr_nsff.priors.weights import KNOWN
@@ -104,6 +107,32 @@ def test_a_points_file_is_for_sam2_alone(clip, tmp_path):
     with pytest.raises(InputError, match="--mask sam2"):
         prepare(replace(clip, out=tmp_path / "scene", mask_points=tmp_path / "points.json"))
     assert not (tmp_path / "scene").exists()
+
+
+def test_a_new_object_of_one_camera_numbers_none_of_another_anew(tmp_path, monkeypatch):
+    """Both cameras see one mover in five frames: objects 1 and 2."""
+    slid = np.stack([disc(30 + 4 * t, 25, 11) for t in range(5)])
+    points = [
+        {"frame": 0, "object": 3, "x": 100.0, "y": 60.0, "label": 1},
+        {"frame": 5, "object": 2, "x": 40.0, "y": 50.0, "label": 0},
+    ]
+    (tmp_path / "points.json").write_text(json.dumps({"points": points}))
+    work = SimpleNamespace(
+        config=PrepareConfig(tmp_path, tmp_path, mask_points=tmp_path / "points.json"),
+        manifest=SimpleNamespace(
+            frames=[SimpleNamespace(split="train")] * 10, height=HEIGHT, width=WIDTH
+        ),
+        equalized=[np.zeros((10, HEIGHT, WIDTH, 3), np.float32)],
+        camera_frames=lambda: [list(range(5)), list(range(5, 10))],
+        folder=tmp_path,
+    )
+    prompted = []
+    monkeypatch.setattr(neural, "load_network", lambda *which: None)
+    monkeypatch.setattr(
+        neural, "sam2_mask", lambda network, video, objects, note: prompted.append(objects) or False
+    )
+    neural.sam2_masks(work, np.concatenate([slid, slid]))  # type: ignore[arg-type]
+    assert [[o.number for o in objects] for objects in prompted] == [[1, 3], [2]]
 
 
 def test_points_in_held_out_frames_are_refused(clip, motion, tmp_path):

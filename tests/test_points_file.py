@@ -64,6 +64,7 @@ BOX = {"frame": 1, "object": 1, "left": 5.0, "top": 1.0, "right": 6.0, "bottom":
         ({"points": [POINT | {"frame": 9}]}, "9 frames"),
         ({"boxes": [BOX | {"right": 4.0}]}, "empty"),
         ({"boxes": [BOX | {"frame": 9}]}, "9 frames"),
+        ({"boxes": [BOX | {"left": 120.0, "right": 130.0}]}, "120x80"),
     ],
 )
 def test_a_points_file_with_a_mistake_is_one_sentence(contents: dict, words: str, tmp_path):

@@ -93,12 +93,12 @@ def sam2_masks(work: Work, moving: np.ndarray) -> np.ndarray:
     video = work.equalized[0]
     outlined = np.zeros_like(moving)
     written: dict[str, list[Any]] = {"points": [], "boxes": []}
-    num_objects = 0  # of the cameras before
+    num_found = 0  # in the clips of the cameras before
     for of_camera in work.camera_frames():
         train = [i for i in of_camera if frames[i].split == "train"]
-        found = find_objects(moving[train], num_objects + 1)
+        found = find_objects(moving[train], num_found + 1)
+        num_found += len(found)  # not the user's: they must not number later ones anew
         prompts = merge_prompts(found, given, train)
-        num_objects = max([num_objects, *(p.number for p in prompts)])
         for key, entries in to_points_file(prompts, train).items():
             written[key] += entries
         outlined[train] = sam2_mask(network, video[train], prompts, "masks: sam2")

@@ -78,7 +78,7 @@ def read_points(path: Path, count: int, size: tuple[int, int]) -> PointsFile:
     for point in given.points:
         check_point(path, point, count, size)
     for box in given.boxes:
-        check_box(path, box, count)
+        check_box(path, box, count, size)
     return given
 
 
@@ -93,11 +93,15 @@ def check_point(path: Path, point: PointEntry, count: int, size: tuple[int, int]
         )
 
 
-def check_box(path: Path, box: BoxEntry, count: int) -> None:
-    """InputError for an empty box, or one in no frame of the clip."""
+def check_box(path: Path, box: BoxEntry, count: int, size: tuple[int, int]) -> None:
+    """InputError for an empty box, or one that lies beside the frames or in none."""
+    height, width = size
     where = f"{path}: the box of object {box.object} in frame {box.frame}"
-    if box.frame >= count:
-        raise InputError(f"{where} is outside the clip of {count} frames; correct it")
+    beside = box.right <= 0 or box.bottom <= 0 or box.left >= width or box.top >= height
+    if box.frame >= count or beside:
+        raise InputError(
+            f"{where} is outside the clip of {count} frames of {width}x{height} pixels; correct it"
+        )
     if box.left >= box.right or box.top >= box.bottom:
         raise InputError(f"{where} is empty; correct it")
 
