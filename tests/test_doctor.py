@@ -19,6 +19,8 @@ PROJECT = tomllib.loads((Path(__file__).parents[1] / "pyproject.toml").read_text
 
 LIBRARIES = doctor.REQUIRED | doctor.HELPFUL
 EXTRAS = doctor.EXTRAS
+NEEDED_BY_WEIGHTS = ("torch", "numpy", "rich", "safetensors", "cv2", "OpenEXR")
+LIBRARIES_OF_WEIGHTS = {k: v for k, v in doctor.REQUIRED.items() if v in NEEDED_BY_WEIGHTS}
 
 
 @pytest.fixture(autouse=True)
@@ -85,6 +87,19 @@ def test_a_library_that_breaks_on_import_is_a_problem_and_not_the_end(
         f"cannot run: numpy {'' if 'crash' in reason else 'cannot be imported ('}{reason}" in said
     )
     assert "weights: unknown without" in said
+
+
+def test_broken_weights_that_run_would_read_are_a_problem(
+    tmp_path: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(doctor, "REQUIRED", LIBRARIES_OF_WEIGHTS)
+    monkeypatch.setattr(doctor, "import_fault", lambda module: None)
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(tmp_path))
+    (tmp_path / "xfeat").mkdir()
+    (tmp_path / "xfeat" / "xfeat.pt").write_text("no weights")
+    said = block(capsys, 1)
+    assert "weights: xfeat BROKEN" in said
+    assert f"cannot run: {tmp_path}/xfeat/xfeat.pt has SHA-256" in said
 
 
 def test_a_library_that_is_too_old_is_a_problem(

@@ -67,6 +67,7 @@ EXTRAS = {
     "raft": {"torchvision>=0.21": "torchvision"},
     "neural": {"transformers>=5.2,<6": "transformers", "kornia>=0.9,<0.10": "kornia"},
 }
+DEFAULT_WEIGHTS = "xfeat"  # `run` reads them where they are here, and needs none else
 # What videos are encoded with; `run` cannot do without the first.
 ENCODERS = ("libx264", "libx265", "libsvtav1", "prores_ks")
 CPU_FEATURES = ("avx", "avx2", "fma", "avx512f", "amx-tile", "neon", "sve")
@@ -349,11 +350,22 @@ def numba_cache(report: Report) -> None:
 
 
 def weights(report: Report) -> None:
-    """Which networks' weights are on this machine."""
+    """Which networks' weights are on this machine, and which of them are broken."""
     known = importlib.import_module("hdr_nsff.priors.weights")
-    found = [name for name, entry in known.KNOWN.items() if known.locate(entry) is not None]
-    others = len(known.KNOWN) - len(found)
-    report.add("weights", f"{', '.join(found) or 'none'}; {others} others not here")
+    words = []
+    for name, entry in known.KNOWN.items():
+        found = known.locate(entry)
+        if found is None:
+            continue
+        fault = known.check_hash(entry, found.path)
+        words.append(f"{name} BROKEN" if fault else name)
+        if fault and name == DEFAULT_WEIGHTS:
+            report.problems.append(
+                f"{short(str(found.path))} {fault}; delete it, then `hdr-nsff weights {name}` "
+                "shows how to get it"
+            )
+    others = len(known.KNOWN) - len(words)
+    report.add("weights", f"{', '.join(words) or 'none'}; {others} others not here")
 
 
 def summary(error: BaseException) -> str:
