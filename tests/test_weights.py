@@ -163,6 +163,16 @@ def test_the_list_names_all_with_licenses_and_how_to_get_them(capsys):
     assert "hf download facebook/dinov2-large" in output
 
 
+def test_no_path_and_no_command_of_the_list_is_cut(tmp_path, monkeypatch, capsys):
+    known(monkeypatch, b"tensors")
+    folder = tmp_path / "a_folder_with_a_name_of_sixty_characters_that_fills_the_line"
+    monkeypatch.setenv("HDR_NSFF_WEIGHTS", str(folder))
+    cached = put(folder / "gmflow/flownet.pkl", b"tensors")
+    output = listed(capsys)
+    assert str(cached) in output and str(KNOWN["raft"].url) in output
+    assert f"hf download {KNOWN['depth-anything-outdoor'].hub}" in output
+
+
 def test_the_list_marks_broken_files(tmp_path, monkeypatch, capsys):
     known(monkeypatch, b"tensors")
     cached = put(tmp_path / "cache/gmflow/flownet.pkl", b"tensors")

@@ -26,7 +26,7 @@ from hdr_nsff.priors.weights import (
     size_and_license,
 )
 
-PIPE_WIDTH = 220  # characters of a line where the output is no terminal
+PIPE_WIDTH = 1000  # characters of a line where the output is no terminal
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,9 @@ def weights(config: WeightsConfig) -> None:
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = PIPE_WIDTH
-    table = Table("name", "for", "size and license", "here", "get it by", box=None)
+    table = Table(box=None)
+    for heading in ("name", "for", "size and license", "here", "get it by"):
+        table.add_column(heading, overflow="fold")  # a path or command that is cut is no use
     for known in KNOWN.values():
         place = found_place(known)
         command = "" if place else get_command(known)
