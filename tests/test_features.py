@@ -16,6 +16,7 @@ from hdr_nsff.priors.flow.features import (
     FeatureTuning,
     XFeat,
     dinov2_features,
+    enlarge_and_pad,
     feature_source,
     load_xfeat,
     patch_tokens,
@@ -146,6 +147,14 @@ def test_a_layer_or_stride_that_is_not_there_is_refused(dino, layer, stride, wor
     source = feature_source("dinov2-small", dino, layer, stride)
     with pytest.raises(InputError, match=words):
         source(noise(1, 28, 28, 3))
+
+
+def test_texture_finer_than_the_pixels_of_a_shrunk_frame_is_averaged():
+    """Stripes of 2.1 pixels, at 0.45 times the size of the frame."""
+    stripes = 0.5 + 0.5 * np.cos(2 * np.pi * np.arange(400) / 2.1)
+    frame = np.broadcast_to(stripes[:, None], (40, 400, 3)).astype(np.float32)
+    shrunk = enlarge_and_pad(frame, 0.45, 1)[..., 4:-4]
+    assert shrunk.shape == (1, 3, 18, 172) and (shrunk - 0.5).abs().max() < 0.01
 
 
 def test_xfeat_has_no_layer_to_choose():

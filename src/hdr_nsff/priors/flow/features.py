@@ -137,7 +137,11 @@ def enlarge_and_pad(frame: np.ndarray, scale: float, multiple: int) -> Tensor:
     image = torch.from_numpy(np.ascontiguousarray(frame, np.float32)).permute(2, 0, 1)[None]
     if scale != 1:
         image = functional.interpolate(
-            image, scale_factor=scale, mode="bicubic", recompute_scale_factor=False
+            image,
+            scale_factor=scale,
+            mode="bicubic",
+            recompute_scale_factor=False,
+            antialias=scale < 1,
         ).clamp(0, 1)
     height, width = image.shape[-2:]
     return functional.pad(image, (0, -width % multiple, 0, -height % multiple), mode="replicate")
