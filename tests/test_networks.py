@@ -95,7 +95,7 @@ def test_weights_name_their_network(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert torch.equal(network.state_dict()["upsampler.0.bias"], state["upsampler.0.bias"])
         assert not any(p.requires_grad for p in network.parameters())
     assert isinstance(load_network(None, tmp_path), GMFlow)
-    with pytest.raises(InputError, match="weights of gmflow, not of raft"):
+    with pytest.raises(InputError, match="not of raft; choose the network gmflow"):
         load_network("raft", tmp_path)
     with pytest.raises(InputError, match="does not name its network"):
         load_network(None, tmp_path / "flownet.pkl")

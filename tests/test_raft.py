@@ -12,7 +12,7 @@ from hdr_nsff.priors.flow.raft import Raft
 
 def test_raft_without_torchvision_is_one_sentence(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "torchvision", None)
-    words = r"--flow raft: torchvision cannot be imported .* use --flow gmflow or dis"
+    words = r"^raft: torchvision cannot be imported .* another network, such as gmflow"
     with pytest.raises(InputError, match=words):
         Raft()
 

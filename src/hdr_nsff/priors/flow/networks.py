@@ -158,7 +158,7 @@ def load_network(
     if name is not None and network_of_file not in (None, name):
         raise InputError(
             f"{path}: weights of {network_of_file}, not of {name}; "
-            f"use --flow {network_of_file} or other weights"
+            f"choose the network {network_of_file}, or other weights"
         )
     chosen = name or network_of_file
     network = build(chosen, torch.device(device))

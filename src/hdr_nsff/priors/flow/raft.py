@@ -57,8 +57,8 @@ def torchvision_raft() -> nn.Module:
         # RuntimeError: a torchvision for CUDA beside a torch for the CPU
         reason = " ".join(str(error).split())[:120]
         raise InputError(
-            f"--flow raft: torchvision cannot be imported ({reason}); install the extra `raft` "
-            "beside the torch it was built for, or use --flow gmflow or dis"
+            f"raft: torchvision cannot be imported ({reason}); install the extra `raft` "
+            "beside the torch it was built for, or choose another network, such as gmflow"
         ) from error
     network: nn.Module = raft_large(weights=None, progress=False)
     return network
