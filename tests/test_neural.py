@@ -193,6 +193,12 @@ def test_weights_of_another_network_are_refused_before_anything_is_written(clip,
     assert not (tmp_path / "scene").exists()
 
 
+@pytest.mark.parametrize("chosen", [{}, {"poses": None, "tripod": True}])
+def test_a_matcher_is_refused_where_no_keypoints_are_matched(chosen, clip, tmp_path):
+    with pytest.raises(InputError, match="no keypoints are matched with --"):
+        prepare(replace(clip, out=tmp_path / "scene", matcher="disk", **chosen))
+
+
 def test_weights_that_no_chosen_network_reads_are_refused(clip, tmp_path):
     for option in ("mask_weights", "depth_weights"):
         with pytest.raises(InputError, match=option.replace("_", "-") + " sam2-large: read by"):

@@ -172,6 +172,11 @@ def check_settings(config: PrepareConfig) -> None:
         raise InputError(f"--rig {config.rig}: give the number of cameras, or 1 for one camera")
     if config.tripod and config.poses is not None:
         raise InputError("--tripod and --poses both given; leave one out")
+    if config.matcher != "sift" and (config.tripod or config.poses is not None):
+        option = "--tripod" if config.tripod else "--poses"
+        raise InputError(
+            f"--matcher {config.matcher}: no keypoints are matched with {option}; leave one out"
+        )
     if truth_place(config).resolve().is_relative_to(config.out.resolve()):
         raise InputError(
             f"--truth-out {config.truth_out}: inside the scene folder, where training reads; "
