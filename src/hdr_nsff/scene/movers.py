@@ -76,7 +76,8 @@ def fill_mover_depth(
     """`disparity` and `confidence` (H, W) with the shapes of movers at the t-th time.
 
     A pixel that is `moving` (H, W) takes the depth of the nearest tracks of one mover,
-    as the camera at `c2w` (3, 4) sees them; pixels far from any track stay as they are.
+    as the camera at `c2w` (3, 4) sees them. Pixels far from any track stay as they are,
+    and so do those of a mover that is not rigid whose own depth is known better.
     """
     disparity, confidence = disparity.copy(), confidence.copy()
     pixels, inverse_depths, owners = track_depths(movers, t, c2w)
@@ -91,6 +92,8 @@ def fill_mover_depth(
     found = (weight * inverse_depths[nearest]).sum(1) / weight.sum(1)
     change = np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9)))
     near = (distance[:, 0] < MAX_TRACK_DISTANCE_PX) & (change < np.log(MAX_DEPTH_RATIO))
+    rigid = np.array([mover.rigid for mover in movers])[owners[nearest[:, 0]]]
+    near &= rigid | (confidence[y, x] <= TRACK_CONFIDENCE)
     y, x = y[near], x[near]
     disparity[y, x] = found[near]
     falloff = np.exp(-((distance[near, 0] / MAX_TRACK_DISTANCE_PX) ** 2))

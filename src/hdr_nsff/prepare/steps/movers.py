@@ -10,10 +10,11 @@ import torch
 
 from hdr_nsff.core.stack import ArrayStack, by_key, map_stack, with_pixels
 from hdr_nsff.prepare.result import StepResult
-from hdr_nsff.prepare.work import Work
+from hdr_nsff.prepare.work import Flows, Work
 from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges, same_time_depth
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
+from hdr_nsff.priors.movers.pixel_distance import pixel_depth
 from hdr_nsff.priors.movers.rigidity import judge_rigidity
 from hdr_nsff.priors.movers.synchronized import take_same_time_depth
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
@@ -27,7 +28,8 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
 
     Where the depth is that of the static scene, there are two rounds, on pixels that
     parallax does not explain. The first one places the movers. The second one starts
-    from the depth of their shapes, inside the outlines of the masks.
+    from the depth of their shapes, inside the outlines of the masks. Pixels of movers
+    that are not rigid then get distances of their own, where the cameras show these.
     """
     if work.manifest.depth_kind == "relative":
         return result((), {}, "not estimated: depth is known up to scale and shift only")
@@ -38,28 +40,18 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     still = work.still()
     clip = work.training_clip()
     masks = clip.moving
-    indices = np.array([f.index for f in work.train])
-    maps: dict[str, Mapping[int, np.ndarray]] = {}
+    whole: PosedVideo | None = None  # with movers whose depth is estimated
+    first: tuple[ArrayStack, ArrayStack] | None = None  # disparity, confidence
     if without_parallax(work):
         share = np.float32(tuning.depth_share_without_parallax)
         disparity = map_stack(lambda d, k: np.where(masks[k], d / share, d), disparity)
-        maps["mover_disparity"] = by_key(indices.tolist(), disparity)
-        maps["mover_confidence"] = by_key(indices.tolist(), confidence)
+        first = disparity, confidence
     elif still is not None:  # the depth is that of the static scene, without movers
-        clip = replace(clip, moving=masks & ~still)
-        moving = clip.moving
-        found, trust = mover_depth(clip, *flow, disparity, tuning.distance)
-        agree = any(np.any(c) for c in confidence)  # about the depth of something
-        if work.manifest.synchronized and agree:
-            seen = same_time_depth(clip, work.static_points())
-            if seen is not None:
-                found, trust = take_same_time_depth(
-                    found, trust, *seen, clip.moving, tuning.synchronized
-                )
-        disparity = found  # that of the static scene elsewhere
+        clip = whole = replace(clip, moving=masks & ~still)
+        moving = whole.moving
+        disparity, trust = first_depth(work, whole, flow, tuning)
         confidence = map_stack(lambda c, k: np.where(moving[k], trust[k], c), confidence)
-        maps["mover_disparity"] = by_key(indices.tolist(), found)
-        maps["mover_confidence"] = by_key(indices.tolist(), trust)
+        first = disparity, trust
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
@@ -68,6 +60,13 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
             clip = replace(clip, moving=within_outlines(masks) & ~still)
         movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     movers = judge_rigidity(movers, clip, *flow, disparity, tuning.rigidity)
+    if first and whole and not all(mover.rigid for mover in movers):
+        first = pixel_depth(whole, *flow, *first, movers, tuning.pixels)
+    indices = np.array([f.index for f in work.train])
+    maps: dict[str, Mapping[int, np.ndarray]] = {}
+    if first is not None:
+        names = ("mover_disparity", "mover_confidence")
+        maps = {n: by_key(indices.tolist(), m) for n, m in zip(names, first, strict=True)}
     movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
     shapes = sum(mover.has_shape for mover in movers)
     rigid = sum(mover.rigid for mover in movers)
@@ -77,6 +76,22 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         if rigid < len(movers):
             note += "; from new viewpoints, the others are guesses beyond what a cycle shows"
     return result(movers, maps, note)
+
+
+def first_depth(
+    work: Work, clip: PosedVideo, flow: Flows, tuning: MoversTuning
+) -> tuple[ArrayStack, ArrayStack]:
+    """Disparity and confidence (T, H, W) of moving pixels, region by region, and of
+    those that several cameras see at one time; those of the static scene elsewhere.
+    """
+    behind, agreement = work.static_depth()
+    disparity, confidence = mover_depth(clip, *flow, behind, tuning.distance)
+    if not work.manifest.synchronized or not any(np.any(c) for c in agreement):
+        return disparity, confidence
+    seen = same_time_depth(clip, work.static_points())
+    if seen is None:
+        return disparity, confidence
+    return take_same_time_depth(disparity, confidence, *seen, clip.moving, tuning.synchronized)
 
 
 def without_parallax(work: Work) -> bool:

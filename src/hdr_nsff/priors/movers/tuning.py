@@ -306,6 +306,51 @@ MOVER_DISTANCE_TUNING = MoverDistanceTuning()
 
 
 @dataclass(frozen=True)
+class PixelDistanceTuning:
+    """Tuning constants of the distance of single moving pixels, hand-chosen on rendered
+    rigs. Half or twice of noise and window changes the error by less than a tenth.
+    """
+
+    reach_frames: int = 3
+    """Neighbors on each side that flow is chained to."""
+    min_valid: float = 0.99
+    """Of the four pixels around a point of a chain, the share that must be valid."""
+    noise_px: float = 0.25
+    """Standard deviation of flow over one link; more where residuals show it."""
+    velocity_sigma_px: float = 20.0
+    """Standard deviation of velocity, pixels a frame at the pixel's distance."""
+    acceleration_sigma_px: float = 3.0
+    """The same of acceleration, pixels a frame^2."""
+    jerk_sigma_px: float = 1.0
+    """The same of jerk, pixels a frame^3: without it, a fast mover's own motion passes
+    for parallax.
+    """
+    robust_rounds: int = 4
+    """Reweighted solutions of a pixel."""
+    robust_sigmas: float = 4.0
+    """Residual, in its sigmas, at which an end of flow counts half (Cauchy weight)."""
+    stride_px: int = 2
+    """Distance of the pixels that are solved, in x and in y."""
+    window_px: float = 4.0
+    """Standard deviation of the Gaussian over which they are averaged."""
+    independent_pixels: float = 2.0
+    """Pixels within it whose flow errs independently."""
+    prior_sigma: float = 0.2
+    """Relative standard deviation of the distance that is refined."""
+    max_median_sigma: float = 0.1
+    """Relative standard deviation of distance that half of a mover's pixels must reach:
+    cloth before a rendered rig has 0.04 to 0.07, things too fast for flow 0.15 to 0.2.
+    """
+    max_change: float = 0.7
+    """Relative change of disparity, at most."""
+    confidence: float = 0.6
+    """Of a pixel whose distance is taken: more than that of a track's shape."""
+
+
+PIXEL_DISTANCE_TUNING = PixelDistanceTuning()
+
+
+@dataclass(frozen=True)
 class MoversTuning:
     """All tuning constants of movers. `dataclasses.replace` changes a record."""
 
@@ -314,6 +359,7 @@ class MoversTuning:
     bundle: BundleTuning = BUNDLE_TUNING
     segmentation: MotionSegmentationTuning = MOTION_SEGMENTATION_TUNING
     distance: MoverDistanceTuning = MOVER_DISTANCE_TUNING
+    pixels: PixelDistanceTuning = PIXEL_DISTANCE_TUNING
     rigidity: RigidityTuning = RIGIDITY_TUNING
     synchronized: SynchronizedTuning = SYNCHRONIZED_TUNING
     depth_share_without_parallax: float = 0.85
