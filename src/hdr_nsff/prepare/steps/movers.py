@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from hdr_nsff.prepare.work import Flows, Work
 from hdr_nsff.priors.depth.geometric import lower_confidence_at_edges, same_time_depth
 from hdr_nsff.priors.movers.distance import mover_depth
 from hdr_nsff.priors.movers.estimate import estimate_movers
-from hdr_nsff.priors.movers.pixel_distance import pixel_depth
+from hdr_nsff.priors.movers.pixel_distance import believe_well_placed, pixel_distances
 from hdr_nsff.priors.movers.rigidity import judge_rigidity
 from hdr_nsff.priors.movers.synchronized import take_same_time_depth
 from hdr_nsff.priors.movers.tuning import MOVERS_TUNING, MoversTuning
@@ -28,8 +28,7 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
 
     Where the depth is that of the static scene, there are two rounds, on pixels that
     parallax does not explain. The first one places the movers. The second one starts
-    from the depth of their shapes, inside the outlines of the masks. Pixels of movers
-    that are not rigid then get distances of their own, where the cameras show these.
+    from the depth of their shapes, inside the outlines of the masks.
     """
     if work.manifest.depth_kind == "relative":
         return result((), {}, "not estimated: depth is known up to scale and shift only")
@@ -40,18 +39,19 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     still = work.still()
     clip = work.training_clip()
     masks = clip.moving
-    whole: PosedVideo | None = None  # with movers whose depth is estimated
-    first: tuple[ArrayStack, ArrayStack] | None = None  # disparity, confidence
+    indices = [f.index for f in work.train]
+    estimated: FirstDepth | None = None
+    maps: dict[str, Mapping[int, np.ndarray]] = {}
     if without_parallax(work):
         share = np.float32(tuning.depth_share_without_parallax)
         disparity = map_stack(lambda d, k: np.where(masks[k], d / share, d), disparity)
-        first = disparity, confidence
+        maps = maps_of(indices, disparity, confidence)
     elif still is not None:  # the depth is that of the static scene, without movers
-        clip = whole = replace(clip, moving=masks & ~still)
-        moving = whole.moving
-        disparity, trust = first_depth(work, whole, flow, tuning)
-        confidence = map_stack(lambda c, k: np.where(moving[k], trust[k], c), confidence)
-        first = disparity, trust
+        moving = masks & ~still
+        clip = replace(clip, moving=moving)
+        first = estimated = first_depth(work, clip, flow, tuning)
+        disparity = first.disparity
+        confidence = map_stack(lambda c, k: np.where(moving[k], first.confidence[k], c), confidence)
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
@@ -60,14 +60,12 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
             clip = replace(clip, moving=within_outlines(masks) & ~still)
         movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     movers = judge_rigidity(movers, clip, *flow, disparity, tuning.rigidity)
-    if first and whole and not all(mover.rigid for mover in movers):
-        first = pixel_depth(whole, *flow, *first, movers, tuning.pixels)
-    indices = np.array([f.index for f in work.train])
-    maps: dict[str, Mapping[int, np.ndarray]] = {}
-    if first is not None:
-        names = ("mover_disparity", "mover_confidence")
-        maps = {n: by_key(indices.tolist(), m) for n, m in zip(names, first, strict=True)}
-    movers = tuple(replace(mover, frames=indices[mover.frames]) for mover in movers)
+    if estimated is not None:
+        believed = believe_well_placed(
+            estimated.confidence, estimated.moving, estimated.sigmas, movers, tuning.pixels
+        )
+        maps = maps_of(indices, estimated.disparity, believed)
+    movers = tuple(replace(m, frames=np.array(indices)[m.frames]) for m in movers)
     shapes = sum(mover.has_shape for mover in movers)
     rigid = sum(mover.rigid for mover in movers)
     note = "none found"
@@ -78,20 +76,38 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     return result(movers, maps, note)
 
 
-def first_depth(
-    work: Work, clip: PosedVideo, flow: Flows, tuning: MoversTuning
-) -> tuple[ArrayStack, ArrayStack]:
-    """Disparity and confidence (T, H, W) of moving pixels, region by region, and of
-    those that several cameras see at one time; those of the static scene elsewhere.
+@dataclass(frozen=True)
+class FirstDepth:
+    """The depth of moving pixels before movers have shapes; maps are (T, H, W)."""
+
+    moving: np.ndarray  # bool
+    disparity: ArrayStack  # that of the static scene elsewhere
+    confidence: ArrayStack  # 0 elsewhere
+    sigmas: list[np.ndarray]  # relative standard deviations (M,) of each frame's pixels
+
+
+def first_depth(work: Work, clip: PosedVideo, flow: Flows, tuning: MoversTuning) -> FirstDepth:
+    """The depth of the moving pixels of `clip`: of whole regions, of those that several
+    cameras see at one time, and then of every pixel.
     """
     behind, agreement = work.static_depth()
-    disparity, confidence = mover_depth(clip, *flow, behind, tuning.distance)
-    if not work.manifest.synchronized or not any(np.any(c) for c in agreement):
-        return disparity, confidence
-    seen = same_time_depth(clip, work.static_points())
-    if seen is None:
-        return disparity, confidence
-    return take_same_time_depth(disparity, confidence, *seen, clip.moving, tuning.synchronized)
+    found = mover_depth(clip, *flow, behind, tuning.distance)
+    if work.manifest.synchronized and any(np.any(c) for c in agreement):
+        seen = same_time_depth(clip, work.static_points())
+        if seen is not None:
+            found = take_same_time_depth(*found, *seen, clip.moving, tuning.synchronized)
+    disparity, sigmas = pixel_distances(clip, *flow, *found, tuning.pixels)
+    return FirstDepth(clip.moving, disparity, found[1], sigmas)
+
+
+def maps_of(
+    indices: list[int], disparity: ArrayStack, confidence: ArrayStack
+) -> dict[str, Mapping[int, np.ndarray]]:
+    """The first depth of the frames of these `indices`, by the names of its maps."""
+    return {
+        "mover_disparity": by_key(indices, disparity),
+        "mover_confidence": by_key(indices, confidence),
+    }
 
 
 def without_parallax(work: Work) -> bool:

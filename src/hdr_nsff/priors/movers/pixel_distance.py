@@ -4,8 +4,8 @@ For a few frames, a point moves smoothly. Seen by cameras that do not, only one 
 puts it where flow leads: at any other one the point would jump with the cameras
 (trajectory triangulation after Park et al., "3D reconstruction of a moving point from a
 series of 2D projections", ECCV 2010). A rig whose cameras take turns shows this in
-every pixel, cloth and limbs included. A hand that shakes shows it for whole regions at
-best (`distance.py`), and rigid movers have a shape (`bundle.py`): these stay.
+every pixel, cloth and limbs included. A hand that shakes shows little; what a region as
+a whole shows (`distance.py`) then remains.
 
 A pixel (x, y, 1) of frame i at disparity d falls, tau frames later, on the homogeneous
 A (x, y, 1) + d b + M (v tau + a tau^2 / 2 + c tau^3 / 6) of frame j: A and b are those
@@ -47,52 +47,67 @@ class FlowEnds:
     links: int  # of flow from there to here
 
 
-def pixel_depth(
+def pixel_distances(
     clip: PosedVideo,
     flow: ArrayStack,
     valid: ArrayStack,
     pairs: np.ndarray,
     disparity: ArrayStack,
     confidence: ArrayStack,
-    movers: Sequence[Mover],
     tuning: PixelDistanceTuning = PIXEL_DISTANCE_TUNING,
-) -> tuple[ArrayStack, ArrayStack]:
-    """`disparity` and `confidence` (T, H, W), corrected in the pixels of those `movers`
-    that are not rigid and whose pixels the cameras place well.
+) -> tuple[ArrayStack, list[np.ndarray]]:
+    """`disparity` (T, H, W) with that of moving pixels corrected as far as the cameras
+    show it; and the relative standard deviation (M,) of it in each frame's moving
+    pixels.
 
-    `disparity` is in 1 / scene units, roughly right there. `flow` (P, H, W, 2) px and
-    `valid` (P, H, W) are of `pairs` (P, 2) of frames; the frames of `movers` are
-    positions in the clip. What is believed more already stays.
+    `disparity` is in 1 / scene units, roughly right there; where `confidence` (T, H, W)
+    in it is high, it stays. `flow` (P, H, W, 2) px and `valid` (P, H, W) are of `pairs`
+    (P, 2) of frames.
     """
     steps = flow_steps(clip.times, flow, valid, pairs)
-    moving = clip.moving
-    owners = [np.full(int(mask.sum()), -1) for mask in moving]
-    for t, i in enumerate(movers[0].frames.tolist()):
-        pixels = np.argwhere(moving[i])[:, ::-1] + 0.5
-        owners[i] = nearest_mover(movers, t, pixels)
     measured = [
         measure_errors(clip, steps, i, disparity[i], tuning)
-        for i in track(range(len(moving)), "movers: pixels")
+        for i in track(range(len(clip.moving)), "movers: pixels")
     ]
     variance = usual_variance(measured)
-    errors, sigmas = [], []
-    for information, pull, misfit, freedom in measured:
+    corrected, sigmas = [], []
+    for i, (information, pull, misfit, freedom) in enumerate(measured):
         # flow that no smooth motion explains errs by more than its noise
         excess = (misfit + MIN_FREEDOM * variance) / (freedom + MIN_FREEDOM)
         independent = tuning.independent_pixels / np.maximum(excess, 1)
         total = independent * information + 1 / tuning.prior_sigma**2
-        error = independent * pull / total
-        errors.append(error.clip(-tuning.max_change, tuning.max_change))
+        error = (independent * pull / total).clip(-tuning.max_change, tuning.max_change)
+        mask = clip.moving[i]
+        stays = confidence[i][mask] >= tuning.confidence
+        corrected.append(disparity[i][mask] * np.where(stays, 1, 1 + error))
         sigmas.append(1 / np.sqrt(total))
+    return with_pixels(disparity, clip.moving, corrected), sigmas
+
+
+def believe_well_placed(
+    confidence: ArrayStack,
+    moving: np.ndarray,
+    sigmas: list[np.ndarray],
+    movers: Sequence[Mover],
+    tuning: PixelDistanceTuning = PIXEL_DISTANCE_TUNING,
+) -> ArrayStack:
+    """`confidence` (T, H, W), higher in pixels of `movers` that are well placed.
+
+    `moving` (T, H, W) and `sigmas`, (M,) of each frame, are those of `pixel_distances`;
+    the frames of `movers` are positions among them.
+    """
+    if not movers:
+        return confidence
+    owners = [np.full(len(sigma), -1) for sigma in sigmas]
+    for t, i in enumerate(movers[0].frames.tolist()):
+        owners[i] = nearest_mover(movers, t, np.argwhere(moving[i])[:, ::-1] + 0.5)
     placed = well_placed(movers, np.concatenate(owners), np.concatenate(sigmas), tuning)
-    disparities, confidences = [], []
+    raised = []
     for i, mask in enumerate(moving):
-        rho, trust = disparity[i][mask], confidence[i][mask]
-        taken = np.isin(owners[i], placed) & (trust < tuning.confidence)
-        disparities.append(np.where(taken, rho * (1 + errors[i]), rho))
-        confidences.append(np.where(taken, tuning.confidence, trust))
-    corrected = with_pixels(disparity, moving, disparities)
-    return corrected, with_pixels(confidence, moving, confidences)
+        trust = confidence[i][mask]
+        own = np.isin(owners[i], placed)
+        raised.append(np.where(own, np.maximum(trust, tuning.confidence), trust))
+    return with_pixels(confidence, moving, raised)
 
 
 def well_placed(
@@ -117,7 +132,8 @@ def measure_errors(
     """
     moving = clip.moving[i]
     y, x = np.nonzero(moving)
-    on_grid = (x % t.stride_px == 0) & (y % t.stride_px == 0)
+    stride = max(t.min_stride_px, math.ceil(math.sqrt(len(y) / t.max_pixels)))
+    on_grid = (x % stride == 0) & (y % stride == 0)
     y, x = y[on_grid], x[on_grid]
     maps = np.zeros((4, *moving.shape), np.float32)
     if len(y):
@@ -126,7 +142,7 @@ def measure_errors(
         if ends:
             maps[:, y, x] = pixel_errors(clip, i, pixels, disparity[y, x], ends, t)
     smooth = [ndimage.gaussian_filter(m, t.window_px)[moving] for m in maps]
-    return t.stride_px**2 * np.stack(smooth)
+    return stride**2 * np.stack(smooth)
 
 
 def usual_variance(measured: list[np.ndarray]) -> float:

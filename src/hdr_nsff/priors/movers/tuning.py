@@ -329,8 +329,10 @@ class PixelDistanceTuning:
     """Reweighted solutions of a pixel."""
     robust_sigmas: float = 4.0
     """Residual, in its sigmas, at which an end of flow counts half (Cauchy weight)."""
-    stride_px: int = 2
-    """Distance of the pixels that are solved, in x and in y."""
+    min_stride_px: int = 2
+    """Distance of the pixels that are solved, in x and in y, at least ..."""
+    max_pixels: int = 10_000
+    """... and more where this many would not do for a frame."""
     window_px: float = 4.0
     """Standard deviation of the Gaussian over which they are averaged."""
     independent_pixels: float = 2.0
@@ -344,7 +346,9 @@ class PixelDistanceTuning:
     max_change: float = 0.7
     """Relative change of disparity, at most."""
     confidence: float = 0.6
-    """Of a pixel whose distance is taken: more than that of a track's shape."""
+    """Of the pixels of such a mover: more than that of a track's shape. What is
+    believed more stays as it is.
+    """
 
 
 PIXEL_DISTANCE_TUNING = PixelDistanceTuning()
