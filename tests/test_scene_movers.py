@@ -67,6 +67,18 @@ def test_two_movers_do_not_mix_their_depths() -> None:
     assert nearest_mover(movers, 1, pixels).tolist() == [0, 1]
 
 
+def test_what_is_not_rigid_keeps_a_depth_that_is_known_better() -> None:
+    disparity, confidence = np.full((4, 8), 0.4, np.float32), np.zeros((4, 8), np.float32)
+    confidence[1, 2] = 0.6
+    bent = replace(mover([[1.5, 1.5]], [[0, 0, 2.0]]), rigid=False)
+    movers = [bent, mover([[6.5, 1.5]], [[0, 0, 3.0]])]
+    given = movers, 1, np.ones((4, 8), bool), C2W, disparity, confidence
+    found, _ = fill_mover_depth(*given)
+    assert found[1, [1, 2, 6]] == pytest.approx([1 / 2, 0.4, 1 / 3])
+    found, _ = fill_mover_depth(*given, rigid_only=True)
+    assert found[1, [1, 2, 6]] == pytest.approx([0.4, 0.4, 1 / 3])
+
+
 def test_another_camera_sees_the_points_of_a_mover_elsewhere() -> None:
     movers = [mover([[0.5, 0.5]], [[0, 0, 2]]), mover([[7.5, 2.5]], [[1, 0, 2]])]
     K = np.array([[10.0, 0, 4], [0, 10.0, 2], [0, 0, 1]])

@@ -72,12 +72,14 @@ def fill_mover_depth(
     c2w: np.ndarray,
     disparity: np.ndarray,
     confidence: np.ndarray,
+    rigid_only: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """`disparity` and `confidence` (H, W) with the shapes of movers at the t-th time.
 
     A pixel that is `moving` (H, W) takes the depth of the nearest tracks of one mover,
-    as the camera at `c2w` (3, 4) sees them. Pixels far from any track stay as they are,
-    and so do those of a mover that is not rigid whose own depth is known better.
+    as the camera at `c2w` (3, 4) sees them. Pixels far from any track stay as they are.
+    So do those of a mover that is not rigid: all with `rigid_only`, else those whose
+    own depth is known better.
     """
     disparity, confidence = disparity.copy(), confidence.copy()
     pixels, inverse_depths, owners = track_depths(movers, t, c2w)
@@ -93,7 +95,7 @@ def fill_mover_depth(
     change = np.abs(np.log(found / np.maximum(disparity[y, x], 1e-9)))
     near = (distance[:, 0] < MAX_TRACK_DISTANCE_PX) & (change < np.log(MAX_DEPTH_RATIO))
     rigid = np.array([mover.rigid for mover in movers])[owners[nearest[:, 0]]]
-    near &= rigid | (confidence[y, x] <= TRACK_CONFIDENCE)
+    near &= rigid | ((confidence[y, x] <= TRACK_CONFIDENCE) & (not rigid_only))
     y, x = y[near], x[near]
     disparity[y, x] = found[near]
     falloff = np.exp(-((distance[near, 0] / MAX_TRACK_DISTANCE_PX) ** 2))

@@ -69,7 +69,9 @@ def halve(values: np.ndarray) -> np.ndarray:
 def depth_with_movers(work: Work, still: ArrayStack) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield disparity and confidence (H, W) of every training frame.
 
-    `still` (T, H, W): pixels of the moving masks that stand still.
+    `still` (T, H, W): pixels of the moving masks that stand still. Only cameras that
+    take turns tell the shape of a mover that is not rigid: before others it would bend
+    the depth (of a rendered walker from 6 % of error to 13 %).
     """
     m = work.manifest
     assert m.movers is not None
@@ -85,6 +87,6 @@ def depth_with_movers(work: Work, still: ArrayStack) -> Iterator[tuple[np.ndarra
         if f.index in time_of:
             c2w = work.camera(f)[1]
             disparity, confidence = fill_mover_depth(
-                movers, time_of[f.index], moving, c2w, disparity, confidence
+                movers, time_of[f.index], moving, c2w, disparity, confidence, rigid_only=m.rig == 1
             )
         yield disparity, lower_confidence_at_edges(disparity, confidence)
