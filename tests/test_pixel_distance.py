@@ -113,6 +113,15 @@ def test_invalid_flow_shows_nothing() -> None:
     assert np.array_equal(disparity, plane.disparity)
 
 
+def test_flow_that_is_not_a_number_shows_nothing() -> None:
+    plane = MovingPlane(RIG)
+    flow = plane.flow.copy()
+    flow[:, :, 30:] = np.nan
+    disparity, _ = plane.found(flow=flow)
+    assert np.isfinite(disparity).all()
+    assert np.abs(disparity[3:-3, 14:-4, 4:16] * Z - 1).max() < 0.02
+
+
 def test_what_is_believed_more_stays() -> None:
     plane = MovingPlane(RIG)
     confidence = plane.confidence.copy()

@@ -166,8 +166,9 @@ def chain(
             step = links[frame]
             y, x = (place[:, ::-1] - 0.5).T
             sure = ndimage.map_coordinates(step.valid.astype(np.float32), (y, x), order=1)
-            valid = valid & (sure > t.min_valid)
             place = place + flow_at(step.flow, place)
+            valid = valid & (sure > t.min_valid) & np.isfinite(place).all(-1)
+            place = np.where(valid[:, None], place, pixels)  # of no weight any more
             frame = step.end
             yield FlowEnds(frame, place, valid, count)
 
@@ -216,8 +217,8 @@ def equations(
     ends: list[FlowEnds],
     t: PixelDistanceTuning,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals in pixels, `slopes` (P, C, 2, 7) @ unknowns + `offsets` (P, C, 2), of C
-    ends of flow, and their weights (P, C), 1 / variance.
+    """Residuals in pixels, `slopes` (P, C, 2, UNKNOWNS) @ them + `offsets` (P, C, 2),
+    of C ends of flow, and their weights (P, C), 1 / variance.
     """
     K, c2w, times = clip.K, clip.c2w, clip.times
     homogeneous = pinhole.homogeneous(pixels)
@@ -226,9 +227,8 @@ def equations(
     weights = np.empty((len(pixels), len(ends)))
     for c, end in enumerate(ends):
         j = end.frame
-        place = np.where(end.valid[:, None], end.pixels, pixels)  # of no weight elsewhere
 
-        def in_picture(point: np.ndarray, place: np.ndarray = place) -> np.ndarray:
+        def in_picture(point: np.ndarray, place: np.ndarray = end.pixels) -> np.ndarray:
             """How far homogeneous points (..., 3) are from their places, px times z."""
             return point[..., :2] - place * point[..., 2:]
 
