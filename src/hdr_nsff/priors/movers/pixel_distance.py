@@ -71,16 +71,20 @@ def pixel_distances(
     ]
     variance = usual_variance(measured)
     corrected, sigmas = [], []
-    for i, (information, pull, misfit, freedom) in enumerate(measured):
+    for i, (wide, near) in enumerate(measured):
+        information, pull, misfit, freedom = near
         # flow that no smooth motion explains errs by more than its noise
         excess = (misfit + MIN_FREEDOM * variance) / (freedom + MIN_FREEDOM)
         independent = tuning.independent_pixels / np.maximum(excess, 1)
-        total = independent * information + 1 / tuning.prior_sigma**2
-        error = (independent * pull / total).clip(-tuning.max_change, tuning.max_change)
+        prior = 1 / tuning.prior_sigma**2
+        around = independent * wide[1] / (independent * wide[0] + prior)
+        relief = 1 / tuning.relief_sigma**2
+        error = (independent * pull + relief * around) / (independent * information + relief)
+        error = error.clip(-tuning.max_change, tuning.max_change)
         mask = clip.moving[i]
         stays = confidence[i][mask] >= tuning.confidence
         corrected.append(disparity[i][mask] * np.where(stays, 1, 1 + error))
-        sigmas.append(1 / np.sqrt(total))
+        sigmas.append(1 / np.sqrt(independent * information + prior))
     return with_pixels(disparity, clip.moving, corrected), sigmas
 
 
@@ -128,7 +132,8 @@ def measure_errors(
     clip: PosedVideo, steps: list[FlowStep], i: int, disparity: np.ndarray, t: PixelDistanceTuning
 ) -> np.ndarray:
     """What the pixels around say of the relative error of `disparity` (H, W) in each
-    moving pixel of frame `i`: the averages (4, M) of `pixel_errors`.
+    moving pixel of frame `i`: the averages of `pixel_errors` over the wide window and
+    over the narrow one, (2, 4, M).
     """
     moving = clip.moving[i]
     y, x = np.nonzero(moving)
@@ -141,13 +146,14 @@ def measure_errors(
         ends = list(chain(steps, i, pixels, t))
         if ends:
             maps[:, y, x] = pixel_errors(clip, i, pixels, disparity[y, x], ends, t)
-    smooth = [ndimage.gaussian_filter(m, t.window_px)[moving] for m in maps]
-    return stride**2 * np.stack(smooth)
+    windows = (t.wide_window_px, t.window_px)
+    smooth = [[ndimage.gaussian_filter(m, w)[moving] for m in maps] for w in windows]
+    return stride**2 * np.array(smooth)
 
 
 def usual_variance(measured: list[np.ndarray]) -> float:
     """The median of squared residuals, in squared sigmas, where there are enough."""
-    _, _, misfit, freedom = np.concatenate(measured, 1)
+    misfit, freedom = np.concatenate(measured, -1)[1, 2:]
     enough = freedom > MIN_FREEDOM
     return float(np.median(misfit[enough] / freedom[enough])) if enough.any() else 1.0
 

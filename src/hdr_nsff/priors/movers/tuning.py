@@ -335,6 +335,12 @@ class PixelDistanceTuning:
     """... and more where this many would not do for a frame."""
     window_px: float = 4.0
     """Standard deviation of the Gaussian over which they are averaged."""
+    wide_window_px: float = 12.0
+    """The same of the surroundings, whose distance a pixel has where it shows none."""
+    relief_sigma: float = 0.05
+    """Relative standard deviation of a pixel's distance from that: more tears apart
+    what one camera shows too little of.
+    """
     independent_pixels: float = 2.0
     """Pixels within it whose flow errs independently."""
     prior_sigma: float = 0.2
