@@ -61,9 +61,11 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     movers = judge_rigidity(movers, clip, *flow, disparity, tuning.rigidity)
     if estimated is not None:
-        believed = believe_well_placed(
-            estimated.confidence, estimated.moving, estimated.sigmas, movers, tuning.pixels
-        )
+        believed = estimated.confidence
+        if estimated.sigmas is not None:
+            believed = believe_well_placed(
+                believed, estimated.moving, estimated.sigmas, movers, tuning.pixels
+            )
         maps = maps_of(indices, estimated.disparity, believed)
     movers = tuple(replace(m, frames=np.array(indices)[m.frames]) for m in movers)
     shapes = sum(mover.has_shape for mover in movers)
@@ -83,12 +85,14 @@ class FirstDepth:
     moving: np.ndarray  # bool
     disparity: ArrayStack  # that of the static scene elsewhere
     confidence: ArrayStack  # 0 elsewhere
-    sigmas: list[np.ndarray]  # relative standard deviations (M,) of each frame's pixels
+    # relative standard deviations (M,) of the pixels of each frame, where these have
+    # distances of their own
+    sigmas: list[np.ndarray] | None
 
 
 def first_depth(work: Work, clip: PosedVideo, flow: Flows, tuning: MoversTuning) -> FirstDepth:
     """The depth of the moving pixels of `clip`: of whole regions, of those that several
-    cameras see at one time, and then of every pixel.
+    cameras see at one time, and where cameras take turns of every pixel.
     """
     behind, agreement = work.static_depth()
     found = mover_depth(clip, *flow, behind, tuning.distance)
@@ -96,6 +100,8 @@ def first_depth(work: Work, clip: PosedVideo, flow: Flows, tuning: MoversTuning)
         seen = same_time_depth(clip, work.static_points())
         if seen is not None:
             found = take_same_time_depth(*found, *seen, clip.moving, tuning.synchronized)
+    if work.manifest.rig == 1:
+        return FirstDepth(clip.moving, *found, None)
     disparity, sigmas = pixel_distances(clip, *flow, *found, tuning.pixels)
     return FirstDepth(clip.moving, disparity, found[1], sigmas)
 

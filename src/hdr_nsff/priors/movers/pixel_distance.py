@@ -1,11 +1,11 @@
-"""The distance of every moving pixel, where the cameras jump from frame to frame.
+"""The distance of every moving pixel before a rig whose cameras take turns.
 
 For a few frames, a point moves smoothly. Seen by cameras that do not, only one distance
 puts it where flow leads: at any other one the point would jump with the cameras
 (trajectory triangulation after Park et al., "3D reconstruction of a moving point from a
-series of 2D projections", ECCV 2010). A rig whose cameras take turns shows this in
-every pixel, cloth and limbs included. A hand that shakes shows little; what a region as
-a whole shows (`distance.py`) then remains.
+series of 2D projections", ECCV 2010). Cameras that take turns jump at every frame, and
+show this in every pixel, cloth and limbs included. One that moves on shows too little:
+there, distances of pixels are no better than those of whole regions (`distance.py`).
 
 A pixel (x, y, 1) of frame i at disparity d falls, tau frames later, on the homogeneous
 A (x, y, 1) + d b + M (v tau + a tau^2 / 2 + c tau^3 / 6) of frame j: A and b are those
