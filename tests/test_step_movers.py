@@ -30,7 +30,7 @@ def work(still: np.ndarray | None, masks: str = "estimated") -> SimpleNamespace:
     steps = {"masks": SimpleNamespace(provenance=masks)}
     return SimpleNamespace(
         manifest=SimpleNamespace(
-            depth_kind="scene", steps=steps, parallax="full", synchronized=False
+            depth_kind="scene", steps=steps, parallax="full", synchronized=False, rig=1
         ),
         train=[SimpleNamespace(index=k) for k in range(TIMES)],
         refined_flows=(),
