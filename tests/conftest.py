@@ -4,7 +4,9 @@ import json
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 import torch
@@ -18,6 +20,9 @@ from hdr_nsff.scene.scene import Scene
 from hdr_nsff.synth.pathtracer import Tracer
 from hdr_nsff.synth.scenes.interior import INTERIOR
 from hdr_nsff.synth.settings import SynthConfig
+
+if TYPE_CHECKING:
+    from browser import Page
 
 prepare_process()  # as the command line does, before a test imports numba
 if os.environ.get("NUMBA_ENABLE_CUDASIM") == "1":
@@ -81,3 +86,23 @@ def tracer() -> Tracer:
     """The synthetic room, for the slow variant of Mitsuba that needs no LLVM."""
     pytest.importorskip("mitsuba", reason="mitsuba is not installed: pip install 'hdr-nsff[synth]'")
     return Tracer(INTERIOR, 0, "scalar_rgb")
+
+
+@pytest.fixture(scope="module")
+def tab(tmp_path_factory: pytest.TempPathFactory) -> Iterator["Page"]:
+    """A tab of headless Chromium."""
+    from browser import browser
+
+    with browser(tmp_path_factory.mktemp("profile")) as page:
+        yield page
+
+
+@pytest.fixture
+def viewer(tab: "Page", toy: Scene, tmp_path: Path) -> Iterator["Page"]:
+    """The tab with the toy scene's page, newly loaded; the console must stay empty."""
+    from viewer_scenes import scene_file
+    from viewer_tab import open_page
+
+    open_page(tab, tmp_path / "scene.html", scene_file(toy))
+    yield tab
+    assert tab.problems() == []

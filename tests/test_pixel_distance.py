@@ -10,6 +10,7 @@ from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.pixel_distance import (
     FlowEnds,
     believe_well_placed,
+    equations,
     pixel_distances,
     pixel_errors,
 )
@@ -170,7 +171,7 @@ def test_a_pixel_says_what_least_squares_over_its_projections_says() -> None:
     normal = slopes.T @ (weight[:, None] * slopes) + prior
     target = -slopes.T @ (weight * misses(np.zeros(10)))
     inverse = np.linalg.inv(normal)
-    found = pixel_errors(clip, 4, pixel, rho, ends, tuning)[:, 0]
+    found = pixel_errors(*equations(clip, 4, pixel, rho, ends, tuning), tuning)[:, 0]
     assert found[0] == pytest.approx(1 / inverse[0, 0], rel=1e-4)
     assert found[1] == pytest.approx((inverse @ target)[0] / inverse[0, 0], rel=1e-3)
     assert found[3] == 0  # ten equations for ten unknowns

@@ -16,16 +16,8 @@ import numpy as np
 import pytest
 from browser import Page, browser, find_browser
 from test_hdr_video import ramp
-from test_viewer_page import (
-    TO_BASE64,
-    open_page,
-    png_text,
-    read_linear,
-    read_png,
-    scene_file,
-    state,
-)
-from viewer_scenes import trained
+from viewer_scenes import scene_file, trained
+from viewer_tab import TO_BASE64, open_page, png_text, read_linear, read_png, state
 
 from hdr_nsff.core.hdr_video import write_hdr_video
 from hdr_nsff.maths.hdr_signal import decode, rec709_to_rec2020

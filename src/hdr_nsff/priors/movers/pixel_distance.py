@@ -145,7 +145,8 @@ def measure_errors(
         pixels = np.stack([x, y], -1) + 0.5
         ends = list(chain(steps, i, pixels, t))
         if ends:
-            maps[:, y, x] = pixel_errors(clip, i, pixels, disparity[y, x], ends, t)
+            system = equations(clip, i, pixels, disparity[y, x], ends, t)
+            maps[:, y, x] = pixel_errors(*system, t)
     windows = (t.wide_window_px, t.window_px)
     smooth = [[ndimage.gaussian_filter(m, w)[moving] for m in maps] for w in windows]
     return stride**2 * np.array(smooth)
@@ -180,19 +181,12 @@ def chain(
 
 
 def pixel_errors(
-    clip: PosedVideo,
-    i: int,
-    pixels: np.ndarray,
-    rho: np.ndarray,
-    ends: list[FlowEnds],
-    t: PixelDistanceTuning,
+    slopes: np.ndarray, offsets: np.ndarray, weights: np.ndarray, t: PixelDistanceTuning
 ) -> np.ndarray:
-    """What each of `pixels` (P, 2) of frame `i` at disparity `rho` (P,) alone says of
-    its relative error, (4, P): information (1 / variance), information times error, the
-    sum of squared residuals in sigmas, and how many residuals there are beyond the
-    number of unknowns.
+    """What each pixel alone says of the relative error of its disparity, (4, P), by its
+    `equations`: information (1 / variance), information times error, the sum of squared
+    residuals in sigmas, and how many residuals there are beyond the number of unknowns.
     """
-    slopes, offsets, weights = equations(clip, i, pixels, rho, ends, t)
     sigmas = (t.velocity_sigma_px, t.acceleration_sigma_px, t.jerk_sigma_px)
     prior = np.diag([0, *np.repeat(np.power(sigmas, -2.0), 3)])
     start = np.zeros((UNKNOWNS, UNKNOWNS))
@@ -223,8 +217,9 @@ def equations(
     ends: list[FlowEnds],
     t: PixelDistanceTuning,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Residuals in pixels, `slopes` (P, C, 2, UNKNOWNS) @ them + `offsets` (P, C, 2),
-    of C ends of flow, and their weights (P, C), 1 / variance.
+    """Residuals in pixels of `pixels` (P, 2) of frame `i` at disparity `rho` (P,), at C
+    ends of their flow: `slopes` (P, C, 2, UNKNOWNS) @ unknowns + `offsets` (P, C, 2),
+    and their weights (P, C), 1 / variance.
     """
     K, c2w, times = clip.K, clip.c2w, clip.times
     homogeneous = pinhole.homogeneous(pixels)
