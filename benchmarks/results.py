@@ -359,7 +359,7 @@ SECTIONS = (
         "`interior` of one camera, 120x68 pixels and 36 frames, exact poses and masks, depth and "
         "flow with a little noise. PSNR over the run is of four of the held-out views. On one "
         "core that computes in bfloat16; others take longer. The order is that of the paper: "
-        "HDR-NSFF, NeRF-WT, NSFF. These are runs of before terms weighed as in the published code.",
+        "HDR-NSFF, NeRF-WT, NSFF. Other programs ran on the other core.",
         "hdr-nsff synth interior interior --size 120x68 --spp 64 --truth-spp 64 --oracle && "
         "hdr-nsff bench OUT --scenes interior --oracle --methods "
         '"paper-small=paper-small --torch-threads 1,..."',
