@@ -194,3 +194,12 @@ def test_a_solution_is_a_local_minimum() -> None:
         assert problem.cost(replace(best, rotations=turn @ best.rotations)) > cost
         assert problem.cost(replace(best, translations=translations)) > cost
         assert problem.cost(replace(best, points=best.points + size * away[1])) > cost
+
+
+def test_trust_in_depth_is_trust_that_gives_its_standard_deviation() -> None:
+    tuning = BUNDLE_TUNING
+    for sigma in (tuning.trusted_depth_sigma, 0.1, tuning.depth_sigma):
+        trust = float(tuning.trust_in_depth(np.array(sigma)))
+        assert tuning.sigma_of_depth(trust) == pytest.approx(sigma)
+    assert tuning.sigma_of_depth(0.0) == tuning.depth_sigma
+    assert float(tuning.trust_in_depth(np.array(1.0))) == tuning.untrusted_confidence

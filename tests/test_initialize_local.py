@@ -113,6 +113,21 @@ def test_two_movers_share_the_mask_by_their_tracks(soft: Scene) -> None:
     assert not local_mask(replace(soft, movers=(east, near)), 2).any()
 
 
+def test_what_moves_beyond_a_rigid_mover_is_local(soft: Scene) -> None:
+    (mover,) = soft.movers
+    card = replace(mover, rigid=True)
+    frame = soft.train[2]
+    assert frame.moving is not None
+    moving = frame.moving.clone()
+    moving[:3, :3] = True  # far from the card
+    scene = replace(soft, movers=(card,), train=[*soft.train])
+    scene.train[2] = replace(frame, moving=moving)
+    shadow = torch.zeros_like(moving)
+    shadow[:3, :3] = True
+    assert torch.equal(local_mask(scene, 2), surely_moving(scene.train[2]) & shadow)
+    assert local_mask(scene, 2).any()
+
+
 def test_rigid_movers_beyond_the_bases_become_time_local(soft: Scene) -> None:
     (mover,) = soft.movers
     card = replace(mover, rigid=True)

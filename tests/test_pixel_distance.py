@@ -74,9 +74,7 @@ class MovingPlane:
         }
         given |= other
         disparity, sigmas = pixel_distances(self.clip, pairs=self.pairs, **given)
-        confidence = believe_well_placed(
-            given["confidence"], self.clip.moving, sigmas, [self.mover]
-        )
+        confidence = believe_well_placed(given["confidence"], self.clip, sigmas, [self.mover])
         return np.array(disparity), np.array(confidence)
 
 

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.scene.movers import (
+    NO_MOVER,
     Mover,
     fill_mover_depth,
     nearest_mover,
@@ -20,6 +21,8 @@ from hdr_nsff.scene.movers import (
 
 TIMES = 3
 C2W = np.eye(3, 4)
+K = np.array([[10.0, 0, 4], [0, 10.0, 2], [0, 0, 1]])
+CAMERA = (K, C2W)
 
 
 def mover(pixels: list[list[float]], points: list[list[float]], error: float = 0.1) -> Mover:
@@ -64,7 +67,7 @@ def test_two_movers_do_not_mix_their_depths() -> None:
     found, _ = fill_mover_depth(movers, 1, np.ones((4, 8), bool), C2W, disparity, confidence)
     assert found[1, [1, 6]] == pytest.approx([1 / 2, 1 / 3])
     pixels = np.array([[0.5, 0.5], [7.5, 2.5]])
-    assert nearest_mover(movers, 1, pixels).tolist() == [0, 1]
+    assert nearest_mover(movers, 1, pixels, CAMERA).tolist() == [0, 1]
 
 
 def test_what_is_not_rigid_keeps_a_depth_that_is_known_better() -> None:
@@ -81,10 +84,20 @@ def test_what_is_not_rigid_keeps_a_depth_that_is_known_better() -> None:
 
 def test_another_camera_sees_the_points_of_a_mover_elsewhere() -> None:
     movers = [mover([[0.5, 0.5]], [[0, 0, 2]]), mover([[7.5, 2.5]], [[1, 0, 2]])]
-    K = np.array([[10.0, 0, 4], [0, 10.0, 2], [0, 0, 1]])
     mirrored = np.array([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 4]])  # from behind
     pixels = np.array([[4.0, 2.0], [-1.0, 2.0]])
-    assert nearest_mover(movers, 1, pixels, (K, mirrored)).tolist() == [0, 1]
+    assert nearest_mover(movers, 1, pixels, (K, mirrored), tracked=False).tolist() == [0, 1]
+
+
+def test_what_moves_out_of_reach_of_a_rigid_mover_is_none_of_it() -> None:
+    nowhere = [np.nan, np.nan]  # its second point is hidden; it would be at pixel (24, 2)
+    rigid = mover([[4.0, 2.0], nowhere], [[0, 0, 1], [2, 0, 1]])
+    pixels = np.array([[4.0, 2.0], [11.0, 2.0], [14.0, 2.0], [20.0, 2.0], [33.0, 2.0]])
+    assert nearest_mover([rigid], 1, pixels, CAMERA).tolist() == [0, 0, NO_MOVER, 0, NO_MOVER]
+    soft = replace(rigid, rigid=False)
+    assert nearest_mover([soft], 1, pixels, CAMERA).tolist() == [0] * 5
+    shapeless = replace(rigid, points=np.full((2, 3), np.nan), error=np.inf)
+    assert nearest_mover([shapeless], 1, pixels, CAMERA).tolist() == [0] * 5
 
 
 def test_a_mover_without_a_shape_gives_no_depth() -> None:

@@ -1,4 +1,6 @@
-"""The step `movers`: which pixels of the masks its tracks follow."""
+"""The step `movers`: which pixels of the masks its tracks follow, and how much their
+depth is trusted.
+"""
 
 from types import SimpleNamespace
 
@@ -6,6 +8,7 @@ import numpy as np
 import pytest
 
 from hdr_nsff.prepare.steps import movers as step
+from hdr_nsff.priors.movers.tuning import MOVERS_TUNING
 from hdr_nsff.scene.movers import Mover
 from hdr_nsff.scene.posed_video import PosedVideo
 
@@ -86,3 +89,17 @@ def test_where_depth_holds_the_movers_already_one_round_is_enough(rounds) -> Non
     step.find_movers(work(None))
     (only,) = rounds
     assert np.array_equal(only, MOVING)
+
+
+def test_before_cameras_in_turn_depth_is_trusted_as_much_as_its_pixels_deserve() -> None:
+    disparity, confidence = np.ones((TIMES, H, W)), np.full((TIMES, H, W), 0.3)
+    counts = [int(mask.sum()) for mask in MOVING]
+    sigmas = [np.full(counts[0], 0.1), np.full(counts[1], 0.001)]
+    bundle, pixels = MOVERS_TUNING.bundle, MOVERS_TUNING.pixels
+    trust = step.trust_in(step.FirstDepth(MOVING, disparity, confidence, sigmas), MOVERS_TUNING)
+    for k, sigma in enumerate((0.1, pixels.min_common_sigma)):
+        assert (trust[k][~MOVING[k]] == 0.3).all()
+        (found,) = np.unique(trust[k][MOVING[k]])
+        assert bundle.sigma_of_depth(float(found)) == pytest.approx(sigma)
+    alone = step.FirstDepth(MOVING, disparity, confidence, None)
+    assert step.trust_in(alone, MOVERS_TUNING) is confidence

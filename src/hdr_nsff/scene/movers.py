@@ -24,7 +24,10 @@ VERSION = 2  # of movers.npz
 NUM_NEAREST_TRACKS = 4  # tracks that a pixel's depth is interpolated from
 MAX_TRACK_DISTANCE_PX = 8.0  # pixels from the nearest track; half or twice was not measured
 TRACK_CONFIDENCE = 0.5  # at a track: its distance as a whole rests on priors
+NO_MOVER = -1  # owner of a pixel that moves, but with none of the movers
 MAX_DEPTH_RATIO = 2.0  # a pixel's depth changes by less than this factor
+
+PinholeCamera = tuple[np.ndarray, np.ndarray]  # K (3, 3), c2w (3, 4)
 
 
 @dataclass(frozen=True)
@@ -122,33 +125,40 @@ def track_depths(
 
 
 def nearest_mover(
-    movers: Sequence[Mover],
-    t: int,
-    pixels: np.ndarray,
-    camera: tuple[np.ndarray, np.ndarray] | None = None,
+    movers: Sequence[Mover], t: int, pixels: np.ndarray, camera: PinholeCamera, tracked: bool = True
 ) -> np.ndarray:
-    """The mover (P,) whose track is nearest to `pixels` (P, 2) at the t-th time.
+    """The mover (P,) whose track is nearest to `pixels` (P, 2) of `camera` at the t-th
+    time; 0 where no mover has a track at that time.
 
-    0 where no mover has a track at that time. The pixels are of the movers' own frame,
-    or of another `camera` at that time, K (3, 3) and c2w (3, 4): there, tracks are
-    where it sees the points of the movers' shapes.
+    `NO_MOVER` where the mover is rigid and its shape out of reach: something else moves
+    there, such as a shadow. The tracks are of this camera's frames if `tracked`. In the
+    picture of another camera, they are where it sees the points of the movers' shapes.
     """
-    tracks = [tracks_in_picture(mover, t, camera) for mover in movers]
+    shapes = [shape_in_picture(mover, t, camera) for mover in movers]
+    tracks = [tracks_in_picture(mover, t) for mover in movers] if tracked else shapes
     owners = np.repeat(np.arange(len(tracks)), [len(p) for p in tracks])
     if not len(owners) or not len(pixels):
         return np.zeros(len(pixels), np.int64)
-    return owners[cKDTree(np.concatenate(tracks)).query(pixels)[1]]
+    distance, nearest = cKDTree(np.concatenate(tracks)).query(pixels)
+    owner = owners[nearest]
+    for k, (mover, shape) in enumerate(zip(movers, shapes, strict=True)):
+        far = np.nonzero((owner == k) & (distance > MAX_TRACK_DISTANCE_PX))[0]
+        if mover.rigid and len(shape) and len(far):
+            to_shape = cKDTree(shape).query(pixels[far])[0]
+            owner[far[to_shape > MAX_TRACK_DISTANCE_PX]] = NO_MOVER
+    return owner
 
 
-def tracks_in_picture(
-    mover: Mover, t: int, camera: tuple[np.ndarray, np.ndarray] | None
-) -> np.ndarray:
-    """The pixels (N, 2) of a mover's tracks at the t-th time, in its own frame or in
-    the picture of another `camera` (see `nearest_mover`).
+def tracks_in_picture(mover: Mover, t: int) -> np.ndarray:
+    """The pixels (N, 2) of a mover's tracks at the t-th time, in its own frame."""
+    own = mover.pixels[:, t]
+    return own[np.isfinite(own[:, 0])]
+
+
+def shape_in_picture(mover: Mover, t: int, camera: PinholeCamera) -> np.ndarray:
+    """The pixels (N, 2) where a camera sees the points of a mover's shape at the t-th
+    time; those that are hidden, too.
     """
-    if camera is None:
-        own = mover.pixels[:, t]
-        return own[np.isfinite(own[:, 0])]
     points = mover.at(t)
     pixels, depth = pinhole.project(points[np.isfinite(points[:, 0])], *camera)
     return pixels[depth > pinhole.MIN_DEPTH]

@@ -33,10 +33,11 @@ from hdr_nsff.fields.splat.detail import cell_sizes, detail_density, scale_by_si
 from hdr_nsff.fields.splat.free_space import remove_fog
 from hdr_nsff.fields.splat.gaussians import START_LOGIT, Gaussians, from_log_radiance
 from hdr_nsff.fields.splat.initialize_local import (
+    camera_arrays,
     limit_rigid_movers,
     local_mask,
-    other_camera,
     place_local,
+    tracks_are_of,
 )
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover
@@ -259,13 +260,13 @@ def mover_points(
     """The pixels of rigid `movers` in training frame `i`, at the t-th time of these, as
     points at their canonical places, and the mover of each (P,).
     """
-    f, camera = scene.train[i], other_camera(scene, i)
-    if camera is None:
+    f, tracked = scene.train[i], tracks_are_of(scene, i)
+    if tracked:
         f = with_mover_depth(f, t, movers)
     moving = surely_moving(f) & ~local_mask(scene, i)
     points = unproject_frame(f, i, moving.reshape(-1), scene.near, scene.far, to_radiance)
     y, x = np.nonzero(moving.numpy())
-    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5, camera)
+    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5, camera_arrays(f), tracked)
     canonical = points.positions.double().numpy().copy()
     for k, mover in enumerate(movers):
         canonical[owner == k] = mover.canonical(canonical[owner == k], t)

@@ -30,7 +30,7 @@ from hdr_nsff.fields.point_cloud import (
 )
 from hdr_nsff.fields.splat.gaussians import from_log_radiance
 from hdr_nsff.fields.splat.local_gaussians import MAX_AGE, LocalGaussians, frame_step
-from hdr_nsff.scene.movers import nearest_mover
+from hdr_nsff.scene.movers import PinholeCamera, nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene, surely_moving
 
 OVERLAP = 0.5  # standard deviation relative to the side of a cell (hand-chosen on real clips)
@@ -72,22 +72,21 @@ def limit_rigid_movers(scene: Scene, most: int) -> Scene:
 
 
 def local_mask(scene: Scene, i: int) -> Tensor:
-    """(H, W) bool: pixels of training frame `i` that surely are of non-rigid movers.
-
-    Where there are no movers, of everything that moves.
+    """(H, W) bool: pixels of training frame `i` that surely move, but with no rigid
+    mover.
     """
     f = scene.train[i]
     moving = surely_moving(f)
-    rigid = [mover.rigid for mover in scene.movers]
+    rigid = np.array([*(mover.rigid for mover in scene.movers), False])
     if not any(rigid):
         return moving
-    if all(rigid):
-        return torch.zeros_like(moving)
     y, x = np.nonzero(moving.numpy())
     pixels = np.stack([x, y], -1) + 0.5
-    owner = nearest_mover(scene.movers, time_of(scene, i), pixels, other_camera(scene, i))
+    owner = nearest_mover(
+        scene.movers, time_of(scene, i), pixels, camera_arrays(f), tracks_are_of(scene, i)
+    )
     result = torch.zeros_like(moving)
-    result[y, x] = torch.from_numpy(~np.array(rigid)[owner])
+    result[y, x] = torch.from_numpy(~rigid[owner])
     return result
 
 
@@ -96,14 +95,15 @@ def time_of(scene: Scene, i: int) -> int:
     return int(torch.searchsorted(scene.times, scene.train[i].time))
 
 
-def other_camera(scene: Scene, i: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """K (3, 3) and c2w (3, 4) of training frame `i`; None where its camera took the
-    frames that the movers' tracks are of.
-    """
-    f = scene.train[i]
+def tracks_are_of(scene: Scene, i: int) -> bool:
+    """Whether the movers' tracks are of frames of the camera of training frame `i`."""
+    camera_id = scene.train[i].camera_id
     tracked = set(scene.movers[0].frames.tolist())
-    if any(g.index in tracked and g.camera_id == f.camera_id for g in scene.train):
-        return None
+    return any(f.index in tracked and f.camera_id == camera_id for f in scene.train)
+
+
+def camera_arrays(f: Frame) -> PinholeCamera:
+    """The camera of a frame in numpy."""
     return f.camera.K.double().numpy(), f.camera.c2w.double().numpy()
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from hdr_nsff.fields.splat.draw import draw
 from hdr_nsff.fields.splat.splat import Splat
 from hdr_nsff.geometry.cameras import Camera
-from hdr_nsff.scene.movers import nearest_mover
+from hdr_nsff.scene.movers import NO_MOVER, nearest_mover
 from hdr_nsff.scene.scene import Frame, Scene
 
 VOTES = 9  # frames that vote, spread evenly over the clip (hand-chosen)
@@ -68,14 +68,15 @@ def label_local(
 
 def labels_in_frame(scene: Scene, camera: Camera, t: int, means: Tensor) -> tuple[Tensor, Tensor]:
     """The mover (P,) of points (P, 3) at the t-th time of movers, and whether `camera`
-    sees them (P,) bool.
+    sees them there (P,) bool.
     """
     pixels, depth = camera.project(means.cpu())
     size = torch.tensor([camera.width, camera.height])
     inside = ((pixels >= 0) & (pixels < size)).all(1) & (depth > 0)
     tracked = any(np.isfinite(mover.pixels[:, t, 0]).any() for mover in scene.movers)
-    label = nearest_mover(scene.movers, t, pixels.numpy())
-    return torch.from_numpy(label), inside & tracked
+    K, c2w = camera.K.double().cpu().numpy(), camera.c2w.double().cpu().numpy()
+    label = torch.from_numpy(nearest_mover(scene.movers, t, pixels.numpy(), (K, c2w)))
+    return label, inside & tracked & (label != NO_MOVER)
 
 
 @torch.no_grad()

@@ -51,7 +51,8 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
         clip = replace(clip, moving=moving)
         first = estimated = first_depth(work, clip, flow, tuning)
         disparity = first.disparity
-        confidence = map_stack(lambda c, k: np.where(moving[k], first.confidence[k], c), confidence)
+        trust = trust_in(first, tuning)
+        confidence = map_stack(lambda c, k: np.where(moving[k], trust[k], c), confidence)
     movers = estimate_movers(clip, *flow, disparity, confidence, tuning)
     if still is not None and any(mover.has_shape for mover in movers):
         disparity, confidence = with_shapes(movers, clip, disparity, confidence)
@@ -63,9 +64,8 @@ def find_movers(work: Work, tuning: MoversTuning = MOVERS_TUNING) -> StepResult:
     if estimated is not None:
         believed = estimated.confidence
         if estimated.sigmas is not None:
-            believed = believe_well_placed(
-                believed, estimated.moving, estimated.sigmas, movers, tuning.pixels
-            )
+            seen = replace(clip, moving=estimated.moving)
+            believed = believe_well_placed(believed, seen, estimated.sigmas, movers, tuning.pixels)
         maps = maps_of(indices, estimated.disparity, believed)
     movers = tuple(replace(m, frames=np.array(indices)[m.frames]) for m in movers)
     shapes = sum(mover.has_shape for mover in movers)
@@ -104,6 +104,17 @@ def first_depth(work: Work, clip: PosedVideo, flow: Flows, tuning: MoversTuning)
         return FirstDepth(clip.moving, *found, None)
     disparity, sigmas = pixel_distances(clip, *flow, *found, tuning.pixels)
     return FirstDepth(clip.moving, disparity, found[1], sigmas)
+
+
+def trust_in(depth: FirstDepth, tuning: MoversTuning) -> ArrayStack:
+    """How much bundle adjustment trusts a first depth, (T, H, W): its confidence, or
+    what the standard deviations of its pixels deserve.
+    """
+    if depth.sigmas is None:
+        return depth.confidence
+    least = tuning.pixels.min_common_sigma
+    trust = [tuning.bundle.trust_in_depth(np.maximum(s, least)) for s in depth.sigmas]
+    return with_pixels(depth.confidence, depth.moving, trust)
 
 
 def maps_of(

@@ -18,6 +18,7 @@ NUM_COLUMNS = 6  # frames shown
 STRIPE_PX = 3  # width of the stripes on movers that are not rigid
 NO_FLOW = 0.25  # gray where there is none
 SHEET = "contact_sheet.png"
+NO_MOVER_COLOR = np.ones((1, 3))  # white
 
 
 def draw_sheet(work: Work) -> StepResult:
@@ -58,7 +59,8 @@ def moving_cell(work: Work, f: FrameEntry) -> np.ndarray:
 
 def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray:
     """The frame in gray (H, W, 3), moving pixels in the color of their mover, tracks as
-    bright dots; a mover without a shape is drawn pale, one that is not rigid striped.
+    bright dots; a mover without a shape is drawn pale, one that is not rigid striped,
+    and what moves with none of them striped in white.
     """
     gray = np.repeat(work.equalized[0][f.index].mean(-1, keepdims=True), 3, axis=-1)
     times = movers[0].frames.tolist() if movers else []
@@ -66,13 +68,13 @@ def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray
         return gray
     t = times.index(f.index)
     y, x = np.nonzero(read_mask(work.folder / str(f.mask)))
-    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5)
-    colors = mover_colors(movers)
-    rigid = np.array([mover.rigid for mover in movers])
+    owner = nearest_mover(movers, t, np.stack([x, y], -1) + 0.5, work.camera(f))
+    colors = np.concatenate([mover_colors(movers), NO_MOVER_COLOR])
+    rigid = np.array([*(mover.rigid for mover in movers), False])  # the last is `NO_MOVER`
     colored = rigid[owner] | ((x + y) // STRIPE_PX % 2 == 0)
     y, x, owner = y[colored], x[colored], owner[colored]
     gray[y, x] = 0.4 * gray[y, x] + 0.6 * colors[owner]
-    for mover, color in zip(movers, colors, strict=True):
+    for mover, color in zip(movers, colors, strict=False):
         pixels = mover.pixels[:, t]
         column, row = pixels[np.isfinite(pixels[:, 0])].astype(int).T
         gray[row, column] = 0.5 + 0.5 * color

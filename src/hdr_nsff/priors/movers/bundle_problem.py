@@ -177,12 +177,8 @@ class BundleProblem:
         # (T, 3) derivative of the mean z-depth of all times by translations
         self.distance_gradient = self.depth_known[:, None] * self.w2c[:, 2] / num_known
 
-        confidence = 0.0
-        if self.visible.any():
-            excess = np.median(trust[self.visible]) - tuning.untrusted_confidence
-            confidence = np.clip(excess / (1 - tuning.untrusted_confidence), 0, 1)
-        change = tuning.trusted_depth_sigma - tuning.depth_sigma
-        sigma = tuning.depth_sigma + change * confidence
+        median_trust = np.median(trust[self.visible]) if self.visible.any() else 0.0
+        sigma = tuning.sigma_of_depth(float(median_trust))
         if self.path_rows.sum() >= tuning.min_path_rows:
             # one observation for all times of a run
             times_in_run = np.bincount(self.run, self.depth_known)[self.run]

@@ -29,7 +29,7 @@ from hdr_nsff.geometry import pinhole
 from hdr_nsff.geometry.round_trip import flow_at
 from hdr_nsff.priors.movers.regions import FlowStep, flow_steps
 from hdr_nsff.priors.movers.tuning import PIXEL_DISTANCE_TUNING, PixelDistanceTuning
-from hdr_nsff.scene.movers import Mover, nearest_mover
+from hdr_nsff.scene.movers import NO_MOVER, Mover, nearest_mover
 from hdr_nsff.scene.posed_video import PosedVideo
 
 ORDER = 3  # of the motion: velocity, acceleration and jerk
@@ -90,28 +90,29 @@ def pixel_distances(
 
 def believe_well_placed(
     confidence: ArrayStack,
-    moving: np.ndarray,
+    clip: PosedVideo,
     sigmas: list[np.ndarray],
     movers: Sequence[Mover],
     tuning: PixelDistanceTuning = PIXEL_DISTANCE_TUNING,
 ) -> ArrayStack:
     """`confidence` (T, H, W), higher in pixels of `movers` that are well placed.
 
-    `moving` (T, H, W) and `sigmas`, (M,) of each frame, are those of `pixel_distances`;
-    the frames of `movers` are positions among them.
+    `clip` and `sigmas`, (M,) of each frame, are those of `pixel_distances`; the frames
+    of `movers` are positions among them.
     """
     if not movers:
         return confidence
-    owners = [np.full(len(sigma), -1) for sigma in sigmas]
+    owners = [np.full(len(sigma), NO_MOVER) for sigma in sigmas]
     for t, i in enumerate(movers[0].frames.tolist()):
-        owners[i] = nearest_mover(movers, t, np.argwhere(moving[i])[:, ::-1] + 0.5)
+        pixels = np.argwhere(clip.moving[i])[:, ::-1] + 0.5
+        owners[i] = nearest_mover(movers, t, pixels, (clip.K[i], clip.c2w[i]))
     placed = well_placed(movers, np.concatenate(owners), np.concatenate(sigmas), tuning)
     raised = []
-    for i, mask in enumerate(moving):
+    for i, mask in enumerate(clip.moving):
         trust = confidence[i][mask]
         own = np.isin(owners[i], placed)
         raised.append(np.where(own, np.maximum(trust, tuning.confidence), trust))
-    return with_pixels(confidence, moving, raised)
+    return with_pixels(confidence, clip.moving, raised)
 
 
 def well_placed(

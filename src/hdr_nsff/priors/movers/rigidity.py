@@ -4,7 +4,8 @@ cameras explain that of the static scene.
 Flow is uncertain, and so are the cameras. How far both together are off shows in the
 static scene, so the test asks for nothing that the clip cannot give: the median
 distance between flow and motion in the mover's pixels may be a small multiple of the
-same in pixels that stand still.
+same in pixels that stand still. A mover that always touches one that is not rigid is a
+part of it, such as a forearm.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hdr_nsff.core.stack import ArrayStack
 from hdr_nsff.geometry import pinhole
 from hdr_nsff.priors.movers.regions import FlowStep, flow_steps
 from hdr_nsff.priors.movers.tuning import RIGIDITY_TUNING, RigidityTuning
-from hdr_nsff.scene.movers import Mover, nearest_mover
+from hdr_nsff.scene.movers import Mover, fill_mover_depth, nearest_mover, tracks_in_picture
 from hdr_nsff.scene.posed_video import PosedVideo
 
 STATIC_STRIDE = 4  # pixels, in x and in y, of the static samples
@@ -52,8 +54,10 @@ def judge_rigidity(
         static.append(static_residuals(clip, step, disparity[start]))
         y, x = np.nonzero(clip.moving[start] & step.valid)
         pixels = np.stack([x, y], -1) + 0.5
-        owner = nearest_mover(movers, t, pixels)
-        points = clip.unproject(start, pixels, disparity[start][y, x].astype(np.float64))
+        c2w, first = clip.c2w[start], disparity[start]
+        owner = nearest_mover(movers, t, pixels, (clip.K[start], c2w))
+        shown, _ = fill_mover_depth(movers, t, clip.moving[start], c2w, first, np.zeros_like(first))
+        points = clip.unproject(start, pixels, shown[y, x].astype(np.float64))
         for k, mover in enumerate(movers):
             own = owner == k
             moved = mover.world(mover.canonical(points[own], t), t + 1)
@@ -72,7 +76,23 @@ def judge_rigidity(
                 rigid=residual <= allowed,
             )
         )
-    return tuple(result)
+    soft = [mover for mover in result if not mover.rigid]
+    return tuple(
+        replace(m, rigid=m.rigid and not any(is_part_of(m, other, tuning) for other in soft))
+        for m in result
+    )
+
+
+def is_part_of(mover: Mover, other: Mover, tuning: RigidityTuning = RIGIDITY_TUNING) -> bool:
+    """Whether a mover touches another one nearly whenever it is seen."""
+    seen = touches = 0
+    for t in range(len(mover.frames)):
+        own, others = tracks_in_picture(mover, t), tracks_in_picture(other, t)
+        if len(own):
+            seen += 1
+        if len(own) and len(others):
+            touches += float(cKDTree(others).query(own)[0].min()) <= tuning.touching_px
+    return touches > tuning.min_touching_share * seen
 
 
 def static_residuals(clip: PosedVideo, step: FlowStep, disparity: np.ndarray) -> np.ndarray:

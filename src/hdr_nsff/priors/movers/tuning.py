@@ -38,12 +38,18 @@ TRACK_TUNING = TrackTuning()
 class RigidityTuning:
     """Tuning constants of the test whether a mover is rigid."""
 
-    max_residual_ratio: float = 2.0
+    max_residual_ratio: float = 1.4
     """Residual of a rigid mover's flow relative to that of the static scene. Chosen on
-    10 real clips and the demo: rendered boxes have 0.8 to 1.3, people 2.1 to 8."""
+    real clips and the demo: rendered boxes have 0.6 to 1.3 (2.4 before cameras that
+    jump), people 1.6 to 6.5."""
     min_uncertainty_px: float = 0.1
     """Flow is never taken to be surer than this, exact flow of a rendered scene
     neither."""
+    touching_px: float = 6.0
+    """Distance of the nearest tracks of two movers that touch."""
+    min_touching_share: float = 0.8
+    """Of the times at which a mover is seen: a part of another one touches it in more.
+    A wrist does always, rendered bodies that pass each other in half of them."""
 
 
 RIGIDITY_TUNING = RigidityTuning()
@@ -169,6 +175,16 @@ class BundleTuning:
     """Trust up to which depth counts as trusted little; geometric depth of movers
     claims 0.5.
     """
+
+    def sigma_of_depth(self, trust: float) -> float:
+        """The relative standard deviation of mean z-depth, for a trust in [0, 1]."""
+        share = np.clip((trust - self.untrusted_confidence) / (1 - self.untrusted_confidence), 0, 1)
+        return float(self.depth_sigma + share * (self.trusted_depth_sigma - self.depth_sigma))
+
+    def trust_in_depth(self, sigma: np.ndarray) -> np.ndarray:
+        """The trust of depth that has these relative standard deviations."""
+        share = (self.depth_sigma - sigma) / (self.depth_sigma - self.trusted_depth_sigma)
+        return self.untrusted_confidence + (1 - self.untrusted_confidence) * np.clip(share, 0, 1)
 
     path_sigma: float = 0.001
     """Lower bound of the standard deviation of the path's third differences, as a share
@@ -348,6 +364,10 @@ class PixelDistanceTuning:
     max_median_sigma: float = 0.1
     """Relative standard deviation of distance that half of a mover's pixels must reach:
     cloth before a rendered rig has 0.04 to 0.07, things too fast for flow 0.15 to 0.2.
+    """
+    min_common_sigma: float = 0.05
+    """Relative standard deviation of the distance of all pixels of a frame, at least:
+    they err alike.
     """
     max_change: float = 0.7
     """Relative change of disparity, at most."""
