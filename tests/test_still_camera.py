@@ -66,6 +66,44 @@ def test_a_wall_above_somebody_who_fills_the_picture_is_a_background():
     assert still_camera_shifts(clip, tuning=spread_out) is None
 
 
+def before_a_plain_wall(shake: float = 0.0, passing: bool = False) -> np.ndarray:
+    """A clip (NUM, H, W, 3): something large moves in the middle, before a wall with a
+    few spots. The camera is shaken by `shake` pixels; something may be `passing` on the
+    right side.
+    """
+    spots = np.zeros((H, W), bool)
+    for x in (W // 20, W - W // 20):
+        for y in (H // 8, H // 3, 5 * H // 8):
+            spots[y - 1 : y + 2, x - 1 : x + 2] = True
+    wall = np.where(spots[..., None], WALL, np.float32(0.5))
+    box = texture(7, W // 2, H)
+    video = []
+    for t in range(NUM):
+        frame = wall.copy()
+        left, top = W // 8 + 2 * t, H // 6 + t
+        part = frame[top : top + 2 * H // 3, left : left + W // 2]
+        part[:] = box[: len(part)]
+        if passing:
+            frame[:, -W // 8 :] = texture(t, W // 8, H)
+        matrix = np.array([[1, 0, shake * (t % 2)], [0, 1, 0]])
+        frame = cv2.warpAffine(frame, matrix, (W, H), borderMode=cv2.BORDER_REPLICATE)
+        video.append(frame)
+    noise = np.random.default_rng(0).normal(0, 0.002, (NUM, H, W, 3))
+    return np.clip(np.stack(video) + noise, 0, 1).astype(np.float32)
+
+
+def test_somebody_before_a_plain_wall_is_filmed_by_a_still_camera():
+    shifts = still_camera_shifts(before_a_plain_wall())
+    assert shifts is not None and np.median(shifts) < 0.2
+    never_calm = StillCameraTuning(max_change_calm=0.0)
+    assert still_camera_shifts(before_a_plain_wall(), tuning=never_calm) is None
+
+
+def test_before_a_plain_wall_a_shaken_camera_or_a_moving_side_is_no_tripod():
+    assert still_camera_shifts(before_a_plain_wall(shake=1.0)) is None
+    assert still_camera_shifts(before_a_plain_wall(passing=True)) is None
+
+
 def test_a_dashboard_is_no_background():
     assert still_camera_shifts(shaken_below(2 * H // 3, above=False)) is None
 
