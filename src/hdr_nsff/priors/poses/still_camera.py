@@ -81,30 +81,55 @@ def still_camera_shifts(
         recorded = np.stack([recorded_detail(clipped[t], size, tuning) for t in chosen])
     background = median_of_recorded(details, recorded)
     kept = kept_detail(details, recorded, background, tuning)
-    scale = video.shape[2] / details.shape[2]
+    found = Detail(details, recorded, background, kept, video.shape[2] / details.shape[2])
+    shifts = shifts_if_spread(found, tuning)
+    return shifts_if_calm(found, tuning) if shifts is None else shifts
 
-    def shifts_in(part: np.ndarray) -> np.ndarray:
-        pairs = zip(details, recorded, strict=True)
-        return scale * np.array([shift_of(d, background, part & seen) for d, seen in pairs])
 
-    max_shift = allowed_shift(kept, tuning)
-    if max_shift is not None:
-        shifts = shifts_in(kept)
-        still = (shifts < max_shift).mean() >= tuning.still_share
-        for part in quarters(kept) if still else ():
-            enough = part.mean() >= tuning.min_quarter_share
-            if enough and np.median(shifts_in(part)) > tuning.max_quarter_shift_px:
-                still = False
-        if still:
-            return shifts
-    at_sides = kept & sides(kept.shape, tuning.side_share)
-    if at_sides.mean() < tuning.min_share_calm:
+@dataclass(frozen=True)
+class Detail:
+    """The detail of frames, and of what is behind movers."""
+
+    frames: np.ndarray  # (F, h, w)
+    recorded: np.ndarray  # (F, h, w) bool: nothing nearby is clipped
+    background: np.ndarray  # (h, w)
+    kept: np.ndarray  # (h, w) bool: where it is that of most frames
+    scale: float  # pixels of the frames for one of these maps
+
+    def shifts(self, part: np.ndarray) -> np.ndarray:
+        """By how many pixels (F,) the background shifts in `part` (h, w)."""
+        pairs = zip(self.frames, self.recorded, strict=True)
+        return self.scale * np.array(
+            [shift_of(frame, self.background, part & seen) for frame, seen in pairs]
+        )
+
+
+def shifts_if_spread(found: Detail, tuning: StillCameraTuning) -> np.ndarray | None:
+    """The shifts (F,) of a still camera whose background is spread over the picture."""
+    max_shift = allowed_shift(found.kept, tuning)
+    if max_shift is None:
         return None
-    if not has_calm_edges(details, recorded, background, tuning):
+    shifts = found.shifts(found.kept)
+    if (shifts < max_shift).mean() < tuning.still_share:
         return None
-    shifts = shifts_in(at_sides)
-    still = (shifts < tuning.max_shift_px).mean() >= tuning.still_share
-    return shifts if still and np.median(shifts) <= tuning.max_median_shift_calm_px else None
+    for part in quarters(found.kept):
+        enough = part.mean() >= tuning.min_quarter_share
+        if enough and np.median(found.shifts(part)) > tuning.max_quarter_shift_px:
+            return None
+    return shifts
+
+
+def shifts_if_calm(found: Detail, tuning: StillCameraTuning) -> np.ndarray | None:
+    """The shifts (F,) of a still camera before a plain wall: the picture's sides are
+    calm.
+    """
+    part = found.kept & sides(found.kept.shape, tuning.side_share)
+    if part.mean() < tuning.min_share_calm or not has_calm_edges(found, tuning):
+        return None
+    shifts = found.shifts(part)
+    if (shifts < tuning.max_shift_px).mean() < tuning.still_share:
+        return None
+    return shifts if np.median(shifts) <= tuning.max_median_shift_calm_px else None
 
 
 def recorded_detail(
@@ -127,7 +152,6 @@ def kept_detail(
     details: np.ndarray, recorded: np.ndarray, background: np.ndarray, tuning: StillCameraTuning
 ) -> np.ndarray:
     """Where (h, w) the detail of the background is that of most frames (F, h, w)."""
-
     strength = around(background**2, tuning)
     present = np.zeros(background.shape, int)
     for detail, seen in zip(details, recorded, strict=True):
@@ -155,20 +179,17 @@ def sides(shape: tuple[int, ...], share: float) -> np.ndarray:
     return columns
 
 
-def has_calm_edges(
-    details: np.ndarray, recorded: np.ndarray, background: np.ndarray, tuning: StillCameraTuning
-) -> bool:
-    """Whether the detail of the frames (F, h, w) hardly ever differs from that of the
-    background (h, w), neither at the left edge nor at the right one.
+def has_calm_edges(found: Detail, tuning: StillCameraTuning) -> bool:
+    """Whether the detail of the frames hardly ever differs from that of the background,
+    neither at the left edge nor at the right one.
     """
-    changed = np.zeros(background.shape, int)
-    for detail, seen in zip(details, recorded, strict=True):
+    changed = np.zeros(found.background.shape, int)
+    for detail, seen in zip(found.frames, found.recorded, strict=True):
         strong = around(detail**2, tuning) > tuning.min_strength
-        changed += seen & strong & ~is_alike(detail, background, tuning)
-    share = changed / np.maximum(recorded.sum(0), 1)
+        changed += seen & strong & ~is_alike(detail, found.background, tuning)
+    share = changed / np.maximum(found.recorded.sum(0), 1)
     edges = sides(share.shape, tuning.edge_share)
-    middle = share.shape[1] // 2
-    left, right = np.split(np.where(edges, share, np.nan), [middle], axis=1)
+    left, right = np.split(np.where(edges, share, np.nan), [share.shape[1] // 2], axis=1)
     return bool(max(np.nanmean(left), np.nanmean(right)) < tuning.max_change_calm)
 
 
