@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,7 +25,9 @@ if TYPE_CHECKING:
 
 prepare_process()  # as the command line does, before a test imports numba
 if os.environ.get("NUMBA_ENABLE_CUDASIM") == "1":
-    sys.setswitchinterval(5e-4)  # seconds: a block's threads wait in loops for each other
+    from simulated_threads import take_turns
+
+    take_turns()
 
 
 @pytest.fixture(scope="session")
