@@ -14,7 +14,7 @@ operation that is no view, and operations for which the host waits.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -23,7 +23,6 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 from torch.utils.backend_registration import (
     _DummyBackendModule,
     _setup_privateuseone_for_python_backend,
@@ -139,7 +138,7 @@ class PretendMode(TorchDispatchMode):
 
 def execute(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
     """Run an operation on the numbers, once its devices agree."""
-    tensors = [x for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)]
+    tensors = tensors_in((*args, *kwargs.values()))
     there = any(isinstance(x, PretendTensor) for x in tensors)
     wanted = kwargs.get("device")
     if there:
@@ -159,10 +158,31 @@ def execute(func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         kwargs = kwargs | {"device": torch.device("cpu")}
     if kwargs.get("pin_memory"):
         kwargs = kwargs | {"pin_memory": False}
-    inner_args, inner_kwargs = tree_map(unwrap, (args, kwargs))
+    inner_args = [convert(x, unwrap) for x in args]
+    inner_kwargs = {name: convert(x, unwrap) for name, x in kwargs.items()}
     with torch.inference_mode(False), torch.no_grad():
         result = func(*inner_args, **inner_kwargs)
-        return tree_map(lambda x: rewrap(x, args, kwargs, on_device), result)
+        return convert(result, lambda x: rewrap(x, tensors)) if on_device else result
+
+
+def tensors_in(values: Iterable[Any]) -> list[Tensor]:
+    """The tensors among arguments, those in lists included."""
+    found: list[Tensor] = []
+    for x in values:
+        if isinstance(x, Tensor):
+            found.append(x)
+        elif isinstance(x, list | tuple):
+            found += tensors_in(x)
+    return found
+
+
+def convert(x: Any, function: Callable[[Tensor], Any]) -> Any:
+    """A value with what a function makes of its tensors, those in lists included."""
+    if isinstance(x, Tensor):
+        return function(x)
+    if isinstance(x, list | tuple):
+        return [convert(part, function) for part in x]
+    return x
 
 
 def check_devices(func: Any, args: tuple[Any, ...], tensors: list[Tensor]) -> None:
@@ -181,11 +201,9 @@ def unwrap(x: Any) -> Any:
     return x.inner if isinstance(x, PretendTensor) else x
 
 
-def rewrap(x: Any, args: tuple[Any, ...], kwargs: dict[str, Any], on_device: bool) -> Any:
+def rewrap(x: Tensor, given_tensors: list[Tensor]) -> Tensor:
     """A result on the device; the argument itself where an operation was in place."""
-    if not isinstance(x, Tensor) or not on_device:
-        return x
-    for given in tree_flatten((args, kwargs))[0]:
+    for given in given_tensors:
         if isinstance(given, PretendTensor) and given.inner is x:
             return given
     return PretendTensor(x)
