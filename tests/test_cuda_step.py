@@ -1,5 +1,5 @@
 """Training steps of `splat` and `grid` by CUDA kernels, without a GPU: every test of
-these files, in processes with numba-cuda's simulator.
+these files, in one process with numba-cuda's simulator.
 """
 
 from pathlib import Path
@@ -13,4 +13,4 @@ PATHS = [Path(__file__).with_name(f"simulated_{name}.py") for name in FILES]
 
 @pytest.mark.parametrize(("path", "name"), [(p, name) for p in PATHS for name in names_in(p)])
 def test_simulated(path: Path, name: str) -> None:
-    assert_passed(path, name)
+    assert_passed(path, name, *PATHS)

@@ -20,7 +20,7 @@ CAPABILITIES = [(7, 5), (8, 0), (9, 0), (12, 0)]  # Turing, Ampere, Hopper, Blac
 
 @pytest.mark.parametrize("name", names_in(SIMULATED))
 def test_simulated(name: str) -> None:
-    assert_passed(SIMULATED, name)
+    assert_passed(SIMULATED, name, SIMULATED)
 
 
 ptx_of = cache(compile_ptx)
