@@ -20,6 +20,8 @@ GPU_EXTRA = import torch; print("gpu12" if (torch.version.cuda or "").startswith
 
 # One thread per test process: they share the cores already.
 ONE_THREAD = OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+# The commands that tests start find the package compiled, even where the environment says otherwise.
+BYTECODE = PYTHONDONTWRITEBYTECODE=
 
 .DEFAULT_GOAL := help
 .PHONY: help demo test docs
@@ -31,7 +33,7 @@ demo: $(VENV)/.ready-demo
 	$(VENV)/bin/hdr-nsff run demo/clip.mp4 demo/out --truth demo/truth
 
 test: $(VENV)/.ready-dev
-	$(ONE_THREAD) $(VENV)/bin/python -m pytest -n $(WORKERS) --dist loadfile --durations=20
+	$(ONE_THREAD) $(BYTECODE) $(VENV)/bin/python -m pytest -n $(WORKERS) --dist loadfile --durations=20
 
 docs: $(VENV)/.ready-docs
 	$(VENV)/bin/sphinx-build -W --keep-going -b html docs docs/_build/html
