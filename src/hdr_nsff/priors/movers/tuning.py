@@ -41,7 +41,7 @@ class RigidityTuning:
     max_residual_ratio: float = 1.4
     """Residual of a rigid mover's flow relative to that of the static scene. Chosen on
     real clips and the demo: rendered boxes have 0.6 to 1.3 (2.4 before cameras that
-    jump), people 1.6 to 6.5."""
+    jump), people 1.6 to 6.5, their raised arms alone 1.1 to 1.3."""
     min_uncertainty_px: float = 0.1
     """Flow is never taken to be surer than this, exact flow of a rendered scene
     neither."""
