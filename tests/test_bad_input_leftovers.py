@@ -25,13 +25,11 @@ from bad_input import (
     training,
     truth,
 )
-from markupsafe import Markup
 from safetensors.torch import save_file
 
 from hdr_nsff.core import notes
 from hdr_nsff.core.checkpoints import latest_checkpoint
 from hdr_nsff.core.io import write_text
-from hdr_nsff.evaluation.report import plots
 from hdr_nsff.training.run_folder import Run
 
 # Checkpoints
@@ -107,12 +105,6 @@ def making(folder: Path) -> list[list[object]]:
     ]
 
 
-@pytest.fixture
-def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reports whose plots are made, but not drawn, which takes most of their time."""
-    monkeypatch.setattr(plots, "svg", lambda drawing: Markup("<svg></svg>"))
-
-
 Change = Callable[[dict], object]
 PLAN, VIEWS, METRICS = "run/render/plan.json", "run/render/views.json", "run/metrics.json"
 SEQUENCE, EXPORTED = "run/render/training/sequence.json", "ply/sequence.json"
@@ -157,7 +149,6 @@ NONSENSE: dict[str, tuple[str, Change]] = {
 }
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("what", NONSENSE)
 def test_a_note_edited_into_nonsense_is_named_and_made_again(
     what: str, worked: Path, capsys: Capture
@@ -177,7 +168,6 @@ def test_a_note_edited_into_nonsense_is_named_and_made_again(
     assert "cut short" not in capsys.readouterr().err
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("text", ["{", "[" * 100_000, "\x00", ""])
 def test_notes_cut_short_are_made_again(text: str, worked: Path, capsys: Capture) -> None:
     for name in KINDS:
