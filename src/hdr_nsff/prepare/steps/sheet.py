@@ -59,8 +59,8 @@ def moving_cell(work: Work, f: FrameEntry) -> np.ndarray:
 
 def mover_cell(work: Work, f: FrameEntry, movers: Sequence[Mover]) -> np.ndarray:
     """The frame in gray (H, W, 3), moving pixels in the color of their mover, tracks as
-    bright dots; a mover without a shape is drawn pale, one that is not rigid striped,
-    and what moves with none of them striped in white.
+    bright dots. A mover without a shape is drawn pale, one that is not rigid striped;
+    white stripes mark pixels that move, but belong to no mover.
     """
     gray = np.repeat(work.equalized[0][f.index].mean(-1, keepdims=True), 3, axis=-1)
     times = movers[0].frames.tolist() if movers else []

@@ -5,7 +5,7 @@ Flow is uncertain, and so are the cameras. How far both together are off shows i
 static scene, so the test asks for nothing that the clip cannot give: the median
 distance between flow and motion in the mover's pixels may be a small multiple of the
 same in pixels that stand still. A mover that always touches one that is not rigid is a
-part of it, such as a forearm.
+part of it, as a wrist is of an arm.
 """
 
 from __future__ import annotations

@@ -49,7 +49,8 @@ class RigidityTuning:
     """Distance of the nearest tracks of two movers that touch."""
     min_touching_share: float = 0.8
     """Of the times at which a mover is seen: a part of another one touches it in more.
-    A wrist does always, rendered bodies that pass each other in half of them."""
+    A wrist touches the hand in all of them, rendered bodies that pass each other do in
+    half of them."""
 
 
 RIGIDITY_TUNING = RigidityTuning()
@@ -176,16 +177,6 @@ class BundleTuning:
     claims 0.5.
     """
 
-    def sigma_of_depth(self, trust: float) -> float:
-        """The relative standard deviation of mean z-depth, for a trust in [0, 1]."""
-        share = np.clip((trust - self.untrusted_confidence) / (1 - self.untrusted_confidence), 0, 1)
-        return float(self.depth_sigma + share * (self.trusted_depth_sigma - self.depth_sigma))
-
-    def trust_in_depth(self, sigma: np.ndarray) -> np.ndarray:
-        """The trust of depth that has these relative standard deviations."""
-        share = (self.depth_sigma - sigma) / (self.depth_sigma - self.trusted_depth_sigma)
-        return self.untrusted_confidence + (1 - self.untrusted_confidence) * np.clip(share, 0, 1)
-
     path_sigma: float = 0.001
     """Lower bound of the standard deviation of the path's third differences, as a share
     of z-depth, in each direction.
@@ -211,6 +202,16 @@ class BundleTuning:
     """Iterations after which a reversed candidate is judged."""
     max_reversal_cost_ratio: float = 0.98
     """Cost, relative to the cost before, that a reversal must reach."""
+
+    def sigma_of_depth(self, trust: float) -> float:
+        """The relative standard deviation of mean z-depth, for a trust in [0, 1]."""
+        share = np.clip((trust - self.untrusted_confidence) / (1 - self.untrusted_confidence), 0, 1)
+        return float(self.depth_sigma + share * (self.trusted_depth_sigma - self.depth_sigma))
+
+    def trust_in_depth(self, sigma: np.ndarray) -> np.ndarray:
+        """The trust of depth that has these relative standard deviations."""
+        share = (self.depth_sigma - sigma) / (self.depth_sigma - self.trusted_depth_sigma)
+        return self.untrusted_confidence + (1 - self.untrusted_confidence) * np.clip(share, 0, 1)
 
 
 BUNDLE_TUNING = BundleTuning()
