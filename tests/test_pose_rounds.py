@@ -20,6 +20,9 @@ PLACED = Poses(
 )
 
 
+PAN = panning(np.linspace(-10, 10, T))
+
+
 @pytest.fixture
 def models() -> list[dict[str, bytes]]:
     """The models that the rounds start from, one after another."""
@@ -32,7 +35,7 @@ def rounds(tmp_path, monkeypatch, models):
     and of which rotations explain a `share`; the masks of every round are given.
     """
 
-    def run(share: float | None, *masks: np.ndarray) -> tuple[Poses, int]:
+    def run(share: float | None, *masks: np.ndarray, video: np.ndarray = PAN) -> tuple[Poses, int]:
         estimates = []
 
         def estimate(work, moving, earlier):
@@ -51,7 +54,7 @@ def rounds(tmp_path, monkeypatch, models):
             folder=tmp_path,
             manifest=SimpleNamespace(rig=1, num_tracks=1, frames=frames),
             raw_flows=(None, None),
-            equalized=(panning(np.linspace(-10, 10, T)), np.zeros((T, H, W), bool)),
+            equalized=(video, np.zeros((T, H, W), bool)),
         )
         (tmp_path / "poses").mkdir(exist_ok=True)
         return step.poses_and_masks(work), len(estimates)
@@ -98,6 +101,15 @@ def test_where_nothing_moves_one_round_is_enough(rounds):
 def test_restless_masks_alone_do_not(rounds, share):
     poses, estimates = rounds(share, *RESTLESS)
     assert poses.parallax == "full" and estimates == 3
+
+
+@pytest.mark.parametrize("shake", [0.0, 0.3])
+def test_restless_masks_before_what_keeps_its_place_mean_a_tripod(rounds, capsys, shake):
+    shaken = panning(shake * (np.arange(T) % 2))
+    poses, estimates = rounds(None, *RESTLESS, video=shaken)
+    assert poses.parallax == "none" and estimates == 3
+    assert np.array_equal(poses.c2w, PLACED.c2w)
+    assert "stands still, since its masks keep changing" in capsys.readouterr().err
 
 
 def test_a_killed_run_goes_on_with_its_first_round(rounds):

@@ -1,11 +1,20 @@
 """The common power of exposures comes back from the noise of a simulated sensor."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hdr_nsff.radiometry.bracketing import FACTORS
 from hdr_nsff.radiometry.recording import Curve, Noise, record, response_curve
-from hdr_nsff.radiometry.sensor_noise import code_step, measure_noise, noise_log_likelihood
+from hdr_nsff.radiometry.sensor_noise import (
+    SensorNoiseTuning,
+    code_step,
+    measure_noise,
+    noise_log_likelihood,
+    noise_variances,
+    robust_deviation,
+)
 
 EV = np.array([-2.0, 0.0, 2.0])
 
@@ -13,12 +22,19 @@ EV = np.array([-2.0, 0.0, 2.0])
 NOISE = Noise()
 
 
-def recordings(curve: Curve, noise: Noise | None = NOISE) -> list[np.ndarray]:
-    """A smooth pattern over five stops, recorded with three exposures."""
+def recordings(
+    curve: Curve,
+    noise: Noise | None = NOISE,
+    texture: np.ndarray | float = 0.0,
+) -> list[np.ndarray]:
+    """A smooth pattern over five stops, and `texture` in stops on it, recorded with
+    three exposures.
+    """
     y, x = np.mgrid[:160, :240] / 60
     level = 2 ** (2.5 * np.sin(x + 0.5 * y) - 2.5)
     radiance = level[..., None] * [1.0, 0.8, 0.6]
     rng = np.random.default_rng(0)
+    radiance = radiance * 2**texture
     return [record(radiance, ev, (1, 1, 1), curve, noise, rng) for ev in EV]
 
 
@@ -81,3 +97,41 @@ def test_measured_noise_is_that_of_the_sensor() -> None:
     exposure = np.exp(bins.log_exposure)
     expected = (NOISE.read**2 + NOISE.shot * exposure) / exposure**2 + bins.rounding
     np.testing.assert_allclose(np.median(bins.variance / expected), 1, atol=0.1)
+
+
+def blocks() -> np.ndarray:
+    """The texture (160, 240, 1) that a codec leaves, in stops: in every third block."""
+    rng = np.random.default_rng(1)
+    kept = rng.random((20, 30)) < 0.35
+    texture = 0.15 * rng.laplace(size=(160, 240))
+    return (texture * np.kron(kept, np.ones((8, 8))))[..., None]
+
+
+@pytest.mark.parametrize("name", ["film", "srgb"])
+def test_the_texture_of_compressed_footage_is_no_noise(name: str) -> None:
+    curve = response_curve(name)
+    found = np.exp(log_likelihood(recordings(curve, texture=blocks()), curve, 1.0))
+    mean = np.exp(found @ np.log(FACTORS) / found.sum())
+    assert mean == pytest.approx(1, abs=0.05)
+
+
+def test_normal_noise_adds_to_texture_of_any_kind() -> None:
+    rng = np.random.default_rng(0)
+    texture = rng.laplace(size=(2, 200_000)) * (rng.random((2, 200_000)) < 0.3)
+    noises = [texture[0], texture[1] + 2 * rng.normal(size=200_000)]
+    still, noisy = noise_variances(noises, np.zeros(2))
+    assert noisy - still == pytest.approx(4, rel=0.02)
+    medians = np.array([robust_deviation(noise) for noise in noises])
+    assert np.diff(medians**2) > 4.2  # a median counts texture as noise
+
+
+def test_where_pixels_clip_no_noise_is_measured() -> None:
+    """Those that are left have less texture than all."""
+    curve = response_curve("gamma")
+    images = recordings(curve, texture=3 * blocks())
+    careful = SensorNoiseTuning(flat_share=1.0)
+    bins = measure_noise(images, [0, 1, 2], curve.x, curve.y, EV, careful)
+    careless = replace(careful, max_clipped=1.0)
+    more = measure_noise(images, [0, 1, 2], curve.x, curve.y, EV, careless)
+    assert 0 < len(bins.count) < len(more.count)
+    assert bins.log_exposure.max() < more.log_exposure.max() - 0.3

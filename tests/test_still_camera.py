@@ -11,9 +11,11 @@ from hdr_nsff.prepare.prepare import check_settings
 from hdr_nsff.prepare.steps.footage import exposure_step
 from hdr_nsff.prepare.steps.poses import find_poses
 from hdr_nsff.prepare.work import PrepareConfig
+from hdr_nsff.priors.poses import estimate
 from hdr_nsff.priors.poses.estimate import estimate_poses
 from hdr_nsff.priors.poses.still_camera import (
     StillCameraTuning,
+    nearly_still_shifts,
     shift_of,
     still_camera_shifts,
 )
@@ -102,6 +104,31 @@ def test_somebody_before_a_plain_wall_is_filmed_by_a_still_camera():
 def test_before_a_plain_wall_a_shaken_camera_or_a_moving_side_is_no_tripod():
     assert still_camera_shifts(before_a_plain_wall(shake=1.0)) is None
     assert still_camera_shifts(before_a_plain_wall(passing=True)) is None
+
+
+def no_poses(*_):
+    raise InputError("nothing matches")
+
+
+def test_what_has_no_other_poses_may_shake_a_little(tmp_path, monkeypatch):
+    monkeypatch.setattr(estimate, "parallax_free_share", lambda *_: None)
+    monkeypatch.setattr(estimate.Mapper, "poses", no_poses)
+    shaken = before_a_plain_wall(shake=0.5)
+    shifts = nearly_still_shifts(shaken)
+    assert still_camera_shifts(shaken) is None
+    assert shifts is not None and 0.1 < shifts.max() < 0.003 * W
+    poses = estimate_poses(shaken, None, tmp_path)
+    assert poses.parallax == "none" and poses.registered.all()
+    assert poses.notes[0] == "treated as a camera that stands still, since nothing matches"
+    with pytest.raises(InputError, match="nothing matches"):
+        estimate_poses(panning(np.linspace(-30, 30, NUM)), None, tmp_path)
+
+
+def test_what_hardly_shows_a_background_or_moves_does_not_stand_nearly_still():
+    assert nearly_still_shifts(before_a_plain_wall(shake=2.0)) is None
+    assert nearly_still_shifts(panning(np.linspace(-30, 30, NUM))) is None
+    more_detail = StillCameraTuning(min_share_last=0.5)
+    assert nearly_still_shifts(before_a_plain_wall(), tuning=more_detail) is None
 
 
 def test_a_dashboard_is_no_background():

@@ -15,8 +15,8 @@ noise. So lossy footage is not asked, and where the fit is bad nothing is conclu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -27,32 +27,34 @@ from hdr_nsff.radiometry.debevec import HIGH, LOW
 # answers to linear and quadratic texture with 0, to white noise of deviation 1 with 1
 # (Immerkaer 1996)
 KERNEL = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
-SLOPE = np.array([[-1, 0, 1]] * 3, np.float32) / 6
+GRADIENT = np.array([[-1, 0, 1]] * 3, np.float32) / 6
 MEDIAN_SQUARE = 0.4549  # of a standard normal variable
 STEP_8_BIT = 1 / 255  # between codes, as values in [0, 1]
 MIN_EXPOSURE = 1e-7
+MIN_MEAN_COSINE = 1e-3  # of noise, for a variance that is a number
 
 
 @dataclass(frozen=True)
 class SensorNoiseTuning:
     """Which pixels show noise, and how well a fit has to explain them.
 
-    Hand-chosen on five re-exposed clips with noise of 6000 electrons. Their misfit is
-    1.4 to 4.3, that of shrunk JPEG photographs 7 to 200, of compressed video mostly
-    above 20.
+    Hand-chosen on eight re-exposed clips with noise of 6000 electrons, five of them
+    from compressed footage. Their misfit is 0.5 to 2.1, that of compressed video 2.1 to
+    170, in eight of nine clips above 3.
     """
 
-    max_pixels: float = 2e6  # that are looked at, of all frames
-    bin_width: float = 0.4  # of log exposure (natural)
+    max_pixels: float = 6e6  # that are looked at, of all frames
+    bin_width: float = 0.4  # of log radiance (natural)
     darkest: float = -7.5  # log exposure relative to saturation
-    flat_share: float = 0.3  # of the pixels of a bin: those with the least slope
-    min_bin_pixels: int = 400
+    flat_share: float = 0.5  # of the pixels of a bin: those with the least texture
+    max_clipped: float = 0.05  # share of those
+    min_bin_pixels: int = 200  # of those
     max_deviation: float = 0.35  # of log exposure; beyond, noise is not linear in it
     clip_margin: float = 3.0  # deviations of noise between a bin and black or white
-    model_error: float = 0.05  # of a bin's variance, however many pixels it has
+    model_error: float = 0.04  # of a bin's variance, however many pixels it has
     min_bins: int = 24
     rounds: int = 8  # of reweighting
-    max_misfit: float = 5.0  # mean robust squared error per degree of freedom
+    max_misfit: float = 2.5  # mean robust squared error per degree of freedom
     read_electrons: float = 4.0  # median of sensors, and its deviation (natural log)
     log_read_deviation: float = 0.7
     # of the natural logarithm of p: what no number of pixels reduces
@@ -63,14 +65,35 @@ class SensorNoiseTuning:
 
 @dataclass(frozen=True)
 class NoiseBins:
-    """Pixels of about one exposure, of one channel and bracket each."""
+    """Pixels of about one radiance, of one channel and bracket each."""
 
     channel: np.ndarray  # (N,) 0 to 2
     log_exposure: np.ndarray  # (N,) natural, measured, 0 at saturation
-    log_radiance: np.ndarray  # (N,) the same at the reference bracket
+    radiance: np.ndarray  # (N,) bin of the log exposure at the reference bracket
     variance: np.ndarray  # (N,) of the log exposure
     rounding: np.ndarray  # (N,) variance of rounding to the codes of the images
     count: np.ndarray  # (N,) pixels
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of one channel, with what is measured in the 3x3 around each."""
+
+    log_exposure: np.ndarray  # (N,)
+    noise: np.ndarray  # (N,) of log exposure
+    texture: np.ndarray  # (N,) how fast log exposure changes across the picture, per pixel
+    value: np.ndarray  # (N,) recorded, in [0, 1]
+    slope: np.ndarray  # (N,) of log exposure, per recorded value
+    clipped: np.ndarray  # (N,) bool: some of them black or white
+
+    @classmethod
+    def joined(cls, parts: Sequence[Pixels]) -> Pixels:
+        """The pixels of all `parts`."""
+        names = [field.name for field in fields(cls)]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+
+    def __getitem__(self, chosen: np.ndarray) -> Pixels:
+        return Pixels(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def noise_log_likelihood(
@@ -96,7 +119,7 @@ def noise_log_likelihood(
     log_reads = np.linspace(-spread, spread, tuning.num_reads)
     reads = tuning.read_electrons * np.exp(log_reads)
     cost = np.array([[fit_cost(bins, p, r, tuning) for r in reads] for p in powers])
-    degrees_of_freedom = len(bins.variance) - texture_columns(bins, tuning).shape[1] - 2
+    degrees_of_freedom = len(bins.variance) - texture_columns(bins).shape[1] - 2
     if degrees_of_freedom < 1 or cost.min() / degrees_of_freedom > tuning.max_misfit:
         return None
     log_prior = -((log_reads / tuning.log_read_deviation) ** 2) / 2
@@ -116,39 +139,77 @@ def measure_noise(
     ev: np.ndarray,
     tuning: SensorNoiseTuning = SensorNoiseTuning(),
 ) -> NoiseBins:
-    """Noise of log exposure in flat places of the `images`, by exposure."""
+    """Noise of log exposure in flat places of the `images`, by radiance."""
     size = images[0].shape[0] * images[0].shape[1]
     stride = max(1, int(np.ceil(3 * len(images) * size / tuning.max_pixels)))
-    num_levels = int(np.ceil(-tuning.darkest / tuning.bin_width)) - 1
-    rows = []
+    rows, noises = [], []
     for bracket in sorted(set(brackets)):
         of_bracket = [k for k, b in enumerate(brackets) if b == bracket]
         step = max(1, min(stride, len(of_bracket) // 3))
         own = [images[k] for k in of_bracket[::step]]
         code = min(code_step(image) for image in own)
+        log_gain = float(ev[bracket] * np.log(2))
         for channel in range(3):
-            pixels = [channel_noise(image[..., channel], x, y[channel]) for image in own]
-            g, noise, slope, z, gain = np.concatenate(pixels, axis=1)
-            level = np.floor((g - tuning.darkest) / tuning.bin_width).astype(int)
-            for k in range(num_levels):
-                members = np.flatnonzero(level == k)
-                if len(members) < tuning.min_bin_pixels:
-                    continue
-                flat = slope[members] <= np.quantile(slope[members], tuning.flat_share)
-                members = members[flat]
-                deviation = np.sqrt(np.median(noise[members] ** 2) / MEDIAN_SQUARE)
-                margin = tuning.clip_margin * deviation / np.median(gain[members])
-                value = np.median(z[members])
-                is_clipped = value - margin < LOW or value + margin > HIGH
-                is_measured = 0 < deviation <= tuning.max_deviation
-                if is_clipped or not is_measured:
-                    continue
-                log_exposure = np.median(g[members])
-                rounding = (np.median(gain[members]) * code) ** 2 / 12
-                log_radiance = log_exposure - ev[bracket] * np.log(2)
-                count = len(members)
-                rows.append((channel, log_exposure, log_radiance, deviation**2, rounding, count))
-    return NoiseBins(*np.array(rows).reshape(-1, 6).T)
+            pixels = [channel_pixels(image[..., channel], x, y[channel]) for image in own]
+            for radiance, flat in flat_places(Pixels.joined(pixels), log_gain, tuning):
+                log_exposure, slope = np.median(flat.log_exposure), np.median(flat.slope)
+                rounding = (slope * code) ** 2 / 12
+                rows.append((channel, log_exposure, radiance, rounding, len(flat.noise)))
+                noises.append(flat.noise)
+    channels, log_exposures, radiances, roundings, counts = np.array(rows).reshape(-1, 5).T
+    variances = noise_variances(noises, texture_of(channels, radiances))
+    return NoiseBins(channels, log_exposures, radiances, variances, roundings, counts)
+
+
+def flat_places(
+    pixels: Pixels, log_gain: float, tuning: SensorNoiseTuning
+) -> Iterator[tuple[int, Pixels]]:
+    """The flattest unclipped `pixels` of every bin of radiance in which noise can be
+    measured; `log_gain` is that of their exposure (natural).
+
+    Bins are of radiance, so that all exposures see the same texture in one. Where some
+    pixels of a bin are clipped, the others are those with the least noise and texture.
+    """
+    radiance = np.floor((pixels.log_exposure - log_gain) / tuning.bin_width).astype(int)
+    for k in np.unique(radiance).tolist():
+        own = pixels[radiance == k]
+        flat = own[own.texture <= np.quantile(own.texture, tuning.flat_share)]
+        if flat.clipped.mean() > tuning.max_clipped or own.log_exposure.min() < tuning.darkest:
+            continue
+        flat = flat[~flat.clipped]
+        if len(flat.noise) < tuning.min_bin_pixels:
+            continue
+        deviation = robust_deviation(flat.noise)
+        margin = tuning.clip_margin * deviation / np.median(flat.slope)
+        value = np.median(flat.value)
+        is_unclipped = value - margin >= LOW and value + margin <= HIGH
+        if is_unclipped and 0 < deviation <= tuning.max_deviation:
+            yield k, flat
+
+
+def robust_deviation(noise: np.ndarray) -> float:
+    """The standard deviation of normal `noise` (N,), from the median of its square."""
+    return float(np.sqrt(np.median(noise**2) / MEDIAN_SQUARE))
+
+
+def noise_variances(noises: Sequence[np.ndarray], texture: np.ndarray) -> np.ndarray:
+    """The variances (N,) of the `noises` of bins, which have a `texture` (N,) each.
+
+    They come from the characteristic function, -2 ln E[cos(w n)] / w^2, at one
+    frequency w for all bins of a texture. So they are robust, and the variance of
+    normal noise adds to what texture contributes, however texture is distributed. A
+    median square does not: compressed footage has smooth blocks beside detailed ones,
+    and the more noise there is, the more of their mean texture would show.
+    """
+    variances = np.empty(len(noises))
+    deviation = np.array([robust_deviation(noise) for noise in noises])
+    for each in np.unique(texture):
+        members = np.flatnonzero(texture == each).tolist()
+        frequency = 1 / deviation[members].max()
+        for k in members:
+            mean = np.cos(frequency * noises[k]).mean()
+            variances[k] = -2 * np.log(max(mean, MIN_MEAN_COSINE)) / frequency**2
+    return variances
 
 
 def code_step(image: np.ndarray) -> float:
@@ -158,34 +219,49 @@ def code_step(image: np.ndarray) -> float:
     return float(np.diff(np.unique(image)).min(initial=STEP_8_BIT))
 
 
-def channel_noise(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Of each unclipped pixel of an `image` (H, W) the log exposure, the noise and the
-    slope in units of it, the recorded value, and log exposure per value: (5, N).
-    """
+def channel_pixels(image: np.ndarray, x: np.ndarray, y: np.ndarray) -> Pixels:
+    """The pixels of an `image` (H, W), but for those at its border."""
     image = np.ascontiguousarray(image, np.float32)
     value = np.linspace(0, 1, 1025)
     log_exposure = np.log(np.maximum(np.interp(value, y, x), MIN_EXPOSURE))
-    gain_at_value = np.gradient(log_exposure, value)
+    slope_at_value = np.gradient(log_exposure, value)
     window = np.ones((3, 3), np.uint8)
-    unclipped = (np.asarray(cv2.erode(image, window)) >= LOW) & (
-        np.asarray(cv2.dilate(image, window)) <= HIGH
+    clipped = (np.asarray(cv2.erode(image, window)) < LOW) | (
+        np.asarray(cv2.dilate(image, window)) > HIGH
     )
-    unclipped[[0, -1]] = False
-    unclipped[:, [0, -1]] = False
-    z = np.asarray(cv2.blur(image, (3, 3)))[unclipped]
-    gain = np.interp(z, value, gain_at_value)
-    noise = np.asarray(cv2.filter2D(image, -1, KERNEL))[unclipped] * gain
-    horizontal = np.asarray(cv2.filter2D(image, -1, SLOPE))[unclipped]
-    vertical = np.asarray(cv2.filter2D(image, -1, np.ascontiguousarray(SLOPE.T)))[unclipped]
-    slope = np.hypot(horizontal, vertical) * gain
-    return np.stack([np.interp(z, value, log_exposure), noise, slope, z, gain])
+    mean = np.asarray(cv2.blur(image, (3, 3)))
+    noise = np.asarray(cv2.filter2D(image, -1, KERNEL))
+    horizontal = np.asarray(cv2.filter2D(image, -1, GRADIENT))
+    vertical = np.asarray(cv2.filter2D(image, -1, np.ascontiguousarray(GRADIENT.T)))
+    z = inner(mean)
+    slope = np.interp(z, value, slope_at_value)
+    return Pixels(
+        log_exposure=np.interp(z, value, log_exposure),
+        noise=inner(noise) * slope,
+        texture=inner(np.hypot(horizontal, vertical)) * slope,
+        value=z,
+        slope=slope,
+        clipped=inner(clipped),
+    )
 
 
-def texture_columns(bins: NoiseBins, tuning: SensorNoiseTuning = SensorNoiseTuning()) -> np.ndarray:
-    """Which bins (N, M) share each of M textures: those of a channel and radiance."""
-    radiance = np.floor(bins.log_radiance / tuning.bin_width)
-    _, texture = np.unique(np.stack([bins.channel, radiance]), axis=1, return_inverse=True)
-    return np.eye(texture.max() + 1)[texture.ravel()]
+def inner(values: np.ndarray) -> np.ndarray:
+    """All `values` (H, W) but those at the border, in a row."""
+    return values[1:-1, 1:-1].ravel()
+
+
+def texture_of(channel: np.ndarray, radiance: np.ndarray) -> np.ndarray:
+    """Which of M textures (N,) bins have: every `channel` (N,) and bin of `radiance`
+    (N,) has its own.
+    """
+    _, texture = np.unique(np.stack([channel, radiance]), axis=1, return_inverse=True)
+    return texture.ravel()
+
+
+def texture_columns(bins: NoiseBins) -> np.ndarray:
+    """Which bins (N, M) share each of M textures."""
+    texture = texture_of(bins.channel, bins.radiance)
+    return np.eye(texture.max() + 1)[texture]
 
 
 def fit_cost(
@@ -197,8 +273,8 @@ def fit_cost(
     """The robust squared error of the best noise with this power and read-out noise:
     twice the sum of sqrt(1 + e^2) - 1 over errors e of log variance in deviations.
     """
-    texture = texture_columns(bins, tuning)
-    deviation = np.sqrt(2.7 / bins.count + tuning.model_error**2)  # 2.7: of a median
+    texture = texture_columns(bins)
+    deviation = np.sqrt(2.2 / bins.count + tuning.model_error**2)  # 2.2: of normal noise
     photons = np.exp(-power * bins.log_exposure) / power**2
     read = read_electrons**2 * np.exp(-2 * power * bins.log_exposure) / power**2
     target = np.maximum(bins.variance - bins.rounding, 0)

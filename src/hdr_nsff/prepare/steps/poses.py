@@ -25,6 +25,7 @@ from hdr_nsff.priors.masks.geometric import geometric_mask, rough_mask
 from hdr_nsff.priors.poses.estimate import (
     PosesTuning,
     estimate_poses,
+    nearly_still_poses,
     panorama_poses,
     parallax_free_share,
     rig_views,
@@ -152,7 +153,8 @@ def poses_and_masks(work: Work) -> Poses:
 
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
     change any more. Where they keep changing and rotations explain much of the
-    footage, the camera counts as one that turns in place. A rig needs one round: its
+    footage, the camera counts as one that turns in place; where the little detail that
+    is no mover's keeps its place, as one that stands still. A rig needs one round: its
     masks need no poses.
     """
     if work.manifest.rig > 1:
@@ -179,29 +181,33 @@ def poses_and_masks(work: Work) -> Poses:
             return poses
         if rounds_left:
             poses, before = estimate(work, moving, earlier), moving
-    if (before ^ moving).mean() < MIN_RESTLESS_SHARE:
-        return poses
-    return turning_poses(work, moving) or poses
+    return poses_without_parallax(work, before, moving) or poses
 
 
-def turning_poses(work: Work, moving: np.ndarray) -> Poses | None:
-    """Poses of a camera that turns in place; None where rotations explain too little of
-    what is not `moving` (T, H, W) bool.
+def poses_without_parallax(work: Work, before: np.ndarray, moving: np.ndarray) -> Poses | None:
+    """Poses of a camera that turns in place or stands still, where masks (T, H, W) bool
+    keep changing, from `before` to `moving`.
+
+    None where the masks change little or rotations explain too little of what is not
+    moving, and nothing keeps its place.
     """
     track = best_track(work)
     own = track_frames(work.manifest, track)
-    video, clipped = work.equalized
-    video, ignore = video[own], moving[own] | np.array(clipped[own])
-    share = parallax_free_share(video, ignore)
-    if share is None or share < PosesTuning().min_rotation_share_fallback:
-        return None
-    poses = rotation_poses(video, ignore)
+    video, clipped = (stack[own] for stack in work.equalized)
+    ignore = moving[own] | np.array(clipped)
+    restless = (before ^ moving).mean() >= MIN_RESTLESS_SHARE
+    share = parallax_free_share(video, ignore) if restless else None
+    reason = "since its masks keep changing"
+    poses = None
+    if share is not None and share >= PosesTuning().min_rotation_share_fallback:
+        poses = rotation_poses(video, ignore)
+        note = f"turns in place, {reason} and rotations explain {share:.0%} of the matches"
+    if poses is None:
+        poses = nearly_still_poses(video, clipped)
+        note = f"stands still, {reason} and what is no mover's keeps its place"
     if poses is None:
         return None
-    note = (
-        "treated as a camera that turns in place, since its masks keep changing and "
-        f"rotations explain {share:.0%} of the matches"
-    )
+    note = f"treated as a camera that {note}"
     say(f"poses: {note}")
     return share_poses(work, replace(poses, notes=(note, *poses.notes)), track)
 

@@ -57,7 +57,11 @@ from hdr_nsff.priors.poses.rotation import (
     rotation_share,
 )
 from hdr_nsff.priors.poses.sfm import LENS_FILE
-from hdr_nsff.priors.poses.still_camera import StillCameraTuning, still_camera_shifts
+from hdr_nsff.priors.poses.still_camera import (
+    StillCameraTuning,
+    nearly_still_shifts,
+    still_camera_shifts,
+)
 from hdr_nsff.priors.poses.view_matches import EarlierRounds
 from hdr_nsff.priors.poses.visit_matches import VisitImages
 
@@ -142,9 +146,12 @@ def estimate_poses(
         except InputError as error:
             if share >= tuning.min_rotation_share_fallback:
                 poses = rotation_poses(video, ignore, tuning, lens)
+            motion = "turns in place"
+            if poses is None:
+                poses, motion = nearly_still_poses(video, clipped, tuning, lens), "stands still"
             if poses is None:
                 raise
-            note = f"treated as a camera that turns in place, since {error}"
+            note = f"treated as a camera that {motion}, since {error}"
             poses = replace(poses, notes=(note, *poses.notes))
     if poses.lenses:
         return replace(poses, lenses={cameras[groups[k][0]]: v for k, v in poses.lenses.items()})
@@ -273,8 +280,24 @@ def still_poses(
     are `clipped` (T, H, W) bool; None where it moves.
     """
     shifts = still_camera_shifts(video, clipped, tuning.still)
-    if shifts is None:
-        return None
+    return None if shifts is None else poses_at_rest(video, shifts, tuning, lens)
+
+
+def nearly_still_poses(
+    video: ArrayStack,
+    clipped: ArrayStack | None,
+    tuning: PosesTuning = PosesTuning(),
+    lens: LensChoice = "none",
+) -> Poses | None:
+    """The same where no other poses are found, of a camera that may shake a little."""
+    shifts = nearly_still_shifts(video, clipped, tuning.still)
+    return None if shifts is None else poses_at_rest(video, shifts, tuning, lens)
+
+
+def poses_at_rest(
+    video: ArrayStack, shifts: np.ndarray, tuning: PosesTuning, lens: LensChoice
+) -> Poses:
+    """Poses of a camera at rest, for frames that shift by `shifts` (F,) pixels."""
     count, height, width = video.shape[:3]
     panorama = still_panorama(count, width, float(np.median(shifts)), tuning)
     return panorama_poses(panorama, height, width, tuning, lens)
@@ -348,14 +371,14 @@ def panorama_poses(
 
 def rotation_notes(panorama: Panorama, still: bool, default_fov: float) -> tuple[str, str]:
     """What was found of a camera without parallax, in sentences."""
-    motion = "stands still"
-    if not still:
-        motion = f"turns in place (by up to {panorama.max_displacement:.0f} px)"
+    motion = "no parallax: the camera stands still"
+    if not still:  # a camera that slides slowly past what is far away looks the same
+        by = f"by up to {panorama.max_displacement:.0f} px"
+        motion = f"hardly any parallax: the camera counts as one that turns in place ({by})"
     origin = "from the turn"
     if not panorama.focal_known:
         origin = f"assumed: {default_fov:.0f} degrees across"
     return (
-        f"no parallax: the camera {motion}; "
-        "HDR video and in-between times work, novel viewpoints do not",
+        f"{motion}; HDR video and in-between times work, novel viewpoints do not",
         f"focal length {panorama.focal:.0f} px, {origin}",
     )

@@ -59,31 +59,13 @@ class StillCameraTuning:
     side_share: float = 0.12  # of the picture's width, of a side whose detail counts
     min_share_calm: float = 0.01  # of the picture, of detail kept there
     max_median_shift_calm_px: float = 0.2
+    # Or hardly any, where no other poses are found: so much detail, in so many cells,
+    # shifted by less than this share of the picture's width (a bottle in a hand before
+    # a plain wall leaves 4 % in 6 cells, shifted by 0.3 %)
+    min_share_last: float = 0.02
+    min_cells_last: int = 3
+    max_shift_share_last: float = 0.003
     detail: LocalDetailTuning = field(default_factory=LocalDetailTuning)
-
-
-def still_camera_shifts(
-    video: ArrayStack,
-    clipped: ArrayStack | None = None,
-    tuning: StillCameraTuning = StillCameraTuning(),
-) -> np.ndarray | None:
-    """By how many pixels (F,) the background shifts in frames spread over a clip; None
-    where the camera does not stand still.
-
-    `video` (T, H, W, 3) at one brightness; `clipped` (T, H, W) bool: pixels without
-    information.
-    """
-    chosen = spread_frames(len(video), tuning.max_frames)
-    details = np.stack([local_detail(video[t], tuning.detail) for t in chosen])
-    size = details.shape[:0:-1]
-    recorded = np.ones(details.shape, bool)
-    if clipped is not None:
-        recorded = np.stack([recorded_detail(clipped[t], size, tuning) for t in chosen])
-    background = median_of_recorded(details, recorded)
-    kept = kept_detail(details, recorded, background, tuning)
-    found = Detail(details, recorded, background, kept, video.shape[2] / details.shape[2])
-    shifts = shifts_if_spread(found, tuning)
-    return shifts_if_calm(found, tuning) if shifts is None else shifts
 
 
 @dataclass(frozen=True)
@@ -102,6 +84,53 @@ class Detail:
         return self.scale * np.array(
             [shift_of(frame, self.background, part & seen) for frame, seen in pairs]
         )
+
+
+def still_camera_shifts(
+    video: ArrayStack,
+    clipped: ArrayStack | None = None,
+    tuning: StillCameraTuning = StillCameraTuning(),
+) -> np.ndarray | None:
+    """By how many pixels (F,) the background shifts in frames spread over a clip; None
+    where the camera does not stand still.
+
+    `video` (T, H, W, 3) at one brightness; `clipped` (T, H, W) bool: pixels without
+    information.
+    """
+    found = detail_of(video, clipped, tuning)
+    shifts = shifts_if_spread(found, tuning)
+    return shifts_if_calm(found, tuning) if shifts is None else shifts
+
+
+def nearly_still_shifts(
+    video: ArrayStack,
+    clipped: ArrayStack | None = None,
+    tuning: StillCameraTuning = StillCameraTuning(),
+) -> np.ndarray | None:
+    """The same of a camera that may shake a little, for footage that has no other
+    poses: the little detail that is no mover's hardly shifts.
+    """
+    found = detail_of(video, clipped, tuning)
+    if found.kept.mean() < tuning.min_share_last:
+        return None
+    if occupied_cells(found.kept, tuning.cells) < tuning.min_cells_last:
+        return None
+    shifts = found.shifts(found.kept)
+    small = shifts < tuning.max_shift_share_last * video.shape[2]
+    return shifts if small.mean() >= tuning.still_share else None
+
+
+def detail_of(video: ArrayStack, clipped: ArrayStack | None, tuning: StillCameraTuning) -> Detail:
+    """The detail of frames spread over a clip."""
+    chosen = spread_frames(len(video), tuning.max_frames)
+    details = np.stack([local_detail(video[t], tuning.detail) for t in chosen])
+    size = details.shape[:0:-1]
+    recorded = np.ones(details.shape, bool)
+    if clipped is not None:
+        recorded = np.stack([recorded_detail(clipped[t], size, tuning) for t in chosen])
+    background = median_of_recorded(details, recorded)
+    kept = kept_detail(details, recorded, background, tuning)
+    return Detail(details, recorded, background, kept, video.shape[2] / details.shape[2])
 
 
 def shifts_if_spread(found: Detail, tuning: StillCameraTuning) -> np.ndarray | None:
