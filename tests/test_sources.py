@@ -93,9 +93,9 @@ def test_weights_for_a_source_without_weights_are_refused(tmp_path: Path):
 def test_semantic_flow_takes_the_weights_of_its_features(tmp_path: Path):
     broken = tmp_path / "xfeat.pt"
     broken.write_bytes(b"nothing")
-    check_flow("semantic", broken)
-    with pytest.raises(InputError, match="no weights of XFeat"):
-        flow_source("semantic", broken)
+    for load in (check_flow, flow_source):
+        with pytest.raises(InputError, match="no weights of XFeat"):
+            load("semantic", broken)
     with pytest.raises(InputError, match="0 or more"):
         flow_source("semantic", broken, SemanticConfig(steps=-1))
 

@@ -215,8 +215,9 @@ def load_xfeat(path: Path) -> XFeat:
     try:
         return XFeat(torch.load(path, map_location="cpu", weights_only=True))
     except Exception as error:  # of many types: no archive, other names, other shapes
+        reason = type(error).__name__  # torch's message is a page
         raise InputError(
-            f"{path}: no weights of XFeat ({type(error).__name__}: {error}); name its xfeat.pt"
+            f"{path}: no weights of XFeat ({reason}); name its xfeat.pt, or copy it again"
         ) from error
 
 

@@ -102,8 +102,8 @@ def check_flow(
             "--flow raft-finetuned needs the weights that `hdr-nsff finetune-flow` wrote; "
             "name them with --flow-weights"
         )
-    if chosen in NETWORKS:
-        flow_source(chosen, weights)
+    if chosen in NETWORKS or (chosen == "semantic" and weights is not None):
+        flow_source(chosen, weights, semantic)
 
 
 def check_weights(chosen: FlowName | Path | None, weights: Path) -> None:
