@@ -217,7 +217,7 @@ def drift_scale(
             levels.tolist(),
             x,
             y,
-            exposures.min() + LEVEL_EV * np.arange(levels.max() + 1),
+            exposures,
             FACTORS,
             tuning.noise,
         )
@@ -291,7 +291,7 @@ def evidence_of_noise(views: Sequence[ResponseView], tuning: ResponseTuning) -> 
     brackets = [v.bracket for v in views]
 
     def evidence(x: np.ndarray, y: np.ndarray, ev: np.ndarray) -> np.ndarray | None:
-        return noise_log_likelihood(images, brackets, x, y, ev, FACTORS, tuning.noise)
+        return noise_log_likelihood(images, brackets, x, y, ev[brackets], FACTORS, tuning.noise)
 
     return evidence
 
