@@ -35,7 +35,9 @@ def rounds(tmp_path, monkeypatch, models):
     and of which rotations explain a `share`; the masks of every round are given.
     """
 
-    def run(share: float | None, *masks: np.ndarray, video: np.ndarray = PAN) -> tuple[Poses, int]:
+    def run(
+        share: float | None, *masks: np.ndarray, video: np.ndarray = PAN, cameras: int = 1
+    ) -> tuple[Poses, int]:
         estimates = []
 
         def estimate(work, moving, earlier):
@@ -49,7 +51,7 @@ def rounds(tmp_path, monkeypatch, models):
         monkeypatch.setattr(step, "rough_mask", lambda *_: masks[0])
         monkeypatch.setattr(step, "geometric_mask", lambda *_: next(after))
         monkeypatch.setattr(step, "parallax_free_share", lambda *_: share)
-        frames = [SimpleNamespace(index=t, track=0, camera_id=0) for t in range(T)]
+        frames = [SimpleNamespace(index=t, track=0, camera_id=t % cameras) for t in range(T)]
         work = SimpleNamespace(
             folder=tmp_path,
             manifest=SimpleNamespace(rig=1, num_tracks=1, frames=frames),
@@ -122,3 +124,8 @@ def test_a_killed_run_starts_its_second_round_from_the_model_of_the_first(rounds
     rounds(0.7, mask(0), mask(0))
     rounds(0.7, mask(9), mask(30), mask(30))
     assert models == [{}, {"images.bin": bytes([1, 0, 255])}]
+
+
+def test_several_cameras_are_no_tripod(rounds):
+    poses, _ = rounds(0.7, *RESTLESS, cameras=2)
+    assert poses.parallax == "full"

@@ -189,8 +189,10 @@ def poses_without_parallax(work: Work, before: np.ndarray, moving: np.ndarray) -
     keep changing, from `before` to `moving`.
 
     None where the masks change little or rotations explain too little of what is not
-    moving, and nothing keeps its place.
+    moving, and nothing keeps its place; and for several cameras.
     """
+    if len({f.camera_id for f in work.manifest.frames if not f.track}) > 1:
+        return None
     track = best_track(work)
     own = track_frames(work.manifest, track)
     video, clipped = (stack[own] for stack in work.equalized)

@@ -125,8 +125,8 @@ def estimate_poses(
                 ignore[t] |= mask[t]
     cameras = camera_ids or [0] * count
     groups = camera_groups(cameras)
-    poses, share = None, 0.0
-    if len(groups) == 1 and views is None:
+    poses, share, is_one_camera = None, 0.0, views is None and len(groups) == 1
+    if is_one_camera:
         poses = still_poses(video, clipped, tuning, lens)
         if poses is None:
             share = parallax_free_share(video, ignore, tuning) or 0.0
@@ -147,7 +147,7 @@ def estimate_poses(
             if share >= tuning.min_rotation_share_fallback:
                 poses = rotation_poses(video, ignore, tuning, lens)
             motion = "turns in place"
-            if poses is None:
+            if poses is None and is_one_camera:
                 poses, motion = nearly_still_poses(video, clipped, tuning, lens), "stands still"
             if poses is None:
                 raise
