@@ -144,20 +144,40 @@ def estimate_poses(
         try:
             poses = mapper.poses(lens)
         except InputError as error:
-            if share >= tuning.min_rotation_share_fallback:
-                poses = rotation_poses(video, ignore, tuning, lens)
-            motion = "turns in place"
-            if poses is None and is_one_camera:
-                poses, motion = nearly_still_poses(video, clipped, tuning, lens), "stands still"
+            if is_one_camera:
+                poses = unmapped_poses(error, share, video, ignore, clipped, tuning, lens)
             if poses is None:
                 raise
-            note = f"treated as a camera that {motion}, since {error}"
-            poses = replace(poses, notes=(note, *poses.notes))
     if poses.lenses:
         return replace(poses, lenses={cameras[groups[k][0]]: v for k, v in poses.lenses.items()})
     for note in poses.notes:
         say(f"poses: {note}")
     return poses
+
+
+def unmapped_poses(
+    error: InputError,
+    rotation_share: float,
+    video: ArrayStack,
+    ignore: np.ndarray,
+    clipped: ArrayStack | None,
+    tuning: PosesTuning,
+    lens: LensChoice,
+) -> Poses | None:
+    """Poses of one camera of which structure from motion says an `error`: of a turn in
+    place that explains the share `rotation_share` of matches, or at rest.
+
+    `video` (T, H, W, 3), `ignore` and `clipped` (T, H, W) bool. None where neither does.
+    """
+    poses, motion = None, "turns in place"
+    if rotation_share >= tuning.min_rotation_share_fallback:
+        poses = rotation_poses(video, ignore, tuning, lens)
+    if poses is None:
+        poses, motion = nearly_still_poses(video, clipped, tuning, lens), "stands still"
+    if poses is None:
+        return None
+    note = f"treated as a camera that {motion}, since {error}"
+    return replace(poses, notes=(note, *poses.notes))
 
 
 def rig_views(pictures: np.ndarray, visits: VisitImages, places: Sequence[int]) -> SfmViews:
