@@ -157,7 +157,7 @@ def estimate_poses(
 
 def unmapped_poses(
     error: InputError,
-    rotation_share: float,
+    share: float,
     video: ArrayStack,
     ignore: np.ndarray,
     clipped: ArrayStack | None,
@@ -165,12 +165,13 @@ def unmapped_poses(
     lens: LensChoice,
 ) -> Poses | None:
     """Poses of one camera of which structure from motion says an `error`: of a turn in
-    place that explains the share `rotation_share` of matches, or at rest.
+    place that explains a `share` of the matches, or at rest.
 
-    `video` (T, H, W, 3), `ignore` and `clipped` (T, H, W) bool. None where neither does.
+    `video` (T, H, W, 3); `ignore` and `clipped` (T, H, W) bool. None where neither
+    explains it.
     """
     poses, motion = None, "turns in place"
-    if rotation_share >= tuning.min_rotation_share_fallback:
+    if share >= tuning.min_rotation_share_fallback:
         poses = rotation_poses(video, ignore, tuning, lens)
     if poses is None:
         poses, motion = nearly_still_poses(video, clipped, tuning, lens), "stands still"
