@@ -8,7 +8,7 @@ explains them as well as E). Three sources narrow it down:
 - Most cameras are about equally steep between the mid-tones and the highlights
   (`debevec.typical_factor`): good to 10 %.
 - The noise of a raw sensor grows with the light in a known way (`sensor_noise.py`):
-  good to 4 to 11 %, where footage still shows that noise.
+  good to 4 to 13 %, where footage still shows that noise.
 - People and cameras bracket in whole stops, seldom in halves or thirds.
 
 The third source decides only where it agrees with the other two: measured steps move to

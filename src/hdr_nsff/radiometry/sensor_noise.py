@@ -38,10 +38,10 @@ MIN_MEAN_COSINE = 1e-3  # of noise, for a variance that is a number
 class SensorNoiseTuning:
     """Which pixels show noise, and how well a fit has to explain them.
 
-    Hand-chosen on eight re-exposed clips with noise of 6000 electrons, five of them
+    Hand-chosen on eight re-exposed clips with noise of 6000 electrons, three of them
     from compressed footage. Their misfit is 0.5 to 2.1, and 3.9 where the curve comes
-    from auto exposure; that of compressed video 2.1 to 170, in seven of nine clips
-    above 4.2, and in the other two the likelihood is wide.
+    from auto exposure; that of compressed video 2.1 to 170, above 4.2 in seven of nine
+    clips.
     """
 
     max_pixels: float = 6e6  # that are looked at, of all frames
