@@ -48,7 +48,7 @@ def training_clip() -> TrainingClip:
     inner = positions[(positions[:, 0] > 2) & (positions[:, 0] < 12)]
     tracks = [Track((0, 2), inner, inner + torch.tensor([2.0, 0.0]))]
     features = Features(maps + noise, 4.0, 2.0)
-    search = Search(reach=5, radius=1.0, temperature=0.05)
+    search = Search(reach=5, radius=1, temperature=0.05)
     return TrainingClip(features, video, tracks, [(0, 1), (1, 2)], search)
 
 

@@ -45,7 +45,7 @@ def test_the_maximum_of_a_parabola_is_found():
     """
     positions, top = cell_positions(15, 15), torch.tensor([7.3, 6.6])
     similarity = 1 - 0.02 * ((positions - top) ** 2).sum(-1)[None]
-    found = soft_argmax(similarity, positions, radius=5, temperature=0.04)[0]
+    found = soft_argmax(similarity.view(1, 15, 15), radius=5, temperature=0.04)[0]
     assert torch.allclose(found, top, atol=1e-3)
 
 

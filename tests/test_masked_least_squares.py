@@ -81,6 +81,13 @@ def test_a_remaining_difference_of_exposure_does_no_harm(change) -> None:
     assert error(refine_mover_flow(source, brighter, blurred(), MASK)) < 0.65 * error(blurred())
 
 
+def test_pixels_far_from_a_mover_do_not_matter() -> None:
+    far = disc(np.float32([-100.0, -100.0]))
+    far[0, 0] = far[-1, -1] = True  # the box around the mover is now the whole picture
+    alone, beside = (refine_mover_flow(*frames(), blurred(), m) for m in (MASK, MASK | far))
+    assert np.abs(alone - beside)[MASK].max() < 1e-4
+
+
 def test_static_pixels_keep_their_flow() -> None:
     found = refine_mover_flow(*frames(), blurred(), MASK)
     assert np.array_equal(found[~MASK], blurred()[~MASK])

@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 from moving_bodies import body, tracked
 
-from hdr_nsff.priors.movers.rigid_groups import cut_graph, find_rigid_groups
+from hdr_nsff.priors.movers.rigid_groups import cut_graph, find_rigid_groups, neighbor_graph
+from hdr_nsff.priors.movers.rigid_motion import RigidGroup
 from hdr_nsff.priors.movers.tracks import Tracks
-from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING
+from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING, RigidGroupsTuning
+
+
+def groups_of(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -> list[RigidGroup]:
+    return find_rigid_groups(tracks, neighbor_graph(tracks, tuning), tuning=tuning)
 
 
 def test_two_bodies_that_touch_are_separate_groups() -> None:
     one, _, _ = body(0, np.array([-0.4, 0, 3.0]), np.array([0.06, 0, 0]), 0.12)
     two, _, _ = body(1, np.array([0.5, 0.1, 3.2]), np.array([-0.04, 0.01, 0]), -0.08)
-    groups = find_rigid_groups(tracked(np.concatenate([one, two]), noise=0.005))
+    groups = groups_of(tracked(np.concatenate([one, two]), noise=0.005))
     assert len(groups) == 2
     for group in groups:
         share = (group.members < len(one)).mean()
@@ -25,17 +30,19 @@ def test_a_group_below_the_least_share_is_dropped() -> None:
     one, _, _ = body(0, np.array([-0.4, 0, 3.0]), np.array([0.06, 0, 0]), 0.12)
     two, _, _ = body(1, np.array([0.5, 0.1, 3.2]), np.array([-0.04, 0.01, 0]), -0.08)
     tracks = tracked(np.concatenate([one, two[:40]]), noise=0.005)
-    assert len(find_rigid_groups(tracks)) == 2  # the second has a quarter of the tracks
+    assert len(groups_of(tracks)) == 2  # the second has a quarter of the tracks
     tuning = replace(RIGID_GROUPS_TUNING, min_group_share=0.5)
-    assert len(find_rigid_groups(tracks, tuning=tuning)) == 1
+    assert len(groups_of(tracks, tuning)) == 1
 
 
 def test_tracks_without_neighbors_are_parts_of_their_own() -> None:
     points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1, count=12)
     near = tracked(points)
     far = [replace(near, pixels=near.pixels + 1000.0 * k) for k in range(12)]
-    columns = [np.concatenate([getattr(t, f.name) for t in far]) for f in fields(Tracks)]
-    assert len(np.unique(cut_graph(Tracks(*columns)))) == RIGID_GROUPS_TUNING.parts
+    names = [f.name for f in fields(Tracks) if f.name != "spacing"]
+    tracks = Tracks(*(np.concatenate([getattr(t, name) for t in far]) for name in names))
+    parts = cut_graph(tracks, neighbor_graph(tracks))
+    assert len(np.unique(parts)) == RIGID_GROUPS_TUNING.parts
 
 
 @pytest.mark.filterwarnings("error")
@@ -44,5 +51,5 @@ def test_one_time_is_no_error() -> None:
     pixels = 200 * points[:, :1, :2] / points[:, :1, 2:] + 100
     once = np.ones((len(points), 1))
     tracks = Tracks(pixels, points[:, :1], once, once.astype(int), once.astype(int))
-    groups = find_rigid_groups(tracks)
+    groups = groups_of(tracks)
     assert len(groups) == 1 and abs(groups[0].translations).max() < 1e-12

@@ -1,9 +1,19 @@
 """Tracks along flow: where they go and where they end."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from hdr_nsff.priors.movers.tracks import MovingView, advance, follow_moving_pixels, smooth_flow
+from hdr_nsff.priors.movers.rigid_groups import neighbor_graph
+from hdr_nsff.priors.movers.tracks import (
+    MovingView,
+    Tracks,
+    advance,
+    follow_moving_pixels,
+    smooth_flow,
+)
+from hdr_nsff.priors.movers.tuning import TRACK_TUNING
 
 
 def test_a_track_ends_where_flow_is_invalid_or_leaves_the_moving_pixels() -> None:
@@ -52,3 +62,23 @@ def test_tracks_end_between_two_objects() -> None:
     assert out[0, 0] == pytest.approx(25)
     assert np.isnan(out[1, 0])
     assert out[2, 0] == pytest.approx(18.2)
+
+
+def test_large_movers_have_sparser_tracks() -> None:
+    moving = np.ones((50, 60), bool)
+    still = np.zeros((50, 60, 2), np.float32)
+    both, sure = {1: still, -1: still}, {1: moving, -1: moving}
+    views = [MovingView(moving, np.zeros((50, 60, 3)), moving.astype(float), both, sure)] * 4
+    few = follow_moving_pixels(views, replace(TRACK_TUNING, max_starts=200))
+    assert few.spacing == 8 and len(few.trust) == 4 * 6 * 7  # of 48 x 58 inner pixels
+    assert follow_moving_pixels(views).spacing == TRACK_TUNING.stride_px
+
+
+def test_tracks_of_any_spacing_have_neighbors() -> None:
+    for spacing in (3, 9):
+        y, x = np.mgrid[:4, :5].reshape(2, -1) * spacing + 0.5
+        pixels = np.stack([x, y], -1)[:, None].repeat(3, 1)
+        ones = np.ones(pixels.shape[:2])
+        tracks = Tracks(pixels, np.zeros((20, 3, 3)), ones, ones.astype(int), ones, spacing)
+        num_neighbors = np.diff(neighbor_graph(tracks).indptr)
+        assert num_neighbors.min() == 5 and num_neighbors.max() == 11

@@ -7,6 +7,7 @@ differentiable except the choice of the maximum.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -23,7 +24,7 @@ class Search:
 
     reach: float
     """Largest motion, in x and in y, in cells."""
-    radius: float
+    radius: int
     """The soft-argmax covers the cells within this distance of the best one, in x and
     in y, in cells.
     """
@@ -55,16 +56,23 @@ def cosines(queries: Tensor, target: Tensor) -> Tensor:
     return functional.normalize(queries, dim=-1) @ functional.normalize(target, dim=0).flatten(1)
 
 
-def soft_argmax(similarity: Tensor, positions: Tensor, radius: float, temperature: float) -> Tensor:
-    """Sub-cell positions (N, 2) of the maxima of `similarity` (N, M).
+def soft_argmax(similarity: Tensor, radius: int, temperature: float) -> Tensor:
+    """Sub-cell positions (N, 2) of the maxima of `similarity` (N, h, w).
 
-    Each is the mean of those `positions` (M, 2) that lie within `radius` cells of the
-    maximum, weighted by softmax(similarity / temperature).
+    Each is the mean of the positions within `radius` cells of the maximum, weighted by
+    softmax(similarity / temperature).
     """
-    best = positions[similarity.detach().argmax(1)]
-    near = ((positions - best[:, None]).abs() <= radius).all(-1)
-    masked = similarity.masked_fill(~near, EXCLUDED)
-    return torch.softmax(masked / temperature, 1) @ positions
+    h, w = similarity.shape[1:]
+    flat = similarity.flatten(1)
+    best = flat.detach().argmax(1)
+    steps = torch.arange(-radius, radius + 1, device=flat.device)
+    y, x = torch.meshgrid(steps, steps, indexing="ij")
+    y = (best // w)[:, None] + y.flatten()
+    x = (best % w)[:, None] + x.flatten()
+    inside = (y >= 0) & (y < h) & (x >= 0) & (x < w)
+    near = flat.gather(1, y.clamp(0, h - 1) * w + x.clamp(0, w - 1))
+    weights = torch.softmax(near.masked_fill(~inside, EXCLUDED) / temperature, 1)
+    return (weights[..., None] * torch.stack([x, y], -1)).sum(1)
 
 
 def locate(queries: Tensor, start: Tensor, target: Tensor, search: Search) -> Tensor:
@@ -72,13 +80,20 @@ def locate(queries: Tensor, start: Tensor, target: Tensor, search: Search) -> Te
 
     They are searched around `start` (N, 2).
     """
-    positions = cell_positions(*target.shape[-2:]).to(target)
+    h, w = target.shape[-2:]
+    rows, columns = torch.arange(h).to(target), torch.arange(w).to(target)
     found = []
     for chunk, center in zip(queries.split(CHUNK), start.split(CHUNK), strict=True):
-        similarity = cosines(chunk, target)
-        beyond = ((positions - center[:, None]).abs() > search.reach).any(-1)
+        first, last = torch.aminmax(center[:, 1].detach())
+        low = max(math.ceil(float(first) - search.reach), 0)
+        high = min(math.floor(float(last) + search.reach) + 1, h)
+        similarity = cosines(chunk, target[:, low:high]).unflatten(1, (high - low, w))
+        beyond_x = (columns - center[:, :1]).abs() > search.reach  # (N, w)
+        beyond_y = (rows[low:high] - center[:, 1:]).abs() > search.reach
+        beyond = beyond_y[:, :, None] | beyond_x[:, None]
         similarity = similarity.masked_fill(beyond, EXCLUDED)
-        found.append(soft_argmax(similarity, positions, search.radius, search.temperature))
+        position = soft_argmax(similarity, search.radius, search.temperature)
+        found.append(position + position.new_tensor([0, low]))
     return torch.cat(found)
 
 

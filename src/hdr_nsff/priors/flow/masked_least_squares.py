@@ -10,12 +10,15 @@ correction is smooth. Flow is in pixels, x then y, as in `dense`.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from hdr_nsff.geometry.round_trip import follow
+
+CUT_AT_SIGMAS = 4.0  # OpenCV's Gaussians of floats end there
 
 
 @dataclass(frozen=True)
@@ -58,16 +61,32 @@ def refine_mover_flow(
     """
     if not moving.any():
         return flow
-    source = cv2.GaussianBlur(source.astype(np.float32), (0, 0), tuning.blur_px)
+    around = box_around(moving, tuning)
+    source = cv2.GaussianBlur(source.astype(np.float32), (0, 0), tuning.blur_px)[around]
     target = cv2.GaussianBlur(target.astype(np.float32), (0, 0), tuning.blur_px)
-    mask = moving.astype(np.float32)[..., None]
-    correction = np.zeros(flow.shape, np.float32)
+    mask = moving[around].astype(np.float32)[..., None]
+    # from pixels of the box to those of the target
+    offset = np.array([around[1].start, around[0].start], np.float32)
+    start = flow[around] + offset
+    correction = np.zeros(start.shape, np.float32)
     for _ in range(tuning.iterations):
-        step = lucas_kanade_step(source, target, flow + correction, mask, tuning)
+        step = lucas_kanade_step(source, target, start + correction, mask, tuning)
         step = np.clip(step, -tuning.max_step_px, tuning.max_step_px)
         smoothed = masked_mean((correction + step) * mask, mask, tuning.smoothing_px)
         correction = mask * smoothed
-    return flow + correction
+    result = flow.copy()
+    result[around] += correction
+    return result
+
+
+def box_around(moving: np.ndarray, tuning: MaskedLeastSquaresTuning) -> tuple[slice, slice]:
+    """Rows and columns of a box around the `moving` (H, W) pixels, so wide that no
+    Gaussian around one of them leaves it, except where it leaves the picture.
+    """
+    margin = math.ceil(CUT_AT_SIGMAS * max(tuning.window_px, tuning.smoothing_px)) + 1
+    inside = (np.nonzero(moving.any(axis))[0] for axis in (1, 0))
+    rows, columns = (slice(max(i[0] - margin, 0), i[-1] + margin + 1) for i in inside)
+    return rows, columns
 
 
 def lucas_kanade_step(
@@ -77,16 +96,18 @@ def lucas_kanade_step(
     mask: np.ndarray,
     tuning: MaskedLeastSquaresTuning,
 ) -> np.ndarray:
-    """The change (H, W, 2) px of `flow` that makes masked windows look alike.
+    """The change (h, w, 2) px of `flow` that makes masked windows look alike.
 
-    Windows hold pixels of `mask` (H, W, 1) only; their mean brightness does not matter.
+    `flow` (h, w, 2) leads from the box `source` (h, w, 3) into the whole `target`
+    (H, W, 3). Windows hold pixels of `mask` (h, w, 1) only; their mean brightness does
+    not matter.
     """
     gradient_x = follow(cv2.Sobel(target, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), flow)
     gradient_y = follow(cv2.Sobel(target, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8), flow)
     error = follow(target, flow, interpolation=cv2.INTER_CUBIC) - source
     error -= masked_mean(error * mask, mask, tuning.window_px)
 
-    ones = np.ones(flow.shape[:2], np.float32)
+    ones = np.ones(target.shape[:2], np.float32)
     inside = follow(ones, flow, fill=0.0) > 0.99  # 1 but for rounding
     weight = mask * inside[..., None] / (1 + (error / tuning.outlier_rgb) ** 2)
     factors = (
@@ -97,7 +118,7 @@ def lucas_kanade_step(
         (gradient_y, error),
     )
     products = np.stack([(weight * (a * b)).sum(-1) for a, b in factors], -1)
-    means = masked_mean(products, mask, tuning.window_px)  # (H, W, 5)
+    means = masked_mean(products, mask, tuning.window_px)  # (h, w, 5)
     xx = means[..., 0] + tuning.flat_gradient
     xy = means[..., 1]
     yy = means[..., 2] + tuning.flat_gradient

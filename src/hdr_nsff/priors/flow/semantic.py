@@ -86,7 +86,7 @@ class SemanticTuning:
 
     reach: float = 1 / 6
     """Largest motion between frames, in x and in y, as a share of the longer side."""
-    argmax_radius_cells: float = 1.0
+    argmax_radius_cells: int = 1
     """Cells around the best one that the soft-argmax covers."""
     temperature: float = 0.05
     """Of the softmax of cosines."""

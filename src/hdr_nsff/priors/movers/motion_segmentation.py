@@ -12,17 +12,16 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
-from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse import csr_matrix
 
 from hdr_nsff.core.progress import track
 from hdr_nsff.priors.movers.bundle import MoverShape, adjust_bundle
 from hdr_nsff.priors.movers.bundle_problem import BundleProblem, BundleState, Cameras
 from hdr_nsff.priors.movers.rigid_groups import (
-    affinity,
     are_in_different_patches,
     find_rigid_groups,
     nearest_times,
-    neighbor_pairs,
+    neighbor_graph,
 )
 from hdr_nsff.priors.movers.rigid_motion import RigidGroup, fit_motion
 from hdr_nsff.priors.movers.tracks import Tracks
@@ -46,8 +45,9 @@ def segment_tracks(
     tracks: Tracks, cameras: Cameras, tuning: MoversTuning = MOVERS_TUNING
 ) -> list[Segment]:
     """The movers among the tracks, largest first."""
-    groups = find_rigid_groups(tracks, min_piece_share(tuning), tuning.groups)
-    return refine_segments(tracks, [group.members for group in groups], cameras, tuning)
+    graph = neighbor_graph(tracks, tuning.groups)
+    groups = find_rigid_groups(tracks, graph, min_piece_share(tuning), tuning.groups)
+    return refine_segments(tracks, graph, [group.members for group in groups], cameras, tuning)
 
 
 def min_piece_share(tuning: MoversTuning) -> float:
@@ -57,18 +57,20 @@ def min_piece_share(tuning: MoversTuning) -> float:
 
 def refine_segments(
     tracks: Tracks,
+    graph: csr_matrix,
     groups: list[np.ndarray],
     cameras: Cameras,
     tuning: MoversTuning = MOVERS_TUNING,
 ) -> list[Segment]:
     """Segments, largest first, from groups of tracks that may be mixed or in pieces.
 
-    `groups` are the members of each. Groups are merged and tracks reassigned until
-    hardly any changes; small segments are dropped, except the first.
+    `graph` (N, N) has the affinities of neighbors, `groups` the members of each. Groups
+    are merged and tracks reassigned until hardly any changes; small segments are
+    dropped, except the first.
     """
     segments = fit_segments(tracks, groups, [], cameras, tuning)
     if any(segment.shape is not None for segment in segments):
-        weights = neighbor_weights(tracks, tuning)
+        weights = rows_of_one(graph)
         for _ in range(tuning.segmentation.rounds):
             segments = merge_segments(tracks, segments, cameras, tuning)
             before = [segment.members for segment in segments]
@@ -234,13 +236,8 @@ def same_members(
     return len(np.setxor1d(before, after)) <= max_changed
 
 
-def neighbor_weights(tracks: Tracks, tuning: MoversTuning = MOVERS_TUNING) -> csr_matrix:
-    """The weights (N, N) of a track's neighbors; rows sum to 1, or 0 without any."""
-    count = len(tracks.trust)
-    pairs = neighbor_pairs(tracks, tuning.groups)
-    weights = affinity(tracks, pairs, tuning.groups)
-    graph = coo_matrix((weights, pairs.T), (count, count)).tocsr()
-    graph = graph + graph.T
+def rows_of_one(graph: csr_matrix) -> csr_matrix:
+    """The graph (N, N) with rows that sum to 1, or to 0 without any neighbor."""
     total = np.maximum(np.asarray(graph.sum(1)).ravel(), 1e-9)
     return csr_matrix(graph.multiply(1 / total[:, None]))
 

@@ -13,7 +13,7 @@ from inspect import signature
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
-from scipy.sparse import coo_matrix, diags
+from scipy.sparse import coo_matrix, csr_matrix, diags
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 from scipy.spatial import cKDTree
@@ -31,16 +31,17 @@ MergeCosts = dict[tuple[int, int], float]  # ids of two groups -> cost of their 
 
 def find_rigid_groups(
     tracks: Tracks,
+    graph: csr_matrix,
     min_share: float | None = None,
     tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING,
 ) -> list[RigidGroup]:
-    """Groups that move as one, largest first.
+    """Groups that move as one, largest first, by the `graph` of neighbors (N, N).
 
     Each has at least the share `min_share` of the tracks (`min_group_share` without
     one). If none does, the first of them is returned.
     """
     min_share = tuning.min_group_share if min_share is None else min_share
-    part = cut_graph(tracks, tuning)
+    part = cut_graph(tracks, graph, tuning)
     sampled = np.unique(np.linspace(0, len(part) - 1, tuning.max_sampled_tracks).astype(int))
     members_of_part = [np.nonzero(part == k)[0] for k in range(part.max() + 1)]
     samples = [np.intersect1d(members, sampled) for members in members_of_part]
@@ -116,8 +117,10 @@ def group_size(tracks: Tracks, group: RigidGroup) -> float:
     return float(np.nanmedian(np.linalg.norm(points - middle, axis=-1)))
 
 
-def cut_graph(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -> np.ndarray:
-    """The part (N,) of every track, by normalized cuts of the graph of neighbors.
+def cut_graph(
+    tracks: Tracks, graph: csr_matrix, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING
+) -> np.ndarray:
+    """The part (N,) of every track, by normalized cuts of a graph (N, N) of neighbors.
 
     There are `parts` of them, more than objects, or one where tracks or times are too
     few.
@@ -125,10 +128,7 @@ def cut_graph(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -
     count, num_times = tracks.trust.shape
     if num_times < 2 or count < tuning.min_tracks_per_part * tuning.parts:
         return np.zeros(count, int)
-    pairs = neighbor_pairs(tracks, tuning)
-    weights = affinity(tracks, pairs, tuning)
-    graph = coo_matrix((weights, pairs.T), (count, count)).tocsr()
-    graph = graph + graph.T + diags(np.full(count, 1e-6))
+    graph = graph + diags(np.full(count, 1e-6))
     degree = np.asarray(graph.sum(1)).ravel()
     scale = diags(1 / np.sqrt(degree))
     start = np.random.default_rng(0).standard_normal(count)
@@ -149,16 +149,26 @@ def cut_graph(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -
     return kmeans2(vectors, tuning.parts, minit="++", rng=np.random.default_rng(0))[1]
 
 
+def neighbor_graph(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -> csr_matrix:
+    """The affinity (N, N) of tracks that come near each other in an image."""
+    count = len(tracks.trust)
+    pairs = neighbor_pairs(tracks, tuning)
+    graph = coo_matrix((affinity(tracks, pairs, tuning), pairs.T), (count, count)).tocsr()
+    return graph + graph.T
+
+
 def neighbor_pairs(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -> np.ndarray:
     """Pairs (P, 2) of tracks that come near each other in an image."""
-    found = [np.zeros((0, 2), int)]
-    for t in range(tracks.trust.shape[1]):
+    count, num_times = tracks.trust.shape
+    found = [np.zeros(0, int)]  # pairs as numbers: these are sorted fast
+    for t in range(num_times):
         visible = np.nonzero(tracks.trust[:, t])[0]
         if len(visible):
             tree = cKDTree(tracks.pixels[visible, t])
-            pairs = tree.query_pairs(tuning.link_px, output_type="ndarray")
-            found.append(visible[pairs])
-    return np.unique(np.concatenate(found), axis=0)
+            reach = tuning.link_spacings * tracks.spacing
+            first, second = visible[tree.query_pairs(reach, output_type="ndarray")].T
+            found.append(first * count + second)
+    return np.stack(np.divmod(np.unique(np.concatenate(found)), max(count, 1)), 1)
 
 
 def affinity(
@@ -177,7 +187,7 @@ def affinity(
         offset = tracks.pixels[first] - tracks.pixels[second]  # (P, T, 2)
         speed = np.linalg.norm(np.diff(offset, axis=1), axis=-1)
         shared = np.isfinite(speed)
-        fastest = np.where(shared, speed, 0).max(1)
+        fastest = np.where(shared, speed, 0).max(1, initial=0)
         result[batch] = shared.sum(1) * np.exp(-((fastest / tuning.parting_px) ** 2))
     return result
 

@@ -9,6 +9,7 @@ lies between two motions. The depth may be wrong; later steps correct it. Pixels
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -49,6 +50,7 @@ class Tracks:
     trust: np.ndarray  # (N, T) in the depth, 0 where not visible
     patch: np.ndarray  # (N, T) connected patch of moving pixels, 0 where not visible
     age: np.ndarray  # (N, T) steps of flow since the start: errors accumulate
+    spacing: float = TRACK_TUNING.stride_px  # px from one start to the next
 
     def at(self, times: np.ndarray) -> Tracks:
         """The same tracks at the `times` (S,)."""
@@ -58,6 +60,7 @@ class Tracks:
             self.trust[:, times],
             self.patch[:, times],
             self.age[:, times],
+            self.spacing,
         )
 
 
@@ -66,7 +69,8 @@ def follow_moving_pixels(views: Sequence[MovingView], tuning: TrackTuning = TRAC
     num = len(views)
     spread = np.linspace(0, num - 1, min(tuning.start_frames, num))
     starts = sorted({round(start) for start in spread.tolist()})
-    begun = [starting_pixels(views, start, tuning) for start in starts]
+    spacing = start_spacing(views, starts, tuning)
+    begun = [starting_pixels(views, start, spacing) for start in starts]
     pixels = np.concatenate(begun)
     start_of = np.repeat(starts, [len(own) for own in begun])
     forward = [(t, 1) for t in range(num - 1)]
@@ -90,16 +94,28 @@ def follow_moving_pixels(views: Sequence[MovingView], tuning: TrackTuning = TRAC
         trust[visible, t] = view.trust[y, x] + tuning.min_trust
         patch[visible, t] = patches[y, x]
     kept = (trust > 0).sum(1) >= min(tuning.min_frames, num)
-    return Tracks(pixels[kept], points[kept], trust[kept], patch[kept], age[kept])
+    return Tracks(pixels[kept], points[kept], trust[kept], patch[kept], age[kept], spacing)
 
 
-def starting_pixels(
-    views: Sequence[MovingView], start: int, tuning: TrackTuning = TRACK_TUNING
-) -> np.ndarray:
+def start_spacing(
+    views: Sequence[MovingView], starts: Sequence[int], tuning: TrackTuning = TRACK_TUNING
+) -> int:
+    """Pixels from one start to the next, in x and in y, of tracks from the times
+    `starts`.
+    """
+    num_pixels = sum(int(inner_pixels(views[start]).sum()) for start in starts)
+    return max(tuning.stride_px, math.ceil(math.sqrt(num_pixels / tuning.max_starts)))
+
+
+def inner_pixels(view: MovingView) -> np.ndarray:
+    """The moving pixels (H, W) that have moving ones on all sides."""
+    return ndimage.binary_erosion(view.moving)
+
+
+def starting_pixels(views: Sequence[MovingView], start: int, spacing: int) -> np.ndarray:
     """Pixels (N, T, 2) of the tracks that start at one time, NaN at all others."""
-    inner = ndimage.binary_erosion(views[start].moving)
-    y, x = np.nonzero(inner)
-    on_grid = (x % tuning.stride_px == 0) & (y % tuning.stride_px == 0)
+    y, x = np.nonzero(inner_pixels(views[start]))
+    on_grid = (x % spacing == 0) & (y % spacing == 0)
     pixels = np.full((int(on_grid.sum()), len(views), 2), np.nan)
     pixels[:, start] = np.stack([x[on_grid], y[on_grid]], -1) + 0.5
     return pixels
@@ -133,7 +149,8 @@ def smooth_flow(
     total_flow = np.zeros_like(flow)
     for offset in itertools.product(offsets, offsets):
         other = np.roll(flow, offset, (0, 1))
-        similar = np.abs(other - flow).max(-1) < tuning.max_flow_difference_px
+        difference = np.abs(other - flow)
+        similar = np.maximum(*np.moveaxis(difference, -1, 0)) < tuning.max_flow_difference_px
         other_weight = np.roll(weight, offset, (0, 1)) * weight * similar
         total_weight += other_weight
         total_flow += other * other_weight[..., None]

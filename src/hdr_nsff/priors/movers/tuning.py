@@ -16,7 +16,9 @@ class TrackTuning:
     """Tuning constants of tracks along flow, hand-chosen on rendered scenes."""
 
     stride_px: int = 3
-    """Distance of the pixels at which tracks start, in x and in y."""
+    """Least distance of the pixels at which tracks start, in x and in y."""
+    max_starts: int = 30_000
+    """Larger movers have sparser tracks: time and memory go with their number."""
     start_frames: int = 12
     """Frames, spread over the clip, in which tracks start."""
     smoothing_radius_px: int = 2
@@ -81,8 +83,10 @@ SYNCHRONIZED_TUNING = SynchronizedTuning()
 class RigidGroupsTuning:
     """Tuning constants of groups and their motion, hand-chosen on rendered scenes."""
 
-    link_px: float = 6.0
-    """Tracks that come this near each other are neighbors."""
+    link_spacings: float = 2.0
+    """Tracks that come this near each other are neighbors, in distances of their
+    starts.
+    """
     parting_px: float = 1.0
     """Fastest change of distance per frame at which the affinity of two neighbors falls
     by a factor of e.
