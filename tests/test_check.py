@@ -61,6 +61,8 @@ def test_a_tripod_with_one_exposure_has_neither_hdr_nor_viewpoints(tmp_path: Pat
     assert works["HDR"].startswith("no") and works["new viewpoints"].startswith("no")
     problems = [finding.subject for finding in judge(facts) if finding.level == "problem"]
     assert problems == ["exposure"]
+    (camera,) = [finding for finding in judge(facts) if finding.subject == "camera"]
+    assert camera.level == "note" and camera.text.startswith("the camera stands still")
 
 
 def test_auto_exposure_is_told_from_a_locked_one(tmp_path: Path) -> None:

@@ -150,19 +150,20 @@ def judge_clipping(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]
 def judge_camera(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
     """Parallax, blur, speed, cuts."""
     camera = facts.camera
-    share = camera.rotation_share
-    if share is None:
+    share = camera.rotation_share  # None where a picture that keeps its place decided it
+    why = "" if share is None else f": turns alone explain {share:.0%} of the matches"
+    if camera.motion == "unknown":
         text = "too few points match between distant frames to see how the camera moves"
         advice = "film something with texture, with smaller steps of exposure, or give --poses"
         yield Finding("warning", "camera", text, advice)
     elif camera.motion == "parallax":
-        text = f"the camera moves through space: turns alone explain {share:.0%} of the matches"
-        level: Level = "good" if share < tuning.sure_parallax else "note"
-        advice = "" if level == "good" else "little parallax: move farther to the side"
-        yield Finding(level, "camera", text, advice)
+        sure = share is not None and share < tuning.sure_parallax
+        advice = "" if sure else "little parallax: move farther to the side"
+        text = f"the camera moves through space{why}"
+        yield Finding("good" if sure else "note", "camera", text, advice)
     else:
         did = "stands still" if camera.motion == "tripod" else "turns, or hardly moves"
-        text = f"the camera {did}: turns alone explain {share:.0%} of the matches"
+        text = f"the camera {did}{why}"
         advice = "for new viewpoints, move sideways or in an arc; HDR and slow motion work as it is"
         if facts.file.cameras > 1:
             text = f"the first of {facts.file.cameras} cameras {did}"
