@@ -34,7 +34,7 @@ from hdr_nsff.priors.poses.matching import (
     view_pairs,
 )
 from hdr_nsff.priors.poses.rotation import fit_panorama, rotation_share
-from hdr_nsff.priors.poses.still_camera import still_camera_shifts
+from hdr_nsff.priors.poses.still_camera import nearly_still_shifts, still_camera_shifts
 from hdr_nsff.radiometry import exposure_cycle as exposure
 from hdr_nsff.radiometry.dropped_frames import find_cycle
 
@@ -281,11 +281,12 @@ def find_motion(
     matches = match_pairs([keypoints[t] for t in chosen], pairs, matching)
     height, width = equalized.shape[1:3]
     panorama = fit_panorama(matches, len(chosen), width, height, rotation)
-    if panorama is None:
-        return "unknown", None
-    share = rotation_share(matches, panorama, width, height, rotation)
-    if share is None:
-        return "unknown", None
+    share = None
+    if panorama is not None:
+        share = rotation_share(matches, panorama, width, height, rotation)
+    if panorama is None or share is None:
+        hardly_shifts = nearly_still_shifts(equalized, clipped, tuning.still) is not None
+        return ("tripod" if hardly_shifts else "unknown"), None
     if share < tuning.min_rotation_share or panorama.slides:
         return "parallax", share
     still = panorama.max_displacement < rotation.max_tripod_motion_px
