@@ -195,6 +195,17 @@ def fill_inputs(
     return seen[0], seen[1], seen[2]
 
 
+def test_wanted_pixels_alone_are_filled_and_as_ever() -> None:
+    generator = np.random.default_rng(7)
+    flow = generator.normal(0, 0.3, (H, W, 2)).astype(np.float32)
+    given = flow, -flow + 0.2, picture(), picture(), NONE, generator.random((H, W)) < 0.3
+    wanted = generator.random((H, W)) < 0.5
+    everywhere = fill_uncertain_flow(*given, NONE)
+    there = fill_uncertain_flow(*given, NONE, wanted)
+    assert (everywhere != flow).any(-1)[wanted].mean() > 0.5
+    assert np.array_equal(there, np.where(wanted[..., None], everywhere, flow))
+
+
 def test_flow_is_trusted_that_agrees_with_its_reverse_on_texture_in_both_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

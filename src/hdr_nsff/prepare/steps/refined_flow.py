@@ -113,12 +113,12 @@ class Refiner:
             fill_uncertain_flow(
                 there, back, here_gray, there_gray,
                 self.clipped[i], self.clipped[j], self.moving[i],
-                self.tuning.local_motion,
+                self.moving[i] | valid_there, self.tuning.local_motion,
             ),
             fill_uncertain_flow(
                 back, there, there_gray, here_gray,
                 self.clipped[j], self.clipped[i], self.moving[j],
-                self.tuning.local_motion,
+                self.moving[j] | valid_back, self.tuning.local_motion,
             ),
         )  # fmt: skip
         there, back = filled

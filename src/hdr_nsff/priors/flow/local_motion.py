@@ -71,6 +71,7 @@ def fill_uncertain_flow(
     source_clipped: np.ndarray,
     target_clipped: np.ndarray,
     moving: np.ndarray,
+    wanted: np.ndarray | None = None,
     tuning: LocalMotionTuning = LOCAL_MOTION_TUNING,
 ) -> np.ndarray:
     """`flow` (H, W, 2) px with uncertain pixels filled from trusted ones around.
@@ -79,7 +80,8 @@ def fill_uncertain_flow(
     agrees with `reverse` (H, W, 2), has texture in both images, and is clipped at
     neither end. Pixels of the mask `moving` (H, W) bool are not filled from static
     ones. The mask misses some movers and knows nothing of clipped pixels, so all other
-    pixels are filled from both.
+    pixels are filled from both. Pixels that are not `wanted` (H, W) bool stay as they
+    are.
     """
     # outside the frame counts as clipped; 0.01 is above rounding
     ends_clipped = follow(target_clipped.astype(np.float32), flow, fill=1.0) > 0.01
@@ -92,6 +94,8 @@ def fill_uncertain_flow(
     exposure = np.where(clipped, tuning.clipped_trust, 1)
     trust = consistency * exposure * corner / (corner + tuning.half_trust_corner)
     uncertain = clipped | (error > tuning.trusted_round_trip_px)
+    if wanted is not None:
+        uncertain &= wanted
     layer = np.where(clipped, UNKNOWN, np.where(moving, MOVING, STATIC))
     return fill_flow(flow, trust, uncertain, layer, tuning)
 
