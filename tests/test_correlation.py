@@ -75,3 +75,24 @@ def test_chunks_do_not_change_the_result(monkeypatch):
     whole = feature_motion(a, b, search)
     monkeypatch.setattr("hdr_nsff.priors.flow.correlation.CHUNK", 37)
     assert torch.allclose(feature_motion(a, b, search), whole, atol=1e-5)
+
+
+def test_positions_are_those_of_a_search_cell_by_cell():
+    a, b, search = shifted(0, 0), shifted(1.3, -0.6), Search(reach=2.5, radius=1, temperature=0.05)
+    starts = torch.tensor([[0.0, 0.0], [27.0, 19.0], [9.4, 7.8], [3.0, 12.5]])
+    queries = sample_features(a, starts)
+    unit = torch.nn.functional.normalize(b, dim=0)
+    for start, query, found in zip(
+        starts, queries, locate(queries, starts, b, search), strict=True
+    ):
+        cosines = {
+            (x, y): float(query / query.norm() @ unit[:, y, x])
+            for x in range(28)
+            for y in range(20)
+            if abs(x - start[0]) <= 2.5 and abs(y - start[1]) <= 2.5
+        }
+        best = max(cosines, key=lambda place: cosines[place])
+        near = [p for p in cosines if max(abs(p[0] - best[0]), abs(p[1] - best[1])) <= 1]
+        weights = np.exp([(cosines[p] - cosines[best]) / 0.05 for p in near])
+        expected = weights @ np.array(near) / weights.sum()
+        assert np.allclose(found.numpy(), expected, atol=1e-4)
