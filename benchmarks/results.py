@@ -381,10 +381,8 @@ SECTIONS = (
         "prepare",
         "What preparing a clip costs",
         "Processor seconds of the steps that cost most, and the peak memory of the process. "
-        "`sports` is the demo clip of the package `sports2d` at 1280x720, re-exposed; it took 33 "
-        "minutes with other programs running. `gopro` is the whole clip, whose lens is found late: "
-        "the first search for its poses, some 400 seconds, is not counted; its movers were found "
-        "again with a later commit.",
+        "`sports` is the demo clip of the package `sports2d`, re-exposed at 640x360; it took 7 "
+        "minutes in all.",
         "python benchmarks/cost.py SCENE ... --prepare --out benchmarks/results/prepare.json",
         prepare_cost,
     ),

@@ -65,10 +65,10 @@ def soft_argmax(similarity: Tensor, radius: int, temperature: float) -> Tensor:
     h, w = similarity.shape[1:]
     flat = similarity.flatten(1)
     best = flat.detach().argmax(1)
-    steps = torch.arange(-radius, radius + 1, device=flat.device)
-    y, x = torch.meshgrid(steps, steps, indexing="ij")
-    y = (best // w)[:, None] + y.flatten()
-    x = (best % w)[:, None] + x.flatten()
+    side = 2 * radius + 1
+    around = torch.arange(side * side, device=flat.device)
+    y = (best // w)[:, None] + around // side - radius
+    x = (best % w)[:, None] + around % side - radius
     inside = (y >= 0) & (y < h) & (x >= 0) & (x < w)
     near = flat.gather(1, y.clamp(0, h - 1) * w + x.clamp(0, w - 1))
     weights = torch.softmax(near.masked_fill(~inside, EXCLUDED) / temperature, 1)
