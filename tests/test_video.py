@@ -80,20 +80,33 @@ def test_a_title_in_another_encoding_is_no_damage(tmp_path: Path) -> None:
     assert read_gopro_ev(tmp_path / "a.avi", 3) is None
 
 
+def shown(path: Path, frame: np.ndarray, aspect: Fraction) -> np.ndarray:
+    """A frame (H, W, 3) uint8, its pixels of this aspect, as a video of it is read."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=24)
+        stream.height, stream.width, stream.pix_fmt = *frame.shape[:2], "yuv444p"
+        stream.codec_context.sample_aspect_ratio = aspect
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
+        container.mux(stream.encode(None))
+    return next(read_video(path))[0]
+
+
 def test_pixels_that_are_not_square_are_widened_as_players_show_them(tmp_path):
     squeezed = np.zeros((48, 60, 3), np.uint8)
     squeezed[12:36, 15:45] = 255  # a square of 40 by 24 shown pixels
-    with av.open(str(tmp_path / "a.mp4"), "w") as container:
-        stream = container.add_stream("libx264", rate=24)
-        stream.width, stream.height, stream.pix_fmt = 60, 48, "yuv444p"
-        stream.codec_context.sample_aspect_ratio = Fraction(4, 3)
-        for _ in range(3):
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(squeezed, format="rgb24")))
-        container.mux(stream.encode(None))
-    picture = next(read_video(tmp_path / "a.mp4"))[0]
+    picture = shown(tmp_path / "a.mp4", squeezed, Fraction(4, 3))
     assert picture.shape == (48, 80, 3)
     assert picture[24, :, 1].sum() == pytest.approx(40, abs=1)
     assert picture[:, 40, 1].sum() == pytest.approx(24, abs=1)
+
+
+def test_pixels_that_are_square_but_for_rounding_are_not_resampled(tmp_path):
+    stripes = np.zeros((48, 256, 3), np.uint8)
+    stripes[:, ::2] = 255
+    picture = shown(tmp_path / "a.mp4", stripes, Fraction(408, 407))
+    assert picture.shape == (48, 256, 3)
+    assert picture[:, ::2].min() > 0.9 and picture[:, 1::2].max() < 0.1
 
 
 def test_mirrored_display_matrices_are_taken_apart_as_ffmpeg_does() -> None:

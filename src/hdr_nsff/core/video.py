@@ -20,6 +20,8 @@ from hdr_nsff.core.io import atomic
 from hdr_nsff.core.picture_size import check_size
 
 DEFAULT_FPS = 24.0  # where a video's header names no rate
+# of the aspect of pixels from 1; the nearest one in use is 16:15 (PAL)
+MAX_ROUNDED_ASPECT = 0.01
 REC709_TAG = 1  # the code of Rec. 709 in H.264's color description, all four fields
 
 
@@ -114,8 +116,12 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
 def pixel_aspect(stream: Any) -> float:
     """Width of a pixel over its height: not 1 for anamorphic lenses and HDV. Frames are
     widened by it, as players show them, so that rows stay rows.
+
+    Encoders that scale to whole pixels leave 408:407 and the like. That counts as 1:
+    to widen 256 pixels to 257 would only blur them.
     """
-    return float(stream.sample_aspect_ratio or 1)
+    aspect = float(stream.sample_aspect_ratio or 1)
+    return aspect if abs(aspect - 1) > MAX_ROUNDED_ASPECT else 1.0
 
 
 def is_mirrored(frame: Any) -> bool:
