@@ -18,7 +18,9 @@ class TrackTuning:
     stride_px: int = 3
     """Least distance of the pixels at which tracks start, in x and in y."""
     max_starts: int = 30_000
-    """Larger movers have sparser tracks: time and memory go with their number."""
+    """Larger movers have sparser tracks: time and memory go with their number. No clip
+    that the others were chosen on has as many.
+    """
     start_frames: int = 12
     """Frames, spread over the clip, in which tracks start."""
     smoothing_radius_px: int = 2
