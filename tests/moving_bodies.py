@@ -36,4 +36,5 @@ def tracked(points: np.ndarray, noise: float = 0.0, seed: int = 0) -> Tracks:
         visible.astype(float),
         visible.astype(int),
         np.zeros(visible.shape, int),
+        np.arange(float(TIMES)),
     )

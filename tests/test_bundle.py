@@ -2,7 +2,7 @@
 depth knows one distance only.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -161,8 +161,8 @@ def test_short_tracks_are_no_error(lasting: int) -> None:
 def test_few_times_are_no_error(times: int) -> None:
     some = tracked(pixels_of(TRUE)).at(np.arange(4, 4 + times))
     visible = (some.trust > 0).any(1)
-    names = (f.name for f in fields(Tracks) if f.name != "spacing")
-    tracks = Tracks(*(getattr(some, name)[visible] for name in names))
+    names = ("pixels", "points", "trust", "patch", "age")
+    tracks = replace(some, **{name: getattr(some, name)[visible] for name in names})
     shape = adjust(tracks, CAMERAS.at(np.arange(4, 4 + times)))
     assert np.isfinite(shape.group.rotations).all()
     assert np.isinf(shape.error) if times == 1 else shape.error < 1
@@ -189,10 +189,9 @@ def test_times_at_which_nothing_is_visible_change_nothing() -> None:
     pixels, points = padded(tracks.pixels, 1, "edge"), padded(tracks.points, 1, "edge")
     pixels[:, hidden] = np.nan
     points[:, hidden] = np.nan
-    longer = Tracks(
-        pixels, points, padded(tracks.trust, 1), padded(tracks.patch, 1), padded(tracks.age, 1)
-    )
-    cameras = Cameras(padded(K, 0, "edge"), padded(CAMERAS.c2w, 0, "edge"), np.arange(TIMES + 7.0))
+    trust, patch, age = (padded(a, 1) for a in (tracks.trust, tracks.patch, tracks.age))
+    longer = Tracks(pixels, points, trust, patch, age, np.arange(TIMES + 7.0))
+    cameras = Cameras(padded(K, 0, "edge"), padded(CAMERAS.c2w, 0, "edge"), longer.times)
     found = adjust(longer, cameras)
     inside = replace(found, group=found.group.at(np.arange(3, 3 + TIMES)))
     np.testing.assert_allclose(points_of_shape(inside), points_of_shape(shape), atol=1e-3)
@@ -221,6 +220,7 @@ def test_a_body_that_is_gone_for_long_has_one_shape_and_moves_on_evenly_meanwhil
         np.zeros((count, total)),
         np.zeros((count, total), int),
         np.zeros((count, total), int),
+        np.arange(float(total)),
     )
     for name in ("pixels", "points", "trust", "patch", "age"):
         getattr(longer, name)[:, old] = getattr(tracks, name)

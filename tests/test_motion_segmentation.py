@@ -2,7 +2,7 @@
 cross, and one that comes back.
 """
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,6 +59,7 @@ def tracked(points: np.ndarray, visible: np.ndarray, far: np.ndarray) -> Tracks:
         visible * 0.3,
         visible.astype(int),
         np.zeros(visible.shape, int),
+        T.astype(float),
     )
 
 
@@ -167,8 +168,8 @@ def test_a_hundredth_of_the_tracks_makes_no_other_group() -> None:
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_hardly_any_tracks_are_no_error() -> None:
     tracks = crossing()
-    names = (f.name for f in fields(Tracks) if f.name != "spacing")
-    few = Tracks(*(getattr(tracks, name)[:5] for name in names))
+    names = ("pixels", "points", "trust", "patch", "age")
+    few = replace(tracks, **{name: getattr(tracks, name)[:5] for name in names})
     found = segment_tracks(few, CAMERAS)
     assert len(found) == 1 and found[0].shape is None
     shape = adjust_bundle(tracks, fit_motion(tracks, np.arange(COUNT)), CAMERAS)

@@ -1,6 +1,6 @@
 """Groups of tracks that move as one, of known bodies."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,8 +39,9 @@ def test_tracks_without_neighbors_are_parts_of_their_own() -> None:
     points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1, count=12)
     near = tracked(points)
     far = [replace(near, pixels=near.pixels + 1000.0 * k) for k in range(12)]
-    names = [f.name for f in fields(Tracks) if f.name != "spacing"]
-    tracks = Tracks(*(np.concatenate([getattr(t, name) for t in far]) for name in names))
+    names = ("pixels", "points", "trust", "patch", "age")
+    every = {name: np.concatenate([getattr(t, name) for t in far]) for name in names}
+    tracks = replace(near, **every)
     parts = cut_graph(tracks, neighbor_graph(tracks))
     assert len(np.unique(parts)) == RIGID_GROUPS_TUNING.parts
 
@@ -50,6 +51,6 @@ def test_one_time_is_no_error() -> None:
     points, _, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0]), 0.1)
     pixels = 200 * points[:, :1, :2] / points[:, :1, 2:] + 100
     once = np.ones((len(points), 1))
-    tracks = Tracks(pixels, points[:, :1], once, once.astype(int), once.astype(int))
+    tracks = Tracks(pixels, points[:, :1], once, once.astype(int), once.astype(int), np.zeros(1))
     groups = groups_of(tracks)
     assert len(groups) == 1 and abs(groups[0].translations).max() < 1e-12

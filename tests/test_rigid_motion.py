@@ -38,10 +38,21 @@ def test_the_motion_of_one_body_is_found_from_tracks_that_come_and_go() -> None:
     points, rotations, _ = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0.01]), 0.1)
     tracks = tracked(points, noise=0.01)
     group = fit_motion(tracks, np.arange(len(points)))
-    middle = slice(2, TIMES - 2)  # smoothing shortens the ends
+    middle = slice(2, TIMES - 2)  # few tracks are left at the ends
     relative = group.rotations @ group.rotations[TIMES // 2].T
     assert abs(relative - rotations @ rotations[TIMES // 2].T)[middle].max() < 0.06
     centered = points - group.center - group.translations  # (N, TIMES, 3)
     canonical = np.einsum("ntj,tji->nti", centered, group.rotations)
     deviation = np.linalg.norm(canonical - canonical[:, [TIMES // 2]], axis=-1)
     assert deviation[:, middle].max() < 0.06
+
+
+def test_a_steady_motion_stays_steady_over_uneven_times() -> None:
+    points, _, positions = body(0, np.array([0, 0, 3.0]), np.array([0.05, 0, 0.01]), 0.0)
+    kept = np.array([0, 1, 2, 4, 5, 9, 10, 11, 13])  # of TIMES frames
+    tracks = tracked(points)
+    visible = np.ones((len(points), len(kept)))
+    tracks = replace(tracks.at(kept), points=points[:, kept], trust=visible)
+    group = fit_motion(tracks, np.arange(len(points)))
+    steps = np.diff(group.translations, axis=0)
+    assert np.allclose(steps, np.diff(positions[kept], axis=0), atol=1e-9)

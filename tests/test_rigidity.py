@@ -53,6 +53,19 @@ def test_a_first_depth_that_was_wrong_is_not_held_against_a_mover(six: Scene) ->
     assert card.rigid and card.flow_residual < 0.2
 
 
+def test_times_at_which_a_mover_is_not_known_are_not_held_against_it(six: Scene) -> None:
+    clip, flow, valid, pairs = video_of(six)
+    disparity = np.stack([f.disparity.numpy() for f in six.train if f.disparity is not None])
+    later = pairs.min(1) >= 2  # something else moves there
+    bent = flow + np.where(later[:, None, None] & clip.moving[pairs[:, 0]], 5.0, 0.0)[..., None]
+    (card,) = movers_of(six)
+    seen = replace(card, known=np.arange(6) <= 2)
+    found = judge_rigidity([card, seen], clip, bent, valid, pairs, disparity)
+    assert not found[0].rigid
+    (alone,) = judge_rigidity([seen], clip, bent, valid, pairs, disparity)
+    assert alone.rigid and alone.flow_residual < 0.2
+
+
 def seen_at(x: float, times: slice = slice(None)) -> Mover:
     """A mover of two tracks around column `x`, at some of ten times."""
     pixels = np.full((2, 10, 2), np.nan)

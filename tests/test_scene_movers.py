@@ -100,6 +100,17 @@ def test_what_moves_out_of_reach_of_a_rigid_mover_is_none_of_it() -> None:
     assert nearest_mover([shapeless], 1, pixels, CAMERA).tolist() == [0] * 5
 
 
+def test_what_moves_while_no_track_is_seen_is_a_mover_where_its_shape_is() -> None:
+    seen = mover([[4.0, 2.0]], [[0, 0, 1]])
+    hidden = replace(seen, pixels=np.full_like(seen.pixels, np.nan))
+    pixels = np.array([[4.0, 2.0], [33.0, 2.0]])
+    assert nearest_mover([hidden], 1, pixels, CAMERA).tolist() == [0, NO_MOVER]
+    shapeless = replace(hidden, points=np.full((1, 3), np.nan), error=np.inf)
+    assert nearest_mover([shapeless], 1, pixels, CAMERA).tolist() == [0, 0]
+    gone = replace(shapeless, known=np.zeros_like(seen.known))
+    assert nearest_mover([gone], 1, pixels, CAMERA).tolist() == [NO_MOVER] * 2
+
+
 def test_a_mover_without_a_shape_gives_no_depth() -> None:
     disparity, confidence = np.full((4, 4), 0.4, np.float32), np.zeros((4, 4), np.float32)
     shapeless = [mover([[1.5, 1.5]], [[np.nan] * 3], error=np.inf)]

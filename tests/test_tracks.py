@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from hdr_nsff.priors.movers.rigid_groups import neighbor_graph
+from hdr_nsff.priors.movers.starts import middle_times
 from hdr_nsff.priors.movers.tracks import (
     MovingView,
     Tracks,
@@ -43,7 +44,7 @@ def test_tracks_follow_a_flow_between_pixels_and_count_their_steps() -> None:
     both = {1: flow, -1: -flow}
     trust = moving.astype(float)
     view = MovingView(moving, np.zeros((20, 60, 3)), trust, both, {1: moving, -1: moving})
-    tracks = follow_moving_pixels([view] * 4)
+    tracks = follow_moving_pixels([view] * 4, np.arange(4.0))
     begun = np.argmin(tracks.age, 1)
     here = np.take_along_axis(tracks.pixels[..., 0], begun[:, None], 1)
     expected = here + 1.25 * (np.arange(4) - begun[:, None])
@@ -69,9 +70,40 @@ def test_large_movers_have_sparser_tracks() -> None:
     still = np.zeros((50, 60, 2), np.float32)
     both, sure = {1: still, -1: still}, {1: moving, -1: moving}
     views = [MovingView(moving, np.zeros((50, 60, 3)), moving.astype(float), both, sure)] * 4
-    few = follow_moving_pixels(views, replace(TRACK_TUNING, max_starts=200))
+    few = follow_moving_pixels(views, np.arange(4.0), replace(TRACK_TUNING, max_starts=200))
     assert few.spacing == 8 and len(few.trust) == 4 * 6 * 7  # of 48 x 58 inner pixels
-    assert follow_moving_pixels(views).spacing == TRACK_TUNING.stride_px
+    assert follow_moving_pixels(views, np.arange(4.0)).spacing == TRACK_TUNING.stride_px
+
+
+def test_somebody_who_passes_between_two_starts_has_tracks() -> None:
+    passing = np.zeros((70, 40, 60), bool)
+    for k, t in enumerate(range(20, 26)):
+        passing[t, 10:20, 5 + 6 * k : 15 + 6 * k] = True
+    waiting = np.zeros((40, 60), bool)
+    waiting[25:35, 20:30] = True
+    views = []
+    for moving in passing | waiting:
+        flow = np.zeros((40, 60, 2), np.float32)
+        flow[:20] = [6.0, 0.0]
+        both, sure = {1: flow, -1: -flow}, {1: moving, -1: moving}
+        views.append(MovingView(moving, np.zeros((40, 60, 3)), moving.astype(float), both, sure))
+    tuning = replace(TRACK_TUNING, start_frames=5)  # 0, 17, 34, 52 and 69
+    tracks = follow_moving_pixels(views, np.arange(70.0), tuning)
+    passers = np.nanmin(tracks.pixels[..., 1], 1) < 20
+    assert 0 < passers.sum() < 20 < (~passers).sum()
+    assert ((tracks.trust[passers] > 0).any(0) == passing.any((1, 2))).all()
+    without = replace(tuning, further_rounds=0)
+    found = follow_moving_pixels(views, np.arange(70.0), without)
+    assert np.array_equal(found.pixels, tracks.pixels[~passers], equal_nan=True)
+
+
+def test_a_region_that_flow_does_not_follow_is_tried_elsewhere_and_given_up() -> None:
+    region = np.ones((4, 4), bool)
+    missed = dict.fromkeys([3, 4, 5, 6, 9], region)
+    assert middle_times(missed, []) == [4, 9]
+    assert middle_times(missed, [4, 9]) == [5]
+    assert middle_times(missed, [3, 4, 5, 6, 9]) == []
+    assert middle_times({}, [1]) == []
 
 
 def test_tracks_of_any_spacing_have_neighbors() -> None:
@@ -79,6 +111,7 @@ def test_tracks_of_any_spacing_have_neighbors() -> None:
         y, x = np.mgrid[:4, :5].reshape(2, -1) * spacing + 0.5
         pixels = np.stack([x, y], -1)[:, None].repeat(3, 1)
         ones = np.ones(pixels.shape[:2])
-        tracks = Tracks(pixels, np.zeros((20, 3, 3)), ones, ones.astype(int), ones, spacing)
+        times = np.arange(3.0)
+        tracks = Tracks(pixels, np.zeros((20, 3, 3)), ones, ones.astype(int), ones, times, spacing)
         num_neighbors = np.diff(neighbor_graph(tracks).indptr)
         assert num_neighbors.min() == 5 and num_neighbors.max() == 11

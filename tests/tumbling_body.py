@@ -63,6 +63,7 @@ def tracked(
         trust * visible,
         visible.astype(int),
         np.zeros(visible.shape, int),
+        np.arange(float(TIMES)),
     )
 
 

@@ -128,17 +128,21 @@ def nearest_mover(
     movers: Sequence[Mover], t: int, pixels: np.ndarray, camera: PinholeCamera, tracked: bool = True
 ) -> np.ndarray:
     """The mover (P,) whose track is nearest to `pixels` (P, 2) of `camera` at the t-th
-    time; 0 where no mover has a track at that time.
+    time.
 
     `NO_MOVER` where the mover is rigid and its shape out of reach: something else moves
     there, such as a shadow. The tracks are of this camera's frames if `tracked`. In the
-    picture of another camera, they are where it sees the points of the movers' shapes.
+    picture of another camera, and where no track is seen, they are where it sees the
+    points of the movers' shapes. Without these, all is the first mover if it is known
+    at that time, else `NO_MOVER`.
     """
     shapes = [shape_in_picture(mover, t, camera) for mover in movers]
     tracks = [tracks_in_picture(mover, t) for mover in movers] if tracked else shapes
+    if not any(map(len, tracks)):
+        tracks = shapes
     owners = np.repeat(np.arange(len(tracks)), [len(p) for p in tracks])
     if not len(owners) or not len(pixels):
-        return np.zeros(len(pixels), np.int64)
+        return np.full(len(pixels), 0 if movers[0].known[t] else NO_MOVER)
     distance, nearest = cKDTree(np.concatenate(tracks)).query(pixels)
     owner = owners[nearest]
     for k, (mover, shape) in enumerate(zip(movers, shapes, strict=True)):

@@ -171,14 +171,18 @@ def noise_of_visits(
 
     common = [visits.in_common(a, b) for a, b in pairwise(learned)]
     differences = np.array([np.abs(a - b) for a, b in common])
-    noise = np.full(tuning.noise_levels, tuning.min_noise)
+    noise = np.full(tuning.noise_levels, tuning.min_noise, np.float32)
     level_of_middle = level(middle)
     for k in range(tuning.noise_levels if len(common) else 0):
         own = differences[:, level_of_middle == k]
         if own.size:
             sigma = SIGMA_PER_MAD * float(np.median(own)) / np.sqrt(2)
             noise[k] = max(noise[k], sigma)
-    return np.hypot(noise[level(visits.blurred)], tuning.relative_noise * visits.blurred)
+    of_visits = [
+        np.hypot(noise[level(frame)], np.float32(tuning.relative_noise) * frame)
+        for frame in visits.blurred
+    ]
+    return np.stack(of_visits)
 
 
 def most_supported(

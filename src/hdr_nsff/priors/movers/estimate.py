@@ -14,9 +14,9 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy import ndimage
 
 from hdr_nsff.core.stack import ArrayStack, LazyMap
+from hdr_nsff.maths.differences import averaged_with_neighbors
 from hdr_nsff.priors.movers.bundle_problem import Cameras
 from hdr_nsff.priors.movers.motion_segmentation import Segment, segment_tracks
 from hdr_nsff.priors.movers.regions import flow_steps
@@ -45,13 +45,14 @@ def estimate_movers(
     frames, views = views_by_time(clip, flow, valid, pairs, disparity, confidence)
     if not any(view.moving.any() for view in views):
         return ()
-    tracks = follow_moving_pixels(views, tuning.tracks)
+    times = clip.times[frames]
+    tracks = follow_moving_pixels(views, times, tuning.tracks)
     segments: list[Segment] = []
     if len(tracks.trust):
-        cameras = Cameras(clip.K[frames], clip.c2w[frames], clip.times[frames])
+        cameras = Cameras(clip.K[frames], clip.c2w[frames], times)
         segments = segment_tracks(tracks, cameras, tuning)
     if not segments:
-        return (mover_without_tracks(np.array(frames), views, tuning),)
+        return (mover_without_tracks(np.array(frames), times, views, tuning),)
     return tuple(mover_of(np.array(frames), tracks, segment) for segment in segments)
 
 
@@ -79,21 +80,23 @@ def mover_of(frames: np.ndarray, tracks: Tracks, segment: Segment) -> Mover:
 
 
 def mover_without_tracks(
-    frames: np.ndarray, views: list[MovingView], tuning: MoversTuning = MOVERS_TUNING
+    frames: np.ndarray,
+    times: np.ndarray,
+    views: list[MovingView],
+    tuning: MoversTuning = MOVERS_TUNING,
 ) -> Mover:
-    """The one mover of all moving pixels, where flow gives no tracks.
+    """The one mover of all moving pixels at `times` (T,), where flow gives no tracks.
 
     It follows the median of their points, without rotation.
     """
     num = len(views)
-    times = np.arange(num)
     visible = np.array([view.moving.any() for view in views])
     medians = np.array(
         [np.median(view.points[view.moving], 0) for view in views if view.moving.any()]
     )
     path = np.stack([np.interp(times, times[visible], axis) for axis in medians.T], 1)
-    sigma = tuning.fallback_smoothing_times
-    path = ndimage.gaussian_filter1d(path, sigma, axis=0, mode="nearest")
+    for _ in range(tuning.fallback_smoothing_rounds):
+        path = averaged_with_neighbors(path, times)
     return Mover(
         frames=frames,
         pixels=np.zeros((0, num, 2)),

@@ -23,6 +23,7 @@ from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING, RigidGroupsTuning
 
 PAIRS_PER_BATCH = 20_000  # bounds the memory of `affinity`
+PENDING_PAIRS = 4_000_000  # the same of `neighbor_pairs`: the rest is free of doubles
 # newer SciPy restarts from random vectors unless it is seeded
 SEEDED_RESTARTS = {"rng": 0} if "rng" in signature(eigsh).parameters else {}
 
@@ -160,7 +161,7 @@ def neighbor_graph(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNI
 def neighbor_pairs(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -> np.ndarray:
     """Pairs (P, 2) of tracks that come near each other in an image."""
     count, num_times = tracks.trust.shape
-    found = [np.zeros(0, int)]  # pairs as numbers: these are sorted fast
+    found, pending = [np.zeros(0, int)], 0  # pairs as numbers: these are sorted fast
     for t in range(num_times):
         visible = np.nonzero(tracks.trust[:, t])[0]
         if len(visible):
@@ -168,6 +169,9 @@ def neighbor_pairs(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNI
             reach = tuning.link_spacings * tracks.spacing
             first, second = visible[tree.query_pairs(reach, output_type="ndarray")].T
             found.append(first * count + second)
+            pending += len(first)
+            if pending > PENDING_PAIRS:
+                found, pending = [np.unique(np.concatenate(found))], 0
     return np.stack(np.divmod(np.unique(np.concatenate(found)), max(count, 1)), 1)
 
 

@@ -14,14 +14,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from hdr_nsff.geometry.alignment import nearest_rotation
+from hdr_nsff.maths.differences import averaged_with_neighbors
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING, RigidGroupsTuning
-
-TEMPORAL_KERNEL = (0.25, 0.5, 0.25)  # binomial: the shortest that removes alternation
 
 
 @dataclass(frozen=True)
@@ -82,7 +80,7 @@ def fit_motion(
     rotations, translations, known = link_poses(points, trust, start, tuning)
     for _ in range(tuning.refit_rounds):
         rotations, translations = refit_poses(points, trust, rotations, translations, known, tuning)
-        rotations, translations = smooth_poses(rotations, translations, known)
+        rotations, translations = smooth_poses(rotations, translations, known, tracks.times)
     return RigidGroup(rotations, translations, center, members, known)
 
 
@@ -193,19 +191,16 @@ def refit_poses(
 
 
 def smooth_poses(
-    rotations: np.ndarray, translations: np.ndarray, known: np.ndarray
+    rotations: np.ndarray, translations: np.ndarray, known: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses averaged with their neighbors in time (1, 2, 1).
+    """Poses at `times` (T,) averaged with their neighbors.
 
     Unknown poses are interpolated between known ones before, and held beyond them.
     Averaged matrices become the nearest rotations.
     """
-    times = np.arange(len(known))
-    known_times = np.nonzero(known)[0]
     flat = np.concatenate([rotations.reshape(-1, 9), translations], 1)
-    columns = [np.interp(times, known_times, column[known_times]) for column in flat.T]
-    flat = np.stack(columns, 1)
-    flat = ndimage.convolve1d(flat, TEMPORAL_KERNEL, axis=0, mode="nearest")
+    columns = [np.interp(times, times[known], column[known]) for column in flat.T]
+    flat = averaged_with_neighbors(np.stack(columns, 1), times)
     return nearest_rotation(flat[:, :9].reshape(-1, 3, 3)), flat[:, 9:]
 
 

@@ -59,6 +59,8 @@ def judge_rigidity(
         shown, _ = fill_mover_depth(movers, t, clip.moving[start], c2w, first, np.zeros_like(first))
         points = clip.unproject(start, pixels, shown[y, x].astype(np.float64))
         for k, mover in enumerate(movers):
+            if not (mover.known[t] and mover.known[t + 1]):
+                continue
             own = owner == k
             moved = mover.world(mover.canonical(points[own], t), t + 1)
             found = step.flow[y[own], x[own]]

@@ -1,6 +1,6 @@
 """Tracks of moving pixels: chains of optical flow, lifted to points by depth.
 
-Tracks start on a grid of moving pixels in a few frames and follow the flow forward and
+Tracks start on a grid of moving pixels (`starts.py`) and follow the flow forward and
 backward in time. A track ends where flow is not valid, leaves the moving pixels, or
 lies between two motions. The depth may be wrong; later steps correct it. Pixels are
 (x, y) with centers at +0.5.
@@ -9,7 +9,6 @@ lies between two motions. The depth may be wrong; later steps correct it. Pixels
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
@@ -19,6 +18,13 @@ from scipy import ndimage
 
 from hdr_nsff.core.progress import track
 from hdr_nsff.geometry.round_trip import flow_at
+from hdr_nsff.priors.movers.starts import (
+    middle_times,
+    missed_regions,
+    spread_times,
+    start_spacing,
+    starting_pixels,
+)
 from hdr_nsff.priors.movers.tuning import TRACK_TUNING, TrackTuning
 
 
@@ -50,6 +56,7 @@ class Tracks:
     trust: np.ndarray  # (N, T) in the depth, 0 where not visible
     patch: np.ndarray  # (N, T) connected patch of moving pixels, 0 where not visible
     age: np.ndarray  # (N, T) steps of flow since the start: errors accumulate
+    times: np.ndarray  # (T,) in frames of the clip, rising
     spacing: float = TRACK_TUNING.stride_px  # px from one start to the next
 
     def at(self, times: np.ndarray) -> Tracks:
@@ -60,28 +67,29 @@ class Tracks:
             self.trust[:, times],
             self.patch[:, times],
             self.age[:, times],
+            self.times[times],
             self.spacing,
         )
 
 
-def follow_moving_pixels(views: Sequence[MovingView], tuning: TrackTuning = TRACK_TUNING) -> Tracks:
-    """Tracks through the moving pixels of consecutive times."""
+def follow_moving_pixels(
+    views: Sequence[MovingView], times: np.ndarray, tuning: TrackTuning = TRACK_TUNING
+) -> Tracks:
+    """Tracks through the moving pixels of consecutive `times` (T,), in frames."""
     num = len(views)
-    spread = np.linspace(0, num - 1, min(tuning.start_frames, num))
-    starts = sorted({round(start) for start in spread.tolist()})
-    spacing = start_spacing(views, starts, tuning)
-    begun = [starting_pixels(views, start, spacing) for start in starts]
-    pixels = np.concatenate(begun)
-    start_of = np.repeat(starts, [len(own) for own in begun])
-    forward = [(t, 1) for t in range(num - 1)]
-    backward = [(t, -1) for t in range(num - 1, 0, -1)]
-    for t, step in track(forward + backward, "movers: tracks"):
-        if step not in views[t].flow:
-            continue
-        own = (t - start_of) * step >= 0
-        view = smoothed(views[t], step, tuning)
-        pixels[own, t + step] = advance(view, views[t + step], step, pixels[own, t], tuning)
-    age = np.abs(np.arange(num) - start_of[:, None])
+    moving = [view.moving for view in views]
+    spread = spread_times(num, tuning)
+    spacing = start_spacing([moving[t] for t in spread], tuning)
+    pixels, age = follow(views, {t: starting_pixels(moving[t], spacing) for t in spread}, tuning)
+    tried = set(spread)
+    for _ in range(tuning.further_rounds):
+        missed = missed_regions(moving, pixels, tuning)
+        starts = {t: starting_pixels(missed[t], spacing) for t in middle_times(missed, tried)}
+        if not starts:
+            break
+        tried |= starts.keys()
+        more, more_age = follow(views, starts, tuning)
+        pixels, age = np.concatenate([pixels, more]), np.concatenate([age, more_age])
 
     points = np.full((*pixels.shape[:2], 3), np.nan)
     trust = np.zeros(pixels.shape[:2])
@@ -93,32 +101,32 @@ def follow_moving_pixels(views: Sequence[MovingView], tuning: TrackTuning = TRAC
         points[visible, t] = view.points[y, x]
         trust[visible, t] = view.trust[y, x] + tuning.min_trust
         patch[visible, t] = patches[y, x]
-    kept = (trust > 0).sum(1) >= min(tuning.min_frames, num)
-    return Tracks(pixels[kept], points[kept], trust[kept], patch[kept], age[kept], spacing)
+    return Tracks(pixels, points, trust, patch, age, np.asarray(times, float), spacing)
 
 
-def start_spacing(
-    views: Sequence[MovingView], starts: Sequence[int], tuning: TrackTuning = TRACK_TUNING
-) -> int:
-    """Pixels from one start to the next, in x and in y, of tracks from the times
-    `starts`.
+def follow(
+    views: Sequence[MovingView],
+    starts: Mapping[int, np.ndarray],
+    tuning: TrackTuning = TRACK_TUNING,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (N, T, 2) of the tracks that start at pixels (S, 2) of some times, NaN
+    where not visible, and steps (N, T) since their start; short ones are left out.
     """
-    num_pixels = sum(int(inner_pixels(views[start]).sum()) for start in starts)
-    return max(tuning.stride_px, math.ceil(math.sqrt(num_pixels / tuning.max_starts)))
-
-
-def inner_pixels(view: MovingView) -> np.ndarray:
-    """The moving pixels (H, W) that have moving ones on all sides."""
-    return ndimage.binary_erosion(view.moving)
-
-
-def starting_pixels(views: Sequence[MovingView], start: int, spacing: int) -> np.ndarray:
-    """Pixels (N, T, 2) of the tracks that start at one time, NaN at all others."""
-    y, x = np.nonzero(inner_pixels(views[start]))
-    on_grid = (x % spacing == 0) & (y % spacing == 0)
-    pixels = np.full((int(on_grid.sum()), len(views), 2), np.nan)
-    pixels[:, start] = np.stack([x[on_grid], y[on_grid]], -1) + 0.5
-    return pixels
+    num = len(views)
+    start_of = np.repeat(list(starts), [len(own) for own in starts.values()])
+    pixels = np.full((len(start_of), num, 2), np.nan)
+    pixels[np.arange(len(start_of)), start_of] = np.concatenate(list(starts.values()))
+    forward = [(t, 1) for t in range(num - 1)]
+    backward = [(t, -1) for t in range(num - 1, 0, -1)]
+    for t, step in track(forward + backward, "movers: tracks"):
+        own = ((t - start_of) * step >= 0) & np.isfinite(pixels[:, t, 0])
+        if step not in views[t].flow or not own.any():
+            continue
+        view = smoothed(views[t], step, tuning)
+        pixels[own, t + step] = advance(view, views[t + step], step, pixels[own, t], tuning)
+    age = np.abs(np.arange(num) - start_of[:, None])
+    kept = np.isfinite(pixels[..., 0]).sum(1) >= min(tuning.min_frames, num)
+    return pixels[kept], age[kept]
 
 
 def smoothed(view: MovingView, step: int, tuning: TrackTuning = TRACK_TUNING) -> MovingView:

@@ -23,6 +23,10 @@ class TrackTuning:
     """
     start_frames: int = 12
     """Frames, spread over the clip, in which tracks start."""
+    min_region_share: float = 1e-3
+    """Share of the frame below which a moving region needs no track."""
+    further_rounds: int = 4
+    """Rounds of starting tracks in regions that no track reaches."""
     smoothing_radius_px: int = 2
     """Flow is averaged over the square of this radius before it is followed."""
     max_flow_difference_px: float = 2.0
@@ -404,9 +408,9 @@ class MoversTuning:
     front of the background, or it would shine through them. 0.8 and 0.9 are as good on
     real clips, 1 costs 0.6 to 0.9 dB.
     """
-    fallback_smoothing_times: float = 1.0
-    """Standard deviation of the Gaussian that smooths the path of all moving pixels
-    together, where no tracks are found.
+    fallback_smoothing_rounds: int = 2
+    """Rounds that smooth the path of all moving pixels together, where no tracks are
+    found: a standard deviation of one time.
     """
 
 
