@@ -65,6 +65,15 @@ def test_what_lights_up_later_is_no_bar(tmp_path: Path):
     assert find_bars(open_footage(clip)) == Bars(9, 0)
 
 
+def test_bars_of_a_clip_that_begins_in_black_or_later_are_found(tmp_path: Path):
+    black, dark, bright = np.zeros((HEIGHT, WIDTH)), picture(8), picture()
+    clip = write_clip(tmp_path / "black", [black] * 14 + [dark] * 3)
+    assert find_bars(open_footage(clip)) == Bars(9, 0)
+    clip = write_clip(tmp_path / "later", [bright] * 14 + [dark] * 3)
+    assert not find_bars(open_footage(clip))
+    assert find_bars(open_footage(clip), 14) == Bars(9, 0)
+
+
 def test_frames_are_read_without_bars_before_they_are_shrunk(tmp_path: Path):
     image = picture(8, 10)
     clip = write_clip(tmp_path / "clip", [image] * 3)

@@ -62,3 +62,13 @@ def test_a_camera_that_paused_its_cycle_is_found_beside_timestamps() -> None:
     known[14] = 2  # a gap in time after which the cycle goes on where it was
     found = find_cycle(steps, known)
     assert found.cycle.brackets == (np.arange(40) % 3).tolist() and found.gaps == (15,)
+
+
+def test_no_exposure_is_made_up_that_no_frame_has() -> None:
+    """Five exposures in turn, and a pause of one frame after each five."""
+    slots = np.delete(np.arange(46), np.s_[5::6])
+    levels = np.array([3.0, 2.0, -1.0, -3.0, -4.0])[slots % 6]
+    steps = np.diff(levels + np.random.default_rng(0).normal(0, 0.02, len(levels)))
+    cycle = find_cycle(steps, np.diff(slots)).cycle
+    assert set(cycle.brackets) == set(range(len(cycle.ev)))
+    assert len({*zip(cycle.brackets, levels.tolist(), strict=True)}) == 5

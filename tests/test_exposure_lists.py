@@ -176,3 +176,13 @@ def test_lists_in_the_folders_of_cameras_are_not_passed_over(tmp_path):
     (tmp_path / "b/exposures.csv").write_text("file,ev\nf1.png,0\nf2.png,1\n")
     with pytest.raises(InputError, match=r"b/exposures.csv: .* one list for all cameras; join"):
         read_exposure_csv(open_footage(tmp_path))
+
+
+def test_a_frame_has_one_exposure(tmp_path):
+    write_frames(tmp_path, 2)
+    text = "file,ev\nf1.png,0\nf2.png,2\nf2.png,2\nf1.png,{}\n"
+    (tmp_path / "exposures.csv").write_text(text.format(0))
+    assert read_exposure_csv(open_footage(tmp_path))[1] == {"f1.png": 0, "f2.png": 2}
+    (tmp_path / "exposures.csv").write_text(text.format(1))
+    with pytest.raises(InputError, match=r"line 5: a second exposure of f1\.png"):
+        read_exposure_csv(open_footage(tmp_path))

@@ -25,6 +25,7 @@ from hdr_nsff.footage.footage import open_footage
 from hdr_nsff.footage.ingest import read_frames, shrink
 from hdr_nsff.footage.still_frames import read_frame
 from hdr_nsff.maths.hdr_signal import REC2020, hlg_oetf, pq_encode, rgb_to_xyz, ycbcr_planes
+from hdr_nsff.prepare.prepare import PrepareConfig, prepare
 
 
 def picture(value: float, height: int = 24, width: int = 32) -> np.ndarray:
@@ -252,14 +253,14 @@ def test_damaged_videos_are_read_or_refused(tmp_path):
     check_reader(path, lambda: all_frames(path), 60)
 
 
-def write_held_video(path: Path) -> Path:
-    """30 frames of noise, 30 a second, and the last of them is shown for a second."""
+def write_held_video(path: Path, count: int = 30) -> Path:
+    """Frames of noise, 30 a second, and the last of them is shown for a second."""
     noise = np.random.default_rng(0)
     with av.open(str(path), "w") as container:
         stream = container.add_stream("libx264", rate=30)
         stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
         packets = []
-        for number in range(30):
+        for number in range(count):
             picture = noise.integers(0, 256, (48, 64, 3), np.uint8)
             frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
             frame.pts, frame.time_base = number, Fraction(1, 30)
@@ -269,6 +270,39 @@ def write_held_video(path: Path) -> Path:
         for packet in packets:
             container.mux(packet)
     return path
+
+
+def test_seconds_since_1970_in_names_are_decimals(tmp_path):
+    """Programs that write them leave out last zeros."""
+    times = [1548266470 + k / 30 for k in range(7)]
+    for second in times:
+        write_png(tmp_path / f"{round(second, 5)}.png", picture(0.5))
+    found = [float(file.stem) for file in open_footage(tmp_path).cameras[0]]
+    assert found == sorted(found) and len(found) == 7
+
+
+def test_videos_of_different_length_are_refused_without_a_count_in_their_headers(tmp_path):
+    for name, count in (("a.mkv", 6), ("b.mkv", 4)):
+        write_held_video(tmp_path / name, count)
+    assert open_footage(tmp_path).count == 0
+    with pytest.raises(InputError, match="6 and 4 frames"):
+        prepare(PrepareConfig(tmp_path, tmp_path.parent / "scene"))
+
+
+def test_all_fragments_of_a_video_are_read(tmp_path):
+    """The header of a fragmented file counts the frames of the first fragment."""
+    path = tmp_path / "a.mp4"
+    options = {"movflags": "frag_keyframe"}
+    with av.open(str(path), "w", options=options) as container:
+        stream = container.add_stream("libx264", rate=30, options={"g": "6"})
+        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+        for number in range(24):
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 5 * number, np.uint8))
+            frame.pts, frame.time_base = number, Fraction(1, 30)
+            container.mux(stream.encode(frame))
+        container.mux(stream.encode(None))
+    assert len(all_frames(path)) == 24
+    assert open_footage(path).count in (0, 24)
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv", ".mov"])

@@ -135,3 +135,15 @@ def test_where_pixels_clip_no_noise_is_measured() -> None:
     more = measure_noise(images, [0, 1, 2], curve.x, curve.y, EV, careless)
     assert 0 < len(bins.count) < len(more.count)
     assert bins.log_exposure.max() < more.log_exposure.max() - 0.3
+
+
+def test_flat_areas_without_any_noise_are_left_out() -> None:
+    """Those of rendered frames differ by the rounding of float32 only."""
+    rng = np.random.default_rng(0)
+    level = np.kron(rng.uniform(0.2, 1, (6, 8)), np.ones((40, 40)))[..., None].repeat(3, 2)
+    flat = np.rint(255 * 0.5 * level) / 255
+    noisy = np.rint(255 * np.clip(level + rng.normal(0, 0.02, level.shape), 0, 1)) / 255
+    images = [image.astype(np.float32) for image in (noisy, flat) * 3]
+    x = np.linspace(0, 1, 256)
+    bins = measure_noise(images, [0, 1] * 3, x, np.stack([x] * 3), np.array([0.0, -1] * 3))
+    assert len(bins.variance) and (bins.variance > 0).all()

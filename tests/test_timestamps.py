@@ -47,3 +47,10 @@ def test_timestamps_of_a_csv_go_by_name_or_number(tmp_path: Path) -> None:
     path.write_text("frame,ev,timestamp_ns\n0,0,now\n")
     with pytest.raises(InputError, match="line 2: 'now' is not a number"):
         read_timestamps(footage)
+
+
+def test_times_that_are_rounded_to_milliseconds_show_long_gaps_exactly() -> None:
+    for fps, missing in ((60, 31), (240, 21), (30, 61)):
+        frames = np.delete(np.arange(150), np.s_[40 : 40 + missing])
+        gaps = frame_gaps((np.round(frames / fps * 1000) / 1000).tolist())
+        assert gaps is not None and gaps.max() == missing + 1

@@ -109,6 +109,20 @@ def test_pixels_that_are_square_but_for_rounding_are_not_resampled(tmp_path):
     assert picture[:, ::2].min() > 0.9 and picture[:, 1::2].max() < 0.1
 
 
+def test_deep_colors_stay_where_the_width_is_odd(tmp_path):
+    """FFmpeg's packed 16-bit rgb of an odd width has wrong colors."""
+    with av.open(str(tmp_path / "a.mkv"), "w") as container:
+        stream = container.add_stream("ffv1", rate=24)
+        stream.height, stream.width, stream.pix_fmt = 48, 61, "yuv420p10le"
+        red = np.full((48, 61, 3), [200, 30, 30], np.uint8)
+        for _ in range(3):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(red, format="rgb24")))
+        container.mux(stream.encode(None))
+    picture = next(read_video(tmp_path / "a.mkv"))[0]
+    assert picture.shape == (48, 61, 3)
+    assert np.allclose(picture, np.array([200, 30, 30]) / 255, atol=0.02)
+
+
 def test_mirrored_display_matrices_are_taken_apart_as_ffmpeg_does() -> None:
     """The matrix (0 1, 1 0) swaps x and y; FFmpeg calls that a turn by -90 degrees."""
 

@@ -103,8 +103,9 @@ def read_video(path: Path | str) -> Iterator[tuple[np.ndarray, float]]:
             aspect = pixel_aspect(container.streams.video[0])
             for frame in container.decode(video=0):
                 deep = frame.format.components[0].bits > 8
+                # not rgb48le: FFmpeg spoils its colors where the width is odd
                 array = frame.reformat(
-                    format="rgb48le" if deep else "rgb24", width=round(frame.width * aspect)
+                    format="gbrp16le" if deep else "rgb24", width=round(frame.width * aspect)
                 ).to_ndarray()
                 turned = turn(array, frame.rotation, is_mirrored(frame))
                 top = np.float32(65535 if deep else 255)
@@ -145,7 +146,7 @@ def turn(picture: np.ndarray, degrees: float, mirrored: bool) -> np.ndarray:
 class VideoInfo:
     """What a video's header says."""
 
-    frames: int  # 0: unknown
+    frames: int  # 0: unknown, as where a header counts only the first fragment
     fps: float
     seconds: float  # of the picture; 0: unknown
     transfer: int = 2  # code of H.273: 16 PQ, 18 HLG, 2 unknown
@@ -172,8 +173,9 @@ def video_info(path: Path | str) -> VideoInfo:
                 raise InputError(f"{path}: the video is cut short; copy it again")
             seconds = duration_of(container, stream)
             pixels = codec.format
+            in_fragments = len(stream.index_entries) > stream.frames
             return VideoInfo(
-                stream.frames,
+                0 if in_fragments else stream.frames,
                 float(stream.average_rate or DEFAULT_FPS),
                 seconds,
                 codec.color_trc,

@@ -21,7 +21,7 @@ class BarsTuning:
     """
 
     first_frames: int = 12  # that show whether there may be bars at all
-    max_frames: int = 300  # from the start of the clip, in which bars stay black
+    max_frames: int = 300  # from the first one used, in which bars stay black
     max_black: float = 0.07  # recorded: limited-range black shown as full range is 0.063
     black_share: float = 0.98  # of the pixels of a row or column
     min_share: float = 0.01  # of the picture's height or width, of a bar
@@ -32,20 +32,21 @@ class BarsTuning:
     min_bright: float = 0.2  # recorded: what half of the pixels between the bars reach
 
 
-def with_bars(footage: Footage, tuning: BarsTuning = BarsTuning()) -> Footage:
+def with_bars(footage: Footage, start: int = 0, tuning: BarsTuning = BarsTuning()) -> Footage:
     """The footage with the bars that its frames have, which `read_frames` cuts off.
 
-    Recorded footage of one camera is looked at; linear frames come from no player.
+    Recorded footage of one camera is looked at, from its frame `start` on; linear
+    frames come from no player.
     """
     if footage.linear or len(footage.cameras) > 1:
         return footage
-    return replace(footage, bars=find_bars(footage, tuning))
+    return replace(footage, bars=find_bars(footage, start, tuning))
 
 
-def find_bars(footage: Footage, tuning: BarsTuning = BarsTuning()) -> Bars:
+def find_bars(footage: Footage, start: int = 0, tuning: BarsTuning = BarsTuning()) -> Bars:
     """The bars of recorded footage; none where frames differ in size."""
     brightest: np.ndarray | None = None  # (H, W) recorded, over the frames so far
-    frames = decode(footage, footage.cameras[0], range(tuning.max_frames))
+    frames = decode(footage, footage.cameras[0], range(start, start + tuning.max_frames))
     for count, (_, _, image, _) in enumerate(frames, start=1):
         gray = image.max(-1)
         if brightest is None:
@@ -53,7 +54,8 @@ def find_bars(footage: Footage, tuning: BarsTuning = BarsTuning()) -> Bars:
         elif gray.shape != brightest.shape:
             return Bars()
         brightest = np.maximum(brightest, gray)
-        if count == tuning.first_frames and not bars_of(brightest, tuning):
+        lit = count >= tuning.first_frames and np.median(brightest) > tuning.max_black
+        if lit and not bars_of(brightest, tuning):
             return Bars()
     return Bars() if brightest is None else bars_of(brightest, tuning)
 

@@ -92,18 +92,22 @@ def read_exposure_csv(footage: Footage) -> tuple[Path, dict[str, float]] | None:
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
     try:
         name, values = find_columns(path, reader.fieldnames or [])
-        rows = {}
+        rows: dict[str, float] = {}
         for row in reader:
             where = f"{path}, line {reader.line_num}"
             check_cells(row, (name, *values), where)
             key = row[name].strip()
             if name == "frame":
                 key = f"#{key}"
-            rows[key] = sum(ev_of_cell(column, row[column], where) for column in values)
-            if abs(rows[key]) > MAX_EV:
+            ev = sum(ev_of_cell(column, row[column], where) for column in values)
+            if abs(ev) > MAX_EV:
                 raise InputError(
-                    f"{where}: {rows[key]:.0f} EV is beyond all light (at most {MAX_EV:g}); "
-                    "correct it"
+                    f"{where}: {ev:.0f} EV is beyond all light (at most {MAX_EV:g}); correct it"
+                )
+            if rows.setdefault(key, ev) != ev:
+                raise InputError(
+                    f"{where}: a second exposure of {shorten(row[name])}; give each frame one, "
+                    "and with several cameras the folder before the name, as in left/0001.png"
                 )
     except csv.Error as error:
         line = reader.line_num + 1

@@ -11,12 +11,19 @@ FRAMES = RECORDED | LINEAR
 LOSSY = {".jpg", ".jpeg"}  # formats of frames
 CHECK_PICTURE = "_check.png"  # ends the name of what `check` writes, which is no frame
 VIDEOS = {".mp4", ".mov", ".mkv", ".m4v", ".avi", ".webm", ".mxf", ".mts"}
+# a name that is a time, whose last zeros may be missing
+SECONDS = re.compile(r"\d{9,}\.\d+", re.ASCII)
+DECIMALS = 30  # more than names of times have
 
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
-    """A key that sorts frame2 before frame10."""
+    """A key that sorts frame2 before frame10, and seconds since 1970 as decimals."""
+    name = path.name
+    if SECONDS.fullmatch(path.stem):
+        whole, fraction = path.stem.split(".")
+        name = f"{whole}.{fraction.ljust(DECIMALS, '0')}{path.suffix}"
     key = []
-    for part in re.split(r"(\d+)", path.name):
+    for part in re.split(r"(\d+)", name):
         if part.isdecimal():  # not `isdigit`: ² is a digit, and no number
             key.append((0, int(part), ""))
         elif part:

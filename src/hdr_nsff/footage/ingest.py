@@ -20,7 +20,7 @@ from hdr_nsff.footage.linear_light import encode_light, encode_signal, linear_sc
 from hdr_nsff.footage.still_frames import read_frame
 
 REC2020_CODE = 9  # of H.273: BT.2020 primaries
-MAX_FRAMES = 10**9  # more than any video without a frame count in its header has
+MAX_FRAMES = 10**9  # more than any footage has
 # frames that may be missing at the end of a video: containers round durations
 MAX_MISSING_FRAMES = 3
 # bits of a camera by their largest code in a 16-bit file, as `read_image` gives it
@@ -51,7 +51,7 @@ def read_frames(
     NaN or infinite radiance, and after the last frame of a camera for codes that leave
     bits of their files unused.
     """
-    stop = end if end is not None else (footage.count or MAX_FRAMES)
+    stop = end if end is not None else MAX_FRAMES  # headers may count too few frames
     chosen = range(start, stop, stride)
     scale = 1.0
     if footage.linear:

@@ -32,12 +32,12 @@ def read_timestamps(footage: Footage) -> dict[str, float]:
     if not path.is_file():
         return {}
     reader = csv.DictReader(io.StringIO(read_utf8(path), newline=""), skipinitialspace=True)
-    columns = reader.fieldnames or []
-    name = next((c for c in ("file", "frame") if c in columns), None)
-    if name is None or COLUMN not in columns:
-        return {}
     seconds = {}
     try:
+        columns = reader.fieldnames or []
+        name = next((c for c in ("file", "frame") if c in columns), None)
+        if name is None or COLUMN not in columns:
+            return {}
         for row in reader:
             where = f"{path}, line {reader.line_num}"
             key = (row[name] or "").strip()
@@ -61,9 +61,10 @@ def frame_gaps(seconds: Sequence[float | None], stride: int = 1) -> np.ndarray |
     if len(seconds) < 3 or any(s is None for s in seconds):
         return None
     gaps = np.diff(np.array(seconds, np.float64))
-    usual = float(np.median(gaps))
-    if not usual > 0 or gaps.min() <= 0:
+    median = float(np.median(gaps))
+    if not median > 0 or gaps.min() <= 0:
         return None
+    usual = float(gaps[gaps < (1 + MIN_EXTRA) * median].mean())  # finer: times are rounded
     frames = gaps / usual * stride
     longer = frames - stride > MIN_EXTRA
     if longer.mean() > MAX_SHARE:

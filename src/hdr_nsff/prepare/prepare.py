@@ -137,7 +137,9 @@ def open_clip(config: PrepareConfig, capture: Capture | None) -> Footage:
         return capture.footage()
     footage = open_footage(config.clip)
     given = (config.poses, config.flow, config.masks, config.mask_points, config.depth)
-    return footage if any(isinstance(value, Path) for value in given) else with_bars(footage)
+    if any(isinstance(value, Path) for value in given):
+        return footage
+    return with_bars(footage, config.start)
 
 
 def report_data_set(work: Work) -> None:

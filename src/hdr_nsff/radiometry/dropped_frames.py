@@ -78,6 +78,8 @@ def find_cycle(
     longest = min(tuning.cycle.max_cycle, (count + 1) // 2)
     for length in range(2, longest + 1):
         phases, levels = fit_phases(steps, known, length, tuning)
+        if len(np.unique(phases)) < length:
+            continue  # an exposure that no frame has
         advance = (np.diff(phases) - known) % length  # frames that are missing beyond `known`
         misfit = mean_misfit(steps, phases, levels, tuning)
         gaps = int(np.count_nonzero(advance))

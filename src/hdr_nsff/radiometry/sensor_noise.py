@@ -32,6 +32,7 @@ MEDIAN_SQUARE = 0.4549  # of a standard normal variable
 STEP_8_BIT = 1 / 255  # between codes, as values in [0, 1]
 MIN_EXPOSURE = 1e-7
 MIN_MEAN_COSINE = 1e-3  # of noise, for a variance that is a number
+MIN_DEVIATION = 1e-5  # of log exposure: less is rounding of float32, and no noise
 
 
 @dataclass(frozen=True)
@@ -187,7 +188,7 @@ def flat_places(pixels: Pixels, tuning: SensorNoiseTuning) -> Iterator[tuple[int
         margin = tuning.clip_margin * deviation / np.median(flat.slope)
         value = np.median(flat.value)
         is_unclipped = value - margin >= LOW and value + margin <= HIGH
-        if is_unclipped and 0 < deviation <= tuning.max_deviation:
+        if is_unclipped and MIN_DEVIATION <= deviation <= tuning.max_deviation:
             yield k, flat
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -59,6 +60,8 @@ def frames_step(work: Work) -> StepResult:
         seconds.append(frame.seconds)
         extents.append(exposure.extent(frame.rgb))
     check_frames(c.clip, entries, extents)
+    if work.footage.video:
+        check_lengths(c.clip, entries)
     missing = leave_gaps(work, entries, seconds)
     m.fps = work.footage.fps / c.stride
     with_time = work.capture is not None  # of other footage, it may have gaps by the cycle
@@ -128,6 +131,19 @@ def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[floa
     if color is not None:
         raise InputError(
             f"{clip}: all frames are {color}; nothing can be learned from them, choose other frames"
+        )
+
+
+def check_lengths(clip: Path, entries: list[FrameEntry]) -> None:
+    """InputError where cameras, or tracks of one, have different numbers of frames, of
+    videos whose headers have none.
+    """
+    counts = Counter((entry.camera_id, entry.track) for entry in entries)
+    if len(set(counts.values())) > 1:
+        found = " and ".join(map(str, counts.values()))
+        raise InputError(
+            f"{clip}: its videos have {found} frames; synchronized cameras and tracks need the "
+            "same number each, cut all to the same moments"
         )
 
 
