@@ -17,7 +17,13 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.io import write_json
 from hdr_nsff.fields.splat.config import SplatConfig
-from hdr_nsff.pipeline import RunConfig, held_out_every, prepare_settings, train_settings
+from hdr_nsff.pipeline import (
+    RunConfig,
+    held_out_every,
+    keep_options,
+    prepare_settings,
+    train_settings,
+)
 from hdr_nsff.prepare.prepare import PrepareConfig
 from hdr_nsff.scene.scene import Scene
 from hdr_nsff.scene.truth import Truth, TruthView
@@ -226,3 +232,18 @@ def test_a_truth_of_the_whole_clip_is_refused_for_segments(tmp_path: Path) -> No
     config = RunConfig(tmp_path, tmp_path, segment=2, truth=truth_of(tmp_path / "truth", (4.0, 4)))
     with pytest.raises(InputError, match="leave --segment or --truth out"):
         pipeline.check_truth(config)
+
+
+def test_other_options_are_refused_before_the_scene_of_a_run_is_replaced(tmp_path: Path) -> None:
+    config = RunConfig(tmp_path / "clip.mp4", tmp_path, max_size=160, minutes=2.0)
+    keep_options(config)
+    keep_options(replace(config, max_size=320))  # nothing was trained yet
+    (tmp_path / "run/checkpoints").mkdir(parents=True)
+    (tmp_path / "run/checkpoints/step_00000010.safetensors").touch()
+    keep_options(replace(config, max_size=320, minutes=None, device="cpu"))
+    for changed in (replace(config, end=14, max_size=320), config):
+        with pytest.raises(InputError, match=r"other options \(--(end|max-size)\)"):
+            keep_options(changed)
+    (tmp_path / pipeline.OPTIONS).write_text("[1")
+    with pytest.raises(InputError, match="damaged"):
+        keep_options(config)

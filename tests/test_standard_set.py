@@ -13,6 +13,8 @@ from hdr_nsff.core.hdr_video import ENCODERS
 from hdr_nsff.core.images import read_image
 from hdr_nsff.geometry.paths import PathView
 from hdr_nsff.rendering.output import Output, Shot
+from hdr_nsff.rendering.shot_views import plan_shot
+from hdr_nsff.rendering.shots import render_shot
 from hdr_nsff.rendering.standard_set import cut, render_all, with_hdr_clip
 
 NAMES = {
@@ -42,6 +44,24 @@ def test_the_set_is_complete_and_restarts_without_work(tmp_path: Path) -> None:
     before = run.field.calls
     render_all(run, out)
     assert run.field.calls - before <= 1  # the focus depth of bullet time
+
+
+def test_the_set_replaces_no_shot_that_was_asked_for_by_itself(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, out = fake_run(tmp_path), tmp_path / "out"
+    slow = plan_shot(run, "slowmo", factor=4, num_views=8)
+    render_shot(run, slow, out, Output())
+    made = {file: file.read_bytes() for file in (out / "slowmo").iterdir()}
+    assert len(list((out / "slowmo").glob("*.exr"))) == len(slow.views)
+    results = render_all(run, out)
+    assert {file: file.read_bytes() for file in (out / "slowmo").iterdir()} == made
+    assert results["slow motion"] == out / "slowmo" and "it stays" in capsys.readouterr().err
+    render_all(run, out, output=Output(ev=-2.0))  # its own shots it does replace
+    assert len(list((out / "fixed").glob("*.png")))
+    render_shot(run, plan_shot(run, "training"), tmp_path / "other", Output(exr="float"))
+    with pytest.raises(InputError, match="other options"):
+        render_all(run, tmp_path / "other")
 
 
 def test_the_shot_as_filmed_has_an_hdr_video_where_one_can_be_encoded(

@@ -4,6 +4,7 @@ what it has done, so a killed run continues with the same command.
 
 from __future__ import annotations
 
+import json
 import time
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -12,7 +13,7 @@ from typing import Any, Literal
 from tyro.conf import Positional
 
 from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.io import writing_to
+from hdr_nsff.core.io import read_json, write_json, writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.evaluate import evaluate_run, views_of_clip
@@ -29,6 +30,8 @@ from hdr_nsff.training.config import TrainConfig, check_config
 from hdr_nsff.training.presets import PRESETS
 from hdr_nsff.training.run_folder import Run
 from hdr_nsff.training.train import train
+
+OPTIONS = "options.json"  # of the command, beside its results
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,7 @@ def run_all(config: RunConfig) -> None:
     footage = prepare_settings(config)
     results: dict[str, Path] = {}
     with writing_to(config.out), lock_output(config.out):
+        keep_options(config)
         scenes = prepare_scenes(footage)
         truth = config.truth or held_out_truth(footage)
         for scene in scenes:
@@ -100,6 +104,41 @@ def run_all(config: RunConfig) -> None:
     width = max(len(name) for name in results)
     for name, path in results.items():
         say(f"  {name:<{width}} {path}")
+
+
+def keep_options(config: RunConfig) -> None:
+    """Write the options of the command beside its results. InputError where a run was
+    trained with others: its scene would be prepared anew, and no longer fit it.
+    """
+    path = config.out / OPTIONS
+    own = options_of(config)
+    runs = [config.out / "run", *config.out.glob("*/run")]
+    runs = [run for run in runs if any((run / "checkpoints").glob("step_*"))]
+    if runs and path.is_file():
+        try:
+            before = dict(read_json(path))
+        except (ValueError, TypeError) as error:
+            raise InputError(f"{path}: damaged; delete it, or choose another OUT") from error
+        if own["minutes"] is None:
+            own["minutes"] = before.get("minutes")
+        changed = [name for name in own if name in before and before[name] != own[name]]
+        if changed:
+            options = ", ".join("--" + name.replace("_", "-") for name in changed)
+            raise InputError(
+                f"{config.out}: holds a run that was trained with other options ({options}); "
+                f"choose another OUT, or delete {runs[0]} to train again with these"
+            )
+    write_json(path, own)
+
+
+def options_of(config: RunConfig) -> dict[str, Any]:
+    """The options of `run` as JSON, but for those that change no result; of the clip,
+    its name.
+    """
+    kept = {f.name: getattr(config, f.name) for f in fields(config)}
+    kept = {name: value for name, value in kept.items() if name not in ("out", "device")}
+    kept["clip"] = config.clip.name
+    return dict(json.loads(json.dumps(kept, default=str)))
 
 
 def finish_scene(settings: TrainConfig, truth: Path | None) -> dict[str, Path]:

@@ -46,8 +46,6 @@ def check(config: CheckConfig) -> Path:
     check_place(picture, config.clip)
     facts, video, brackets = measure_clip(config.clip)
     findings, works = judge(facts), outlook(facts)
-    with writing_to(picture):
-        draw(picture, facts, video, brackets, works, findings)
     if config.json:
         document = {
             "clip": str(config.clip),
@@ -59,6 +57,9 @@ def check(config: CheckConfig) -> Path:
         print(json.dumps(document, indent=1, ensure_ascii=False))
     else:
         print_findings(works, findings)
+    with writing_to(picture):
+        draw(picture, facts, video, brackets, works, findings)
+    if not config.json:
         print(f"picture: {picture}")
     return picture
 

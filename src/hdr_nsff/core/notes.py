@@ -69,6 +69,7 @@ class Sequence(Note):
     views: list[SequenceView] = Field(min_length=1)
     seconds: float  # spent so far
     complete: bool = False
+    of_set: bool = False  # of the standard set, which replaces its own shots only
 
 
 class ExportedSequence(Note):

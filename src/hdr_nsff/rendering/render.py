@@ -13,6 +13,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.hdr_video import check_encoder
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
+from hdr_nsff.core.progress import say
 from hdr_nsff.rendering.interpolate import LayeredField
 from hdr_nsff.rendering.lens import original_lens
 from hdr_nsff.rendering.output import Output, Shot
@@ -88,7 +89,10 @@ def render(config: RenderConfig) -> dict[str, Path]:
         planned = plan_shot(run, config.path, config.frame, config.factor, config.views)
         shot = resize_shot(planned, config.scale, config.fps)
         result = render_shot(run, shot, out, config.output)
-        return name_results(out, shot, shot.name, config.output, result)
+        named = name_results(out, shot, shot.name, config.output, result)
+        for name, path in named.items():
+            say(f"{name}: {path}")
+        return named
 
 
 def resize_shot(shot: Shot, scale: float, fps: float | None) -> Shot:

@@ -37,10 +37,11 @@ SHEET_VIEWS = 12  # on a contact sheet
 SHEET_COLUMNS = 4
 
 
-def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
+def render_shot(run: Run, shot: Shot, out: Path, output: Output, of_set: bool = False) -> Path:
     """Write the shot's stills to `out/<name>/`, its video and contact sheet beside it.
 
-    Returns the path of the video; without one, of the folder.
+    Returns the path of the video; without one, of the folder. `of_set`: it is one of
+    the standard set.
     """
     cameras = run.tonemapper.num_cameras
     if not 0 <= output.camera_id < cameras:
@@ -50,7 +51,7 @@ def render_shot(run: Run, shot: Shot, out: Path, output: Output) -> Path:
     folder, video = out / shot.name, out / f"{shot.name}.mp4"
     sheet = out / f"{shot.name}_sheet.png"
     products = [video, sheet, *hdr_paths(out, shot.name)]
-    note = open_sequence(run, shot, folder, output, products)
+    note = open_sequence(run, shot, folder, output, products, of_set)
     result = video if output.video else folder
     pictures = [folder / f"{i:05d}.png" for i in range(len(shot.views))]
     stills = still_paths(pictures, output.hdr_still)
@@ -94,8 +95,21 @@ def describe_view(run: Run, view: PathView, output: Output) -> notes.SequenceVie
     return notes.SequenceView(time=view.time, ev=ev_of(view, output), frame=index)
 
 
+def is_made_by_path(run: Run, shot: Shot, out: Path, output: Output) -> bool:
+    """Whether the shot is there, made with `--path` and otherwise than asked."""
+    found = notes.read(out / shot.name / "sequence.json", notes.Sequence)
+    if found is None or found.of_set or not found.complete:
+        return False
+    return found.key != fingerprint(run, shot.views, shot.fps, picture_settings(output))
+
+
 def open_sequence(
-    run: Run, shot: Shot, folder: Path, output: Output, products: Sequence[Path]
+    run: Run,
+    shot: Shot,
+    folder: Path,
+    output: Output,
+    products: Sequence[Path],
+    of_set: bool = False,
 ) -> notes.Sequence:
     """The note of a shot, new or as it was left.
 
@@ -122,6 +136,7 @@ def open_sequence(
         display_exposure=display_exposure(run, shot.views),
         views=[describe_view(run, v, output) for v in shot.views],
         seconds=0.0,
+        of_set=of_set,
     )
     notes.write(path, note)
     return note

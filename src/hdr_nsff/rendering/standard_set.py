@@ -25,7 +25,7 @@ from hdr_nsff.rendering.fingerprint import fingerprint
 from hdr_nsff.rendering.output import Output, Shot
 from hdr_nsff.rendering.set_pictures import write_pictures
 from hdr_nsff.rendering.shot_views import SHOTS, find_frame, plan_shot
-from hdr_nsff.rendering.shots import name_results, render_shot
+from hdr_nsff.rendering.shots import is_made_by_path, name_results, render_shot
 from hdr_nsff.rendering.stills import render_still
 from hdr_nsff.training.run_folder import Run
 
@@ -77,13 +77,25 @@ def render_all(
     for shot in fit_to_budget(run, out, budget, shots, refused):
         if shot.name == "training":
             filmed = with_hdr_clip(output, shot)
-            video = render_shot(run, shot, out, filmed)
+            if is_made_by_path(run, shot, out, filmed):
+                raise InputError(
+                    f"{out / shot.name}: made with --path and other options, and the standard "
+                    "set would replace it; choose another --out, or delete it"
+                )
+            video = render_shot(run, shot, out, filmed, of_set=True)
             results["EXR sequence"] = out / "training"
             results |= write_pictures(run, out, shot, filmed)
             results |= name_results(out, shot, LABELS[shot.name], filmed, video)
         else:
             others = replace(output, exr="none", hdr_still=())
-            video = render_shot(run, shot, out, others)
+            if is_made_by_path(run, shot, out, others):
+                say(
+                    f"{shot.name}: made with --path and other options, it stays; for that of the "
+                    f"standard set, choose another --out, or delete {out / shot.name}"
+                )
+                results[LABELS[shot.name]] = out / shot.name
+                continue
+            video = render_shot(run, shot, out, others, of_set=True)
             results |= name_results(out, shot, LABELS[shot.name], others, video)
     return results
 

@@ -79,6 +79,7 @@ class RunWriter:
         with self.progress:
             self.task = self.progress.add_task("train", total=1000, note="")
             yield
+            self.progress.update(self.task, completed=1000)
 
     def log(self, clock: Clock, values: dict[str, float]) -> None:
         """Every `LOG_EVERY` steps, append a line to the log and move the bar."""

@@ -143,6 +143,7 @@ class Trainer:
                         self.writer.finish_checkpoint(self.clock)
         self.save(previews)
         self.writer.say(self.poses.describe())
+        self.writer.say(f"run: {self.config.out}  ({self.clock.step:,} steps)")
 
     def step(self) -> dict[str, float]:
         """One optimizer step over this process's share of the batches.
