@@ -271,7 +271,7 @@ def test_without_tracks_the_path_fills_times_without_moving_pixels(toy: Scene) -
     hidden = torch.zeros(34, 60, dtype=torch.bool)
     train = [replace(f, moving=hidden) if f.time in (0, 3, 5) else f for f in toy.train]
     frames, views = scene_views(replace(toy, train=train))
-    mover = mover_without_tracks(np.array(frames), views)
+    mover = mover_without_tracks(np.array(frames), np.arange(6.0), views)
     assert mover.known.tolist() == [False, True, True, False, True, False]
     steps = np.diff(mover.translations[:, 0])
     assert np.isfinite(steps).all() and (steps[1:4] > 0.03).all()  # 0.1 a time, smoothed

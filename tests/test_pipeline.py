@@ -20,7 +20,7 @@ from hdr_nsff.fields.splat.config import SplatConfig
 from hdr_nsff.pipeline import (
     RunConfig,
     held_out_every,
-    keep_options,
+    options_for,
     prepare_settings,
     train_settings,
 )
@@ -236,14 +236,15 @@ def test_a_truth_of_the_whole_clip_is_refused_for_segments(tmp_path: Path) -> No
 
 def test_other_options_are_refused_before_the_scene_of_a_run_is_replaced(tmp_path: Path) -> None:
     config = RunConfig(tmp_path / "clip.mp4", tmp_path, max_size=160, minutes=2.0)
-    keep_options(config)
-    keep_options(replace(config, max_size=320))  # nothing was trained yet
+    write_json(tmp_path / pipeline.OPTIONS, options_for(config))
+    options_for(replace(config, max_size=320))  # nothing was trained yet
     (tmp_path / "run/checkpoints").mkdir(parents=True)
     (tmp_path / "run/checkpoints/step_00000010.safetensors").touch()
-    keep_options(replace(config, max_size=320, minutes=None, device="cpu"))
-    for changed in (replace(config, end=14, max_size=320), config):
+    same = replace(config, minutes=None, device="cpu")
+    assert options_for(same) == options_for(config)
+    for changed in (replace(config, end=14), replace(config, max_size=320)):
         with pytest.raises(InputError, match=r"other options \(--(end|max-size)\)"):
-            keep_options(changed)
+            options_for(changed)
     (tmp_path / pipeline.OPTIONS).write_text("[1")
     with pytest.raises(InputError, match="damaged"):
-        keep_options(config)
+        options_for(config)

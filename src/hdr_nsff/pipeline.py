@@ -89,8 +89,9 @@ def run_all(config: RunConfig) -> None:
     footage = prepare_settings(config)
     results: dict[str, Path] = {}
     with writing_to(config.out), lock_output(config.out):
-        keep_options(config)
+        options = options_for(config)
         scenes = prepare_scenes(footage)
+        write_json(config.out / OPTIONS, options)
         truth = config.truth or held_out_truth(footage)
         for scene in scenes:
             if config.segment is None:
@@ -106,9 +107,9 @@ def run_all(config: RunConfig) -> None:
         say(f"  {name:<{width}} {path}")
 
 
-def keep_options(config: RunConfig) -> None:
-    """Write the options of the command beside its results. InputError where a run was
-    trained with others: its scene would be prepared anew, and no longer fit it.
+def options_for(config: RunConfig) -> dict[str, Any]:
+    """The options to be kept beside the results. InputError where a run was trained
+    with others: its scene would be prepared anew, and no longer fit it.
     """
     path = config.out / OPTIONS
     own = options_of(config)
@@ -128,7 +129,7 @@ def keep_options(config: RunConfig) -> None:
                 f"{config.out}: holds a run that was trained with other options ({options}); "
                 f"choose another OUT, or delete {runs[0]} to train again with these"
             )
-    write_json(path, own)
+    return own
 
 
 def options_of(config: RunConfig) -> dict[str, Any]:
