@@ -60,8 +60,10 @@ def test_the_set_replaces_no_shot_that_was_asked_for_by_itself(
     render_all(run, out, output=Output(ev=-2.0))  # its own shots it does replace
     assert len(list((out / "fixed").glob("*.png")))
     render_shot(run, plan_shot(run, "training"), tmp_path / "other", Output(exr="float"))
-    with pytest.raises(InputError, match="other options"):
-        render_all(run, tmp_path / "other")
+    made = {file: file.read_bytes() for file in (tmp_path / "other/training").iterdir()}
+    results = render_all(run, tmp_path / "other")
+    assert {file: file.read_bytes() for file in (tmp_path / "other/training").iterdir()} == made
+    assert results["as filmed"] == tmp_path / "other/training" and "overview" not in results
 
 
 def test_the_shot_as_filmed_has_an_hdr_video_where_one_can_be_encoded(

@@ -75,28 +75,21 @@ def render_all(
         say(sentence)
     results: dict[str, Path] = {}
     for shot in fit_to_budget(run, out, budget, shots, refused):
-        if shot.name == "training":
-            filmed = with_hdr_clip(output, shot)
-            if is_made_by_path(run, shot, out, filmed):
-                raise InputError(
-                    f"{out / shot.name}: made with --path and other options, and the standard "
-                    "set would replace it; choose another --out, or delete it"
-                )
-            video = render_shot(run, shot, out, filmed, of_set=True)
+        filmed = shot.name == "training"
+        others = replace(output, exr="none", hdr_still=())
+        own = with_hdr_clip(output, shot) if filmed else others
+        if is_made_by_path(run, shot, out, own):
+            say(
+                f"{shot.name}: made with --path and other options, it stays; for the standard "
+                f"set's with its pictures, choose another --out, or delete {out / shot.name}"
+            )
+            results[LABELS[shot.name]] = out / shot.name
+            continue
+        video = render_shot(run, shot, out, own, of_set=True)
+        if filmed:
             results["EXR sequence"] = out / "training"
-            results |= write_pictures(run, out, shot, filmed)
-            results |= name_results(out, shot, LABELS[shot.name], filmed, video)
-        else:
-            others = replace(output, exr="none", hdr_still=())
-            if is_made_by_path(run, shot, out, others):
-                say(
-                    f"{shot.name}: made with --path and other options, it stays; for that of the "
-                    f"standard set, choose another --out, or delete {out / shot.name}"
-                )
-                results[LABELS[shot.name]] = out / shot.name
-                continue
-            video = render_shot(run, shot, out, others, of_set=True)
-            results |= name_results(out, shot, LABELS[shot.name], others, video)
+            results |= write_pictures(run, out, shot, own)
+        results |= name_results(out, shot, LABELS[shot.name], own, video)
     return results
 
 
