@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from toy_scene import EV, ToyScene
 
+from hdr_nsff.check import measure
 from hdr_nsff.check.check import CheckConfig, check
 from hdr_nsff.check.facts import CameraFacts, ClipFacts, ExposureFacts, FileFacts
 from hdr_nsff.check.findings import judge, outlook
@@ -63,6 +64,18 @@ def test_a_tripod_with_one_exposure_has_neither_hdr_nor_viewpoints(tmp_path: Pat
     assert problems == ["exposure"]
     (camera,) = [finding for finding in judge(facts) if finding.subject == "camera"]
     assert camera.level == "note" and camera.text.startswith("the camera stands still")
+
+
+@pytest.mark.parametrize("share", [0.6, 0.75])
+def test_no_lens_is_looked_for_where_turns_alone_explain_most(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, share: float
+) -> None:
+    looked_for = []
+    monkeypatch.setattr(measure, "find_motion", lambda *_: ("parallax", share))
+    monkeypatch.setattr(measure, "measure_lens", lambda *_: looked_for.append(share))
+    facts, _, _ = measure_clip(clip_of(tmp_path, still_scene, [0.0] * 4))
+    assert facts.camera.lens is None and facts.camera.rotation_share == share
+    assert looked_for == ([share] if share < 0.7 else [])
 
 
 def test_auto_exposure_is_told_from_a_locked_one(tmp_path: Path) -> None:

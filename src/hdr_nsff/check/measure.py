@@ -247,7 +247,10 @@ def measure_camera(
     shifts = [np.linalg.norm(pair.q - pair.p, axis=1) for pair in following if len(pair.p)]
     per_frame = float(np.median(np.concatenate(shifts))) if shifts else 0.0
     lens = None
-    if motion == "parallax" and not cuts:
+    # with so little parallax `prepare` looks for no lens either: mapping would take
+    # minutes and fail
+    enough = share is None or share < PosesTuning().no_lens_share
+    if motion == "parallax" and enough and not cuts:
         lens = measure_lens(equalized, clipped, scale)
     height, width = equalized.shape[1:3]
     readout = None
