@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from typing import Any
 import pytest
 
 from hdr_nsff import __version__, cli
+from hdr_nsff.core import refusals
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import TrainConfig
@@ -202,18 +204,44 @@ main(["report", "--help"])
         assert "Traceback" not in ended.stderr
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ("render",),
-        ("train",),
-        ("train", "sparkle"),
-        ("train", "tiny", "--steps", "x"),
-        ("run", "a"),
-    ],
-)
-def test_what_the_parser_refuses_exits_with_2(arguments: tuple[str, ...]) -> None:
-    assert call(*arguments) == 2
+REFUSED = {
+    "render": "RUN is missing; `hdr-nsff render --help` explains it",
+    "run a": "OUT is missing; `hdr-nsff run --help`",
+    "bench": "OUT, --scenes and --methods are missing; `hdr-nsff bench --help` explains them",
+    "bench out --scene a --methods b": "--scene: no such option (did you mean --scenes?)",
+    "prepare a b --sterde 3": "--sterde: no such option (did you mean --stride?); `hdr-nsff prep",
+    "prepare a b -x": "-x: no such option; `hdr-nsff prepare --help` lists all",
+    "prepare a b --redo nothing": "--redo nothing: no such choice; choose one of frames, exp",
+    "prepare a b c": "'c': one argument too many",
+    "prepare a b --same-camera x": "--same-camera x: not two values; `hdr-nsff prepare --help`",
+    "prepare a b --max_size=1e": "--max-size 1e: not a whole number; `hdr-nsff prepare --help`",
+    "run a b --tripod maybe": "--tripod maybe: the option takes no value; leave 'maybe' out",
+    "run a b --preset gird": "--preset gird: no such choice (did you mean grid?)",
+    "run a b --preset paper-small": "`hdr-nsff train paper-small --scene OUT/scene` has it",
+    "synth cave out": "NAME cave: no such choice; choose one of interior, lamp",
+    "train": "train: name a preset first, as in `hdr-nsff train splat`; the presets are splat,",
+    "train --steps 3": "train: name a preset first",
+    "train splatt a b": "no preset 'splatt' (did you mean splat?); the presets are splat, grid,",
+    "train tiny --steps x": "--steps x: not a whole number; `hdr-nsff train tiny --help`",
+    "train tiny --steps": "--steps: no value follows; `hdr-nsff train tiny --help` explains",
+    "train splat --field.statik 3": "--field.statik: no such option (did you mean --field.static?)",
+    "doctor extra": "'extra': `doctor` takes no arguments; leave it out",
+}
+
+
+@pytest.mark.parametrize("command", list(REFUSED))
+def test_what_the_parser_refuses_is_one_sentence(command: str, capsys: Capture) -> None:
+    assert call(*command.split()) == 2
+    assert REFUSED[command] in one_sentence(capsys.readouterr().err)
+
+
+def test_a_parser_that_explains_itself_by_a_box_alone_is_one_sentence_too(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(refusals, "hook", lambda refuse: nullcontext())
+    assert call("prepare", "a", "b", "--max-size", "x") == 2
+    sentence = one_sentence(capsys.readouterr().err)
+    assert "--max-size" in sentence and "'x'" in sentence and "\u2500" not in sentence
 
 
 def test_arguments_reach_the_verb(trained_with: list[TrainConfig]) -> None:

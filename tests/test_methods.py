@@ -59,6 +59,8 @@ def test_budget_and_seed_are_the_same_for_every_preset() -> None:
         ("x=tiny --steps 3", "same for all"),
         ("x=tiny 'a", "correct the quotes"),
         ("x=tiny --rays -1", "--rays"),
+        ("x=tiny --rays a", "--methods 'x=tiny --rays a': --rays a: not a whole number"),
+        ("x=tiny --raiys 3", r"--raiys: no such option \(did you mean --rays\?\)"),
     ],
 )
 def test_texts_that_are_no_method_are_refused(text: str, words: str) -> None:

@@ -13,6 +13,7 @@ try:
     from collections.abc import Sequence
     from contextlib import nullcontext
     from dataclasses import dataclass
+    from functools import partial
     from importlib import import_module
     from typing import Any, NoReturn
 
@@ -213,9 +214,25 @@ def load(place: str) -> Any:
 
 
 def parse(name: str, config: Any, options: Sequence[str]) -> Any:
-    """The config of a verb from its options. tyro prints help and typos itself and
-    exits.
+    """The config of a verb from its options. tyro prints help and exits.
+
+    InputError where it refuses them.
     """
+    from hdr_nsff.core.refusals import Command, refusals_as_sentences
+
+    start: list[str] = []
+    if isinstance(config, dict):
+        check_preset(name, config, options)
+        start = [option for option in options[:1] if option in config]
+    read = partial(parse_options, name, config)
+    words = " ".join(["hdr-nsff", name, *start])
+    command = Command(words, options, partial(read, [*start, "--help"]), partial(elsewhere, name))
+    with refusals_as_sentences(command):
+        return read(options)
+
+
+def parse_options(name: str, config: Any, options: Sequence[str]) -> Any:
+    """The same in tyro's words: what it refuses is a box and exit code 2."""
     import tyro
 
     if isinstance(config, dict):
@@ -226,6 +243,28 @@ def parse(name: str, config: Any, options: Sequence[str]) -> Any:
         args=options,
         config=(tyro.conf.OmitSubcommandPrefixes,),
     )
+
+
+def elsewhere(name: str, option: str, value: str) -> str:
+    """Where a preset can be found that `run` lacks."""
+    if (name, option) == ("run", "--preset") and value in PRESET_HELP:
+        return f" (`hdr-nsff train {value} --scene OUT/scene` has it)"
+    return ""
+
+
+def check_preset(name: str, presets: dict[str, Any], options: Sequence[str]) -> None:
+    """InputError unless a preset, or a request for help, stands first."""
+    from hdr_nsff.core.errors import shorten
+    from hdr_nsff.core.refusals import did_you_mean
+
+    first = options[0] if options else ""
+    if first in presets or first == "-h" or first.startswith(("--help", "--tyro-")):
+        return
+    listed = f"the presets are {', '.join(PRESET_HELP)}"
+    if not first or first.startswith("-"):
+        raise InputError(f"{name}: name a preset first, as in `hdr-nsff {name} splat`; {listed}")
+    hint = did_you_mean(first, presets)
+    raise InputError(f"no preset {shorten(first)!r}{hint}; {listed}")
 
 
 def parse_preset(name: str, presets: dict[str, Any], options: Sequence[str]) -> Any:
@@ -260,7 +299,10 @@ def refuse_options(name: str, verb: Verb, options: Sequence[str]) -> None:
     """Help and errors of a verb without options, which needs no library."""
     import argparse
 
-    argparse.ArgumentParser(f"hdr-nsff {name}", description=verb.summary).parse_args(options)
+    parser = argparse.ArgumentParser(f"hdr-nsff {name}", description=verb.summary)
+    superfluous = parser.parse_known_args(options)[1]
+    if superfluous:
+        fail(f"{superfluous[0]!r:.60}: `{name}` takes no arguments; leave it out")
 
 
 def usage() -> str:

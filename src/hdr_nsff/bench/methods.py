@@ -5,11 +5,13 @@ from __future__ import annotations
 import re
 import shlex
 from dataclasses import replace
+from functools import partial
 
 import tyro
 
 from hdr_nsff.bench.config import BenchConfig, safe_name
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.refusals import Command, refusals_as_sentences
 from hdr_nsff.core.settings import check
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.config import HELP, TrainConfig, check_config
@@ -27,8 +29,7 @@ def parse_method(text: str, config: BenchConfig) -> tuple[str, TrainConfig]:
     name, rest = found.groups()
     words = split_words(text, rest)
     check_words(text, name, words)
-    presets = {preset: ("", settings) for preset, settings in PRESETS.items()}
-    settings = tyro.extras.overridable_config_cli(presets, prog="--methods", args=words)
+    settings = settings_of(text, words)
     settings = replace(check_config(settings), seed=config.seed, device=config.device)
     if config.budget is not None:
         settings = replace(settings, budget=Budget(minutes=minutes_of(config.budget)))
@@ -36,6 +37,18 @@ def parse_method(text: str, config: BenchConfig) -> tuple[str, TrainConfig]:
         settings = replace(settings, budget=Budget(steps=config.steps, minutes=None))
     check(settings, HELP)
     return safe_name(name or words[0], "--methods"), settings
+
+
+def settings_of(text: str, words: list[str]) -> TrainConfig:
+    """The settings of a preset with options, in words as `train` takes them."""
+    presets = {preset: ("", settings) for preset, settings in PRESETS.items()}
+    read = partial(tyro.extras.overridable_config_cli, presets, prog="hdr-nsff train")
+    print_help = partial(read, args=[words[0], "--help"])
+    try:
+        with refusals_as_sentences(Command(f"hdr-nsff train {words[0]}", words, print_help)):
+            return read(args=words)
+    except InputError as error:
+        raise InputError(f"--methods {text!r:.60}: {error}") from error
 
 
 def split_words(text: str, rest: str) -> list[str]:
