@@ -15,8 +15,9 @@ from test_bench_scenes import made
 
 from hdr_nsff.bench.bench import MEASURING_SHARE, share_done
 from hdr_nsff.bench.config import BenchConfig, BenchRun
-from hdr_nsff.bench.plan import check_run, make_plan
+from hdr_nsff.bench.plan import check_run, claim, make_plan
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import write_text
 from hdr_nsff.scene.scene import Manifest
 from hdr_nsff.training.budget import Budget
 from hdr_nsff.training.presets import PRESETS
@@ -120,9 +121,34 @@ def test_settings_that_exclude_each_other(
 def test_a_run_outside_the_plan_is_refused(
     toy_folder: Path, tmp_path: Path, capsys: Capture
 ) -> None:
-    command = [*bench_words(tmp_path, toy_folder), "--only", "../tiny"]
-    assert "scene/tiny" in refused(capsys, *command)
-    assert not (tmp_path / "runs").exists()
+    assert "scene/tiny" in bad(capsys, tmp_path, "--only", "../tiny", scenes=toy_folder)
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "difference"),
+    [
+        ({"steps": 5}, {}, "with --steps 5, not without it;"),
+        ({}, {"steps": 5}, "without --steps, not with --steps 5;"),
+        ({"steps": 5}, {"steps": 7}, "with --steps 5, not 7;"),
+        ({}, {"oracle": True}, "without --oracle, not with it;"),
+    ],
+)
+def test_a_setting_that_is_not_given_is_said_to_be_left_out(
+    before: dict[str, Any], now: dict[str, Any], difference: str, toy_folder: Path, tmp_path: Path
+) -> None:
+    config = BenchConfig(tmp_path, str(toy_folder), "tiny", device="cpu")
+    plan = make_plan(replace(config, **before))
+    claim(plan)
+    write_text(tmp_path / "runs/scene/tiny/config.json", "{}")
+    with pytest.raises(InputError, match=difference):
+        claim(replace(plan, config=replace(config, **now)))
+
+
+def test_settings_with_which_nothing_was_made_may_change(toy_folder: Path, tmp_path: Path) -> None:
+    config = BenchConfig(tmp_path, str(toy_folder), "tiny", device="cpu", steps=5)
+    for steps in (5, None, 7):
+        claim(make_plan(replace(config, steps=steps)))
+    assert json.loads((tmp_path / "bench.json").read_text())["settings"]["steps"] == 7
 
 
 def test_a_folder_of_other_files_is_left_alone(

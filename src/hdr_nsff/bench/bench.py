@@ -18,7 +18,6 @@ from hdr_nsff.bench.pool import Job, end_with_parent, failure_reason, run_jobs, 
 from hdr_nsff.bench.run import LOG, do_run, is_complete, prepare_scene
 from hdr_nsff.bench.tables import Row, row_of, write_tables
 from hdr_nsff.core import notes
-from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import writing_to
 from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import bar, say
@@ -65,11 +64,8 @@ def do_one(plan: BenchPlan, name: str) -> None:
     for scene in plan.scenes:
         if scene.name == name:
             return prepare_scene(scene)
-    for run in plan.runs:
-        if run.name == name:
-            return do_run(run, plan.config.views, plan.config.lpips)
-    names = ", ".join(run.name for run in plan.runs)
-    raise InputError(f"--only {name!r:.100}: no such run; there are {names}")
+    (run,) = [run for run in plan.runs if run.name == name]
+    return do_run(run, plan.config.views, plan.config.lpips)
 
 
 def prepare_scenes(plan: BenchPlan) -> None:

@@ -6,6 +6,7 @@ Settings are checked before anything runs, and a folder holds one benchmark.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import TypeVar
 
 from hdr_nsff.bench.config import SHARED, BenchConfig, BenchPlan, BenchRun
@@ -13,6 +14,7 @@ from hdr_nsff.bench.methods import parse_method
 from hdr_nsff.bench.scenes import parse_scene
 from hdr_nsff.core import notes
 from hdr_nsff.core.errors import InputError
+from hdr_nsff.core.io import SCENE_FILE
 from hdr_nsff.core.progress import say
 from hdr_nsff.evaluation.report import check_place
 from hdr_nsff.training.run_folder import open_folder
@@ -29,7 +31,9 @@ def make_plan(config: BenchConfig) -> BenchPlan:
     methods = [parse_method(text, config) for text in config.methods.split(",")]
     scenes = [parse_scene(text, config) for text in config.scenes.split(",")]
     by_name = distinct(((scene.name, scene) for scene in scenes), "--scenes")
-    return BenchPlan(config, tuple(by_name.values()), distinct(methods, "--methods"))
+    plan = BenchPlan(config, tuple(by_name.values()), distinct(methods, "--methods"))
+    check_only(plan)
+    return plan
 
 
 def check_settings(config: BenchConfig) -> None:
@@ -45,6 +49,14 @@ def check_settings(config: BenchConfig) -> None:
     if config.budget is not None and config.steps is not None:
         problem = "both given, and each sets how long to train"
         raise InputError(f"--budget and --steps {problem}; leave one out")
+
+
+def check_only(plan: BenchPlan) -> None:
+    """InputError where `--only` names neither a run nor a scene."""
+    only = plan.config.only
+    names = [run.name for run in plan.runs] + [scene.name for scene in plan.scenes]
+    if only is not None and only not in names:
+        raise InputError(f"--only {only!r:.100}: no such run; there are {', '.join(names)}")
 
 
 def distinct(named: Iterable[tuple[str, T]], option: str) -> dict[str, T]:
@@ -78,12 +90,18 @@ def claim(plan: BenchPlan) -> None:
     settings = {name: getattr(plan.config, name) for name in SHARED}
     sources = {scene.name: str(scene.source.resolve()) for scene in plan.scenes}
     before = notes.read(path, notes.Bench)
-    if before is not None:
+    if before is not None and is_begun(out):
         check_same(plan, before, settings, sources)
         sources = before.scenes | sources
     for run in plan.runs:
         check_run(run)
     notes.write(path, notes.Bench(settings=settings, scenes=sources))
+
+
+def is_begun(out: Path) -> bool:
+    """Whether anything in the folder was made with the settings that it notes."""
+    made = ("runs/*/*/config.json", f"scenes/*/{SCENE_FILE}")
+    return any(next(out.glob(pattern), None) is not None for pattern in made)
 
 
 def check_same(
@@ -94,14 +112,25 @@ def check_same(
     for name, value in settings.items():
         earlier = before.settings.get(name)
         if earlier != value:
-            option = f"--{name.replace('_', '-')}"
-            problem = f"holds runs with {option} {earlier}, not {value}"
+            problem = f"holds runs {difference(name, earlier, value)}"
             raise InputError(f"{out}: {problem}; choose another folder, or delete it")
     for name, source in sources.items():
         earlier_source = before.scenes.get(name, source)
         if earlier_source != source:
             problem = f"there {name} is the scene {earlier_source}"
             raise InputError(f"{out}: {problem}; give this one another name, NAME=FOLDER")
+
+
+def difference(name: str, earlier: object, value: object) -> str:
+    """How a setting was given before, and how not: "with --steps 5, not 7"."""
+    option = f"--{name.replace('_', '-')}"
+    if isinstance(value, bool):
+        return f"with {option}, not without it" if earlier else f"without {option}, not with it"
+    if value is None:
+        return f"with {option} {earlier}, not without it"
+    if earlier is None:
+        return f"without {option}, not with {option} {value}"
+    return f"with {option} {earlier}, not {value}"
 
 
 def check_run(run: BenchRun) -> None:
