@@ -5,8 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from moving_bodies import body, tracked
+from scipy.sparse import csr_matrix
 
-from hdr_nsff.priors.movers.rigid_groups import cut_graph, find_rigid_groups, neighbor_graph
+from hdr_nsff.priors.movers.rigid_groups import (
+    cut_graph,
+    find_rigid_groups,
+    neighbor_graph,
+    split_unconnected,
+)
 from hdr_nsff.priors.movers.rigid_motion import RigidGroup
 from hdr_nsff.priors.movers.tracks import Tracks
 from hdr_nsff.priors.movers.tuning import RIGID_GROUPS_TUNING, RigidGroupsTuning
@@ -44,6 +50,28 @@ def test_tracks_without_neighbors_are_parts_of_their_own() -> None:
     tracks = replace(near, **every)
     parts = cut_graph(tracks, neighbor_graph(tracks))
     assert len(np.unique(parts)) == RIGID_GROUPS_TUNING.parts
+
+
+def test_more_bodies_than_parts_are_told_apart() -> None:
+    outward = [np.array([np.cos(0.45 * k), np.sin(0.45 * k), 0]) for k in range(14)]
+    bodies = [
+        body(k, 3 * way + [0, 0, 6], 0.2 * way, 0.3 * (-1) ** k, count=40)[0]
+        for k, way in enumerate(outward)
+    ]
+    groups = groups_of(tracked(np.concatenate(bodies), noise=0.002))
+    assert len(groups) == 14
+    purity = [np.bincount(group.members // 40).max() / len(group.members) for group in groups]
+    assert min(purity) > 0.9
+
+
+def test_small_pieces_stay_with_the_largest_of_their_part() -> None:
+    part = np.array([0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
+    links = [(0, 1), (1, 2), (3, 4), (5, 6), (6, 7), (7, 8), (4, 9)]
+    row, column = np.array(links).T
+    graph = csr_matrix((np.ones(len(links)), (row, column)), (10, 10))
+    graph = graph + graph.T
+    split = split_unconnected(part, graph, 0.2)
+    assert split.tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 2, 2]
 
 
 @pytest.mark.filterwarnings("error")

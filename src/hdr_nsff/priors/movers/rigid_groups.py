@@ -42,7 +42,7 @@ def find_rigid_groups(
     one). If none does, the first of them is returned.
     """
     min_share = tuning.min_group_share if min_share is None else min_share
-    part = cut_graph(tracks, graph, tuning)
+    part = split_unconnected(cut_graph(tracks, graph, tuning), graph, tuning.min_piece_share)
     sampled = np.unique(np.linspace(0, len(part) - 1, tuning.max_sampled_tracks).astype(int))
     members_of_part = [np.nonzero(part == k)[0] for k in range(part.max() + 1)]
     samples = [np.intersect1d(members, sampled) for members in members_of_part]
@@ -148,6 +148,32 @@ def cut_graph(
         return np.minimum(rank[component], tuning.parts - 1)
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True) + 1e-12
     return kmeans2(vectors, tuning.parts, minit="++", rng=np.random.default_rng(0))[1]
+
+
+def split_unconnected(part: np.ndarray, graph: csr_matrix, min_share: float) -> np.ndarray:
+    """The part (N,) of every track, where pieces of one `part` (N,) that no chain of
+    neighbors connects are parts of their own.
+
+    Pieces of less than the share `min_share` of all tracks stay with their part's
+    largest. Where there are more movers than parts, each part holds several of them.
+    """
+    pairs = graph.tocoo()
+    inside = part[pairs.row] == part[pairs.col]
+    kept = pairs.data[inside], (pairs.row[inside], pairs.col[inside])
+    piece = connected_components(coo_matrix(kept, graph.shape))[1]
+    sizes = np.bincount(piece)
+    split = np.empty_like(part)
+    count = 0
+    for k in np.unique(part):
+        members = np.nonzero(part == k)[0]
+        pieces = np.unique(piece[members])
+        pieces = pieces[np.argsort(-sizes[pieces], kind="stable")]
+        large = [p for p in pieces if sizes[p] >= min_share * len(part)]
+        split[members] = count
+        for number, p in enumerate(large[1:], count + 1):
+            split[piece == p] = number
+        count += max(len(large), 1)
+    return split
 
 
 def neighbor_graph(tracks: Tracks, tuning: RigidGroupsTuning = RIGID_GROUPS_TUNING) -> csr_matrix:

@@ -99,6 +99,10 @@ class RigidGroupsTuning:
     """
     parts: int = 10
     """Parts that the graph of neighbors is cut into, before they are merged."""
+    min_piece_share: float = 0.01
+    """Share of all tracks from which pieces of a part are parts of their own, where no
+    chain of neighbors connects them.
+    """
     min_tracks_per_part: int = 3
     """Fewer tracks than this times `parts` remain one part."""
     cut_iterations: int = 1000
