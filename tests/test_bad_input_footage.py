@@ -210,6 +210,21 @@ def test_a_range_without_frames(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip")
     assert "no frame 50" in prepared(capsys, folder, "--start", 50)
     assert "nothing to read" in prepared(capsys, folder, "--start", 5, "--end", 5)
+    sentence = prepared(capsys, folder, "--start", 50)
+    assert f"--start 50: no frame 50 in {folder}, which has 9, counted from 0" in sentence
+    assert "--hold-out -3: no number of frames; use 2" in prepared(capsys, folder, "--hold-out", -3)
+    out = tmp_path / "problem"
+    sentence = refused(capsys, "reexpose", folder, out, "--ev=-2,0", "--start", 50)
+    assert "--start 50: no frame 50" in sentence and not out.exists()
+
+
+def test_too_few_frames_are_refused_before_anything_is_written(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    footage, out = clip(tmp_path / "clip"), tmp_path / "out"
+    for more in (["--start", 7], ["--stride", 5], ["--end", 2]):
+        assert "2 frames to use; at least 3" in refused(capsys, "prepare", footage, out, *more)
+        assert not out.exists()
 
 
 # Exposures
@@ -352,6 +367,7 @@ def test_output_that_is_a_file_or_holds_other_files_is_refused(
 def test_scene_json_edited_into_nonsense(tmp_path: Path, capsys: Capture) -> None:
     folder = clip(tmp_path / "clip", recorded(2))
     assert "at least 3" in prepared(capsys, folder)
+    (tmp_path / "scene").mkdir()
     for text in ("{", "[]", '{"source": 3}', '{"version": 99}', "\x00", ""):
         (tmp_path / "scene/scene.json").write_text(text)
         assert "scene.json: not a valid scene" in prepared(capsys, folder)

@@ -64,6 +64,12 @@ def test_what_an_option_names_must_be_there(
         assert str(nowhere) in refused(capsys, verb, footage, tmp_path / "out", option, nowhere)
     assert "truth.json" in refused(capsys, "run", footage, tmp_path / "out", "--truth", footage)
     assert "truth.json" in refused(capsys, "evaluate", run_folder, "--truth", nowhere)
+    layout = ("--layout", "nerfstudio", "--truth", nowhere)
+    sentence = refused(capsys, "export", run_folder, tmp_path / "out", *layout)
+    assert f"--truth {nowhere}: no truth.json here; give a folder" in sentence
+    for more in ([], ["--truth", nowhere]):
+        sentence = refused(capsys, "evaluate", run_folder, "--lpips", nowhere, *more)
+        assert f"--lpips {nowhere}: no such weights file; give a file" in sentence
     assert "--renders" in refused(capsys, "report", run_folder, "--renders", nowhere)
     assert str(nowhere) in refused(capsys, "render", run_folder, "--path", f"{nowhere}.json")
     assert not (tmp_path / "out").exists()
@@ -90,6 +96,16 @@ def test_a_place_that_cannot_be_written_is_named(
     sentence = refused(capsys, *commands(run_folder, footage, out)[verb])
     assert place.partition("/")[0][:40] in sentence
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_a_file_in_the_place_of_a_folder_is_said_to_be_one(
+    run_folder: Path, tmp_path: Path, capsys: Capture
+) -> None:
+    out = tmp_path / "file"
+    out.write_text("mine")
+    for verb in ("run", "render", "train"):
+        sentence = refused(capsys, *commands(run_folder, clip(tmp_path / "clip"), out)[verb])
+        assert f"{out}: is a file, where a folder is needed; choose another place" in sentence
 
 
 @pytest.mark.usefixtures("flow_data")

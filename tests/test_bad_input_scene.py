@@ -148,6 +148,8 @@ def test_binary_rubbish_for_scene_json(folder: Path) -> None:
 def test_no_folder_and_no_scene_json(tmp_path: Path) -> None:
     assert "no scene.json here; make a scene folder with `hdr-nsff prepare" in sentence(tmp_path)
     assert "no scene.json here" in sentence(tmp_path / "nowhere")
+    (tmp_path / "file").write_text("mine")
+    assert "is a file, no scene; name the folder" in sentence(tmp_path / "file")
 
 
 H, W = 34, 60

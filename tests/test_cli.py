@@ -218,6 +218,8 @@ REFUSED = {
     "run a b --tripod maybe": "--tripod maybe: the option takes no value; leave 'maybe' out",
     "run a b --preset gird": "--preset gird: no such choice (did you mean grid?)",
     "run a b --preset paper-small": "`hdr-nsff train paper-small --scene OUT/scene` has it",
+    "export a b --layout foo": "--layout foo: no such choice; choose one of hdr-gopro, nerfstudio",
+    "render a b": "'b': one argument too many; name it by its option (--out), leave it out, or",
     "synth cave out": "NAME cave: no such choice; choose one of interior, lamp",
     "train": "train: name a preset first, as in `hdr-nsff train splat`; the presets are splat,",
     "train --steps 3": "train: name a preset first",

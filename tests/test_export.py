@@ -25,6 +25,9 @@ from hdr_nsff.training.run_folder import write_config
     ("change", "word"),
     [
         ({}, "--ply-sequence"),
+        ({}, r"a\.ply: add --ply for Gaussians at one time"),
+        ({"out": Path("a.xyz")}, r"a\.xyz: .*end it in \.html, \.hdr4d, \.usdc, \.usda, "),
+        ({"out": Path("a.hdr4d"), "ply": True}, "the scene of a page; .* leave --ply,"),
         ({"ply": True, "ply_sequence": True}, "--ply-sequence"),
         ({"ply": True, "out": Path("a.obj")}, "ends in .ply"),
         ({"ply_sequence": True, "time": 1.0}, "every training time"),

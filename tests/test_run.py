@@ -199,6 +199,32 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         Run.open(tmp_path)
 
 
+def test_what_is_taken_for_a_run_folder_is_named(run: Path, tmp_path: Path) -> None:
+    (tmp_path / "note").write_text("mine")
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene/scene.json").write_text("{}")
+    whole = run.rename(tmp_path / "run").parent
+    for name, words in (
+        ("note", "is a file and not a run folder"),
+        ("scene", "a scene and not a run folder; train one from it with `hdr-nsff train splat"),
+        ("", f"not a run folder, but {whole / 'run'} is one"),
+    ):
+        with pytest.raises(InputError, match=words):
+            Run.open(whole / name if name else whole)
+
+
+def test_a_config_without_its_scene_says_how_to_name_it(run: Path) -> None:
+    change_config(run, lambda d: d.pop("scene"))
+    with pytest.raises(InputError, match=r'config\.json: no scene is named; add "scene"'):
+        Run.open(run)
+
+
+def test_a_config_of_another_version_is_named_with_its_folder(run: Path) -> None:
+    change_config(run, lambda d: d.update(version=0))
+    with pytest.raises(InputError, match=f"^{run}: the run's config.json is of another version"):
+        Run.open(run)
+
+
 def test_a_scene_that_was_moved_is_named(run: Path) -> None:
     nowhere = {"scene": "/nowhere/scene", "scene_from_run": "../nowhere"}
     change_config(run, lambda d: d.update(nowhere))

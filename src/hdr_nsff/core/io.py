@@ -104,6 +104,7 @@ def is_alive(pid: int) -> bool:
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 FORBIDDEN = (errno.EACCES, errno.EPERM, errno.EROFS)
 IMPOSSIBLE = (errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP)
+NO_FOLDER = (errno.ENOTDIR, errno.EEXIST)  # the first where it lies above the path
 GONE = (errno.ENOENT, errno.ENOTEMPTY)
 BROKEN = (errno.EIO,)
 
@@ -158,6 +159,9 @@ def describe_disk_error(error: Exception, place: Path | str) -> str | None:
     if code in FORBIDDEN:
         advice = "check its permissions, or choose another place"
         return f"{path}: may not be read or written ({text}); {advice}"
+    blocking = file_in_the_way(Path(path)) if code in NO_FOLDER else None
+    if blocking is not None:
+        return f"{blocking}: is a file, where a folder is needed; choose another place"
     if code in IMPOSSIBLE:
         advice = "correct the path, or choose another place"
         return f"{path}: cannot be read or written ({text}); {advice}"
@@ -168,6 +172,11 @@ def describe_disk_error(error: Exception, place: Path | str) -> str | None:
         advice = "check the disk, or choose another place"
         return f"{path}: cannot be read or written ({text}); {advice}"
     return None
+
+
+def file_in_the_way(path: Path) -> Path | None:
+    """The path, or what lies above it, where that is a file; None where none is."""
+    return next((place for place in (path, *path.parents) if place.is_file()), None)
 
 
 def path_of(error: Exception, place: Path | str) -> Path:

@@ -20,6 +20,7 @@ from hdr_nsff.core.errors import InputError, shorten
 
 FLAG = re.compile(r"--[a-z][a-z0-9.-]*")
 BOX = re.compile("[\u2500-\u257f]+")  # box-drawing characters
+PLACES = ("--scene", "--out", "--truth", "--renders")  # options for files and folders
 MAY_BE_LEFT_OUT = "{None}|"  # in tyro's name of a type
 TYPES = {"INT": "not a whole number", "FLOAT": "not a number", "STR STR": "not two values"}
 
@@ -82,8 +83,11 @@ def describe(event: Any, command: Command) -> str:
         case "InvalidChoice":
             option, value = name_of(event.argument), event.value
             hint = command.elsewhere(option, value) or did_you_mean(value, event.choices)
-            choices = ", ".join(event.choices)
-            return f"{option} {shorten(value)}: no such choice{hint}; choose one of {choices}"
+            choices = list(event.choices)
+            if "None" in choices:  # the option may be left out: tyro keeps no order then
+                choices = sorted(set(choices) - {"None"})
+            listed = ", ".join(choices)
+            return f"{option} {shorten(value)}: no such choice{hint}; choose one of {listed}"
         case "InstantiationFailure" if event.argument is not None:
             option, problem = name_of(event.argument), problem_of(event.argument)
             value = shorten(value_of(option, command.options))
@@ -116,9 +120,11 @@ def unknown(words: Sequence[str], command: Command) -> str:
     before = command.options[place - 1] if place > 0 else ""
     if is_option(before):
         return f"{before} {shorten(word)}: the option takes no value; leave {shorten(word)!r} out"
+    named = [flag for flag in command.flags() if flag in PLACES]
+    advice = f"name it by its option ({', '.join(named)}), " if named else ""
     return (
-        f"{shorten(word)!r}: one argument too many; leave it out, or quote a name that has spaces"
-        f" ({command.help} lists all arguments)"
+        f"{shorten(word)!r}: one argument too many; {advice}leave it out, or quote a name that "
+        f"has spaces; {command.help} lists all"
     )
 
 

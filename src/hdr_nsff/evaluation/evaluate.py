@@ -23,6 +23,7 @@ import torch
 import tyro
 from torch import Tensor
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import contact_sheet, write_png
 from hdr_nsff.core.io import write_json, writing_to
 from hdr_nsff.core.lock import lock_output
@@ -132,7 +133,11 @@ def load_lpips(weights: str | None) -> metrics.Lpips | None:
         return None
     if weights == "hub":
         return metrics.Lpips([find("alexnet"), find("lpips")])
-    return metrics.Lpips(weights)
+    try:
+        return metrics.Lpips(weights)
+    except InputError as error:
+        advice = "give a file with AlexNet weights, or `hub`"
+        raise InputError(f"--lpips {error}; {advice}") from error
 
 
 def exposure_of(targets: Sequence[Target]) -> float:

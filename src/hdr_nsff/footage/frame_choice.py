@@ -24,9 +24,17 @@ def check_choice(
     if max_size < MIN_MAX_SIZE:
         raise InputError(f"--max-size {shorten(max_size)}: too small; use at least {MIN_MAX_SIZE}")
     if hold_out is not None and (hold_out < 0 or hold_out == 1):
-        raise InputError(
-            f"--hold-out {shorten(hold_out)}: leaves nothing to train on; use 0, or 2 and more"
-        )
+        problem = "leaves nothing to train on" if hold_out == 1 else "no number of frames"
+        advice = "use 2 or more to hold out every N-th frame, 0 for none"
+        raise InputError(f"--hold-out {shorten(hold_out)}: {problem}; {advice}")
+
+
+def no_frame(clip: Path, start: int, count: int) -> str:
+    """The sentence for a `start` beyond the end of a clip of `count` frames, 0 where
+    their number is unknown.
+    """
+    has = f", which has {count}, counted from 0" if count else ""
+    return f"--start {start}: no frame {start} in {clip}{has}; choose a smaller number"
 
 
 def check_frame_size(clip: Path, width: int, height: int) -> None:

@@ -177,7 +177,7 @@ def read_path(path: Path | str, like: Camera) -> list[PathView]:
         entries = read_json(path)
     except OSError as error:
         raise InputError(
-            f"{path}: no readable camera path file ({error.strerror}); check the name"
+            f"--path {path}: no readable camera path file ({error.strerror}); correct the name"
         ) from error
     except ValueError as error:
         raise InputError(

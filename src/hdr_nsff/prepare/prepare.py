@@ -12,6 +12,7 @@ all steps: once the scene is complete, it goes into a truth folder outside of it
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 from hdr_nsff.core.errors import InputError
@@ -26,12 +27,13 @@ from hdr_nsff.footage.datasets.capture import Capture
 from hdr_nsff.footage.datasets.held_out import truth_folder, write_truth
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.footage import Footage, open_footage
-from hdr_nsff.footage.frame_choice import check_choice
-from hdr_nsff.footage.ingest import read_frames
+from hdr_nsff.footage.frame_choice import check_choice, no_frame
+from hdr_nsff.footage.ingest import FootageFrame, read_frames
 from hdr_nsff.footage.tracks import open_tracks
 from hdr_nsff.prepare.engine import found_manifest
 from hdr_nsff.prepare.lens import given_lenses, known_lenses, parse_lens
 from hdr_nsff.prepare.segments import CLIP_FOLDER, check_segments, prepare_segments
+from hdr_nsff.prepare.steps.footage import MIN_FRAMES, check_count
 from hdr_nsff.prepare.steps.neural import check_networks
 from hdr_nsff.prepare.table import STEPS, run_steps
 from hdr_nsff.prepare.work import Part, PrepareConfig, Work
@@ -114,16 +116,26 @@ def begin(config: PrepareConfig) -> Work:
         work = Work(config, footage, found, capture)
         found.lens |= given_lenses(work)
         return work
-    start = config.start
-    first = next(read_frames(footage, start, start + 1, 1, config.max_size), None)
-    if first is None:
-        raise InputError(f"{config.clip}: no frame {start}; choose a smaller `--start`")
-    height, width = first.rgb.shape[:2]
+    height, width = first_frame(config, footage).rgb.shape[:2]
     manifest = Manifest(source=str(config.clip), inputs=inputs, width=width, height=height)
     work = Work(config, footage, manifest, capture)
     manifest.lens = given_lenses(work)
     work.save()
     return work
+
+
+def first_frame(config: PrepareConfig, footage: Footage) -> FootageFrame:
+    """The first frame to use; InputError where there is none, or too few follow."""
+    start, stride = config.start, config.stride
+    enough = start + MIN_FRAMES * stride
+    end = enough if config.end is None else min(enough, config.end)
+    chosen = read_frames(footage, start, end, stride, config.max_size)
+    first = list(islice(chosen, MIN_FRAMES))
+    if not first:
+        raise InputError(no_frame(config.clip, start, footage.count))
+    if len(footage.cameras) == 1:  # of several, frames are counted once all are read
+        check_count(config.clip, len(first))
+    return first[0]
 
 
 def open_clip(config: PrepareConfig, capture: Capture | None) -> Footage:

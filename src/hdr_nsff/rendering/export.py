@@ -27,7 +27,7 @@ from hdr_nsff.training.run_folder import Run, read_config
 Layout = Literal["hdr-gopro", "nerfstudio"]
 MAX_EV = 60  # stops: beyond this float32 radiance is 0 or Inf
 # What files of these endings are
-KINDS = {PAGE: "a page", BARE: "a page", CHAN: "a camera path"}
+KINDS = {PAGE: "a page", BARE: "the scene of a page", CHAN: "a camera path"}
 KINDS |= dict.fromkeys(USD_ENDINGS, "USD")
 
 
@@ -119,9 +119,7 @@ def check_settings(config: ExportConfig) -> None:
     if is_whole(config.out):
         check_whole(config, others)
     elif others != 1:
-        choices = "one of --ply (a file), --ply-sequence and --layout NAME (a folder)"
-        endings = "NAME.html, NAME.usdc, NAME.chan"
-        raise InputError(f"export: choose what to write, {endings} or {choices}")
+        raise InputError(nothing_chosen(config.out, others))
     check_output(config)
     check_colors(config.colors)
     if config.layout is not None:
@@ -136,13 +134,28 @@ def check_settings(config: ExportConfig) -> None:
         raise InputError(f"--time: --ply-sequence writes every training time; {advice}")
 
 
+def nothing_chosen(out: Path, others: int) -> str:
+    """The sentence for an output that no option, or more than one, says the kind of."""
+    if others > 1:
+        return f"{out}: --ply, --ply-sequence and --layout exclude each other; choose one"
+    if out.suffix.lower() == ".ply":
+        folder = "name a folder and add --ply-sequence for those at every time"
+        return f"{out}: add --ply for Gaussians at one time (--time), or {folder}"
+    endings = f"{PAGE}, {BARE}, {', '.join(USD_ENDINGS)} or {CHAN}"
+    return (
+        f"{out}: the name does not say what to write; end it in {endings}, or in .ply and add "
+        "--ply, or name a folder and add --ply-sequence or --layout NAME"
+    )
+
+
 def check_whole(config: ExportConfig, others: int) -> None:
     """InputError for options that have no use here; `others` counts outputs."""
     out = config.out
     kind = "a page" if out.suffix.lower() in (PAGE, BARE) else "a file with this ending"
     if others:
         problem = f"a file with this ending is {KINDS[out.suffix.lower()]}"
-        raise InputError(f"{out}: {problem}; name another output, or leave the option out")
+        advice = "name another output, or leave --ply, --ply-sequence and --layout out"
+        raise InputError(f"{out}: {problem}; {advice}")
     if config.time is not None or config.colors != ColorTransform():
         problem = f"{kind} holds all times and linear radiance"
         raise InputError(f"{out}: {problem}; leave --time, --ev, --linear and --camera-id out")

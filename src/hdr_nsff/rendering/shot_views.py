@@ -115,7 +115,7 @@ def find_frame(run: Run, index: int | None) -> Frame:
     known = {f.index: f for f in run.scene.train + run.scene.test}
     if index not in known:
         problem = f"the scene has no such frame; it has {min(known)} to {max(known)}"
-        raise InputError(f"frame {index}: {problem}")
+        raise InputError(f"--frame {index}: {problem}; choose one of these")
     return known[index]
 
 
@@ -160,9 +160,11 @@ def check_views(run: Run, path: str, views: Sequence[PathView]) -> None:
     for i, view in enumerate(views):
         if not first <= view.time <= last:
             problem = f"outside the clip ({first:g} to {last:g} frames)"
-            raise InputError(f"{path}: view {i} is at time {view.time:g}, {problem}")
+            advice = "choose a time within"
+            raise InputError(f"{path}: view {i} is at time {view.time:g}, {problem}; {advice}")
         distance = (centers - view.camera.c2w[:, 3]).norm(dim=-1).min()
         moved = distance > VIEWPOINT_SHARE * run.scene.near
         if moved and run.scene.manifest.parallax != "full":
             problem = "leaves the clip's viewpoint, but the clip has no parallax and so no depth"
-            raise InputError(f"{path}: view {i} {problem}")
+            advice = "only turn the camera where it stands"
+            raise InputError(f"{path}: view {i} {problem}; {advice}")

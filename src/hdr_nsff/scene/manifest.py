@@ -212,6 +212,8 @@ class Manifest(Strict):
             raise InputError(
                 f"{folder}: holds the segments of a long clip; name one of them, such as {segment}"
             )
+        if Path(folder).is_file():
+            raise InputError(f"{folder}: is a file, no scene; name the folder with scene.json")
         if not path.is_file():
             raise InputError(
                 f"{folder}: no scene.json here; "

@@ -139,8 +139,8 @@ class Truth(Strict):
         path = Path(folder) / "truth.json"
         if not path.is_file():
             raise InputError(
-                f"{folder}: no truth.json here; "
-                "leave `--truth` out to evaluate on held-out frames of the clip"
+                f"--truth {folder}: no truth.json here; give a folder that `synth`, `reexpose` or "
+                "`prepare` of a public data set wrote, or leave the option out"
             )
         try:
             truth = Truth.model_validate(read_json(path))

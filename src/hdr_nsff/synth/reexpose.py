@@ -33,7 +33,7 @@ from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.exposure_lists import parse_exposures
 from hdr_nsff.footage.footage import FOLDER_FPS, MAX_RATE_DIFFERENCE, Footage, open_footage
-from hdr_nsff.footage.frame_choice import check_choice, check_frame_size
+from hdr_nsff.footage.frame_choice import check_choice, check_frame_size, no_frame
 from hdr_nsff.footage.frame_files import frame_files
 from hdr_nsff.footage.hold_out import HOLD_OUT, hold_out_every
 from hdr_nsff.footage.ingest import FootageFrame, read_frames
@@ -149,6 +149,8 @@ def reexpose(config: ReexposeConfig) -> Path:
         if footage.bars:
             say(footage.bars.sentence())
         numbers, extents, size = look_through(config, footage)
+        if not numbers:
+            raise InputError(no_frame(config.clip, config.start, footage.count))
         check_references(config.clip, (size[1], size[0]), config.hdr_video, config.hdr_still)
         plan = plan_frames(len(numbers), len(evs), config.hold_out, config.poses is not None)
         poses = None
@@ -281,7 +283,7 @@ def plan_frames(count: int, cycle: int, hold_out: int, remove: bool) -> FramePla
         frames = "1 frame" if len(kept) == 1 else f"{len(kept)} frames"
         raise InputError(
             f"{frames} left for the footage; at least {MIN_FRAMES} are needed, "
-            "so give a longer clip or another --hold-out"
+            "so give a longer clip, or another --hold-out, --start, --end or --stride"
         )
     bracket = [sum(j < k for j in kept) % cycle for k in range(count)]
     return FramePlan(bracket, test, kept)

@@ -168,9 +168,7 @@ def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
     """
     path = Path(folder) / CONFIG
     if not path.is_file():
-        raise InputError(
-            f"{folder}: no {CONFIG} here; this is not a run folder, make one with `hdr-nsff train`"
-        )
+        raise InputError(no_run(Path(folder)))
     try:
         data = read_json(path)
     except ValueError as error:
@@ -178,11 +176,29 @@ def stored_config(folder: Path) -> tuple[TrainConfig, list[Path]]:
             f"{path}: not readable JSON; restore it or train again into a new folder"
         ) from error
     beside = data.pop(SCENE_FROM_RUN, None) if isinstance(data, dict) else None
-    config = TrainConfig.from_json(data)
+    if isinstance(data, dict) and "scene" not in data and "version" in data:
+        advice = 'add "scene": "FOLDER", the scene folder that it was trained on'
+        raise InputError(f"{path}: no scene is named; {advice}")
+    try:
+        config = TrainConfig.from_json(data)
+    except InputError as error:
+        raise InputError(f"{folder}: {error}") from error
     places = [config.scene]
     if isinstance(beside, str) and "\0" not in beside:
         places.insert(0, (Path(folder).resolve() / beside).resolve())
     return config, places
+
+
+def no_run(folder: Path) -> str:
+    """The sentence for a path that is no run folder."""
+    if folder.is_file():
+        return f"{folder}: is a file and not a run folder; name the folder that holds {CONFIG}"
+    if (folder / SCENE_FILE).is_file():
+        advice = f"train one from it with `hdr-nsff train splat --scene {folder}`"
+        return f"{folder}: a scene and not a run folder; {advice}"
+    if (folder / "run" / CONFIG).is_file():
+        return f"{folder}: not a run folder, but {folder / 'run'} is one; name that"
+    return f"{folder}: no {CONFIG} here; this is not a run folder, make one with `hdr-nsff train`"
 
 
 def write_config(folder: Path, config: TrainConfig) -> None:

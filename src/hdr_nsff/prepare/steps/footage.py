@@ -116,17 +116,21 @@ def fits_8_bits(rgb: np.ndarray) -> bool:
     return bool(np.abs(rgb - np.rint(rgb * 255) / 255).max() < MAX_ROUNDING_8_BIT)
 
 
+def check_count(clip: Path, times: int) -> None:
+    """InputError where frames of so few `times` are chosen that they show no motion."""
+    if times < MIN_FRAMES:
+        raise InputError(
+            f"{clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are "
+            "needed to see motion; give a longer clip, or correct --start, --end, --stride"
+        )
+
+
 def check_frames(clip: Path, entries: list[FrameEntry], extents: list[tuple[float, float]]) -> None:
     """InputError where frames are too few, or all black or white.
 
     `extents` are the recorded values between which nearly all of each frame lies.
     """
-    times = len({entry.time for entry in entries})
-    if times < MIN_FRAMES:
-        raise InputError(
-            f"{clip}: {times} frame{'s' * (times != 1)} to use; at least {MIN_FRAMES} are "
-            "needed to see motion"
-        )
+    check_count(clip, len({entry.time for entry in entries}))
     color = exposure.all_clipped(extents)
     if color is not None:
         raise InputError(
