@@ -31,6 +31,7 @@ from hdr_nsff.core.exr import write_exr
 from hdr_nsff.core.images import encode, write_png
 from hdr_nsff.core.io import write_npy, write_text
 from hdr_nsff.core.video import write_video
+from hdr_nsff.scene.manifest import Manifest
 
 
 def prepared(capsys: Capture, clip: Path, *options: object) -> str:
@@ -332,6 +333,29 @@ def test_flow_and_masks_of_the_wrong_size_or_number_are_refused(
         capsys, "reexpose", folder, tmp_path / "out", "--masks", tmp_path / "masks"
     )
     assert not (tmp_path / "out").exists()
+
+
+def test_masks_and_depth_that_do_not_fit_are_found_before_flow(
+    tmp_path: Path, capsys: Capture
+) -> None:
+    folder, wide = clip(tmp_path / "clip"), tmp_path / "wide"
+    for i in range(FRAMES):
+        write_png(wide / f"{i}.png", np.zeros((34, 61), bool))
+        write_png(tmp_path / f"named/{i // 2:03d}.png", np.zeros((34, 60), bool))
+    named = f"{tmp_path / 'named'}: 5 maps for 9 frames, none for 005.png;"
+    for option, place, words in (
+        ("--mask", wide, f"--mask {wide / '0.png'}: the mask is 61x34"),
+        ("--mask", tmp_path / "named", f"--mask {named}"),
+        ("--depth", tmp_path / "named", f"--depth {named}"),
+        ("--mask", wide / "0.png", "0.png: is a file; name the folder that holds it"),
+    ):
+        assert words in prepared(capsys, folder, option, place)
+    steps = Manifest.load(tmp_path / "scene").steps
+    assert [name for name, step in steps.items() if step.done] == ["frames", "exposure"]
+    # A step that would be done again keeps what it has left.
+    write_text(tmp_path / "scene/raw_flow/00000_00001.npy", "")
+    assert "61x34" in prepared(capsys, folder, "--mask", wide, "--redo", "flow")
+    assert (tmp_path / "scene/raw_flow/00000_00001.npy").is_file()
 
 
 # Output that is there already, or half there

@@ -37,6 +37,8 @@ class Step:
     run: Callable[[Work], StepResult]
     needs: tuple[StepName, ...] = ()
     settings: tuple[str, ...] = ()  # fields of `PrepareConfig`; a path counts by contents
+    # InputError for bad input of this step or later ones, before anything is removed
+    check: Callable[[Work], None] = field(default=lambda work: None)
     outputs: tuple[str, ...] = ()  # folders and files it owns
     # whether the manifest names all it should
     complete: Callable[[Manifest], bool] = field(default=lambda m: True)
@@ -49,13 +51,17 @@ def run_step(work: Work, name: StepName, step: Step) -> None:
     """Do one step, or skip it where it is done."""
     records = work.manifest.steps
     key = step_key(work, name, step)
-    record = records.get(name)
-    if record is None or record.key != key or name in work.config.redo:
+    before = records.get(name)
+    begun = before if name not in work.config.redo else None
+    if begun is not None and begun.key != key:
+        begun = None
+    if begun is not None and begun.done and step.complete(work.manifest) and present(work, step):
+        return
+    step.check(work)
+    if begun is None:
         for output in step.outputs:
             remove(work.folder / output)
-        record = next_attempt(record, key)
-    elif record.done and step.complete(work.manifest) and present(work, step):
-        return
+    record = begun or next_attempt(before, key)
     records[name] = record.model_copy(update={"done": False})
     work.save()
     start, cpu_before = time.monotonic(), cpu_seconds()

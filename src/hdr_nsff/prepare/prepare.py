@@ -210,4 +210,6 @@ def check_settings(config: PrepareConfig) -> None:
                 f"--{option} {path}: no such file or folder; "
                 "correct the path, or leave the option out to estimate it"
             )
+        if isinstance(path, Path) and path.is_file() and option in ("mask", "depth"):
+            raise InputError(f"--{option} {path}: is a file; name the folder that holds it")
     check_networks(config)

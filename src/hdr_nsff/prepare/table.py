@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from hdr_nsff.prepare.engine import Step, all_have, run_step
+from hdr_nsff.prepare.given_maps import check_given_maps
 from hdr_nsff.prepare.lens import DistortedFramesError
 from hdr_nsff.prepare.steps import footage as on_footage
 from hdr_nsff.prepare.steps.depth import find_depth
@@ -51,6 +52,7 @@ STEPS: dict[StepName, Step] = {
         find_flow,
         needs=("exposure",),
         settings=("flow", "flow_weights", "semantic"),
+        check=check_given_maps,
         outputs=("raw_flow", UNDISTORTED_FLOW),
         complete=has_flow,
         forgets=("raw_flows", "refined_flows"),
@@ -59,6 +61,7 @@ STEPS: dict[StepName, Step] = {
         find_poses,
         needs=("flow",),
         settings=("poses", "masks", "matcher", "tripod"),
+        check=check_given_maps,
         outputs=("poses", "points.npy"),
         complete=all_have("c2w"),
     ),
@@ -74,6 +77,7 @@ STEPS: dict[StepName, Step] = {
         find_static_depth,
         needs=("masks",),
         settings=("depth", "depth_weights", "depth_kind"),
+        check=check_given_maps,
         outputs=("static_disparity", "static_confidence", "still"),
         complete=all_have("static_disparity", "train"),
         forgets=("raw_flows",),

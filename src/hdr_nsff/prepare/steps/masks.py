@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hdr_nsff.core.errors import InputError
-from hdr_nsff.core.images import mask_gray
 from hdr_nsff.footage.datasets import maps
-from hdr_nsff.footage.frame_files import RECORDED, natural_key, sorted_folders
+from hdr_nsff.prepare.given_maps import user_masks
 from hdr_nsff.prepare.result import StepResult
 from hdr_nsff.prepare.steps.neural import sam2_masks
 from hdr_nsff.prepare.still_cameras import still_cameras
@@ -78,54 +75,15 @@ def given_masks(work: Work) -> np.ndarray:
     order; InputError where one is missing or of another size.
     """
     m, folder, capture = work.manifest, work.config.masks, work.capture_with("masks")
+    if capture is None:
+        assert isinstance(folder, Path)
+        return user_masks(work, folder)
     size = (m.height, m.width)
     masks = []
-    if capture is not None:
-        for f in m.frames:
-            path = work.picture(f).mask
-            mask = np.zeros(size, bool)
-            if path is not None:
-                mask = maps.moving_mask(path, size, capture.white_moves)
-            masks.append(mask)
-        return np.stack(masks)
-    assert isinstance(folder, Path)
-    brightest = 0.0
-    for f, path in zip(m.frames, given_files(work, folder, RECORDED), strict=True):
-        gray = mask_gray(path)
-        mask, brightest = gray > 0.5, max(brightest, float(gray.max()))
-        if mask.shape != size:
-            raise InputError(
-                f"{path}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
-                f"frame {f.index} is {m.width}x{m.height}; make it that size"
-            )
+    for f in m.frames:
+        path = work.picture(f).mask
+        mask = np.zeros(size, bool)
+        if path is not None:
+            mask = maps.moving_mask(path, size, capture.white_moves)
         masks.append(mask)
-    if 0 < brightest <= 0.5:
-        raise InputError(
-            f"{folder}: no mask is white anywhere, the brightest pixel is {255 * brightest:.3g} of "
-            "255; paint moving pixels white (255)"
-        )
     return np.stack(masks)
-
-
-def given_files(work: Work, folder: Path, suffixes: set[str]) -> list[Path]:
-    """The file for each frame in the user's folder of maps: as many files as frames, in
-    order (of each camera, in a folder like the footage's).
-    """
-    folders = [folder]
-    if len(work.footage.cameras) > 1:
-        folders = sorted_folders(folder)
-    found = [
-        path
-        for each in folders
-        for path in sorted(each.iterdir(), key=natural_key)
-        if path.suffix.lower() in suffixes
-    ]
-    count = len(work.manifest.frames)
-    rows: Sequence[int] = range(count)
-    if work.segment is not None:
-        count, rows = work.segment.clip_frames, work.segment.rows
-    if len(found) != count:
-        raise InputError(
-            f"{folder}: {len(found)} maps for {count} frames; one per used frame, in order"
-        )
-    return [found[row] for row in rows]

@@ -17,8 +17,8 @@ from hdr_nsff.core.progress import say
 from hdr_nsff.core.stack import ArrayStack, Stack, by_key, spread_frames
 from hdr_nsff.footage.datasets import maps
 from hdr_nsff.footage.depth_files import read_depth_files
+from hdr_nsff.prepare.given_maps import depth_files
 from hdr_nsff.prepare.result import StepResult
-from hdr_nsff.prepare.steps.masks import given_files
 from hdr_nsff.prepare.steps.neural import network_depth
 from hdr_nsff.prepare.still_cameras import still_cameras
 from hdr_nsff.prepare.work import Work
@@ -32,7 +32,6 @@ KNOWN = 0.5  # confidence of depth from which on a pixel counts as well known
 # of synchronized still cameras, below which depth is mere chance (hand-chosen: 3 % of
 # cameras a quarter of a circle apart, where a picture before each was 4 dB better)
 MIN_KNOWN_SHARE = 0.1
-DEPTH_FILES = {".npy", ".exr", ".png"}
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ def data_set_depth(work: Work) -> Depth:
 def user_depth(work: Work, folder: Path) -> Depth:
     """The depth maps in the user's folder."""
     m, kind = work.manifest, work.config.depth_kind
-    files = given_files(work, folder, DEPTH_FILES)
+    files = depth_files(work, folder)
     disparity, confidence = read_depth_files(files, kind, (m.height, m.width))
     index = [f.index for f in work.train]
     disparity, confidence = disparity[index], confidence[index]
