@@ -109,6 +109,14 @@ def test_the_report_of_a_finished_run_has_every_section(
         assert words in text, words
 
 
+def test_the_report_counts_the_steps_of_the_run_and_not_of_its_log(
+    finished: tuple[Run, Path], tmp_path: Path
+) -> None:
+    later = replace(finished[0], step=64)  # the log ends at 59
+    text, _ = read(write_report(later, tmp_path / "report.html", tmp_path))
+    assert "; step 64;" in text and "64 steps, 1,234 rays" in text and "59 steps" not in text
+
+
 def test_the_report_shows_what_was_given_and_estimated_with_names_escaped(
     finished: tuple[Run, Path],
 ) -> None:

@@ -86,7 +86,7 @@ def write_report(run: Run, path: Path, renders: Path) -> Path:
         quality=quality_tables(metrics),
         camera_plots=[*plot_responses(run, metrics), plot_gains(run)],
         radiance=plot_radiance(run, renders),
-        training=plot_training(log),
+        training=plot_training(log, run.step),
         timings=timing_table(run, metrics, renders),
         provenance=provenance_table(run),
         settings=json.dumps(run.config.to_json(), indent=1),

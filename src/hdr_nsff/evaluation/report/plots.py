@@ -142,11 +142,14 @@ def darkest_exposure(run: Run) -> float:
     return float(x[min(max(index, 1), len(x) - 1)])
 
 
-def plot_training(log: Sequence[notes.LogLine]) -> Plots | None:
-    """PSNR on training pixels, and every loss term, over time; None without a log."""
+def plot_training(log: Sequence[notes.LogLine], steps: int) -> Plots | None:
+    """PSNR on training pixels, and every loss term, over time; None without a log.
+
+    `steps` of the run: its last ones may have no line in the log.
+    """
     if len(log) < 2:
         return None
-    note = f"{log[-1].step} steps, {log[-1].rays_per_second:,.0f} rays per second."
+    note = f"{steps} steps, {log[-1].rays_per_second:,.0f} rays per second."
     return Plots([plot_psnr(log), plot_losses(log)], note)
 
 
