@@ -172,6 +172,13 @@ def test_a_good_clip_has_nothing_to_warn_of() -> None:
     assert {finding.level for finding in judge(good_facts())} <= {"good", "note"}
 
 
+def test_an_interlaced_clip_is_told_how_to_be_made_progressive() -> None:
+    good = good_facts()
+    interlaced = replace(good, file=replace(good.file, interlaced=True))
+    (finding,) = [f for f in judge(interlaced) if f.subject == "interlaced"]
+    assert finding.level == "warning" and "ffmpeg -i a.mp4 -vf bwdif" in finding.advice
+
+
 def test_every_warning_comes_with_advice() -> None:
     good = good_facts()
     exposure = replace(

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from test_exposure_cycle import clip
+from test_video import write_interlaced
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
@@ -49,6 +50,37 @@ def test_the_frames_of_brackets_are_named_by_their_place_in_the_cycle(
     exposure_step(work_on(tmp_path, clip([0, 2, 0, -2], frames=20)))
     printed = " ".join(capsys.readouterr().err.split())
     assert "from dark to bright frame [3, 0, 1] of the cycle" in printed
+
+
+@pytest.mark.parametrize(
+    ("evs", "stride", "kept"), [([-2, 0, 2], 3, 2), ([-2, 0], 2, 1), ([-3, 0, 3, 0], 4, 3)]
+)
+def test_a_stride_that_leaves_one_exposure_of_a_cycle_is_named(
+    evs: list[float], stride: int, kept: int, tmp_path: Path
+) -> None:
+    work = work_on(tmp_path, clip(evs, frames=40), stride=stride)
+    (note, *_) = exposure_step(work).details["doubts"]
+    assert f"--stride {stride} leaves frames of one exposure" in note
+    assert f"a cycle of {len(evs)}: use --stride {kept}, which keeps all" in note
+    other = work_on(tmp_path / "other", clip(evs, frames=40), stride=kept)
+    assert not any("--stride" in doubt for doubt in exposure_step(other).details["doubts"])
+
+
+def test_a_stride_through_a_clip_that_does_not_alternate_is_fine(tmp_path: Path) -> None:
+    work = work_on(tmp_path, clip([0], frames=40), stride=3)
+    assert not any("--stride" in doubt for doubt in exposure_step(work).details["doubts"])
+
+
+def test_an_interlaced_video_is_named_with_the_way_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "my clip.mpg"
+    write_interlaced(path, clip([0], frames=4))
+    footage = open_footage(path)
+    manifest = Manifest(source="clip", width=1, height=1)
+    frames_step(Work(PrepareConfig(path, tmp_path / "scene"), footage, manifest))
+    (sentence,) = [line for line in capsys.readouterr().err.splitlines() if "interlaced" in line]
+    assert f"`ffmpeg -i '{path}' -vf bwdif=send_frame" in sentence
 
 
 def test_exposures_beyond_all_light_are_one_sentence(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +16,7 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.video import (
     frame_spans,
     frame_times,
+    is_interlaced,
     is_mirrored,
     read_video,
     turn,
@@ -24,6 +26,26 @@ from hdr_nsff.core.video import (
 from hdr_nsff.footage.gpmf import read_gopro_ev
 
 FRAMES = [np.full((17, 33, 3), level) for level in (0.1, 0.5, 0.9)]
+
+
+def write_interlaced(path: Path, frames: Sequence[np.ndarray]) -> None:
+    """MPEG-2 whose frames are marked as interlaced."""
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
+        stream.pix_fmt = "yuv420p"
+        stream.height, stream.width = frames[0].shape[:2]
+        for frame in frames:
+            rgb = av.VideoFrame.from_ndarray(np.rint(frame * 255).astype(np.uint8), format="rgb24")
+            container.mux(stream.encode(rgb.reformat(format="yuv420p")))
+        container.mux(stream.encode())
+
+
+def test_interlaced_video_is_known_by_its_marks(tmp_path: Path) -> None:
+    write_interlaced(tmp_path / "a.mpg", [np.full((32, 48, 3), 0.5)] * 5)
+    write_video(tmp_path / "b.mp4", FRAMES)
+    (tmp_path / "c.mp4").write_bytes(b"no video")
+    assert is_interlaced(tmp_path / "a.mpg")
+    assert not is_interlaced(tmp_path / "b.mp4") and not is_interlaced(tmp_path / "c.mp4")
 
 
 def test_frames_and_times_are_read_back_at_even_size(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ class FileFacts:
     interval_ms: tuple[float, float] | None
     missing: int = 0  # frames by the timestamps of a video
     bars: str = ""  # what `prepare` does with black bars, in words
+    interlaced: bool = False  # by the marks of its frames
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from hdr_nsff.check.facts import ClipFacts
+from hdr_nsff.footage.footage import INTERLACED, deinterlacing
 from hdr_nsff.prepare.length import offered_segments
 from hdr_nsff.prepare.work import PrepareConfig
 from hdr_nsff.radiometry.exposure_cycle import MAX_CYCLE, MIN_STEP
@@ -235,6 +236,8 @@ def judge_file(facts: ClipFacts, tuning: FindingTuning) -> Iterator[Finding]:
         count = f"{file.cameras} cameras of {count}"
     size = f"{file.width} x {file.height}, {file.fps:.4g} a second"
     yield Finding("note", "file", f"{count} of {size}; {kinds[file.kind]}")
+    if file.interlaced:
+        yield Finding("warning", "interlaced", INTERLACED, deinterlacing(file.name))
     if file.bars:
         yield Finding("note", "file", file.bars)
     if 0 < file.frames < tuning.few_frames:

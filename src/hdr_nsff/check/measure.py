@@ -4,7 +4,7 @@ the cycle by brightness, SIFT matches on equalized frames, rotations that explai
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -125,7 +125,8 @@ def describe_file(footage: Footage) -> FileFacts:
     cameras = len(footage.cameras)
     name, count, fps = footage.path.name, footage.count, footage.fps
     bars = footage.bars.sentence() if footage.bars else ""
-    return FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing, bars)
+    facts = FileFacts(name, count, cameras, width, height, fps, bits, kind, interval, missing, bars)
+    return replace(facts, interlaced=footage.interlaced)
 
 
 # Exposure

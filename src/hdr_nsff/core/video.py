@@ -10,6 +10,7 @@ import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from hdr_nsff.core.picture_size import check_size
 DEFAULT_FPS = 24.0  # where a video's header names no rate
 # of the aspect of pixels from 1; the nearest one in use is 16:15 (PAL)
 MAX_ROUNDED_ASPECT = 0.01
+FRAMES_FOR_INTERLACING = 8  # that are looked at: telecined film marks some of its frames
 REC709_TAG = 1  # the code of Rec. 709 in H.264's color description, all four fields
 
 
@@ -184,6 +186,21 @@ def video_info(path: Path | str) -> VideoInfo:
             )
     except (av.FFmpegError, OSError, UnicodeDecodeError) as error:
         raise unreadable(path, error) from error
+
+
+def is_interlaced(path: Path | str) -> bool:
+    """Whether most of the first frames are marked as interlaced.
+
+    False where none can be decoded: whoever reads the frames refuses the file.
+    """
+    import av
+
+    try:
+        with open_video(path) as container:
+            first = list(islice(container.decode(video=0), FRAMES_FOR_INTERLACING))
+    except (av.FFmpegError, OSError, UnicodeDecodeError):
+        return False
+    return sum(bool(frame.interlaced_frame) for frame in first) > len(first) / 2
 
 
 def duration_of(container: Any, stream: Any) -> float:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import numpy as np
 
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.io import SCENE_FILE
-from hdr_nsff.core.video import video_info
+from hdr_nsff.core.video import is_interlaced, video_info
 from hdr_nsff.footage.frame_files import (
     FRAMES,
     LINEAR,
@@ -27,6 +28,7 @@ ACCEPTED = (
     "or a folder of such folders or videos (one per camera)"
 )
 TRANSFERS: dict[int, Transfer] = {16: "pq", 18: "hlg"}  # by their codes in H.273
+INTERLACED = "the video is interlaced: the odd and even rows of a frame show two moments"
 FOLDER_FPS = 24.0  # frames per second assumed for a folder of frames
 MAX_RATE_DIFFERENCE = 0.01  # of synchronized cameras: headers round the rate
 
@@ -71,6 +73,7 @@ class Footage:
     transfer: Transfer | None = None  # of HDR video, by its tags
     same_camera: bool = False  # the `cameras` are tracks of one (`tracks.py`)
     bars: Bars = Bars()  # that are cut off the frames
+    interlaced: bool = False  # of video, by the marks of its first frames
 
     @property
     def root(self) -> Path:
@@ -87,6 +90,12 @@ class Footage:
         """Whether all frames are of formats that keep the noise of the sensor."""
         suffixes = {f.suffix.lower() for files in self.cameras for f in files}
         return not self.video and not suffixes & LOSSY
+
+
+def deinterlacing(name: str) -> str:
+    """What to do about an interlaced video, in words."""
+    clip = shlex.quote(name)
+    return f"deinterlace it first: `ffmpeg -i {clip} -vf bwdif=send_frame -crf 12 deinterlaced.mp4`"
 
 
 def open_footage(clip: Path) -> Footage:
@@ -128,7 +137,10 @@ def open_video(clip: Path) -> Footage:
         raise InputError(f"{clip}: the file is empty; copy it again")
     info = video_info(clip)
     transfer = TRANSFERS.get(info.transfer)
-    return Footage(clip, [[clip]], True, info.frames, info.fps, False, transfer=transfer)
+    interlaced = is_interlaced(clip)
+    return Footage(
+        clip, [[clip]], True, info.frames, info.fps, False, transfer=transfer, interlaced=interlaced
+    )
 
 
 def open_videos(folder: Path) -> Footage:

@@ -7,7 +7,9 @@ training learns the exposures.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from hdr_nsff.footage.exposure_lists import (
     read_exposure_csv,
 )
 from hdr_nsff.footage.gpmf import read_gopro_ev
+from hdr_nsff.footage.ingest import read_frames
 from hdr_nsff.prepare.times import by_timestamps, evenly_spaced
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.radiometry import exposure_cycle as exposure
@@ -31,6 +34,7 @@ MIN_CONFIDENCE = 0.8
 GOPRO = "GoPro's metadata"  # as a source of exposures
 MIN_DRIFT_EV = 0.02  # of such exposures; below it, they are one
 MAX_LISTED = 5  # frames in a message
+FRAMES_OF_START = 4 * exposure.MAX_CYCLE  # in which a cycle shows, none left out
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ def frame_exposures(work: Work) -> FrameExposures:
     gapped = cycle_with_gaps(work, given)
     found = exposures_by(work, source, given, gapped)
     if gapped is None:
-        return found
+        return replace(found, notes=(*stride_notes(work, found), *found.notes))
     slots = tuple(gapped.slots.astype(float).tolist())
     notes = (*gap_notes(work, gapped), *found.notes)
     return replace(found, slots=slots, cycle=gapped.period(), notes=notes)
@@ -130,6 +134,26 @@ def gap_notes(work: Work, gapped: GappedCycle) -> list[str]:
     if by_timestamps(work):
         return [f"{sentence}; times are those of the timestamps"]
     return [f"{sentence}; times leave the gaps"]
+
+
+def stride_notes(work: Work, found: FrameExposures) -> list[str]:
+    """A sentence where `--stride` takes one exposure alone of a clip that alternates.
+
+    The start of the clip shows it by its brightness.
+    """
+    c = work.config
+    if c.stride == 1 or len(found.ev) > 1 or work.capture is not None:
+        return []
+    frames = read_frames(work.footage, c.start, c.start + FRAMES_OF_START, 1, c.max_size)
+    own = takewhile(lambda frame: frame.camera_id == 0 and frame.track == 0, frames)
+    length = exposure.detect_cycle(np.stack([frame.rgb for frame in own])).length
+    if length == 1:
+        return []
+    kept = max(stride for stride in range(1, c.stride) if math.gcd(stride, length) == 1)
+    return [
+        f"--stride {c.stride} leaves frames of one exposure, and the clip alternates in a cycle "
+        f"of {length}: use --stride {kept}, which keeps all exposures"
+    ]
 
 
 def track_exposures(work: Work, source: str, given: list[float] | None) -> FrameExposures:
