@@ -139,6 +139,17 @@ def test_version_and_help_answer_at_once(option: str) -> None:
     assert min(seconds) < 0.3
 
 
+@pytest.mark.parametrize(("is_terminal", "seconds"), [(True, 0.0), (True, 60.0), (False, 0.0)])
+def test_a_terminal_shows_that_libraries_are_loaded_where_that_takes_long(
+    is_terminal: bool, seconds: float, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: is_terminal)
+    with cli.loading(seconds):
+        time.sleep(0.1)
+    shown = f"{cli.LOADING}\r{' ' * len(cli.LOADING)}\r"
+    assert capsys.readouterr().err == (shown if is_terminal and not seconds else "")
+
+
 def test_an_unknown_verb_suggests_the_closest_one(capsys: Capture) -> None:
     assert call("trian") == 2
     sentence = one_sentence(capsys.readouterr().err)

@@ -4,6 +4,7 @@ import importlib.metadata
 import sys
 import tempfile
 import tomllib
+from collections.abc import Iterable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -62,6 +63,23 @@ def test_a_working_installation_is_described_and_exits_with_0(capsys: Capture) -
     assert f"Python: {sys.version.split()[0]}" in said
     assert "usable of" in said and "GB free at" in said
     assert said.endswith("`hdr-nsff run` can work here, on the CPU at least")
+
+
+def test_every_line_is_printed_as_soon_as_it_is_known(
+    capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before libraries are imported, which takes seconds."""
+    before: list[str] = []
+
+    def import_faults(modules: Iterable[str]) -> dict[str, str | None]:
+        before.append(capsys.readouterr().out)
+        return dict.fromkeys(modules)
+
+    monkeypatch.setattr(doctor, "import_faults", import_faults)
+    cli.main(["doctor"])
+    of_machine, of_libraries = before
+    assert "temporary files:" in of_machine and "libraries:" not in of_machine
+    assert of_libraries.startswith("libraries:")
 
 
 def test_a_missing_library_is_named_with_its_fix(

@@ -10,8 +10,8 @@ from __future__ import annotations
 try:
     import os
     import sys
-    from collections.abc import Sequence
-    from contextlib import nullcontext
+    from collections.abc import Iterator, Sequence
+    from contextlib import contextmanager, nullcontext
     from dataclasses import dataclass
     from functools import partial
     from importlib import import_module
@@ -26,6 +26,8 @@ except KeyboardInterrupt:  # Ctrl-C before `main` is reached
 INTERRUPTED = 130  # exit code by convention: 128 + SIGINT
 CLOSED_PIPE = 141  # 128 + SIGPIPE
 VIEW = "--view"  # of `train`: show the field in the browser while it trains
+LOADING = "loading libraries ..."
+SILENT_SECONDS = 0.7  # without a word, of a verb that is called on a terminal
 MAX_MESSAGE = 560  # characters of a sentence about bad input
 
 
@@ -175,8 +177,9 @@ def run_verb(name: str, verb: Verb, options: list[str]) -> None:
         refuse_options(name, verb, options)
         load(verb.function)()
         return
-    function, config = load(verb.function), load(verb.config)
-    from hdr_nsff.core.io import writing_to
+    with loading():
+        function, config = load(verb.function), load(verb.config)
+        from hdr_nsff.core.io import writing_to
 
     with_viewer = name == "train" and VIEW in options
     try:
@@ -192,6 +195,33 @@ def run_verb(name: str, verb: Verb, options: list[str]) -> None:
         if "KeyboardInterrupt" not in str(error):  # pydantic's core wraps one in its own
             raise
         stop()
+
+
+@contextmanager
+def loading(seconds: float = SILENT_SECONDS) -> Iterator[None]:
+    """A line on the terminal while libraries are imported, where that takes longer than
+    `seconds`; it is erased afterwards.
+    """
+    if not sys.stderr.isatty():
+        yield
+        return
+    from threading import Timer
+
+    written: list[str] = []
+
+    def write(text: str) -> None:
+        written.append(text)
+        print(text, end="", file=sys.stderr, flush=True)
+
+    timer = Timer(seconds, write, [LOADING])
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+        timer.join()
+        if written:
+            write(f"\r{' ' * len(LOADING)}\r")
 
 
 def stop() -> NoReturn:

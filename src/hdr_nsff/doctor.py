@@ -75,26 +75,29 @@ CPU_FEATURES = ("avx", "avx2", "fma", "avx512f", "amx-tile", "neon", "sve")
 
 @dataclass
 class Report:
-    """The lines of the block, and what keeps `run` from working, with the fix."""
+    """The lines of the block, each printed as soon as it is known, and what keeps `run`
+    from working, with the fix.
+    """
 
     lines: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
 
     def add(self, name: str, value: str) -> None:
-        """One entry of the block, on several lines where it is long."""
+        """Print one entry of the block, on several lines where it is long."""
         indent = " " * 17
         start = f"{name + ':':<17}"
         wrapped = textwrap.wrap(
             value, LINE_WIDTH, initial_indent=start, subsequent_indent=indent,
             break_on_hyphens=False, break_long_words=False,
         )  # fmt: skip
-        self.lines += wrapped or [start]
+        entry = wrapped or [start]
+        print("\n".join(entry), flush=True)
+        self.lines += entry
 
 
 def doctor() -> None:
     """The verb. SystemExit with 1 where `run` cannot work on the CPU."""
     report = examine()
-    print("\n".join(report.lines))
     if report.problems:
         print("\n".join(f"cannot run: {problem}" for problem in report.problems))
         raise SystemExit(1)
@@ -102,7 +105,7 @@ def doctor() -> None:
 
 
 def examine() -> Report:
-    """Everything about this installation."""
+    """Print everything about this installation."""
     report = Report()
     report.add("hdr-nsff", f"{__version__} ({commit()})")
     python(report)
