@@ -423,7 +423,7 @@ def frame_masks(
         mask = read_mask(file)
         if mask.shape != size:
             raise InputError(
-                f"{file}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
+                f"--masks {file}: the mask is {mask.shape[1]}x{mask.shape[0]}, "
                 f"the frames are {size[1]}x{size[0]}; make it that size"
             )
         masks[k] = mask
