@@ -70,7 +70,7 @@ def test_small_pieces_stay_with_the_largest_of_their_part() -> None:
     row, column = np.array(links).T
     graph = csr_matrix((np.ones(len(links)), (row, column)), (10, 10))
     graph = graph + graph.T
-    split = split_unconnected(part, graph, 0.2)
+    split = split_unconnected(part, graph, 2)
     assert split.tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 2, 2]
 
 

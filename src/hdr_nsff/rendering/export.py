@@ -137,7 +137,8 @@ def check_settings(config: ExportConfig) -> None:
 def nothing_chosen(out: Path, others: int) -> str:
     """The sentence for an output that no option, or more than one, says the kind of."""
     if others > 1:
-        return f"{out}: --ply, --ply-sequence and --layout exclude each other; choose one"
+        kinds = "--ply, --ply-sequence and --layout exclude each other"
+        return f"{out}: {kinds}; choose what to write by one of them"
     if out.suffix.lower() == ".ply":
         folder = "name a folder and add --ply-sequence for those at every time"
         return f"{out}: add --ply for Gaussians at one time (--time), or {folder}"

@@ -42,7 +42,8 @@ def find_rigid_groups(
     one). If none does, the first of them is returned.
     """
     min_share = tuning.min_group_share if min_share is None else min_share
-    part = split_unconnected(cut_graph(tracks, graph, tuning), graph, tuning.min_piece_share)
+    least = max(tuning.min_tracks, tuning.min_piece_share * graph.shape[0])
+    part = split_unconnected(cut_graph(tracks, graph, tuning), graph, least)
     sampled = np.unique(np.linspace(0, len(part) - 1, tuning.max_sampled_tracks).astype(int))
     members_of_part = [np.nonzero(part == k)[0] for k in range(part.max() + 1)]
     samples = [np.intersect1d(members, sampled) for members in members_of_part]
@@ -150,12 +151,12 @@ def cut_graph(
     return kmeans2(vectors, tuning.parts, minit="++", rng=np.random.default_rng(0))[1]
 
 
-def split_unconnected(part: np.ndarray, graph: csr_matrix, min_share: float) -> np.ndarray:
+def split_unconnected(part: np.ndarray, graph: csr_matrix, least: float) -> np.ndarray:
     """The part (N,) of every track, where pieces of one `part` (N,) that no chain of
     neighbors connects are parts of their own.
 
-    Pieces of less than the share `min_share` of all tracks stay with their part's
-    largest. Where there are more movers than parts, each part holds several of them.
+    Pieces of fewer than `least` tracks stay with their part's largest. Where there are
+    more movers than parts, each part holds several of them.
     """
     pairs = graph.tocoo()
     inside = part[pairs.row] == part[pairs.col]
@@ -168,7 +169,7 @@ def split_unconnected(part: np.ndarray, graph: csr_matrix, min_share: float) -> 
         members = np.nonzero(part == k)[0]
         pieces = np.unique(piece[members])
         pieces = pieces[np.argsort(-sizes[pieces], kind="stable")]
-        large = [p for p in pieces if sizes[p] >= min_share * len(part)]
+        large = [p for p in pieces if sizes[p] >= least]
         split[members] = count
         for number, p in enumerate(large[1:], count + 1):
             split[piece == p] = number
