@@ -144,8 +144,8 @@ def nothing_chosen(out: Path, others: int) -> str:
         return f"{out}: add --ply for Gaussians at one time (--time), or {folder}"
     endings = f"{PAGE}, {BARE}, {', '.join(USD_ENDINGS)} or {CHAN}"
     return (
-        f"{out}: the name does not say what to write; end it in {endings}, or in .ply and add "
-        "--ply, or name a folder and add --ply-sequence or --layout NAME"
+        f"{out}: choose what to write; the name does not say it: end it in {endings}, or in "
+        ".ply and add --ply, or name a folder and add --ply-sequence or --layout NAME"
     )
 
 
