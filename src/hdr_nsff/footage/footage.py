@@ -91,6 +91,11 @@ class Footage:
         suffixes = {f.suffix.lower() for files in self.cameras for f in files}
         return not self.video and not suffixes & LOSSY
 
+    def interlacing(self) -> str:
+        """That a video is interlaced, and what to do, in words; "" where it is not."""
+        clip = str(self.cameras[0][0])
+        return f"{INTERLACED}; {deinterlacing(clip)}" if self.interlaced else ""
+
 
 def deinterlacing(name: str) -> str:
     """What to do about an interlaced video, in words."""
@@ -137,10 +142,8 @@ def open_video(clip: Path) -> Footage:
         raise InputError(f"{clip}: the file is empty; copy it again")
     info = video_info(clip)
     transfer = TRANSFERS.get(info.transfer)
-    interlaced = is_interlaced(clip)
-    return Footage(
-        clip, [[clip]], True, info.frames, info.fps, False, transfer=transfer, interlaced=interlaced
-    )
+    footage = Footage(clip, [[clip]], True, info.frames, info.fps, False, transfer=transfer)
+    return replace(footage, interlaced=is_interlaced(clip))
 
 
 def open_videos(folder: Path) -> Footage:

@@ -32,14 +32,7 @@ from hdr_nsff.core.lock import lock_output
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.bars import with_bars
 from hdr_nsff.footage.exposure_lists import parse_exposures
-from hdr_nsff.footage.footage import (
-    FOLDER_FPS,
-    INTERLACED,
-    MAX_RATE_DIFFERENCE,
-    Footage,
-    deinterlacing,
-    open_footage,
-)
+from hdr_nsff.footage.footage import FOLDER_FPS, MAX_RATE_DIFFERENCE, Footage, open_footage
 from hdr_nsff.footage.frame_choice import check_choice, check_frame_size, no_frame
 from hdr_nsff.footage.frame_files import frame_files
 from hdr_nsff.footage.hold_out import HOLD_OUT, hold_out_every
@@ -156,7 +149,7 @@ def reexpose(config: ReexposeConfig) -> Path:
         if footage.bars:
             say(footage.bars.sentence())
         if footage.interlaced:
-            say(f"{INTERLACED}; {deinterlacing(str(config.clip))}")
+            say(footage.interlacing())
         numbers, extents, size = look_through(config, footage)
         if not numbers:
             raise InputError(no_frame(config.clip, config.start, footage.count))

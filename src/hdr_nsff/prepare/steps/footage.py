@@ -12,7 +12,6 @@ from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.images import write_png
 from hdr_nsff.core.progress import say, track
 from hdr_nsff.footage.cuts import find_cuts
-from hdr_nsff.footage.footage import INTERLACED, deinterlacing
 from hdr_nsff.footage.frame_choice import check_frame_size
 from hdr_nsff.footage.hold_out import HOLD_OUT, frames_between, hold_out_every
 from hdr_nsff.footage.ingest import read_frames
@@ -39,7 +38,7 @@ def frames_step(work: Work) -> StepResult:
     """Decode the chosen frames into `images/`, and check that they show something."""
     c, m = work.config, work.manifest
     if work.footage.interlaced:
-        say(f"frames: {INTERLACED}; {deinterlacing(str(work.footage.cameras[0][0]))}")
+        say(f"frames: {work.footage.interlacing()}")
     entries: list[FrameEntry] = []
     extents = []
     seconds: list[float | None] = []
