@@ -99,7 +99,7 @@ def test_a_stopped_run_resumes_to_the_unbroken_ones_parameters(
 SMOOTH_ADAM = (
     "from hdr_nsff.training import optimizers\n"
     "as_dict = optimizers.as_dict\n"
-    "optimizers.as_dict = lambda group: as_dict(group) | {'eps': 1e-6}\n"
+    "optimizers.as_dict = lambda group: as_dict(group) | {'eps': 1e-5}\n"
 )
 
 
