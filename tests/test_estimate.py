@@ -77,6 +77,8 @@ def test_a_tripod_has_no_camera_motion(tmp_path):
     assert poses.parallax == "none"
     assert np.array_equal(poses.c2w, np.tile(np.eye(4)[:3], (9, 1, 1)))
     assert "60 degrees" in poses.notes[1]  # nothing fixes the focal length
+    upright = estimate_poses(np.rot90(video, axes=(1, 2)).astype(np.float32), None, tmp_path)
+    assert upright.parallax == "none" and upright.K[0, 0, 0] == poses.K[0, 0, 0]
 
 
 def test_parallax_is_distinguished_from_a_turn():

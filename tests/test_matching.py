@@ -43,7 +43,7 @@ def test_noise_hides_fewer_matches_of_frames_that_are_not_doubled():
     ignore = np.zeros(clip.shape[:3], bool)
 
     def num_matches(denoise_px):
-        tuning = MatchingTuning(small_width=0, denoise_px=denoise_px)
+        tuning = MatchingTuning(small_side=0, denoise_px=denoise_px)
         keypoints = detect_keypoints(noisy, ignore, tuning)
         return len(match_pairs(keypoints, [(0, 1)], tuning)[0].p)
 

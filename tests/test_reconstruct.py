@@ -51,6 +51,11 @@ def test_a_plausible_lens_counts_more_than_images():
     assert model_rank(model(250, 34), 36) > model_rank(model(250, 20), 36)
 
 
+def test_a_phone_held_upright_has_a_plausible_lens():
+    upright = ColmapCamera("SIMPLE_PINHOLE", 136, 240, np.diag([330.0, 330, 1]), np.zeros(0))
+    assert has_plausible_lens(replace(model(330, 36), cameras={1: upright}))  # 40 degrees
+
+
 def test_a_lens_that_bends_strongly_may_be_wider():
     def bent(k1: float) -> Lens:
         return Lens(np.array([[120, 0, 120], [0, 120, 68], [0, 0, 1.0]]), (k1, 0, 0, 0), 240, 136)

@@ -1,6 +1,7 @@
 """Cameras without parallax: rotations, their derivatives, and what is no rotation."""
 
 import numpy as np
+import pytest
 from posed_clips import FOCAL, H, W, seen, texture
 from scipy.spatial.transform import Rotation
 
@@ -9,6 +10,8 @@ from hdr_nsff.priors.poses.rotation import (
     MAD_TO_SIGMA,
     RotationMatches,
     RotationTuning,
+    default_focal,
+    field_of_view,
     fit_panorama,
     normal_equations,
     refine,
@@ -27,6 +30,38 @@ def test_a_slide_past_a_flat_wall_is_no_turn():
     keypoints = detect_keypoints(slide, np.zeros((8, H, W), bool))
     matches = match_pairs(keypoints, view_pairs([list(range(8))]))
     assert fit_panorama(matches, 8, W, H).slides
+
+
+def turn_of(focal: float, width: int, height: int) -> list[PairMatches]:
+    """Matches of 8 frames of a camera that turns 24 degrees along its longer side."""
+    rng = np.random.default_rng(0)
+    axis = "y" if width > height else "x"
+    turns = Rotation.from_euler(axis, np.linspace(-12, 12, 8)[:, None], degrees=True).as_matrix()
+    size = np.array([width, height])
+    matches = []
+    for i in range(8):
+        for j in range(i + 1, 8):
+            p = rng.uniform(-0.5, 0.5, (200, 2)) * size
+            q, _ = rotate_pixels(turns, focal, np.tile([i, j], (200, 1)), p)
+            q = q + rng.normal(size=q.shape) * 0.1
+            seen = (np.abs(q) < size / 2).all(1)
+            matches.append(PairMatches(i, j, p[seen] + size / 2, q[seen] + size / 2))
+    return matches
+
+
+@pytest.mark.parametrize(("width", "height"), [(320, 180), (180, 320)])
+def test_a_long_lens_is_plausible_however_the_camera_is_held(width: int, height: int) -> None:
+    focal = 500.0  # 35 degrees across the longer side, 20 across the other
+    panorama = fit_panorama(turn_of(focal, width, height), 8, width, height)
+    assert panorama is not None and panorama.focal_known and not panorama.slides
+    assert panorama.focal == pytest.approx(focal, rel=0.01)
+
+
+@pytest.mark.parametrize(("width", "height"), [(320, 180), (180, 320)])
+def test_the_default_field_of_view_is_across_the_longer_side(width: int, height: int) -> None:
+    focal = default_focal(max(width, height))
+    assert focal == pytest.approx(160 / np.tan(np.radians(30)))
+    assert field_of_view(focal, width, height) == pytest.approx(60)
 
 
 def test_derivatives_of_turned_pixels_agree_with_differences():

@@ -134,7 +134,7 @@ def tripod_poses(work: Work) -> Poses:
         raise InputError(
             "--tripod is for one camera; leave it out: the poses of several are estimated"
         )
-    panorama = still_panorama(len(m.frames), m.width)
+    panorama = still_panorama(len(m.frames), max(m.width, m.height))
     poses = panorama_poses(panorama, m.height, m.width, lens=lens_to_find(work))
     if poses.lenses:
         raise DistortedFramesError(poses.lenses)

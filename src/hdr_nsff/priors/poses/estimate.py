@@ -320,18 +320,18 @@ def poses_at_rest(
 ) -> Poses:
     """Poses of a camera at rest, for frames that shift by `shifts` (F,) pixels."""
     count, height, width = video.shape[:3]
-    panorama = still_panorama(count, width, float(np.median(shifts)), tuning)
+    panorama = still_panorama(count, max(height, width), float(np.median(shifts)), tuning)
     return panorama_poses(panorama, height, width, tuning, lens)
 
 
 def still_panorama(
-    count: int, width: int, error_px: float = 0.0, tuning: PosesTuning = PosesTuning()
+    count: int, longer_side: int, error_px: float = 0.0, tuning: PosesTuning = PosesTuning()
 ) -> Panorama:
-    """`count` frames of a camera that stands still, `width` pixels wide."""
+    """`count` frames of a still camera whose `longer_side` has as many pixels."""
     return Panorama(
         rotations=np.tile(np.eye(3), (count, 1, 1)),
         linked=np.ones(count, bool),
-        focal=default_focal(width, tuning.reconstruction.rotation),
+        focal=default_focal(longer_side, tuning.reconstruction.rotation),
         focal_known=False,
         slides=False,
         explained=1.0,
@@ -398,7 +398,7 @@ def rotation_notes(panorama: Panorama, still: bool, default_fov: float) -> tuple
         motion = f"hardly any parallax: the camera counts as one that turns in place ({by})"
     origin = "from the turn"
     if not panorama.focal_known:
-        origin = f"assumed: {default_fov:.0f} degrees across"
+        origin = f"assumed: {default_fov:.0f} degrees across the longer side"
     return (
         f"{motion}; HDR video and in-between times work, novel viewpoints do not",
         f"focal length {panorama.focal:.0f} px, {origin}",

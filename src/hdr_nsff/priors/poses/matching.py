@@ -28,7 +28,7 @@ class MatchingTuning:
     max_keypoints: int = 1000  # per frame, the strongest ones
     contrast_threshold: float = 0.02  # of SIFT; half of OpenCV's, for dark frames
     max_ratio: float = 0.85  # of descriptor distances, best to second best (Lowe 2004: 0.8)
-    small_width: int = 480  # pixels: narrower frames are doubled
+    small_side: int = 480  # pixels: frames whose longer side is shorter are doubled
     # standard deviation of the Gaussian that quiets the noise of other frames; doubling
     # does so by itself (640x360, a small sensor: 1.6 times as many matches)
     denoise_px: float = 0.7
@@ -59,9 +59,9 @@ class PairMatches:
     q: np.ndarray  # (M, 2) pixels in frame j
 
 
-def upsampling_factor(width: int, tuning: MatchingTuning = MatchingTuning()) -> int:
-    """How many times a frame of `width` pixels is enlarged for detection."""
-    return 2 if width < tuning.small_width else 1
+def upsampling_factor(size: tuple[int, ...], tuning: MatchingTuning = MatchingTuning()) -> int:
+    """How many times a frame of `size`, in pixels, is enlarged for detection."""
+    return 2 if max(size) < tuning.small_side else 1
 
 
 def sift_image(
@@ -106,7 +106,7 @@ def detect_keypoints(
         contrastThreshold=tuning.contrast_threshold,
         enable_precise_upscale=True,
     )
-    scale = upsampling_factor(video.shape[2], tuning)
+    scale = upsampling_factor(video.shape[1:3], tuning)
     detected = []
     for t in track(range(len(video)), "keypoints"):
         mask = keypoint_mask(ignore[t], scale, tuning.mask_margin_px)

@@ -101,13 +101,13 @@ def normalize_world(poses: Poses, tuning: ReconstructionTuning) -> Poses:
 def summary(poses: Poses) -> str:
     """One sentence: frames, points, focal length, errors."""
     focal = poses.K[:, 0, 0]
-    fov = np.degrees(2 * np.arctan(poses.K[:, 0, 2] / focal))
+    fov = np.degrees(2 * np.arctan(poses.K[:, :2, 2].max(1) / focal))
     focal_range = f"{focal.min():.0f}"
     if np.ptp(focal) >= 1e-6:
         focal_range += f" to {focal.max():.0f}"
     return (
         f"{int(poses.registered.sum())} of {len(focal)} frames registered, "
         f"{len(poses.points)} static points, focal length {focal_range} px "
-        f"({fov.max():.0f} degrees across), "
+        f"({fov.max():.0f} degrees across the longer side), "
         f"median reprojection error {np.nanmedian(poses.frame_errors):.2f} px"
     )

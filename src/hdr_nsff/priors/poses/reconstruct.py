@@ -34,7 +34,12 @@ from hdr_nsff.priors.poses.matching import (
     sift_image,
     upsampling_factor,
 )
-from hdr_nsff.priors.poses.rotation import RotationTuning, default_focal, fit_video
+from hdr_nsff.priors.poses.rotation import (
+    RotationTuning,
+    default_focal,
+    field_of_view,
+    fit_video,
+)
 from hdr_nsff.priors.poses.view_matches import (
     EarlierRounds,
     KeyframeTuning,
@@ -52,13 +57,14 @@ class ReconstructionTuning:
     Hand-chosen on rendered clips if no other origin is given.
     """
 
-    # across the image: what undistorted video cameras plausibly see
+    # across the longer side: what undistorted video cameras plausibly see
     min_fov_degrees: float = 25.0
     max_fov_degrees: float = 100.0
     # of a lens that was found to bend strongly, as wide ones do (a GoPro's: 104)
     max_fov_degrees_bent: float = 120.0
-    strong_bend: float = 0.02  # of the width, at the corners (that clip: 0.1)
+    strong_bend: float = 0.02  # of the longer side, at the corners (that clip: 0.1)
     enough_registered: float = 0.9  # share of the views that ends the search for a model
+    max_attempts: int = 8  # mappings before the search ends
     min_registered: float = MIN_REGISTERED_SHARE  # share of the views below which poses have failed
     min_track_views: int = 3  # of a point that is kept
     min_points: int = 10
@@ -171,8 +177,8 @@ def best_model(
     """
     count = len(views.images)
     best: ColmapModel | None = None
-    scale = upsampling_factor(views.images.shape[2], tuning.matching)
-    failures = []
+    scale = upsampling_factor(views.images.shape[1:3], tuning.matching)
+    failures, tries_left = [], tuning.max_attempts
     for leftover in workdir.glob(".sfm-*"):
         shutil.rmtree(leftover, ignore_errors=True)
     workdir.mkdir(parents=True, exist_ok=True)
@@ -180,6 +186,8 @@ def best_model(
     # learned keypoints work in color, and leveling the contrast gains nothing for them
     contrasts = {"leveled": True, "plain": False} if matcher == "sift" else {"plain": False}
     for contrast, level_contrast in contrasts.items():
+        if not tries_left:
+            break
         with tempfile.TemporaryDirectory(prefix=".sfm-", dir=workdir) as folder:
             try:
                 job = write_job(
@@ -190,7 +198,8 @@ def best_model(
             except sfm.SfmError as error:
                 failures.append(str(error))
                 continue
-            for attempt in attempts(job, earlier):
+            for attempt in attempts(job, earlier)[:tries_left]:
+                tries_left -= 1
                 try:
                     folders = sfm.run(attempt)
                     models = [read_model(p) for p in folders]
@@ -262,7 +271,7 @@ def write_job(
         folder=str(folder),
         groups=[[names[v] for v in group] for group in views.groups],
         pairs=named_pairs,
-        focal=default_focal(views.images.shape[2], tuning.rotation) * scale,
+        focal=default_focal(max(views.images.shape[1:3]), tuning.rotation) * scale,
         task="match",
         threads=threads,
         keyframes=[names[v] for v in keyframes],
@@ -297,7 +306,7 @@ def tuning_for_lenses(
     lenses: Sequence[Lens], tuning: ReconstructionTuning = ReconstructionTuning()
 ) -> ReconstructionTuning:
     """The tuning for frames that were undistorted by `lenses`; none: a pinhole's."""
-    bends = [lens.max_displacement_px() / lens.width for lens in lenses]
+    bends = [lens.max_displacement_px() / max(lens.width, lens.height) for lens in lenses]
     if not bends or min(bends) < tuning.strong_bend:
         return tuning
     return replace(tuning, max_fov_degrees=tuning.max_fov_degrees_bent)
@@ -307,7 +316,7 @@ def has_plausible_lens(
     model: ColmapModel, tuning: ReconstructionTuning = ReconstructionTuning()
 ) -> bool:
     """Whether the focal lengths are those of real lenses."""
-    fov = [np.degrees(2 * np.arctan(c.width / 2 / c.K[0, 0])) for c in model.cameras.values()]
+    fov = [field_of_view(c.K[0, 0], c.width, c.height) for c in model.cameras.values()]
     return all(tuning.min_fov_degrees <= f <= tuning.max_fov_degrees for f in fov)
 
 
@@ -330,7 +339,7 @@ def failure_message(
     tuning: ReconstructionTuning = ReconstructionTuning(),
 ) -> str:
     """Why there are no poses, for which frames, and what to do."""
-    count, width = len(views.of_frame), views.images.shape[2]
+    count, (height, width) = len(views.of_frame), views.images.shape[1:3]
     advice = ADVICE if len(views.groups) == 1 else RIG_ADVICE
     if model is None:
         last_error = f"; the last error was: {failures[-1]}" if failures else ""
@@ -341,11 +350,11 @@ def failure_message(
     registered = views_of_images(model)
     missing = [t for t in range(count) if int(views.of_frame[t]) not in registered]
     if len(missing) <= (1 - tuning.min_registered) * count:
-        scale = upsampling_factor(width, tuning.matching)
+        scale = upsampling_factor((height, width), tuning.matching)
         focal = next(iter(model.cameras.values())).K[0, 0] / scale
         return (
             f"poses failed: the estimated focal length of {focal:.0f} px is impossible "
-            f"for {width} px wide frames; {advice}"
+            f"for frames of {width}x{height}; {advice}"
         )
     return (
         f"poses failed: {len(missing)} of {count} frames could not be registered "

@@ -44,7 +44,8 @@ class RotationTuning:
     Hand-chosen on painted and rendered clips if no other origin is given.
     """
 
-    default_fov_degrees: float = 60.0  # across the image, where the footage does not fix it
+    # fields of view are across the longer side of the image, however the camera is held
+    default_fov_degrees: float = 60.0  # where the footage does not fix it
     homography_error_px: float = 1.5  # of inliers
     epipolar_error_px: float = 1.0  # of inliers
     min_pair_matches: int = 20  # of inliers of a pair's homography ...
@@ -68,9 +69,10 @@ class RotationTuning:
     min_gap_share: float = 1 / 6
     min_far_matches: int = 30  # static matches of such a pair
     min_static_matches: int = 150  # of all such pairs
-    # a rotation explains a static match to this error, or to this share of the width
+    # a rotation explains a static match to this error, or to this share of the longer
+    # side
     rotation_error_px: float = 1.5
-    rotation_error_width_share: float = 0.004
+    rotation_error_share: float = 0.004
 
 
 @dataclass(frozen=True)
@@ -100,9 +102,18 @@ class RotationMatches:
     q: np.ndarray  # (M, 2) in frame j
 
 
-def default_focal(width: int, tuning: RotationTuning = RotationTuning()) -> float:
-    """The focal length in pixels of a camera with the default field of view."""
-    return width / 2 / float(np.tan(np.radians(tuning.default_fov_degrees) / 2))
+def default_focal(longer_side: int, tuning: RotationTuning = RotationTuning()) -> float:
+    """The focal length in pixels of a camera with the default field of view across the
+    `longer_side` of the image, in pixels.
+    """
+    return longer_side / 2 / float(np.tan(np.radians(tuning.default_fov_degrees) / 2))
+
+
+def field_of_view(focal: float, width: int, height: int) -> float:
+    """The field of view in degrees across the longer side of an image, which is the
+    same however the camera is held. All arguments are in pixels.
+    """
+    return float(np.degrees(2 * np.arctan(max(width, height) / 2 / focal)))
 
 
 def epipolar(
@@ -160,7 +171,7 @@ def rotation_share(
     """
     min_gap = max((m.j - m.i for m in matches), default=0) * tuning.min_gap_share
     center = np.array([width / 2, height / 2])
-    tolerance = max(tuning.rotation_error_px, tuning.rotation_error_width_share * width)
+    tolerance = max(tuning.rotation_error_px, tuning.rotation_error_share * max(width, height))
     num_explained = num_static = 0
     for m in matches:
         if m.j - m.i < min_gap or len(m.p) < tuning.min_far_matches:
@@ -210,12 +221,12 @@ def fit_panorama(
     if not kept:
         return None
     center = np.array([width / 2, height / 2])
-    guess = default_focal(width, tuning)
+    guess = default_focal(max(width, height), tuning)
     chained, linked = chain_rotations(kept, homographies, count, guess, center)
     pairs = collect_matches([m for m in kept if linked[m.i] and linked[m.j]], center)
     held = refine(chained, guess, pairs, False, tuning)
     free = refine(held.rotations, guess, pairs, True, tuning)
-    fov = float(np.degrees(2 * np.arctan(width / 2 / free.focal)))
+    fov = field_of_view(free.focal, width, height)
     plausible = tuning.min_fov_degrees < fov < tuning.max_fov_degrees
     focal_known = plausible and free.log_focal_deviation < tuning.max_log_focal_deviation
     # through an endlessly long lens a turn is a shift of the image

@@ -98,7 +98,7 @@ def match_visits(
     """Keypoints and matches of the cameras of a rig, found in the images of their
     visits, which are written into the folder of the `job`.
     """
-    scale = upsampling_factor(visits.images.shape[2], matching)
+    scale = upsampling_factor(visits.images.shape[1:3], matching)
     pairs = visits.pairs()
     masks = [keypoint_mask(ignore, scale, matching.mask_margin_px) for ignore in visits.ignore]
     if matcher == "sift":
