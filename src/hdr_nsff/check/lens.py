@@ -12,10 +12,16 @@ import numpy as np
 from hdr_nsff.check.facts import LensFacts
 from hdr_nsff.core.errors import InputError
 from hdr_nsff.core.stack import spread_frames
-from hdr_nsff.priors.poses.estimate import estimate_poses
+from hdr_nsff.priors.poses.estimate import PosesTuning, estimate_poses
+from hdr_nsff.priors.poses.reconstruct import ReconstructionTuning
 
 # frames that are mapped (hand-chosen: seconds, and enough for one lens)
 MAX_FRAMES = 16
+# where the first mapping fails, others take minutes and find a lens of few frames
+TUNING = PosesTuning(reconstruction=ReconstructionTuning(max_attempts=1))
+# share of the frames that a lens must explain to be believed (hand-chosen: a globe that
+# turns was mapped in part, with a lens that bent)
+MIN_REGISTERED_SHARE = 0.9
 
 
 def measure_lens(equalized: np.ndarray, clipped: np.ndarray, scale: float) -> LensFacts | None:
@@ -29,11 +35,11 @@ def measure_lens(equalized: np.ndarray, clipped: np.ndarray, scale: float) -> Le
     with tempfile.TemporaryDirectory() as folder:
         try:
             poses = estimate_poses(
-                equalized[chosen], None, Path(folder), clipped[chosen], lens="auto"
+                equalized[chosen], None, Path(folder), clipped[chosen], tuning=TUNING, lens="auto"
             )
         except InputError:
             return None
-    if poses.parallax != "full":
+    if poses.parallax != "full" or poses.registered.mean() < MIN_REGISTERED_SHARE:
         return None
     if not poses.lenses:
         return LensFacts(0.0, 0.0, 0.0)
