@@ -15,6 +15,7 @@ from hdr_nsff.prepare.tracks import share_masks
 from hdr_nsff.prepare.work import Work
 from hdr_nsff.priors.masks.background import correct_by_background
 from hdr_nsff.priors.masks.geometric import geometric_mask
+from hdr_nsff.priors.masks.unsteady import mark_unsteady
 
 
 def find_masks(work: Work) -> StepResult:
@@ -41,7 +42,8 @@ def find_masks(work: Work) -> StepResult:
 
 def estimated_masks(work: Work) -> np.ndarray:
     """Moving masks (T, H, W) from flow and poses; also from the visits of a rig's
-    cameras, or from the background, where a camera shows it at other times.
+    cameras, from the background, where a camera shows it at other times, or from what a
+    camera that stands still never shows again.
     """
     evidence = work.visits.distance if work.manifest.rig > 1 else None
     found, valid, pairs = work.raw_flows
@@ -64,6 +66,8 @@ def estimated_masks(work: Work) -> np.ndarray:
     )
     groups = recorded_alike[1].ravel()
     for own in work.camera_frames():  # frames of two cameras are no neighbors
+        if np.allclose(c2w[own], c2w[own][0]):
+            moving[own] = mark_unsteady(moving[own], video[own], groups[own], train[own])
         moving[own] = correct_by_background(
             moving[own], video[own], groups[own], train[own], K[own], c2w[own]
         )

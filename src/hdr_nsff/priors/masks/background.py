@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from hdr_nsff.core.progress import track
 from hdr_nsff.core.stack import ArrayStack
+from hdr_nsff.priors.masks.regions import marked_regions, regions_with_disc, without_specks
 
 SIGMA_PER_MAD = 1.48  # standard deviation of a Gaussian per median absolute deviation
 
@@ -86,8 +87,7 @@ def correct_by_background(
     without parallax in each group.
     """
     count, height, width = moving.shape
-    coarseness = int(np.ceil(np.sqrt(height * width / tuning.working_pixels)))
-    size = (-(-width // coarseness), -(-height // coarseness))
+    size = working_size((height, width), tuning.working_pixels)
     shrink = np.array([size[0] / width, size[1] / height, 1])[:, None]
     K = np.broadcast_to(K, (count, 3, 3)) * shrink
     frames = [resize(np.asarray(frame), size, tuning.blur_px) for frame in video]
@@ -150,6 +150,15 @@ def grow_masks(
         for neighbor in (max(t - 1, 0), min(t + 1, len(masks) - 1)):
             grow(t, neighbor)
     return grown
+
+
+def working_size(shape: tuple[int, int], max_pixels: int) -> tuple[int, int]:
+    """The size (width, height) of frames of `shape` (height, width), made coarser by
+    the whole number that leaves at most about `max_pixels`.
+    """
+    height, width = shape
+    coarseness = int(np.ceil(np.sqrt(height * width / max_pixels)))
+    return -(-width // coarseness), -(-height // coarseness)
 
 
 def resize(image: np.ndarray, size: tuple[int, int], blur_px: float = 0.0) -> np.ndarray:
@@ -224,10 +233,7 @@ def compare(frame: np.ndarray, samples: np.ndarray, tuning: BackgroundTuning) ->
     threshold = np.maximum(tuning.min_difference, tuning.deviations * deviation)
     differs = (difference > threshold).any(-1) & known
     hint = np.maximum(tuning.min_trace, tuning.trace_deviations * deviation)
-    opening = np.ones((tuning.opening_px,) * 2, np.uint8)
-    closing = np.ones((tuning.closing_px,) * 2, np.uint8)
-    opened = cv2.morphologyEx(differs.astype(np.uint8), cv2.MORPH_OPEN, opening)
-    certain = cv2.morphologyEx(opened, cv2.MORPH_CLOSE, closing) > 0
+    certain = without_specks(differs, tuning.opening_px, tuning.closing_px)
     much = np.maximum(tuning.solid_difference, 2 * tuning.deviations * deviation)
     differs_much = (difference > much).any(-1) & known
     solid = marked_regions(certain, differs_much, tuning.solid_share)
@@ -250,24 +256,3 @@ def near(pixels: np.ndarray, reach: int) -> np.ndarray:
 def enlarge(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """A mask of the working grid at `size` (width, height)."""
     return cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST) > 0
-
-
-def marked_regions(differs: np.ndarray, marked: np.ndarray, min_share: float) -> np.ndarray:
-    """The connected regions (H, W) of `differs` of which at least `min_share` are
-    `marked` (H, W).
-    """
-    num, labels = cv2.connectedComponents(differs.astype(np.uint8))
-    pixels = np.bincount(labels.ravel(), minlength=num)
-    marked_pixels = np.bincount(labels.ravel(), weights=marked.ravel(), minlength=num)
-    kept = marked_pixels >= min_share * pixels
-    kept[0] = False  # what does not differ
-    return kept[labels]
-
-
-def regions_with_disc(differs: np.ndarray, much: np.ndarray, radius: float) -> np.ndarray:
-    """The connected regions (H, W) of `differs` with a disc of `radius` pixels that is
-    all `much` (H, W).
-    """
-    _, labels = cv2.connectedComponents(differs.astype(np.uint8))
-    inside = cv2.distanceTransform((much & differs).astype(np.uint8), cv2.DIST_L2, 3)
-    return np.isin(labels, np.unique(labels[inside > radius]))

@@ -1,0 +1,128 @@
+"""Moving masks of what a camera that stands still never shows again."""
+
+import numpy as np
+
+from hdr_nsff.priors.masks.regions import marked_regions, regions_with_disc, without_specks
+from hdr_nsff.priors.masks.unsteady import UnsteadyTuning, mark_unsteady, typical_deviation
+
+T, H, W = 24, 40, 60
+FACE = np.s_[8:32, 18:42]
+CORE = np.s_[11:29, 21:39]  # of the face, beyond the blur
+ONE_GROUP = np.zeros(T, int)
+ALL = np.ones(T, bool)
+
+
+def talking(seed: int = 0, frames: range = range(T)) -> np.ndarray:
+    """A wall, before which a face of blotches changes in some `frames`."""
+    noise = np.random.default_rng(seed)
+    wall = np.repeat(np.repeat(noise.uniform(0.3, 1, (H // 4, W // 4, 3)), 4, 0), 4, 1)
+    video = np.tile(wall, (T, 1, 1, 1)) + noise.normal(0, 0.01, (T, H, W, 3))
+    for t in frames:
+        blotches = noise.uniform(0.2, 0.8, (6, 6, 3))
+        video[t][FACE] = np.repeat(np.repeat(blotches, 4, 0), 4, 1)
+    return video.astype(np.float32)
+
+
+def seen_by_flow(*frames: int) -> np.ndarray:
+    """Masks of flow that finds the face in some `frames`."""
+    moving = np.zeros((T, H, W), bool)
+    for t in frames:
+        moving[t][FACE] = True
+    return moving
+
+
+def test_what_changes_always_and_is_marked_at_times_moves_always():
+    marked = mark_unsteady(seen_by_flow(3, 4, 11), talking(), ONE_GROUP, ALL)
+    assert marked[:, *CORE].all()
+    outside = np.ones((H, W), bool)
+    outside[6:34, 16:44] = False
+    assert not marked[:, outside].any()
+
+
+def test_what_flow_never_marks_stays_static():
+    before = seen_by_flow(3)  # one of 24 frames
+    assert (mark_unsteady(before, talking(), ONE_GROUP, ALL) == before).all()
+
+
+def test_somebody_who_passes_by_is_marked_no_longer_than_he_is_there():
+    before = seen_by_flow(*range(8, 16))
+    after = mark_unsteady(before, talking(frames=range(8, 16)), ONE_GROUP, ALL)
+    assert (after == before).all()
+
+
+def test_small_changes_and_thin_regions_are_left_alone():
+    still = talking(frames=range(0))
+    before = seen_by_flow(*range(0, T, 3))
+    assert (mark_unsteady(before, still, ONE_GROUP, ALL) == before).all()
+    branch = still.copy()
+    branch[::2, 10:14, 5:55] = 0.05  # four rows: the blur leaves them narrow
+    before = np.zeros((T, H, W), bool)
+    before[::2, 10:14, 5:55] = True
+    wide = UnsteadyTuning(radius_share=0.1)
+    assert (mark_unsteady(before, branch, ONE_GROUP, ALL, wide) == before).all()
+
+
+def test_one_exposure_that_shows_the_change_is_enough():
+    video, groups = talking(), np.arange(T) % 2
+    video[1::2] = np.clip(video[1::2] * 40, 0, 1)  # clips everywhere
+    marked = mark_unsteady(seen_by_flow(3, 4, 11), video, groups, ALL)
+    assert marked[:, *CORE].all()
+
+
+def test_a_difference_of_exposures_is_no_change():
+    video, groups = talking(frames=range(0)), np.arange(T) % 2
+    video[1::2] *= 0.3
+    before = seen_by_flow(*range(0, T, 3))
+    assert (mark_unsteady(before, video, groups, ALL) == before).all()
+
+
+def test_held_out_frames_decide_nothing_about_training_frames():
+    train = np.arange(T) % 4 != 3
+    before = seen_by_flow(*np.flatnonzero(~train))
+    after = mark_unsteady(before, talking(), ONE_GROUP, train)
+    assert not after[train].any()
+    assert after[~train][:, *CORE].all()
+
+
+def test_few_frames_of_an_exposure_show_nothing():
+    before = seen_by_flow(0, 1, 2)
+    assert (mark_unsteady(before, talking(), np.arange(T) // 5, ALL) == before).all()
+
+
+def test_memory_does_not_grow_with_the_clip():
+    class Counted:
+        """A clip that counts the frames that are read."""
+
+        def __init__(self, video: np.ndarray) -> None:
+            self.video, self.reads = video, 0
+
+        def __getitem__(self, t: int) -> np.ndarray:
+            self.reads += 1
+            return self.video[t]
+
+    clip = Counted(talking())
+    mark_unsteady(seen_by_flow(3, 4), clip, ONE_GROUP, ALL, UnsteadyTuning(max_frames=9))  # type: ignore[arg-type]
+    assert clip.reads == 9
+
+
+def test_the_typical_deviation_is_that_of_a_gaussian_and_ignores_moments():
+    values = np.random.default_rng(1).normal(0.5, 0.05, (400, 8, 8, 3))
+    assert abs(typical_deviation(values[..., :1]).mean() / 0.05 - 1) < 0.05
+    values[::5] = 3.0
+    assert typical_deviation(values).max() < 0.09
+
+
+def test_regions_are_cleaned_and_chosen():
+    pixels = np.zeros((24, 40), bool)
+    pixels[6:16, 4:14] = True
+    pixels[9:11, 8:10] = False  # a gap
+    pixels[6:16, 22:32] = True
+    pixels[20, 35] = True  # a speck
+    clean = without_specks(pixels, 3, 5)
+    assert clean[6:16, 4:14].all() and not clean[20, 35] and clean.sum() == 200
+    share = np.where(np.arange(40) < 18, 0.3, 0.1) * np.ones((24, 1))
+    assert marked_regions(clean, share, 0.2).sum() == 100
+    assert marked_regions(clean, share, 0.05).sum() == 200
+    inside = clean.copy()
+    inside[9:, 22:32] = False  # three rows are left of the second
+    assert regions_with_disc(clean, inside, 3.0).sum() == 100
