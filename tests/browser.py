@@ -9,7 +9,9 @@ from __future__ import annotations
 import base64
 import json
 import os
+import select
 import shutil
+import signal
 import subprocess
 import time
 from collections.abc import Iterator
@@ -65,18 +67,23 @@ class Page:
             message["sessionId"] = self.session
         os.write(self.to_browser, json.dumps(message).encode() + b"\0")
         deadline = time.monotonic() + TIMEOUT_SECONDS
-        while time.monotonic() < deadline:
-            answer = self.next_message()
+        while True:
+            answer = self.next_message(deadline, method)
             if answer.get("id") != self.last_id:
                 self.events.append(answer)
             elif "error" in answer:
                 raise RuntimeError(f"{method}: {answer['error']}")
             else:
                 return answer["result"]
-        raise TimeoutError(method)
 
-    def next_message(self) -> dict[str, Any]:
+    def next_message(self, deadline: float, method: str) -> dict[str, Any]:
+        """The next message; TimeoutError where none is complete by the `deadline` of the
+        command `method`, on the monotonic clock.
+        """
         while b"\0" not in self.received:
+            left = max(0.0, deadline - time.monotonic())
+            if not select.select([self.from_browser], [], [], left)[0]:
+                raise TimeoutError(method)
             chunk = os.read(self.from_browser, 1 << 20)
             if not chunk:
                 raise RuntimeError("the browser has ended")
@@ -180,7 +187,9 @@ class Page:
 
 @contextmanager
 def browser(profile: Path, *more: str) -> Iterator[Page]:
-    """A tab of a new browser whose profile is the folder `profile`; `more` options."""
+    """A tab of a new browser whose profile is the folder `profile`; `more` options. It
+    ends with all of its processes, also where it hangs.
+    """
     found = find_browser()
     assert found is not None
     browser_reads, to_browser = os.pipe()
@@ -198,6 +207,7 @@ def browser(profile: Path, *more: str) -> Iterator[Page]:
         close_fds=False,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
+        start_new_session=True,
     )
     os.close(browser_reads)
     os.close(browser_writes)
@@ -207,6 +217,10 @@ def browser(profile: Path, *more: str) -> Iterator[Page]:
         yield page
     finally:
         process.terminate()
-        process.wait(30)
+        try:
+            process.wait(30)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait(30)
         os.close(to_browser)
         os.close(from_browser)
