@@ -77,8 +77,8 @@ class Page:
                 return answer["result"]
 
     def next_message(self, deadline: float, method: str) -> dict[str, Any]:
-        """The next message; TimeoutError where none is complete by the `deadline` of the
-        command `method`, on the monotonic clock.
+        """The next message; TimeoutError where none is complete by the `deadline` of
+        the command `method`, on the monotonic clock.
         """
         while b"\0" not in self.received:
             left = max(0.0, deadline - time.monotonic())
