@@ -62,6 +62,22 @@ def test_small_changes_and_thin_regions_are_left_alone():
     assert (mark_unsteady(before, branch, ONE_GROUP, ALL, wide) == before).all()
 
 
+def test_a_change_below_what_is_visible_is_none_even_without_noise():
+    video = np.full((T, H, W, 3), 0.5, np.float32)
+    video[::2][:, *FACE] += 0.03  # a deviation of 0.022
+    before = seen_by_flow(*range(0, T, 3))
+    assert (mark_unsteady(before, video, ONE_GROUP, ALL) == before).all()
+    sharper = UnsteadyTuning(min_deviation=0.02)
+    assert mark_unsteady(before, video, ONE_GROUP, ALL, sharper)[:, *CORE].all()
+
+
+def test_noise_is_no_change():
+    noise = np.random.default_rng(2).normal(0.5, 0.15, (T, H, W, 3)).astype(np.float32)
+    before = np.zeros((T, H, W), bool)
+    before[::3] = True
+    assert (mark_unsteady(before, noise, ONE_GROUP, ALL) == before).all()
+
+
 def test_one_exposure_that_shows_the_change_is_enough():
     video, groups = talking(), np.arange(T) % 2
     video[1::2] = np.clip(video[1::2] * 40, 0, 1)  # clips everywhere

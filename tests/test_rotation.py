@@ -32,11 +32,11 @@ def test_a_slide_past_a_flat_wall_is_no_turn():
     assert fit_panorama(matches, 8, W, H).slides
 
 
-def turn_of(focal: float, width: int, height: int) -> list[PairMatches]:
-    """Matches of 8 frames of a camera that turns 24 degrees along its longer side."""
+def turn_of(focal: float, width: int, height: int, degrees: float = 24) -> list[PairMatches]:
+    """Matches of 8 frames of a camera that turns along its longer side."""
     rng = np.random.default_rng(0)
     axis = "y" if width > height else "x"
-    turns = Rotation.from_euler(axis, np.linspace(-12, 12, 8)[:, None], degrees=True).as_matrix()
+    turns = Rotation.from_euler(axis, np.linspace(0, degrees, 8)[:, None], degrees=True).as_matrix()
     size = np.array([width, height])
     matches = []
     for i in range(8):
@@ -61,6 +61,8 @@ def test_a_long_lens_is_plausible_however_the_camera_is_held(width: int, height:
 def test_the_default_field_of_view_is_across_the_longer_side(width: int, height: int) -> None:
     focal = default_focal(max(width, height))
     assert focal == pytest.approx(160 / np.tan(np.radians(30)))
+    panorama = fit_panorama(turn_of(200.0, width, height, 0.3), 8, width, height)
+    assert panorama is not None and not panorama.focal_known and panorama.focal == focal
     assert field_of_view(focal, width, height) == pytest.approx(60)
 
 
