@@ -330,9 +330,7 @@ SECTIONS = (
         "Alternating exposures as filmed (`hand_books`, `nv_balloon1`: re-exposed; `gopro`: auto "
         "exposure), nothing given but the poses of the two and the GoPro's metadata. Measured on "
         "every eighth frame, of the two on other frames of the original. Moving pixels are those "
-        "of the estimated masks. 2 minutes of training are on one thread, beside another run, on "
-        "frames widened from 256 to 257 pixels, as they were read before: blurred, they score "
-        "about 1 dB more.",
+        "of the estimated masks. 2 minutes of training are on one thread, beside another run.",
         "hdr-nsff bench OUT --scenes CLIP,CLIP,... --methods splat --steps 800 --max-size 320 "
         "--views 0` and `--methods splat,grid --budget 2min --views 0 --jobs 2",
         bench_clips,

@@ -61,7 +61,7 @@ def test_a_mask_of_most_of_the_frame_is_reported(monkeypatch):
     monkeypatch.setattr(geometric, "motion_score", lambda *given: high_score)
     *given, _ = painted_clip("rising")
     assert rough_mask(*given).all()
-    assert "8 of 8 frames" in messages[0] and "--masks" in messages[0]
+    assert "8 of 8 frames" in messages[0] and "--mask FOLDER" in messages[0]
 
 
 def test_large_frames_are_judged_on_a_coarser_grid():

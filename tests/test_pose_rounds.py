@@ -91,7 +91,7 @@ def test_restless_masks_of_a_clip_that_rotations_explain_mean_a_turn(rounds, cap
 def test_small_movers_that_flicker_do_not(rounds):
     dots = [m & (np.arange(H) == 50)[:, None] for m in RESTLESS]
     poses, estimates = rounds(0.7, *dots)
-    assert poses.parallax == "full" and estimates == 3
+    assert poses.parallax == "full" and estimates == 3 and not poses.notes
 
 
 def test_where_nothing_moves_one_round_is_enough(rounds):
@@ -103,6 +103,12 @@ def test_where_nothing_moves_one_round_is_enough(rounds):
 def test_restless_masks_alone_do_not(rounds, share):
     poses, estimates = rounds(share, *RESTLESS)
     assert poses.parallax == "full" and estimates == 3
+    assert "in doubt" in poses.notes[-1] and "--tripod" in poses.notes[-1]
+
+
+def test_masks_that_nearly_settle_are_in_no_doubt(rounds):
+    poses, estimates = rounds(0.3, mask(0), mask(30), mask(60), mask(66))  # IoU 0.54
+    assert poses.parallax == "full" and estimates == 3 and not poses.notes
 
 
 @pytest.mark.parametrize("shake", [0.0, 0.3])

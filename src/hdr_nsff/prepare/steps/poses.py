@@ -42,6 +42,9 @@ MIN_MASK_IOU = 0.85  # intersection over union from which masks count as the sam
 # share of all pixels whose masks change in the last round, from which poses have not
 # settled (hand-chosen; 0.02 or more on two clips that do not)
 MIN_RESTLESS_SHARE = 0.01
+# intersection over union of the last two masks below which poses are in doubt
+# (hand-chosen; a man who fills a still picture, mapped as a camera that moves: 0.25)
+MIN_TRUSTED_IOU = 0.5
 # z-depth around distance 1, where everything lies when there is no parallax:
 SPHERE_NEAR = 0.5
 SPHERE_FAR = 2.0
@@ -154,8 +157,8 @@ def poses_and_masks(work: Work) -> Poses:
     Poses need masks, and good masks need poses. The rounds end once the masks hardly
     change any more. Where they keep changing and rotations explain much of the
     footage, the camera counts as one that turns in place; where the little detail that
-    is no mover's keeps its place, as one that stands still. A rig needs one round: its
-    masks need no poses.
+    is no mover's keeps its place, as one that stands still; else a note says that they
+    are in doubt. A rig needs one round: its masks need no poses.
     """
     if work.manifest.rig > 1:
         return estimate(work, work.visits.moving)
@@ -181,7 +184,23 @@ def poses_and_masks(work: Work) -> Poses:
             return poses
         if rounds_left:
             poses, before = estimate(work, moving, earlier), moving
-    return poses_without_parallax(work, before, moving) or poses
+    without_parallax = poses_without_parallax(work, before, moving)
+    if without_parallax is not None:
+        return without_parallax
+    if agreement < MIN_TRUSTED_IOU and is_restless(before, moving):
+        note = (
+            f"in doubt: after {MAX_ROUNDS + 1} rounds masks still agree to {agreement:.0%} only; "
+            "give --tripod if the camera stands still, else poses (--poses PATH) or masks "
+            "(--mask FOLDER)"
+        )
+        say(f"poses: {note}")
+        return replace(poses, notes=(*poses.notes, note))
+    return poses
+
+
+def is_restless(before: np.ndarray, moving: np.ndarray) -> bool:
+    """Whether masks (T, H, W) bool change much from one round to the next."""
+    return bool((before ^ moving).mean() >= MIN_RESTLESS_SHARE)
 
 
 def poses_without_parallax(work: Work, before: np.ndarray, moving: np.ndarray) -> Poses | None:
@@ -197,8 +216,7 @@ def poses_without_parallax(work: Work, before: np.ndarray, moving: np.ndarray) -
     own = track_frames(work.manifest, track)
     video, clipped = (stack[own] for stack in work.equalized)
     ignore = moving[own] | np.array(clipped)
-    restless = (before ^ moving).mean() >= MIN_RESTLESS_SHARE
-    share = parallax_free_share(video, ignore) if restless else None
+    share = parallax_free_share(video, ignore) if is_restless(before, moving) else None
     reason = "since its masks keep changing"
     poses = None
     if share is not None and share >= PosesTuning().min_rotation_share_fallback:

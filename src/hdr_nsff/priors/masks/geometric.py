@@ -128,7 +128,7 @@ def warn_of_large_masks(moving: np.ndarray, report: str, tuning: GeometricMaskTu
         say(
             f"{report}: in {len(large)} of {len(moving)} frames more than "
             f"{tuning.doubtful_share:.0%} of the pixels seem to move (first: frame {large[0]}); "
-            "if that is wrong, give masks (--masks FOLDER) or flow (--flow FOLDER)"
+            "if that is wrong, give masks (--mask FOLDER) or flow (--flow FOLDER)"
         )
 
 
