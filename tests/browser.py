@@ -67,7 +67,7 @@ class Page:
             message["sessionId"] = self.session
         os.write(self.to_browser, json.dumps(message).encode() + b"\0")
         deadline = time.monotonic() + TIMEOUT_SECONDS
-        while True:
+        while time.monotonic() < deadline:
             answer = self.next_message(deadline, method)
             if answer.get("id") != self.last_id:
                 self.events.append(answer)
@@ -75,6 +75,7 @@ class Page:
                 raise RuntimeError(f"{method}: {answer['error']}")
             else:
                 return answer["result"]
+        raise TimeoutError(method)
 
     def next_message(self, deadline: float, method: str) -> dict[str, Any]:
         """The next message; TimeoutError where none is complete by the `deadline` of

@@ -117,7 +117,8 @@ def test_memory_does_not_grow_with_the_clip():
             return self.video[t]
 
     clip = Counted(talking())
-    mark_unsteady(seen_by_flow(3, 4), clip, ONE_GROUP, ALL, UnsteadyTuning(max_frames=9))  # type: ignore[arg-type]
+    few = UnsteadyTuning(max_frames=9)
+    mark_unsteady(seen_by_flow(3, 4), clip, ONE_GROUP, ALL, few)  # type: ignore[arg-type]
     assert clip.reads == 9
 
 
