@@ -3,12 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from posed_clips import panning
 
+from hdr_nsff.core.errors import InputError
 from hdr_nsff.footage.colmap import ColmapCamera, ColmapImage, ColmapModel
 from hdr_nsff.geometry.lens import Lens
+from hdr_nsff.priors.poses import reconstruct, sfm
 from hdr_nsff.priors.poses.reconstruct import (
+    ReconstructionTuning,
     SfmViews,
+    best_model,
     failure_message,
     has_plausible_lens,
     model_rank,
@@ -92,3 +97,20 @@ def test_failure_names_the_lens_or_the_frames():
     rig = replace(views_of(10), groups=[[0, 1, 2, 3, 4], [5, 6, 7, 8, 9]])
     assert "one each is enough" in failure_message(None, rig, [])
     assert "--tripod" in failure_message(None, views_of(10), [])
+
+
+@pytest.mark.parametrize(("limit", "tried"), [(1, 1), (3, 3), (8, 4)])
+def test_no_more_mappings_than_allowed_are_tried(tmp_path, monkeypatch, limit, tried):
+    jobs = []
+
+    def fail(job):
+        jobs.append(job.task)
+        raise sfm.SfmError("nothing matches")
+
+    job = sfm.Job(str(tmp_path), [[]], [], 100.0, "match")
+    monkeypatch.setattr(reconstruct, "write_job", lambda *_: job)
+    monkeypatch.setattr(sfm, "run", fail)
+    tuning = ReconstructionTuning(max_attempts=limit)
+    with pytest.raises(InputError, match="nothing matches"):
+        best_model(views_of(5), tmp_path, 1, "sift", tuning)
+    assert len(jobs) == tried
